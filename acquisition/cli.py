@@ -328,8 +328,7 @@ def run(
     SESSION: session.toml, chart.json, illuminations.csv, frames/, previews/, journal.sqlite, frames.csv, report.html.
     Interrupt it as you like and run it again. Ends with 4 when frames were refused; the next run tries those again.
     """
-    from acquisition.run.notices import Terminal
-    from acquisition.run.run import run_session
+    from acquisition.run.run import Terminal, run_session
     from experiment.config import load_lab
 
     settings = load_lab(lab)

@@ -36,15 +36,9 @@ import rawpy
 
 from benchmarks import words_given
 from calibration.checks.frame_consistency import ConsistencyCheck
-from calibration.pipeline.baseline import (
-    PAPER_OPTIONS,
-    BuildOptions,
-    baseline_of,
-    decode_frame,
-    select_frames,
-    with_lens,
-)
+from calibration.pipeline.baseline import baseline_of, select_frames, with_lens
 from calibration.pipeline.build import build, thread_count
+from calibration.pipeline.frames import PAPER_OPTIONS, BuildOptions, decode_frame
 from calibration.registration.register import register
 from calibration.sampling import gather_values, sites_at
 from drivers.camera import CapturedFrame

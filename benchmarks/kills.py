@@ -27,7 +27,7 @@ from foundation.console import run
 from foundation.errors import DeviceError
 from generator.dataset.making import Workers, generate_dataset
 from generator.dataset.plan import DatasetOptions
-from generator.lights.choices import RandomLights
+from generator.lights.lighting import RandomLights
 from generator.pictures.sources import random_scenes
 
 IMAGES = 10_000

@@ -32,8 +32,8 @@ import numpy.typing as npt
 
 from benchmarks.cases import chart_of
 from benchmarks.sessions import SETTINGS, FrameChange, compare, short_plan, short_session
-from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
+from calibration.pipeline.frames import BuildOptions
 from calibration.table.lut import open_lut
 from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings

@@ -32,8 +32,8 @@ from foundation.errors import FormatError, InputError, QualityError
 from foundation.secret_texts import masked, printable
 
 if TYPE_CHECKING:
-    from calibration.pipeline.baseline import BuildOptions
     from calibration.pipeline.build import TableProgress
+    from calibration.pipeline.frames import BuildOptions
     from calibration.table.lut import Lut
     from calibration.verdict import BuildResult
     from experiment.session.folder import Session
@@ -256,7 +256,7 @@ def build_lut(
         elif fetch is not None:
             _fetch_table(*fetch, expect, output)
         else:
-            from calibration.pipeline.baseline import BuildOptions
+            from calibration.pipeline.frames import BuildOptions
             from calibration.sampling import WINDOW
             from experiment.framing.field import parse_corners
 

@@ -1,23 +1,21 @@
-"""The inner loops of calibration, compiled: sampling frames, the lens's spread, cells among neighbours, moments.
+"""Inner loops of calibration, compiled: the lens's spread, cells among neighbours, moments.
 
 Compiled for the processor at hand at the first call and kept on disk for the next. No state, no lock, and the
 interpreter's is released, so that each frame has a thread to itself. Without licence to reorder sums: a table's bytes
 depend on neither processor nor thread. What the numbers mean stands where the kernels are called, in
-`calibration.sampling`, `calibration.spread.surroundings`, `calibration.checks.frame_consistency` and
-`calibration.comparison.comparing`. Nothing of ours but the compiler is imported: whatever is, its change has all of
-them compiled again.
+`calibration.spread.surroundings` and `calibration.spread.predicting`, `calibration.checks.frame_consistency` and
+`calibration.comparison.comparing`; those of sampling stand in `calibration.sampling`. Nothing of ours but the compiler
+is imported: whatever is, its change has all of them compiled again.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numpy import uint64
 
-from foundation.compiled import compiled, inlined
+from foundation.compiled import compiled
 
 _Array = npt.NDArray[np.float64]
 _Float = npt.NDArray[np.float32]
@@ -35,145 +33,6 @@ depend on where within its slot a patch is sampled."""
 
 ACROSS = 2 * REACH + 1
 """Slots along the neighbourhood of a patch."""
-
-
-@inlined
-def _sampled(sensor: Any, corner: Any, step: Any, places: Any, window: Any, black: Any, samples: Any) -> Any:
-    """Fill a patch's samples (window², 3) float32 and return the highest of its counts, int32."""
-    red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
-    highest, number = np.int32(0), uint64(0)
-    for row in range(window):
-        # Unsigned places spare the test for one before the array's beginning.
-        at = uint64(corner + row * step)
-        for _ in range(window):
-            r, b = np.int32(sensor[at + red]), np.int32(sensor[at + blue])
-            g, h = np.int32(sensor[at + green]), np.int32(sensor[at + other])
-            at += uint64(2)
-            samples[number, 0] = np.float32(r) - black[0]
-            samples[number, 1] = np.float32(g + h) * np.float32(0.5) - black[1]
-            samples[number, 2] = np.float32(b) - black[2]
-            highest = max(highest, max(max(r, b), max(g, h)))
-            number += uint64(1)
-    return highest
-
-
-@inlined
-def _tabulated(samples: Any, dark: Any, field: Any, values: Any) -> None:
-    """Fill a patch's values (S, 3) uint16 from its samples (S, 3) float32, less `dark` (3,), over `field` (3,)."""
-    for number in range(len(samples)):
-        for channel in range(3):
-            level = np.rint((samples[number, channel] - dark[channel]) / field[channel])
-            values[number, channel] = np.uint16(min(max(level, np.float32(0)), np.float32(65535)))
-
-
-@compiled
-def sample(
-    sensor: _Count,
-    corner: _Place,
-    order: _Place,
-    inside: _Mask,
-    step: int,
-    places: _Place,
-    window: int,
-    black: _Float,
-    samples: _Float,
-    peak: _Count,
-) -> None:
-    """Fill samples (N, window², 3) float32 and their highest counts `peak` (N,); patches that are not inside get 0.
-
-    `sensor`: (photosites,) uint16. `corner`: (N,) the top-left photosite of each patch's first pixel. `order`: (N,) the
-    patches as they are best visited: neighbours on the sensor one after another, for the memory's sake. `inside`: (N,)
-    whether a patch lies on the sensor. `places`: (4,) photosites from a block's top-left one to its red, its two greens
-    and its blue. `black`: (3,) float32 counts, of red, green and blue.
-    """
-    for patch in order:
-        if not inside[patch]:
-            samples[patch] = 0
-            peak[patch] = 0
-            continue
-        peak[patch] = _sampled(sensor, corner[patch], step, places, window, black, samples[patch])
-
-
-@compiled
-def tabulate(samples: _Float, dark: _Float, field: _Float, values: _Count) -> None:
-    """Fill values (N, S, 3) uint16 from samples (N, S, 3) float32, less `dark` (N, 3), over `field` (N, 3)."""
-    for patch in range(samples.shape[0]):
-        _tabulated(samples[patch], dark[patch], field[patch], values[patch])
-
-
-@compiled
-def sample_to_table(
-    sensor: _Count,
-    corner: _Place,
-    order: _Place,
-    inside: _Mask,
-    step: int,
-    places: _Place,
-    window: int,
-    black: _Float,
-    dark: _Float,
-    field: _Float,
-    values: _Count,
-    peak: _Count,
-) -> None:
-    """Do `sample` and `tabulate` patch by patch, without the samples (N, window², 3) between them.
-
-    `values` (N, window², 3) uint16 and `peak` (N,) uint16 are filled; `dark` and `field` are (N, 3) float32, the rest
-    as for `sample`.
-    """
-    samples = np.empty(values.shape[1:], np.float32)
-    for patch in order:
-        if not inside[patch]:
-            values[patch] = 0
-            peak[patch] = 0
-            continue
-        peak[patch] = _sampled(sensor, corner[patch], step, places, window, black, samples)
-        _tabulated(samples, dark[patch], field[patch], values[patch])
-
-
-@compiled
-def count_means(
-    sensor: _Count,
-    corner: _Place,
-    order: _Place,
-    inside: _Mask,
-    step: int,
-    places: _Place,
-    window: int,
-    black: _Float,
-    means: _Array,
-) -> None:
-    """Fill means (N, 3) float64, counts above black; patches that are not inside get 0. Parameters as for `sample`."""
-    red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
-    samples = window * window
-    for patch in order:
-        if not inside[patch]:
-            means[patch] = 0
-            continue
-        r, g, b = np.int64(0), np.int64(0), np.int64(0)
-        for row in range(window):
-            at = uint64(corner[patch] + row * step)
-            for _ in range(window):
-                r += sensor[at + red]
-                g += np.int64(sensor[at + green]) + np.int64(sensor[at + other])
-                b += sensor[at + blue]
-                at += uint64(2)
-        means[patch, 0] = r / samples - black[0]
-        means[patch, 1] = g / (2 * samples) - black[1]
-        means[patch, 2] = b / samples - black[2]
-
-
-@compiled
-def patch_means(values: _Count, means: _Array) -> None:
-    """Fill means (N, 3) float64 of values (N, S, 3) uint16."""
-    samples = values.shape[1]
-    for patch in range(values.shape[0]):
-        red, green, blue = np.int64(0), np.int64(0), np.int64(0)
-        for number in range(samples):
-            red += values[patch, number, 0]
-            green += values[patch, number, 1]
-            blue += values[patch, number, 2]
-        means[patch, 0], means[patch, 1], means[patch, 2] = red / samples, green / samples, blue / samples
 
 
 @compiled

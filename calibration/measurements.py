@@ -21,11 +21,10 @@ from calibration.checks.stray_light import StrayLight
 from calibration.citation import OriginRecord
 from calibration.radiometry.dark_frames import DarkSummary
 from calibration.radiometry.drift import DriftCorrection
-from calibration.radiometry.greys import PhotonTransfer, tint_deg
 from calibration.radiometry.primaries import Additivity, Primaries
 from calibration.radiometry.superposition import Superposition
 from calibration.registration.register import Registration
-from calibration.sampling import bleed
+from calibration.sampling import PhotonTransfer, bleed
 from calibration.spread.added_light import AddedLight
 from calibration.spread.correction import LensFigures
 from calibration.spread.fitting import PointSpread
@@ -36,6 +35,7 @@ from experiment.measures.paper import Paper
 from experiment.measures.sensor import black_drift
 from experiment.measures.stains import Stains
 from experiment.session.records import FrameRecord
+from foundation.colorimetry import angles_deg
 from foundation.records import FloatArray
 
 _Array = npt.NDArray[np.float64]
@@ -213,12 +213,13 @@ class GreyMeasurements:
     def tints_deg(self, white: _Array) -> _Array:
         """Return (G,) degrees between each level and white, under the light with the most of its weakest channel.
 
-        `white` (L, 3) float64 is the ground truth.
+        `white` (L, 3) float64 is the ground truth; a grey has the light's chromaticity only as far as the print is
+        neutral.
         """
         if not self.names:
             return np.zeros(0)
         best = int(np.argmax(white.min(axis=1)))
-        return tint_deg(white[best], self.values[best])
+        return angles_deg(white[best], self.values[best])
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ Rules that hold inside:
 - A cell's samples are the 5×5 half-size pixels around its rounded centre (paper, section 3.2), or another odd window.
   Pixels are taken whole; nothing is interpolated, which would alter the noise that the samples are for.
 - A cell that is cut off, clipped, or not of one colour is listed with its cause. It is never filled from elsewhere.
+- The inner loops are compiled without licence to reorder sums: a table's bytes depend on neither processor nor thread.
 
 Works on the raw photosites under the cells and nowhere else: a frame need not be debayered to be sampled. How large a
 window may be is a matter of the light of neighbouring cells that the lens's blur mixes in.
@@ -14,13 +15,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy import uint64
 
-from calibration import kernels
 from drivers.raw.rawfile import CHANNELS, Mosaic, phases
 from experiment.framing.pictures import MAX_BLUR_PX
+from foundation.compiled import compiled, inlined
 
 UNEVEN_SHARE = 0.01
 """Difference of rim and middle, as a share of the patch, that matters (judgement)."""
@@ -35,17 +38,20 @@ sees more."""
 DEAD_LEVEL = 300.0
 """Counts that a cell must have for a dead photosite to be distinguished from noise: half of it is 21 σ."""
 
+NOISY = 1e-8
+"""Chance that noise alone lists a cell: a variance 3.5 times the model's for 25 samples."""
+
 _NOISE_BINS = 32
 """Levels at which noise is read: a full chart has a thousand patches in each, a chart of 512 colours sixteen."""
+
+_CURVE_BINS = 48
+"""The same for the photon-transfer curve: seven hundred cells of a full chart in each."""
 
 WINDOWS = (3, 5, 7, 9)
 """Sides of windows, half-size px: odd, so that a cell has a middle pixel; a cell is about 10 px wide."""
 
 SAFE_BLEED = 0.002
 """Share of a sample's light from beyond its cell that counts as none: less than half of what the verdict remarks on."""
-
-WINDOW_PX = 5
-"""Pixels along the side of a cell's window, where the user names no other: the paper's (section 3.2)."""
 
 MISPLACEMENT_PX = 0.75
 """How far a sample may lie from its place: 0.5 px of rounding and 0.25 px of registration."""
@@ -56,17 +62,160 @@ SAMPLE_REACH_PX = 3.25
 _LEAST_BLUR_PX = 1e-3
 """Keeps a perfectly sharp picture from dividing by 0."""
 
-WINDOW = WINDOW_PX
-"""Pixels along the side of a cell's window, where the user names no other: the paper's."""
+WINDOW = 5
+"""Pixels along the side of a cell's window, where the user names no other: the paper's (section 3.2)."""
 
 _Array = npt.NDArray[np.float64]
+_Float = npt.NDArray[np.float32]
+_Count = npt.NDArray[np.uint16]
+_Place = npt.NDArray[np.int64]
+_Mask = npt.NDArray[np.bool_]
 
 
 def patch_means(values: npt.NDArray[np.uint16]) -> npt.NDArray[np.float64]:
     """Return the means (N, 3) float64 of patches' values (N, S, 3) uint16, in an eighth of NumPy's time."""
     means = np.empty((values.shape[0], 3))
-    kernels.patch_means(values, means)
+    _patch_means(values, means)
     return means
+
+
+@inlined
+def _sampled(sensor: Any, corner: Any, step: Any, places: Any, window: Any, black: Any, samples: Any) -> Any:
+    """Fill a patch's samples (window², 3) float32 and return the highest of its counts, int32."""
+    red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
+    highest, number = np.int32(0), uint64(0)
+    for row in range(window):
+        # Unsigned places spare the test for one before the array's beginning.
+        at = uint64(corner + row * step)
+        for _ in range(window):
+            r, b = np.int32(sensor[at + red]), np.int32(sensor[at + blue])
+            g, h = np.int32(sensor[at + green]), np.int32(sensor[at + other])
+            at += uint64(2)
+            samples[number, 0] = np.float32(r) - black[0]
+            samples[number, 1] = np.float32(g + h) * np.float32(0.5) - black[1]
+            samples[number, 2] = np.float32(b) - black[2]
+            highest = max(highest, max(max(r, b), max(g, h)))
+            number += uint64(1)
+    return highest
+
+
+@inlined
+def _tabulated(samples: Any, dark: Any, field: Any, values: Any) -> None:
+    """Fill a patch's values (S, 3) uint16 from its samples (S, 3) float32, less `dark` (3,), over `field` (3,)."""
+    for number in range(len(samples)):
+        for channel in range(3):
+            level = np.rint((samples[number, channel] - dark[channel]) / field[channel])
+            values[number, channel] = np.uint16(min(max(level, np.float32(0)), np.float32(65535)))
+
+
+@compiled
+def _sample(
+    sensor: _Count,
+    corner: _Place,
+    order: _Place,
+    inside: _Mask,
+    step: int,
+    places: _Place,
+    window: int,
+    black: _Float,
+    samples: _Float,
+    peak: _Count,
+) -> None:
+    """Fill samples (N, window², 3) float32 and their highest counts `peak` (N,); patches that are not inside get 0.
+
+    `sensor`: (photosites,) uint16. `corner`: (N,) the top-left photosite of each patch's first pixel. `order`: (N,) the
+    patches as they are best visited: neighbours on the sensor one after another, for the memory's sake. `inside`: (N,)
+    whether a patch lies on the sensor. `places`: (4,) photosites from a block's top-left one to its red, its two greens
+    and its blue. `black`: (3,) float32 counts, of red, green and blue.
+    """
+    for patch in order:
+        if not inside[patch]:
+            samples[patch] = 0
+            peak[patch] = 0
+            continue
+        peak[patch] = _sampled(sensor, corner[patch], step, places, window, black, samples[patch])
+
+
+@compiled
+def _tabulate(samples: _Float, dark: _Float, field: _Float, values: _Count) -> None:
+    """Fill values (N, S, 3) uint16 from samples (N, S, 3) float32, less `dark` (N, 3), over `field` (N, 3)."""
+    for patch in range(samples.shape[0]):
+        _tabulated(samples[patch], dark[patch], field[patch], values[patch])
+
+
+@compiled
+def _sample_to_table(
+    sensor: _Count,
+    corner: _Place,
+    order: _Place,
+    inside: _Mask,
+    step: int,
+    places: _Place,
+    window: int,
+    black: _Float,
+    dark: _Float,
+    field: _Float,
+    values: _Count,
+    peak: _Count,
+) -> None:
+    """Do `_sample` and `_tabulate` patch by patch, without the samples (N, window², 3) between them.
+
+    `values` (N, window², 3) uint16 and `peak` (N,) uint16 are filled; `dark` and `field` are (N, 3) float32, the rest
+    as for `_sample`.
+    """
+    samples = np.empty(values.shape[1:], np.float32)
+    for patch in order:
+        if not inside[patch]:
+            values[patch] = 0
+            peak[patch] = 0
+            continue
+        peak[patch] = _sampled(sensor, corner[patch], step, places, window, black, samples)
+        _tabulated(samples, dark[patch], field[patch], values[patch])
+
+
+@compiled
+def _count_means(
+    sensor: _Count,
+    corner: _Place,
+    order: _Place,
+    inside: _Mask,
+    step: int,
+    places: _Place,
+    window: int,
+    black: _Float,
+    means: _Array,
+) -> None:
+    """Fill means (N, 3) float64, counts above black; patches that are not inside get 0. Parameters as for `_sample`."""
+    red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
+    samples = window * window
+    for patch in order:
+        if not inside[patch]:
+            means[patch] = 0
+            continue
+        r, g, b = np.int64(0), np.int64(0), np.int64(0)
+        for row in range(window):
+            at = uint64(corner[patch] + row * step)
+            for _ in range(window):
+                r += sensor[at + red]
+                g += np.int64(sensor[at + green]) + np.int64(sensor[at + other])
+                b += sensor[at + blue]
+                at += uint64(2)
+        means[patch, 0] = r / samples - black[0]
+        means[patch, 1] = g / (2 * samples) - black[1]
+        means[patch, 2] = b / samples - black[2]
+
+
+@compiled
+def _patch_means(values: _Count, means: _Array) -> None:
+    """Fill means (N, 3) float64 of values (N, S, 3) uint16."""
+    samples = values.shape[1]
+    for patch in range(values.shape[0]):
+        red, green, blue = np.int64(0), np.int64(0), np.int64(0)
+        for number in range(samples):
+            red += values[patch, number, 0]
+            green += values[patch, number, 1]
+            blue += values[patch, number, 2]
+        means[patch, 0], means[patch, 1], means[patch, 2] = red / samples, green / samples, blue / samples
 
 
 def _inner(samples: int) -> npt.NDArray[np.bool_]:
@@ -130,12 +279,8 @@ def sample_noise(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     middle = (samples[:, inner] if inner.sum() >= 9 else samples).astype(np.float64)
     level, variance = middle.mean(axis=1), middle.var(axis=1, ddof=1)
     noise = np.empty_like(level)
-    degrees = middle.shape[1] - 1
     for channel in range(3):
-        order = np.argsort(level[:, channel])
-        bins: list[npt.NDArray[np.int64]] = np.array_split(order, max(1, min(_NOISE_BINS, len(order) // 16)))
-        at = np.array([float(np.median(level[part, channel])) for part in bins])
-        usual = np.array([float(np.median(variance[part, channel])) for part in bins]) / median_of_variance(degrees)
+        at, usual = noise_levels(level[:, channel], variance[:, channel], middle.shape[1], 1, _NOISE_BINS)
         noise[:, channel] = np.interp(level[:, channel], at, np.sqrt(usual))
     return noise
 
@@ -151,7 +296,79 @@ def median_of_variance(degrees: int) -> float:
     return (1 - 2 / (9 * degrees)) ** 3
 
 
-def bleed(cell_px: float, blur_px: float, window: int = WINDOW_PX) -> float:
+@dataclass(frozen=True, eq=False)
+class PhotonTransfer:
+    """The sensor's noise as the cells show it, per channel of half-size RGB; green is the mean of two photosites.
+
+    - `gain_e`: (3,) float64 electrons per count.
+    - `read_noise`: (3,) float64 counts.
+    - `response`: (3,) float64, standard deviation of the photosites' response, a share.
+    - `misfit`: (3,) float64, RMS of the levels' variances about the curve, relative.
+    - `ratio`: (N,) float64, each cell's variance over the model's, the largest of its channels.
+    - `allowed`: the ratio from which a cell is noisier than its level explains.
+    """
+
+    gain_e: _Array
+    read_noise: _Array
+    response: _Array
+    misfit: _Array
+    ratio: _Array
+    allowed: float
+
+    def variance(self, level: _Array) -> _Array:
+        """Return the variance (..., 3) float64, counts², of one sample at levels (..., 3), counts above black."""
+        lit = np.maximum(level, 0)
+        return self.read_noise**2 + lit / self.gain_e + (self.response * lit) ** 2
+
+    @property
+    def noisy(self) -> npt.NDArray[np.bool_]:
+        """(N,) bool, whether a cell is noisier than its level allows."""
+        return self.ratio > self.allowed
+
+
+def noise_levels(
+    level: _Array, variance: _Array, samples: int, least: int = 4, most: int = _CURVE_BINS
+) -> tuple[_Array, _Array]:
+    """Return the noise of one channel at levels, between `least` and `most` of them: medians of cells of like levels.
+
+    `level`, `variance`: (N,) float64 mean, counts above black, and variance of one sample, counts², of each cell.
+    Returns levels (B,), counts above black, and variances (B,), counts², both float64.
+    """
+    median = median_of_variance(samples - 1)
+    order = np.argsort(level)
+    bins: list[npt.NDArray[np.int64]] = np.array_split(order, max(least, min(most, len(order) // 16)))
+    at = np.array([float(np.median(level[part])) for part in bins if len(part)])
+    return at, np.array([float(np.median(variance[part])) for part in bins if len(part)]) / median
+
+
+def photon_transfer(level: _Array, variance: _Array, samples: int = 25) -> PhotonTransfer:
+    """Return the curve through cells: non-negative least squares on the medians of cells of like levels.
+
+    `level`: (N, 3) float64 mean of each cell, counts above black. `variance`: (N, 3) float64 variance of one sample of
+    each, counts².
+    """
+    from scipy.optimize import nnls
+    from scipy.stats import chi2
+
+    terms, misfit = np.zeros((3, 3)), np.zeros(3)
+    ratio = np.zeros(len(level))
+    for channel in range(3):
+        at, seen = noise_levels(level[:, channel], variance[:, channel], samples)
+        design = np.column_stack([np.ones_like(at), np.maximum(at, 0), np.maximum(at, 0) ** 2])
+        weight = 1 / np.maximum(seen, 1e-9)
+        scale = np.maximum(np.abs(design * weight[:, None]).max(axis=0), 1e-30)
+        terms[:, channel] = nnls(design * weight[:, None] / scale, seen * weight)[0] / scale
+        misfit[channel] = float(np.sqrt(np.mean((design @ terms[:, channel] * weight - 1) ** 2)))
+        here = np.maximum(level[:, channel], 0)
+        model = terms[0, channel] + terms[1, channel] * here + terms[2, channel] * here**2
+        ratio = np.maximum(ratio, variance[:, channel] / np.maximum(model, 1e-9))
+    allowed = float(chi2.isf(NOISY, samples - 1)) / (samples - 1)
+    with np.errstate(divide="ignore"):
+        gain = np.where(terms[1] > 0, 1 / terms[1], np.inf)
+    return PhotonTransfer(gain, np.sqrt(terms[0]), np.sqrt(terms[2]), misfit, ratio, allowed)
+
+
+def bleed(cell_px: float, blur_px: float, window: int = WINDOW) -> float:
     """Return the share, 0 … 1, of the worst sample's light that comes from beyond its cell.
 
     The normal integral (a Gaussian of σ `blur_px`) beyond the cell's nearest edge, for the outermost of `window` pixels
@@ -164,7 +381,7 @@ def bleed(cell_px: float, blur_px: float, window: int = WINDOW_PX) -> float:
     return float(ndtr(-(cell_px / 2 - window // 2 - MISPLACEMENT_PX) / max(blur_px, _LEAST_BLUR_PX)))
 
 
-def mean_bleed(cell_px: float, blur_px: npt.NDArray[np.float64], window: int = WINDOW_PX) -> npt.NDArray[np.float64]:
+def mean_bleed(cell_px: float, blur_px: npt.NDArray[np.float64], window: int = WINDOW) -> npt.NDArray[np.float64]:
     """Return the share (N,), 0 … 1, of the light of a window's mean from beyond its cell, at blurs (N,) float64.
 
     Units and sources are those of `bleed`.
@@ -238,7 +455,7 @@ def gather(
     """
     samples = np.empty((len(sites.rows), sites.window**2, 3), dtype=np.float32)
     highest = np.empty(len(sites.rows), dtype=np.uint16)
-    kernels.sample(*_photosites(mosaic, black, sites), samples, highest)
+    _sample(*_photosites(mosaic, black, sites), samples, highest)
     return samples, highest
 
 
@@ -248,7 +465,7 @@ def gather_means(mosaic: Mosaic, black: npt.NDArray[np.float64], sites: Sites) -
     Parameters are those of `gather`: `black` (2, 2) float64 counts.
     """
     means = np.empty((len(sites.rows), 3))
-    kernels.count_means(*_photosites(mosaic, black, sites), means)
+    _count_means(*_photosites(mosaic, black, sites), means)
     return means
 
 
@@ -296,7 +513,7 @@ def table_values(
     """
     dark = np.zeros(field.shape, dtype=np.float32) if dark is None else dark
     values = np.empty(samples.shape, dtype=np.uint16)
-    kernels.tabulate(samples, dark, field.astype(np.float32), values)
+    _tabulate(samples, dark, field.astype(np.float32), values)
     return values
 
 
@@ -314,5 +531,5 @@ def gather_values(
     dark = np.zeros(field.shape, dtype=np.float32) if dark is None else dark
     values = np.empty((len(sites.rows), sites.window**2, 3), dtype=np.uint16)
     highest = np.empty(len(sites.rows), dtype=np.uint16)
-    kernels.sample_to_table(*_photosites(mosaic, black, sites), dark, field.astype(np.float32), values, highest)
+    _sample_to_table(*_photosites(mosaic, black, sites), dark, field.astype(np.float32), values, highest)
     return values, highest

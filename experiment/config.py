@@ -12,6 +12,7 @@ import re
 import shlex
 import tomllib
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, cast
 from urllib.parse import urlsplit
@@ -133,7 +134,7 @@ class CameraSettings(Settings):
     shutter_s: Positive = 0.5
     """Shutter time in seconds; under a DLP projector at least 0.5 and a whole multiple of 1/60."""
 
-    @property
+    @cached_property
     def exposure(self) -> ExposureSettings:
         """The same as the camera drivers take it."""
         return ExposureSettings(self.iso, None if self.aperture == "none" else self.aperture, self.shutter_s)

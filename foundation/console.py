@@ -212,16 +212,12 @@ class Ending:
     def __init__(self, say: Callable[[str], object] = _say) -> None:
         self._say = say
         self._promise = ""
-        self._asked = False
-
-    @property
-    def asked(self) -> bool:
+        self.asked = False
         """Whether somebody asked for the end."""
-        return self._asked
 
     def ask(self) -> None:
         """Ask for the end, as a signal does."""
-        first, self._asked = not self._asked, True
+        first, self.asked = not self.asked, True
         if not (first and self._promise):
             raise KeyboardInterrupt
         self._say(self._promise)
@@ -240,7 +236,7 @@ class Ending:
         """Let the first request end the block at once: nothing has begun in it that could be finished."""
         before, self._promise = self._promise, ""
         try:
-            if self._asked:
+            if self.asked:
                 raise KeyboardInterrupt
             yield
         finally:

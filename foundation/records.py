@@ -19,10 +19,8 @@ from pydantic import (
     ConfigDict,
     PlainSerializer,
     PlainValidator,
-    SerializerFunctionWrapHandler,
     TypeAdapter,
     ValidationError,
-    model_serializer,
 )
 
 from foundation.errors import ConfigurationError, FormatError, nearest_names
@@ -53,15 +51,6 @@ class Record(BaseModel):
     """A frozen record; a key that is not known is passed over, as later versions may have more."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True, use_attribute_docstrings=True)
-
-
-class SparseRecord(Record):
-    """A record of which keys that are None by default are left out while they are, so that files stay as they were."""
-
-    @model_serializer(mode="wrap")
-    def _without_none(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        left_out = {name for name, field in type(self).model_fields.items() if field.default is None}
-        return {key: value for key, value in serialise(self).items() if value is not None or key not in left_out}
 
 
 @cache

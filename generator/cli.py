@@ -137,8 +137,7 @@ def generate(
             loaded()
             _draw_sheet(_verify(work.verify, work.workers, output), work.verify, sheet)
         elif work.finish is not None:
-            from generator.dataset.making import finish_dataset
-            from generator.dataset.workplace import holds_dataset
+            from generator.dataset.making import finish_dataset, holds_dataset
 
             loaded()
             was_there = holds_dataset(work.finish)
@@ -251,9 +250,8 @@ def _plan(
 ) -> Plan:
     """Return the plan of a dataset whose place is free, or holds a dataset, which may be the one planned."""
     from calibration.table.lut import open_lut
-    from generator.dataset.making import begun_rendering
+    from generator.dataset.making import begun_rendering, holds_dataset, require_free_place
     from generator.dataset.plan import DatasetOptions, Plan
-    from generator.dataset.workplace import holds_dataset, require_free_place
 
     if not holds_dataset(out):
         require_free_place(out)
@@ -386,7 +384,7 @@ def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None, again:
 
     One that is there is refused unless a dataset is, too, where the command may have made both before.
     """
-    from generator.dataset.workplace import holds_dataset
+    from generator.dataset.making import holds_dataset
     from generator.stores import is_remote, local_path
 
     if shard is not None:

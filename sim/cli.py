@@ -172,7 +172,7 @@ def camera(
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    from drivers.canon.records import SHUTTER
+    from drivers.canon import SHUTTER
     from drivers.ptp.codes import Property
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError

@@ -15,7 +15,7 @@ before them.
 which a table takes a sixth: the 10 by 10 photosites in the middle of each cell (25 half-size pixels), and those of
 the references. Here these alone exist, patch below patch in a frame as wide as one patch. Their light is what the
 simulated room would let fall on them without the lens's blur; their counts come from the simulated sensor itself
-(`sim.world.rendering.counts`), so that response, shot and read noise, rounding and saturation are those of a
+(`sim.world.sensors.counts`), so that response, shot and read noise, rounding and saturation are those of a
 photographed frame, and calibration's own functions sample them as they do any other frame.
 
 What differs from a photographed frame: nothing is blurred, so no light leaks between neighbouring cells; all of a
@@ -45,9 +45,9 @@ from experiment.lights import Illumination, parse_ccts, shown_colour
 from foundation.colorimetry import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError, nearest_names
 from sim.spectral import PublishedSpectrum, daylight, published_spectra, regridded, require_grid
-from sim.world.rendering import PAPER, counts
+from sim.world.rendering import PAPER
 from sim.world.room import WAVELENGTHS_NM, Room, printed_reflectance, sensitivities
-from sim.world.sensors import Body, HotPattern
+from sim.world.sensors import Body, HotPattern, counts
 from sim.world.world import World
 
 WAVELENGTH: Final = "wavelength"

@@ -6,9 +6,9 @@ Rules that hold inside:
 - The table appears whole or not at all; what it needs of the disk is asked for before the work.
 - Its provenance says that it was computed, from what, and with which settings; no frame is listed.
 
-A light's frame is treated as `calibration.pipeline.measuring` treats a photographed one that lies exactly where it was
-registered: black subtracted, field and white read from the white references, samples divided by the field, and by how
-much the field of a cell differs from that of paper. So the ground truth has the error that a photographed one has.
+A light's frame is treated as `calibration.pipeline.frames` treats a photographed one that lies exactly where it
+was registered: black subtracted, field and white read from the white references, samples divided by the field, and by
+how much the field of a cell differs from that of paper. So the ground truth has the error that a photographed one has.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.citation import OriginRecord
-from calibration.pipeline.baseline import ChartPoints, usable_means
+from calibration.pipeline.frames import ChartPoints, usable_means
 from calibration.radiometry.drift import corrections
-from calibration.radiometry.greys import references_csv
 from calibration.radiometry.primaries import Primaries
 from calibration.sampling import Sites, gather, gather_values, patch_means
-from calibration.table.lut import REFERENCES, LutWriter, Provenance, Unfit, frames_sha256
+from calibration.table.lut import REFERENCES, LutWriter, Provenance, Unfit, frames_sha256, references_csv
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.chart.model import Chart

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from calibration.causes.rules import Evidence
 from calibration.measurements import FrameMeasurements, TableMeasurements
-from calibration.sampling import WINDOW_PX, bleed
+from calibration.sampling import WINDOW, bleed
 from experiment.measures.stains import Stains, cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
 from experiment.session.records import FrameRecord
 
@@ -233,7 +233,7 @@ def _lens(table: TableMeasurements) -> dict[str, float]:
     registration, unfit = table.registration, table.cells.unfit
     known = {"waves_px": registration.lens_residual_px / registration.clearance}
     # A window that is too large sees the neighbours through any lens.
-    if table.cells.window <= WINDOW_PX:
+    if table.cells.window <= WINDOW:
         core = bleed(registration.cell_px, registration.blur_px, table.cells.window)
         known["beyond_cell"] = core + table.lens.beyond_cell
     if unfit:

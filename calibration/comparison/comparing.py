@@ -32,8 +32,8 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.kernels import moments
-from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
+from calibration.pipeline.frames import BuildOptions
 from calibration.report.report import report_json
 from calibration.table.lut import REFERENCES, REPORT_JSON, Lut, open_lut
 from calibration.table.verification import chart_difference

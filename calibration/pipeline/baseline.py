@@ -1,27 +1,19 @@
-"""The frames of a table, each read once, its hash checked; and what holds for all of them, from the first.
+"""Which frames a table is made of, and what holds for all of them, from the first: the shape of light, cells, the lens.
 
-The shape of its light is the base of all others', and its cells are what those of every frame are compared with; the
-frames of the primaries show how the field of a coloured cell differs from that of paper. A baseline does not change, so
-threads share it. Here, too, is what a user may choose about how a table is built (`BuildOptions`), and where the chart
-lies from a frame in which it was registered until it moves too far from there (`RegisteredFrame`).
-
-Rules that hold inside:
-
-- Cells are in the order of colour indices, as in the table, and not in the chart's own order.
-- References follow the cells, the white ones before the grey ones.
+The shape of the first frame's light is the base of all others', and its cells are what those of every frame are
+compared with; the frames of the primaries show how the field of a coloured cell differs from that of paper. What comes
+of it is a `frames.Baseline`, with which `calibration.pipeline.frames` measures every frame.
 
 C cells, W white references, N grey references; places on the print in millimetres, in frames in half-size pixels.
 """
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import timedelta
-from functools import cached_property
 from itertools import chain, pairwise
 from statistics import median
 from typing import Any
@@ -33,13 +25,23 @@ from threadpoolctl import threadpool_limits
 
 from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.citation import Rig, StatedOrigin
-from calibration.radiometry.dark_frames import DarkLightEstimate, reflectances
-from calibration.radiometry.greys import GreyLevels, PhotonTransfer, photon_transfer
+from calibration.pipeline.frames import (
+    PAPER_OPTIONS,
+    Baseline,
+    BuildOptions,
+    ChartPoints,
+    DecodedFrame,
+    RegisteredFrame,
+    SelectedFrames,
+    SensorLayout,
+    beyond_print,
+    compared_cells,
+    register_frame,
+    usable_means,
+)
 from calibration.radiometry.primaries import Primaries, pure_lights
 from calibration.radiometry.superposition import MOVED, NO_PRIMARIES, Superposition, printed_predictors, superposition
-from calibration.registration.register import Registration, register
-from calibration.sampling import WINDOW, WINDOWS, Sites, gather, gather_means, sites_at
-from calibration.spread.added_light import AddedLight, added_light
+from calibration.sampling import PhotonTransfer, gather, photon_transfer
 from calibration.spread.correction import (
     FrameCorrection,
     LensCorrection,
@@ -53,27 +55,17 @@ from calibration.spread.predicting import VARYING_BITS
 from calibration.spread.surroundings import FrameLevels, photosite_offsets_px, printed_grid, unsuitable
 from calibration.table.lut import Lut, SourceFrame
 from drivers.raw.rawfile import (
-    CHANNELS,
     CLIPPING_SHARE,
-    Channel,
-    Mosaic,
-    Plane,
-    decode_raw,
-    filled_fault,
-    frame_black,
-    strongest_channel,
 )
-from drivers.raw.storage import Area
 from experiment.chart.model import Chart
 from experiment.config import CameraSettings, CitationSettings
-from experiment.framing.field import Corners
-from experiment.framing.pictures import STILL_PX, Shift, gauges_of, shift_between
+from experiment.framing.pictures import STILL_PX
 from experiment.measures.least_squares import code_polynomial, code_powers, least_squares, page_polynomial
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, FlatField, PaperReader
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
-from foundation.errors import CropError, FormatError, InputError
-from foundation.files import file_sha256, read_whole
+from foundation.errors import CropError, FormatError
+from foundation.files import file_sha256
 from foundation.robust import huber_weights, sigma_of
 
 _log = logging.getLogger(__name__)
@@ -98,130 +90,11 @@ _EVEN_COUNTS = 300.0
 _PAPER_WORTH = 10.0
 """Cells that a white reference counts for: its colour needs no polynomial."""
 
-_LEAST_BITS = 3
-"""Bits of a channel from which on neighbours in colour predict a cell."""
-
 _MORE_WHITES = 3
 """White frames beside the first that a lens is measured on, where the noise of few cells matters."""
 
 _ROUNDS = 5
 """Reweighted solutions in a row; Huber's weights, squared, have settled by then."""
-
-
-@dataclass(frozen=True)
-class BuildOptions:
-    """How a table is built; by default 25 samples, the paper's, from which black and the lens's spread are subtracted.
-
-    - `window`: pixels along the side of a cell's window: one of `calibration.sampling.WINDOWS`.
-    - `subtract_dark`: whether the light of the dark frames is subtracted from samples and ground truth.
-    - `corners`: four corners (x, y) of the field of cells in the frame that is registered first, half-size px,
-      clockwise from the printed top-left, for a chart without tags; None to have it found.
-    - `correct_drift`: whether the lamp's drift between white frames is taken out of samples and ground truth at the
-      end.
-    - `lens_correction`: whether what the lens spreads beside its sharp core is subtracted from samples and ground
-      truth, where the print proves that it does.
-    - `citation`: what the lab states of the table's origin; None for what the session's settings state. No sample
-      depends on it.
-    """
-
-    window: int = WINDOW
-    subtract_dark: bool = False
-    corners: Corners | None = None
-    correct_drift: bool = False
-    lens_correction: bool = True
-    citation: CitationSettings | None = None
-
-    def __post_init__(self) -> None:
-        if self.window not in WINDOWS:
-            raise InputError(
-                f"a window of {self.window} pixels was asked for; {', '.join(map(str, WINDOWS[:-1]))} or {WINDOWS[-1]} "
-                "expected: a window has a middle pixel, and cells are about 10 pixels wide"
-            )
-
-    @property
-    def samples(self) -> int:
-        """Samples of each cell."""
-        return self.window**2
-
-
-PAPER_OPTIONS = BuildOptions()
-"""The paper's options, which hold where none are given."""
-
-
-@dataclass(frozen=True, eq=False)
-class ChartPoints:
-    """The points of a chart that are sampled.
-
-    - `cells_mm`: (C, 2) float64 mm, centres of the cells in the order of colour indices.
-    - `whites_mm`, `greys_mm`: (W, 2) and (N, 2) float64 mm, centres of the white and of the grey references.
-    - `levels`: the level of each grey reference.
-    """
-
-    cells_mm: _Array
-    whites_mm: _Array
-    greys_mm: _Array
-    levels: GreyLevels
-
-    @staticmethod
-    def of(chart: Chart) -> ChartPoints:
-        """Return the points of a chart."""
-        whites = [reference for reference in chart.references if reference.is_white]
-        greys = [reference for reference in chart.references if not reference.is_white]
-        whites_mm, greys_mm = (
-            np.array([reference.centre_mm for reference in references]).reshape(-1, 2) for references in (whites, greys)
-        )
-        return ChartPoints(chart.centres_mm[chart.cell_of_colour], whites_mm, greys_mm, GreyLevels.of(greys))
-
-    @property
-    def references_mm(self) -> _Array:
-        """(W + N, 2) float64 mm, centres of the references."""
-        return np.concatenate([self.whites_mm, self.greys_mm])
-
-
-@dataclass(frozen=True, eq=False)
-class RegisteredFrame:
-    """A frame in which the chart was registered; it holds for those after it until the chart moves too far.
-
-    - `registration`: the chart's place in it.
-    - `cells`: where the C cells are sampled.
-    - `references`: where the W + N references are sampled.
-    - `gauges`: the frame around its tags, or the outline of its field, to measure movements against.
-    - `lens`: corrects frames sampled at these places for what the lens spreads; None where nothing is corrected.
-    """
-
-    file: str
-    registration: Registration
-    cells: Sites
-    references: Sites
-    gauges: dict[Channel, Plane]
-    lens: FrameCorrection | None = None
-
-
-def register_frame(
-    decoded: DecodedFrame, chart: Chart, points: ChartPoints, options: BuildOptions, near: Registration | None = None
-) -> RegisteredFrame:
-    """Return a frame with the chart registered in it."""
-    registration = register(decoded.mosaic, chart, decoded.record.file, options.corners, near)
-    cells, references = sites_of(registration, points, decoded.mosaic.block_planes().shape[2:], options.window)
-    gauges: dict[Channel, Plane] = {
-        channel: gauges_of(decoded.mosaic, channel, decoded.black, registration.framing) for channel in CHANNELS
-    }
-    return RegisteredFrame(decoded.record.file, registration, cells, references, gauges)
-
-
-def sites_of(
-    registration: Registration, points: ChartPoints, shape: tuple[int, ...], window: int
-) -> tuple[Sites, Sites]:
-    """Return the sites of the cells and of the references.
-
-    `shape` is rows and columns of the half-size frame, `window` the pixels along a window's side.
-    """
-    height, width = shape
-    cells, references = (
-        sites_at(registration.to_pixels(places), (height, width), window)
-        for places in (points.cells_mm, points.references_mm)
-    )
-    return cells, references
 
 
 def field_of_cells(
@@ -274,137 +147,6 @@ def field_of_cells(
         factors.append((smooth / float((light @ smooth).mean()),))
     red, green, blue = factors
     return FlatField(page_mm, (red, green, blue))
-
-
-@dataclass(frozen=True)
-class SensorLayout:
-    """What all frames of a session have in common: visible area, shape of the sensor, Bayer pattern."""
-
-    visible: Area
-    shape: tuple[int, ...]
-    pattern: str
-
-    @staticmethod
-    def of(mosaic: Mosaic) -> SensorLayout:
-        """Return the layout of a frame."""
-        return SensorLayout(mosaic.visible, mosaic.sensor.shape, mosaic.pattern)
-
-    def __str__(self) -> str:
-        return f"{self.shape[1]}×{self.shape[0]} photosites {self.pattern}"
-
-
-@dataclass(frozen=True, eq=False)
-class Baseline:
-    """What holds for all frames of a session; made by `baseline_of`.
-
-    - `chart`, `points`: the chart, and its points: C cells, W white and N grey references.
-    - `options`: how the table is built.
-    - `camera`, `layout`: maker and model, and the sensor's layout, the same in all frames.
-    - `first`: the frame that is registered first.
-    - `whites`: (W, 3) float64 counts above black of its white references; NaN where one cannot be used.
-    - `means`: (C + W + N, 3) float64 counts above black of its cells and references.
-    - `paper`: reads flat field and white of frames, with the shape of this one's as base.
-    - `transfer`: photon-transfer curve of its cells.
-    - `consistency_check`: compares other frames' cells with those of this one.
-    - `primaries`: the primaries each alone; None where they were not given or cannot be used.
-    - `lens`: what the lens spreads beside its sharp core, measured; None where it was not, or could not be.
-    - `superposition`: what the first frame and those of the primaries show of the sensor's linearity; None where one of
-      them is lacking, or the chart has moved in it.
-    """
-
-    chart: Chart
-    points: ChartPoints
-    options: BuildOptions
-    camera: str
-    layout: SensorLayout
-    first: RegisteredFrame
-    whites: _Array
-    means: _Array
-    paper: PaperReader
-    transfer: PhotonTransfer
-    consistency_check: ConsistencyCheck
-    primaries: Primaries | None = None
-    lens: LensCorrection | None = None
-    superposition: Superposition | None = None
-
-    @property
-    def levels(self) -> _Array:
-        """(C, 3) float64, of each cell in the first frame, bare paper 1."""
-        paper, at_cells = self.paper.read(self.whites, self.first.file)
-        return self.means[: len(at_cells)] / (at_cells * np.maximum(paper.white, 1e-9))
-
-    def require_layout(self, mosaic: Mosaic, what: str) -> None:
-        """Refuse a frame, called `what`, whose sensor or setting is not that of the first."""
-        found = SensorLayout.of(mosaic)
-        if found != self.layout:
-            raise FormatError(
-                f"{what}: the sensor has {found}, that of {self.first.file} {self.layout}; a session has one camera "
-                "with one setting, so take the session anew"
-            )
-
-    def register(self, decoded: DecodedFrame) -> RegisteredFrame:
-        """Return a later frame with the chart registered in it; errors are those of `register_frame`."""
-        # A chart without tags hangs as in the first frame, so that a build that goes on has it the same way up.
-        registered = register_frame(decoded, self.chart, self.points, self.options, self.first.registration)
-        lens = self.correction(registered.registration, registered.cells, registered.references)
-        return replace(registered, lens=lens)
-
-    def correction(self, registration: Registration, cells: Sites, references: Sites) -> FrameCorrection | None:
-        """Return what corrects the lens in frames that are sampled at these places; None where nothing is corrected."""
-        if self.lens is None or not self.corrects_lens:
-            return None
-        return self.lens.of(registration, cells, references)
-
-    @property
-    def corrects_lens(self) -> bool:
-        """Whether frames are corrected for what the lens spreads."""
-        return self.lens is not None and self.options.lens_correction and self.lens.spread.proven
-
-    def movement(self, mosaic: Mosaic, black: _Array, channel: Channel, what: str) -> Shift:
-        """Return how far the chart has moved in a frame since the first one.
-
-        `black`: (2, 2) float64 counts.
-        """
-        self.require_layout(mosaic, what)
-        framing = self.first.registration.framing
-        return shift_between(self.first.gauges[channel], framing, gauges_of(mosaic, channel, black, framing))
-
-    def patches(self, mosaic: Mosaic, black: _Array) -> tuple[_Array, npt.NDArray[np.uint16]]:
-        """Return what a frame has where cells and references were in the first one.
-
-        `black`: (2, 2) float64 counts. Returns (C + W + N, 3) float64 counts above black; NaN where a patch does not
-        lie in the frame. Returns (C + W + N,) uint16, the highest raw count of each patch.
-        """
-        means: list[_Array] = []
-        peaks: list[npt.NDArray[np.uint16]] = []
-        for sites in (self.first.cells, self.first.references):
-            samples, highest = gather(mosaic, black, sites)
-            means.append(np.where(sites.inside[:, None], samples.mean(axis=1, dtype=np.float64), np.nan))
-            peaks.append(highest)
-        return np.concatenate(means), np.concatenate(peaks)
-
-    def added_light(self) -> AddedLight:
-        """Return the light that lies on parts of the print in the first frame, whatever is printed there."""
-        count = len(self.points.cells_mm)
-        if self.chart.bits < _LEAST_BITS:
-            return AddedLight.none(count)
-        paper, _ = self.paper.read(self.whites, self.first.file)
-        white = np.maximum(paper.white, 1e-9)
-        noise = self.transfer.variance(self.levels * white) / self.options.samples / white**2
-        usable = _compared(self.chart, self.first)
-        with threadpool_limits(limits=1, user_api="blas"):
-            return added_light(self.levels, noise, usable, self.points.cells_mm, self.chart.page_mm, self.chart.bits)
-
-    def dark_light_estimate(self) -> DarkLightEstimate:
-        """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""
-        inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
-        return DarkLightEstimate.none(self.reflectances(), inside, self.options.samples)
-
-    def reflectances(self) -> _Array:
-        """Return the reflectance (C + W + N, 3) float64 of cells and references in the first frame, bare paper 1."""
-        paper, shape = self.paper.read(self.whites, self.first.file)
-        field = np.concatenate([shape, paper.field.at(self.points.references_mm)])
-        return reflectances(self.means, field, paper.white)
 
 
 def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = PAPER_OPTIONS) -> Baseline:
@@ -482,7 +224,7 @@ def with_superposition(baseline: Baseline, first: DecodedFrame, primaries: Seque
     clipped = [peak >= CLIPPING_SHARE * one.saturation for peak, one in zip(peaks, frames, strict=True)]
     usable = np.isfinite(seen).all(axis=(0, 2)) & ~np.any(clipped, axis=0)
     chart, points = baseline.chart, baseline.points
-    usable[: chart.colour_count] &= _compared(chart, baseline.first)
+    usable[: chart.colour_count] &= compared_cells(chart, baseline.first)
     printed = np.concatenate([np.zeros(len(points.whites_mm), dtype=np.int64), 1 + points.levels.level])
     found = superposition(
         seen[1:],
@@ -501,13 +243,6 @@ def lens_figures(baseline: Baseline) -> LensFigures:
         why = unsuitable(baseline.chart) or f"no channel of paper has {LEAST_COUNTS:g} counts in a frame to measure on"
         return LensFigures.unknown(why, baseline.reflectances()[: baseline.chart.colour_count])
     return baseline.lens.figures
-
-
-def beyond_print(decoded: DecodedFrame, beyond: Sites) -> _Array:
-    """Return the mean (3,) float64 counts above black of what lies behind the print; 0 where it is not seen."""
-    if not len(beyond.rows):
-        return np.zeros(3)
-    return gather_means(decoded.mosaic, decoded.black, beyond).mean(axis=0)
 
 
 def _is_still(baseline: Baseline, decoded: DecodedFrame) -> bool:
@@ -579,7 +314,7 @@ def _baseline(
     base = PaperReader(points.whites_mm, points.cells_mm, chart.page_mm).read(whites, first.record.file)[0].field
     if not chart.tags:
         # Its references are in the margin, and do not show what light there is in the middle.
-        there, codes = _compared(chart, registered), chart.rgb[chart.cell_of_colour]
+        there, codes = compared_cells(chart, registered), chart.rgb[chart.cell_of_colour]
         base = field_of_cells(codes, points.cells_mm, level, there, points.whites_mm, whites, chart.page_mm)
     order = MAX_ORDER if chart.tags else MAX_ORDER_AROUND
     transfer = photon_transfer(level, spread, options.samples)
@@ -599,11 +334,6 @@ def _baseline(
     )
 
 
-def _compared(chart: Chart, registered: RegisteredFrame) -> npt.NDArray[np.bool_]:
-    """Return which cells (C,) are inside the frame and look like the chart's."""
-    return registered.cells.inside & ~registered.registration.mismatched_cells[chart.cell_of_colour]
-
-
 def _consistency_check(
     chart: Chart,
     points: ChartPoints,
@@ -615,91 +345,16 @@ def _consistency_check(
     """Return the check of frames against cells' levels `evened` (C, 3) counts, in the frame `registered`."""
     variance = transfer.variance(evened) / options.samples
     codes = chart.rgb[chart.cell_of_colour]
-    return ConsistencyCheck(codes, points.cells_mm, evened, variance, _compared(chart, registered))
+    return ConsistencyCheck(codes, points.cells_mm, evened, variance, compared_cells(chart, registered))
 
-
-def usable_means(
-    samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites, saturation: int
-) -> _Array:
-    """Return the means (N, 3) float64, counts above black, of patches; NaN where one is cut off or clipped.
-
-    `samples`: (N, S, 3) float32 counts above black. `highest`: (N,) uint16, the highest raw count of each patch.
-    `saturation`: raw count of saturation.
-    """
-    means = samples.mean(axis=1, dtype=np.float64)
-    means[~(sites.inside & (highest < CLIPPING_SHARE * saturation))] = np.nan
-    return means
-
-
-_TAKEN_AGAIN = "or take it again: acquire run LAB.toml SESSION finds such frames by itself"
 
 ReportProgress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and what is being done."""
-
-
-class ChangedFrame(FormatError):
-    """A frame's file is gone, or is not what was taken; the next run of the session takes it again by itself."""
-
 
 _RIGS: tuple[Rig, ...] = ("lab", "simulated", "replay", "imported")
 
 _SETTING_RIGS = ("lab", "simulated")
 """Rigs whose settings set the camera; of others they say nothing of the exposure."""
-
-
-@dataclass(frozen=True, eq=False)
-class DecodedFrame:
-    """A frame as read.
-
-    `mosaic`: its counts.
-
-    - `black`: (2, 2) float64 counts, black level of each position of the block.
-    - `strongest`: the channel with the brightest paper.
-    - `saturation`: raw count of saturation, as far as it can be seen in this frame.
-    """
-
-    record: FrameRecord
-    mosaic: Mosaic
-    black: _Array
-    strongest: Channel
-    saturation: int
-
-
-@dataclass(frozen=True, eq=False)
-class SelectedFrames:
-    """The frames that a table is made of.
-
-    - `records`: every light's last accepted frame, and the accepted white and dark ones, in the order taken.
-    - `lights_without`: lights that have no accepted frame.
-    - `registered`: the frame in which the chart is registered first.
-    - `primaries`: the frames of red, green and blue alone; () where one of the three is lacking.
-    - `more_whites`: of a chart of few colours, further frames of the light in which it is registered.
-    """
-
-    records: tuple[FrameRecord, ...]
-    lights_without: tuple[int, ...]
-    registered: FrameRecord
-    primaries: tuple[FrameRecord, ...]
-    more_whites: tuple[FrameRecord, ...]
-
-    @cached_property
-    def first_lit(self) -> FrameRecord:
-        """The first frame that is not dark."""
-        return next(record for record in self.records if record.kind != "dark")
-
-    @property
-    def newest(self) -> FrameRecord:
-        """The frame that was taken last, dark ones apart."""
-        lit = (record for record in self.records if record.kind != "dark")
-        return max(lit, key=lambda record: record.attempt)
-
-    def is_even(self, record: FrameRecord) -> bool:
-        """Return whether a frame's samples show how even cells are: the white ones, or the first with any light.
-
-        A file counts once, whatever it stands for: its noise is the same each time, and would not average out.
-        """
-        first = next((one for one in self.records if one.kind == "white" and one.sha256 == record.sha256), None)
-        return record == first or record is self.first_lit
 
 
 def select_frames(session: Session) -> SelectedFrames:
@@ -769,34 +424,6 @@ def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> Fra
         return min(session.illuminations[record.illumination].codes)
 
     return max((record for record in accepted if record.kind == "light"), key=brightness)
-
-
-def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
-    """Return a frame as read from its file, whose SHA-256 is checked first."""
-    path = session.folder / record.file
-    try:
-        data = read_whole(path)
-    except FileNotFoundError as error:
-        raise ChangedFrame(
-            f"{path} is missing, but the session's journal counts it; restore the file from a copy, {_TAKEN_AGAIN}"
-        ) from error
-    except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk") from error
-    found = hashlib.sha256(data).hexdigest()
-    if found != record.sha256:
-        raise ChangedFrame(
-            f"{path} is not the file that was taken: its SHA-256 is {found[:16]}…, the journal says "
-            f"{record.sha256[:16]}…; restore the file from a copy, {_TAKEN_AGAIN}"
-        )
-    mosaic = decode_raw(data, path, known_whole=session.frames_are_known_whole)
-    fault = filled_fault(mosaic.counts, mosaic.black, mosaic.white_level)
-    if fault is not None:
-        raise FormatError(
-            f"{path} is no whole frame: {fault}; restore the file from a copy, or take it again: acquire run LAB.toml "
-            "SESSION --retake with the number of its light"
-        )
-    black = frame_black(mosaic)
-    return DecodedFrame(record, mosaic, black, strongest_channel(mosaic, black), mosaic.saturation())
 
 
 def stated_origin(session: Session) -> StatedOrigin:

@@ -36,16 +36,9 @@ import numpy.typing as npt
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import Figure
 from calibration.measurements import LinearityMeasurements, TableMeasurements
-from calibration.pipeline.accumulator import Accumulator, EarlyMeasurement, stored_names
 from calibration.pipeline.baseline import (
-    PAPER_OPTIONS,
-    BuildOptions,
-    ChangedFrame,
-    DecodedFrame,
     ReportProgress,
-    SelectedFrames,
     baseline_of,
-    decode_frame,
     select_frames,
     source_frames,
     with_lens,
@@ -53,15 +46,23 @@ from calibration.pipeline.baseline import (
     with_superposition,
 )
 from calibration.pipeline.collecting import check_figures, table_figures
-from calibration.pipeline.linearity import read_linearity
-from calibration.pipeline.measuring import (
+from calibration.pipeline.frames import (
+    PAPER_OPTIONS,
+    Accumulator,
+    BuildOptions,
+    ChangedFrame,
+    DecodedFrame,
+    EarlyMeasurement,
     MeasuredFrame,
+    SelectedFrames,
+    decode_frame,
     measure_primaries,
     measure_registered_frame,
     sample_dark_frame,
+    stored_names,
 )
+from calibration.pipeline.linearity import read_linearity
 from calibration.radiometry.drift import LEAST_WHITES, applied_drift, corrected, corrections
-from calibration.radiometry.greys import references_csv
 from calibration.table.lut import (
     CELLS,
     REFERENCES,
@@ -74,6 +75,7 @@ from calibration.table.lut import (
     LutWriter,
     Provenance,
     frames_sha256,
+    references_csv,
 )
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
 from experiment.framing.pictures import Shift, annotated_png

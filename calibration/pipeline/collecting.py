@@ -23,9 +23,9 @@ from calibration.measurements import (
     SessionMeasurements,
     TableMeasurements,
 )
-from calibration.pipeline.accumulator import Accumulator
-from calibration.pipeline.baseline import Baseline, lens_figures, stated_origin
+from calibration.pipeline.baseline import lens_figures, stated_origin
 from calibration.pipeline.components import budget_of
+from calibration.pipeline.frames import Accumulator, Baseline
 from calibration.radiometry.drift import drift_correction
 from calibration.radiometry.primaries import additivity, drift_gains, pure_lights
 from calibration.radiometry.superposition import Superposition

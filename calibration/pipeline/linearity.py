@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.measurements import LinearityMeasurements
-from calibration.pipeline.baseline import Baseline
+from calibration.pipeline.frames import Baseline
 from drivers.raw.rawfile import CLIPPING_SHARE, Mosaic, frame_black, read_raw, strongest_channel
 from experiment.framing.pictures import REREGISTER_PX, Shift
 from experiment.measures.sensor import HIGHEST, LOWEST, deviations

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
-from calibration.radiometry.greys import photon_transfer
+from calibration.sampling import photon_transfer
 from foundation.errors import InputError
 
 if TYPE_CHECKING:
-    from calibration.radiometry.greys import PhotonTransfer
+    from calibration.sampling import PhotonTransfer
     from calibration.table.lut import Lut
 
 _LIGHTS: Final = 6
@@ -30,7 +30,7 @@ def noise_curve(lut: Lut) -> PhotonTransfer | None:
 
     Read from the cells under up to six of its lights, those that are brightest in their darkest channel, so that
     dark samples, which are cut at 0 and hence too quiet, are few; cells with such a sample, and unfit cells, are left
-    out. The curve is fitted by `calibration.radiometry.greys`.
+    out. The curve is fitted by `calibration.sampling`.
 
     Raises
     ------

@@ -21,9 +21,8 @@ from calibration.budget import Budget
 from calibration.causes.gathering import PrintPlace
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.measurements import FrameMeasurements, TableMeasurements
-from calibration.radiometry.greys import PhotonTransfer, noise_levels
 from calibration.registration.register import Registration
-from calibration.sampling import rim_difference, sample_noise, sites_at
+from calibration.sampling import PhotonTransfer, noise_levels, rim_difference, sample_noise, sites_at
 from drivers.raw.rawfile import CHANNELS, Mosaic, frame_black, phases
 from experiment.chart.model import Chart
 from experiment.framing.pictures import STILL_PX

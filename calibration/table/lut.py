@@ -62,6 +62,9 @@ FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$")]
 FRAME_FIELDS: Final = ("kind", "illumination", "file", "sha256")
 """Columns of a table's `frames.csv` (docs/formats.md)."""
 
+REFERENCE_COLUMNS: Final = ("light", "name", "r", "g", "b", "r_error", "g_error", "b_error")
+"""Columns of a table's `references.csv` (docs/formats.md)."""
+
 MOST_SAMPLES: Final = 1024
 """Samples of a cell at most: the largest window has 9×9."""
 
@@ -116,6 +119,7 @@ MOST_BYTES: Final = {
 OPTIONAL: Final = frozenset({REPORT_PAGE})
 """Files that a table may do without: no number is read from them, and a table that was fetched has none."""
 
+_Array = npt.NDArray[np.float64]
 _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")
 _TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, REPORT_PAGE)
 RESTORE: Final = "restore it from a copy, fetch the table again, or build it anew"
@@ -703,4 +707,24 @@ def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[
                 *([light.name or ""] if named else []),
             ]
         )
+    return text.getvalue()
+
+
+def references_csv(names: Sequence[str], white: _Array, white_error: _Array, greys: _Array, errors: _Array) -> str:
+    """Return the text of `references.csv`: every light's white, then its greys.
+
+    `white`, `white_error`: (L, 3), units of the samples. `greys`, `errors`: (L, G, 3), the same units; NaN is left
+    empty.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(REFERENCE_COLUMNS)
+
+    def row(light: int, name: str, value: _Array, error: _Array) -> None:
+        writer.writerow([light, name, *("" if np.isnan(v) else f"{v:.6f}" for v in (*value.tolist(), *error.tolist()))])
+
+    for light in range(len(white)):
+        row(light, "white", white[light], white_error[light])
+        for number, name in enumerate(names):
+            row(light, name, greys[light, number], errors[light, number])
     return text.getvalue()

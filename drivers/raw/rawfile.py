@@ -12,14 +12,19 @@ Rules that hold inside:
   integers. A plane of red or blue photosites lies a quarter pixel beside the blocks' centres, and `Plane.offset_px`
   puts its places right; green is the mean of its two photosites and lies in the middle. A sum of planes under deep red
   or blue would be a fifth of a pixel off.
+- LibRaw chooses by itself which picture of a file it decodes, and reads behind the end of what is stored without a
+  word. So each picture of a sensor that a file describes must be whole, and what LibRaw makes must have the size of
+  one of them (`Stored.holds`). A file of whose layout neither can be told is refused.
 - LibRaw is called here and nowhere else in the suite. A DNG that holds its counts as memory does needs none: it is read
   as LibRaw would, and what is not sure of it is left to LibRaw. Rows and columns of colour filters and of black levels
   count from the active area's corner (DNG 1.7, ActiveArea). LibRaw's table of colour matrices is asked by opening a raw
   file of nothing but a camera's name, made here: no matrix is copied into the suite.
 
-Sources: Exif 2.32, section 4.6.5 (BodySerialNumber, LensModel); DNG 1.7.1 (CameraSerialNumber). Canon's note, which
-bodies before Exif 2.3 (such as the 550D) have instead, is a TIFF directory without a standard: P. Harvey, ExifTool,
-lib/Image/ExifTool/Canon.pm (0x000c SerialNumber, 0x0095 LensModel), whose offsets count from the file's beginning.
+Sources: TIFF 6.0 (strips), TIFF technical note 1 and DNG 1.7.1 (tiles, CameraSerialNumber); LibRaw 0.22 for which
+directory, size and packing it takes (src/metadata/tiff.cpp); Exif 2.32, section 4.6.5 (BodySerialNumber, LensModel).
+Canon's note, which bodies before Exif 2.3 (such as the 550D) have instead, is a TIFF directory without a standard: P.
+Harvey, ExifTool, lib/Image/ExifTool/Canon.pm (0x000c SerialNumber, 0x0095 LensModel), whose offsets count from the
+file's beginning.
 """
 
 from __future__ import annotations
@@ -29,29 +34,33 @@ import io
 import struct
 import sys
 import threading
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.raw.lossless_jpeg import lossless_fault
+from drivers.raw.lossless_jpeg import jpeg_size, lossless_fault
 from drivers.raw.storage import (
+    LEAST_BITS,
     Area,
     Cr3,
+    Extent,
     NotBayer,
     RawDamaged,
     RawUnsupported,
     Stored,
-    checked,
     ciff_entries,
-    is_cr3,
+    of_crw,
+    of_phase_one,
+    of_raf,
+    of_rw2,
     read_cr3,
-    stored_frames,
 )
 from drivers.tiff import CFA, Directory, Tags, TiffDamaged, TiffTag, ValueType, head, is_tiff, read_directories, text
 from foundation.errors import FormatError
@@ -384,6 +393,208 @@ def decode_raw(data: bytes | memoryview, path: Path, *, known_whole: bool = Fals
             raise _unreadable(path, str(error) or type(error).__name__) from error
 
 
+_LOSSLESS_BITS = 1.0
+"""Bits that lossless JPEG spends on a photosite at least (ITU-T T.81, annex H)."""
+
+_UNCOMPRESSED, _OLD_JPEG, _JPEG, _SONY, _LOSSY_JPEG = 1, 6, 7, 32767, 34892
+"""Compression (TIFF 6.0; DNG 1.7.1, chapter 3; Sony's own)."""
+
+_UNSUPPORTED = {8: "Deflate", 32946: "Deflate", 9: "VC-5", 52546: "JPEG XL"}
+"""Compression of DNG that LibRaw is not built with (DNG 1.7.1, chapter 3; 32946: Adobe's number of old)."""
+
+_MAKERS = ("nikon", "sony", "pentax", "ricoh", "olympus", "om digital", "samsung", "hasselblad")
+"""Beginnings of makers' names in files of TIFF of whose raw pixels TIFF's own tags say size and place."""
+
+_TONES = (TiffTag.LINEARIZATION_TABLE, TiffTag.GRAY_RESPONSE_CURVE)
+"""Tags of tables that LibRaw applies to what is stored."""
+
+_LINEAR_RAW = 34892
+"""PhotometricInterpretation of pixels that hold all colours (DNG 1.7.1)."""
+
+
+def stored_frames(data: bytes | memoryview, directories: Sequence[Directory]) -> list[Stored]:
+    """Return the frames that a file describes, the largest first; all their bytes are there.
+
+    `data`: the file's bytes; `directories`: those of a TIFF file.
+    """
+    start = bytes(data[:32])
+    if b"IIII" in start or b"MMMM" in start:
+        frames = [of_phase_one(data)]
+    elif start.startswith(b"FUJIFILM"):
+        frames = [of_raf(data)]
+    elif start[6:14] == b"HEAPCCDR":
+        frames = [of_crw(data)]
+    elif start.startswith(b"IIU\0"):
+        frames = [of_rw2(data, directories)]
+    elif is_tiff(data):
+        frames = list(_of_tiff(data, directories))
+    else:
+        raise RawDamaged(
+            "it begins as none of the raw files that can be checked (CR2, CR3, CRW, NEF, ARW, PEF, ORF, SRW, RW2, RAF, "
+            "3FR, IIQ, DNG)"
+        )
+    return sorted(checked(data, frames), key=lambda frame: -frame.rows * frame.columns)
+
+
+def checked(data: bytes | memoryview, frames: Sequence[Stored]) -> Sequence[Stored]:
+    """Return `frames`; refuse none, and those whose bytes are not all in the file, are stored twice, or are too few."""
+    if not frames:
+        raise RawDamaged("it describes no pixels of a sensor")
+    for frame in frames:
+        if not (0 < frame.rows < 1 << 16 and 0 < frame.columns < 1 << 16):
+            raise RawDamaged(f"it states a sensor of {frame.columns}×{frame.rows}")
+        extents = sorted(frame.extents)
+        for offset, size in extents:
+            if size <= 0 or offset + size > len(data):
+                raise RawDamaged(f"its pixels reach from byte {offset} to {offset + size}, and it has only {len(data)}")
+        for (first, size), (following, _) in pairwise(extents):
+            if first + size > following:
+                raise RawDamaged(f"parts of its pixels lie upon each other, at byte {following}")
+        size, photosites = sum(size for _, size in extents), frame.rows * frame.columns
+        if 8 * size < photosites * frame.least_bits:
+            raise RawDamaged(
+                f"it holds {size} bytes of pixels for {photosites} photosites, at least {frame.least_bits:.3g} "
+                "bits each expected"
+            )
+    return frames
+
+
+def _of_tiff(data: bytes | memoryview, directories: Sequence[Directory]) -> Iterator[Stored]:
+    """Yield the frames behind colour filters of a DNG, a CR2, or a maker's TIFF."""
+    # A version of zeros is none to LibRaw.
+    dng = any(any(one.integers(TiffTag.DNG_VERSION)) for one in directories)
+    canon = bytes(data[8:10]) == b"CR" and not dng
+    maker = next((name for one in directories if (name := one.text(TiffTag.MAKE))), "")
+    # Olympus calls its pixels grey.
+    meant = {CFA, 1} if data[2:4] in (b"RO", b"RS", b"OR") else {CFA}
+    for directory in directories:
+        if canon:
+            found = _of_cr2(data, directory)
+            if found is not None:
+                yield found
+            continue
+        interpretation = directory.first(TiffTag.PHOTOMETRIC_INTERPRETATION)
+        if dng and directory.first(TiffTag.NEW_SUBFILE_TYPE) == 0 and interpretation == _LINEAR_RAW:
+            raise NotBayer("its pixels hold all colours (LinearRaw)")
+        if interpretation not in meant or (dng and directory.first(TiffTag.NEW_SUBFILE_TYPE)):
+            continue
+        if not dng and not maker.casefold().startswith(_MAKERS):
+            raise RawUnsupported(f"it is of {maker or 'an unnamed maker'}, whose layout is not checked")
+        for tones in (directory.integers(tag) for tag in _TONES):
+            if tones and (list(tones) != sorted(tones) or tones[0] == tones[-1]):
+                raise RawDamaged("its table of tones does not rise")
+        yield (_of_dng if dng else _of_maker)(data, directory, _extents(directory))
+
+
+def _extents(directory: Directory) -> tuple[Extent, ...]:
+    """Return the strips of a directory, or its tiles, which count where both are stated, as in Sony's files."""
+    places, sizes = (
+        (TiffTag.TILE_OFFSETS, TiffTag.TILE_BYTE_COUNTS)
+        if directory.integers(TiffTag.TILE_OFFSETS)
+        else (TiffTag.STRIP_OFFSETS, TiffTag.STRIP_BYTE_COUNTS)
+    )
+    numbers = directory.integers(places), directory.integers(sizes)
+    if len(numbers[0]) != len(numbers[1]):
+        raise RawDamaged(f"it states {len(numbers[0])} places of its pixels and {len(numbers[1])} sizes")
+    return tuple(zip(*numbers, strict=True))
+
+
+def _in_a_row(extents: Sequence[Extent]) -> bool:
+    return all(offset + size == following for (offset, size), (following, _) in pairwise(extents))
+
+
+def _of_dng(data: bytes | memoryview, directory: Directory, extents: tuple[Extent, ...]) -> Stored:
+    rows, columns = directory.first(TiffTag.IMAGE_LENGTH), directory.first(TiffTag.IMAGE_WIDTH)
+    compression, bits = (
+        directory.first(TiffTag.COMPRESSION),
+        max(directory.integers(TiffTag.BITS_PER_SAMPLE), default=0),
+    )
+    if directory.first(TiffTag.SAMPLES_PER_PIXEL) > 1:
+        raise NotBayer(f"it has {directory.first(TiffTag.SAMPLES_PER_PIXEL)} samples for each pixel")
+    if compression not in (_UNCOMPRESSED, _JPEG, _LOSSY_JPEG):
+        name = _UNSUPPORTED.get(compression, f"number {compression}")
+        raise RawUnsupported(f"its pixels are compressed by {name}, which is not supported")
+    # A table of tones makes any number of what is stored.
+    largest = 16 if any(directory.integers(tag) for tag in _TONES) else min(bits, 16)
+    if not 8 <= bits <= 16 or directory.first(TiffTag.SAMPLE_FORMAT) > 1:
+        raise RawUnsupported(f"its photosites are of {bits} bits or no integers, 8 to 16 bits expected")
+    tiled = bool(directory.integers(TiffTag.TILE_OFFSETS))
+    high = directory.first(TiffTag.TILE_LENGTH if tiled else TiffTag.ROWS_PER_STRIP)
+    wide = directory.first(TiffTag.TILE_WIDTH) if tiled else columns
+    high = high if tiled else min(high or rows, rows)
+    if high <= 0 or wide <= 0:
+        raise RawDamaged(f"its pixels are in parts of {wide}×{high}")
+    across, down = -(-columns // wide), -(-rows // high)
+    if len(extents) != across * down:
+        raise RawDamaged(f"its pixels are in {len(extents)} parts, {across * down} expected")
+    if compression == _UNCOMPRESSED:
+        if not tiled and not _in_a_row(extents):
+            raise RawUnsupported("its strips do not follow one another")
+        for number, (_, size) in enumerate(extents):
+            part = min(high, rows - number // across * high)
+            if 8 * size < (high if tiled else part) * wide * bits:
+                raise RawDamaged(f"part {number} of its pixels has {size} bytes for {part} rows of {wide} photosites")
+        return Stored(rows, columns, extents, bits, largest, directory=directory)
+    if compression == _LOSSY_JPEG:
+        return Stored(rows, columns, extents, bits=largest, directory=directory)
+    # LibRaw wraps rows at the sensor's edge, and takes the first strip for all.
+    if wide > columns or not (tiled or len(extents) == 1):
+        raise RawUnsupported("its JPEG is in several strips, or in tiles that are wider than the sensor")
+    lossless = True
+    for number, (offset, size) in enumerate(extents):
+        left = min(high, rows - number // across * high)
+        found = jpeg_size(data[offset : offset + size])
+        if found is None or found.rows * found.columns not in (high * wide, left * wide):
+            raise RawDamaged(f"part {number} of its pixels is no JPEG of {left} rows of {wide} photosites")
+        lossless &= found.lossless
+    least = _LOSSLESS_BITS if lossless else LEAST_BITS
+    return Stored(rows, columns, extents, least, largest, lossless=lossless, directory=directory)
+
+
+def _of_cr2(data: bytes | memoryview, directory: Directory) -> Stored | None:
+    """Return the frame of the one directory whose strip is a lossless JPEG; its size is the JPEG's."""
+    if not directory.integers(TiffTag.STRIP_OFFSETS):
+        return None
+    offset, size = directory.first(TiffTag.STRIP_OFFSETS), directory.first(TiffTag.STRIP_BYTE_COUNTS)
+    found = jpeg_size(data[offset : offset + size])
+    if found is None or not found.lossless:
+        if directory.integers(TiffTag.CR2_SLICES):
+            raise RawDamaged(f"its pixels at byte {offset} are no lossless JPEG")
+        return None
+    rows, columns, components, bits, _ = found
+    number, each, last = (*directory.integers(TiffTag.CR2_SLICES), 0, 0, 0)[:3]
+    if components % 2 == 0 and number and number * each + last != columns:
+        raise RawDamaged(f"its {number + 1} slices are {number * each + last} photosites wide, its pixels {columns}")
+    if components % 2 == 0 and columns > 4 * rows:
+        rows, columns = 2 * rows, columns // 2
+    return Stored(rows, columns, ((offset, size),), _LOSSLESS_BITS, bits, lossless=True, directory=directory)
+
+
+def _of_maker(data: bytes | memoryview, directory: Directory, extents: tuple[Extent, ...]) -> Stored:
+    """Return the frame of a TIFF of any maker; Olympus calls compressed pixels of 16 bits uncompressed."""
+    rows, columns = directory.first(TiffTag.IMAGE_LENGTH), directory.first(TiffTag.IMAGE_WIDTH)
+    compression, bits = directory.first(TiffTag.COMPRESSION), directory.first(TiffTag.BITS_PER_SAMPLE)
+    size, least, spare = sum(size for _, size in extents), LEAST_BITS, 0
+    if compression == _UNCOMPRESSED:
+        if not 8 <= bits <= 16:
+            raise RawDamaged(f"its photosites are of {bits} bits, 8 to 16 expected")
+        if not _in_a_row(extents):
+            raise RawUnsupported("its strips do not follow one another")
+        grey = directory.first(TiffTag.PHOTOMETRIC_INTERPRETATION) != CFA
+        # LibRaw takes grey ones for compressed from 8/7 bits each on, and reads 14 bits as 16 unless they fill just
+        # their rows, of whole blocks of 16 bytes.
+        in_14_bits = rows * -(-columns * 7 // 64) * 16 if columns % 4 == 0 else 0
+        least = 8 / 7 if grey and bits == 16 else 16 if bits > 12 and size != in_14_bits else bits
+    elif compression in (_OLD_JPEG, _JPEG):
+        least = _LOSSLESS_BITS
+        headers = [jpeg_size(data[offset : offset + length]) for offset, length in extents]
+        if not all(header is not None and header.lossless for header in headers):
+            raise RawDamaged("parts of its pixels are no lossless JPEG")
+    elif compression == _SONY and size not in (rows * columns, 2 * rows * columns):
+        spare = 8
+    return Stored(rows, columns, extents, least, spare_rows=spare, directory=directory)
+
+
 def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Contents) -> Mosaic:
     import rawpy
 
@@ -484,7 +695,7 @@ class _Contents:
 def _examined(path: Path, data: bytes | memoryview, known_whole: bool) -> _Contents:
     """Return what a file says of itself; refuse one that cannot hold the frame that it claims."""
     try:
-        cr3 = read_cr3(data) if is_cr3(data) else None
+        cr3 = read_cr3(data) if bytes(data[4:12]) == b"ftypcrx " else None
         directories = read_directories(data) if is_tiff(data) else []
         frames = stored_frames(data, directories) if cr3 is None else checked(data, cr3.frames)
     except (TiffDamaged, RawDamaged) as error:

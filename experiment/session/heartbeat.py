@@ -11,22 +11,17 @@ from __future__ import annotations
 
 import fcntl
 import json
-import math
 import os
 import shlex
 import socket
 import struct
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Generator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Literal, Protocol
-
-from foundation.errors import CropError
+from typing import Literal
 
 RunState = Literal["running", "late", "waiting", "paused", "ended"]
 """What a run does: takes frames, hangs at a step, waits for something that comes by itself, waits for somebody, or
@@ -40,8 +35,6 @@ BEAT_S = 5.0
 """Seconds between two signs of life of a run that takes frames: each is a write to the disk, and "5 s ago" frightens
 nobody."""
 
-BEGINS = "a run begins: it looks at its frames and opens its devices"
-"""What a run says before it takes frames."""
 
 AGAIN = "run the same command again"
 """What helps after a run was killed."""
@@ -211,52 +204,6 @@ class Heartbeat:
             f"copied from {there} at {moment} or later, while a run was at work there, which is over now; acquire "
             f"status {shlex.quote(there)} says how it ended, if it is still there"
         )
-
-
-class SignOfLife(Protocol):
-    """A run's way to say that it is there."""
-
-    def __call__(self, waits_for: str = "", /) -> None:
-        """Say what is waited for, or, with nothing, that frames are taken."""
-
-
-@contextmanager
-def signs_of_life(
-    beat: Callable[[RunState, str, datetime], None], newest: Callable[[], Heartbeat | None], within_s: float
-) -> Generator[SignOfLife]:
-    """Say that a run is there while the block runs, and in the end that it is over, and why."""
-    last, said = -math.inf, ""
-
-    def say(state: RunState, sentence: str) -> None:
-        with suppress(CropError):
-            beat(state, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
-
-    def changes(state: RunState) -> bool:
-        with suppress(CropError):
-            heartbeat = newest()
-            return heartbeat is not None and heartbeat.state != state
-        return False
-
-    def alive(waits_for: str = "", /) -> None:
-        nonlocal last, said
-        state: RunState = "waiting" if waits_for else "running"
-        if time.monotonic() - last >= BEAT_S or state != said or changes(state):
-            last, said = time.monotonic(), state
-            say(state, waits_for or "frames are taken")
-
-    cause = f"ended by a mistake of the program; {AGAIN}"
-    try:
-        alive(BEGINS)
-        yield alive
-        cause = ""
-    except KeyboardInterrupt:
-        cause = f"interrupted; {AGAIN}"
-        raise
-    except CropError as error:
-        cause = str(error)
-        raise
-    finally:
-        say("ended", cause)
 
 
 def _generation(folder: Path) -> int:

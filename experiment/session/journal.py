@@ -278,6 +278,11 @@ class Journal:
         begun, due = datetime.fromisoformat(at), datetime.fromisoformat(until)
         return Heartbeat(begun, Process(*process), state, sentence, due, place)
 
+    def run_state(self) -> RunState | None:
+        """Return what the newest sign of life says that the run does; None if none was ever given."""
+        rows = self._newer_rows("SELECT state FROM heartbeat")
+        return rows[0][0] if rows else None
+
     def attempts(self) -> list[Attempt]:
         """Return every attempt, oldest first."""
         rows = self._rows(

@@ -1,10 +1,17 @@
-"""Making a dataset: whole, in shares beside other programs, and out of the shards of all shares.
+"""Making a dataset: whole, in shares beside other programs, and out of the shards of all shares; and the place of it.
 
 Shards are made by threads of this program, or by the workers of a Dask cluster. Either takes the shards that are not
 done and returns when they are, whatever died meanwhile. A shard is made from its sources to the record that says it is
 done: pictures are read, photographed and written.
 
-Rules that hold inside:
+The place where a dataset is made (`Workplace`): work that was interrupted is continued there, and the dataset appears
+whole. On a disk everything happens in the hidden folder `.OUT.partial`: `dataset-ID/`, with the plan's identifier,
+fills with files, and `plan/` has the plan, the records of the shards that are done, and of those that are not a line
+for each image whose files are written. At the end `dataset-ID/` gets its name by one rename, then the rest is removed.
+An object store has no rename: the files are written where they stay, plan and records below `OUT/.plan/`, and
+`dataset.json`, written last, makes a dataset of them.
+
+Rules that hold inside, of shards:
 
 - A shard's bytes depend on its job alone: not on the workers, on other shards, or on how often it is made.
 - Its record is written last, when all else has been synchronised with the disk: a shard with a record is whole. The
@@ -13,6 +20,16 @@ Rules that hold inside:
   written, and whose source is as it was. The bytes of the others do not depend on it.
 - At most about three pictures are in memory for each worker.
 
+Of places:
+
+- A place belongs to one plan. Another plan is refused with a message that says how the two differ. A worker of a plan
+  that was removed may still be alive: its records bear the identifier of its plan, so they are never taken for ours.
+- A program that makes the whole dataset locks the folder alone; programs that make shares of it share the lock.
+- A place without a finished image is of no use later and is removed when the work fails; so is one without a finished
+  shard where the command is at fault, which has to be another then.
+- The lines of images are not synchronised with the disk and may be cut: each bears its own hash and those of its files,
+  and what does not agree with them is made again. An object store cannot add to a file, and has no such lines.
+
 An image under one light has that light's ground truth, however its intensity falls off. Where it falls off with a tint
 (`generator.variation.variation`) the light stands in the records twice, as it is at the near and at the far end, and
 masks and maps say how much of either reaches a pixel.
@@ -20,11 +37,14 @@ masks and maps say how much of either reaches a pixel.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import io
+import json
 import math
 import re
+import shutil
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -33,18 +53,37 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import CropError, DeviceError, FormatError, InputError, first_of
-from foundation.files import HashingWriter
+from foundation.files import (
+    HashingWriter,
+    clear_folder,
+    held_folder,
+    partial_path,
+    publish_folder,
+    require_free,
+    sha256_of,
+    storage_error,
+    stream_sha256,
+)
+from foundation.records import from_json
 from foundation.version import software
-from generator.dataset.layouts import Beside, Sample, ShardWriter, card, croissant, datasheet, open_writer
-from generator.dataset.plan import DatasetOptions, Plan, ShardJob, light_of, split_of, versions
+from generator.dataset.layouts import (
+    Beside,
+    Sample,
+    ShardWriter,
+    card,
+    croissant,
+    datasheet,
+    open_writer,
+)
+from generator.dataset.plan import DatasetOptions, Plan, ShardJob, versions
 from generator.dataset.reader import Dataset, load_description, open_dataset
 from generator.dataset.records import (
     CARD,
@@ -72,39 +111,76 @@ from generator.dataset.records import (
     ShardRecord,
     Skipped,
     SourceRecord,
+    Split,
     TableRecord,
     Triple,
     image_key,
-)
-from generator.dataset.workplace import (
-    Workplace,
-    differences,
-    finished,
-    holds_dataset,
-    is_begun,
-    stored_identity,
-    workplace,
+    shard_key,
 )
 from generator.files import suffix_of
 from generator.lights.choices import listed_lights
 from generator.lights.lighting import LightChoice, Lighting, Mixture
 from generator.pictures.sources import Cut, Picture, Source, hash_since, keep_bits
-from generator.stores import DESCRIPTION, Pieces, Store, is_remote, local_path, open_store
+from generator.stores import DESCRIPTION, LocalStore, Pieces, RemoteStore, Store, is_remote, local_path, open_store
 from generator.variation.variation import Varied
 
 if TYPE_CHECKING:
     import distributed
 
     from calibration.table.lut import Lut
-    from generator.pictures.sources import Source
     from generator.rendering import Rendering
     from generator.rendering.colorimetric import ColorimetricRendering
 
+PLAN: Final = "plan.json"
+RECORDS: Final = "shards"
+_NOTES: Final = ".plan"
+_DONE: Final = ".json"
+_IMAGES: Final = ".images"
+PlanIdentity = Mapping[str, Any]
 
 _threads: Final = threading.local()
 
 TINY_PX: Final = 16
 """A shorter side below which a picture is noted: icons and failed downloads are so small, photographs never are."""
+
+
+_WORD: Final = 1 << 64
+"""Values of the eight bytes of a hash that place a source among the parts."""
+
+
+def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
+    """Return the part of the dataset that a source belongs to.
+
+    Decided by the seed and the source's content, or its name where it has no file, and by no other source, so that two
+    copies of one file, whatever their names, are in the same part. The shares hold on average.
+
+    `shares`: of train, validation and test; sum 1. None leaves it undivided.
+    """
+    if shares is None:
+        return None
+    word = hashlib.sha256(f"split {seed} {sha256 or name}".encode()).digest()[:8]
+    place = int.from_bytes(word, "big") / _WORD
+    bound = 0.0
+    for part, share in zip(SPLITS, shares, strict=True):
+        bound += share
+        if place < bound and share:
+            return part
+    return max(zip(shares, SPLITS, strict=True))[1]
+
+
+def light_of(lut: Lut, light: int) -> Light:
+    """Return the record of light number `light` of the table."""
+    shown, expanded = lut.illuminations[light], lut.truth_uncertainty_deg
+    red, green, blue = (float(part) for part in lut.white[light])
+    return Light(
+        illumination=light,
+        kind=shown.kind,
+        cct_k=shown.cct_k,
+        codes=shown.colour.codes,
+        white=(red, green, blue),
+        name=shown.name,
+        uncertainty_deg=None if expanded is None else float(f"{expanded[light]:.4g}"),
+    )
 
 
 def photograph(
@@ -1202,3 +1278,277 @@ def _uncertainty(label: str, lights: Mapping[int, Light]) -> str:
     parts = [lights[int(part.partition(":")[0])].uncertainty_deg for part in label.split("+")]
     known = [part for part in parts if part is not None]
     return f"{max(known):.4g}" if len(known) == len(parts) else ""
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Where a dataset is being made.
+
+    - `files`: what will be the dataset.
+    - `notes`: the plan and the shards' records, which are removed at the end.
+    - `out`: the dataset's place.
+    - `plan_id`: identifier of the plan; see `_plan_id`.
+    """
+
+    files: Store
+    notes: Store
+    out: str
+    plan_id: str
+
+    def done(self) -> set[int]:
+        """Return the shards that are done."""
+        ending = f".{self.plan_id}{_DONE}"
+        found = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
+        return {int(name.removesuffix(ending)) for name in found if name.endswith(ending)}
+
+    def has(self, shard: int) -> bool:
+        """Return whether a shard is done."""
+        return self.notes.has(self._record_name(shard))
+
+    def load(self, shard: int) -> ShardRecord:
+        """Return the record of a shard that is done."""
+        name = self._record_name(shard)
+        remedy = "remove it and run the same command again, which makes it anew"
+        return from_json(ShardRecord, self.notes.get(name), f"{self.notes.place}/{name}", remedy)
+
+    def commit(self, record: ShardRecord) -> None:
+        """Bring the record of a shard to the disk whose files are there: from here on it is done."""
+        name = self._record_name(record.shard)
+        self.notes.put(name, record.model_dump_json().encode())
+        self.notes.sync([name])
+        if isinstance(self.notes, LocalStore):
+            # Whoever makes the shard at the same time may have it open, and no later reader asks for it.
+            with contextlib.suppress(OSError):
+                (self.notes.root / self._images_name(record.shard)).unlink(missing_ok=True)
+
+    def note(self, shard: int, image: FinishedImage) -> None:
+        """Note that all files of an image of a shard are written; any thread may do so."""
+        if isinstance(self.notes, LocalStore):
+            line = image.model_dump_json().encode()
+            # It begins anew behind a line that was cut.
+            self.notes.append(self._images_name(shard), b"\n%s %s\n" % (sha256_of(line).encode(), line))
+
+    def noted(self, shard: int) -> list[FinishedImage]:
+        """Return what was noted of the images of a shard, but for what cannot be read; see `is_whole`."""
+        name = self._images_name(shard)
+        if not isinstance(self.notes, LocalStore) or not self.notes.has(name):
+            return []
+        found: list[FinishedImage] = []
+        # Whoever makes the shard at the same time may be done, and have removed them.
+        with contextlib.suppress(FormatError):
+            for noted in self.notes.get(name).splitlines():
+                sha256, _, line = noted.partition(b" ")
+                if sha256 == sha256_of(line).encode():
+                    found.append(from_json(FinishedImage, line, f"{self.notes.place}/{name}", "remove it"))
+        return found
+
+    def is_whole(self, image: FinishedImage) -> bool:
+        """Return whether all files of an image are there as they were written."""
+        try:
+            for file in image.files:
+                with self.files.open(file.name) as stream:
+                    if stream_sha256(stream) != file.sha256:
+                        return False
+        except (CropError, OSError):
+            return False
+        return True
+
+    def discard(self) -> None:
+        """Remove the records of the shards that are done, since to continue would end the same."""
+        self.notes.remove(RECORDS)
+
+    def publish(self) -> None:
+        """Make a dataset of the files; all of them, the description last, are there."""
+        if isinstance(self.files, LocalStore):
+            out = Path(self.out)
+            require_free(out, "the dataset")
+            self.files.sweep()
+            publish_folder(self.files.root, out, "the dataset")
+        _remove_notes(self.notes)
+
+    def _record_name(self, shard: int) -> str:
+        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}{_DONE}"
+
+    def _images_name(self, shard: int) -> str:
+        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}{_IMAGES}"
+
+
+def finished(out: str | Path, identity: PlanIdentity) -> bool:
+    """Return whether the dataset of this plan is complete; notes that a killed program left are removed then."""
+    notes = _notes(out)
+    if not open_store(out).has(DESCRIPTION):
+        return False
+    planned = notes.has(PLAN)
+    if planned and list(_differences(_load(notes), _read_back(identity))):
+        return False
+    _remove_notes(notes)
+    return planned
+
+
+def _remove_notes(notes: Store) -> None:
+    """Remove the notes, the plan last: until then a program that is run again finds that the dataset is its own."""
+    notes.remove(RECORDS)
+    if isinstance(notes, LocalStore):
+        shutil.rmtree(notes.root.parent, ignore_errors=True)
+    else:
+        notes.remove("")
+
+
+def require_free_place(out: str | Path) -> None:
+    """Raise an InputError if `out` is taken, so that a command can say so before it does any work."""
+    if is_begun(out):
+        return
+    if isinstance(out, str) and is_remote(out):
+        if RemoteStore(out).has(DESCRIPTION):
+            raise InputError(f"{out} already holds a dataset; name another place, or remove what is there")
+    else:
+        require_free(local_path(out), "the dataset")
+
+
+def holds_dataset(out: str | Path) -> bool:
+    """Return whether a dataset is complete at `out`, and no plan lies there that its making was ended by."""
+    return open_store(out).has(DESCRIPTION) and not is_begun(out)
+
+
+def is_begun(out: str | Path) -> bool:
+    """Return whether a plan lies at `out` of a dataset that is being made, or was before its program ended."""
+    return _notes(out).has(PLAN)
+
+
+def differences(stored: Any, wanted: Any) -> list[str]:
+    """Return each difference of two plans, or of parts of them, in words."""
+    return list(_differences(stored, json.loads(json.dumps(wanted))))
+
+
+@contextmanager
+def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Generator[Workplace]:
+    """Open the place where the dataset `out` is being made, or begin one."""
+    if isinstance(out, str) and is_remote(out):
+        yield from _remote(out, identity)
+        return
+    path = local_path(out)
+    require_free(path, "the dataset")
+    # Whole, since a worker may have been started in another folder.
+    folder = partial_path(path).absolute()
+    busy = f"{path} is being made by another program; wait for it, or name another place"
+    planned = None if alone else (folder / "plan" / PLAN).is_file
+    with held_folder(folder, busy, share_if=planned, of=path) as lock:
+        notes = LocalStore(folder / "plan")
+        plan_id = _plan_id(identity)
+        place = Workplace(LocalStore(folder / f"dataset-{plan_id}"), notes, str(path), plan_id)
+        try:
+            if not notes.has(PLAN):
+                _require_still_free(path, folder)
+                _begin(folder, plan_id)
+                notes.put(PLAN, _text(identity))
+                notes.sync([PLAN])
+            _require_same(notes, identity, path, f"remove {folder}")
+            if not alone:
+                lock.share()
+            yield place
+        except BaseException as error:
+            # An InputError asks for another command, which could not go on with images of this one.
+            useful = _DONE if isinstance(error, InputError) else (_DONE, _IMAGES)
+            if alone and folder.is_dir() and not any(name.endswith(useful) for name in notes.names(RECORDS)):
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+
+def stored_identity(out: str | Path) -> PlanIdentity:
+    """Return the identity of the plan of a dataset that is being made."""
+    notes = _notes(out)
+    if not notes.has(PLAN):
+        raise InputError(f"no dataset is being made at {out}; begin one with generate")
+    return _load(notes)
+
+
+def _notes(out: str | Path) -> Store:
+    if isinstance(out, str) and is_remote(out):
+        return RemoteStore(f"{out.rstrip('/')}/{_NOTES}")
+    return LocalStore(partial_path(local_path(out)) / "plan")
+
+
+def _remote(out: str, identity: PlanIdentity) -> Generator[Workplace]:
+    files, notes = RemoteStore(out), RemoteStore(f"{out.rstrip('/')}/{_NOTES}")
+    place = Workplace(files, notes, out, _plan_id(identity))
+    if files.has(DESCRIPTION):
+        raise InputError(f"{out} already holds a dataset; name another place, or remove what is there")
+    begun = notes.has(PLAN)
+    if not begun:
+        if next(files.names(), None) is not None:
+            raise InputError(f"{out} already holds something else; name another place, or remove what is there")
+        notes.put(PLAN, _text(identity))
+    _require_same(notes, identity, out, f"remove what is below {out}")
+    try:
+        yield place
+    except BaseException:
+        with contextlib.suppress(Exception):
+            if not begun and not any(notes.names(RECORDS)):
+                files.remove("")
+        raise
+
+
+def _require_still_free(path: Path, folder: Path) -> None:
+    """Refuse when another program finished the dataset while its hold was waited for; `folder` is then new."""
+    try:
+        require_free(path, "the dataset")
+    except InputError:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def _begin(folder: Path, plan_id: str) -> None:
+    """Make the folders inside; files that are there without a plan are left from before the plan was written."""
+    try:
+        clear_folder(folder)
+        for inner in ("plan", f"dataset-{plan_id}"):
+            (folder / inner).mkdir()
+    except OSError as error:
+        raise storage_error(folder, error) from error
+
+
+def _text(identity: PlanIdentity) -> bytes:
+    return (json.dumps(identity, indent=1) + "\n").encode()
+
+
+def _plan_id(identity: PlanIdentity) -> str:
+    """Return the first 16 hexadecimal digits of the SHA-256 of the plan's identity."""
+    return hashlib.sha256(json.dumps(_read_back(identity), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _read_back(identity: PlanIdentity) -> Any:
+    """Return an identity as it is read back."""
+    return json.loads(_text(identity))
+
+
+def _load(notes: Store) -> dict[str, Any]:
+    try:
+        loaded = json.loads(notes.get(PLAN))
+    except ValueError as error:
+        raise FormatError(f"{notes.place}/{PLAN} is damaged; remove it and all beside it, then begin anew") from error
+    return dict(loaded)
+
+
+def _require_same(notes: Store, identity: PlanIdentity, out: str | Path, remedy: str) -> None:
+    stored = _load(notes)
+    differing = list(_differences(stored, _read_back(identity)))
+    if differing:
+        raise InputError(
+            f"{out} was begun with another plan ({'; '.join(differing)}); finish it as it was begun, {remedy}, or name "
+            "another place"
+        )
+
+
+def _differences(stored: Any, wanted: Any, name: str = "") -> Generator[str]:
+    """Yield each difference of two plans, in words."""
+    if isinstance(stored, dict) and isinstance(wanted, dict):
+        one, other = cast("dict[str, Any]", stored), cast("dict[str, Any]", wanted)
+        for key in dict.fromkeys([*one, *other]):
+            yield from _differences(one.get(key), other.get(key), f"{name} {key}".strip())
+    elif stored != wanted:
+        yield f"{name} {_short(stored)}, now {_short(wanted)}"
+
+
+def _short(value: Any, most: int = 40) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= most else f"{text[:most]}…"

@@ -28,7 +28,7 @@ from foundation.files import file_sha256
 from foundation.secret_texts import masked_values
 from foundation.version import software
 from generator.dataset.layouts import library_of, require_library
-from generator.dataset.records import SPLITS, Layout, Light, Scale, Split, TableRecord
+from generator.dataset.records import SPLITS, Layout, Scale, Split, TableRecord
 from generator.files import FORMATS, Format, libraries_of
 from generator.pictures.sources import PictureFile
 from generator.rendering import DEFAULT, Rendering
@@ -280,10 +280,6 @@ def _file_of(source: Source) -> Source:
     return getattr(source, "source", source)
 
 
-_WORD: Final = 1 << 64
-"""Values of the eight bytes of a hash that place a source among the parts."""
-
-
 @dataclass(frozen=True)
 class ShardJob:
     """Everything that a worker on any machine needs to make one shard.
@@ -441,26 +437,6 @@ class Plan:
         return json.loads(json.dumps(masked_values(recorded)))
 
 
-def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
-    """Return the part of the dataset that a source belongs to.
-
-    Decided by the seed and the source's content, or its name where it has no file, and by no other source, so that two
-    copies of one file, whatever their names, are in the same part. The shares hold on average.
-
-    `shares`: of train, validation and test; sum 1. None leaves it undivided.
-    """
-    if shares is None:
-        return None
-    word = hashlib.sha256(f"split {seed} {sha256 or name}".encode()).digest()[:8]
-    place = int.from_bytes(word, "big") / _WORD
-    bound = 0.0
-    for part, share in zip(SPLITS, shares, strict=True):
-        bound += share
-        if place < bound and share:
-            return part
-    return max(zip(shares, SPLITS, strict=True))[1]
-
-
 def sources_sha256(sources: Sequence[Source]) -> str:
     """Return a hash over the list of sources: the name of each, and how it is made or read.
 
@@ -497,19 +473,4 @@ def table_of(lut: Lut) -> TableRecord:
         computed=provenance.computed,
         lights=len(lut.illuminations),
         origin=provenance.origin,
-    )
-
-
-def light_of(lut: Lut, light: int) -> Light:
-    """Return the record of light number `light` of the table."""
-    shown, expanded = lut.illuminations[light], lut.truth_uncertainty_deg
-    red, green, blue = (float(part) for part in lut.white[light])
-    return Light(
-        illumination=light,
-        kind=shown.kind,
-        cct_k=shown.cct_k,
-        codes=shown.colour.codes,
-        white=(red, green, blue),
-        name=shown.name,
-        uncertainty_deg=None if expanded is None else float(f"{expanded[light]:.4g}"),
     )

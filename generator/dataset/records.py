@@ -9,11 +9,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from pydantic import Field
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 
 from calibration.citation import OriginRecord
-from foundation.records import Record, SparseRecord
+from foundation.records import Record
 from generator.files import Format
+
+
+class SparseRecord(Record):
+    """A record of which keys that are None by default are left out while they are, so that files stay as they were."""
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        left_out = {name for name, field in type(self).model_fields.items() if field.default is None}
+        return {key: value for key, value in serialise(self).items() if value is not None or key not in left_out}
+
 
 FORMAT: Final = "crop.dataset"
 VERSION: Final = 2

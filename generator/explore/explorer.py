@@ -31,8 +31,8 @@ from foundation.files import cache_folder, sha256_of, write_whole
 from foundation.local_server import LocalServer, Refusal, Request, Response
 from foundation.pages import render
 from foundation.secret_texts import masked
-from generator.dataset.making import chromaticity, photograph
-from generator.dataset.plan import DatasetOptions, light_of
+from generator.dataset.making import chromaticity, light_of, photograph
+from generator.dataset.plan import DatasetOptions
 from generator.kernels.choice import replace_unfit_colours
 from generator.lights.choices import parse_light
 from generator.lights.gamut import Gamut, black_body, rb_of

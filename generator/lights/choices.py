@@ -22,7 +22,7 @@ from generator import philox
 from generator.kernels.rendering import known_light
 from generator.lights.distributions import Distribution
 from generator.lights.gamut import Gamut, Match, OutsideGamut, OutsideGamutError, black_body, rgb_of
-from generator.lights.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
+from generator.lights.lighting import LightChoice, Lighting, ListedLights, Mixture, parse_mixture, plain
 from generator.masks.making import MaskPlan
 from generator.named_numbers import parse_numbers
 
@@ -36,58 +36,6 @@ _BATCHES: Final = 2048
 `_LEAST_WITHIN` is."""
 _LEAST_WITHIN: Final = 1e-3
 """Share of a distribution that must lie in the gamut; with less, a light would take thousands of draws."""
-
-
-@dataclass(frozen=True)
-class ListedLights:
-    """The same lights for every picture: numbers of the table's lights, or mixtures of them."""
-
-    lights: tuple[int | Mixture, ...]
-
-    @property
-    def lights_each(self) -> int:
-        """Images for each picture."""
-        return len(self.lights)
-
-    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
-        """Return the lighting of each image; `position` does not matter."""
-        del position
-        mixtures = (light if isinstance(light, Mixture) else plain(light) for light in self.lights)
-        return tuple(Lighting((mixture,)) for mixture in mixtures)
-
-    def describe(self) -> dict[str, Any]:
-        """Return the choice as plain values."""
-        lights = [light.label if isinstance(light, Mixture) else light for light in self.lights]
-        return {"choice": "listed", "lights": lights}
-
-
-@dataclass(frozen=True)
-class RandomLights:
-    """`count` distinct lights of `total` for each picture, every set equally likely; purpose 1 of `philox`."""
-
-    count: int
-    total: int
-    seed: int
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.count <= self.total:
-            raise InputError(
-                f"{self.count} random lights a picture were asked for; the table has {self.total}, expected 1 to that"
-            )
-
-    @property
-    def lights_each(self) -> int:
-        """Images for each picture."""
-        return self.count
-
-    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
-        """Return the lighting of each image of the picture at `position`."""
-        lights = philox.distinct(self.seed, self.count, self.total, position, philox.LIGHTS)
-        return tuple(Lighting((plain(light),)) for light in lights)
-
-    def describe(self) -> dict[str, Any]:
-        """Return the choice as plain values."""
-        return {"choice": "random", "count": self.count}
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,8 @@
 """The light on a picture: a mixture of the table's lights, or several mixtures, each in its part of the picture.
 
+And which falls on which picture (`LightChoice`): lights that are listed, or drawn from the table's, stand here, others
+in `generator.lights.choices`.
+
 Light adds, so a mixture with weights from 0 is a real light, its ground truth the same mixture of the ground truths.
 Rules that hold inside:
 
@@ -21,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
+from generator import philox
 from generator.masks.making import MaskMaker
 
 if TYPE_CHECKING:
@@ -183,3 +187,55 @@ class LightChoice(Protocol):
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values for `dataset.json`: enough to make every byte again."""
         ...
+
+
+@dataclass(frozen=True)
+class ListedLights:
+    """The same lights for every picture: numbers of the table's lights, or mixtures of them."""
+
+    lights: tuple[int | Mixture, ...]
+
+    @property
+    def lights_each(self) -> int:
+        """Images for each picture."""
+        return len(self.lights)
+
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image; `position` does not matter."""
+        del position
+        mixtures = (light if isinstance(light, Mixture) else plain(light) for light in self.lights)
+        return tuple(Lighting((mixture,)) for mixture in mixtures)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the choice as plain values."""
+        lights = [light.label if isinstance(light, Mixture) else light for light in self.lights]
+        return {"choice": "listed", "lights": lights}
+
+
+@dataclass(frozen=True)
+class RandomLights:
+    """`count` distinct lights of `total` for each picture, every set equally likely; purpose 1 of `philox`."""
+
+    count: int
+    total: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= self.total:
+            raise InputError(
+                f"{self.count} random lights a picture were asked for; the table has {self.total}, expected 1 to that"
+            )
+
+    @property
+    def lights_each(self) -> int:
+        """Images for each picture."""
+        return self.count
+
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image of the picture at `position`."""
+        lights = philox.distinct(self.seed, self.count, self.total, position, philox.LIGHTS)
+        return tuple(Lighting((plain(light),)) for light in lights)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the choice as plain values."""
+        return {"choice": "random", "count": self.count}

@@ -22,8 +22,6 @@ from foundation.errors import FormatError, InputError, first_of
 from foundation.files import read_text
 from generator.lights.choices import (
     DrawnLights,
-    ListedLights,
-    RandomLights,
     SimultaneousLights,
     matched_lights,
     nearest_lights,
@@ -32,7 +30,7 @@ from generator.lights.choices import (
 )
 from generator.lights.distributions import TRIPLES, is_ground_truth, load_ground_truths, parse_distribution
 from generator.lights.gamut import Gamut, Match, OutsideGamut, OutsideGamutError
-from generator.lights.lighting import LightChoice, Lighting
+from generator.lights.lighting import LightChoice, Lighting, ListedLights, RandomLights
 from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 from types import MappingProxyType
 
-from drivers.canon import records
-from drivers.canon.records import RAW_ONLY, DeviceInfoEx, ImageFile, ImageFormat, number_value, text_value
+from drivers import canon
+from drivers.canon import RAW_ONLY, DeviceInfoEx, ImageFile, ImageFormat, number_value, text_value
 from drivers.ptp.codes import (
     VENDOR_CANON_USB,
     AeMode,
@@ -215,7 +215,7 @@ def _device_info(model: str, version: str, manufacturer: str, extension_version:
     )
 
 
-def _stops(scale: records.Scale, first: int, last: int, thirds: bool = True) -> tuple[int, ...]:
+def _stops(scale: canon.Scale, first: int, last: int, thirds: bool = True) -> tuple[int, ...]:
     fractions = (0, 3, 5) if thirds else (0, 4)
     return tuple(step.code for step in scale.steps if first <= step.code <= last and step.code % 8 in fractions)
 
@@ -366,8 +366,8 @@ EOS_550D = EosModel(
     info=_device_info("Canon EOS 550D", "3-1.0.9", "Canon Inc.", 200),
     usb=(VENDOR_CANON_USB, 0x31EA),
     properties=_properties(_CHOICES_550D),
-    shutter_codes=(_BULB, *_stops(records.SHUTTER, 0x10, 0x98)),
-    aperture_codes=_stops(records.APERTURE, 0x25, 0x50),
+    shutter_codes=(_BULB, *_stops(canon.SHUTTER, 0x10, 0x98)),
+    aperture_codes=_stops(canon.APERTURE, 0x25, 0x50),
     burst=6,
     frames_per_s=3.7,
     frame_bytes=25 << 20,
@@ -388,8 +388,8 @@ EOS_550D_AS_LISTED = replace(
             _CHOICES_550D, iso=(0x00, 0x50, 0x58, 0x60, 0x68, 0x70, 0x78), bracketing=(0, 4, 8, 12, 16), half_stops=True
         )
     ),
-    shutter_codes=(_BULB, *_stops(records.SHUTTER, 0x10, 0x98, thirds=False)),
-    aperture_codes=_stops(records.APERTURE, 0x28, 0x54, thirds=False),
+    shutter_codes=(_BULB, *_stops(canon.SHUTTER, 0x10, 0x98, thirds=False)),
+    aperture_codes=_stops(canon.APERTURE, 0x28, 0x54, thirds=False),
 )
 """The EOS 550D whose owner listed its settings: half stops, no ISO 100 (highlight priority, it seems), f/4 at best."""
 
@@ -406,7 +406,7 @@ EOS_6D_MARK_II = EosModel(
                 *(ImageFormat((_raw(size), jpeg)) for size, jpeg in product((0, 1, 2), _JPEGS_6D2)),
                 *(ImageFormat((_raw(size),)) for size in (0, 1, 2)),
             ),
-            iso=(0x00, *_stops(records.ISO, 0x48, 0x8D)),
+            iso=(0x00, *_stops(canon.ISO, 0x48, 0x8D)),
             white_balance=(WhiteBalance.AUTO, WhiteBalance.AUTO_WHITE, *_COMMON_WHITE, WhiteBalance.KELVIN),
             drive=(
                 DriveMode.SINGLE,
@@ -428,8 +428,8 @@ EOS_6D_MARK_II = EosModel(
             mirror_lockup_in_menu=True,
         )
     ),
-    shutter_codes=_stops(records.SHUTTER, 0x10, 0x98),
-    aperture_codes=_stops(records.APERTURE, 0x15, 0x50),
+    shutter_codes=_stops(canon.SHUTTER, 0x10, 0x98),
+    aperture_codes=_stops(canon.APERTURE, 0x15, 0x50),
     burst=21,
     frames_per_s=6.5,
     frame_bytes=35 << 20,

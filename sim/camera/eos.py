@@ -30,9 +30,9 @@ from enum import Enum
 from io import BytesIO
 from typing import NamedTuple
 
+from drivers import canon
 from drivers.camera import ExposureSettings
-from drivers.canon import records
-from drivers.canon.records import (
+from drivers.canon import (
     IMAGE_FORMAT_PROPERTIES,
     AvailableFormats,
     AvailableValues,
@@ -693,13 +693,13 @@ class SimulatedEos:
         shutter = self._number_of(Property.EOS_SHUTTER_SPEED)
         mode = self._number_of(Property.EOS_AE_MODE)
         return ExposureSettings(
-            round(records.ISO.value(iso)) if iso else _AUTO_ISO,
+            round(canon.ISO.value(iso)) if iso else _AUTO_ISO,
             None
             if not self.body.aperture_codes
-            else records.APERTURE.value(aperture)
+            else canon.APERTURE.value(aperture)
             if aperture and mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
             else _METERED_APERTURE,
-            records.SHUTTER.value(shutter)
+            canon.SHUTTER.value(shutter)
             if shutter and shutter != BULB and mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
             else _METERED_S,
         )

@@ -1,4 +1,4 @@
-"""From a drawing on the print to the light on every photosite, and from light to counts.
+"""From a drawing on the print to the light on every photosite.
 
 **Loops.** Compiled by numba on first use, single-threaded and without the interpreter's lock; `sim.world.world` calls
 them for blocks of rows from as many threads as there are processors. A row's result depends on its own arguments
@@ -474,46 +474,3 @@ def light(
                 out[1, row, x] = green * passed * falloff[1, 3] / (1 + falloff[1, 2] * (du * du + dv * dv))
                 du, dv = u - falloff[2, 0], v - falloff[2, 1]
                 out[2, row, x] = blue * passed * falloff[2, 3] / (1 + falloff[2, 2] * (du * du + dv * dv))
-
-
-@compiled
-def counts(
-    light: NDArray[np.float32],
-    weights: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    left: int,
-    black: float,
-    read_noise: float,
-    gain_e: float,
-    saturation: int,
-    out: NDArray[np.uint16],
-) -> None:
-    """Write the counts of some rows of the sensor.
-
-    Shot noise is taken as normal, of variance signal / gain; with the read noise that makes one normal deviate of
-    variance signal / gain + read noise²: the photon transfer of EMVA 1288 (release 4.0 linear, section 2.2).
-
-    `light`: (3, rows, visible columns) float32, from `light`; no columns at all for rows of the masked border.
-    `weights`: (3,) float32, drive of each primary. `noise`: (rows, sensor columns) float32, standard normal deviates.
-    `black`, `read_noise`: mean and standard deviation of a dark count, DN. `gain_e`: electrons per DN. `saturation`:
-    largest count. `out`: (rows, sensor columns) uint16, written.
-    """
-    rows, columns = out.shape
-    right = left + light.shape[2]
-    top = np.float32(saturation)
-    half = np.float32(black + 0.5)
-    per_dn = np.float32(1 / gain_e)
-    floor = np.float32(read_noise * read_noise)
-    dark = np.float32(read_noise)
-    red, green, blue = weights[0], weights[1], weights[2]
-    nothing = np.float32(0)
-    for row in range(rows):
-        for x in range(left):
-            out[row, x] = np.uint16(min(max(half + dark * noise[row, x], nothing), top))
-        for x in range(left, right):
-            i = x - left
-            signal = red * light[0, row, i] + green * light[1, row, i] + blue * light[2, row, i]
-            count = half + signal + math.sqrt(signal * per_dn + floor) * noise[row, x]
-            out[row, x] = np.uint16(min(max(count, nothing), top))
-        for x in range(right, columns):
-            out[row, x] = np.uint16(min(max(half + dark * noise[row, x], nothing), top))

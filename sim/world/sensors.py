@@ -1,7 +1,7 @@
-"""The camera bodies that the simulated room can be photographed with: their sensors, colour filters and noise.
+"""The camera bodies that the simulated room can be photographed with: sensors, colour filters, noise, light to counts.
 
-A body is a table of facts, without behaviour. Photosites count from the sensor's top-left corner, masked borders
-included, unless said; a count is what the raw file holds (DN).
+A body is a table of facts, without behaviour; `counts` is what all sensors do. Photosites count from the sensor's
+top-left corner, masked borders included, unless said; a count is what the raw file holds (DN).
 
 Sizes and margins: dcraw 9.28 (`adobe_coeff` and the Canon table in `identify`), masked rectangles: rawspeed's
 cameras.xml. Saturation: RawTherapee's camconst.json. Conversion gain and read noise: of the order that EMVA 1288
@@ -14,6 +14,7 @@ sensors have: plausible, not measured on these bodies. Whoever knows better says
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from foundation.compiled import compiled
 from foundation.errors import ConfigurationError
 from foundation.records import from_settings
 from sim.spectral import Sensitivities, read_sensitivities
@@ -303,3 +305,46 @@ def _require_sensor(body: Body, where: str, key: str) -> None:
     for name, value, allowed, expected in limits:
         if not allowed:
             raise ConfigurationError(f"{where}: {key}.{name} is {value:g}; {expected} expected")
+
+
+@compiled
+def counts(
+    light: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    noise: NDArray[np.float32],
+    left: int,
+    black: float,
+    read_noise: float,
+    gain_e: float,
+    saturation: int,
+    out: NDArray[np.uint16],
+) -> None:
+    """Write the counts of some rows of the sensor.
+
+    Shot noise is taken as normal, of variance signal / gain; with the read noise that makes one normal deviate of
+    variance signal / gain + read noise²: the photon transfer of EMVA 1288 (release 4.0 linear, section 2.2).
+
+    `light`: (3, rows, visible columns) float32, from `light`; no columns at all for rows of the masked border.
+    `weights`: (3,) float32, drive of each primary. `noise`: (rows, sensor columns) float32, standard normal deviates.
+    `black`, `read_noise`: mean and standard deviation of a dark count, DN. `gain_e`: electrons per DN. `saturation`:
+    largest count. `out`: (rows, sensor columns) uint16, written.
+    """
+    rows, columns = out.shape
+    right = left + light.shape[2]
+    top = np.float32(saturation)
+    half = np.float32(black + 0.5)
+    per_dn = np.float32(1 / gain_e)
+    floor = np.float32(read_noise * read_noise)
+    dark = np.float32(read_noise)
+    red, green, blue = weights[0], weights[1], weights[2]
+    nothing = np.float32(0)
+    for row in range(rows):
+        for x in range(left):
+            out[row, x] = np.uint16(min(max(half + dark * noise[row, x], nothing), top))
+        for x in range(left, right):
+            i = x - left
+            signal = red * light[0, row, i] + green * light[1, row, i] + blue * light[2, row, i]
+            count = half + signal + math.sqrt(signal * per_dn + floor) * noise[row, x]
+            out[row, x] = np.uint16(min(max(count, nothing), top))
+        for x in range(right, columns):
+            out[row, x] = np.uint16(min(max(half + dark * noise[row, x], nothing), top))

@@ -29,7 +29,7 @@ from drivers.presenter import Colour
 from foundation.compiled import processor_count
 from sim.optics import APERTURE_VARIANCE, PhotographicLens, lens_falloff, projector_falloff
 from sim.world.disturbances import UNDISTURBED, Situation, moved, moved_back
-from sim.world.rendering import GRID_PX, PAPER, Print, Sheet, View, counts, label_map
+from sim.world.rendering import GRID_PX, PAPER, Print, Sheet, View, label_map
 from sim.world.room import (
     REFERENCE_APERTURE,
     REFERENCE_EXPOSURE,
@@ -39,7 +39,7 @@ from sim.world.room import (
     sensitivities,
     worn,
 )
-from sim.world.sensors import Body, HotPattern
+from sim.world.sensors import Body, HotPattern, counts
 
 _BACKDROP_REFLECTANCE: Final = 0.04
 """Of what lies behind the print, at every wavelength: dark, as a backdrop should be."""

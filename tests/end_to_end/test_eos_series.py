@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from drivers.camera import CapturedFrame, capture
-from drivers.canon.camera import CanonEos
-from drivers.canon.records import OtherRecord, TransferRequest, decode_events, encode_events
+from drivers.canon import CanonEos, OtherRecord, TransferRequest, decode_events, encode_events
 from drivers.links.usb import UsbPipes
 from drivers.ptp.codes import Operation, ResponseCode
 from drivers.ptp.protocol import Answer, NoAnswer, PtpRequest, PtpResponse, Responder

@@ -29,8 +29,7 @@ from pathlib import Path
 import pytest
 
 from drivers.camera import ExposureSettings
-from drivers.canon.camera import EosState, plan, shutter_speeds
-from drivers.canon.records import decode_events
+from drivers.canon import EosState, decode_events, plan, shutter_speeds
 from drivers.projector import Power
 from drivers.ptp.codes import Property
 from foundation.clock import SimulatedClock

@@ -23,9 +23,9 @@ from typing import BinaryIO
 import numpy as np
 import pytest
 
+from drivers import canon
 from drivers.camera import ExposureSettings
-from drivers.canon import records
-from drivers.canon.records import RAW_ONLY, ImageFile, ImageFormat
+from drivers.canon import RAW_ONLY, ImageFile, ImageFormat
 from drivers.presenter import WHITE
 from drivers.ptp.codes import Property
 from drivers.raw.rawfile import read_raw
@@ -248,7 +248,7 @@ camera.exit()
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert [(served.folder / f"frame{number}").read_bytes() for number in range(2)] == served.film.frames
-    assert served.film.exposures == [ExposureSettings(200, 8.0, records.SHUTTER.value(0x60))] * 2
+    assert served.film.exposures == [ExposureSettings(200, 8.0, canon.SHUTTER.value(0x60))] * 2
 
 
 def test_the_command_serves_a_camera(tmp_path: Path) -> None:

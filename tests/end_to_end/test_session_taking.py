@@ -22,7 +22,7 @@ from acquisition.cli import main
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import run_session
 from drivers.camera import capture
-from drivers.canon.camera import CanonEos
+from drivers.canon import CanonEos
 from drivers.pjlink import PjLinkProjector
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import load_chart
@@ -38,7 +38,7 @@ Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 
 FORKS = multiprocessing.get_context("forkserver")
 """Programs beside this one, without waiting for their imports each time."""
-FORKS.set_forkserver_preload([__name__, "acquisition.run.run", "acquisition.run.notices", "sim.camera.eos"])
+FORKS.set_forkserver_preload([__name__, "acquisition.run.run", "acquisition.run.run", "sim.camera.eos"])
 
 PLACES = {
     "renaming": (Path, "replace"),

@@ -19,8 +19,8 @@ from typing import TypeVar
 import atheris  # pyright: ignore[reportMissingModuleSource]  # installed by hand only
 
 with atheris.instrument_imports():
-    from drivers.canon import records
-    from drivers.canon.records import (
+    from drivers import canon
+    from drivers.canon import (
         DeviceInfoEx,
         ImageFormat,
         PropertySetting,
@@ -102,7 +102,7 @@ CHECKS: tuple[tuple[Callable[[bytes], None], tuple[bytes, ...]], ...] = (
     (_both(StorageInfo.decode, StorageInfo.encode), (examples.STORAGE_INFO,)),
     (_both(decode_u32_array, encode_u32_array), (b"\x01\0\0\0\x01\0\x02\0",)),
     (
-        _both(records.decode_events, records.encode_events),
+        _both(canon.decode_events, canon.encode_events),
         (examples.EOS_400D_SHOT[12:], examples.TRANSFER_REQUEST, examples.STATE),
     ),
     (_both(decode_object_entries, encode_object_entries), (examples.OBJECT_ENTRIES,)),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from acquisition.run.devices import Devices, LightNotShown, ask_all, require_whole_turns
 from drivers.camera import Camera
-from drivers.canon.camera import CanonEos
+from drivers.canon import CanonEos
 from drivers.display.fullscreen import FullScreen, display_warnings, identify_displays, list_displays
 from drivers.display.jvc import PORT as JVC_PORT
 from drivers.display.jvc import JvcFlatField

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from acquisition.run.devices import Devices
-from drivers.canon.camera import CanonEos
+from drivers.canon import CanonEos
 from drivers.links.link import PeerLink
 from drivers.pjlink import PjLinkProjector
 from drivers.presenter import Colour

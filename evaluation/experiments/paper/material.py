@@ -32,8 +32,9 @@ from evaluation.datasets import open_scenes
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.colorimetry import srgb_codes
 from foundation.errors import FormatError, InputError
-from generator.lights.choices import RandomLights, nearest_lights
+from generator.lights.choices import nearest_lights
 from generator.lights.distributions import load_ground_truths
+from generator.lights.lighting import RandomLights
 from generator.pictures.sources import Source, SourcePicture
 from generator.rendering.matrices import ColourMatrix
 

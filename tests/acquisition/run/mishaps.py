@@ -19,7 +19,7 @@ from unittest.mock import patch
 from acquisition.run.devices import Devices
 from acquisition.run.run import RunOutcome, take_session
 from drivers.camera import ExposureSettings
-from drivers.canon.camera import CanonEos
+from drivers.canon import CanonEos
 from drivers.links.link import Link, PeerLink
 from drivers.links.usb import Pipe, UsbPipes, open_usb
 from drivers.pjlink import PjLinkProjector

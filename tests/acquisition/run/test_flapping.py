@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.run.devices import RECURS_WITHIN
-from acquisition.run.notices import QUIET_S, PauseNotices
-from acquisition.run.run import RunOutcome, take_session
+from acquisition.run.run import QUIET_S, PauseNotices, RunOutcome, take_session
 from drivers.presenter import BLACK, Colour
 from experiment.config import LabSettings
 from experiment.lights import Illumination

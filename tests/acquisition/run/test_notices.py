@@ -21,9 +21,8 @@ from typing import Any
 
 import pytest
 
-from acquisition.run import notices
-from acquisition.run.notices import ALIVE_S, Life, Notices
-from acquisition.run.run import take_session
+from acquisition.run import run
+from acquisition.run.run import ALIVE_S, Life, Notices, take_session
 from drivers.presenter import Colour
 from experiment.config import NotifySettings
 from experiment.lights import Illumination
@@ -148,8 +147,8 @@ class TestWebhook:
         assert "s3cret" not in warning
 
     def test_a_server_that_hangs_is_not_waited_for(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(notices, "LIMIT_S", 0.1)
-        monkeypatch.setattr(notices, "ENDING_S", 0.1)
+        monkeypatch.setattr(run, "LIMIT_S", 0.1)
+        monkeypatch.setattr(run, "ENDING_S", 0.1)
         with served(Receiver(hangs=threading.Event())) as receiver:
             warnings = told(f"http://127.0.0.1:{receiver.port}/s3cret", "paused", "resumed", "complete")
         assert warnings
@@ -184,7 +183,7 @@ class TestCommand:
     def test_one_that_hangs_is_ended_with_what_it_started(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(notices, "LIMIT_S", 0.5)
+        monkeypatch.setattr(run, "LIMIT_S", 0.5)
         numbers = tmp_path / "pids"
         (warning,) = told(f"sh -c 'sleep 600 & echo $$ $! > {numbers}; wait'")
         assert "within 0.5 s" in warning
@@ -198,13 +197,13 @@ class TestCommand:
 def test_telling_takes_no_time_and_loses_what_nobody_takes() -> None:
     with served(Receiver(hangs=threading.Event())) as receiver:
         told_by = Notices(f"http://127.0.0.1:{receiver.port}/", "night")
-        for number in range(3 * notices.QUEUED):
+        for number in range(3 * run.QUEUED):
             told_by.tell(f"event {number}", "", AT)
         assert len(receiver.got) <= 1
         assert receiver.hangs is not None
         receiver.hangs.set()
         told_by.close()
-        assert len(receiver.got) <= notices.QUEUED + 2
+        assert len(receiver.got) <= run.QUEUED + 2
 
 
 def test_the_environment_stays_as_it_was() -> None:

@@ -14,6 +14,7 @@ from acquisition.run.devices import Devices
 from acquisition.run.pipeline import link_runs
 from acquisition.run.rig.lab import session_clock
 from acquisition.run.run import (
+    BEGINS,
     check_frames,
     clock_note,
     killed_note,
@@ -27,7 +28,6 @@ from drivers.projector import ProjectorIdentity
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.heartbeat import BEGINS
 from experiment.session.journal import Journal
 from experiment.session.records import Judgement, link_steps, plan_steps
 from foundation.console import Ending

@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from acquisition.run.devices import ENGRAVED_S, holds_whole_turns, require_whole_turns
-from drivers.canon.records import SHUTTER
+from drivers.canon import SHUTTER
 from experiment.config import CameraSettings, ProjectorCable
 from foundation.errors import ConfigurationError
 

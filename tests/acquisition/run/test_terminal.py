@@ -7,8 +7,8 @@ import io
 
 import pytest
 
-from acquisition.run.notices import PLAIN_S, Terminal, TimeLeft, verdict_line
 from acquisition.run.pipeline import Taken
+from acquisition.run.run import PLAIN_S, Terminal, TimeLeft, verdict_line
 from drivers.presenter import Colour
 from experiment.session.records import Check, Judgement, SessionStep
 

@@ -9,8 +9,8 @@ import pytest
 
 from calibration.cli import main
 from calibration.comparison.comparing import compare, table_of
-from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
+from calibration.pipeline.frames import BuildOptions
 from experiment.session.folder import Session
 from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, take

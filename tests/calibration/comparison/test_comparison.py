@@ -21,8 +21,7 @@ from calibration.comparison.comparing import (
     recorded_drift,
 )
 from calibration.comparison.report import cells_csv, comparison_json, lights_csv, lines, write_comparison
-from calibration.radiometry.greys import references_csv
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, LutWriter, Provenance, open_lut, references_csv
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from foundation.errors import FormatError

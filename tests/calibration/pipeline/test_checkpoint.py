@@ -19,9 +19,9 @@ import pytest
 
 import calibration.pipeline.build as building
 import calibration.table.lut as lut_files
-from calibration.pipeline.accumulator import stored_names
 from calibration.pipeline.baseline import frame_faults
 from calibration.pipeline.build import CHECKPOINT, Checkpoint, TableProgress, append, build, unfinished_table
+from calibration.pipeline.frames import stored_names
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
 from calibration.verdict import BuildResult

@@ -12,8 +12,8 @@ import pytest
 
 from calibration.cli import main
 from calibration.comparison.comparing import compare
-from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import BuildResult, build
+from calibration.pipeline.frames import BuildOptions
 from calibration.radiometry.drift import as_measured
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults

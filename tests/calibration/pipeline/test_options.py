@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from calibration.cli import main
-from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build, check
+from calibration.pipeline.frames import BuildOptions
 from calibration.report.report import summary as report_summary
 from calibration.table.lut import open_lut
 from calibration.table.verification import describe, find_faults

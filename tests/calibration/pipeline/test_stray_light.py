@@ -12,8 +12,8 @@ from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan
 from benchmarks.troubles import Troubles, tried
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.light import TOO_DARK
-from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import build
+from calibration.pipeline.frames import BuildOptions
 from calibration.report.report import summary
 from calibration.verdict import BuildResult, judge, judged_values, remark
 from drivers.presenter import Colour

@@ -11,8 +11,8 @@ import numpy.typing as npt
 import pytest
 
 from calibration.cli import main
-from calibration.pipeline.baseline import BuildOptions
 from calibration.pipeline.build import TableProgress, append, build, check
+from calibration.pipeline.frames import BuildOptions
 from calibration.radiometry.dark_frames import DarkLight, DarkLightEstimate, reflectances, winsorised_means
 from calibration.report.report import summary
 from calibration.table.lut import open_lut

@@ -8,7 +8,9 @@ import io
 import numpy as np
 import pytest
 
-from calibration.radiometry.greys import GreyLevels, references_csv, tint_deg
+from calibration.measurements import GreyMeasurements
+from calibration.pipeline.frames import GreyLevels
+from calibration.table.lut import references_csv
 from experiment.chart.model import Reference
 
 GREYS = [
@@ -43,7 +45,7 @@ def test_a_level_without_patches_is_empty_in_the_file() -> None:
 
 def test_a_grey_in_white_s_direction_has_no_tint() -> None:
     white = np.array([[3000.0, 5000, 4000]])
-    greys = np.stack([0.3 * white[0], white[0] * [0.3, 0.3, 0.33]])[None]
-    tint = tint_deg(white, greys)[0]
+    values = np.stack([0.3 * white[0], white[0] * [0.3, 0.3, 0.33]])[None]
+    tint = GreyMeasurements(("neutral", "bluish"), values, np.zeros_like(values)).tints_deg(white)
     assert tint[0] == pytest.approx(0, abs=1e-6)
     assert 1 < tint[1] < 4

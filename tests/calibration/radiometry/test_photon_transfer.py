@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.radiometry.greys import photon_transfer
+from calibration.sampling import photon_transfer
 
 
 def test_gain_and_read_noise_are_found() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from drivers.camera import CapturedFrame, capture
-from drivers.canon.camera import CanonEos
+from drivers.canon import CanonEos
 from drivers.links.usb import UsbPipes, open_usb
 from drivers.ptp.protocol import Responder, Transport
 from drivers.ptp.usb import UsbTransport

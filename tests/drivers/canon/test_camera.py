@@ -13,21 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.camera import CameraIdentity, ExposureSettings, ReportsSupplies, capture
-from drivers.canon.camera import (
+from drivers.canon import (
     MAX_LIST,
     MAX_PROPERTIES,
     MAX_VALUE,
-    CanonEos,
-    EosState,
-    battery_level,
-    custom_functions,
-    plan,
-    power_source,
-    problems,
-)
-from drivers.canon.records import (
     AvailableFormats,
     AvailableValues,
+    CanonEos,
+    EosState,
     ImageFile,
     ImageFormat,
     Notice,
@@ -35,9 +28,14 @@ from drivers.canon.records import (
     PropertyChanged,
     Record,
     TransferRequest,
+    battery_level,
+    custom_functions,
     decode_events,
     encode_events,
     number_value,
+    plan,
+    power_source,
+    problems,
 )
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canon import records as canon
-from drivers.canon.records import (
+from drivers import canon
+from drivers.canon import (
     APERTURE,
     ISO,
     SHUTTER,

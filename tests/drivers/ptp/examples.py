@@ -10,9 +10,7 @@ from itertools import pairwise
 
 from hypothesis import strategies as st
 
-from drivers.canon import records as canon
-from drivers.canon import records as datasets
-from drivers.canon import records as values
+from drivers import canon
 from drivers.ptp import ip as ptpip
 from drivers.ptp import usb as container
 from drivers.ptp.protocol import DeviceInfo, ObjectInfo, StorageInfo, decode_u32_array, decode_value
@@ -121,11 +119,11 @@ READERS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
     ("GetEvent, shot", canon.decode_events, EOS_400D_SHOT[12:]),
     ("GetEvent, transfer", canon.decode_events, TRANSFER_REQUEST),
     ("GetEvent, state", canon.decode_events, STATE),
-    ("GetObjectInfoEx", datasets.decode_object_entries, OBJECT_ENTRIES),
-    ("DeviceInfoEx", datasets.DeviceInfoEx.decode, DEVICE_INFO_EX),
-    ("setting", values.PropertySetting.decode, SETTING),
-    ("image format", values.ImageFormat.decode, RAW_FORMAT),
-    ("number", values.number_of, bytes(4)),
+    ("GetObjectInfoEx", canon.decode_object_entries, OBJECT_ENTRIES),
+    ("DeviceInfoEx", canon.DeviceInfoEx.decode, DEVICE_INFO_EX),
+    ("setting", canon.PropertySetting.decode, SETTING),
+    ("image format", canon.ImageFormat.decode, RAW_FORMAT),
+    ("number", canon.number_of, bytes(4)),
     ("device status", container.DeviceStatus.decode, bytes.fromhex("0800 0120 81000000")),
     ("cancel", container.decode_cancel, bytes.fromhex("0140 05000000")),
     *((f"packet {number}", ptpip.decode, packet) for number, packet in enumerate(IP_PACKETS, 1)),

@@ -9,9 +9,8 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.canon import records as canon
-from drivers.canon import records as values
-from drivers.canon.records import (
+from drivers import canon
+from drivers.canon import (
     APERTURE,
     ISO,
     AvailableValues,
@@ -114,7 +113,7 @@ def test_commands_are_the_bytes_that_the_host_sent(recording: list[Recorded]) ->
     settings = [payload(entry) for entry in recording if entry["dir"] == "out"]
     destination, aperture = Property.EOS_CAPTURE_DESTINATION, Property.EOS_APERTURE
     sent = [(destination, 4), (aperture, 0x24), (destination, 2), (destination, 4), (aperture, 0x24), (destination, 1)]
-    assert [PropertySetting(code, values.number_value(value)).encode() for code, value in sent] == settings
+    assert [PropertySetting(code, canon.number_value(value)).encode() for code, value in sent] == settings
 
 
 def test_what_the_body_is(body: str, recording: list[Recorded]) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.raw.rawfile import decode_raw, filled_fault, read_raw
-from drivers.raw.storage import Stored, stored_frames
+from drivers.raw.rawfile import decode_raw, filled_fault, read_raw, stored_frames
+from drivers.raw.storage import Stored
 from drivers.tiff import Directory, TiffTag
 from foundation.errors import FormatError
 from tests.drivers.raw.maker_files import in_maker_tiff, maker_files, rw2

@@ -20,7 +20,8 @@ from foundation.errors import InputError
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.records import Layout
-from generator.lights.choices import ListedLights, SimultaneousLights
+from generator.lights.choices import SimultaneousLights
+from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks
 from generator.pictures.sources import random_scenes
 from tests.evaluation.datasets import contract

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 import os
 import shutil
 import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
 
 import pytest
 
 from experiment.session import heartbeat
-from experiment.session.heartbeat import Heartbeat, Process, SessionPlace, signs_of_life
+from experiment.session.heartbeat import Heartbeat, Process, SessionPlace
 from experiment.session.journal import Journal
-from foundation.errors import DeviceError, StorageError
 
 NOW = datetime(2026, 1, 1, 23, 30, tzinfo=UTC)
 SELF = Process.own()
@@ -234,80 +230,18 @@ class TestPlace:
         )
 
 
-class TestSignsOfLife:
-    @staticmethod
-    def told(block: Callable[[Callable[[], None]], None]) -> list[tuple[str, str]]:
-        said: list[tuple[str, str]] = []
-        signs = signs_of_life(lambda state, sentence, until: said.append((state, sentence)), lambda: None, 60.0)
-        with contextlib.suppress(BaseException), signs as alive:
-            block(alive)
-        return said
-
-    def test_a_run_that_comes_to_its_end_gives_no_cause(self) -> None:
-        assert self.told(lambda alive: alive()) == [
-            ("waiting", heartbeat.BEGINS),
-            ("running", "frames are taken"),
-            ("ended", ""),
-        ]
-
-    def test_what_ended_it_is_told(self) -> None:
-        def interrupted(alive: Callable[[], None]) -> None:
-            raise KeyboardInterrupt
-
-        def unplugged(alive: Callable[[], None]) -> None:
-            raise DeviceError("the camera is gone; find it")
-
-        def mistaken(alive: Callable[[], None]) -> None:
-            raise ZeroDivisionError
-
-        assert self.told(interrupted)[-1] == ("ended", "interrupted; run the same command again")
-        assert self.told(unplugged)[-1] == ("ended", "the camera is gone; find it")
-        assert self.told(mistaken)[-1][0] == "ended"
-        assert "mistake of the program" in self.told(mistaken)[-1][1]
-
-    def test_a_frame_a_second_is_no_write_a_second(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        seconds = itertools.count()
-        clock = SimpleNamespace(monotonic=lambda: float(next(seconds)))
-        monkeypatch.setattr(heartbeat, "time", clock)
-
-        def twelve_frames(alive: Callable[[], None]) -> None:
-            for _ in range(12):
-                alive()
-
-        assert len(self.told(twelve_frames)) < 8
-
-    def test_a_frame_is_a_sign_of_life(self, tmp_path: Path) -> None:
-        Journal.create(tmp_path / "journal.sqlite", ())
-        with closing(Journal.open_for_run(tmp_path / "journal.sqlite")) as journal:
-            journal.beat("running", "frames are taken", NOW)
-            before = journal.heartbeat()
-            journal.note(NOW, "refused", "a frame")
-            after = journal.heartbeat()
-            assert before is not None
-            assert after is not None
-            assert after.at > before.at
-            assert replace(after, at=before.at) == before
-            journal.beat("ended", "", NOW)
-            last = journal.heartbeat()
-            journal.note(NOW, "complete", "what is written behind the end is none")
-            assert journal.heartbeat() == last
-
-    def test_after_a_wait_the_first_frame_says_that_it_is_over(self, tmp_path: Path) -> None:
-        Journal.create(tmp_path / "journal.sqlite", ())
-        with closing(Journal.open_for_run(tmp_path / "journal.sqlite")) as journal:
-            with signs_of_life(journal.beat, journal.heartbeat, 60.0) as alive:
-                journal.beat("waiting", "the lamp warms up", NOW)
-                alive()
-                told = journal.heartbeat()
-                assert told is not None
-                assert told.state == "running"
-            told = journal.heartbeat()
-            assert told is not None
-            assert told.state == "ended"
-
-    def test_a_full_disk_does_not_end_the_run(self) -> None:
-        def full(state: str, sentence: str, until: datetime) -> None:
-            raise StorageError("no space")
-
-        with signs_of_life(full, lambda: None, 60.0) as alive:
-            alive()
+def test_a_frame_is_a_sign_of_life(tmp_path: Path) -> None:
+    Journal.create(tmp_path / "journal.sqlite", ())
+    with closing(Journal.open_for_run(tmp_path / "journal.sqlite")) as journal:
+        journal.beat("running", "frames are taken", NOW)
+        before = journal.heartbeat()
+        journal.note(NOW, "refused", "a frame")
+        after = journal.heartbeat()
+        assert before is not None
+        assert after is not None
+        assert after.at > before.at
+        assert replace(after, at=before.at) == before
+        journal.beat("ended", "", NOW)
+        last = journal.heartbeat()
+        journal.note(NOW, "complete", "what is written behind the end is none")
+        assert journal.heartbeat() == last

@@ -20,7 +20,8 @@ from experiment.session.folder import Session
 from experiment.session.records import Check, Judgement, plan_steps
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
-from generator.lights.choices import ListedLights, SimultaneousLights
+from generator.lights.choices import SimultaneousLights
+from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks
 from generator.pictures.sources import random_scenes
 

@@ -15,7 +15,7 @@ from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
 from generator.dataset.records import Entry
-from generator.lights.choices import RandomLights
+from generator.lights.lighting import RandomLights
 from generator.pictures.sources import random_scenes
 
 pytestmark = pytest.mark.slow

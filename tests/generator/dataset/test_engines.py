@@ -17,7 +17,7 @@ import pytest
 from foundation.errors import InputError
 from generator.dataset.making import SILENT, Callbacks, Workers, generate_dataset, parse_engine
 from generator.dataset.plan import DatasetOptions
-from generator.lights.choices import RandomLights
+from generator.lights.lighting import RandomLights
 from generator.pictures.sources import find_pictures, random_scenes
 
 pytestmark = pytest.mark.slow

@@ -26,7 +26,8 @@ from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset, file_faults, open_dataset
 from generator.dataset.records import COMPLETED_BY_HAND, Layout
-from generator.lights.choices import ListedLights, SimultaneousLights
+from generator.lights.choices import SimultaneousLights
+from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks
 from generator.options import ImageOptions
 from generator.pictures.sources import SourcePicture, random_scenes

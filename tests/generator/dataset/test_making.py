@@ -18,8 +18,7 @@ from foundation.errors import FormatError, InputError
 from generator.dataset.making import Callbacks, generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import open_dataset
-from generator.lights.choices import ListedLights, RandomLights
-from generator.lights.lighting import mixture_of
+from generator.lights.lighting import ListedLights, RandomLights, mixture_of
 from generator.pictures.sources import find_pictures, random_scenes, read_picture
 from generator.rendering.render import render
 

@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.errors import InputError
-from generator.dataset.making import generate_dataset, parse_share
-from generator.dataset.plan import DatasetOptions, parse_split, split_of
+from generator.dataset.making import generate_dataset, parse_share, split_of
+from generator.dataset.plan import DatasetOptions, parse_split
 from generator.pictures.sources import find_pictures
 
 if TYPE_CHECKING:

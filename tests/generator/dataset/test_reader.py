@@ -11,7 +11,8 @@ from foundation.errors import FormatError
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import open_dataset
-from generator.lights.choices import ListedLights, SimultaneousLights
+from generator.lights.choices import SimultaneousLights
+from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks
 from generator.pictures.sources import random_scenes
 

@@ -16,14 +16,12 @@ import pytest
 
 from foundation.errors import InputError
 from generator.cli import main
-from generator.dataset.making import finish_dataset, generate_dataset, make_shard, make_share
+from generator.dataset.making import finish_dataset, generate_dataset, make_shard, make_share, workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import open_dataset
-from generator.dataset.workplace import workplace
 from generator.kernels.printing import draw_printed
 from generator.kernels.rendering import draw_samples
-from generator.lights.choices import ListedLights
-from generator.lights.lighting import Mixture, plain
+from generator.lights.lighting import ListedLights, Mixture, plain
 from generator.lights.request import LightRequest
 from generator.masks.making import FULL
 from generator.masks.maps import quantised_chromaticities

@@ -21,12 +21,18 @@ from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.registry import register_implementation
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.making import finish_dataset, generate_dataset, make_dataset, make_elsewhere, make_share
+from generator.dataset.making import (
+    finish_dataset,
+    generate_dataset,
+    make_dataset,
+    make_elsewhere,
+    make_share,
+    workplace,
+)
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import file_faults, open_dataset
 from generator.dataset.records import Layout
-from generator.dataset.workplace import workplace
-from generator.lights.choices import ListedLights
+from generator.lights.lighting import ListedLights
 from generator.pictures.sources import find_pictures, random_scenes
 from generator.stores import LocalStore, RemoteStore, open_store
 from tests.generator.groups import grouped

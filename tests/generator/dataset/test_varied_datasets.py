@@ -20,7 +20,8 @@ from generator.cli import main
 from generator.dataset.making import Workers, generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset, file_faults, open_dataset
-from generator.lights.choices import RandomLights, SimultaneousLights
+from generator.lights.choices import SimultaneousLights
+from generator.lights.lighting import RandomLights
 from generator.masks.making import parse_masks
 from generator.pictures.sources import Preparation, find_pictures, read_picture
 from generator.rendering.render import render

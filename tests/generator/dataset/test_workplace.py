@@ -25,16 +25,18 @@ from generator.dataset.making import (
     SILENT,
     Callbacks,
     Workers,
+    Workplace,
     finish_dataset,
     generate_dataset,
     make_dataset,
     make_share,
+    workplace,
 )
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, open_dataset
 from generator.dataset.records import FinishedImage, Layout, ShardRecord
-from generator.dataset.workplace import Workplace, workplace
-from generator.lights.choices import ListedLights, RandomLights, SimultaneousLights
+from generator.lights.choices import SimultaneousLights
+from generator.lights.lighting import ListedLights, RandomLights
 from generator.masks.making import parse_masks
 from generator.pictures.sources import Source, find_pictures, random_scenes
 from generator.rendering.black_points import BlackPoint
@@ -414,7 +416,7 @@ def test_a_share_that_waited_for_the_whole_is_refused(
         (tmp_path / "whole").rename(out)
         return held_folder(*arguments, **named)
 
-    monkeypatch.setattr("generator.dataset.workplace.held_folder", finished_meanwhile)
+    monkeypatch.setattr("generator.dataset.making.held_folder", finished_meanwhile)
     with pytest.raises(InputError, match="already exists; name another place"):
         make_share(plan_of(lut), out, (0, 2))
     assert not (tmp_path / ".out.partial").exists()

@@ -12,17 +12,9 @@ import numpy as np
 import pytest
 
 from foundation.errors import InputError
-from generator.lights.choices import (
-    ListedLights,
-    RandomLights,
-    SimultaneousLights,
-    matched_lights,
-    nearest_lights,
-    parse_light,
-    parse_lights,
-)
+from generator.lights.choices import SimultaneousLights, matched_lights, nearest_lights, parse_light, parse_lights
 from generator.lights.gamut import Gamut
-from generator.lights.lighting import LightChoice, Lighting, Mixture, plain
+from generator.lights.lighting import LightChoice, Lighting, ListedLights, Mixture, RandomLights, plain
 from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ import pytest
 
 from calibration.table.lut import Lut
 from foundation.errors import CropError, FormatError, InputError
-from generator.lights.choices import DrawnLights, ListedLights, RandomLights, SequentialLights, SimultaneousLights
+from generator.lights.choices import DrawnLights, SequentialLights, SimultaneousLights
 from generator.lights.gamut import Gamut
-from generator.lights.lighting import Mixture, plain
+from generator.lights.lighting import ListedLights, Mixture, RandomLights, plain
 from generator.lights.request import LightRequest, load_named_truths, named_lights
 
 

@@ -14,13 +14,13 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from drivers import canon
 from drivers.camera import ExposureSettings, capture
-from drivers.canon import records
-from drivers.canon.camera import CanonEos
-from drivers.canon.records import (
+from drivers.canon import (
     RAW_ONLY,
     AvailableFormats,
     AvailableValues,
+    CanonEos,
     DeviceInfoEx,
     ImageFile,
     ImageFormat,
@@ -269,9 +269,9 @@ def test_a_550d_can_be_the_one_that_was_listed() -> None:
     host.ok(Operation.OPEN_SESSION, 1)
     host.ok(Operation.EOS_SET_EVENT_MODE, 1)
     offered = lists(host.events())
-    assert [records.SHUTTER.label(code) for code in offered[Property.EOS_SHUTTER_SPEED]] == LISTED_SHUTTER_550D.split()
-    assert [records.APERTURE.label(code) for code in offered[Property.EOS_APERTURE]] == LISTED_APERTURE_550D.split()
-    assert [records.ISO.label(code) for code in offered[Property.EOS_ISO_SPEED]] == (
+    assert [canon.SHUTTER.label(code) for code in offered[Property.EOS_SHUTTER_SPEED]] == LISTED_SHUTTER_550D.split()
+    assert [canon.APERTURE.label(code) for code in offered[Property.EOS_APERTURE]] == LISTED_APERTURE_550D.split()
+    assert [canon.ISO.label(code) for code in offered[Property.EOS_ISO_SPEED]] == (
         ["auto", "200", "400", "800", "1600", "3200", "6400"]
     )
 
@@ -301,7 +301,7 @@ def test_a_6d_mark_ii_is_the_one_that_was_listed() -> None:
     host.ok(Operation.OPEN_SESSION, 1)
     host.ok(Operation.EOS_SET_EVENT_MODE, 1)
     reported = host.events()
-    assert [records.ISO.label(code) for code in lists(reported)[Property.EOS_ISO_SPEED]] == LISTED_ISO_6D2.split()
+    assert [canon.ISO.label(code) for code in lists(reported)[Property.EOS_ISO_SPEED]] == LISTED_ISO_6D2.split()
     formats = next(
         r.formats for r in reported if isinstance(r, AvailableFormats) and r.code == Property.EOS_IMAGE_FORMAT
     )

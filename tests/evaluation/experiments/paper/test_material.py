@@ -28,7 +28,8 @@ from evaluation.scene import SceneSet
 from foundation.colorimetry import decode_srgb, srgb_codes
 from foundation.errors import FormatError, InputError
 from generator import DatasetOptions, generate_dataset
-from generator.lights.choices import RandomLights, nearest_lights
+from generator.lights.choices import nearest_lights
+from generator.lights.lighting import RandomLights
 from generator.pictures.sources import random_scenes
 from generator.rendering.matrices import camera_matrix
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker

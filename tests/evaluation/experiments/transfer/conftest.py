@@ -19,8 +19,7 @@ from experiment.lights import Illumination
 from foundation.colorimetry import decode_srgb
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
-from generator.lights.choices import ListedLights
-from generator.lights.lighting import LightChoice
+from generator.lights.lighting import LightChoice, ListedLights
 from generator.pictures.sources import UNPREPARED, Preparation, find_pictures
 from generator.variation.sensor_noise import SensorNoise
 from generator.variation.variation import NO_VARIATION, Variation, parse_gradient

@@ -30,8 +30,8 @@ from foundation.errors import FormatError, InputError
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
-from generator.lights.choices import ListedLights, SimultaneousLights
-from generator.lights.lighting import mixture_of
+from generator.lights.choices import SimultaneousLights
+from generator.lights.lighting import ListedLights, mixture_of
 from generator.masks.making import parse_masks
 from generator.pictures.sources import Preparation, random_scenes
 from generator.rendering.matrices import ColourMatrix

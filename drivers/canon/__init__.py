@@ -1,1 +1,0 @@
-"""Canon EOS bodies over PTP: their records, their state, their release."""
