@@ -7,15 +7,13 @@ values for programs.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import datetime
-from pathlib import Path
 from typing import Any
 
-from acquisition.monitor.view import AttemptView, Head, SessionView, read_session
-from experiment.session.folder import Session
+from acquisition.monitor.view import AttemptView, Head, SessionView
 from experiment.session.records import ACCEPTED, Check, doubts_of, duration_text
-from foundation.errors import CropError, counted
+from foundation.errors import counted
 
 LAST = 5
 """Verdicts, and events, that are shown: chosen, a screen has room for them beside the rest."""
@@ -42,17 +40,6 @@ MEANINGS = {
     "additivity": "white beyond the sum of the primaries",
 }
 """What the numbers of the checks are, for who has not read docs/how-to/night-run.md."""
-
-
-def read_status(folder: Path, now: datetime) -> SessionView:
-    """Return a session as it stands; one that is complete is opened, too, as who makes a table of it opens it."""
-    view = read_session(folder)
-    if view.head(now).state == "complete":
-        try:
-            Session.open(folder).close()
-        except CropError as error:
-            return replace(view, unreadable=str(error))
-    return view
 
 
 def status_lines(view: SessionView, now: datetime) -> list[str]:

@@ -38,6 +38,7 @@ from typing import Any
 import numpy as np
 
 from experiment.lights import Illumination, load_illuminations
+from experiment.session.folder import Session
 from experiment.session.heartbeat import AGAIN, BEAT_S, LATE_S, Heartbeat, Process, SessionPlace
 from experiment.session.journal import JOURNAL_FILE, Journal, ledger_path, lost_files, open_journal, without_journal
 from experiment.session.records import (
@@ -157,7 +158,8 @@ class SessionView:
     - `place`: where it lies; None if that is not known.
     - `frame_bytes`: size of its largest frame; 0 before the first.
     - `lost`: files of frames that count and are gone or cut, by step; only looked for where all frames are there.
-    - `unreadable`: why no table can be made of it, and what helps, such as a lost chart; empty where nobody looked.
+    - `unreadable`: why no table can be made of it, and what helps, such as a lost chart; only looked for where all
+      frames are there.
     """
 
     name: str
@@ -229,7 +231,17 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
         SessionPlace.of(path),
         max((frame.size for frame in accepted), default=0),
         {frame.step: frame.file for frame in lost_files(folder, accepted)} if is_complete else {},
+        _why_unreadable(folder) if is_complete else "",
     )
+
+
+def _why_unreadable(folder: Path) -> str:
+    """Return why a session cannot be opened as who makes a table of it opens it; nothing where it can."""
+    try:
+        Session.open(folder).close()
+    except CropError as error:
+        return str(error)
+    return ""
 
 
 def _is_same(view: AttemptView, row: Attempt) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.presenter import Colour
+from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.lights import Illumination, plan_illuminations, save_illuminations
 from experiment.session.journal import JOURNAL_FILE, Journal
 from experiment.session.records import RESPONSE, Check, Judgement, SessionStep, plan_steps
@@ -53,6 +54,7 @@ class MadeUpRun:
         """Make the folder and the plan."""
         folder.mkdir()
         (folder / "previews").mkdir()
+        design_chart(1, A_SERIES_MM["A5"]).save(folder / "chart.json")
         save_illuminations(lights, folder / "illuminations.csv")
         steps = plan_steps(lights, 25, seed=1, response=RESPONSE if response else ())
         Journal.create(folder / JOURNAL_FILE, steps)

@@ -62,6 +62,10 @@ def test_a_run_that_writes_it_counts_as_ended_and_others_do_not(run: MadeUpRun) 
     for step in run.steps[5:]:
         run.take(step)
     assert data_of(write_session_report(run.folder))["head"]["state"] == "complete"
+    (run.folder / "chart.json").unlink()
+    head = data_of(write_session_report(run.folder))["head"]
+    assert head["state"] == "incomplete"
+    assert "chart.json" in head["sentence"]
 
 
 def test_pictures_are_bounded_and_those_of_refused_frames_go_first(
