@@ -386,14 +386,13 @@ def status(
     """
     from datetime import UTC, datetime
 
-    from acquisition.monitor.view import read_session
-    from acquisition.status import status_json, status_lines
+    from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path
     from experiment.session.repair import secrets_warning
 
     journal_path(session)
     now = datetime.now(UTC)
-    view = read_session(session)
+    view = read_status(session, now)
     if told.asked:
         told.add(**status_json(view, now))
     else:

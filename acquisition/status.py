@@ -7,13 +7,15 @@ values for programs.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
-from acquisition.monitor.view import AttemptView, Head, SessionView
+from acquisition.monitor.view import AttemptView, Head, SessionView, read_session
+from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, Check, doubts_of, duration_text
-from foundation.errors import counted
+from foundation.errors import CropError, counted
 
 LAST = 5
 """Verdicts, and events, that are shown: chosen, a screen has room for them beside the rest."""
@@ -40,6 +42,17 @@ MEANINGS = {
     "additivity": "white beyond the sum of the primaries",
 }
 """What the numbers of the checks are, for who has not read docs/how-to/night-run.md."""
+
+
+def read_status(folder: Path, now: datetime) -> SessionView:
+    """Return a session as it stands; one that is complete is opened, too, as who makes a table of it opens it."""
+    view = read_session(folder)
+    if view.head(now).state == "complete":
+        try:
+            Session.open(folder).close()
+        except CropError as error:
+            return replace(view, unreadable=str(error))
+    return view
 
 
 def status_lines(view: SessionView, now: datetime) -> list[str]:

@@ -38,7 +38,6 @@ from typing import Any
 import numpy as np
 
 from experiment.lights import Illumination, load_illuminations
-from experiment.session.folder import Session
 from experiment.session.heartbeat import AGAIN, BEAT_S, LATE_S, Heartbeat, Process, SessionPlace
 from experiment.session.journal import JOURNAL_FILE, Journal, ledger_path, lost_files, open_journal, without_journal
 from experiment.session.records import (
@@ -231,17 +230,14 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
         SessionPlace.of(path),
         max((frame.size for frame in accepted), default=0),
         {frame.step: frame.file for frame in lost_files(folder, accepted)} if is_complete else {},
-        _why_unreadable(folder) if is_complete else "",
+        _without_own_files(folder) if is_complete else "",
     )
 
 
-def _why_unreadable(folder: Path) -> str:
-    """Return why a session cannot be opened as who makes a table of it opens it; nothing where it can."""
-    try:
-        Session.open(folder).close()
-    except CropError as error:
-        return str(error)
-    return ""
+def _without_own_files(folder: Path) -> str:
+    """Return that chart or lights of a session are gone, and what helps; nothing where they are there."""
+    gone = [name for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
+    return f"{' and '.join(gone)} of the session: gone; restore from a copy of it" if gone else ""
 
 
 def _is_same(view: AttemptView, row: Attempt) -> bool:
