@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.cases import chart_of
 from benchmarks.sessions import AS_PLANNED, FrameChange, light_named, short_plan, short_session, world_of
-from benchmarks.troubles import Troubles, tried
+from benchmarks.troubles import TroubledWorld, Troubles, random_room, tried
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.light import TOO_DARK
 from calibration.pipeline.build import build
@@ -76,3 +76,13 @@ def test_a_sensor_that_compresses_white_does_not_hide_what_was_subtracted_too_mu
     _, says, table = tried(3, Troubles(compression=0.037, in_darks=(0.0017, 0.0058, 0.0036)), small=True)
     assert table is None
     assert says[0].startswith(f"{TOO_DARK.title}: 0.4")
+
+
+def test_counts_lost_near_black_do_not_hide_a_veil(tmp_path: Path) -> None:
+    chart, veil = chart_of(small=True), 0.012
+    troubles = Troubles(lost=4.5, veil=(veil, veil, veil))
+    world = TroubledWorld(world_of(chart, BODIES["Test"], random_room(1)), troubles)
+    with short_session(tmp_path / "session", chart, world, every=3) as session:
+        lens = build(session, tmp_path / "lut").figures.lens
+    assert lens.veil_error < 0.0025
+    assert lens.veil == pytest.approx(veil, abs=2 * lens.veil_error)
