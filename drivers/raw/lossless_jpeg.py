@@ -19,7 +19,7 @@ from numpy import int64, uint64
 
 from foundation.compiled import compiled
 
-_SOI, _EOI, _SOF0, _SOF1, _SOF3, _DHT, _DRI, _SOS = 0xD8, 0xD9, 0xC0, 0xC1, 0xC3, 0xC4, 0xDD, 0xDA
+_SOI, _EOI, _SOF0, _SOF1, _SOF3, _DHT, _DQT, _DRI, _SOS = 0xD8, 0xD9, 0xC0, 0xC1, 0xC3, 0xC4, 0xDB, 0xDD, 0xDA
 """Markers (T.81, table B.1)."""
 
 _PADDING: Final = 4
@@ -67,16 +67,22 @@ class JpegSize(NamedTuple):
 
 
 def jpeg_size(stream: bytes | memoryview) -> JpegSize | None:
-    """Return what a JPEG states of its frame, lossless or of a sequential DCT; None for anything else."""
-    at = 2
+    """Return what a JPEG states of its frame, lossless or of a sequential DCT; None for anything else.
+
+    Of a DCT are 8 or 12 bits that are quantised (T.81, tables B.2 and B.4); LibRaw leaves what is not as memory was.
+    """
+    found, quantised, at = None, False, 2
     while bytes(stream[:2]) == bytes((0xFF, _SOI)) and at + 10 <= len(stream) and stream[at] == 0xFF:
         marker, length = struct.unpack_from(">BH", stream, at + 1)
-        if marker in (_SOF0, _SOF1, _SOF3):
-            bits, rows, columns, components = struct.unpack_from(">BHHB", stream, at + 4)
-            return JpegSize(rows, columns * components, components, bits, marker == _SOF3)
         if marker == _SOS:
             break
+        if marker in (_SOF0, _SOF1, _SOF3) and found is None:
+            bits, rows, columns, components = struct.unpack_from(">BHHB", stream, at + 4)
+            found = JpegSize(rows, columns * components, components, bits, marker == _SOF3)
+        quantised |= marker == _DQT
         at += 2 + length
+    if found is None or found.lossless or (quantised and found.bits in (8, 12)):
+        return found
     return None
 
 
