@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from drivers.presenter import BLACK, WHITE, Colour
 from sim.optics import APERTURE_VARIANCE, MILD_SHOULDERS, STRONG_SHOULDERS, PhotographicLens
-from sim.world.disturbances import Blob, Situation
 from sim.world.rendering import Print, Sheet
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import Blob, Situation, World
 
 PAGE_MM = (180.0, 125.0)
 EOS_550D_PHOTOSITE_MM = 22.3 / 5202
