@@ -32,16 +32,9 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.compiled import processor_count
 from sim.optics import APERTURE_VARIANCE, PhotographicLens, lens_falloff, projector_falloff
+from sim.spectral import printed_reflectance, projector_primaries, sensitivities
 from sim.world.rendering import GRID_PX, PAPER, Print, Sheet, View, label_map
-from sim.world.room import (
-    REFERENCE_APERTURE,
-    REFERENCE_EXPOSURE,
-    Room,
-    printed_reflectance,
-    projector_primaries,
-    sensitivities,
-    worn,
-)
+from sim.world.room import REFERENCE_APERTURE, REFERENCE_EXPOSURE, Room, worn
 from sim.world.sensors import Body, HotPattern, counts
 
 _BACKDROP_REFLECTANCE: Final = 0.04

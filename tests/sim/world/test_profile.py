@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim.world.room import (
+from sim.spectral import (
     PaperName,
     ProfileName,
     ink_codes,

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from sim.world.room import (
+from sim.spectral import (
     SURFACE_REFLECTANCE,
     WAVELENGTHS_NM,
     LampSpectrum,
