@@ -77,7 +77,8 @@ from calibration.table.lut import (
     references_csv,
 )
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
-from experiment.framing.pictures import Shift, annotated_png
+from experiment.framing.finding import annotated_png
+from experiment.framing.pictures import Shift
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.compiled import processor_count
