@@ -55,9 +55,8 @@ from sim.spectral import (
     sensitivities,
 )
 from sim.world.rendering import PAPER
-from sim.world.room import Room
 from sim.world.sensors import Body, HotPattern, counts
-from sim.world.world import World
+from sim.world.world import Room, World
 
 WAVELENGTH: Final = "wavelength"
 """Head of the column of wavelengths."""

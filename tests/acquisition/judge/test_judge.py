@@ -26,9 +26,8 @@ from sim.world.disturbances import (
     ScreenSaver,
     ZeroedStrip,
 )
-from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.world import Situation
+from sim.world.world import Room, Situation
 from tests.acquisition.judge.conftest import EXPOSURE, FRAMES, LAB, Bench, bench
 
 pytestmark = pytest.mark.slow

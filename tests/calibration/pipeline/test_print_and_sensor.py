@@ -14,7 +14,7 @@ from calibration.verdict import judged_values
 from drivers.presenter import WHITE, Colour
 from sim.spectral import PaperName, ProfileName
 from sim.world.rendering import PAPER
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.causes.rooms import BRIGHT, Counts, taken
 from tests.calibration.lab import LIGHTS, SETTINGS, hang, renumbered, take
 

@@ -19,7 +19,7 @@ from experiment.chart.model import Chart
 from experiment.framing.field import field_mm
 from experiment.framing.finding import Framing, annotated_png, apparent_sizes, find_chart, small_parts_warning
 from experiment.framing.pictures import gauge_boxes, shift_between
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang, hang_chart
 from tests.data_files import shipped
 

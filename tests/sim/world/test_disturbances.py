@@ -40,9 +40,8 @@ from sim.world.disturbances import (
     read_disturbances,
 )
 from sim.world.rendering import Print
-from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
-from sim.world.world import OVERSCAN, Blob, Situation, World, moved, moved_back, projected_mm
+from sim.world.world import OVERSCAN, REFERENCE_EXPOSURE, Blob, Room, Situation, World, moved, moved_back, projected_mm
 from tests.sim.conftest import PAGE_MM
 
 RED, GREEN, GREY = Colour(255, 0, 0), Colour(0, 255, 0), Colour(128, 128, 128)
