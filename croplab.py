@@ -50,7 +50,7 @@ def _require_own_packages() -> None:
     if Path(lowest.__file__ or "").resolve().parent != Path(__file__).resolve().parent / "foundation":
         raise ImportError(f"{lowest.__file__} hides the package foundation of CroP; rename it")
     from foundation.errors import InputError
-    from foundation.packages import require_own_packages
+    from foundation.version import require_own_packages
 
     try:
         require_own_packages()

@@ -127,7 +127,7 @@ def chart(
     from experiment.chart.layout import design_chart, paper_chart
     from experiment.chart.printing import save_pdf, save_preview, save_tiff
     from experiment.chart.proof import save_instructions, save_proof
-    from experiment.framing.pictures import small_parts_warning
+    from experiment.framing.finding import small_parts_warning
     from foundation.files import whole_folder
 
     if arrangement is Arrangement.PAPER:

@@ -51,9 +51,8 @@ from experiment.session.records import Judgement, plan_steps
 from sim.camera.film import write_dng
 from sim.optics import MILD_SHOULDERS
 from sim.world.rendering import Print
-from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import REFERENCE_EXPOSURE, Room, World
 from tests.drivers.raw.raw_files import write_cr2
 
 RUNS = 4

@@ -50,10 +50,8 @@ from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.errors import CropError
 from sim.optics import MILD_SHOULDERS, STRONG_SHOULDERS
-from sim.world.disturbances import Blob, Glare, Situation
-from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import Blob, Glare, Room, Situation, World
 
 WRONG_DEG: Final = 0.1
 """Angle from which a light's ground truth is wrong; those of random rooms are within 0.02."""

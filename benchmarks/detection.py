@@ -30,7 +30,7 @@ from benchmarks.judged_labs import Lab, lab_of, rooms
 from benchmarks.troubled_runs import causes
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination
-from sim.world.room import Room
+from sim.world.world import Room
 
 
 def neighbours(model: ProjectorModel, plan: Sequence[Illumination]) -> tuple[int, int, list[str]]:

@@ -16,7 +16,7 @@ from drivers.presenter import Colour
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
 from sim.world.disturbances import Disturbances, LampDrift, SensorWarming
-from sim.world.room import Room
+from sim.world.world import Room
 
 
 def drifting(frames: int) -> Disturbances:

@@ -32,7 +32,7 @@ from calibration.registration.register import Registration, register
 from drivers.raw.rawfile import CHANNELS
 from experiment.chart.layout import design_chart, paper_chart
 from foundation.errors import CropError
-from sim.world.room import Room
+from sim.world.world import Room
 
 MOST_RMS_PX: Final = 0.04
 """RMS distance from the truth that cells may have in a channel (wanted of the suite)."""

@@ -16,8 +16,8 @@ import numpy as np
 from benchmarks.rooms import Case, photographed
 from calibration.registration.register import register
 from experiment.chart.layout import paper_chart
-from sim.world.room import Room
 from sim.world.sensors import BODIES
+from sim.world.world import Room
 
 LIMITS_PX = {0.5: (0.05, 0.5), 3.0: (0.05, 0.5), 6.0: (0.1, 0.7)}
 """RMS and worst, px, for each waviness in mm."""

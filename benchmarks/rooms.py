@@ -46,9 +46,8 @@ from experiment.chart.printing import drawing
 from sim.camera.film import write_dng
 from sim.optics import MILD_SHOULDERS
 from sim.world.rendering import Print
-from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import Room, World
 
 SILENT_PX = 1.0
 """A cell this far off lies beyond what its samples' window allows for, 0.25 px, by enough to hold another colour."""

@@ -39,11 +39,9 @@ from experiment.session.folder import ReceivedFile, Session
 from experiment.session.records import Judgement, SessionStep, plan_steps
 from foundation.colorimetry import angles_deg
 from sim.camera.film import write_dng
-from sim.world.disturbances import UNDISTURBED, Situation
 from sim.world.rendering import Print
-from sim.world.room import Room
 from sim.world.sensors import Body
-from sim.world.world import PAPER, World
+from sim.world.world import PAPER, UNDISTURBED, Room, Situation, World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 TAKEN_AT = datetime(2024, 3, 1, 9, 0, tzinfo=UTC)

@@ -17,9 +17,8 @@ import numpy as np
 from drivers.presenter import WHITE
 from sim.camera.film import write_dng
 from sim.world.rendering import Print
-from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import REFERENCE_EXPOSURE, Room, World
 
 PAGE_MM = (1189.0, 841.0)
 CELLS = (221, 155)

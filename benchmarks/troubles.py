@@ -42,11 +42,9 @@ from experiment.chart.printing import drawing
 from experiment.session.records import SessionStep, plan_steps
 from foundation.colorimetry import angles_deg
 from foundation.errors import CropError
-from sim.world.disturbances import UNDISTURBED, Glare, Situation
 from sim.world.rendering import Print
-from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.world import PAPER, World
+from sim.world.world import PAPER, UNDISTURBED, Glare, Room, Situation, World
 
 _Array = npt.NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from what the session shows of it, else from what is usual, which is then named 
 and add up (JCGM 100:2008, GUM, 5.1); what is stated is expanded, k = 2 (6.2), for about 95 % of cases.
 
 The noise of samples is no error of a cell: it is the camera's, and belongs to the table. What each component is taken
-from is said in `calibration.pipeline.components`.
+from is said in `calibration.pipeline.collecting`.
 
 L lights, C cells in the order of colour indices.
 """

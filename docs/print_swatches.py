@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from foundation.colorimetry import encode_srgb
-from sim.world.room import WAVELENGTHS_NM, PaperName, ProfileName, printed_reflectance
+from sim.spectral import WAVELENGTHS_NM, PaperName, ProfileName, printed_reflectance
 
 PAPERS: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 PROFILES: tuple[ProfileName, ...] = ("unmanaged", "managed")

@@ -37,8 +37,7 @@ from evaluation.learning.standard import standard_learners
 from evaluation.metrics import recovery_error
 from foundation.colorimetry import decode_srgb
 from generator.rendering.matrices import camera_matrix
-from sim.spectral import read_sensitivities
-from sim.world.room import print_reflectance, projector_primaries
+from sim.spectral import print_reflectance, projector_primaries, read_sensitivities
 
 Floats = npt.NDArray[Any]
 

@@ -181,9 +181,8 @@ def camera(
     from sim.buses.usbip import serve_usbip
     from sim.camera.bodies import EOS_BODIES
     from sim.camera.eos import SimulatedEos
-    from sim.world.room import REFERENCE_EXPOSURE, read_room
     from sim.world.sensors import BODIES
-    from sim.world.world import World
+    from sim.world.world import REFERENCE_EXPOSURE, World, read_room
 
     if (port is None) == (usbip is None):
         raise ConfigurationError("one camera has one cable: either --port N for PTP/IP or --usbip N for USB/IP")
@@ -229,7 +228,7 @@ def _film(
     from sim.camera.film import WatchedFilm, WorldFilm
     from sim.projectors.watching import Beam, ScreenPlace, Screenshots
     from sim.world.disturbances import read_disturbances
-    from sim.world.room import REFERENCE_EXPOSURE
+    from sim.world.world import REFERENCE_EXPOSURE
 
     listed = [_value("--event", text, text) for text in events]
     happens = read_disturbances(listed, "the command line", "--event")

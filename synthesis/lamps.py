@@ -44,11 +44,19 @@ from drivers.raw.storage import Area
 from experiment.lights import Illumination, parse_ccts, shown_colour
 from foundation.colorimetry import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError, nearest_names
-from sim.spectral import PublishedSpectrum, daylight, published_spectra, regridded, require_grid
+from sim.spectral import (
+    WAVELENGTHS_NM,
+    PublishedSpectrum,
+    daylight,
+    printed_reflectance,
+    published_spectra,
+    regridded,
+    require_grid,
+    sensitivities,
+)
 from sim.world.rendering import PAPER
-from sim.world.room import WAVELENGTHS_NM, Room, printed_reflectance, sensitivities
 from sim.world.sensors import Body, HotPattern, counts
-from sim.world.world import World
+from sim.world.world import Room, World
 
 WAVELENGTH: Final = "wavelength"
 """Head of the column of wavelengths."""
@@ -73,7 +81,7 @@ _Array = npt.NDArray[np.float64]
 class LightSpectrum:
     """A light.
 
-    - `power`: (81,) float64 ≥ 0, relative power per nm at `sim.world.room.WAVELENGTHS_NM`.
+    - `power`: (81,) float64 ≥ 0, relative power per nm at `sim.spectral.WAVELENGTHS_NM`.
     - `cct_k`: its temperature if a black body, K; None otherwise.
     """
 

@@ -22,8 +22,8 @@ from foundation.errors import ConfigurationError
 from foundation.files import read_text
 from foundation.records import from_settings
 from sim.spectral import describe_sensitivities, read_sensitivities
-from sim.world.room import Room
 from sim.world.sensors import find_body
+from sim.world.world import Room
 from synthesis.lamps import LightSpectra, illuminations_of
 from synthesis.table import TableTask
 
@@ -66,7 +66,7 @@ class TableSettings(Settings):
     """Facts of the body that differ; see `sim.world.sensors.find_body`."""
     exposure: ComputedExposure = ComputedExposure()
     room: dict[str, bool | int | float | str] = Field(default_factory=dict[str, bool | int | float | str])
-    """Parameters of the room that differ; see `sim.world.room.Room`."""
+    """Parameters of the room that differ; see `sim.world.world.Room`."""
     chart: ComputedChart = ComputedChart()
 
     def changed(self, seed: int | None, room: dict[str, str | float]) -> TableSettings:

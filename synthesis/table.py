@@ -38,9 +38,8 @@ from foundation.errors import QualityError, StorageError
 from foundation.files import require_free, whole_folder
 from foundation.version import software
 from sim.world.rendering import Print
-from sim.world.room import Room
 from sim.world.sensors import Body
-from sim.world.world import World
+from sim.world.world import Room, World
 from synthesis.lamps import ChartLamp, PatchSensor, ProjectorLamp, SpectralLamp
 
 _Array = npt.NDArray[np.float64]

@@ -31,8 +31,7 @@ from calibration.registration.register import (
     MIN_GOOD_BLOCKS,
 )
 from calibration.sampling import SAFE_BLEED, bleed, largest_window
-from experiment.framing.finding import MIN_TAG_SHARE
-from experiment.framing.pictures import MIN_CELL_PX
+from experiment.framing.finding import MIN_CELL_PX, MIN_TAG_SHARE
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -175,7 +175,7 @@ SOFTER_BLEED = Figure(
     source=SIMULATED + ": 0.9 px of blur in one frame of a session with 0.5 px give 0.8 % and cells 1.2 % off, "
     "1.1 px 2 % and cells 4 % off",
     remedy="switch off autofocus and stabilisation, see that nothing shakes the camera",
-    measure=lambda table: max(map(table.added_bleed, table.frames), default=0.0), forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: table.added_bleed(_softest(table)), forecast=ONLY_OF_A_SESSION,
     worst=lambda table, chart: Worst(f"blur σ {_softest(table).blur_px:.2f} px", _softest(table).record.file),
     where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
     cause=Explanation("frame", blur_evidence),

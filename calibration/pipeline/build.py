@@ -45,7 +45,7 @@ from calibration.pipeline.baseline import (
     with_primaries,
     with_superposition,
 )
-from calibration.pipeline.collecting import check_figures, table_figures
+from calibration.pipeline.collecting import check_figures, read_linearity, table_figures
 from calibration.pipeline.frames import (
     PAPER_OPTIONS,
     Accumulator,
@@ -61,7 +61,6 @@ from calibration.pipeline.frames import (
     sample_dark_frame,
     stored_names,
 )
-from calibration.pipeline.linearity import read_linearity
 from calibration.radiometry.drift import LEAST_WHITES, applied_drift, corrected, corrections
 from calibration.table.lut import (
     CELLS,
@@ -78,7 +77,8 @@ from calibration.table.lut import (
     references_csv,
 )
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
-from experiment.framing.pictures import Shift, annotated_png
+from experiment.framing.finding import annotated_png
+from experiment.framing.pictures import Shift
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.compiled import processor_count

@@ -26,9 +26,9 @@ from calibration.sampling import SAMPLE_REACH_PX, largest_blur_px
 from drivers.raw.rawfile import CHANNELS, Channel, Mosaic, Plane, frame_black, plane_of
 from experiment.chart.model import Chart
 from experiment.framing.field import SIDE_POINTS, FoundField, field_mm, refine_edges
-from experiment.framing.finding import Framing, find_chart
+from experiment.framing.finding import MIN_CELL_PX, Framing, find_chart
 from experiment.framing.homography import rms
-from experiment.framing.pictures import MIN_CELL_PX, blur_px
+from experiment.framing.pictures import blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
 

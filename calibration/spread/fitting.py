@@ -183,15 +183,6 @@ _EVEN_TERMS = 3
 """Unknowns of a kernel that is the same all over the frame, at most: one for each channel."""
 
 
-def kernel_names() -> list[str]:
-    """Return the name of each kernel: σ in half-size px, and "veil".
-
-    >>> kernel_names()
-    ['1.5', '3', '6', '12', '24', '96', '384', 'veil']
-    """
-    return [*(f"{scale:g}" for scale in NEAR_PX + FAR_PX), "veil"]
-
-
 def place_terms(places_px: npt.NDArray[np.floating], frame_px: tuple[int, int]) -> _Array:
     """Return the terms (N, 9) float64 of a near kernel's share at pixels: products of Legendre polynomials, 1 first.
 

@@ -77,12 +77,11 @@ class JvcFlatField:
     def __init__(
         self,
         connect: Callable[[], Link],
-        timeout: float = TIMEOUT_S,
         label: str = "the JVC projector",
         clock: Clock = _SYSTEM_CLOCK,
     ) -> None:
         self._label = label
-        self._exchange = Exchange(connect, timeout, label, clock, self._greet, _SILENT, _CHECK_MODEL)
+        self._exchange = Exchange(connect, TIMEOUT_S, label, clock, self._greet, _SILENT, _CHECK_MODEL)
         self._open = True
         self.show(BLACK)
 

@@ -301,7 +301,7 @@ def paired(
 
 
 def independent(
-    errors_a: npt.ArrayLike, errors_b: npt.ArrayLike, seed: int = 0, count: int = _COUNT, level: float = _LEVEL
+    errors_a: npt.ArrayLike, errors_b: npt.ArrayLike, seed: int = 0, count: int = _COUNT
 ) -> tuple[Compared, ...]:
     """Return difference and ratio of every statistic for two sets of images that have nothing to do with each other.
 
@@ -323,7 +323,7 @@ def independent(
         for sample, stream in zip((one, other), seeds, strict=True)
     )
     left_out = [(one.without_each(), other.estimate()[None]), (one.estimate()[None], other.without_each())]
-    return _compare(one, other, (first, second), left_out, level)
+    return _compare(one, other, (first, second), left_out, _LEVEL)
 
 
 def _compare(

@@ -111,7 +111,7 @@ class StoredMethod(LearnedMethod):
 
 
 def provenance_of(
-    data: SceneSet, seed: int, clock: Clock, part: str = "all", adapted_from: TrainingRecord | None = None
+    data: SceneSet, seed: int, clock: Clock, adapted_from: TrainingRecord | None = None
 ) -> TrainingRecord:
     """Return the provenance of a model that is trained on a data set now.
 
@@ -125,7 +125,7 @@ def provenance_of(
         treatment=dict(data.treatment),
         scenes=len(data.scenes),
         sha256=scenes_sha256(data.scenes),
-        part=part,
+        part="all",
         seed=seed,
         software=software(),
         date=clock.now().isoformat(timespec="seconds"),

@@ -44,7 +44,7 @@ from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.standard import local_methods, standard_methods
 from evaluation.methods.wrapped import PATCHES, PatchwiseMethod, ResizedMethod
 from foundation.errors import InputError, nearest_names
-from foundation.packages import PACKAGES, require_own_packages
+from foundation.version import PACKAGES, require_own_packages
 
 if TYPE_CHECKING:
     from evaluation.methods.method import Learner, Method

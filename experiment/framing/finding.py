@@ -7,6 +7,10 @@ Rules that hold inside:
 - Places are half-size pixels (`drivers.raw.rawfile`).
 - Faults of the picture are a `RegistrationError` that says what was looked for, what was found, and what helps.
 
+`annotated_png` draws a frame with what was found on it, or with what was looked for and not found, with ticks along its
+border that count raw pixels, in which corners are given by hand (`experiment.framing.field`); `small_parts_warning`
+says of a chart, before it is printed, whether a camera will find its tags and cells.
+
 Knows the chart and a mosaic of counts; nothing of sessions, cells' colours or lenses
 (`calibration.registration.register`).
 
@@ -27,7 +31,7 @@ import numpy.typing as npt
 
 from drivers.raw.rawfile import CHANNELS, Mosaic, Plane, frame_black, plane_of, strongest_plane
 from experiment.chart.model import TAG_MODULES, Chart
-from experiment.framing.field import MIN_SIGNAL, FoundField, corners_text, find_field, paper_level
+from experiment.framing.field import MIN_SIGNAL, FoundField, PreparedPicture, corners_text, find_field, paper_level
 from experiment.framing.homography import project, rms, robust_homography
 from foundation.errors import InputError, RegistrationError
 
@@ -254,3 +258,150 @@ def _detect(image: npt.NDArray[np.uint8], offset_px: tuple[float, float]) -> tup
         if detection.hamming <= 1 and (tag.id not in found or found[tag.id].margin < tag.margin):
             found[tag.id] = tag
     return tuple(found[number] for number in sorted(found))
+
+
+GREEN, RED, AMBER, _GREY = (60, 200, 60), (40, 40, 255), (40, 200, 255), (200, 200, 200)
+"""BGR codes: of page and tags; of outlines that place them and of what deviates; of texts and candidates; of ticks."""
+
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+_TICK_RAW_PX = 500
+"""Raw pixels from tick to tick along the border: about ten on the longer side of an 18-megapixel frame."""
+
+_Image = npt.NDArray[np.uint8]
+
+
+def annotated_png(mosaic: Mosaic, chart: Chart, framing: Framing | None) -> bytes:
+    """Return a frame, stretched to be seen, as PNG bytes: half-size, with what was found, or looked for, drawn on it.
+
+    Found are the page's outline and tags, or the outline of the field. Where the chart was not found, the picture says
+    what was looked for, and shows what came nearest: tags of any number, or large outlines.
+    """
+    black = frame_black(mosaic)
+    plane = framing.plane if framing is not None else strongest_plane(mosaic, black)
+    white = max(float(np.percentile(plane.values[::4, ::4], 99.5)), 1.0)
+    grey = np.clip(plane.values / white, 0, 1) ** (1 / 2.2) * 255
+    image: _Image = cv2.cvtColor(grey.astype(np.uint8), cv2.COLOR_GRAY2BGR).astype(np.uint8)
+    _draw_ticks(image)
+    if framing is not None:
+        width, height = chart.page_mm
+        _draw_outline(image, project(framing.homography, [(0, 0), (width, 0), (width, height), (0, height)]), GREEN)
+        _draw_tags(image, framing)
+        if framing.field is not None:
+            for place in framing.field.outline_px.round().astype(int).tolist():
+                cv2.circle(image, place, 2, RED, -1)
+    elif chart.tags:
+        _draw_missing_tags(image, plane, chart)
+    else:
+        _draw_rectangles(image, [plane_of(mosaic, channel, black) for channel in CHANNELS], chart)
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def _draw_missing_tags(image: _Image, plane: Plane, chart: Chart) -> None:
+    ids = sorted(tag.id for tag in chart.tags)
+    found = find_tags(plane)
+    for tag in found:
+        _draw_outline(image, tag.corners_px, AMBER)
+    _draw_text(
+        image,
+        f"looked for: {len(ids)} AprilTags 36h11, ids {ids[0]} to {ids[-1]}",
+        f"found: {', '.join(str(tag.id) for tag in found[:12]) or 'none'}",
+    )
+
+
+def _draw_rectangles(image: _Image, planes: list[Plane], chart: Chart) -> None:
+    quads = PreparedPicture.of(planes).quads()
+    for quad in quads:
+        _draw_outline(image, quad, AMBER, 1)
+    _draw_text(
+        image,
+        f"looked for: a rectangle of {chart.colour_count} cells in white paper",
+        f"found: {len(quads) or 'no'} large rectangles, none of these cells",
+    )
+
+
+def _draw_tags(image: _Image, framing: Framing) -> None:
+    for tag in framing.tags:
+        _draw_outline(image, tag.corners_px, RED)
+        place = tag.corners_px[0].round().astype(int).tolist()
+        cv2.putText(image, str(tag.id), place, FONT, 0.8, AMBER, 2, cv2.LINE_AA)
+
+
+def _draw_outline(image: _Image, corners_px: _Points, colour: tuple[int, int, int], width: int = 2) -> None:
+    cv2.polylines(image, [corners_px.round().astype(np.int32)], True, colour, width, cv2.LINE_AA)
+
+
+def _draw_ticks(image: _Image) -> None:
+    height, width = image.shape[:2]
+    for raw in range(_TICK_RAW_PX, 2 * max(height, width), _TICK_RAW_PX):
+        at = raw // 2
+        if at < width:
+            cv2.line(image, (at, 0), (at, 12), _GREY, 1)
+            cv2.putText(image, str(raw), (at + 3, 14), FONT, 0.45, _GREY, 1, cv2.LINE_AA)
+        if at < height:
+            cv2.line(image, (0, at), (12, at), _GREY, 1)
+            cv2.putText(image, str(raw), (3, at - 4), FONT, 0.45, _GREY, 1, cv2.LINE_AA)
+
+
+def _draw_text(image: _Image, *lines: str) -> None:
+    height, width = image.shape[:2]
+    scale = max(0.4, width / 1600)
+    step = round(36 * scale)
+    image[height - step * len(lines) - step // 3 :] = 0
+    for number, line in enumerate(lines):
+        place = (step // 2, height - step * (len(lines) - number - 1) - step // 2)
+        cv2.putText(image, line, place, FONT, scale, AMBER, 1, cv2.LINE_AA)
+
+
+MIN_CELL_PX = 8.0
+"""Half-size pixels a cell must have for 25 of them to lie safely inside: 5, rounding and registration, and the blur.
+8.6 already bleeds 1 % at σ = 0.7."""
+
+HALF_SIZE_PX = {"EOS 550D": (2601, 1732), "EOS 6D Mark II": (3132, 2090)}
+"""Width and height of the paper's cameras' half-size images (section 3.3 names them)."""
+
+FILL = 0.94
+"""Share of the frame that a sheet fills along its tighter axis."""
+
+
+@dataclass(frozen=True)
+class _ApparentSize:
+    """What a camera sees of a chart: pixels of a cell's shorter side and of a tag's module (None without tags)."""
+
+    camera: str
+    cell_px: float
+    module_px: float | None
+
+    @property
+    def enough(self) -> bool:
+        """Whether 25 pixels of a cell can be sampled and tags be found."""
+        return self.cell_px >= MIN_CELL_PX and (self.module_px is None or self.module_px >= MIN_MODULE_PX)
+
+    def __str__(self) -> str:
+        """Return "EOS 550D: 6.1 px a cell, 2.4 px a tag module"."""
+        module = "" if self.module_px is None else f", {self.module_px:.1f} px a tag module"
+        return f"{self.camera}: {self.cell_px:.1f} px a cell{module}"
+
+
+def apparent_sizes(chart: Chart) -> list[_ApparentSize]:
+    """Return what each of the paper's cameras sees of a chart that fills 94 % of its frame, turned as it fits best."""
+    module_mm = min((float(np.ptp(tag.corners_mm[:, 0])) / TAG_MODULES for tag in chart.tags), default=None)
+    page = sorted(chart.page_mm)
+    seen: list[_ApparentSize] = []
+    for camera, frame in HALF_SIZE_PX.items():
+        px_per_mm = FILL * min(pixels / side for pixels, side in zip(sorted(frame), page, strict=True))
+        seen.append(_ApparentSize(camera, min(chart.cell_mm) * px_per_mm, module_mm and module_mm * px_per_mm))
+    return seen
+
+
+def small_parts_warning(chart: Chart) -> str | None:
+    """Return a sentence when a camera cannot separate the chart's cells or read its tags, else None."""
+    seen = apparent_sizes(chart)
+    if all(size.enough for size in seen):
+        return None
+    least = "" if seen[0].module_px is None else f" and {MIN_MODULE_PX:g} px a tag module"
+    return (
+        f"cells of {min(chart.cell_mm):.2f} mm are small for a camera: at {FILL:.0%} of the frame (half-size) "
+        f"{'; '.join(map(str, seen))}; {MIN_CELL_PX:g} px a cell{least} are needed: fewer bits, larger cells, or a "
+        "page nearer to 3 : 2"
+    )

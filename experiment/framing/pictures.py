@@ -1,12 +1,11 @@
-"""What the picture of a chart shows once it is found: how far it has moved, how sharp it is, and itself, for people.
+"""What the picture of a chart shows once it is found: how far it has moved, how sharp it is, and itself, made small.
 
 Movement is measured in one colour plane on a few gauges. A gauge is a tag, or without tags a strip across the edge
 between the field of cells and its margin, which is there in every light. Sharpness is measured on the same edges. Both
 are in half-size pixels.
 
-A frame is drawn for people in two ways: `annotated_png` with what was found on it, or with what was looked for and not
-found, with ticks along its border that count raw pixels, in which corners are given by hand
-(`experiment.framing.field`); and `preview_jpeg`, the small picture that a session keeps of each frame.
+`preview_jpeg` is the small picture that a session keeps of each frame; `experiment.framing.finding` draws what was
+found on a frame.
 
 Source: B. D. Lucas and T. Kanade, "An iterative image registration technique", IJCAI 1981.
 """
@@ -28,15 +27,11 @@ from drivers.raw.rawfile import (
     Mosaic,
     Plane,
     channel_offset_px,
-    frame_black,
     phases,
-    plane_of,
-    strongest_plane,
 )
-from experiment.chart.model import TAG_MODULES, Chart
-from experiment.framing.field import FoundField, PreparedPicture
-from experiment.framing.finding import MIN_MODULE_PX, FoundTag, Framing, find_tags
-from experiment.framing.homography import project
+from experiment.chart.model import TAG_MODULES
+from experiment.framing.field import FoundField
+from experiment.framing.finding import AMBER, FONT, GREEN, RED, FoundTag, Framing
 from foundation.robust import huber_weights, sigma_of
 
 MAX_SHIFT_PX = 3.0
@@ -304,11 +299,6 @@ WIDTH_PX = 640
 _QUALITY = 80
 """JPEG quality: some 40 kB, 30 MB a session."""
 
-_GREEN, _RED, _AMBER, _GREY = (60, 200, 60), (40, 40, 255), (40, 200, 255), (200, 200, 200)
-"""BGR codes: of page and tags; of outlines that place them and of what deviates; of texts and candidates; of ticks."""
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-_TICK_RAW_PX = 500
-"""Raw pixels from tick to tick along the border: about ten on the longer side of an 18-megapixel frame."""
 
 _LETTER_PX = 7.4
 """Width of a letter of the cause at `_SCALE`, px."""
@@ -318,90 +308,6 @@ _SCALE = 0.42
 
 _FAINTEST = 0.01
 """Share of white to which a dark frame is brightened at most: else its noise would be the picture."""
-
-_Image = npt.NDArray[np.uint8]
-
-
-def annotated_png(mosaic: Mosaic, chart: Chart, framing: Framing | None) -> bytes:
-    """Return a frame, stretched to be seen, as PNG bytes: half-size, with what was found, or looked for, drawn on it.
-
-    Found are the page's outline and tags, or the outline of the field. Where the chart was not found, the picture says
-    what was looked for, and shows what came nearest: tags of any number, or large outlines.
-    """
-    black = frame_black(mosaic)
-    plane = framing.plane if framing is not None else strongest_plane(mosaic, black)
-    white = max(float(np.percentile(plane.values[::4, ::4], 99.5)), 1.0)
-    grey = np.clip(plane.values / white, 0, 1) ** (1 / 2.2) * 255
-    image: _Image = cv2.cvtColor(grey.astype(np.uint8), cv2.COLOR_GRAY2BGR).astype(np.uint8)
-    _draw_ticks(image)
-    if framing is not None:
-        width, height = chart.page_mm
-        _draw_outline(image, project(framing.homography, [(0, 0), (width, 0), (width, height), (0, height)]), _GREEN)
-        _draw_tags(image, framing)
-        if framing.field is not None:
-            for place in framing.field.outline_px.round().astype(int).tolist():
-                cv2.circle(image, place, 2, _RED, -1)
-    elif chart.tags:
-        _draw_missing_tags(image, plane, chart)
-    else:
-        _draw_rectangles(image, [plane_of(mosaic, channel, black) for channel in CHANNELS], chart)
-    return cv2.imencode(".png", image)[1].tobytes()
-
-
-def _draw_missing_tags(image: _Image, plane: Plane, chart: Chart) -> None:
-    ids = sorted(tag.id for tag in chart.tags)
-    found = find_tags(plane)
-    for tag in found:
-        _draw_outline(image, tag.corners_px, _AMBER)
-    _draw_text(
-        image,
-        f"looked for: {len(ids)} AprilTags 36h11, ids {ids[0]} to {ids[-1]}",
-        f"found: {', '.join(str(tag.id) for tag in found[:12]) or 'none'}",
-    )
-
-
-def _draw_rectangles(image: _Image, planes: list[Plane], chart: Chart) -> None:
-    quads = PreparedPicture.of(planes).quads()
-    for quad in quads:
-        _draw_outline(image, quad, _AMBER, 1)
-    _draw_text(
-        image,
-        f"looked for: a rectangle of {chart.colour_count} cells in white paper",
-        f"found: {len(quads) or 'no'} large rectangles, none of these cells",
-    )
-
-
-def _draw_tags(image: _Image, framing: Framing) -> None:
-    for tag in framing.tags:
-        _draw_outline(image, tag.corners_px, _RED)
-        place = tag.corners_px[0].round().astype(int).tolist()
-        cv2.putText(image, str(tag.id), place, _FONT, 0.8, _AMBER, 2, cv2.LINE_AA)
-
-
-def _draw_outline(image: _Image, corners_px: _Points, colour: tuple[int, int, int], width: int = 2) -> None:
-    cv2.polylines(image, [corners_px.round().astype(np.int32)], True, colour, width, cv2.LINE_AA)
-
-
-def _draw_ticks(image: _Image) -> None:
-    height, width = image.shape[:2]
-    for raw in range(_TICK_RAW_PX, 2 * max(height, width), _TICK_RAW_PX):
-        at = raw // 2
-        if at < width:
-            cv2.line(image, (at, 0), (at, 12), _GREY, 1)
-            cv2.putText(image, str(raw), (at + 3, 14), _FONT, 0.45, _GREY, 1, cv2.LINE_AA)
-        if at < height:
-            cv2.line(image, (0, at), (12, at), _GREY, 1)
-            cv2.putText(image, str(raw), (3, at - 4), _FONT, 0.45, _GREY, 1, cv2.LINE_AA)
-
-
-def _draw_text(image: _Image, *lines: str) -> None:
-    height, width = image.shape[:2]
-    scale = max(0.4, width / 1600)
-    step = round(36 * scale)
-    image[height - step * len(lines) - step // 3 :] = 0
-    for number, line in enumerate(lines):
-        place = (step // 2, height - step * (len(lines) - number - 1) - step // 2)
-        cv2.putText(image, line, place, _FONT, scale, _AMBER, 1, cv2.LINE_AA)
 
 
 def preview_jpeg(
@@ -430,10 +336,10 @@ def preview_jpeg(
     brightest = max(float(np.percentile(small[::4, ::4].max(axis=2), 99.5)), _FAINTEST)
     image = (np.sqrt(np.clip(small, 0, brightest) / np.float32(brightest)) * 255).astype(np.uint8)
     for corners in outlines_px:
-        cv2.polylines(image, [(corners / step).round().astype(np.int32)], True, _GREEN, 1, cv2.LINE_AA)
+        cv2.polylines(image, [(corners / step).round().astype(np.int32)], True, GREEN, 1, cv2.LINE_AA)
     for box in boxes:
         x0, y0, x1, y1 = (edge // step for edge in box)
-        cv2.rectangle(image, (x0, y0), (x1 - 1, y1 - 1), _RED, 1)
+        cv2.rectangle(image, (x0, y0), (x1 - 1, y1 - 1), RED, 1)
     if cause:
         image = _written(image, cause)
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
@@ -448,19 +354,8 @@ def _written(image: npt.NDArray[np.uint8], cause: str) -> npt.NDArray[np.uint8]:
     top = height - line * len(lines) - line // 2
     image[top:] //= 3
     for number, text in enumerate(lines):
-        cv2.putText(image, text, (6, top + line * (number + 1)), _FONT, _SCALE, _AMBER, 1, cv2.LINE_AA)
+        cv2.putText(image, text, (6, top + line * (number + 1)), FONT, _SCALE, AMBER, 1, cv2.LINE_AA)
     return image
-
-
-MIN_CELL_PX = 8.0
-"""Half-size pixels a cell must have for 25 of them to lie safely inside: 5, rounding and registration, and the blur.
-8.6 already bleeds 1 % at σ = 0.7."""
-
-HALF_SIZE_PX = {"EOS 550D": (2601, 1732), "EOS 6D Mark II": (3132, 2090)}
-"""Width and height of the paper's cameras' half-size images (section 3.3 names them)."""
-
-FILL = 0.94
-"""Share of the frame that a sheet fills along its tighter axis."""
 
 
 MAX_BLUR_PX = 1.0
@@ -475,49 +370,6 @@ _OUTLINE_PLACES = 80
 
 _INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0
 """How much around a place of the field's outline is looked at: one cell, and not the marks in the margin."""
-
-
-@dataclass(frozen=True)
-class _ApparentSize:
-    """What a camera sees of a chart: pixels of a cell's shorter side and of a tag's module (None without tags)."""
-
-    camera: str
-    cell_px: float
-    module_px: float | None
-
-    @property
-    def enough(self) -> bool:
-        """Whether 25 pixels of a cell can be sampled and tags be found."""
-        return self.cell_px >= MIN_CELL_PX and (self.module_px is None or self.module_px >= MIN_MODULE_PX)
-
-    def __str__(self) -> str:
-        """Return "EOS 550D: 6.1 px a cell, 2.4 px a tag module"."""
-        module = "" if self.module_px is None else f", {self.module_px:.1f} px a tag module"
-        return f"{self.camera}: {self.cell_px:.1f} px a cell{module}"
-
-
-def apparent_sizes(chart: Chart) -> list[_ApparentSize]:
-    """Return what each of the paper's cameras sees of a chart that fills 94 % of its frame, turned as it fits best."""
-    module_mm = min((float(np.ptp(tag.corners_mm[:, 0])) / TAG_MODULES for tag in chart.tags), default=None)
-    page = sorted(chart.page_mm)
-    seen: list[_ApparentSize] = []
-    for camera, frame in HALF_SIZE_PX.items():
-        px_per_mm = FILL * min(pixels / side for pixels, side in zip(sorted(frame), page, strict=True))
-        seen.append(_ApparentSize(camera, min(chart.cell_mm) * px_per_mm, module_mm and module_mm * px_per_mm))
-    return seen
-
-
-def small_parts_warning(chart: Chart) -> str | None:
-    """Return a sentence when a camera cannot separate the chart's cells or read its tags, else None."""
-    seen = apparent_sizes(chart)
-    if all(size.enough for size in seen):
-        return None
-    least = "" if seen[0].module_px is None else f" and {MIN_MODULE_PX:g} px a tag module"
-    return (
-        f"cells of {min(chart.cell_mm):.2f} mm are small for a camera: at {FILL:.0%} of the frame (half-size) "
-        f"{'; '.join(map(str, seen))}; {MIN_CELL_PX:g} px a cell{least} are needed: fewer bits, larger cells, or a "
-        "page nearer to 3 : 2"
-    )
 
 
 def blur_px(framing: Framing) -> float:

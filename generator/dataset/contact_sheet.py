@@ -49,11 +49,11 @@ def contact_sheet(dataset: Dataset, max_rows: int = MAX_ROWS, max_columns: int =
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def save_contact_sheet(dataset: Dataset, path: Path, max_rows: int = MAX_ROWS, max_columns: int = MAX_COLUMNS) -> None:
+def save_contact_sheet(dataset: Dataset, path: Path) -> None:
     """Write the contact sheet of a dataset as a PNG file."""
     import cv2
 
-    sheet = contact_sheet(dataset, max_rows, max_columns)
+    sheet = contact_sheet(dataset)
     write_whole(path, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 

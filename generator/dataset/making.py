@@ -208,8 +208,10 @@ def photograph(
     for mixture in lighting.mixtures:
         for light in mixture.lights:
             lut.require_unchanged(light)
-    share = options.black_point.share(seed, number) if black_taken is None else black_taken
-    details: Details = {} if options.black_point.kind == "keep" else {"black_taken": share}
+    share, details = 0.0, Details()
+    if options.black_point.kind != "keep":
+        share = options.black_point.share(seed, number) if black_taken is None else black_taken
+        details["black_taken"] = share
     weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
     if options.rendering == "colorimetric":
         rendering = rendering_of(lut, options)

@@ -304,17 +304,27 @@ class WorldFilm:
         key = (*colour.codes, self._exposed[colour])
         self._exposed[colour] += 1
         self._before.append((seconds, colour))
-        stale = self._disturbances.stale(moment)
+        if self._disturbances.events:
+            taken_at, counts = self._disturbed(settings, released_at, moment, key, lamp)
+        else:
+            taken_at, counts = released_at, self._world.expose(colour, settings, key=key, lamp=lamp)
+        write_dng(into, counts, self._world.body, settings=settings, taken_at=taken_at, serial=self._serial)
+
+    def _disturbed(
+        self, settings: ExposureSettings, released_at: datetime, moment: Moment, key: tuple[int, ...], lamp: float
+    ) -> tuple[datetime, NDArray[np.uint16]]:
+        """Return when the file says that it was taken, and its counts, where something may be wrong at a moment."""
+        events, stale = self._disturbances, self._disturbances.stale(moment)
         if stale is None or self._last is None:
-            shown, situation = self._disturbances.shown(moment), self._disturbances.situation(moment)
+            shown, situation = events.shown(moment), events.situation(moment)
             counts = self._world.expose(shown, settings, key=key, lamp=lamp, situation=situation)
-            taken_at, counts = released_at, self._disturbances.counted(counts, moment)
+            taken_at, counts = released_at, events.counted(counts, moment)
         else:
             taken_at, counts = self._last
             taken_at = released_at if stale.new_header else taken_at
-        if self._disturbances.repeats_files:
+        if events.repeats_files:
             self._last = taken_at, counts
-        write_dng(into, counts, self._world.body, settings=settings, taken_at=taken_at, serial=self._serial)
+        return taken_at, counts
 
 
 def _accept(settings: ExposureSettings) -> None:

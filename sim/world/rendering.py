@@ -9,7 +9,8 @@ integers, unless said.
 towards the camera. The sheet is turned by roll, then tilt, then pan, and seen through a pinhole and Brown's lens
 distortion (D. C. Brown, "Close-range camera calibration", 1971; normalised coordinates and coefficient order as
 OpenCV has them). The paper does not stretch: its heights are so small against their wavelengths that a point keeps
-its x and y.
+its x and y. A fold is a crease that does not lie flat: the sheet rises towards it on both sides, so that the crease
+stands off the plane, and either flank is turned a little towards the light or away from it.
 
 Pixels are half-size, centres at integers, x right, y down; millimetres on the print, origin at its top-left corner.
 Pure functions of frozen values; light is not treated here.
@@ -28,13 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foundation.compiled import compiled
-from sim.world.room import Fold, Room
 
 _RIPPLE: Final = 0.1
 """Height of each of the weaker short waves over that of the first; chosen."""
-
-_A0_DIAGONAL_MM: Final = math.hypot(1189, 841)
-"""Of a sheet of A0 (ISO 216)."""
 
 _NEWTON_STEPS = 6
 """An end to steps that do not converge; they stop earlier once every point is met within 10⁻⁷ px."""
@@ -90,6 +87,45 @@ class Waviness:
         return total
 
 
+ROUND_MM = 4.0
+"""Paper bends; a crease is no sharper than this."""
+
+FLANK_MM = 40.0
+"""From the crease to where the sheet lies flat again, to 1 / e."""
+
+
+@dataclass(frozen=True)
+class Fold:
+    """A crease across the sheet, from its upper to its lower edge.
+
+    - `at_mm`: A point of the crease.
+    - `along`: its direction, a unit vector.
+    - `height_mm`: how far the crease stands off the plane, towards the camera.
+    - `slant`: change of the light with a flank's slope: the tangent of the angle under which the light falls in.
+    """
+
+    at_mm: tuple[float, float]
+    along: tuple[float, float]
+    height_mm: float
+    slant: float
+
+    def _away(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the distance (...) of points from the crease, positive on its right."""
+        x, y = np.moveaxis(points_mm - np.array(self.at_mm), -1, 0)
+        return x * self.along[1] - y * self.along[0]
+
+    def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the height (...) in mm of points (..., 2)."""
+        rounded = np.hypot(self._away(points_mm), ROUND_MM) - ROUND_MM
+        return self.height_mm * np.exp(-rounded / FLANK_MM)
+
+    def shade(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the light (...) on points (..., 2) over that on a flat sheet."""
+        away = self._away(points_mm)
+        slope = -self.height(points_mm) * away / np.hypot(away, ROUND_MM) / FLANK_MM
+        return 1 + self.slant * slope
+
+
 @dataclass(frozen=True, eq=False)
 class Sheet:
     """The shape of a sheet of paper: waves, a curl and a crease, added.
@@ -103,13 +139,6 @@ class Sheet:
     waves: Waviness
     curl_mm: float = 0.0
     fold: Fold | None = None
-
-    @classmethod
-    def of_room(cls, room: Room, page_mm: tuple[float, float], fold: Fold | None) -> Sheet:
-        """Return the shape of a room's sheet; waves and curl shrink with its size."""
-        size = math.hypot(*page_mm) / _A0_DIAGONAL_MM
-        waves = Waviness.random(room.seed, room.waviness_mm * size, page_mm, wave_mm=room.wave_mm * size)
-        return cls(waves, room.curl_mm * size, fold)
 
     @property
     def page_mm(self) -> tuple[float, float]:

@@ -54,7 +54,7 @@ class Body:
     - `read_noise_dn`: standard deviation of a dark count at ISO 100, DN.
     - `sensor_noise_e`: the share of the read noise that arises before the amplifier, electrons: it grows with the ISO
       speed in DN, the rest does not.
-    - `sensitivities`: name of the spectral sensitivities in `sim.data`, see `sim.world.room.sensitivities`.
+    - `sensitivities`: name of the spectral sensitivities in `sim.data`, see `sim.spectral.sensitivities`.
     - `masked`: rectangles of the sensor that are covered and measure black.
     """
 

@@ -30,9 +30,8 @@ from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, SessionStep
 from sim.camera.film import write_dng
 from sim.world.rendering import Print
-from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import Room, World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 Paint = Callable[[npt.NDArray[np.uint16]], None]

@@ -26,10 +26,8 @@ from calibration.pipeline.build import build
 from calibration.table.lut import open_lut
 from drivers.raw.rawfile import read_raw
 from experiment.session.records import SessionStep, plan_steps
-from sim.world.disturbances import Blob, Glare, Situation
-from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import Blob, Glare, Room, Situation, World
 
 pytestmark = pytest.mark.slow
 

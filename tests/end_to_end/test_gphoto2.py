@@ -35,9 +35,8 @@ from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D_AS_LISTED, TEST_BODY
 from sim.camera.eos import SimulatedEos
 from sim.camera.film import Film, WorldFilm
 from sim.world.rendering import Print
-from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import Room, World
 
 pytestmark = pytest.mark.slow
 

@@ -26,7 +26,7 @@ from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.colorimetry import angles_deg
 from foundation.errors import CropError, QualityError
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ from functools import cache
 
 import pytest
 
-from foundation.packages import PACKAGES
+from foundation.version import PACKAGES
 from tests.house.sources import sources
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from foundation.packages import PACKAGES
+from foundation.version import PACKAGES
 from tests.house.sources import sources
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from sim.world.rendering import Print
-from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import Room, World
 
 PAGE_MM = (180.0, 125.0)
 

@@ -9,7 +9,7 @@ import pytest
 
 from experiment.lights import blackbody_light, shown_colour
 from foundation.errors import FormatError, InputError
-from sim.world.room import WAVELENGTHS_NM
+from sim.spectral import WAVELENGTHS_NM
 from synthesis.lamps import illuminations_of, parse_spectra, read_lights
 
 

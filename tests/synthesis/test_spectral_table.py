@@ -17,7 +17,7 @@ from experiment.lights import load_illuminations
 from foundation.errors import FormatError, InputError
 from generator.cli import main as generate
 from generator.lights.choices import parse_light
-from sim.world.room import print_reflectance, printed_reflectance, sensitivities
+from sim.spectral import print_reflectance, printed_reflectance, sensitivities
 from synthesis.lamps import LightSpectra, read_lights
 from synthesis.settings import parse_settings, table_task
 from synthesis.table import compute_table

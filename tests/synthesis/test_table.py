@@ -18,8 +18,8 @@ from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
 from experiment.lights import plan_illuminations
 from foundation.errors import InputError, QualityError, StorageError
-from sim.world.room import Room
 from sim.world.sensors import BODIES
+from sim.world.world import Room
 from synthesis.settings import TableSettings, parse_settings, table_task
 from synthesis.table import TableTask, compute_table
 from tests.calibration.lab import LIGHTS, SETTINGS, designed, hang, take

@@ -33,9 +33,8 @@ from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjec
 from sim.spectral import known_sensitivities
 from sim.world.disturbances import read_disturbances
 from sim.world.rendering import Print
-from sim.world.room import Room, read_room
 from sim.world.sensors import BODIES, Body, find_body
-from sim.world.world import World
+from sim.world.world import Room, World, read_room
 
 SERIAL = "0000000001"
 """Serial number of the simulated body, on its wire and in its frames; one lab has one body."""

@@ -36,6 +36,9 @@ from generator.statistics import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
 TOLERANCE: Final = 0.25
 """Share by which figures may differ and still be called alike: a convention."""
 
+_SIZES: Final = 6
+"""Sizes of images that are listed, the most frequent ones."""
+
 _LEAST: Final = 3
 """Images of which a figure must be known in each set: a quartile needs them."""
 
@@ -370,12 +373,12 @@ def describe_page(one: DataDescription, other: DataDescription | None = None, se
     return pages.page(" beside ".join(made.name for made in both), parts)
 
 
-def sizes_table(description: DataDescription, count: int = 6) -> Table:
+def sizes_table(description: DataDescription) -> Table:
     """Return the most frequent sizes of the images."""
-    rest = sum(number for _, _, number in description.sizes[count:])
-    rows = [(f"{width} x {height}", number) for width, height, number in description.sizes[:count]]
+    rest = sum(number for _, _, number in description.sizes[_SIZES:])
+    rows = [(f"{width} x {height}", number) for width, height, number in description.sizes[:_SIZES]]
     if rest:
-        rows.append((f"{len(description.sizes) - count} other sizes", rest))
+        rows.append((f"{len(description.sizes) - _SIZES} other sizes", rest))
     notes = [f"{description.mixed} images under several lights; {description.masked:.1%} of the pixels are masked."]
     return Table(f"{description.name}: sizes, px", ("Size", "Images"), tuple(rows), notes=tuple(notes))
 

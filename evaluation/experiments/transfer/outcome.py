@@ -113,7 +113,6 @@ class _Replicates:
 def figures_of(
     rows: Sequence[TransferRow],
     error: ErrorKind,
-    seed: int = 0,
     base: str | None = None,
     groups: Sequence[str] | None = None,
 ) -> TransferFigures:
@@ -127,7 +126,7 @@ def figures_of(
     bases = _named(rows, base)
     samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]
     drawn: list[list[Floats]] = [[] for _ in rows]
-    for counts in resamples(len(samples[0][0].order), seed, COUNT, numbers):
+    for counts in resamples(len(samples[0][0].order), 0, COUNT, numbers):
         for batches, several in zip(drawn, samples, strict=True):
             batches.append(np.mean([one.statistics(counts) for one in several], axis=0))
     known = [

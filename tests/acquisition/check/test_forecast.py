@@ -29,7 +29,7 @@ from experiment.lights import plan_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.errors import QualityError, RegistrationError
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, Paint, hang, hang_chart, take
 
 pytestmark = pytest.mark.slow

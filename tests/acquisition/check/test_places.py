@@ -13,7 +13,7 @@ from acquisition.check.places import levels, place_chart, window_px
 from experiment.chart.layout import paper_chart
 from experiment.chart.model import Chart
 from experiment.framing.finding import find_chart
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import Lab, Paint, hang, hang_chart
 
 WAVING = Room(waviness_mm=5.0, seed=5)

@@ -18,7 +18,7 @@ from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from foundation.console import plain
 from sim.world import world
-from sim.world.room import Room, Stain, worn
+from sim.world.world import Room, Stain, worn
 from tests.acquisition.check.conftest import Check, lab_toml
 
 pytestmark = pytest.mark.slow

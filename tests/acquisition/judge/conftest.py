@@ -24,9 +24,8 @@ from experiment.lights import Illumination, plan_illuminations
 from experiment.session.records import RESPONSE, Judgement, SessionStep, plan_steps
 from sim.camera.film import write_dng
 from sim.world.disturbances import AnyDisturbance, Disturbances, Moment
-from sim.world.room import Room
 from sim.world.sensors import BODIES, Body
-from sim.world.world import World
+from sim.world.world import Room, World
 
 LAB = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "illuminations.csv"\n'
 

@@ -24,11 +24,10 @@ from sim.world.disturbances import (
     PopUp,
     ScrambledRows,
     ScreenSaver,
-    Situation,
     ZeroedStrip,
 )
-from sim.world.room import Room
 from sim.world.sensors import BODIES
+from sim.world.world import Room, Situation
 from tests.acquisition.judge.conftest import EXPOSURE, FRAMES, LAB, Bench, bench
 
 pytestmark = pytest.mark.slow

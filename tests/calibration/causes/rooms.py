@@ -16,7 +16,7 @@ from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from sim.camera.film import write_dng
-from sim.world.disturbances import UNDISTURBED, Blob, Situation
+from sim.world.world import UNDISTURBED, Blob, Situation
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, renumbered, take
 
 BRIGHT = renumbered(

@@ -28,8 +28,7 @@ from calibration.verdict import BuildResult, ProbableCause, findings, remark, re
 from drivers.presenter import Colour
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
-from sim.world.disturbances import Blob, Situation
-from sim.world.room import Room
+from sim.world.world import Blob, Room, Situation
 from tests.calibration.causes.rooms import BRIGHT, HAND, Counts, glare, half, nth_white, taken
 from tests.calibration.lab import Lab, hang
 

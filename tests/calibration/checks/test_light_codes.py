@@ -18,7 +18,8 @@ from experiment.lights import plan_illuminations
 from experiment.session.records import SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError
-from sim.world.room import Room, projector_primaries, sensitivities
+from sim.spectral import projector_primaries, sensitivities
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, take
 
 pytestmark = pytest.mark.slow

@@ -16,7 +16,7 @@ from calibration.sampling import gather, sites_at
 from drivers.raw.rawfile import frame_black
 from experiment.measures.paper import PaperReader
 from experiment.measures.stains import Stains, find_stains
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang
 
 pytestmark = pytest.mark.slow

@@ -12,7 +12,7 @@ from calibration.comparison.comparing import compare, table_of
 from calibration.pipeline.build import build
 from calibration.pipeline.frames import BuildOptions
 from experiment.session.folder import Session
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, take
 
 pytestmark = pytest.mark.slow

@@ -28,7 +28,7 @@ from experiment.session.folder import Session
 from experiment.session.records import SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError
 from sim.camera.film import write_dng
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
 from tests.json_of import json_of
 

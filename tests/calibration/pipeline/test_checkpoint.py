@@ -28,7 +28,7 @@ from calibration.verdict import BuildResult
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.errors import FormatError, InputError
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
 
 pytestmark = pytest.mark.slow

@@ -21,9 +21,8 @@ from experiment.session.records import SessionStep
 from experiment.session.repair import lights_text
 from foundation.errors import QualityError
 from sim.camera.film import write_dng
-from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import Room, World
 from tests.calibration.lab import SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
 
 pytestmark = pytest.mark.slow

@@ -22,7 +22,7 @@ from drivers.presenter import WHITE
 from experiment.measures.sensor import deviations
 from experiment.session.folder import Session
 from foundation.errors import FormatError, InputError
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import Lab, figures_alone, hang
 
 pytestmark = pytest.mark.slow

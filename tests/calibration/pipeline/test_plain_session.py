@@ -18,7 +18,7 @@ from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
 from experiment.framing.field import field_mm
 from experiment.lights import Illumination
 from experiment.session.records import ACCEPTED, SessionStep
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, figures_alone, hang_chart, renumbered, take
 
 pytestmark = pytest.mark.slow

@@ -12,8 +12,9 @@ from calibration.report.report import summary
 from calibration.table.lut import open_lut
 from calibration.verdict import judged_values
 from drivers.presenter import WHITE, Colour
+from sim.spectral import PaperName, ProfileName
 from sim.world.rendering import PAPER
-from sim.world.room import PaperName, ProfileName, Room
+from sim.world.world import Room
 from tests.calibration.causes.rooms import BRIGHT, Counts, taken
 from tests.calibration.lab import LIGHTS, SETTINGS, hang, renumbered, take
 

@@ -14,7 +14,7 @@ from calibration.table.lut import open_lut
 from calibration.verdict import judged_values, remark
 from experiment.chart.layout import design_chart
 from experiment.lights import plan_illuminations
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, hang_chart, renumbered, take
 
 pytestmark = pytest.mark.slow

@@ -18,9 +18,8 @@ from calibration.report.report import summary
 from calibration.verdict import BuildResult, judge, judged_values, remark
 from drivers.presenter import Colour
 from experiment.session.records import SessionStep
-from sim.world.disturbances import Situation
-from sim.world.room import Room
 from sim.world.sensors import BODIES
+from sim.world.world import Room, Situation
 
 pytestmark = pytest.mark.slow
 

@@ -13,9 +13,8 @@ from experiment.chart.printing import drawing
 from experiment.measures.least_squares import code_polynomial, code_powers, page_polynomial
 from experiment.measures.paper import PaperReader
 from sim.world.rendering import Print
-from sim.world.room import Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import Room, World
 from tests.calibration.lab import SETTINGS
 
 pytestmark = pytest.mark.slow

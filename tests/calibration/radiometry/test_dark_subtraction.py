@@ -22,7 +22,7 @@ from experiment.measures.paper import FlatField, Paper
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.errors import FormatError
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 
 pytestmark = pytest.mark.slow

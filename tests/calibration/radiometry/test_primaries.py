@@ -16,7 +16,7 @@ from calibration.table.lut import open_lut
 from drivers.presenter import Colour
 from experiment.lights import Illumination, plan_illuminations
 from experiment.measures.paper import FlatField, Paper, PaperReader
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import SETTINGS, hang, renumbered, take
 
 FULL = 12000.0

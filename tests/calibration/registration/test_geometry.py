@@ -23,7 +23,7 @@ from calibration.registration.geometry import (
 from calibration.registration.register import Registration, register
 from drivers.raw.rawfile import CHANNELS, Mosaic
 from foundation.errors import RegistrationError
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang
 
 

@@ -16,7 +16,7 @@ from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from foundation.errors import RegistrationError
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang
 from tests.data_files import shipped
 

@@ -17,7 +17,7 @@ from experiment.chart.layout import paper_chart
 from experiment.chart.model import Chart
 from experiment.framing.field import field_mm
 from foundation.errors import RegistrationError
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang_chart
 
 pytestmark = pytest.mark.slow

@@ -18,7 +18,6 @@ from calibration.spread.fitting import (
     far_groups,
     free_terms,
     groups_of_terms,
-    kernel_names,
     place_terms,
     terms_of,
 )
@@ -40,7 +39,6 @@ def test_each_unknown_belongs_to_one_channel_and_one_group() -> None:
     # Near kernels' means and changes, then what is the same all over, a number a channel.
     assert [len(group) for group in groups] == [3, 3 * (PLACES - 1)] * len(NEAR_PX) + [3] * (len(FAR_PX) + 1)
     assert [group.tolist() for group in far_groups()] == [group.tolist() for group in groups[2 * len(NEAR_PX) :]]
-    assert len(kernel_names()) == KERNELS
     assert np.flatnonzero(~free_terms()).tolist() == sorted(np.concatenate(far_groups()).tolist())
 
 

@@ -25,7 +25,7 @@ from experiment.framing.field import FoundField, corners_text, field_mm, find_fi
 from experiment.framing.finding import find_chart
 from experiment.framing.pictures import blur_px
 from foundation.errors import CropError, InputError, RegistrationError
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang_chart
 from tests.data_files import available
 

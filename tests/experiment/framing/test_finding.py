@@ -15,7 +15,7 @@ from experiment.chart.model import Chart
 from experiment.framing.finding import find_chart, find_tags
 from experiment.framing.pictures import blur_px, shift_between
 from foundation.errors import RegistrationError
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang
 from tests.data_files import available
 

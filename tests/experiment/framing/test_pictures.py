@@ -17,9 +17,9 @@ from drivers.raw.rawfile import Mosaic, Plane, plane_of, read_raw, strongest_pla
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
 from experiment.framing.field import field_mm
-from experiment.framing.finding import Framing, find_chart
-from experiment.framing.pictures import annotated_png, apparent_sizes, gauge_boxes, shift_between, small_parts_warning
-from sim.world.room import Room
+from experiment.framing.finding import Framing, annotated_png, apparent_sizes, find_chart, small_parts_warning
+from experiment.framing.pictures import gauge_boxes, shift_between
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang, hang_chart
 from tests.data_files import shipped
 

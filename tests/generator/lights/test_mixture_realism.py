@@ -18,7 +18,7 @@ from experiment.lights import Illumination
 from foundation.colorimetry import angles_deg
 from generator.lights.gamut import Gamut
 from generator.lights.lighting import Mixture, plain
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.calibration.lab import SETTINGS, Lab, hang, take
 
 pytestmark = pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from generator.likeness.balancing import balance, effective_size
+from generator.likeness.real_data import balance, effective_size
 
 
 def normal(count: int, mean: float, spread: float, seed: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from drivers.presenter import BLACK, WHITE, Colour
 from sim.optics import APERTURE_VARIANCE, MILD_SHOULDERS, STRONG_SHOULDERS, PhotographicLens
-from sim.world.disturbances import Blob, Situation
-from sim.world.rendering import Print, Sheet
-from sim.world.room import REFERENCE_EXPOSURE, Room
+from sim.world.rendering import Print
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import REFERENCE_EXPOSURE, Blob, Room, Situation, World, sheet_of
 
 PAGE_MM = (180.0, 125.0)
 EOS_550D_PHOTOSITE_MM = 22.3 / 5202
@@ -193,7 +191,7 @@ def test_lateral_aberration_is_as_large_as_stated_and_half_of_it_cubic() -> None
 
 def test_short_waves_have_their_length_and_height() -> None:
     page = (1189.0, 841.0)
-    surface = Sheet.of_room(Room(waviness_mm=6, wave_mm=150), page, None)
+    surface = sheet_of(Room(waviness_mm=6, wave_mm=150), page, None)
     x, y = np.meshgrid(np.arange(0, 1189, 2.0), np.arange(0, 841, 2.0))
     heights = surface.height(np.stack([x, y], axis=-1))
     assert np.ptp(heights) == pytest.approx(6, rel=0.05)
@@ -205,7 +203,7 @@ def test_short_waves_have_their_length_and_height() -> None:
 
 def test_a_curl_lifts_both_edges_and_shrinks_with_the_sheet() -> None:
     for page, height in (((1189.0, 841.0), 10.0), ((594.5, 420.5), 5.0)):
-        surface = Sheet.of_room(Room(waviness_mm=0, curl_mm=10), page, None)
+        surface = sheet_of(Room(waviness_mm=0, curl_mm=10), page, None)
         edges = surface.height(np.array([[0.0, 3.0], [page[0] / 2, 100.0], [page[0], 400.0]]))
         np.testing.assert_allclose(edges, [height, 0, height], atol=1e-9)
 

@@ -29,7 +29,7 @@ from sim.projectors.watching import (
     ask,
     picture_light,
 )
-from sim.world.room import Room
+from sim.world.world import Room
 from tests.drivers.display.x_servers import virtual_screen
 
 WHITE, RED = 0xFFFFFF, 0xFF0000

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
-from sim.spectral import known_sensitivities, parse_sensitivities, read_sensitivities
-from sim.world.room import WAVELENGTHS_NM, sensitivities
+from sim.spectral import WAVELENGTHS_NM, known_sensitivities, parse_sensitivities, read_sensitivities, sensitivities
 
 
 def document(step: float = 10, low: float = 390, high: float = 720, **changes: Any) -> dict[str, Any]:

@@ -19,10 +19,8 @@ from foundation.errors import ConfigurationError
 from sim.camera.film import WorldFilm
 from sim.world.disturbances import (
     KINDS,
-    OVERSCAN,
     AmbientStep,
     AnyDisturbance,
-    Blob,
     Bump,
     Defocus,
     Disturbances,
@@ -36,19 +34,14 @@ from sim.world.disturbances import (
     Reflection,
     ScrambledRows,
     SensorWarming,
-    Situation,
     StaleFile,
     ZeroedStrip,
     drawn,
-    moved,
-    moved_back,
-    projected_mm,
     read_disturbances,
 )
 from sim.world.rendering import Print
-from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
-from sim.world.world import World
+from sim.world.world import OVERSCAN, REFERENCE_EXPOSURE, Blob, Room, Situation, World, moved, moved_back, projected_mm
 from tests.sim.conftest import PAGE_MM
 
 RED, GREEN, GREY = Colour(255, 0, 0), Colour(0, 255, 0), Colour(128, 128, 128)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim.world.room import (
+from sim.spectral import (
     PaperName,
     ProfileName,
     ink_codes,
@@ -51,7 +51,7 @@ def test_managed_greys_are_neutral_and_rise(on: PaperName) -> None:
 
 @pytest.mark.parametrize("on", PAPERS)
 def test_unmanaged_greys_have_the_tint_that_measured_prints_have(on: PaperName) -> None:
-    # Papers printed without colour management (head of `sim.world.room`): the largest chroma is 5 to 14, but for one
+    # Papers printed without colour management (head of `sim.world.world`): the largest chroma is 5 to 14, but for one
     # printer, an Epson P800, whose driver balances its greys (1.3).
     lab = seen("unmanaged", on)
     assert 5 < np.hypot(lab[:, 1], lab[:, 2]).max() < 14

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from sim.world.room import (
+from sim.spectral import (
     SURFACE_REFLECTANCE,
     WAVELENGTHS_NM,
     LampSpectrum,
@@ -89,7 +89,7 @@ def bell(peak_nm: float, width_nm: float) -> dict[str, NDArray[np.float64]]:
     return {"wavelength_nm": wavelength, "power (median of 7 scans)": power}
 
 
-# Peaks and widths that `sim.world.room` documents of the measured primaries, and the curves where they are found.
+# Peaks and widths that `sim.world.world` documents of the measured primaries, and the curves where they are found.
 LED_PRIMARIES = {
     "red": (0, lambda: bell(632, 19)),
     "green": (1, lambda: bell(516, 34)),
@@ -133,7 +133,7 @@ def test_sensitivities_are_the_measured_ones() -> None:
 
 
 def documented_paper() -> dict[str, NDArray[np.float64]]:
-    """Return the values of measured photo paper that `sim.world.room` documents, in the layout of the whole."""
+    """Return the values of measured photo paper that `sim.world.world` documents, in the layout of the whole."""
     # Between 450 and 600 nm the white falls evenly; the inks are given as densities over white.
     white = np.array([0.64, 0.93, 0.882, 0.85])
     return {
@@ -170,7 +170,7 @@ def test_bare_paper_is_white_and_black_is_as_black_as_matte_paper_gets() -> None
 
 
 # CIELAB (D50, CIE 1931, ideal white) of solids that an Epson XP-960 printed without colour management, computed from
-# the measured spectra that the head of `sim.world.room` names.
+# the measured spectra that the head of `sim.world.world` names.
 SOLID_CODES = [[255] * 3, [0, 255, 255], [255, 0, 255], [255, 255, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255], [0] * 3]
 SOLID_LAB: dict[PaperName, list[list[int]]] = {
     "matt": [[96, 0, -1], [50, -27, -56], [50, 78, -11], [90, 1, 104], [49, 69, 51], [41, -56, 27], [22, 30, -50],
@@ -190,7 +190,7 @@ def test_solids_of_photo_papers_look_like_measured_ones(on: PaperName) -> None:
     assert np.mean(off) < 2.5
 
 
-# Density of the blackest print: 12 measured papers, 1.63 to 1.79 and 2.11 to 2.42 (head of `sim.world.room`); black
+# Density of the blackest print: 12 measured papers, 1.63 to 1.79 and 2.11 to 2.42 (head of `sim.world.world`); black
 # over white of the paper that was there before: 1.43.
 DENSITIES: dict[PaperName, tuple[float, float]] = {"poster": (1.4, 1.55), "matt": (1.6, 1.8), "glossy": (2.1, 2.42)}
 

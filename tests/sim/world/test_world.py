@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from sim.world.rendering import Print
-from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES, Body, Rectangle
-from sim.world.world import World
+from sim.world.world import REFERENCE_EXPOSURE, Room, World
 
 pytestmark = pytest.mark.slow
 
