@@ -30,6 +30,7 @@ illuminations = "illuminations.csv"
 response = false
 [sequence]
 reference_every = 2
+warm_up_s = 0
 [simulated]
 body = "Test"
 seed = 7
