@@ -157,7 +157,11 @@ def rendered_once() -> Generator[None]:
         # Light that is added, the wheel and hot photosites come with the exposure.
         room = replace(self.room, ambient=0.0, black_leak=0.0, hot_per_million=0.0, wheel_hz=0.0)
         drawn = hashlib.sha256(sheet.rectangles_mm.tobytes() + sheet.rgb.tobytes()).digest()
-        key = (type(self), self.body, room, self.stain, self.fold, sheet.page_mm, drawn, situation.view)
+        # A test may put stain, fold or camera elsewhere than the room says.
+        view = self.view
+        seen = (view.rotation.tobytes(), view.distance_mm, view.focal_px, view.centre_px, view.distortion)
+        worn = (self.stain, self.fold)
+        key = (type(self), self.body, room, worn, seen, sheet.page_mm, drawn, situation.view)
         # The one that was asked for last is the last to go.
         _rendered[key] = found = _rendered.pop(key, None) or render(self, situation)
         for array in found:
