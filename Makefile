@@ -11,9 +11,10 @@ READY := $(VENV)/.ready
 REST := \# What follows is for work on the repository.
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 DEMO := build/demo
+THREADS := 2
 ROOMS := foundation drivers sim experiment calibration acquisition synthesis generator evaluation
 
-.PHONY: install demo test quick lint docs bench full-session lock clean
+.PHONY: install demo test suite quick lint docs bench full-session lock clean
 
 # The first part of the lock: what a plain installation has, and the photographs of the demo.
 $(DEMO_READY): requirements.lock pyproject.toml
@@ -50,7 +51,11 @@ demo: $(DEMO_READY)
 	@echo "How the table was measured:                 $(CURDIR)/$(DEMO)/lut/report.html"
 	@echo "Look at this first:                         $(CURDIR)/$(DEMO)/contact_sheet.png"
 
-test: $(READY) lint
+# Lint runs beside the tests, which wait for programs and servers now and then; by one thread, which takes less in all.
+test: $(READY)
+	$(MAKE) --no-print-directory --jobs 2 --output-sync=line THREADS=1 lint suite
+
+suite: $(READY)
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
 # What most mistakes are caught by: every test function that takes no longer than a quarter of a second.
@@ -61,7 +66,7 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	$(BIN)/basedpyright --threads 2
+	$(BIN)/basedpyright --threads $(THREADS)
 
 # The site: tutorial, how-to, reference from the docstrings, explanation; a warning is an error. Needs no network.
 docs: $(READY)

@@ -164,15 +164,26 @@ def _covariance(bits: int) -> _Array:
 
 def _left_by_others(root: _Array, usable: _Mask, bits: int) -> tuple[_Array, _Array]:
     """Return the matrix (C, C) by which roots of levels (C,) become what the function leaves, and their variance."""
+    return _left_of(root.tobytes(), usable.tobytes(), bits)
+
+
+@lru_cache(maxsize=6)
+def _left_of(roots: bytes, usables: bytes, bits: int) -> tuple[_Array, _Array]:
+    """Return `_left_by_others`, not to be written; three channels are asked for again between others of their own."""
+    root, usable = np.frombuffer(roots), np.frombuffer(usables, dtype=np.bool_)
     function = _covariance(bits)
     noise = (1 + _DARK / np.maximum(root, 0.1) ** 2) * np.where(usable, 1.0, _UNKNOWN)
     inverse, share = _likeliest(function, noise, root)
     own = np.diag(inverse)
     left = inverse @ root
     size = float(np.sqrt(np.mean(left[usable] ** 2 / own[usable])))
-    noise = np.where(np.abs(left) > _OUTLIER * size * np.sqrt(own), _UNKNOWN, noise)
-    inverse, share = _likeliest(function, noise, root, share)
-    return share**2 * noise[:, None] * inverse, noise
+    outliers = np.abs(left) > _OUTLIER * size * np.sqrt(own)
+    if outliers.any():
+        noise = np.where(outliers, _UNKNOWN, noise)
+        inverse, share = _likeliest(function, noise, root, share)
+    matrix = share**2 * noise[:, None] * inverse
+    matrix.flags.writeable = noise.flags.writeable = False
+    return matrix, noise
 
 
 def _likeliest(function: _Array, noise: _Array, root: _Array, *shares: float) -> tuple[_Array, float]:
@@ -182,12 +193,14 @@ def _likeliest(function: _Array, noise: _Array, root: _Array, *shares: float) ->
     found: list[tuple[float, float, _Array]] = []
     for share in shares or _NOISES:
         # Symmetric, and so in LAPACK's order as well.
-        covariance = (function + np.diag(share**2 * noise)).T
+        covariance = function.T.copy(order="F")
+        covariance[np.diag_indices_from(covariance)] += share**2 * noise
         factor: _Array = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
         inner = solve_triangular(factor, root, lower=True, check_finite=False)
         size = float(inner @ inner) / len(root)
         found.append((0.5 * len(root) * np.log(size) + float(np.log(np.diag(factor)).sum()), share, factor))
     _, share, factor = min(found, key=lambda one: one[:2])
-    # LAPACK inverts what it factored in a fourth of the time of a general solution, one triangle of it.
-    lower = np.tril(lapack.dpotri(factor, lower=1)[0])
-    return lower + np.tril(lower, -1).T, share
+    # LAPACK inverts what it factored in a fourth of the time of a general solution, one triangle of it; the other is 0.
+    inverse: _Array = lapack.dpotri(factor, lower=1)[0]
+    inverse += np.tril(inverse, -1).T
+    return inverse, share

@@ -17,11 +17,13 @@ their path leaves it, and slide along its surface: neighbours stay neighbours.
 
 from __future__ import annotations
 
-from typing import Final
+import math
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from foundation.compiled import compiled
 from generator.kernels.choice import channels_of
 
 _Array = npt.NDArray[np.float64]
@@ -31,6 +33,9 @@ STEPS: Final = 8
 
 _ROUNDS: Final = 12
 """Levenberg-Marquardt steps at each step of a path; inside the gamut four are enough."""
+
+_STRIDE: Final = 4.0
+"""Cells that one of these steps goes at most, along each axis."""
 
 BRIGHTNESS_COST: Final = 0.5
 """What a relative difference of brightness counts against one of chromaticity. Chosen: see
@@ -65,26 +70,87 @@ def corners(places: _Array, bits: int) -> tuple[npt.NDArray[np.int64], _Array]:
     return cells, weights
 
 
-def _seen(colours: _Array, places: _Array, bits: int) -> tuple[_Array, _Array]:
-    """Return log R (K, 3) at places (K, 3), and its derivatives by the place (K, 3 channels, 3 codes).
+@compiled
+def _look(colours: Any, place: Any, target: Any, side: Any, scale: Any, miss: Any, jacobian: Any) -> Any:
+    """Put S (log R(p) - log t) into `miss` (3,) and its derivatives by p into `jacobian` (3, 3); return its square."""
+    low_r = min(max(math.floor(place[0]), 0), side - 2)
+    low_g = min(max(math.floor(place[1]), 0), side - 2)
+    low_b = min(max(math.floor(place[2]), 0), side - 2)
+    red, green, blue = place[0] - low_r, place[1] - low_g, place[2] - low_b
+    first = (low_r * side + low_g) * side + low_b
+    miss[:], jacobian[:] = 0.0, 0.0
+    for channel in range(3):
+        seen, by_red, by_green, by_blue = 0.0, 0.0, 0.0, 0.0
+        for corner in range(8):
+            up_r, up_g, up_b = corner >> 2, corner >> 1 & 1, corner & 1
+            colour = colours[first + (up_r * side + up_g) * side + up_b, channel]
+            part_r, part_g, part_b = (
+                red if up_r else 1 - red,
+                green if up_g else 1 - green,
+                blue if up_b else 1 - blue,
+            )
+            seen += part_r * part_g * part_b * colour
+            by_red += (2 * up_r - 1) * part_g * part_b * colour
+            by_green += (2 * up_g - 1) * part_r * part_b * colour
+            by_blue += (2 * up_b - 1) * part_r * part_g * colour
+        for axis in range(3):
+            miss[axis] += scale[axis, channel] * (math.log(seen) - target[channel])
+            jacobian[axis, 0] += scale[axis, channel] * by_red / seen
+            jacobian[axis, 1] += scale[axis, channel] * by_green / seen
+            jacobian[axis, 2] += scale[axis, channel] * by_blue / seen
+    return miss[0] ** 2 + miss[1] ** 2 + miss[2] ** 2
 
-    `colours`: (8**bits, 3) float64 > 0.
-    """
-    cells, weights = corners(places, bits)
-    around = colours[cells]
-    seen = np.einsum("kc,kcx->kx", weights, around)
-    part = places - np.clip(np.floor(places), 0, (1 << bits) - 2)
-    cube = around.reshape(-1, 2, 2, 2, 3)
-    red, green, blue = (np.stack([1 - part[:, channel], part[:, channel]], axis=1) for channel in range(3))
-    slopes = np.stack(
-        [
-            np.einsum("kj,kl,kjlx->kx", green, blue, cube[:, 1] - cube[:, 0]),
-            np.einsum("ki,kl,kilx->kx", red, blue, cube[:, :, 1] - cube[:, :, 0]),
-            np.einsum("ki,kj,kijx->kx", red, green, cube[:, :, :, 1] - cube[:, :, :, 0]),
-        ],
-        axis=2,
-    )
-    return np.log(seen), slopes / seen[:, :, None]
+
+@compiled
+def _descend(colours: Any, targets: Any, places: Any, side: Any, scale: Any, rounds: Any, costs: Any) -> None:
+    """Move places (K, 3) to where log R comes nearest to `targets` (K, 3), and put what is missed into `costs` (K,)."""
+    top = side - 1.0
+    miss, missed, jacobian, derived = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    gradient, tried, normal, held = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3, np.bool_)
+    for k in range(len(places)):
+        place, damping = places[k], 1e-3
+        cost = _look(colours, place, targets[k], side, scale, miss, jacobian)
+        for _ in range(rounds):
+            largest = 0.0
+            for p in range(3):
+                gradient[p] = jacobian[0, p] * miss[0] + jacobian[1, p] * miss[1] + jacobian[2, p] * miss[2]
+                held[p] = (place[p] <= 0 and gradient[p] > 0) or (place[p] >= top and gradient[p] < 0)
+            for p in range(3):
+                for q in range(3):
+                    normal[p, q] = 0.0
+                    if not (held[p] or held[q]):
+                        for axis in range(3):
+                            normal[p, q] += jacobian[axis, p] * jacobian[axis, q]
+                largest = max(largest, normal[p, p])
+            for p in range(3):
+                normal[p, p] += damping * (normal[p, p] + 1e-3 * (largest + 1e-12))
+                if held[p]:
+                    normal[p, p] += largest + 1e-12
+                    gradient[p] = 0.0
+            # Cholesky's factor, in the lower triangle, and both substitutions.
+            for p in range(3):
+                for q in range(p + 1):
+                    for r in range(q):
+                        normal[p, q] -= normal[p, r] * normal[q, r]
+                    normal[p, q] = math.sqrt(normal[p, p]) if p == q else normal[p, q] / normal[q, q]
+            for p in range(3):
+                tried[p] = -gradient[p]
+                for r in range(p):
+                    tried[p] -= normal[p, r] * tried[r]
+                tried[p] /= normal[p, p]
+            for p in range(2, -1, -1):
+                for r in range(p + 1, 3):
+                    tried[p] -= normal[r, p] * tried[r]
+                tried[p] /= normal[p, p]
+            for p in range(3):
+                tried[p] = min(max(place[p] + min(max(tried[p], -_STRIDE), _STRIDE), 0.0), top)
+            new = _look(colours, tried, targets[k], side, scale, missed, derived)
+            if new < cost:
+                place[:], miss[:], jacobian[:], cost = tried, missed, derived, new
+                damping *= 0.3
+            else:
+                damping *= 8.0
+        costs[k] = cost
 
 
 def nearest_to(colours: _Array, wanted: _Array, start: _Array, bits: int) -> _Array:
@@ -92,36 +158,15 @@ def nearest_to(colours: _Array, wanted: _Array, start: _Array, bits: int) -> _Ar
 
     `colours`: (8**bits, 3) float64 > 0, what the camera sees of the cells. `wanted`: (K, 3) float64 > 0.
     """
-    top = float((1 << bits) - 1)
-    target = np.log(wanted)
-    places, damping = start.copy(), np.full(len(start), 1e-3)
-    logs, slopes = _seen(colours, places, bits)
-    miss = (logs - target) @ _SCALE.T
-    cost = (miss**2).sum(axis=1)
-    for _ in range(_ROUNDS):
-        jacobian = np.einsum("ac,kcp->kap", _SCALE, slopes)
-        gradient = np.einsum("kap,ka->kp", jacobian, miss)
-        held = ((places <= 0) & (gradient > 0)) | ((places >= top) & (gradient < 0))
-        jacobian = np.where(held[:, None, :], 0.0, jacobian)
-        normal = np.einsum("kap,kaq->kpq", jacobian, jacobian)
-        diagonal = np.einsum("kpp->kp", normal)
-        scale = diagonal.max(axis=1, keepdims=True) + 1e-12
-        normal[:, range(3), range(3)] += damping[:, None] * (diagonal + 1e-3 * scale) + np.where(held, scale, 0.0)
-        towards = np.where(held, 0.0, -gradient)[..., None]
-        step = np.asarray(np.linalg.solve(normal, towards), np.float64)[..., 0]
-        tried: _Array = np.clip(places + np.clip(step, -4.0, 4.0), 0.0, top)
-        logs, derived = _seen(colours, tried, bits)
-        missed = (logs - target) @ _SCALE.T
-        new = (missed**2).sum(axis=1)
-        better = new < cost
-        places[better], miss[better], slopes[better], cost[better] = (
-            tried[better],
-            missed[better],
-            derived[better],
-            new[better],
-        )
-        damping = np.where(better, damping * 0.3, damping * 8.0)
-    return places
+    return _nearest_to(colours, wanted, start, bits)[0]
+
+
+def _nearest_to(colours: _Array, wanted: _Array, start: _Array, bits: int) -> tuple[_Array, _Array]:
+    """Return `nearest_to`, and by how much (K,) colours are missed there."""
+    places, costs = np.array(start, np.float64), np.empty(len(start))
+    given = np.array(colours, np.float64), np.log(np.array(wanted, np.float64))
+    _descend(*given, places, 1 << bits, _SCALE, _ROUNDS, costs)
+    return places, costs
 
 
 def invert(colours: _Array, greys: _Array, wanted: _Array, bits: int) -> _Array:
@@ -145,17 +190,14 @@ def _grey_places(colours: _Array, levels: _Array, bits: int) -> _Array:
     top = (1 << bits) - 1
     wanted = np.repeat(levels[:, None], 3, axis=1)
     logs = np.log(colours) @ _SCALE.T
-    start = np.empty((len(levels), 3))
-    for row, target in enumerate(np.log(wanted) @ _SCALE.T):
-        cell = int(((logs - target) ** 2).sum(axis=1).argmin())
-        start[row] = channels_of(cell, bits)
+    nearest = [((logs - target) ** 2).sum(axis=1).argmin() for target in np.log(wanted) @ _SCALE.T]
     # On a chart of few cells the nearest may lie beside the grey axis, at a kink of its own: two starts, the better.
-    found = [nearest_to(colours, wanted, start, bits)]
+    starts = [channels_of(nearest, bits).astype(np.float64)]
     brightness = np.maximum.accumulate(np.sort(colours.mean(axis=1)[_diagonal(bits)]))
     along = np.interp(levels, brightness, np.linspace(0, top, len(brightness)))
-    found.append(nearest_to(colours, wanted, np.repeat(along[:, None], 3, axis=1), bits))
-    costs = [(((_seen(colours, places, bits)[0] - np.log(wanted)) @ _SCALE.T) ** 2).sum(axis=1) for places in found]
-    return np.where((costs[1] <= costs[0])[:, None], found[1], found[0])
+    starts.append(np.repeat(along[:, None], 3, axis=1))
+    (one, missed), (other, missed_there) = (_nearest_to(colours, wanted, start, bits) for start in starts)
+    return np.where((missed_there <= missed)[:, None], other, one)
 
 
 def _diagonal(bits: int) -> npt.NDArray[np.int64]:

@@ -1,5 +1,6 @@
 """The charts and lights of the experiment's tests are the acquisition's as well."""
 
+from tests.calibration.lab import rendered_once
 from tests.experiment.conftest import a0, a7, plan
 
-__all__ = ["a0", "a7", "plan"]
+__all__ = ["a0", "a7", "plan", "rendered_once"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
@@ -29,6 +30,7 @@ from experiment.lights import Illumination, plan_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, SessionStep
 from sim.camera.film import write_dng
+from sim.world.disturbances import Situation
 from sim.world.rendering import Print
 from sim.world.sensors import BODIES
 from sim.world.world import Room, World
@@ -134,6 +136,41 @@ def blank_pictures() -> Generator[None]:
     with pytest.MonkeyPatch.context() as patched:
         for page in ("calibration.report.report", "calibration.comparison.report"):
             patched.setattr(f"{page}.png_of", blank)
+        yield
+
+
+RENDERED_BYTES = 100_000_000
+"""Of renderings that are kept: sixteen of the Test body."""
+
+Rendering = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+_rendered: dict[tuple[object, ...], Rendering] = {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def rendered_once() -> Generator[None]:
+    """Render worlds that are equal once a process: the same charts hang in the same rooms in hundreds of tests."""
+    render = World._lit  # pyright: ignore[reportPrivateUsage]
+
+    def kept(self: World, situation: Situation) -> Rendering:
+        sheet = self.sheet
+        # Light that is added, the wheel and hot photosites come with the exposure.
+        room = replace(self.room, ambient=0.0, black_leak=0.0, hot_per_million=0.0, wheel_hz=0.0)
+        drawn = hashlib.sha256(sheet.rectangles_mm.tobytes() + sheet.rgb.tobytes()).digest()
+        # A test may put stain, fold or camera elsewhere than the room says.
+        view = self.view
+        seen = (view.rotation.tobytes(), view.distance_mm, view.focal_px, view.centre_px, view.distortion)
+        worn = (self.stain, self.fold)
+        key = (type(self), self.body, room, worn, seen, sheet.page_mm, drawn, situation.view)
+        # The one that was asked for last is the last to go.
+        _rendered[key] = found = _rendered.pop(key, None) or render(self, situation)
+        for array in found:
+            array.flags.writeable = False
+        while sum(light.nbytes for light, _ in _rendered.values()) > RENDERED_BYTES:
+            del _rendered[next(iter(_rendered))]
+        return found
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(World, "_lit", kept)
         yield
 
 

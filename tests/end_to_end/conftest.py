@@ -14,6 +14,9 @@ from acquisition.cli import main
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination, save_illuminations
+from tests.calibration.lab import rendered_once
+
+__all__ = ["frame_hashes", "lab", "rendered_once", "session", "undisturbed"]
 
 LIGHTS = (
     Illumination(0, "uniform", None, Colour(255, 0, 0)),
@@ -30,6 +33,7 @@ illuminations = "illuminations.csv"
 response = false
 [sequence]
 reference_every = 2
+warm_up_s = 0
 [simulated]
 body = "Test"
 seed = 7

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.cases import BY_NAME, CASES, FAILURES, Outcome, chart_of, outcome_of, try_case
+from benchmarks.cases import BY_NAME, CASES, FAILURES, Outcome, chart_of, try_case
 from benchmarks.rooms import calm_case, is_silent, natural_vignetting, random_case
 from benchmarks.sessions import (
     AS_PLANNED,
@@ -41,8 +41,10 @@ TRIED_ELSEWHERE = {
     "other-print", "bump",
     # tests/calibration/pipeline/test_stray_light.py
     "leak",
+    # tests/calibration/pipeline/test_held_against_itself.py, test_print_and_sensor.py; tests/calibration/registration
+    "nothing-wrong", "hot-photosites", "upside-down",
     # Here, both at once, and in tests/calibration/spread/test_spread.py
-    "mild-shoulders", "veil",
+    "mild-shoulders", "strong-shoulders", "veil",
 }  # fmt: skip
 """Cases whose session has a sharper test of its own, of the same size; `benchmarks.rooms --case all` tries all."""
 
@@ -108,17 +110,6 @@ def test_every_case_changes_the_room_the_plan_or_a_frame(world: World) -> None:
         changes = case.changes(world, chart_of(small=True), lights)
         changed = any(changes(step) != AS_PLANNED for step in plan_steps(lights, case.every))
         assert changed or case.room or len(lights) < len(EIGHT_LIGHTS), case.name
-
-
-def test_exchanged_files_are_wrong_by_the_truth(world: World, tmp_path: Path) -> None:
-    """Whatever the verdict: the table of red and blue exchanged has lights that are nowhere near."""
-    chart, lights = chart_of(small=True), short_plan()
-    changes = BY_NAME["red-blue"].changes(world, chart, lights)
-    with short_session(tmp_path / "exchanged", chart, world, changes, lights) as session:
-        found = outcome_of(session, tmp_path / "lut", world, chart, changes)
-    if found.truth is not None:
-        assert found.is_wrong
-        assert found.truth.light_deg[[0, 2]].min() > 30
 
 
 def test_words_are_found_whatever_their_case() -> None:

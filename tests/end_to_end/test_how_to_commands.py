@@ -26,7 +26,7 @@ HOW_TO = "docs/how-to/"
 ELSEWHERE = {"rehearsal.md"}
 """Pages whose commands have a test of their own."""
 
-LAB = 'rig = "simulated"\nchart = "chart/chart.json"\nilluminations = "illuminations.csv"\n'
+LAB = 'rig = "simulated"\nchart = "chart/chart.json"\nilluminations = "illuminations.csv"\n[sequence]\nwarm_up_s = 0\n'
 SIMULATED = '[simulated]\nbody = "Test"\nseed = 11\n'
 _REAL = (
     "takes the real data set of the page, which is downloaded from its makers; tests/evaluation/commands has it made up"

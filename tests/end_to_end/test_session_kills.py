@@ -1,4 +1,4 @@
-"""Thirty runs killed at random operations and times; `python -m benchmarks.session_kills` kills ten thousand."""
+"""Twenty runs killed at random operations and times; `python -m benchmarks.session_kills` kills ten thousand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.session_kills import KilledSessions
 
-KILLS = 30
+KILLS = 20
 
 pytestmark = [
     pytest.mark.slow,

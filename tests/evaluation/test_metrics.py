@@ -30,6 +30,7 @@ def test_reproduction_is_the_angle_of_the_corrected_white() -> None:
     assert reproduction_error([0, 1, 1], [1, 1, 1]) == pytest.approx(math.degrees(math.acos(1 / math.sqrt(3))))
 
 
+@pytest.mark.slow
 @given(lights, lights, st.floats(0.001, 1000))
 def test_brightness_does_not_matter(estimate: tuple[float, ...], truth: tuple[float, ...], scale: float) -> None:
     for error in (recovery_error, reproduction_error):

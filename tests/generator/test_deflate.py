@@ -193,6 +193,7 @@ def test_codes_are_complete_and_begin_no_other(counts: list[int]) -> None:
     assert not any(after.startswith(before) for before, after in pairwise(ordered))
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(st.lists(st.integers(1, 60), min_size=2, max_size=40))
 def test_codes_are_the_shortest(counts: list[int]) -> None:

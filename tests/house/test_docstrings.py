@@ -230,6 +230,7 @@ def test_a_reason_is_seen(source: str, reasoned: bool) -> None:
     assert all(found) is reasoned
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", PACKAGES)
 def test_public_array_functions_state_shape_and_dtype(package: str) -> None:
     assert without_shape(package) == []

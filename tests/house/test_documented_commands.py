@@ -91,6 +91,7 @@ def test_commands_are_found() -> None:
     assert len(FOUND) >= 60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "words"), FOUND, ids=[f"{page}: {' '.join(words)[:80]}" for page, words in FOUND])
 def test_a_documented_command_is_taken(page: str, words: list[str]) -> None:
     try:

@@ -81,6 +81,7 @@ def made_with(shape: Shape) -> set[str]:
     return known
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", PACKAGES)
 def test_no_attribute_appears_after_its_object_was_made(package: str) -> None:
     late = [

@@ -46,6 +46,7 @@ def test_serves_a_projector_until_interrupted() -> None:
     assert err == ""
 
 
+@pytest.mark.slow
 def test_is_found_and_announces_itself() -> None:
     with (
         NoticePort(0, "127.0.0.1") as controller,

@@ -33,7 +33,7 @@ def lab_toml(chart: str, camera: str = "", more: str = "", seed: int = 1, **room
     told = "".join(f"{key} = {json.dumps(value)}\n" for key, value in room.items())
     return (
         f'rig = "simulated"\nchart = "{chart}"\nilluminations = "illuminations.csv"\n[camera]\n{camera}\n{more}\n'
-        f'[simulated]\nbody = "Test"\nseed = {seed}\n[simulated.room]\n{told}'
+        f'[sequence]\nwarm_up_s = 0\n[simulated]\nbody = "Test"\nseed = {seed}\n[simulated.room]\n{told}'
     )
 
 

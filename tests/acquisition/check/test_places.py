@@ -74,6 +74,7 @@ def test_a_shift_that_its_neighbours_do_not_share_is_theirs() -> None:
     np.testing.assert_array_equal(settled(found, np.zeros_like(good)), 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bits", "page", "window"), [(3, "A5", 5), (2, "A7", 9)])
 def test_the_window_is_half_of_the_smallest_patch(bits: int, page: str, window: int, tmp_path: Path) -> None:
     lab = hang(bits, page)

@@ -315,6 +315,7 @@ def test_a_complete_session_whose_files_go_is_complete_no_more(
     assert read_session(folder).head(lab.clock.now()).done == len(lab.session.steps) - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["chart.json", "illuminations.csv"])
 @pytest.mark.parametrize("mishap", [Path.unlink, lambda path: os.truncate(path, 9)])  # type: ignore[misc]
 def test_a_complete_session_without_its_chart_or_lights_says_what_is_lost(

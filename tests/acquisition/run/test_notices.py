@@ -180,6 +180,7 @@ class TestCommand:
         expected = [f"{label} could not be told: {why}; the run goes on without"] if why else []
         assert told(target, "paused", "resumed") == expected
 
+    @pytest.mark.slow
     def test_one_that_hangs_is_ended_with_what_it_started(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -167,6 +167,7 @@ class TestRefusals:
         assert lab.projector.power() is Power.COOLING, "nobody may be there: `sequence.lamp_if_unfinished`"
         assert run(lab, ScriptedJudge()).complete
 
+    @pytest.mark.slow
     def test_what_was_measured_of_earlier_frames_is_recalled(self, folder: Path) -> None:
         lab = Lab(folder)
         run(lab, ScriptedJudge({3: refused("another light"), 5: refused("again"), 7: refused("again")}))

@@ -334,6 +334,7 @@ def test_one_back_off_holds_across_pauses() -> None:
     assert waited[-1] >= LONGEST_BACK_OFF_S
 
 
+@pytest.mark.slow
 def test_a_full_disk_never_loses_the_frame_in_the_camera(tmp_path: Path) -> None:
     """The real driver, and a kernel that lets no file grow: the download is repeated when there is space again."""
     resource = pytest.importorskip("resource")

@@ -19,7 +19,7 @@ from experiment.framing.field import field_mm
 from experiment.lights import Illumination
 from experiment.session.records import ACCEPTED, SessionStep
 from sim.world.world import Room
-from tests.calibration.lab import LIGHTS, SETTINGS, Lab, figures_alone, hang_chart, renumbered, take
+from tests.calibration.lab import LIGHTS, SETTINGS, Lab, blank_pictures, figures_alone, hang_chart, renumbered, take
 
 pytestmark = pytest.mark.slow
 
@@ -63,7 +63,7 @@ def test_a_bump_is_followed_and_reported(plain: Lab, tmp_path: Path, by: tuple[f
     def frame(step: SessionStep) -> bytes:
         return (bumped if step.number >= 4 else plain).dng(step.colour, step.number)
 
-    with take(plain, tmp_path / "session", lights, frame=frame) as session:
+    with take(plain, tmp_path / "session", lights, frame=frame) as session, blank_pictures():
         result = build(session, tmp_path / "lut", report=write_report if anew else None)
     assert [figures.record.illumination for figures in result.figures.frames if figures.reregistered] == anew
     first = next(figures for figures in result.figures.frames if figures.record.illumination == 2)

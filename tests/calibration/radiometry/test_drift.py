@@ -82,6 +82,7 @@ def test_every_count_comes_back_exactly(gain: list[float], seed: int) -> None:
     assert np.array_equal(as_measured(corrected(counts, stored), stored), counts)
 
 
+@pytest.mark.slow
 def test_every_count_of_a_camera_comes_back_at_awkward_gains() -> None:
     counts = np.arange(16384, dtype=np.uint16)[:, None, None] * np.ones((1, 25, 3), dtype=np.uint16)
     for gain in (0.5, 0.666667, 0.999999, 0.9, 0.75, 1.0):

@@ -249,6 +249,7 @@ def test_what_a_store_claims_has_to_fit_together(lut: Lut, tmp_path: Path, chang
     assert [path.name for path in tmp_path.iterdir() if path.name not in ("lut", "published")] == []
 
 
+@pytest.mark.slow
 def test_claimed_lights_do_not_fill_the_disk(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     publish(lut, str(tmp_path / "published"))
 

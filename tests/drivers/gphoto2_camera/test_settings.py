@@ -214,6 +214,7 @@ def test_labels_that_mean_the_same() -> None:
     assert not is_same("Bulb", "30")
 
 
+@pytest.mark.slow
 @given(st.text(max_size=30))
 def test_any_label_is_a_number_or_none(label: str) -> None:
     number = number_of(label)
@@ -339,6 +340,7 @@ print(json.dumps(said))
 """
 
 
+@pytest.mark.slow
 def test_libgphoto2s_virtual_camera(tmp_path: Path) -> None:
     pytest.importorskip("gphoto2", reason="the extra `gphoto2` is not installed")
     (tmp_path / "IMG_0001.JPG").write_bytes(b"\xff\xd8\xff\xd9")

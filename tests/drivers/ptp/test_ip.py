@@ -394,6 +394,7 @@ def test_a_stranger_in_the_middle_of_a_transaction_is_refused() -> None:
         transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S)
 
 
+@pytest.mark.slow
 def test_a_second_initiator_hears_that_the_device_is_busy() -> None:
     with serve_ptpip(Echo(), 0) as server:
         first = IpTransport.connect(*server.address, guid=GUID, name="CroP", clock=SystemClock())

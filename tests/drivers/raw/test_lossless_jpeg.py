@@ -32,6 +32,7 @@ def by_imagecodecs(counts: Counts) -> bytes:
     return bytes(imagecodecs.ljpeg_encode(counts, bitspersample=14))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encode", [lossless_jpeg, by_imagecodecs])
 @pytest.mark.parametrize("counts", [NOISE, RAMP, FLAT], ids=["noise", "ramp", "flat"])
 def test_whole_streams_are_whole(counts: Counts, encode: Callable[[Counts], bytes]) -> None:

@@ -10,6 +10,7 @@ import pytest
 from evaluation.cli import main
 
 
+@pytest.mark.slow
 def test_a_family_is_tuned_and_its_setting_evaluated(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = dataset.parent / "settings.csv"
     assert main(["tune", "shades-of-gray", str(dataset), "--out", str(out)]) == 0
@@ -30,6 +31,7 @@ def test_a_family_is_tuned_and_its_setting_evaluated(dataset: Path, capsys: pyte
     assert str(out) in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_errors_stand_beside(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = dataset.parent / "settings.csv"
     assert main(["tune", "gray-edge-1@48", str(dataset), "--errors", "recovery", "--out", str(out)]) == 0

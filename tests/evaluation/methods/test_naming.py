@@ -63,6 +63,7 @@ def test_a_class_of_a_module() -> None:
     assert find_method("evaluation.methods.pca:BrightDark").name == "PCA bright and dark"
 
 
+@pytest.mark.slow
 def test_parameters_in_a_name() -> None:
     assert find_method("gray-edge-1:sigma=2.5") == GrayEdge("1st-order Gray-Edge (p=1, σ=2.5)", 1, 1, 2.5)
     assert find_method("gray-edge-1:sigma=2:p=4") == find_method("gray-edge-1:p=4:sigma=2")

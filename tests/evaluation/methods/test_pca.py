@@ -14,6 +14,7 @@ from evaluation.metrics import recovery_error
 LIGHT = np.array([0.5, 1.0, 0.7])
 
 
+@pytest.mark.slow
 def test_bright_and_dark_pixels_alone_decide() -> None:
     image = np.random.default_rng(1).uniform(400, 600, (50, 50, 3))
     image[:2] = 2000 * LIGHT

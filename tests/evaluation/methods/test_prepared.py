@@ -43,6 +43,7 @@ def test_an_image_that_is_no_larger_is_left_as_it_is() -> None:
     assert PreparedImage(image).at_most(49) is not PreparedImage(image).at_most(50)
 
 
+@pytest.mark.slow
 def test_independent_noise_misleads_second_derivatives_until_it_is_averaged_away() -> None:
     # Grey things under a warm light, and noise that knows nothing of the light: half of what is bright in blue.
     light, random = np.array([1.0, 0.8, 0.3]), np.random.default_rng(0)

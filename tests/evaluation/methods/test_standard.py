@@ -57,6 +57,7 @@ def test_every_method_finds_the_light_on_grey_things(name: str) -> None:
     assert np.linalg.norm(estimate) == pytest.approx(1)
 
 
+@pytest.mark.slow
 @every_method
 def test_masked_and_saturated_pixels_do_not_matter(name: str) -> None:
     image = grey_scene()
@@ -141,6 +142,7 @@ def test_an_image_of_any_layout_gives_the_same_twice_and_is_left_as_it_is(name: 
     assert np.array_equal(image, kept)
 
 
+@pytest.mark.slow
 @every_method
 def test_shared_parts_change_no_estimate(name: str) -> None:
     image, methods = colourful_scene().astype(np.uint16), standard_methods()

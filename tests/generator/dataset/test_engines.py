@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import shutil
-import signal
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,12 +21,10 @@ from generator.pictures.sources import find_pictures, random_scenes
 pytestmark = pytest.mark.slow
 
 if TYPE_CHECKING:
-    from distributed import LocalCluster
-
     from calibration.table.lut import Lut
 
-IMAGES = 240
-SHARD = 12
+IMAGES = 96
+SHARD = 8
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -40,7 +36,7 @@ def contents(folder: Path) -> dict[str, str]:
     }
 
 
-def make(lut: Lut, out: Path, engine: str, workers: int, on_image: Callable[[], None] | None = None) -> None:
+def make(lut: Lut, out: Path, engine: str, workers: int, callbacks: Callbacks = SILENT) -> None:
     scenes = random_scenes(IMAGES // 2, 24, 16, 4)
     lights = RandomLights(2, 4, 4)
     generate_dataset(
@@ -51,7 +47,7 @@ def make(lut: Lut, out: Path, engine: str, workers: int, on_image: Callable[[], 
         seed=4,
         options=DatasetOptions(previews=False, shard_images=SHARD, split=(0.8, 0.1, 0.1)),
         workers=Workers(engine, workers),
-        callbacks=SILENT if on_image is None else Callbacks(on_image=on_image),
+        callbacks=callbacks,
     )
 
 
@@ -79,112 +75,53 @@ def test_a_killed_worker_changes_no_byte(undisturbed: tuple[Lut, dict[str, str]]
             victim.kill()
             killed.append(victim.pid)
 
-    make(lut, tmp_path / "out", "dask", 2, kill_one)
+    make(lut, tmp_path / "out", "dask", 2, Callbacks(on_image=kill_one))
     assert len(killed) == 1
     assert contents(tmp_path / "out") == expected
     assert not list(tmp_path.glob(".out*"))
 
 
-PROGRAM = """
-import os, signal, sys
-from pathlib import Path
-sys.path.insert(0, {tests!r})
-from calibration.table.lut import open_lut
-from test_engines import make
-
-if __name__ == "__main__":
-    seen = iter(range({images}))
-    make(
-        open_lut(Path({lut!r})), Path({out!r}), {engine!r}, 2,
-        lambda: None if next(seen, None) is not None else os.kill(os.getpid(), signal.SIGKILL),
-    )
-"""
-
-
-@pytest.mark.parametrize("engine", ["local", "dask"])
-def test_a_killed_program_is_gone_on_with(undisturbed: tuple[Lut, dict[str, str]], tmp_path: Path, engine: str) -> None:
-    lut, expected = undisturbed
-    program = PROGRAM.format(
-        tests=str(Path(__file__).parent),
-        images=3 * SHARD,
-        lut=str(lut.folder),
-        out=str(tmp_path / "out"),
-        engine=engine,
-    )
-    (tmp_path / "program.py").write_text(program)
-    died = subprocess.run([sys.executable, tmp_path / "program.py"], capture_output=True, text=True, check=False)
-    assert died.returncode == -signal.SIGKILL, died.stderr
-    done = len(list((tmp_path / ".out.partial" / "plan" / "shards").glob("*.json")))
-    assert 0 < done < IMAGES // SHARD
-    made: list[None] = []
-    make(lut, tmp_path / "out", "local", 2, lambda: made.append(None))
-    assert len(made) <= IMAGES - SHARD * done, "what was done is not done again"
-    assert contents(tmp_path / "out") == expected
-    assert not list(tmp_path.glob(".out*"))
-
-
-@pytest.fixture
-def cluster(request: pytest.FixtureRequest) -> Iterator[LocalCluster]:
-    """Return a cluster that is somebody else's, of one process, or of as many as are asked for."""
-    import logging
-
+def test_a_cluster_of_somebody_else_s(
+    undisturbed: tuple[Lut, dict[str, str]],
+    make_lut: Callable[..., Lut],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     from distributed import LocalCluster
 
+    lut, expected = undisturbed
     with LocalCluster(
-        n_workers=getattr(request, "param", 1),
+        n_workers=0,
         threads_per_worker=2,
         host="127.0.0.1",
         dashboard_address="127.0.0.1:0",
         memory_limit=None,
         silence_logs=logging.CRITICAL,
     ) as cluster:
-        yield cluster
+        address = cluster.scheduler_address.replace("tcp://", "dask://")
+        said: list[str] = []
 
+        def start_one(sentence: str) -> None:
+            said.append(sentence)
+            cluster.scale(1)
 
-def test_a_cluster_by_its_address(
-    undisturbed: tuple[Lut, dict[str, str]], make_lut: Callable[..., Lut], tmp_path: Path, cluster: LocalCluster
-) -> None:
-    lut, expected = undisturbed
-    address = cluster.scheduler_address.replace("tcp://", "dask://")
-    make(lut, tmp_path / "out", address, 1)
-    assert contents(tmp_path / "out") == expected
-    # A worker that finds another table at the same path says so.
-    other = make_lut(name="other")
-    assert other.sha256, "looked at before it is changed"
-    shutil.rmtree(other.folder)
-    make_lut(name="other", unfit=(3,))
-    with pytest.raises(InputError, match="of a worker is not that of the plan; give every machine the same table"):
-        generate_dataset(other, tmp_path / "refused", random_scenes(2, 24, 16), [0], workers=Workers(address))
-
-
-@pytest.mark.parametrize("cluster", [0], indirect=True)
-def test_a_scheduler_without_workers_is_named_and_waited_for(
-    make_lut: Callable[..., Lut], tmp_path: Path, cluster: LocalCluster
-) -> None:
-    address = cluster.scheduler_address.replace("tcp://", "dask://")
-    said: list[str] = []
-
-    def start_one(sentence: str) -> None:
-        said.append(sentence)
-        cluster.scale(1)
-
-    scenes = random_scenes(2, 24, 16)
-    made = generate_dataset(
-        make_lut(), tmp_path / "out", scenes, [0], workers=Workers(address), callbacks=Callbacks(on_wait=start_one)
-    )
-    assert made.description.images == 2
-    assert said == [f"the Dask scheduler has no worker yet; start some with: dask worker {cluster.scheduler_address}"]
-
-
-def test_workers_that_were_started_in_another_folder(
-    make_lut: Callable[..., Lut], tmp_path: Path, cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("pictures").mkdir()
-    Path("pictures/a.pgm").write_bytes(b"P5 2 2 255 abcd")
-    address = cluster.scheduler_address.replace("tcp://", "dask://")
-    made = generate_dataset(make_lut(), Path("out"), find_pictures(["pictures"]), [0], workers=Workers(address))
-    assert made.description.images == 1
+        make(lut, tmp_path / "out", address, 1, Callbacks(on_wait=start_one))
+        assert contents(tmp_path / "out") == expected
+        hint = f"the Dask scheduler has no worker yet; start some with: dask worker {cluster.scheduler_address}"
+        assert said == [hint]
+        # A worker that finds another table at the same path says so.
+        other = make_lut(name="other")
+        assert other.sha256, "looked at before it is changed"
+        shutil.rmtree(other.folder)
+        make_lut(name="other", unfit=(3,))
+        with pytest.raises(InputError, match="of a worker is not that of the plan; give every machine the same table"):
+            generate_dataset(other, tmp_path / "refused", random_scenes(2, 24, 16), [0], workers=Workers(address))
+        # The worker was started in another folder.
+        monkeypatch.chdir(tmp_path)
+        Path("pictures").mkdir()
+        Path("pictures/a.pgm").write_bytes(b"P5 2 2 255 abcd")
+        made = generate_dataset(lut, Path("relative"), find_pictures(["pictures"]), [0], workers=Workers(address))
+        assert made.description.images == 1
 
 
 @pytest.mark.parametrize(

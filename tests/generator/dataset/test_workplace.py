@@ -298,16 +298,16 @@ def dies_at(step: int, below: Path, action: Callable[[], object]) -> bool:
 
 def test_a_kill_at_any_file_operation_is_gone_on_from(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     lut = make_lut()
-    make(lut, tmp_path / "whole", 2)
+    make(lut, tmp_path / "whole", 1, shard_images=1)
     below = tmp_path / "below"
     step = 0
     killed = True
     while killed:
         step += 1
         below.mkdir()
-        killed = dies_at(step, below, lambda: make(lut, below / "out", 2))
+        killed = dies_at(step, below, lambda: make(lut, below / "out", 1, shard_images=1))
         with contextlib.suppress(InputError):  # "already exists", where all that was left were empty folders
-            make(lut, below / "out", 2)
+            make(lut, below / "out", 1, shard_images=1)
         assert contents(below / "out") == contents(tmp_path / "whole"), f"killed before file operation {step}"
         assert [path.name for path in below.iterdir()] == ["out"], f"killed before file operation {step}"
         shutil.rmtree(below)

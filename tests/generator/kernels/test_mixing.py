@@ -83,6 +83,7 @@ def test_colours_that_are_not_wanted_change_no_other(make_lut: Callable[..., Lut
         mixed_table(samples, (0.2, 0.5, 0.3), colours=wanted[1:])
 
 
+@pytest.mark.slow
 def test_saturation_is_kept(noisy: npt.NDArray[np.uint16]) -> None:
     mixed = mixed_table(noisy, (3, 3), white_level=4095)
     assert mixed.max() == 4095

@@ -29,6 +29,7 @@ PLANES = SensorNoise((6.0, 4.2, 5.0), (0.56, 0.28, 0.4))
 WHITE = 10000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gain", "ratio"), [(0.25, 1.0), (0.5, 8.0), (2.0, 4.0)])
 def test_the_noise_is_that_of_the_model(gain: float, ratio: float) -> None:
     mean = np.array([2000.0] * 3)

@@ -38,6 +38,7 @@ def device() -> SimulatedProjector:
     return SimulatedProjector(SimulatedClock(), traits=AT_ONCE)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:open_text is deprecated:DeprecationWarning")
 def test_benqprojector_drives_the_simulated_benq(device: SimulatedProjector) -> None:
     async def talk(path: str) -> None:

@@ -205,6 +205,7 @@ def test_the_question_is_understood_by_a_projector_of_either_class(pjlink_class:
     assert ask(projector).share == 0
 
 
+@pytest.mark.slow
 def test_a_frozen_picture_stays_and_another_input_is_black() -> None:
     clock, answers = SimulatedClock(), Answers()
     codes = [RED]
