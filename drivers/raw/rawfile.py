@@ -573,7 +573,9 @@ def _of_cr2(data: bytes | memoryview, directory: Directory) -> Stored | None:
 def _of_maker(data: bytes | memoryview, directory: Directory, extents: tuple[Extent, ...]) -> Stored:
     """Return the frame of a TIFF of any maker; Olympus calls compressed pixels of 16 bits uncompressed."""
     rows, columns = directory.first(TiffTag.IMAGE_LENGTH), directory.first(TiffTag.IMAGE_WIDTH)
-    compression, bits = directory.first(TiffTag.COMPRESSION), directory.first(TiffTag.BITS_PER_SAMPLE)
+    # TIFF 6.0: uncompressed where nothing is said.
+    compression = directory.first(TiffTag.COMPRESSION) or _UNCOMPRESSED
+    bits = directory.first(TiffTag.BITS_PER_SAMPLE)
     size, least, spare = sum(size for _, size in extents), LEAST_BITS, 0
     if compression == _UNCOMPRESSED:
         if not 8 <= bits <= 16:
