@@ -236,8 +236,8 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
 
 def _without_own_files(folder: Path) -> str:
     """Return that chart or lights of a session are gone, and what helps; nothing where they are there."""
-    gone = [name for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
-    return f"{' and '.join(gone)} of the session: gone; restore from a copy of it" if gone else ""
+    gone = [str(folder / name) for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
+    return f"{' and '.join(gone)}: gone; restore it from a copy of the session" if gone else ""
 
 
 def _is_same(view: AttemptView, row: Attempt) -> bool:
