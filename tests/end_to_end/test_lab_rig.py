@@ -88,8 +88,7 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
         eos = SimulatedEos(EOS_BODIES["Test"], film, clock, auto_power_off_s=0, executor=executor)
         bus = SimulatedBus()
         text = lab.read_text().replace('rig = "simulated"', 'rig = "lab"')
-        text += "[sequence]\nsettle_s = 0.0\n" if "[sequence]" not in text else ""
-        text = text.replace("[sequence]\n", "[sequence]\nsettle_s = 0.0\nwarm_up_s = 0.0\n")
+        text = text.replace("[sequence]\n", "[sequence]\nsettle_s = 0.0\n")
         if cables == "network":
             _, port = opened.enter_context(serve_ptpip(eos, 0)).address
             _, control = opened.enter_context(serve_pjlink(beamer, 0, PASSWORD)).address
@@ -127,6 +126,7 @@ def test_check_reports_what_may_alter_the_light(
             return ("the gamma ramp is not straight: switch off night light",)
 
     monkeypatch.setattr("acquisition.run.rig.simulated.SimulatedPresenter", WarningPresenter)
+    lab.write_text(lab.read_text().replace("warm_up_s = 0", "warm_up_s = 1200"))
     assert main(["check", str(lab)]) == 0
     printed = capsys.readouterr()
     assert "gamma ramp is not straight" in printed.out
