@@ -74,7 +74,7 @@ _LEAST_TIED = 3
 _LEAST_NEIGHBOURS = 5
 """Cells of a neighbourhood that must be known for its mean to count."""
 
-_MANY_BESIDE = 3
+_MANY_BESIDE = 2
 """Stained cells of a neighbourhood from which on it need not deviate itself for a cell to belong to the stain."""
 
 _BRIGHT_PERCENTILE = 99.0
