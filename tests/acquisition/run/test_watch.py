@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -123,16 +125,30 @@ def test_what_hangs_is_named_while_it_hangs(
     lab, heads = Lab(tmp_path / "session"), list[Head]()
     owner = ExposureJudge if hangs == "judge" else type(lab.camera) if hangs == "expose" else type(lab.screen)
     real, calls = getattr(owner, hangs), [0]
-    watches = list[RunWatch]()
+    watches, kinds, entered = list[RunWatch](), list[str](), threading.Condition()
 
     class Watched(RunWatch):
         def __init__(self, on_late: Callable[[str, datetime], object]) -> None:
             super().__init__(on_late, time)
             watches.append(self)
 
+        @contextmanager
+        def step(self, device: str, doing: str, expected_s: float, kind: str) -> Generator[None]:
+            with super().step(device, doing, expected_s, kind):
+                with entered:
+                    kinds[:] = [kind]
+                    entered.notify_all()
+                try:
+                    yield
+                finally:
+                    kinds.clear()
+
     def hanging(*given: object) -> object:
         calls[0] += 1
         if calls[0] == 4:
+            # Frames are judged beside the run, which comes to wait for the verdict.
+            with entered:
+                assert entered.wait_for(lambda: kinds == [hangs], timeout=60)
             for _ in range(60):
                 time.now += 1
                 watches[0].look()
