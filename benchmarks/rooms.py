@@ -35,7 +35,7 @@ import numpy.typing as npt
 
 from benchmarks.cases import BY_NAME, CASES, FAILURES, LENS_LEFT, WRONG_SHARE, Outcome, chart_of, outcome_of, try_case
 from benchmarks.sessions import short_session, world_of
-from calibration.figures.geometry import CELL_PX
+from calibration.figures.geometry import CELL_PX, cell_sides_px
 from calibration.registration.register import Registration, register
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
@@ -229,14 +229,8 @@ def tried(case: Case, small: bool) -> Outcome:
 def true_rows(case: Case, small: bool) -> set[str]:
     """Return the rows of a verdict that may remark on a calm room: that of the cells' size where one is too small."""
     chart = chart_of(small, case.seed)
-    world, half = world_of(chart, BODIES["Test" if small else case.body], case.room), np.array(chart.cell_mm) / 2
-    sides = [
-        np.linalg.norm(
-            world.project(chart.centres_mm + half * axis) - world.project(chart.centres_mm - half * axis), axis=1
-        )
-        for axis in np.eye(2)
-    ]
-    return {CELL_PX.name} if np.min(sides) < CELL_PX.accept else set()
+    world = world_of(chart, BODIES["Test" if small else case.body], case.room)
+    return {CELL_PX.name} if cell_sides_px(world.project, chart).min() < CELL_PX.accept else set()
 
 
 def is_silent(found: Outcome) -> bool:

@@ -29,7 +29,7 @@ from calibration.sampling import sites_at
 from calibration.table.lut import Lut
 from calibration.verdict import BuildResult
 from drivers.camera import CapturedFrame, ExposureSettings
-from drivers.presenter import Colour
+from drivers.presenter import BLACK, Colour
 from drivers.raw.rawfile import CHANNELS, read_raw
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
@@ -225,7 +225,8 @@ def short_session(
 class TableTruth:
     """A table against the room that it should show; L lights, C cells.
 
-    - `light_deg`: (L,) float64, angle between the ground truth and bare paper's light, its mean over the cells.
+    - `light_deg`: (L,) float64, angle between the ground truth and bare paper's light, its mean over the cells, less
+      dark light where the table lacks it.
     - `light_stated`, `cell_stated`: (L,) float64 degrees and (C, 3) float64, what the table states of both.
     - `brightness`: (L,) float64, the light's brightness over the truth, 1 for the median light.
     - `level`: (L, C, 3) float64 counts that cells should have in the table.
@@ -293,6 +294,8 @@ def compare(
     codes = chart.rgb[chart.cell_of_colour]
     paper = [PAPER] * len(cells_mm)
     white = np.array([world.seen(paper, cells_mm, light.colour, SETTINGS).mean(axis=0) for light in lights])
+    if result.figures.lights.subtracted is not None:
+        white -= world.seen(paper, cells_mm, BLACK, SETTINGS).mean(axis=0)
     records = {frame.record.illumination: frame for frame in result.figures.frames if frame.record.kind == "light"}
     steps = {step.illumination: step for step in plan_steps(lights, every) if step.kind == "light"}
     level, error = (np.zeros((len(lights), len(codes), 3)) for _ in range(2))

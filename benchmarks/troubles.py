@@ -31,20 +31,17 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.cases import chart_of
-from benchmarks.sessions import SETTINGS, FrameChange, compare, short_plan, short_session
+from benchmarks.sessions import FrameChange, compare, short_plan, short_session, world_of
 from calibration.pipeline.build import build
 from calibration.pipeline.frames import BuildOptions
 from calibration.table.lut import open_lut
 from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
-from experiment.chart.printing import drawing
 from experiment.session.records import SessionStep, plan_steps
-from foundation.colorimetry import angles_deg
 from foundation.errors import CropError
-from sim.world.rendering import Print
 from sim.world.sensors import BODIES
-from sim.world.world import PAPER, UNDISTURBED, Glare, Room, Situation, World
+from sim.world.world import UNDISTURBED, Glare, Room, Situation, World
 
 _Array = npt.NDArray[np.float64]
 
@@ -243,11 +240,9 @@ class Stated:
 def tried(seed: int, troubles: Troubles, small: bool) -> tuple[str, list[str], Stated | None]:
     """Return verdict, what is said, and a table's errors; None where there is no table."""
     chart = chart_of(small)
-    picture = drawing(chart)
-    sheet = Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
     room = random_room(seed)
     room = replace(room, response_spread=troubles.prnu or room.response_spread)
-    world = TroubledWorld(World(sheet, BODIES["Test" if small else "EOS 550D"], room), troubles)
+    world = TroubledWorld(world_of(chart, BODIES["Test" if small else "EOS 550D"], room), troubles)
 
     def changes(step: SessionStep) -> FrameChange:
         return FrameChange(situation=troubles.situation(seed, step.number))
@@ -263,20 +258,12 @@ def tried(seed: int, troubles: Troubles, small: bool) -> tuple[str, list[str], S
         except CropError as refused:
             return "refuse", [str(refused).split("no table is made. ")[-1][:160]], None
         lut = open_lut(Path(folder) / "lut")
-        cells_mm = chart.centres_mm[chart.cell_of_colour]
-        paper = [PAPER] * len(cells_mm)
-        dark = world.seen(paper, cells_mm, BLACK, SETTINGS).mean(axis=0) if options.subtract_dark else np.zeros(3)
-        white = np.array(
-            [world.seen(paper, cells_mm, light.colour, SETTINGS).mean(axis=0) - dark for light in lut.illuminations]
-        )
         truth = compare(result, lut, world, chart, session, changes, every=3)
-        stated_cells, stated_lights = lut.cell_uncertainty, lut.truth_uncertainty_deg
-        assert stated_cells is not None
-        assert stated_lights is not None
         # Under the light in which the chart is registered, as the table states them.
         full = next(number for number, light in enumerate(lut.illuminations) if light.colour == WHITE)
         lit = truth.lit[full]
-        found = Stated(angles_deg(white, lut.white), stated_lights, np.abs(truth.error[full][lit]), stated_cells[lit])
+        error, stated = np.abs(truth.error[full][lit]), truth.cell_stated[lit]
+        found = Stated(truth.light_deg, truth.light_stated, error, stated)
         return result.verdict.outcome, _said(result), found
 
 

@@ -34,6 +34,8 @@ from calibration.sampling import SAFE_BLEED, bleed, largest_window
 from experiment.framing.finding import MIN_CELL_PX, MIN_TAG_SHARE
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy.typing as npt
 
     from calibration.measurements import TableMeasurements
@@ -49,9 +51,11 @@ _LESS_VEIL = (
 )
 
 
-def cell_sides_px(table: TableMeasurements, chart: Chart) -> npt.NDArray[np.float64]:
-    """Return the shorter side of each cell (N,) float64 half-size px, in the chart's order."""
-    to_pixels = table.registration.to_pixels
+def cell_sides_px(to_pixels: Callable[..., npt.NDArray[np.float64]], chart: Chart) -> npt.NDArray[np.float64]:
+    """Return the shorter side of each cell (N,) float64 half-size px, in the chart's order.
+
+    `to_pixels`: takes places on the print (N, 2) mm to the half-size frame.
+    """
     half = np.array(chart.cell_mm) / 2
     sides = [
         np.linalg.norm(to_pixels(chart.centres_mm + half * axis) - to_pixels(chart.centres_mm - half * axis), axis=1)
@@ -108,7 +112,7 @@ def _bleed_in_check(check: CheckMeasurements) -> float | None:
 
 
 def _smallest_cell(table: TableMeasurements, chart: Chart) -> Worst:
-    file, sides = table.session.registered_file, cell_sides_px(table, chart)
+    file, sides = table.session.registered_file, cell_sides_px(table.registration.to_pixels, chart)
     smallest = int(np.argmin(sides))
     x, y = chart.centres_mm[smallest].tolist()
     return Worst(f"smallest cell, {sides[smallest]:.1f} px", file, place=PrintPlace(file, x, y, 0.0))

@@ -259,7 +259,7 @@ def test_the_worst_of_each_figure_is_somewhere(built: BuildResult, session: Sess
             assert 0 <= worst.place.y_mm <= chart.page_mm[1]
     assert found["truth_worst_deg"].light == int(np.argmax(built.figures.budget.expanded_deg))
     assert found["bleed"].place is not None
-    smallest = cell_sides_px(built.figures, chart).min()
+    smallest = cell_sides_px(built.figures.registration.to_pixels, chart).min()
     assert smallest == pytest.approx(built.figures.registration.cell_px, rel=0.1)
 
 
