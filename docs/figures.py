@@ -171,6 +171,11 @@ def text(
     return f"<text {place} font-size='{size}' fill='{fill}'{weight}>{escape(words)}</text>"
 
 
+def is_package(room: str) -> bool:
+    """Return whether a room is a sub-package; a folder that only keeps what was compiled is none."""
+    return (ROOT / room.replace(".", "/") / "__init__.py").exists()
+
+
 def box(x: float, y: float, width: float, words: str, fill: str = BOX, height: float = BOX_HEIGHT) -> str:
     """Return a labelled box; `x` and `y` are its top-left corner."""
     place = f"x='{x:.0f}' y='{y:.0f}' width='{width:.0f}' height='{height:.0f}'"
@@ -302,7 +307,7 @@ def draw_band(
             ends = ((x + width / 2, y + BOX_HEIGHT), (to_x + to_width / 2, to_y))
         parts.append(arrow(ends, colour=WALL if circle(inside, room, one) else LINE))
     parts += [
-        box(x, y, width, room.partition(".")[2], BOX if (ROOT / room.replace(".", "/")).is_dir() else PAPER)
+        box(x, y, width, room.partition(".")[2], BOX if is_package(room) else PAPER)
         for room, (x, y, width) in places.items()
     ]
     return parts
