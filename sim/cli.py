@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import queue
 import signal
-import threading
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -320,14 +320,13 @@ def _host_and_port(text: str) -> tuple[str, int]:
 
 def _until_interrupted(announcement: str) -> None:
     """Say where the device is, and serve until Ctrl-C or a request to end, also where a shell had them ignored."""
-    try:
-        for request in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(request, signal.default_int_handler)
-        # Whoever reads it may interrupt at once.
-        print(announcement, flush=True)
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        print("stopped")
+    asked = queue.SimpleQueue[int]()
+    for request in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(request, lambda number, _: asked.put(number))
+    # Whoever reads it may interrupt at once: an exception while it is written would have it written twice.
+    print(announcement, flush=True)
+    asked.get()
+    print("stopped")
 
 
 if __name__ == "__main__":
