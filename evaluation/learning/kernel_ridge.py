@@ -6,10 +6,11 @@ weighted sum of kernels between an image and each training image, and the weight
 regression", ICIP 2006, estimate the light's chromaticities by kernel regression on chromaticity histograms.
 
 Features are the square roots of the shares of bins, so that the distance of two images is Hellinger's up to a factor:
-K = exp(-d² / 2), d² = Σ (√p - √q)² ≤ 2. *Chosen, not from these papers:* the 64 × 64 bins of (r, g), the square root,
-the width of the kernel, and λ, which is 1 for 900 training images and grows in proportion to their number. A penalty
-of that size keeps the method from following accidents of the images it was trained on, which differ most between
-generated and real ones. Nothing of it was chosen by results on generated images.
+K = exp(-d² / 2), d² = Σ (√p - √q)² ≤ 2. A pixel counts by its brightness: the variance of a chromaticity is inverse to
+the light that was counted, and what is dark in a photograph has the colour of its noise and of the black that was taken
+out rather than that of the scene. *Chosen, not from these papers:* the 64 × 64 bins of (r, g), the square root, the
+width of the kernel, and λ, which is 0.3 for 900 training images and grows in proportion to their number. Nothing of it
+was chosen by results on generated images; see docs/reference/learned-methods.md.
 """
 
 from __future__ import annotations
@@ -30,10 +31,9 @@ BINS = 64
 _LARGEST = 255
 """Working size up to which the counts of a histogram fit in 16 bits."""
 _IMAGES = 900
-"""Training images of which `penalty` is the λ: the number of the measurement in which 1 was found to be robust."""
-_TUNED = 0.3
-"""Share of the penalty of images learned elsewhere that is left once images of the camera at hand stand beside them:
-they hold what the penalty guarded against. See docs/transfer.md#what-was-chosen-and-on-what."""
+"""Training images of which `penalty` is the λ."""
+_WHOLE = 65535
+"""What the share of a bin that holds all of an image is kept as: the largest that 16 bits hold."""
 
 
 @dataclass(frozen=True)
@@ -42,34 +42,43 @@ class KernelRidge(FeatureLearner):
 
     - `working_size`: largest side of the image whose chromaticities are counted, px.
     - `penalty`: λ for 900 training images, above 0; it grows in proportion to their number.
+    - `brightness`: power of a pixel's brightness by which it counts, 0 or more; 0: each pixel counts alike.
     """
 
     key: ClassVar[str] = "kernel-ridge"
     title: ClassVar[str] = "Kernel ridge (chromaticity histograms)"
+    added: ClassVar[Mapping[str, float]] = {"brightness": 0.0}
 
     working_size: int = 64
-    penalty: float = 1.0
+    penalty: float = 0.3
+    brightness: float = 1.0
 
     def __post_init__(self) -> None:
         if not 1 <= self.working_size <= _LARGEST:
             raise ValueError(f"a working size of {self.working_size} px; expected 1 to {_LARGEST}")
         if not self.penalty > 0:
             raise ValueError(f"a penalty of {self.penalty}; expected a number above 0")
+        if not 0 <= self.brightness < float("inf"):
+            raise ValueError(f"a power of {self.brightness} of brightness; expected 0 or more")
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.uint16] | None:
         """Return the counts of (r, g), (64, 64) uint16, r along the first axis; see `FeatureLearner.features`.
 
-        The image is (H, W, 3), the mask (H, W) bool. Black pixels have no chromaticity and are not counted.
+        The image is (H, W, 3), the mask (H, W) bool. Black pixels have no chromaticity and are not counted. Pixels that
+        count by their brightness are kept as shares of 65535.
         """
         small, used = reduce(image, saturation, mask, self.working_size)
         pixels = small[used & small.any(axis=2)]
         if not len(pixels):
             return None
         places = np.minimum((chromaticities(pixels) * BINS).astype(np.int64), BINS - 1) @ np.array([BINS, 1])
-        counts = np.bincount(places, minlength=BINS * BINS).reshape(BINS, BINS)
-        return counts.astype(np.uint16)
+        weights = pixels.sum(axis=1, dtype=np.float64) ** self.brightness
+        counts = np.bincount(places, weights, minlength=BINS * BINS).reshape(BINS, BINS)
+        if self.brightness:
+            counts *= _WHOLE / counts.sum()
+        return np.rint(counts).astype(np.uint16)
 
     def fit_features(self, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> KernelRidgeModel:
         """Return the weights fitted to counts (N, 64, 64) uint16 and lights (N, 3) float64; nothing in it is random."""
@@ -96,7 +105,7 @@ class KernelRidge(FeatureLearner):
         learned = kernel @ model.weights + penalty * model.weights
         across = _kernel(known, new)
         both: npt.NDArray[np.float64] = np.block([[kernel, across], [across.T, _kernel(new, new)]])
-        penalties = _TUNED * penalty * np.concatenate([np.ones(number), np.full(len(new), worth / max(worth, number))])
+        penalties = penalty * np.concatenate([np.ones(number), np.full(len(new), worth / max(worth, number))])
         solve: Any = np.linalg.solve
         weights = solve(both + np.diag(penalties), np.concatenate([learned, truths[:, :2] - model.centre]))
         counts = np.concatenate([model.counts, features.reshape(len(features), -1)])

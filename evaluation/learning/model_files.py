@@ -244,6 +244,7 @@ def settings_of(learner: FeatureLearner) -> dict[str, Any]:
 
 def _with_settings(learner: FeatureLearner, settings: Mapping[str, Any]) -> FeatureLearner:
     expected = settings_of(learner)
+    settings = {**learner.added, **settings}
     if set(settings) != set(expected):
         raise ValueError(f"it has the settings {', '.join(sorted(settings))}; expected {', '.join(sorted(expected))}")
     for name, value in settings.items():

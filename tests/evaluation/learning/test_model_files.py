@@ -15,6 +15,7 @@ import pytest
 
 from evaluation.datasets.identity import known_again
 from evaluation.learning.feature_learner import LearnedMethod
+from evaluation.learning.kernel_ridge import KernelRidge
 from evaluation.learning.model_files import load_model, save_model, scenes_sha256
 from evaluation.learning.regression_trees import RegressionTrees
 from evaluation.methods.standard import standard_methods
@@ -90,6 +91,15 @@ def test_a_file_without_its_images_is_read(saved: Path) -> None:
     assert record is not None
     assert record.scenes == 12
     assert record.images.shape == (0, 2)
+
+
+def test_kernel_ridge_of_a_file_without_the_brightness_counts_pixels_alike(tmp_path: Path) -> None:
+    path = tmp_path / "old.npz"
+    before = KernelRidge(penalty=1.0, brightness=0.0).fit(SCENES)
+    save_model(path, before, story(SCENES, "Cube+"))
+    rewrite(path, lambda _, about: about["settings"].pop("brightness"))
+    assert load_model(path).learner == before.learner
+    np.testing.assert_array_equal(load_model(path).estimate(SCENES[0].image), before.estimate(SCENES[0].image))
 
 
 def test_nothing_is_overwritten(saved: Path, fitted: LearnedMethod) -> None:

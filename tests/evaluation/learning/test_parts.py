@@ -148,15 +148,28 @@ def test_kernel_ridge_solves_its_equations() -> None:
     np.testing.assert_allclose(model.lights(counts)[:, :2], expected, atol=1e-12)
 
 
-def test_kernel_ridge_counts_chromaticities_where_they_lie() -> None:
+@pytest.mark.parametrize(
+    ("brightness", "red", "green"),
+    # Four pixels of red, brightness 1, and twelve of green, .5; or 4 over 4 + 6 and 4 over 4 + 3 of 65535.
+    [(0.0, 4, 12), (1.0, 26214, 39321), (2.0, 37449, 28086)],
+)
+def test_kernel_ridge_counts_chromaticities_where_they_lie(brightness: float, red: int, green: int) -> None:
     image = np.zeros((8, 8, 3), np.float32)
-    image[:2], image[2:4] = RED, (0.1, 0.8, 0.1)
-    counts: Any = KernelRidge().features(image)
+    image[0, :4], image[1:2], image[2, :4] = RED, (0.05, 0.4, 0.05), (0.05, 0.4, 0.05)
+    counts: Any = KernelRidge(brightness=brightness).features(image)
     assert counts.shape == (64, 64)
-    assert counts[51, 6] == 16
-    assert counts[6, 51] == 16
-    # Black pixels, half of the image, have no chromaticity.
-    assert counts.sum() == 32
+    assert (counts[51, 6], counts[6, 51]) == (red, green)
+    # Black pixels, most of the image, have no chromaticity.
+    assert counts.sum() == red + green
+
+
+def test_what_is_dark_hardly_counts_for_kernel_ridge() -> None:
+    # Half of the image at a hundredth of the brightness, in a colour of its own, as noise and black leave it.
+    image = np.full((8, 8, 3), GREY, np.float32)
+    image[:4] = np.array(RED) / 200
+    found: list[Any] = [KernelRidge().features(one) for one in (image[4:], image)]
+    plain, dirty = (np.sqrt(counts / 65535) for counts in found)
+    assert 0 < ((plain - dirty) ** 2).sum() < 0.02
 
 
 def test_the_penalty_of_kernel_ridge_grows_with_the_images() -> None:
@@ -177,10 +190,17 @@ def test_kernel_ridge_refuses_a_penalty_that_is_none(penalty: float) -> None:
         KernelRidge(penalty=penalty)
 
 
+@pytest.mark.parametrize("power", [-0.5, float("inf"), float("nan")])
+def test_kernel_ridge_refuses_a_power_of_brightness_that_is_none(power: float) -> None:
+    with pytest.raises(ValueError, match="0 or more"):
+        KernelRidge(brightness=power)
+
+
 @pytest.mark.parametrize("learner", [KernelRidge, LogChroma])
 def test_counts_of_the_largest_working_size_are_not_cut(learner: type[KernelRidge | LogChroma]) -> None:
     image = np.full((255, 255, 3), RED, np.float32)
-    counts: Any = learner(working_size=255).features(image)
+    own = {"brightness": 0.0} if learner is KernelRidge else {}
+    counts: Any = learner(working_size=255, **own).features(image)
     assert counts.max() == 255 * 255
     with pytest.raises(ValueError, match="a working size of 256 px; expected 1 to 255"):
         learner(working_size=256)
