@@ -93,7 +93,7 @@ class LiveJudge:
     def __init__(self, settings: LabSettings, chart: Chart, illuminations: Sequence[Illumination]) -> None:
         self._settings = settings
         self._chart = chart if settings.judge.chart else None
-        self._plan = tuple(dict.fromkeys(light.codes for light in illuminations))
+        self._plan = tuple(dict.fromkeys(light.colour.codes for light in illuminations))
         self._state = self._base = JudgeState()
         self._fresh = True
 

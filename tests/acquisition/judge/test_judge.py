@@ -86,7 +86,7 @@ def test_a_frozen_screen_lasts_at_the_third_frame(taught: Bench) -> None:
 def test_another_light_of_the_plan_is_named(taught: Bench) -> None:
     lab = taught.fork()
     assert lab.take(lab.light(*DEEP_BLUE)).accepted
-    other = lab.lights[300].codes
+    other = lab.lights[300].colour.codes
     seen = lab.show(lab.counts(lab.light(*other)), lab.light(*ORANGE))
     assert cause(seen) == "light"
     assert str(other) in seen.reason
