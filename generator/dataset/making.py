@@ -208,9 +208,11 @@ def photograph(
     for mixture in lighting.mixtures:
         for light in mixture.lights:
             lut.require_unchanged(light)
-    share = options.black_point.share(seed, number) if black_taken is None else black_taken
-    is_kept = black_taken is None and options.black_point.kind == "keep"
-    details: Details = {} if is_kept else {"black_taken": share}
+    details: Details = {}
+    share = 0.0
+    if black_taken is not None or options.black_point.kind != "keep":
+        share = options.black_point.share(seed, number) if black_taken is None else black_taken
+        details["black_taken"] = share
     weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
     if options.rendering == "colorimetric":
         rendering = rendering_of(lut, options)
