@@ -75,17 +75,6 @@ from foundation.files import (
 from foundation.records import from_json
 from foundation.version import software
 from generator.dataset.layouts import (
-    Beside,
-    Sample,
-    ShardWriter,
-    card,
-    croissant,
-    datasheet,
-    open_writer,
-)
-from generator.dataset.plan import DatasetOptions, Plan, ShardJob, versions
-from generator.dataset.reader import Dataset, load_description, open_dataset
-from generator.dataset.records import (
     CARD,
     COMPLETED_BY_HAND,
     CROISSANT,
@@ -101,6 +90,7 @@ from generator.dataset.records import (
     TRUTHS,
     UNCERTAINTY_COLUMN,
     VERSION,
+    Beside,
     Description,
     Details,
     FinishedImage,
@@ -108,15 +98,23 @@ from generator.dataset.records import (
     Light,
     LightRow,
     RenderingSummary,
+    Sample,
     ShardRecord,
+    ShardWriter,
     Skipped,
     SourceRecord,
     Split,
     TableRecord,
     Triple,
+    card,
+    croissant,
+    datasheet,
     image_key,
+    open_writer,
     shard_key,
 )
+from generator.dataset.plan import DatasetOptions, Plan, ShardJob, versions
+from generator.dataset.reader import Dataset, load_description, open_dataset
 from generator.files import suffix_of
 from generator.lights.choices import listed_lights
 from generator.lights.lighting import LightChoice, Lighting, Mixture

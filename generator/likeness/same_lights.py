@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foundation.errors import FormatError, InputError, first_of
+from generator.dataset.layouts import GROUND_TRUTH, Light
 from generator.dataset.reader import Dataset, open_dataset
-from generator.dataset.records import GROUND_TRUTH, Light
 from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture
 from generator.masks.making import GivenMaskPlan, find_masks
 from generator.pictures.sources import RandomScene, Source, SourcePicture
