@@ -71,7 +71,7 @@ def _load(dataset: Dataset, entry: Entry) -> npt.NDArray[np.uint8]:
         picture = cv2.imdecode(np.frombuffer(preview, np.uint8), cv2.IMREAD_COLOR_RGB)
         if picture is not None:
             return np.asarray(picture, dtype=np.uint8)
-    from generator.pictures.preview import preview_of
+    from generator.files import preview_of
 
     return preview_of(dataset.read_image(entry), dataset.description.table.white_level)
 

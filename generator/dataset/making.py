@@ -620,10 +620,10 @@ def _photographed(
         ImageMetadata,
         encode_pieces,
         encode_preview,
+        preview_of,
         suffix_of,
         to_full_scale,
     )
-    from generator.pictures.preview import preview_of
 
     options, cut = job.options, source.cuts[crop]
     height, width = cut.picture.shape[:2]
