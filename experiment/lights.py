@@ -106,7 +106,7 @@ def illuminations_to_csv(illuminations: Sequence[Illumination]) -> str:
     for light in illuminations:
         # Whole kelvin without a point, anything else with all its digits.
         cct = "" if light.cct_k is None else repr(light.cct_k).removesuffix(".0")
-        writer.writerow([light.index, light.kind, cct, *light.colour.codes])
+        writer.writerow([light.index, light.kind, cct, *light.colour])
     return text.getvalue()
 
 
@@ -138,6 +138,9 @@ def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illuminat
                 if cct_k is None or not 0 < cct_k < math.inf:
                     raise ValueError(f"cct_k is {kelvin or 'missing'}, expected kelvin above 0")
             colour = Colour(int(row["red"]), int(row["green"]), int(row["blue"]))
+            for name, code in zip(Colour._fields, colour, strict=True):
+                if not 0 <= code <= 255:
+                    raise ValueError(f"{name} is {code}; a code is 0 … 255")
         except ValueError as error:
             raise FormatError(f"{path}, light {number}: {error}") from error
         lights.append(Illumination(number, kind, cct_k, colour, (row.get(NAME) or None) if computed else None))
@@ -185,8 +188,8 @@ def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
     ending = path.suffix.lower().removeprefix(".")
     if ending not in FORMATS:
         raise InputError(f"a figure cannot be written as {path.name}; end its name with .{', .'.join(FORMATS)}")
-    lit = [light for light in illuminations if any(light.colour.codes)]
-    codes = np.array([light.colour.codes for light in lit]).reshape(-1, 3) / 255
+    lit = [light for light in illuminations if any(light.colour)]
+    codes = np.array([light.colour for light in lit]).reshape(-1, 3) / 255
     linear = decode_srgb(codes)
     r, _, b = (linear / linear.sum(axis=1, keepdims=True)).T
     black_body = np.array([light.kind == "blackbody" for light in lit], dtype=np.bool_)

@@ -174,7 +174,7 @@ def light_of(lut: Lut, light: int) -> Light:
         illumination=light,
         kind=shown.kind,
         cct_k=shown.cct_k,
-        codes=shown.colour.codes,
+        codes=shown.colour,
         white=(red, green, blue),
         name=shown.name,
         uncertainty_deg=None if expanded is None else float(f"{expanded[light]:.4g}"),

@@ -193,13 +193,13 @@ def _same_lights(used: Sequence[Light], lut: Lut, place: str) -> dict[int, int]:
     """Return the number in the table of each light that a dataset used."""
     by_codes: dict[_Shown, int] = {}
     for shown in lut.illuminations:
-        by_codes.setdefault((shown.colour.codes, shown.name), shown.index)
+        by_codes.setdefault((shown.colour, shown.name), shown.index)
     numbers: dict[int, int] = {}
     missing: list[str] = []
     for light in used:
         key = (light.codes, light.name)
         found = lut.illuminations[light.illumination] if light.illumination < len(lut.illuminations) else None
-        same = found is not None and (found.colour.codes, found.name) == key
+        same = found is not None and (found.colour, found.name) == key
         number = light.illumination if same else by_codes.get(key)
         if number is None:
             named = "" if light.name is None else f" called {light.name}"

@@ -571,7 +571,7 @@ class World:
 
     def decoded(self, colour: Colour) -> NDArray[np.float64]:
         """Return (3,) float64, 0 … 1: the light of each primary that a colour's codes stand for."""
-        return self._light_of_code[list(colour.codes)]
+        return self._light_of_code[list(colour)]
 
     def signal(
         self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0, situation: Situation = UNDISTURBED
