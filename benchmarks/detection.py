@@ -38,7 +38,7 @@ def neighbours(model: ProjectorModel, plan: Sequence[Illumination]) -> tuple[int
 
     A light that is seen instead is told if it would be on average: by `limits.STALE_SIGMAS` and `STALE_ADVANTAGE`.
     """
-    codes = [light.codes for light in plan]
+    codes = [light.colour for light in plan]
     amounts = np.array([model.predict(one).amounts for one in codes])
     least = max(limits.STALE_SIGMAS, limits.STALE_ADVANTAGE**0.5)
 
@@ -53,7 +53,7 @@ def neighbours(model: ProjectorModel, plan: Sequence[Illumination]) -> tuple[int
         pairs |= {(min(k, n), max(k, n)) for n in near if codes[n] == codes[k]}
     lights = {one for pair in pairs for one in pair}
     following = sum((k, k + 1) in pairs for k in range(len(plan) - 1))
-    return len(lights), following, [f"{plan[a].codes} and {plan[b].codes}" for a, b in sorted(pairs)]
+    return len(lights), following, [f"{plan[a].colour} and {plan[b].colour}" for a, b in sorted(pairs)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

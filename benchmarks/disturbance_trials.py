@@ -157,7 +157,7 @@ def disturbed(lab: Lab, trial: Trial, step: SessionStep, shown: Colour) -> Judge
     if trial.special == "frozen":
         judgement = lab.show(lab.counts(shown), step)
     elif trial.special == "exchanged":
-        red, green, blue = step.colour.codes
+        red, green, blue = step.colour
         judgement = lab.show(lab.counts(Colour(blue, green, red)), step)
     elif trial.special == "serial":
         judgement = lab.show(lab.counts(step.colour), step, serial="7")

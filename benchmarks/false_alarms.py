@@ -28,7 +28,7 @@ def with_white_segment(room: Room, share: float) -> Projector:
     """Return a projector whose wheel has a white segment, which shows what the three colours have in common."""
 
     def light(colour: Colour, before: Colour) -> npt.NDArray[np.float64]:
-        alone = room.light_of(np.array(colour.codes)) / (1 + share)
+        alone = room.light_of(np.array(colour)) / (1 + share)
         return np.asarray(alone + share * alone.min(), dtype=np.float64)
 
     return light
@@ -38,7 +38,7 @@ def with_memory(room: Room, share: float) -> Projector:
     """Return a projector whose primaries are weaker, by up to a share, the brighter each was in the picture before."""
 
     def light(colour: Colour, before: Colour) -> npt.NDArray[np.float64]:
-        now, past = (room.light_of(np.array(c.codes)) for c in (colour, before))
+        now, past = (room.light_of(np.array(c)) for c in (colour, before))
         return np.asarray(now * (1 - share * past), dtype=np.float64)
 
     return light

@@ -76,7 +76,7 @@ def report(name: str, value: float, unit: str, against: str) -> None:
 
 def drives(lights: Sequence[Illumination]) -> _Array:
     """Return (L, 3) float64, the primaries' light as shares of full."""
-    codes = [light.codes for light in lights]
+    codes = [light.colour for light in lights]
     return decode_srgb(np.array(codes) / 255)
 
 

@@ -285,7 +285,7 @@ class TroubledJudge(LightJudge):
         """Look at the colour, and how often it was exposed."""
         seen = super().judge(file, step)
         tries = int(file.read_bytes().split(b") ")[1].split()[0])
-        kind = sum(step.colour.codes) % 3
+        kind = sum(step.colour) % 3
         if not seen.accepted or step.kind == "dark" or tries >= kind:
             return seen
         return Judgement((Check("light", reason="somebody walks past"),), lasting=kind == 2)

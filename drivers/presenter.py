@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 
-@dataclass(frozen=True)
-class Colour:
-    """The codes of a plain frame as the projector receives them, each 0 … 255."""
+class Colour(NamedTuple):
+    """The codes of a plain frame as the projector receives them, each 0 … 255; readers of files check that."""
 
     red: int
     green: int
     blue: int
-
-    def __post_init__(self) -> None:
-        for name, code in (("red", self.red), ("green", self.green), ("blue", self.blue)):
-            if not 0 <= code <= 255:
-                raise ValueError(f"{name} is {code}; a code is 0 … 255")
-
-    @property
-    def codes(self) -> tuple[int, int, int]:
-        """Red, green, and blue."""
-        return self.red, self.green, self.blue
 
 
 BLACK = Colour(0, 0, 0)

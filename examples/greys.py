@@ -54,7 +54,7 @@ def row(rendering: ColorimetricRendering, light: int, shares: Array) -> list[str
     printed = lut.samples[light][greys].mean(axis=1) / white
     angles = [angles_deg(colours, np.ones(3)) for colours in (printed, seen[GREYS])]
     plan = lut.illuminations[light]
-    name = "{} {} {}".format(*plan.codes) if plan.cct_k is None else f"{plan.cct_k:g} K"
+    name = "{} {} {}".format(*plan.colour) if plan.cct_k is None else f"{plan.cct_k:g} K"
     inside = shares * (wanted.min(axis=1) > 0.01) * (bare.min(axis=1) > 0.01)
     return [
         f"{light}",

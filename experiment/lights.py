@@ -10,7 +10,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -61,11 +62,6 @@ class Illumination:
     colour: Colour
     name: str | None = None
 
-    @property
-    def codes(self) -> tuple[int, int, int]:
-        """Codes of red, green and blue that the projector shows, 0 … 255."""
-        return self.colour.codes
-
 
 def shown_colour(linear: npt.ArrayLike) -> Colour:
     """Return the codes that show a linear RGB light (3,) float ≥ 0 at the brightest that its chromaticity allows."""
@@ -110,7 +106,7 @@ def illuminations_to_csv(illuminations: Sequence[Illumination]) -> str:
     for light in illuminations:
         # Whole kelvin without a point, anything else with all its digits.
         cct = "" if light.cct_k is None else repr(light.cct_k).removesuffix(".0")
-        writer.writerow([light.index, light.kind, cct, *light.codes])
+        writer.writerow([light.index, light.kind, cct, *light.colour])
     return text.getvalue()
 
 
@@ -126,37 +122,29 @@ def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illuminat
         raise FormatError(f"{path}: expected lights under the columns {','.join(COLUMNS)}")
     lights: list[Illumination] = []
     for number, row in enumerate(rows):
+        kind, kelvin = row["kind"], row["cct_k"]
+        cct_k: float | None = None
         try:
-            kind = row["kind"]
             if kind not in ("uniform", "blackbody", "spectrum") or (kind == "spectrum" and not computed):
                 raise ValueError(f"kind is {kind!r}, expected uniform or blackbody")
-            if _whole(row, "index") != number:
+            for column in ("index", "red", "green", "blue"):
+                if not row[column].strip().removeprefix("-").isdecimal():
+                    raise ValueError(f"{column} is {row[column] or 'missing'}, expected a whole number")
+            if int(row["index"]) != number:
                 raise ValueError(f"index is {row['index']}, expected {number}")
-            cct_k = _kelvin(row) if kind == "blackbody" else None
-            codes = Colour(_whole(row, "red"), _whole(row, "green"), _whole(row, "blue"))
+            if kind == "blackbody":
+                with suppress(ValueError):
+                    cct_k = float(kelvin)
+                if cct_k is None or not 0 < cct_k < math.inf:
+                    raise ValueError(f"cct_k is {kelvin or 'missing'}, expected kelvin above 0")
+            colour = Colour(int(row["red"]), int(row["green"]), int(row["blue"]))
+            for name, code in zip(Colour._fields, colour, strict=True):
+                if not 0 <= code <= 255:
+                    raise ValueError(f"{name} is {code}; a code is 0 … 255")
         except ValueError as error:
             raise FormatError(f"{path}, light {number}: {error}") from error
-        lights.append(Illumination(number, kind, cct_k, codes, (row.get(NAME) or None) if computed else None))
+        lights.append(Illumination(number, kind, cct_k, colour, (row.get(NAME) or None) if computed else None))
     return tuple(lights)
-
-
-def _whole(row: Mapping[str, str | None], column: str) -> int:
-    text = row[column]
-    # A short row holds None where its cells are missing.
-    if text is None or not text.strip().lstrip("-").isdecimal():
-        raise ValueError(f"{column} is {text or 'missing'}, expected a whole number")
-    return int(text)
-
-
-def _kelvin(row: Mapping[str, str | None]) -> float:
-    text = row["cct_k"]
-    try:
-        cct_k = float(text or "nan")
-    except ValueError:
-        cct_k = float("nan")
-    if not 0 < cct_k < float("inf"):
-        raise ValueError(f"cct_k is {text or 'missing'}, expected kelvin above 0")
-    return cct_k
 
 
 def parse_ccts(text: str) -> tuple[float, ...]:
@@ -200,8 +188,8 @@ def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
     ending = path.suffix.lower().removeprefix(".")
     if ending not in FORMATS:
         raise InputError(f"a figure cannot be written as {path.name}; end its name with .{', .'.join(FORMATS)}")
-    lit = [light for light in illuminations if any(light.codes)]
-    codes = np.array([light.codes for light in lit]).reshape(-1, 3) / 255
+    lit = [light for light in illuminations if any(light.colour)]
+    codes = np.array([light.colour for light in lit]).reshape(-1, 3) / 255
     linear = decode_srgb(codes)
     r, _, b = (linear / linear.sum(axis=1, keepdims=True)).T
     black_body = np.array([light.kind == "blackbody" for light in lit], dtype=np.bool_)

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from generator.dataset.making import Callbacks, Workers, generate_dataset
     from generator.dataset.plan import DatasetOptions
     from generator.dataset.reader import open_dataset
+    from generator.files import flash
     from generator.kernels.mixing import mix_samples, mixed_table
     from generator.kernels.planar import draw_batch, draw_planar
     from generator.kernels.rendering import draw_mosaic, draw_samples
-    from generator.pictures.preview import flash
     from generator.pictures.sources import find_pictures, read_picture
     from generator.rendering.render import render
 
@@ -56,7 +56,7 @@ _HOMES = {
     "draw_planar": "generator.kernels.planar",
     "draw_samples": "generator.kernels.rendering",
     "find_pictures": "generator.pictures.sources",
-    "flash": "generator.pictures.preview",
+    "flash": "generator.files",
     "generate_dataset": "generator.dataset.making",
     "mix_samples": "generator.kernels.mixing",
     "mixed_table": "generator.kernels.mixing",

@@ -55,10 +55,10 @@ from generator.options import (
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from generator.dataset.layouts import Description
     from generator.dataset.making import Callbacks, Workers
     from generator.dataset.plan import Plan
     from generator.dataset.reader import Dataset
-    from generator.dataset.records import Description
     from generator.rendering.matrices import ColourMatrix
 
 

@@ -273,7 +273,12 @@ class ImageOptions:
     ] = None
 
     def dataset_options(
-        self, shard_images: int, reading: Mapping[str, Any], variation: Variation, crops: int, weighted: bool = False
+        self,
+        shard_images: int,
+        reading: Mapping[str, Any],
+        variation: Variation | None,
+        crops: int,
+        weighted: bool = False,
     ) -> DatasetOptions:
         """Return what the dataset is to be; an InputError says which option cannot be used."""
         from generator.dataset.plan import DatasetOptions, parse_split
@@ -373,17 +378,17 @@ class VariationOptions:
         ),
     ] = None
 
-    def variation(self, lut: Lut, like: ExposureChoice | None = None) -> Variation:
-        """Return the variation of images of a table, exposed like a data set unless an option says how."""
+    def variation(self, lut: Lut, like: ExposureChoice | None = None) -> Variation | None:
+        """Return the variation of images of a table, exposed like a data set unless an option says how, or None."""
         from generator.variation.iso_speed import known_of_table, parse_iso
         from generator.variation.variation import parse_exposure, parse_gradient, varied_by
 
-        return varied_by(
-            lut,
-            like if self.exposure is None else parse_exposure(self.exposure),
-            None if self.gradient is None else parse_gradient(self.gradient),
-            None if self.iso is None else parse_iso(self.iso, *known_of_table(lut)),
-        )
+        exposure = like if self.exposure is None else parse_exposure(self.exposure)
+        gradient = None if self.gradient is None else parse_gradient(self.gradient)
+        iso = None if self.iso is None else parse_iso(self.iso, *known_of_table(lut))
+        if exposure is None and gradient is None and iso is None:
+            return None
+        return varied_by(lut, exposure, gradient, iso)
 
 
 @dataclass(frozen=True)

@@ -417,7 +417,7 @@ def darkest_counts(
     """
     if not lights:
         return None
-    shares = decode_srgb(np.array([light.codes for light in lights]) / 255)
+    shares = decode_srgb(np.array([light.colour for light in lights]) / 255)
     black = primaries["black"]
     alone = np.stack([primaries[name] - black for name in ("red", "green", "blue")])
     return float(((shares @ alone + black) * exposure_ratio).max(axis=1).min())

@@ -93,7 +93,7 @@ class LiveJudge:
     def __init__(self, settings: LabSettings, chart: Chart, illuminations: Sequence[Illumination]) -> None:
         self._settings = settings
         self._chart = chart if settings.judge.chart else None
-        self._plan = tuple(dict.fromkeys(light.codes for light in illuminations))
+        self._plan = tuple(dict.fromkeys(light.colour for light in illuminations))
         self._state = self._base = JudgeState()
         self._fresh = True
 
@@ -206,7 +206,7 @@ class LiveJudge:
     def _look_at_light(self, state: JudgeState, frame: Frame, step: SessionStep) -> _Findings:
         """Return what is found of the light of a lit frame, and of its evenness."""
         measured = frame.measured
-        primary = primary_of(step.colour.codes) if step.kind == "response" else None
+        primary = primary_of(step.colour) if step.kind == "response" else None
         checks: list[Check] = []
         if primary is not None and not state.modelled:
             checks.append(judge_first_primary(state, measured, primary))
@@ -248,7 +248,7 @@ class LiveJudge:
 
 def _is_compared(step: SessionStep) -> bool:
     """Return whether later frames are held against the frame of a step, so that all of it is kept."""
-    return step.kind in REFERENCES or (step.kind == "response" and primary_of(step.colour.codes) is not None)
+    return step.kind in REFERENCES or (step.kind == "response" and primary_of(step.colour) is not None)
 
 
 def _seen(paper: npt.NDArray[np.float64]) -> tuple[float, float, float] | None:
@@ -751,7 +751,7 @@ def _judge_light(
     drift_percent: float,
 ) -> tuple[tuple[Check, ...], LampSeen]:
     """Return whether a lit frame shows what its step asks for, and what it shows of the lamp."""
-    codes = step.colour.codes
+    codes = step.colour
     before = state.recent[-1] if state.recent else None
     if not state.modelled:
         return (_without_model(light, codes, before),), LampSeen()

@@ -696,7 +696,7 @@ class JudgeState:
 
     def after(self, step: SessionStep, found: Examined) -> JudgeState:
         """Return what is known after a frame of a step."""
-        frame, codes = found.frame, step.colour.codes
+        frame, codes = found.frame, step.colour
         seen = Seen(codes, frame.measured, None if found.light is None else found.light.amounts)
         state = replace(
             self,
@@ -768,7 +768,7 @@ class JudgeState:
             state = replace(state, dark=measured, first_dark=self.first_dark or measured)
             if state.basis is not None and state.basis.of_primaries:
                 state = replace(state, basis=state.basis.with_dark(measured))
-        primary = primary_of(step.colour.codes)
+        primary = primary_of(step.colour)
         if is_brightest_grey(step):
             state = replace(state, first_grey=self.first_grey or frame)
         if not self.modelled and (step.kind == "white" or (step.kind == "response" and primary is None)):
@@ -790,7 +790,7 @@ class JudgeState:
                 model = self.model
                 for number, frame in enumerate((red, green, blue)):
                     light = basis.light(frame)
-                    model = model.learn(light.amounts, _primary_codes(number), light.covariance)
+                    model = model.learn(light.amounts, PRIMARIES[number], light.covariance)
                 if self.white is not None and not self.moved_on:
                     light = basis.light(self.white)
                     model = model.learn(light.amounts, (255, 255, 255), light.covariance)
@@ -802,14 +802,9 @@ class JudgeState:
 
 def is_brightest_grey(step: SessionStep) -> bool:
     """Return whether a step shows grey at `TOP`, with which a run that is taken up again begins."""
-    return step.kind == "response" and step.colour.codes == (TOP, TOP, TOP)
-
-
-def _primary_codes(primary: int) -> Codes:
-    """Return the codes that show primary 0, 1 or 2 alone at `TOP` (`experiment.session.records`)."""
-    return PRIMARIES[primary].codes
+    return step.kind == "response" and step.colour == (TOP, TOP, TOP)
 
 
 def primary_of(codes: Codes) -> int | None:
     """Return which primary codes show alone at `TOP`; None if they show anything else."""
-    return next((number for number in range(3) if codes == _primary_codes(number)), None)
+    return next((number for number in range(3) if codes == PRIMARIES[number]), None)

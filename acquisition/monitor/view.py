@@ -558,11 +558,11 @@ def _session_json(view: SessionView) -> Json:
     """
     kinds = {light.index: (light.kind, light.cct_k) for light in view.lights}
     shown = {step.illumination: step.colour for step in view.steps if step.illumination is not None}
-    codes = {index: colour.codes for index, colour in sorted(shown.items())}
+    codes = dict(sorted(shown.items()))
     places = planned_places(list(codes.values()))
     return {
         "name": view.name,
-        "steps": [[step.number, step.kind, step.illumination, *step.colour.codes] for step in view.steps],
+        "steps": [[step.number, step.kind, step.illumination, *step.colour] for step in view.steps],
         "lights": [
             [index, *kinds.get(index, ("", None)), place, *codes[index]]
             for index, place in zip(codes, places, strict=True)

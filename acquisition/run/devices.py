@@ -386,7 +386,7 @@ class LightNotShown:
 
     def show(self, colour: Colour) -> None:
         """Refuse to."""
-        raise DeviceRefused(f"{colour.codes} is not shown: the light was not opened")
+        raise DeviceRefused(f"{tuple(colour)} is not shown: the light was not opened")
 
     def close(self) -> None:
         """Do nothing."""

@@ -535,7 +535,7 @@ def _disk_fault(work: Work, size: Estimate, free_bytes: int) -> StorageError | s
 
 def _black_fault(settings: LabSettings, work: Work) -> CropError | None:
     """Return why a new session with a light that is none could never be complete; one that is begun goes on."""
-    black = [step.illumination for step in work.steps if step.kind == "light" and not any(step.colour.codes)]
+    black = [step.illumination for step in work.steps if step.kind == "light" and not any(step.colour)]
     if work.done or not black:
         return None
     return InputError(

@@ -341,7 +341,7 @@ def warnings_of(one: Lut, other: Lut, pairs: LightPairs) -> tuple[str, ...]:
 
 
 def _key(light: Illumination) -> object:
-    return light.kind, light.cct_k, light.codes, light.name
+    return light.kind, light.cct_k, light.colour, light.name
 
 
 def answers_of(lights: LightDifferences, cells: CellDifferences) -> tuple[NoiseAnswer, ...]:

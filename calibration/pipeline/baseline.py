@@ -421,7 +421,7 @@ def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> Fra
     def brightness(record: FrameRecord) -> int:
         if record.illumination is None or record.illumination >= len(session.illuminations):
             return -1
-        return min(session.illuminations[record.illumination].codes)
+        return min(session.illuminations[record.illumination].colour)
 
     return max((record for record in accepted if record.kind == "light"), key=brightness)
 

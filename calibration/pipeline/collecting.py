@@ -354,7 +354,7 @@ def _figures(
             lights=lights_taken,
             registered_file=done.selected.registered.file,
             white_references=len(session.chart.white_references),
-            codes=tuple(light.codes for light in session.illuminations),
+            codes=tuple(light.colour for light in session.illuminations),
         ),
         registration=baseline.first.registration,
         frames=frames,
@@ -459,7 +459,7 @@ def _code_agreement(
 ) -> CodeAgreement:
     """Return how the lights, and white frames behind them, agree with their codes; stated exposures aside."""
     frames = [*by_light, *whites]
-    codes = np.array([*(light.codes for light in illuminations), *((255, 255, 255) for _ in whites)])
+    codes = np.array([*(light.colour for light in illuminations), *((255, 255, 255) for _ in whites)])
     factor = _to_one_exposure(frames)
     drift = np.concatenate([gains, np.ones((len(whites), 3))])
     error = np.array([frame.paper.error for frame in frames])
@@ -493,7 +493,7 @@ def _stray_light(
     factor = _to_one_exposure(frames) / np.concatenate([gains, np.ones((len(whites), 3))])
     white = (np.array([frame.paper.white for frame in frames]) - dark) * factor
     error = np.array([frame.paper.error for frame in frames]) * factor
-    codes = np.array([light.codes for light in illuminations], dtype=np.int64)
+    codes = np.array([light.colour for light in illuminations], dtype=np.int64)
     # Lights of full white are white frames, too: the more there are, the better the lamp's flicker is known.
     full = np.concatenate([white[lights:], white[:lights][(codes == _FULL_CODE).all(axis=1)]])
     return stray_light(codes, white[:lights], error[:lights], full, pure_lights(illuminations))

@@ -66,7 +66,7 @@ def additivity(
     paper in the dark frames; zeros where already subtracted. `gains`: (L, 3) the lamp's drift at each light, of which
     white frames are free; `drift_gains`. `sensor`: how its counts deviate from proportion to light.
     """
-    index_of = {light.codes: light.index for light in lights}
+    index_of: dict[tuple[int, int, int], int] = {light.colour: light.index for light in lights}
     primaries = [index_of[codes] for codes in ((255, 0, 0), (0, 255, 0), (0, 0, 255)) if codes in index_of]
     full = index_of.get((255, 255, 255))
     if len(primaries) < 3 or (full_white is None and full is None) or not np.isfinite(dark).all():
@@ -102,8 +102,8 @@ def pure_lights(illuminations: Sequence[Illumination]) -> tuple[int, int, int] |
     for channel in range(3):
         alone: list[tuple[int, int]] = []
         for light in illuminations:
-            code = light.codes[channel]
-            if code > 0 and sum(light.codes) == code:
+            code = light.colour[channel]
+            if code > 0 and sum(light.colour) == code:
                 alone.append((code, -light.index))
         if not alone:
             return None

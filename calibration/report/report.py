@@ -316,7 +316,7 @@ def _first_pictures(
     """Return what a scientist looks at first: chart, lights, errors, noise."""
     table, chart = result.figures, session.chart
     registration, window = table.registration, table.cells.window
-    codes = np.array([light.codes for light in session.illuminations])
+    codes = np.array([light.colour for light in session.illuminations])
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
     seen = f"seen by the {table.session.camera}"
     truth = worsts[TRUTH_WORST_DEG.name].light if TRUTH_WORST_DEG.name in worsts else None

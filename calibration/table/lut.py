@@ -702,7 +702,7 @@ def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[
                 light.index,
                 light.kind,
                 "" if light.cct_k is None else f"{light.cct_k:g}",
-                *light.codes,
+                *light.colour,
                 *(f"{value:.6f}" for value in values),
                 *([light.name or ""] if named else []),
             ]

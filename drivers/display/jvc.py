@@ -89,7 +89,7 @@ class JvcFlatField:
         """Fill the picture with exactly `colour`; returns when the projector has acknowledged all of it."""
         if not self._open:
             raise DeviceError(f"{self._label} was closed; open the rig again")
-        levels = zip(LEVELS, colour.codes, strict=True)
+        levels = zip(LEVELS, colour, strict=True)
         texts = (FLAT_FIELD, *(encode_level(channel, code) for channel, code in levels))
         while True:
             for text in texts:

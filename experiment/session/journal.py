@@ -190,7 +190,7 @@ class Journal:
         """Put steps at the end of the plan; their numbers must be free."""
         with self._writing() as change:
             for step in steps:
-                red, green, blue = step.colour.codes
+                red, green, blue = step.colour
                 row = {"step": step.number, "kind": step.kind, "illumination": step.illumination}
                 change.put("plan", row | {"red": red, "green": green, "blue": blue})
 

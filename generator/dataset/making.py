@@ -75,17 +75,6 @@ from foundation.files import (
 from foundation.records import from_json
 from foundation.version import software
 from generator.dataset.layouts import (
-    Beside,
-    Sample,
-    ShardWriter,
-    card,
-    croissant,
-    datasheet,
-    open_writer,
-)
-from generator.dataset.plan import DatasetOptions, Plan, ShardJob, versions
-from generator.dataset.reader import Dataset, load_description, open_dataset
-from generator.dataset.records import (
     CARD,
     COMPLETED_BY_HAND,
     CROISSANT,
@@ -101,6 +90,7 @@ from generator.dataset.records import (
     TRUTHS,
     UNCERTAINTY_COLUMN,
     VERSION,
+    Beside,
     Description,
     Details,
     FinishedImage,
@@ -108,15 +98,23 @@ from generator.dataset.records import (
     Light,
     LightRow,
     RenderingSummary,
+    Sample,
     ShardRecord,
+    ShardWriter,
     Skipped,
     SourceRecord,
     Split,
     TableRecord,
     Triple,
+    card,
+    croissant,
+    datasheet,
     image_key,
+    open_writer,
     shard_key,
 )
+from generator.dataset.plan import DatasetOptions, Plan, ShardJob, versions
+from generator.dataset.reader import Dataset, load_description, open_dataset
 from generator.files import suffix_of
 from generator.lights.choices import listed_lights
 from generator.lights.lighting import LightChoice, Lighting, Mixture
@@ -176,7 +174,7 @@ def light_of(lut: Lut, light: int) -> Light:
         illumination=light,
         kind=shown.kind,
         cct_k=shown.cct_k,
-        codes=shown.colour.codes,
+        codes=shown.colour,
         white=(red, green, blue),
         name=shown.name,
         uncertainty_deg=None if expanded is None else float(f"{expanded[light]:.4g}"),
@@ -208,9 +206,11 @@ def photograph(
     for mixture in lighting.mixtures:
         for light in mixture.lights:
             lut.require_unchanged(light)
-    share = options.black_point.share(seed, number) if black_taken is None else black_taken
-    is_kept = black_taken is None and options.black_point.kind == "keep"
-    details: Details = {} if is_kept else {"black_taken": share}
+    details: Details = {}
+    share = 0.0
+    if black_taken is not None or options.black_point.kind != "keep":
+        share = options.black_point.share(seed, number) if black_taken is None else black_taken
+        details["black_taken"] = share
     weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
     if options.rendering == "colorimetric":
         rendering = rendering_of(lut, options)
@@ -468,7 +468,8 @@ def _taken_up(image: FinishedImage) -> Sample:
 def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
     options = job.options
     lightings = job.choice.lightings_of(job.position * options.crops)
-    maps = options.variation.tints or any(lighting.masks is not None for lighting in lightings)
+    tints = options.variation is not None and options.variation.tints
+    maps = tints or any(lighting.masks is not None for lighting in lightings)
     return open_writer(options.layout, place.files, job.shard, Beside(options.previews, maps, options.has_details))
 
 
@@ -620,20 +621,23 @@ def _photographed(
         ImageMetadata,
         encode_pieces,
         encode_preview,
+        preview_of,
         suffix_of,
         to_full_scale,
     )
-    from generator.pictures.preview import preview_of
 
     options, cut = job.options, source.cuts[crop]
     height, width = cut.picture.shape[:2]
     white_level = lut.provenance.white_level
     # What exceeds saturation may be below it once it is exposed anew, and is cut then.
-    most = LARGEST_COUNT if options.variation.is_on else white_level
+    most = white_level if options.variation is None else LARGEST_COUNT
     taken = source.black_taken
     image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
-    varied = options.variation.apply(image, white_level, job.seed, number)
-    light = _image_light(lut, lighting, weights, varied, options.variation.tints)
+    varied, tints = Varied(), False
+    if options.variation is not None:
+        varied = options.variation.apply(image, white_level, job.seed, number)
+        tints = options.variation.tints
+    light = _image_light(lut, lighting, weights, varied, tints)
     stored, level = (image, white_level) if options.scale == "table" else (to_full_scale(image, white_level), FULL)
     metadata = ImageMetadata(level, light.truth, lut.provenance.camera)
     files: list[tuple[str, str, Pieces]] = [

@@ -27,15 +27,14 @@ from foundation.errors import InputError
 from foundation.files import file_sha256
 from foundation.secret_texts import masked_values
 from foundation.version import software
-from generator.dataset.layouts import library_of, require_library
-from generator.dataset.records import SPLITS, Layout, Scale, Split, TableRecord
+from generator.dataset.layouts import SPLITS, Layout, Scale, Split, TableRecord, library_of, require_library
 from generator.files import FORMATS, Format, libraries_of
 from generator.pictures.sources import PictureFile
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.black_points import KEEP, BlackPoint
 from generator.rendering.matrices import ColourMatrix, matrix_for
 from generator.stores import is_remote
-from generator.variation.variation import NO_VARIATION, Variation
+from generator.variation.variation import Variation
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -116,7 +115,7 @@ class DatasetOptions:
     previews: bool = True
     split: tuple[float, float, float] | None = None
     shard_images: int = SHARD_IMAGES
-    variation: Variation = NO_VARIATION
+    variation: Variation | None = None
     crops: int = 1
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
     weighted: bool = False
@@ -131,7 +130,7 @@ class DatasetOptions:
     @property
     def has_details(self) -> bool:
         """Whether options do something to each image that is recorded of it: `images.csv` lists it then."""
-        return self.variation.is_on or self.crops > 1 or self.weighted or self.is_rendered
+        return self.variation is not None or self.crops > 1 or self.weighted or self.is_rendered
 
     @property
     def is_rendered(self) -> bool:
@@ -327,7 +326,12 @@ class Plan:
             )
         if self.total > 1 << 32:
             raise InputError(f"{self.total} images are more than a dataset holds, 2^32; make several, each with a seed")
-        if self.options.variation.tints and any(lighting.masks for lighting in self.choice.lightings_of(0)):
+        variation = self.options.variation
+        if (
+            variation is not None
+            and variation.tints
+            and any(lighting.masks for lighting in self.choice.lightings_of(0))
+        ):
             raise InputError(
                 "a gradient with a colour and several lights an image were both asked for, but masks tell either; "
                 "leave out colour, or ask for one light"
@@ -421,7 +425,7 @@ class Plan:
             "shard_images": options.shard_images,
         }
         # What is off is no key: such datasets keep their bytes.
-        if options.variation.is_on:
+        if options.variation is not None:
             recorded["variation"] = options.variation.describe()
         if options.crops > 1:
             recorded["crops"] = options.crops

@@ -38,13 +38,13 @@ from pydantic import ValidationError
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError, counted
 from foundation.files import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object, stream_sha256
-from generator.dataset.layouts import JOINED, member_name, read_member
-from generator.dataset.records import (
+from generator.dataset.layouts import (
     COMPLETED_BY_HAND,
     FORMAT,
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,
     IMAGES,
+    JOINED,
     SOURCES,
     SPLITS,
     STRETCHED_VERSION,
@@ -57,6 +57,8 @@ from generator.dataset.records import (
     SourceRecord,
     Split,
     Triple,
+    member_name,
+    read_member,
     shard_key,
 )
 from generator.files import decode_image, from_full_scale

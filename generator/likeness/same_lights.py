@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foundation.errors import FormatError, InputError, first_of
+from generator.dataset.layouts import GROUND_TRUTH, Light
 from generator.dataset.reader import Dataset, open_dataset
-from generator.dataset.records import GROUND_TRUTH, Light
 from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture
 from generator.masks.making import GivenMaskPlan, find_masks
 from generator.pictures.sources import RandomScene, Source, SourcePicture
@@ -193,13 +193,13 @@ def _same_lights(used: Sequence[Light], lut: Lut, place: str) -> dict[int, int]:
     """Return the number in the table of each light that a dataset used."""
     by_codes: dict[_Shown, int] = {}
     for shown in lut.illuminations:
-        by_codes.setdefault((shown.codes, shown.name), shown.index)
+        by_codes.setdefault((shown.colour, shown.name), shown.index)
     numbers: dict[int, int] = {}
     missing: list[str] = []
     for light in used:
         key = (light.codes, light.name)
         found = lut.illuminations[light.illumination] if light.illumination < len(lut.illuminations) else None
-        same = found is not None and (found.codes, found.name) == key
+        same = found is not None and (found.colour, found.name) == key
         number = light.illumination if same else by_codes.get(key)
         if number is None:
             named = "" if light.name is None else f" called {light.name}"

@@ -376,30 +376,22 @@ class Varied:
 
 @dataclass(frozen=True)
 class Variation:
-    """What differs from image to image; without anything set, nothing.
+    """What differs from image to image; something is set.
 
     - `exposure`: how much light; None as the table.
     - `gradient`: how it falls off over the image; None not at all.
     - `iso`: ISO speed whose noise images have; None the table's.
-    - `noise`: of the table's samples; needed with any of the others. See `varied_by`.
+    - `noise`: of the table's samples; see `varied_by`.
     """
 
     exposure: ExposureChoice | None = None
     gradient: Gradient | None = None
     iso: IsoSpeed | None = None
-    noise: SensorNoise | None = None
+    noise: SensorNoise = field(kw_only=True)
 
     def __post_init__(self) -> None:
-        if self.is_on and self.noise is None:
-            raise InputError(
-                "the noise of the table is not known, which exposure, gradient and ISO speed need; measure it with "
-                "generator.variation.sensor_noise.measured_noise"
-            )
-
-    @property
-    def is_on(self) -> bool:
-        """Whether anything is done to images."""
-        return not (self.exposure is None and self.gradient is None and self.iso is None)
+        if self.exposure is None and self.gradient is None and self.iso is None:
+            raise InputError("a variation has neither exposure, gradient nor ISO speed; set one, or give no variation")
 
     @property
     def tints(self) -> bool:
@@ -412,8 +404,6 @@ class Variation:
         `image`: (H, W, 3) uint16, contiguous; counts of the table, as drawn.
         """
         noise = self.noise
-        if not self.is_on or noise is None:
-            return Varied()
         details: dict[str, int | float | str] = {}
         weights, end = None, _EVEN
         if self.gradient is not None:
@@ -465,14 +455,8 @@ class Variation:
         return {name: part.describe() for name, part in parts.items() if part is not None}
 
 
-NO_VARIATION: Final = Variation()
-"""Images as the table gives them."""
-
-
 def varied_by(
     lut: Lut, exposure: ExposureChoice | None = None, gradient: Gradient | None = None, iso: IsoSpeed | None = None
 ) -> Variation:
-    """Return the variation of images of a table, whose noise is measured if anything is set."""
-    if exposure is None and gradient is None and iso is None:
-        return NO_VARIATION
-    return Variation(exposure, gradient, iso, measured_noise(lut))
+    """Return the variation of images of a table, whose noise is measured."""
+    return Variation(exposure, gradient, iso, noise=measured_noise(lut))

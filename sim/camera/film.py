@@ -87,7 +87,7 @@ class ReplayFilm:
         frames = self._frames.get(colour, [])
         number = self._exposed[colour]
         if number >= len(frames):
-            codes = colour.codes
+            codes = tuple(colour)
             raise DeviceRefused(
                 f"the recording has {len(frames)} frames under the colour {codes}, frame {number + 1} was asked for; "
                 "replay it with the illuminations and sequence settings it was taken with"
@@ -301,7 +301,7 @@ class WorldFilm:
         moment = Moment(len(self._before), seconds, colour, tuple(self._before))
         lamp = self._light() * (1 - self._world.room.lamp_drift_per_hour * seconds / 3600)
         # The noise is that of the frame that was ordered, whatever there is to see.
-        key = (*colour.codes, self._exposed[colour])
+        key = (*colour, self._exposed[colour])
         self._exposed[colour] += 1
         self._before.append((seconds, colour))
         if self._disturbances.events:

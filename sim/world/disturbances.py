@@ -349,7 +349,7 @@ class ScreenSaver(Disturbance):
         noise = np.random.default_rng(self.seed).random((60, 96, 3))
         soft = gaussian_filter(noise, (_PATCH, _PATCH, 0))
         drawn = (soft - soft.min()) / np.ptp(soft)
-        ordered = decode_srgb(np.array(moment.colour.codes) / 255)
+        ordered = decode_srgb(np.array(moment.colour) / 255)
         mixed = self.share * drawn + (1 - self.share) * ordered
         return replace(situation, picture=mixed.astype(np.float32))
 

@@ -476,6 +476,7 @@ class World:
             sheet.page_mm, room.projector_falloff, room.primary_difference, self._random(2)
         )
         self._falloff[:, 3] = self._balance()
+        self._light_of_code = room.light_of(np.arange(256))
         self.hot = HotPattern.drawn(self._random(6), body.sensor, room.hot_per_million, room.hot_dn_per_s)
         self._lock = threading.Lock()
         self._rendered: dict[tuple[float, ...], tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
@@ -570,7 +571,7 @@ class World:
 
     def decoded(self, colour: Colour) -> NDArray[np.float64]:
         """Return (3,) float64, 0 … 1: the light of each primary that a colour's codes stand for."""
-        return self.room.light_of(np.array(colour.codes))
+        return self._light_of_code[list(colour)]
 
     def signal(
         self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0, situation: Situation = UNDISTURBED

@@ -30,7 +30,7 @@ HEADER = "index,kind,cct_k,red,green,blue\n"
 
 
 def codes(lights: tuple[Illumination, ...]) -> list[tuple[int, int, int]]:
-    return [light.codes for light in lights]
+    return [light.colour for light in lights]
 
 
 def test_the_plan_is_666_uniform_lights_and_41_black_bodies(plan: tuple[Illumination, ...]) -> None:

@@ -63,7 +63,7 @@ def test_a_black_body_is_plancks_and_keeps_its_temperature() -> None:
     # The projector's black body of the same temperature has the same codes, to rounding.
     for light, cct_k in zip(shown, (2000, 6000, 10_000), strict=True):
         expected = shown_colour(blackbody_light(cct_k))
-        assert np.abs(np.subtract(light.codes, (expected.red, expected.green, expected.blue))).max() <= 1
+        assert np.abs(np.subtract(light.colour, (expected.red, expected.green, expected.blue))).max() <= 1
 
 
 def test_a_set_names_several_and_daylight_any_temperature() -> None:
@@ -76,7 +76,7 @@ def test_a_set_names_several_and_daylight_any_temperature() -> None:
 
 def test_spectra_that_are_no_black_bodies_have_names_and_no_temperature() -> None:
     (light,) = illuminations_of(read_lights("D65").lights)
-    assert (light.kind, light.cct_k, light.name, light.codes) == ("spectrum", None, "D65", (255, 255, 255))
+    assert (light.kind, light.cct_k, light.name, light.colour) == ("spectrum", None, "D65", (255, 255, 255))
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 Real linear images are tone mapped by Flash to codes of 8 bits, the lowest n bits of each code are set to zero, and the
 reversed operator takes them back to linear; then methods estimate their lights. Flash's k and scale are those of the
-image before (`generator.pictures.preview`), so that with n = 0 only the rounding to whole codes is left. Masked pixels
+image before (`generator.files`), so that with n = 0 only the rounding to whole codes is left. Masked pixels
 have no say in k and scale.
 
 In files, linear images become codes of 8 bits and codes linear images; a folder of codes lies so::
@@ -40,7 +40,7 @@ from evaluation.scene import Image, Scene, SceneSet
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
 from foundation.files import is_inside_name, read_inside, reading_error, whole_folder, write_whole
-from generator.pictures.preview import Flash, fit_flash
+from generator.files import Flash, fit_flash
 from generator.pictures.sources import clear_bits
 
 BITS: Final = tuple(range(8))

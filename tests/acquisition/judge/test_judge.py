@@ -86,7 +86,7 @@ def test_a_frozen_screen_lasts_at_the_third_frame(taught: Bench) -> None:
 def test_another_light_of_the_plan_is_named(taught: Bench) -> None:
     lab = taught.fork()
     assert lab.take(lab.light(*DEEP_BLUE)).accepted
-    other = lab.lights[300].codes
+    other = lab.lights[300].colour
     seen = lab.show(lab.counts(lab.light(*other)), lab.light(*ORANGE))
     assert cause(seen) == "light"
     assert str(other) in seen.reason
@@ -382,7 +382,7 @@ def test_a_projector_that_does_not_add_is_told_and_not_refused(tmp_path: Path, t
     lab.world = taught.world
 
     def shown(colour: Colour) -> Situation:
-        alone = lab.world.room.light_of(np.array(colour.codes)) / 1.4
+        alone = lab.world.room.light_of(np.array(colour)) / 1.4
         return Situation(picture=(alone + 0.4 * alone.min()).astype(np.float32)[None, None])
 
     def take(step: SessionStep, colour: Colour | None = None) -> Judgement:

@@ -76,7 +76,7 @@ class MadeUpRun:
 
     def seen(self, step: SessionStep) -> tuple[float, float, float]:
         """Return what the camera would see of a step's light, counts."""
-        linear = decode_srgb([code / 255 for code in step.colour.codes])
+        linear = decode_srgb([code / 255 for code in step.colour])
         counts = (CROSSTALK @ linear + 0.0005) * 9000 * (1 + self.random.normal(0, 0.0005, 3))
         return float(counts[0]), float(counts[1]), float(counts[2])
 
@@ -105,7 +105,7 @@ class MadeUpRun:
             timings={"settle": 0.2, "expose": 0.55, "download": 0.9, "save": 0.2, "wait": 1.4e-5},
         )
         if self.previews:
-            colour = step.colour.codes
+            colour = step.colour
             (self.folder / "previews" / f"{stem}.jpg").write_bytes(jpeg(colour, f"{stem} {reason[:24]}"))
         return attempt
 

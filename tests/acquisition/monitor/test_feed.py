@@ -233,4 +233,4 @@ def test_places_in_the_plane() -> None:
 def test_lights_are_shown_also_without_their_file(run: MadeUpRun) -> None:
     (run.folder / "illuminations.csv").unlink()
     lights = told(SessionWatch(run.folder))["session"]["lights"]
-    assert [light[4:] for light in lights] == [list(light.codes) for light in LIGHTS]
+    assert [light[4:] for light in lights] == [list(light.colour) for light in LIGHTS]

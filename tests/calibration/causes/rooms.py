@@ -20,8 +20,8 @@ from sim.world.world import UNDISTURBED, Blob, Situation
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, renumbered, take
 
 BRIGHT = renumbered(
-    [light for light in LIGHTS if sum(light.codes) == max(light.codes) == 255]
-    + [light for light in LIGHTS if min(light.codes) > 80][:2]
+    [light for light in LIGHTS if sum(light.colour) == max(light.colour) == 255]
+    + [light for light in LIGHTS if min(light.colour) > 80][:2]
 )
 """Each primary alone, and two lights under which most cells can be compared."""
 

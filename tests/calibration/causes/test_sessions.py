@@ -82,7 +82,7 @@ def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tm
 def test_what_covers_few_cells_costs_these_cells_and_not_the_table(lab: Lab, tmp_path: Path) -> None:
     """A fly of two cells' size in one light: with the limits as they are."""
     fly = Situation(blobs=(Blob((0.5, 0.5, 0.54, 0.56), left=0.4),))
-    light = next(light.index for light in BRIGHT if min(light.codes) > 80)
+    light = next(light.index for light in BRIGHT if min(light.colour) > 80)
     with taken(lab, tmp_path / "session", lambda step: step.illumination == light, situation=fly) as session:
         result = build(session, tmp_path / "lut")
     (row,) = (row for row in result.verdict.remarks if row.figure.name == "disturbed_cells")
@@ -102,7 +102,7 @@ def test_what_covers_few_cells_costs_these_cells_and_not_the_table(lab: Lab, tmp
 
 
 def test_a_reflection_in_one_frame_is_no_hand(lab: Lab, tmp_path: Path) -> None:
-    light = next(light.index for light in BRIGHT if min(light.codes) > 80)
+    light = next(light.index for light in BRIGHT if min(light.colour) > 80)
     session = taken(lab, tmp_path / "session", lambda step: step.illumination == light, paint=glare(lab, 0.05, 0.2))
     result, found = measured(session, tmp_path)
     assert causes(found) == {REFLECTION_IN_FRAME}

@@ -39,14 +39,14 @@ SESSIONS: dict[str, Codes] = {
     "two": [(255, 255, 255), (255, 120, 60)],
     "red and white": [(255, 0, 0), (255, 255, 255)],
     "primaries": [(255, 0, 0), (0, 255, 0), (0, 0, 255)],
-    "two black bodies": [light.codes for light in plan_illuminations(0, (3000, 8000))],
-    "five black bodies": [light.codes for light in plan_illuminations(0, (2500, 3500, 4500, 6500, 9500))],
+    "two black bodies": [light.colour for light in plan_illuminations(0, (3000, 8000))],
+    "five black bodies": [light.colour for light in plan_illuminations(0, (2500, 3500, 4500, 6500, 9500))],
     "eight": [
         (255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 200, 120), (150, 190, 255), (255, 255, 0),
         (128, 128, 128),
     ],
-    "thirteen": [light.codes for light in plan_illuminations(3, (2500, 4500, 6500))],
-    "41 black bodies": [light.codes for light in plan_illuminations(0, tuple(range(2000, 10001, 200)))],
+    "thirteen": [light.colour for light in plan_illuminations(3, (2500, 4500, 6500))],
+    "41 black bodies": [light.colour for light in plan_illuminations(0, tuple(range(2000, 10001, 200)))],
 }  # fmt: skip
 _SCATTER = ([0, 0.003, 0.01, 0.03], [0.0003, 0.001, 0.002], [0.0002, 0.0005, 0.002])
 CAMERAS = ("Canon_EOS-1Ds_Mark_III", "Canon_EOS_200D", "Canon_EOS_5DS", "Canon_EOS_5D_Mark_II", "Canon_EOS_600D")
@@ -99,7 +99,7 @@ def agreement(codes: Codes, white: _Array, error: _Array) -> CodeAgreement:
 
 
 def of_plan(white: _Array, error: float = 0.0005) -> CodeAgreement:
-    return agreement([light.codes for light in PLAN], white, error * white + 0.1)
+    return agreement([light.colour for light in PLAN], white, error * white + 0.1)
 
 
 def exchanged(values: _Array, one: int, other: int) -> _Array:
@@ -173,7 +173,7 @@ def shifted(count: int) -> npt.NDArray[np.int64]:
 
 
 def shifted_but_for_primaries(count: int) -> npt.NDArray[np.int64]:
-    alone = [np.count_nonzero(light.codes) == 1 for light in PLAN]
+    alone = [np.count_nonzero(light.colour) == 1 for light in PLAN]
     return np.where(alone, np.arange(count), shifted(count))
 
 

@@ -66,7 +66,7 @@ def test_uneven_primaries_are_no_dirt_on_the_print(tmp_path: Path) -> None:
 def test_hot_photosites_side_by_side_are_no_object(tmp_path: Path) -> None:
     """In two cells that touch, in every frame: under lights these are as far off as what lies there makes them."""
     lab = hang()
-    light = next(light for light in BRIGHT if min(light.codes) > 80)
+    light = next(light for light in BRIGHT if min(light.colour) > 80)
     codes, places = lab.chart.rgb[lab.chart.cell_of_colour], lab.chart.centres_mm[lab.chart.cell_of_colour]
     dark = np.argsort(lab.world.reflected(codes, light.colour, SETTINGS).max(axis=1))[40:160]
     apart = np.linalg.norm(places[dark, None] - places[dark], axis=-1) + 1e3 * np.eye(len(dark))

@@ -141,7 +141,7 @@ def test_the_brightest_pure_lights_are_chosen() -> None:
     lights = plan_illuminations(3, (3000,))
     found = pure_lights(lights)
     assert found is not None
-    assert [lights[n].codes for n in found] == [
+    assert [lights[n].colour for n in found] == [
         (255, 0, 0),
         (0, 255, 0),
         (0, 0, 255),

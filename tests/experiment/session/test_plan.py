@@ -55,7 +55,7 @@ def test_response_frames_come_after_the_first_pair_and_are_taken_for_nothing_els
     assert "".join(step.kind[0] for step in steps) == "wd" + "r" * len(RESPONSE) + "llwdllwdlwd"
     response = [step for step in steps if step.kind == "response"]
     assert tuple(step.colour for step in response) == RESPONSE
-    assert all(step.illumination is None and max(step.colour.codes) < 255 for step in response)
+    assert all(step.illumination is None and max(step.colour) < 255 for step in response)
     assert response[0].stem == "0002_response"
     assert len(set(RESPONSE)) == len(RESPONSE)
 

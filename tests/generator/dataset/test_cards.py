@@ -11,10 +11,20 @@ from typing import TYPE_CHECKING, get_args
 import pytest
 
 from calibration.citation import NOT_RECORDED, OriginRecord
-from generator.dataset.layouts import CONFORMS_TO, JOINED, OPEN, card, datasheet, kind_of, size_category
+from generator.dataset.layouts import (
+    CONFORMS_TO,
+    JOINED,
+    OPEN,
+    Description,
+    Layout,
+    Split,
+    card,
+    datasheet,
+    kind_of,
+    size_category,
+)
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
-from generator.dataset.records import Description, Layout, Split
 from generator.pictures.sources import random_scenes
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ import pytest
 from matplotlib import text
 
 from generator.dataset.contact_sheet import contact_sheet
+from generator.dataset.layouts import Entry
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
-from generator.dataset.records import Entry
 from generator.lights.lighting import RandomLights
 from generator.pictures.sources import random_scenes
 

@@ -21,11 +21,10 @@ import numpy.typing as npt
 import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.layouts import JOINED
+from generator.dataset.layouts import COMPLETED_BY_HAND, JOINED, Layout
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset, file_faults, open_dataset
-from generator.dataset.records import COMPLETED_BY_HAND, Layout
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks

@@ -21,6 +21,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.registry import register_implementation
 
 from foundation.errors import FormatError, InputError, StorageError
+from generator.dataset.layouts import Layout
 from generator.dataset.making import (
     finish_dataset,
     generate_dataset,
@@ -31,7 +32,6 @@ from generator.dataset.making import (
 )
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import file_faults, open_dataset
-from generator.dataset.records import Layout
 from generator.lights.lighting import ListedLights
 from generator.pictures.sources import find_pictures, random_scenes
 from generator.stores import LocalStore, RemoteStore, open_store

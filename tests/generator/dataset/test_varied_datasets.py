@@ -60,9 +60,7 @@ def make(lut: Lut, pictures: Path, tmp_path: Path) -> Make:
         name: str, variation: Variation | None = None, crops: int = 1, lights: Any = None, workers: int = 1, **more: Any
     ) -> Dataset:
         preparation = Preparation(crop=(32, 24), crops=crops, seed=5) if crops > 1 else Preparation()
-        options = DatasetOptions(
-            form="tiff", previews=False, variation=variation or Variation(), crops=crops, shard_images=3, **more
-        )
+        options = DatasetOptions(form="tiff", previews=False, variation=variation, crops=crops, shard_images=3, **more)
         choice = lights or RandomLights(2, len(lut.white), 5)
         sources = find_pictures(pictures, preparation)
         return generate_dataset(

@@ -21,6 +21,7 @@ from foundation.errors import FormatError, InputError
 from foundation.files import FolderLock, held_folder
 from generator.dataset import layouts as plain_files
 from generator.dataset import making
+from generator.dataset.layouts import FinishedImage, Layout, ShardRecord
 from generator.dataset.making import (
     SILENT,
     Callbacks,
@@ -34,7 +35,6 @@ from generator.dataset.making import (
 )
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, open_dataset
-from generator.dataset.records import FinishedImage, Layout, ShardRecord
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights, RandomLights
 from generator.masks.making import parse_masks

@@ -16,9 +16,9 @@ import pytest
 
 from foundation.errors import QualityError
 from generator.explore.explorer import Explorer, ExploreServer
+from generator.files import flash
 from generator.lights.gamut import rb_of
 from generator.lights.lighting import parse_mixture
-from generator.pictures.preview import flash
 from generator.pictures.sources import Preparation, find_pictures
 from tests.acquisition.monitor.browser import (
     NAMELESS,

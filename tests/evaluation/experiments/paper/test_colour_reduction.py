@@ -35,7 +35,7 @@ from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
-from generator.pictures.preview import fit_flash
+from generator.files import fit_flash
 
 
 @dataclass(frozen=True, eq=False)

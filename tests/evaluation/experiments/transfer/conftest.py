@@ -22,7 +22,7 @@ from generator.dataset.plan import DatasetOptions
 from generator.lights.lighting import LightChoice, ListedLights
 from generator.pictures.sources import UNPREPARED, Preparation, find_pictures
 from generator.variation.sensor_noise import SensorNoise
-from generator.variation.variation import NO_VARIATION, Variation, parse_gradient
+from generator.variation.variation import Variation, parse_gradient
 
 LIGHTS = np.array([[4000.0, 8000, 3000], [3000, 8000, 6000]])
 """Counts of white under the two lights of the table."""
@@ -55,7 +55,7 @@ class Maker:
         if seed != preparation.seed:
             reading["lights_of"] = {"pictures_seed": preparation.seed}
         silent = SensorNoise((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        variation = NO_VARIATION if gradient is None else Variation(gradient=parse_gradient(gradient), noise=silent)
+        variation = None if gradient is None else Variation(gradient=parse_gradient(gradient), noise=silent)
         options = DatasetOptions(
             previews=False,
             split=split,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from foundation.errors import InputError
-from generator.pictures.preview import fit_flash, flash, preview_of
+from generator.files import fit_flash, flash, preview_of
 
 
 def test_two_pixels_by_hand() -> None:
