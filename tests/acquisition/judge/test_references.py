@@ -278,7 +278,8 @@ def test_amounts_are_as_sure_as_the_noise_of_all_tiles_and_the_black_level() -> 
     seen = frame.tiles[0] - DARK
     # Of 100 blocks to a tile, green twice a block; what else a tile is off by is 0.3 %.
     variance = NOISE.variance(frame.tiles[0]) / [100, 200, 100] + (0.003 * seen) ** 2
-    by_noise = np.linalg.inv(TILES * (PRIMARIES / variance) @ PRIMARIES.T)
+    gram: npt.NDArray[np.float64] = TILES * (PRIMARIES / variance) @ PRIMARIES.T
+    by_noise = np.asarray(np.linalg.inv(gram), dtype=np.float64)
     # The black level of both frames is 0.3 counts off in all tiles alike.
     by_black = by_noise @ (TILES * PRIMARIES / variance)
     light = basis.light(frame)
