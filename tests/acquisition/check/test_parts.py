@@ -164,15 +164,23 @@ def test_the_run_s_own_limit_makes_the_room_s_light_a_fault() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mm", "focal_px"),
-    [(35.0, 5728.1 * 35 / 25.4 / 2), (0.0, None), (5000.0, None)],
-    ids=["stated", "without contacts", "no lens is so long"],
+    ("mm", "unit", "density", "focal_px"),
+    [
+        (35.0, 2, 5728.1, 5728.1 * 35 / 25.4 / 2),
+        (35.0, 3, 2255.2, 2255.2 * 35 / 10 / 2),
+        (35.0, 4, 225.5, 225.5 * 35 / 2),
+        (0.0, 2, 5728.1, None),
+        (5000.0, 2, 5728.1, None),
+    ],
+    ids=["inch", "centimetre", "millimetre", "without contacts", "no lens is so long"],
 )
-def test_the_focal_length_is_read_from_exif(tmp_path: Path, mm: float, focal_px: float | None) -> None:
+def test_the_focal_length_is_read_from_exif(
+    tmp_path: Path, mm: float, unit: int, density: float, focal_px: float | None
+) -> None:
     exif = {
         TiffTag.FOCAL_LENGTH: rationals(mm),
-        TiffTag.FOCAL_PLANE_X_RESOLUTION: rationals(5728.1),
-        TiffTag.FOCAL_PLANE_RESOLUTION_UNIT: (ValueType.SHORT, [2]),
+        TiffTag.FOCAL_PLANE_X_RESOLUTION: rationals(density),
+        TiffTag.FOCAL_PLANE_RESOLUTION_UNIT: (ValueType.SHORT, [unit]),
     }
     path = tmp_path / "frame.dng"
     path.write_bytes(head({TiffTag.IMAGE_WIDTH: (ValueType.LONG, [5184])}, 0, exif))
