@@ -350,7 +350,7 @@ class Spot:
     - `patches`: its cells, or references.
     - `deviation`: light there over what is expected, less 1, of the channel that deviates most.
     - `crease`: whether it is long and narrow.
-    - `width_mm`, `angle_deg`: of a crease: its width, and its direction, clockwise from the right.
+    - `width_mm`, `angle_deg`: of a crease: its width, and its direction, clockwise from the right; else `size_mm`, 0.
     """
 
     centre_mm: tuple[float, float]
@@ -358,8 +358,8 @@ class Spot:
     patches: int
     deviation: float
     crease: bool
-    width_mm: float = 0.0
-    angle_deg: float = 0.0
+    width_mm: float
+    angle_deg: float
 
     def __str__(self) -> str:
         """Return "a stain or shadow of 58 mm at 420, 310 mm, 34 % darker"."""

@@ -88,7 +88,7 @@ def _draw_frame(axes: Any, seen: CheckFrames, figures: ChartMeasurements | None,
 def _rim_mm(spot: Spot, least_mm: float) -> npt.NDArray[np.float64]:
     """Return (N, 2) mm, an ellipse about a spot: a circle, or along a crease; its half axes are no less than given."""
     turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    along, across = (max(side / 2, least_mm) for side in (spot.size_mm, spot.width_mm or spot.size_mm))
+    along, across = (max(side / 2, least_mm) for side in (spot.size_mm, spot.width_mm))
     angle = np.radians(spot.angle_deg)
     x, y = along * np.cos(turn), across * np.sin(turn)
     turned = [x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)]

@@ -722,7 +722,7 @@ class JudgeState:
             leaning = Leaning() if found.lamp.stepped or state.rested else state.leaning.then(found.lamp.leaning)
             state = replace(state, rested=False, leaning=leaning)
         steady = float(np.hypot(*(frame.moved_px - np.array(self.candidate[1:])))) <= limits.STEADY_PX
-        if not np.isnan(frame.moved_px).any() and (self.moved_px is None or self.rested or steady):
+        if not np.isnan(frame.moved_px).any() and (self.rested or steady):
             state = replace(state, moved_px=frame.moved_px)
         if frame.anchor is not None:
             state = state._anchored(frame.anchor)

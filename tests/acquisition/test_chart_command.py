@@ -11,7 +11,7 @@ import tifffile
 from pyapriltags import Detector
 
 from acquisition.cli import main
-from experiment.chart.layout import design_chart
+from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import load_chart
 
 pytestmark = pytest.mark.slow
@@ -66,18 +66,21 @@ def test_a_page_too_small_for_the_usual_cells_gets_smaller_ones(chart: Run, caps
 def test_cells_that_a_camera_cannot_separate_are_made_and_warned_of(
     chart: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert chart("out", "--bits", "3", "--page", "1000x60", "--cell-mm", "1.5", "--no-tiff") == 0
+    assert chart("out", "--bits", "2", "--page", "600x40", "--cell-mm", "1.5", "--no-tiff") == 0
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("warning: cells of 1.48 mm are small for a camera")
-    # 0.94 × 2601 and 3132 px for 1000 mm: 2.44 and 2.94 px a millimetre, of which a module has 0.593 and a cell 1.482.
-    assert "EOS 550D: 3.6 px a cell, 1.4 px a tag module; EOS 6D Mark II: 4.4 px a cell, 1.7 px a tag module" in line
+    # 0.94 × 2601 and 3132 px for 600 mm: 4.07 and 4.91 px a millimetre, of which a module has 0.593 and a cell 1.482.
+    assert "EOS 550D: 6.0 px a cell, 2.4 px a tag module; EOS 6D Mark II: 7.3 px a cell, 2.9 px a tag module" in line
     assert load_chart(Path("out/chart.json")).cell_mm[0] == pytest.approx(35 * 25.4 / 600)
 
 
 def test_the_paper_s_arrangement(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    assert chart("out", "--arrangement", "paper", "--no-tiff") == 0
-    assert "32768 colours, 0 tags, 23 references on 1189 × 841 mm, cells of 4.57 × 6.43 mm" in capsys.readouterr().out
+    assert chart("out", "--arrangement", "paper", "--bits", "2", "--page", "A6", "--no-tiff") == 0
+    assert "64 colours, 0 tags, 10 references on 148 × 105 mm, cells of 16.47 × 11.09 mm" in capsys.readouterr().out
     assert load_chart(Path("out/chart.json")).tags == ()
+    whole = paper_chart()
+    assert (whole.colour_count, whole.page_mm, len(whole.references)) == (32768, (1189, 841), 23)
+    assert whole.cell_mm == pytest.approx((4.57, 6.43), abs=0.005)
 
 
 @pytest.mark.parametrize(

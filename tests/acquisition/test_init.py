@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from acquisition.cli import main
+from experiment.chart import layout
 from experiment.chart.layout import design_chart
+from experiment.chart.model import Chart
 from experiment.config import load_lab
 from experiment.lights import load_illuminations, plan_illuminations, save_illuminations
 
@@ -44,7 +46,17 @@ def test_settings_are_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.slow
-def test_an_empty_folder_gets_the_whole_experiment(tmp_path: Path) -> None:
-    assert main(["init", str(tmp_path / "new" / "lab"), "--rig", "simulated"]) == 0
-    assert len(load_illuminations(tmp_path / "new" / "lab" / "illuminations.csv")) == 707
-    assert {path.name for path in (tmp_path / "new" / "lab" / "chart").iterdir()} >= {"chart.pdf", "chart.json"}
+def test_an_empty_folder_gets_the_whole_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[object]()
+
+    def designed(*design: object) -> Chart:
+        asked.append(design)
+        return design_chart(1)
+
+    monkeypatch.setattr(layout, "design_chart", designed)
+    lab = tmp_path / "new" / "lab"
+    assert main(["init", str(lab), "--rig", "simulated"]) == 0
+    assert asked == [(5, None, 1, None)], "the chart of all colours, of which a small one is drawn here"
+    assert len(load_illuminations(lab / "illuminations.csv")) == 707
+    names = {path.name for path in (lab / "chart").iterdir()}
+    assert names == {"chart.json", "chart.pdf", "preview.png", "proof.pdf", "PRINTING.txt"}

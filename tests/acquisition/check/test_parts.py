@@ -8,48 +8,168 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
+from acquisition.check import check
 from acquisition.check.camera import (
+    BlurMap,
     fit_transfer,
+    judge_clipping,
     judge_disk,
+    judge_hot,
     judge_noise_reduction,
+    judge_sharpness,
     judge_supplies,
+    judge_tilt,
+    judge_turn,
+    pair_noise,
     series_times,
-    tilt_deg,
 )
+from acquisition.check.findings import Finding
 from acquisition.check.frames import stated_focal_px
 from acquisition.check.light_and_print import AREAS, area_name, areas_of, judge_flicker, judge_primaries, measure_light
-from acquisition.check.places import Levels
+from acquisition.check.places import ChartMap, Levels
+from calibration.sampling import bleed
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
+from drivers.raw.rawfile import Mosaic, Plane
+from drivers.raw.storage import Area
 from drivers.tiff import TiffTag, ValueType, head, rationals
 from experiment.chart.layout import design_chart
+from experiment.framing.finding import Framing
 from foundation.errors import LinkTimeout
 
+WIDTH, HEIGHT = 420, 280
+"""Of a made-up frame, half-size pixels; its chart is a page of as many half millimetres, square to it."""
+PAGE = design_chart(2, (210.0, 140.0))
+SQUARE = np.diag([2.0, 2.0, 1.0])
 
-@pytest.mark.parametrize(("pan", "tilt"), [(0.0, 0.0), (8.0, 0.0), (0.0, -6.0), (-4.0, 3.0)])
-def test_tilt_is_read_from_a_homography(pan: float, tilt: float) -> None:
-    focal, centre = 3000.0, (1300.0, 866.0)
+
+def framing(homography: npt.NDArray[np.float64] = SQUARE, rotation_deg: float = 0.0) -> Framing:
+    plane = Plane("G", np.zeros((HEIGHT, WIDTH), dtype=np.float32), (0.0, 0.0))
+    return Framing(plane, (), (), homography, 0.0, 6.0, 1.0, True, rotation_deg)
+
+
+def mosaic(counts: npt.NDArray[np.uint16]) -> Mosaic:
+    area = Area(0, 0, *counts.shape)
+    return Mosaic(counts, "RGGB", np.full((2, 2), 2048.0), 15831, "a camera", counts, area, ())
+
+
+@pytest.mark.parametrize(
+    ("pan", "tilt", "nearer"),
+    [(0.0, 0.0, ""), (8.0, 0.0, "right nearer"), (0.0, -6.0, "top nearer"), (-9.0, 5.0, "left and bottom nearer")],
+)
+def test_tilt_is_read_from_a_homography_about_the_middle_of_the_frame(pan: float, tilt: float, nearer: str) -> None:
+    focal, centre = 600.0, ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
     normal = np.array([np.tan(np.radians(pan)), np.tan(np.radians(tilt)), 1.0])
     z = normal / np.linalg.norm(normal)
     x = np.cross([0, 1, 0], z)
     x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z], axis=1)
     camera = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
-    homography = camera @ np.column_stack([rotation[:, 0], rotation[:, 1], [-500.0, -400.0, 1800.0]])
-    assert tilt_deg(homography / homography[2, 2], focal, centre) == pytest.approx((pan, tilt), abs=1e-6)
+    homography = camera @ np.column_stack([x, np.cross(z, x), [-105.0, -70.0, 600.0]])
+    found = judge_tilt(framing(homography / homography[2, 2]), PAGE, focal)
+    assert (found.details["pan_deg"], found.details["tilt_deg"]) == pytest.approx((pan, tilt), abs=1e-6)
+    assert nearer in found.said
 
 
 @pytest.mark.parametrize(
-    ("mm", "focal_px"),
-    [(35.0, 5728.1 * 35 / 25.4 / 2), (0.0, None), (5000.0, None)],
-    ids=["stated", "without contacts", "no lens is so long"],
+    ("rotation_deg", "said", "off", "grade"),
+    [(-5.0, "upright", -5.0, "good"), (5.1, "upright", 5.1, "remark"), (91.0, "90° clockwise", 1.0, "remark"),
+     (-92.0, "90° counter-clockwise", -2.0, "remark"), (180.0, "upside down", 0.0, "remark")],
+)  # fmt: skip
+def test_quarter_turns_are_named(rotation_deg: float, said: str, off: float, grade: str) -> None:
+    found = judge_turn(framing(rotation_deg=rotation_deg))
+    assert (found.value, found.grade) == (pytest.approx(off), grade)
+    assert said in found.said
+
+
+def test_blur_is_judged_by_what_it_does_to_cells_of_their_size() -> None:
+    def seen(sigma_px: float, cell_px: float) -> Finding:
+        # One corner is softer by a third of a pixel.
+        places = PAGE.centres_mm
+        corner = (places > np.array([0.8, 2 / 3]) * PAGE.page_mm).all(axis=1)
+        return judge_sharpness(BlurMap(places, np.where(corner, sigma_px + 0.33, sigma_px)), PAGE, 4.0, cell_px)
+
+    soft, same, corner = seen(1.05, 10.0), seen(1.05, 15.0), seen(0.75, 10.0)
+    assert (soft.grade, same.grade, corner.grade) == ("fault", "good", "remark")
+    assert soft.value == pytest.approx(bleed(10.0, 1.38))
+    assert soft.details["median_bleed"] == pytest.approx(bleed(10.0, 1.05))
+    assert "the bottom far right is farther out of focus" in soft.remedy
+    assert judge_sharpness(BlurMap(PAGE.centres_mm, np.ones(64)), PAGE, 1.0, 10.0).grade == "not checked"
+
+
+def test_the_place_of_clipped_photosites_is_named_and_the_run_s_limit_is_the_fault_s() -> None:
+    place = ChartMap(PAGE.page_mm, SQUARE, np.zeros((1, 2)), np.zeros((1, 1, 2)), 1.0)
+    rows, columns = AREAS
+    counts = np.full((2 * HEIGHT, 2 * WIDTH), 9000, dtype=np.uint16)
+    for number in range(rows * columns):
+        counts[:] = 9000
+        row, column = divmod(number, columns)
+        # Near the area's last corner, and a few photosites near the frame's first.
+        bottom, right = 2 * HEIGHT * (row + 1) // rows, 2 * WIDTH * (column + 1) // columns
+        counts[bottom - 20 : bottom - 8, right - 20 : right - 8] = 13584
+        counts[8:10, 8:10] = 13584
+        found = judge_clipping(mosaic(counts), 0.5, 13584.0, 0.1, place)
+        assert f"most of them at {area_name(number)} of the chart" in found.said
+        assert found.value == pytest.approx(148 / counts.size)
+    share = 100 * 148 / (4 * WIDTH * HEIGHT)
+    grades = [judge_clipping(mosaic(counts), 0.5, 13584.0, limit, None).grade for limit in (0.99 * share, 1.01 * share)]
+    assert grades == ["fault", "remark"]
+
+
+def test_hot_photosites_are_counted() -> None:
+    random = np.random.default_rng(2)
+    dark = np.rint(2048 + 4 * random.standard_normal((600, 800))).astype(np.uint16)
+    dark[25::50, 30::80] += 60
+    white = np.full_like(dark, 9000)
+    for share in (0.0, 0.01):
+        lit = np.rint(dark + share * white).astype(np.uint16)
+        found = judge_hot(mosaic(lit), share, mosaic(white))
+        assert found.details["count"] == 12 * 10
+        assert found.value == pytest.approx(120e6 / dark.size)
+
+
+def test_the_noise_of_a_pair_is_that_of_single_photosites() -> None:
+    random = np.random.default_rng(6)
+    one, other = (
+        mosaic(np.rint(6048 + 20 * random.standard_normal((2 * HEIGHT, 2 * WIDTH))).astype(np.uint16)) for _ in range(2)
+    )
+    place = ChartMap(PAGE.page_mm, SQUARE, np.zeros((1, 2)), np.zeros((1, 1, 2)), 1.0)
+    points = np.stack(np.meshgrid(np.arange(3.0, 207, 2.5), np.arange(3.0, 137, 2.5)), axis=-1).reshape(-1, 2)
+    level, variance = pair_noise(one, other, place, points)
+    np.testing.assert_allclose(level.mean(axis=0), 4000, atol=1)
+    # 25 samples of each of 4 400 windows; rounding adds a twelfth.
+    np.testing.assert_allclose(variance.mean(axis=0), 400 + 1 / 12, rtol=0.02)
+
+
+def test_the_run_s_own_limit_makes_the_room_s_light_a_fault() -> None:
+    refuses = check._as_the_run_refuses  # pyright: ignore[reportPrivateUsage]
+    seen = Finding("room light", "remark", "seen", 0.03)
+    assert [refuses(seen, percent).grade for percent in (2.9, 3.1)] == ["fault", "remark"]
+    assert refuses(seen, 2.9).tolerable == (None, pytest.approx(0.029))
+    assert refuses(replace(seen, grade="good"), 2.9).grade == "good"
+    unknown = replace(seen, value=None, grade="not checked")
+    assert refuses(unknown, 2.9) == unknown
+
+
+@pytest.mark.parametrize(
+    ("mm", "unit", "density", "focal_px"),
+    [
+        (35.0, 2, 5728.1, 5728.1 * 35 / 25.4 / 2),
+        (35.0, 3, 2255.2, 2255.2 * 35 / 10 / 2),
+        (35.0, 4, 225.5, 225.5 * 35 / 2),
+        (0.0, 2, 5728.1, None),
+        (5000.0, 2, 5728.1, None),
+    ],
+    ids=["inch", "centimetre", "millimetre", "without contacts", "no lens is so long"],
 )
-def test_the_focal_length_is_read_from_exif(tmp_path: Path, mm: float, focal_px: float | None) -> None:
+def test_the_focal_length_is_read_from_exif(
+    tmp_path: Path, mm: float, unit: int, density: float, focal_px: float | None
+) -> None:
     exif = {
         TiffTag.FOCAL_LENGTH: rationals(mm),
-        TiffTag.FOCAL_PLANE_X_RESOLUTION: rationals(5728.1),
-        TiffTag.FOCAL_PLANE_RESOLUTION_UNIT: (ValueType.SHORT, [2]),
+        TiffTag.FOCAL_PLANE_X_RESOLUTION: rationals(density),
+        TiffTag.FOCAL_PLANE_RESOLUTION_UNIT: (ValueType.SHORT, [unit]),
     }
     path = tmp_path / "frame.dng"
     path.write_bytes(head({TiffTag.IMAGE_WIDTH: (ValueType.LONG, [5184])}, 0, exif))

@@ -96,7 +96,7 @@ def bench(folder: Path, room: Room, count: int = 12, every: int = 6, lab: str = 
 @pytest.fixture(scope="session")
 def taught(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     """Make a bench whose judge has seen a whole small session under a colour wheel, all of it accepted."""
-    made = bench(tmp_path_factory.mktemp("judge"), Room(seed=3, wheel_hz=60, transfer=2.2), count=24, every=12)
+    made = bench(tmp_path_factory.mktemp("judge"), Room(seed=3, wheel_hz=60, transfer=2.2), count=12, every=6)
     for step in made.steps:
         judgement = made.take(step)
         assert judgement.accepted, f"{step}: {judgement.reason}"

@@ -45,6 +45,27 @@ def few(taught: Bench, tmp_path: Path) -> Bench:
     return lab
 
 
+@pytest.fixture(scope="module")
+def earlier(taught: Bench, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[SessionStep, bytes]]:
+    """Return what was measured of the frames of such a plan, but for its last pair, by a run that is over."""
+    lab = bench(tmp_path_factory.mktemp("earlier"), Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
+    lab.world = taught.world
+    kept: list[tuple[SessionStep, bytes]] = []
+    for step in lab.steps[:-2]:
+        judgement = lab.take(step)
+        assert judgement.accepted
+        kept.append((step, judgement.measurement))
+    return kept
+
+
+def resume(lab: Bench, earlier: list[tuple[SessionStep, bytes]]) -> Bench:
+    """Return the lab of another run that has taken up what an earlier one took."""
+    resumed = replace(lab, judge=LiveJudge(lab.settings, lab.chart, lab.lights))
+    for step, measurement in earlier:
+        resumed.judge.recall(step, measurement, True)
+    return resumed
+
+
 def cause(judgement: Judgement) -> str:
     return next((check.name for check in judgement.checks if check.reason), "")
 
@@ -53,11 +74,11 @@ def check(judgement: Judgement, name: str) -> Check:
     return next(found for found in judgement.checks if found.name == name)
 
 
-@pytest.mark.parametrize("codes", [ORANGE, SKY, DEEP_BLUE, (255, 0, 0), (48, 255, 188)])
+@pytest.mark.parametrize("codes", [SKY, DEEP_BLUE, (48, 255, 188)])
 def test_a_light_that_was_ordered_is_accepted(taught: Bench, codes: tuple[int, int, int]) -> None:
     lab = taught.fork()
-    said = [lab.take(lab.light(*codes)) for _ in range(3)]
-    assert [judgement.reason for judgement in said] == ["", "", ""]
+    said = [lab.take(lab.light(*codes)) for _ in range(2)]
+    assert [judgement.reason for judgement in said] == ["", ""]
     assert said[0].seen is not None
     assert said[0].preview[:2] == b"\xff\xd8"
 
@@ -92,9 +113,8 @@ def test_another_light_of_the_plan_is_named(taught: Bench) -> None:
     assert str(other) in seen.reason
 
 
-@pytest.mark.parametrize("pixels", [0.3, 1.0, 3.0, 8.0])
-@pytest.mark.parametrize("codes", [ORANGE, DEEP_BLUE])
-def test_a_bump_is_movement(taught: Bench, pixels: float, codes: tuple[int, int, int]) -> None:
+@pytest.mark.parametrize(("codes", "pixels"), [(ORANGE, 0.3), (DEEP_BLUE, 1.0), (DEEP_BLUE, 3.0), (ORANGE, 8.0)])
+def test_a_bump_is_movement(taught: Bench, codes: tuple[int, int, int], pixels: float) -> None:
     lab = taught.fork()
     judgement = lab.take(lab.light(*codes), Bump(px=pixels))
     assert cause(judgement) == "movement"
@@ -112,16 +132,12 @@ def test_a_small_bump_that_stays_is_followed_and_a_large_one_lasts(taught: Bench
     assert [lab.take(lab.light(*ORANGE), large).lasting for _ in range(3)] == [False, False, True]
 
 
-@pytest.mark.parametrize("sigma", [1.0, 3.0])
-def test_defocus_is_refused(taught: Bench, sigma: float) -> None:
+def test_defocus_is_refused(taught: Bench) -> None:
     lab = taught.fork()
-    judgement = lab.take(lab.light(*ORANGE), Defocus(px=sigma))
-    assert cause(judgement) in ("blur", "movement")
-    if sigma == 1.0:
-        assert cause(judgement) == "blur"
+    assert cause(lab.take(lab.light(*ORANGE), Defocus(px=1.0))) == "blur"
 
 
-@pytest.mark.parametrize("percent", [-2.0, -10.0, -50.0])
+@pytest.mark.parametrize("percent", [-2.0, -50.0])
 def test_a_step_of_the_lamp_is_told_from_another_light(taught: Bench, percent: float) -> None:
     lab = taught.fork()
     judgement = lab.take(lab.light(*SKY), LampStep(percent=percent))
@@ -133,13 +149,12 @@ def test_a_step_of_the_lamp_is_told_from_another_light(taught: Bench, percent: f
         assert lab.take(lab.light(*ORANGE), LampStep(percent=percent)).accepted
 
 
-@pytest.mark.parametrize("percent", [1.0, 3.0])
-def test_light_in_the_room_is_told(taught: Bench, percent: float) -> None:
-    lit = AmbientStep(percent=percent)
+def test_light_in_the_room_is_told(taught: Bench) -> None:
+    lit = AmbientStep(percent=1.0)
     lab = taught.fork()
     blue = lab.take(lab.light(*DEEP_BLUE), lit)
     assert cause(blue) == "ambient", blue.reason
-    assert check(blue, "ambient").value == pytest.approx(percent, rel=0.2)
+    assert check(blue, "ambient").value == pytest.approx(1.0, rel=0.2)
     lab = taught.fork()
     dark = lab.take(DARK_STEP, lit)
     assert cause(dark) == "ambient"
@@ -169,8 +184,7 @@ def test_who_walks_past_is_no_chart_that_moved(taught: Bench) -> None:
     assert cause(taught.fork().take(WHITE_STEP, Defocus(px=0.5))) == "blur"
 
 
-@pytest.mark.parametrize("share", [1.0, 0.3])
-@pytest.mark.parametrize("codes", [ORANGE, DEEP_BLUE])
+@pytest.mark.parametrize(("codes", "share"), [(ORANGE, 1.0), (DEEP_BLUE, 0.3)])
 def test_a_screen_saver_is_named(taught: Bench, codes: tuple[int, int, int], share: float) -> None:
     lab = taught.fork()
     drawn = lab.take(lab.light(*codes), ScreenSaver(share=share))
@@ -179,7 +193,7 @@ def test_a_screen_saver_is_named(taught: Bench, codes: tuple[int, int, int], sha
     assert "cable" not in drawn.reason
 
 
-@pytest.mark.parametrize("codes", [ORANGE, (255, 255, 255), (40, 180, 220)])
+@pytest.mark.parametrize("codes", [ORANGE, (40, 180, 220)])
 def test_a_primary_without_light_is_named(taught: Bench, codes: tuple[int, int, int]) -> None:
     lab = taught.fork()
     judgement = lab.take(lab.light(*codes), DeadPrimary())
@@ -193,7 +207,7 @@ def test_a_primary_without_light_is_named(taught: Bench, codes: tuple[int, int, 
         assert "comes through" not in seen.reason
 
 
-@pytest.mark.parametrize("part", [HalfChanged(), HalfChanged(place=(-9, -9, 0.2, 0.2)), HalfChanged(share=0.3)])
+@pytest.mark.parametrize("part", [HalfChanged(), HalfChanged(share=0.3)])
 def test_a_picture_changed_in_part_is_told(taught: Bench, part: HalfChanged) -> None:
     lab = taught.fork()
     assert lab.take(lab.light(*SKY)).accepted
@@ -280,7 +294,7 @@ def test_nothing_is_accepted_unseen_where_a_primary_or_the_dark_frame_is_wanting
     assert cause(few.show(few.counts(green), light)) == "light"
 
 
-@pytest.mark.parametrize("passing", [0, 2, 4])
+@pytest.mark.parametrize("passing", [0, 4])
 def test_somebody_who_passes_in_a_frame_that_others_are_held_against_is_told(few: Bench, passing: int) -> None:
     hand = Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3)
     said = [few.take(step, *([hand] if step.number == passing else [])) for step in few.steps[:5]]
@@ -292,11 +306,10 @@ def test_somebody_who_passes_in_a_frame_that_others_are_held_against_is_told(few
     assert [judgement.reason for judgement in again] == [""] * 7
 
 
-def test_somebody_who_passes_while_a_chart_that_moved_is_shown_the_primaries_is_told(few: Bench) -> None:
-    first = [few.take(step) for step in few.steps[:-2]]
-    resumed = replace(few, judge=LiveJudge(few.settings, few.chart, few.lights))
-    for step, judgement in zip(few.steps, first, strict=False):
-        resumed.judge.recall(step, judgement.measurement, True)
+def test_somebody_who_passes_while_a_chart_that_moved_is_shown_the_primaries_is_told(
+    few: Bench, earlier: list[tuple[SessionStep, bytes]]
+) -> None:
+    resumed = resume(few, earlier)
     elsewhere, hand = Bump(px=6.7), Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3)
     ties = link_steps(500)
     said = [resumed.take(step, elsewhere, *([hand] if step.number == 502 else [])) for step in ties[:4]]
@@ -313,15 +326,8 @@ def test_a_session_whose_measurements_are_lost_goes_on(few: Bench) -> None:
     assert few.judge.state.modelled
 
 
-def test_a_run_taken_up_again_knows_what_was_seen(few: Bench) -> None:
-    kept: list[tuple[SessionStep, bytes]] = []
-    for step in few.steps[:-2]:
-        judgement = few.take(step)
-        assert judgement.accepted
-        kept.append((step, judgement.measurement))
-    resumed = replace(few, judge=LiveJudge(few.settings, few.chart, few.lights))
-    for step, measurement in kept:
-        resumed.judge.recall(step, measurement, True)
+def test_a_run_taken_up_again_knows_what_was_seen(few: Bench, earlier: list[tuple[SessionStep, bytes]]) -> None:
+    resumed = resume(few, earlier)
     assert resumed.judge.state.modelled
     # A day later the lamp is 3 % weaker: drift, no other light.
     weaker = LampStep(percent=-3)
@@ -331,19 +337,16 @@ def test_a_run_taken_up_again_knows_what_was_seen(few: Bench) -> None:
     assert resumed.take(resumed.light(*SKY), weaker).accepted
     assert cause(resumed.show(resumed.counts(resumed.light(*SKY), weaker), resumed.light(*ORANGE))) == "light"
     assert cause(resumed.take(resumed.light(*SKY), LampStep(percent=-6))) == "lamp"
-    another = replace(few, judge=LiveJudge(few.settings, few.chart, few.lights))
-    for step, measurement in kept:
-        another.judge.recall(step, measurement, True)
     # Another lamp is told before the first light is taken under it.
-    tie = another.take(link_steps(500)[0], LampStep(percent=-21))
+    tie = resume(few, earlier).take(link_steps(500)[0], LampStep(percent=-21))
     assert cause(tie) == "white drift"
     assert tie.lasting
 
 
-def test_a_chart_that_moved_between_runs_is_told_and_followed(few: Bench) -> None:
-    resumed = replace(few, judge=LiveJudge(few.settings, few.chart, few.lights))
-    for step in few.steps[:-2]:
-        resumed.judge.recall(step, few.take(step).measurement, True)
+def test_a_chart_that_moved_between_runs_is_told_and_followed(
+    few: Bench, earlier: list[tuple[SessionStep, bytes]]
+) -> None:
+    resumed = resume(few, earlier)
     elsewhere = Bump(px=6.7, direction_deg=-27)
     said = [resumed.take(step, elsewhere) for step in link_steps(500)]
     assert all(judgement.accepted for judgement in said), [judgement.reason for judgement in said]
@@ -356,7 +359,7 @@ def test_a_chart_that_moved_between_runs_is_told_and_followed(few: Bench) -> Non
 def test_without_response_frames_a_stale_light_is_told_and_others_are_not_refused(
     tmp_path: Path, taught: Bench
 ) -> None:
-    lab = bench(tmp_path, Room(seed=3), count=12, every=6, response=False)
+    lab = bench(tmp_path, Room(seed=3), count=6, every=3, response=False)
     lab.world = taught.world
     for step in lab.steps:
         assert (judgement := lab.take(step)).accepted, judgement.reason
@@ -378,7 +381,7 @@ def test_a_chart_that_is_not_there_is_said_in_the_first_frame(tmp_path: Path, ta
 
 
 def test_a_projector_that_does_not_add_is_told_and_not_refused(tmp_path: Path, taught: Bench) -> None:
-    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=16, every=8)
+    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=10, every=5)
     lab.world = taught.world
 
     def shown(colour: Colour) -> Situation:
@@ -419,7 +422,7 @@ def test_a_part_that_still_shows_the_light_before_is_named_as_that(taught: Bench
 
 def test_a_hand_is_named_as_one_also_where_the_light_before_was_darker(taught: Bench) -> None:
     hand = Person(place=(0.3, 0.4, 0.5, 0.6), left=0.3)
-    for before in (SKY, (120, 77, 48), (0, 0, 255)):
+    for before in (SKY, (120, 77, 48)):
         lab = taught.fork()
         assert lab.take(lab.light(*before)).accepted
         uneven = lab.take(lab.light(*ORANGE), hand, before=Colour(*before))
@@ -436,13 +439,13 @@ def test_light_in_the_room_that_no_frame_tells_alone_is_told_by_two(added: float
 
 
 def test_scrambled_rows_are_named_also_where_they_are_brighter(taught: Bench) -> None:
-    for top in np.linspace(0.2, 0.8, 13).tolist():
+    for top in np.linspace(0.2, 0.8, 5).tolist():
         lab = taught.fork()
         assert cause(lab.take(lab.light(*ORANGE), ScrambledRows(top=top, bottom=top + 0.05))) == "rows", top
 
 
 def test_where_white_has_some_hundred_counts_noise_and_black_level_are_no_light(tmp_path: Path) -> None:
-    lab = bench(tmp_path, Room(seed=14, wheel_hz=60, white_level_share=0.05), count=8, every=4)
+    lab = bench(tmp_path, Room(seed=14, wheel_hz=60, white_level_share=0.05), count=4, every=4)
     assert [said.reason for said in map(lab.take, lab.steps) if said.reason] == []
     assert lab.take(lab.light(*ORANGE)).accepted
     assert cause(lab.show(lab.counts(lab.light(*ORANGE)), lab.light(*SKY))) == "light"

@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from acquisition.judge import judge as judge_module
 from acquisition.judge import limits, state
 from acquisition.judge.judge import MOST_RESTARTS, judge_dark, judge_first_frames, judge_first_primary, judge_white
 from acquisition.judge.measure import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Frame, FramePlaces, Measured, Noise
-from acquisition.judge.state import Basis, Codes, JudgeState, ProjectorModel, Seen
+from acquisition.judge.state import Basis, Codes, Examined, JudgeState, ProjectorModel, Seen
 from drivers.presenter import Colour
 from experiment.config import JudgeSettings
 from experiment.session.records import TOP, Check, SessionStep
@@ -229,6 +230,7 @@ def test_the_first_white_frame_is_held_against_what_the_others_say_before_the_fi
         assert found.value == pytest.approx(100 * (float(np.max(gain)) - 1), abs=2)
         assert found.low is not None
         assert found.low == -(found.high or 0) < -JUDGE.drift_percent
+        assert f"{found.value:+.1f} % as bright" in found.reason
 
 
 def test_the_first_white_frame_is_judged_at_the_first_light_alone_and_where_enough_is_known() -> None:
@@ -268,6 +270,60 @@ def test_first_frames_are_taken_again_as_often_as_a_passer_by_needs_and_then_som
     ]
     asked = ["do not agree" in found.reason for found in said if found is not None]
     assert asked == [False] * MOST_RESTARTS + [True, True]
+
+
+def test_amounts_are_as_sure_as_the_noise_of_all_tiles_and_the_black_level() -> None:
+    frame, basis = picture((200, 150, 100)), begun().basis
+    assert basis is not None
+    seen = frame.tiles[0] - DARK
+    # Of 100 blocks to a tile, green twice a block; what else a tile is off by is 0.3 %.
+    variance = NOISE.variance(frame.tiles[0]) / [100, 200, 100] + (0.003 * seen) ** 2
+    gram: npt.NDArray[np.float64] = TILES * (PRIMARIES / variance) @ PRIMARIES.T
+    by_noise = np.asarray(np.linalg.inv(gram), dtype=np.float64)
+    # The black level of both frames is 0.3 counts off in all tiles alike.
+    by_black = by_noise @ (TILES * PRIMARIES / variance)
+    light = basis.light(frame)
+    np.testing.assert_allclose(light.covariance, by_noise + 2 * 0.3**2 * by_black @ by_black.T)
+    np.testing.assert_allclose(light.amounts, (np.array([200, 150, 100]) / TOP) ** 2.2, rtol=1e-9)
+
+
+def test_more_light_is_no_room_s_light_where_the_lamp_scatters_as_much() -> None:
+    codes, scatter = (255, 249, 255), 0.03
+    first = begun()
+    model = first.without_white()
+    assert model is not None
+    assert first.basis is not None
+    light = first.basis.light(picture(codes, 1.08))
+
+    def added(brightness_sd: float) -> tuple[float, float] | None:
+        steady = replace(model, brightness=(100 * brightness_sd**2, 100.0))
+        return judge_module._SeenLight(steady, light, codes, None, ())._added_of(None)  # pyright: ignore[reportPrivateUsage]
+
+    assert added(scatter) is None
+    found = added(0.0006)
+    assert found is not None
+    assert found[0] == pytest.approx(0.08, abs=0.01)
+
+
+def test_of_black_a_model_foretells_nothing_but_stray_light() -> None:
+    expected = ProjectorModel.unknown().predict((0, 0, 0))
+    assert expected.amounts.tolist() == [0, 0, 0]
+    np.testing.assert_allclose(expected.covariance, 3e-4**2 * np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("rested", "candidate", "rests"),
+    [(False, (np.nan, np.nan), (0.0, 0.0)), (False, (0.35, 0.0), (0.3, 0.0)), (True, (np.nan, np.nan), (0.3, 0.0))],
+    ids=["creeps", "repeated", "after a pause"],
+)
+def test_a_chart_s_place_of_rest_is_another_only_if_it_is_shown_twice_or_after_a_pause(
+    rested: bool, candidate: tuple[float, float], rests: tuple[float, float]
+) -> None:
+    frame = Frame(measured(WHITE), np.full(3, 500.0), np.array([0.3, 0.0]))
+    before = known(moved_px=np.zeros(2), rested=rested, candidate=(np.nan, *candidate))
+    after = before.after(LIGHT, Examined(frame, None, True)).moved_px
+    assert after is not None
+    assert after.tolist() == list(rests)
 
 
 def test_of_a_curve_a_small_part_is_the_primary_s_own() -> None:

@@ -26,13 +26,18 @@ from tests.serving import serving
 SCRIPT = "<script>alert(1)</script>"
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Iterator[MadeUpRun]:
+def begun(folder: Path) -> MadeUpRun:
     """Return a run of four lights with hostile names and reasons: white and dark taken, the first light refused."""
-    made = MadeUpRun.begin(tmp_path / "night <b>1")
+    made = MadeUpRun.begin(folder / "night <b>1")
     made.take(made.steps[0])
     made.take(made.steps[1])
     made.take(made.steps[2], f"{SCRIPT} in the light", value=8.0)
+    return made
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[MadeUpRun]:
+    made = begun(tmp_path)
     yield made
     made.journal.close()
 
@@ -45,6 +50,15 @@ def served(folder: Path, host: str = "127.0.0.1") -> AbstractContextManager[Moni
 def opened(run: MadeUpRun) -> Iterator[MonitorServer]:
     with served(run.folder) as monitor:
         yield monitor
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MonitorServer]:
+    """Serve one such run to all who only ask."""
+    made = begun(tmp_path_factory.mktemp("served"))
+    with served(made.folder) as monitor:
+        yield monitor
+    made.journal.close()
 
 
 def ask(
@@ -67,14 +81,14 @@ def state_of(monitor: MonitorServer, since: str = "") -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("target", ["/frame/١.jpg", "/frame/1.jpg\n", "//[", "/%", "", "http://localhost/", "*"])
-def test_what_is_no_address_is_refused(opened: MonitorServer, target: str) -> None:
-    asked = opened.access.judge(target, "localhost")
+def test_what_is_no_address_is_refused(still: MonitorServer, target: str) -> None:
+    asked = still.access.judge(target, "localhost")
     assert isinstance(asked, Request)
-    assert isinstance(opened.answer(asked), Refusal) == (target != "")
+    assert isinstance(still.answer(asked), Refusal) == (target != "")
 
 
-def test_how_the_session_stands_is_told_to_scripts(opened: MonitorServer) -> None:
-    told = json.loads(ask(opened, "/status.json")[2])
+def test_how_the_session_stands_is_told_to_scripts(still: MonitorServer) -> None:
+    told = json.loads(ask(still, "/status.json")[2])
     assert (told["state"], told["alive"]) == ("running", True)
     assert (told["done"], told["total"]) == (2, 8)
     assert (told["lights_done"], told["lights_total"]) == (0, 4)
@@ -82,8 +96,8 @@ def test_how_the_session_stands_is_told_to_scripts(opened: MonitorServer) -> Non
     assert told["remaining_s"] == pytest.approx(6 * 5 * 3 / 2, abs=1), "two of three attempts gave a frame"
 
 
-def test_the_page_stands_alone_and_holds_no_markup_of_the_session(opened: MonitorServer) -> None:
-    status, headers, body = ask(opened, "/")
+def test_the_page_stands_alone_and_holds_no_markup_of_the_session(still: MonitorServer) -> None:
+    status, headers, body = ask(still, "/")
     text = body.decode()
     assert status == 200
     assert "night &lt;b&gt;1" in text
@@ -153,25 +167,25 @@ def test_no_row_of_a_journal_leads_out_of_the_previews(opened: MonitorServer, ru
         "/journal.sqlite",
     ],
 )
-def test_other_addresses_do_not_exist(opened: MonitorServer, path: str) -> None:
-    assert ask(opened, path)[0] == 404
+def test_other_addresses_do_not_exist(still: MonitorServer, path: str) -> None:
+    assert ask(still, path)[0] == 404
 
 
 @pytest.mark.parametrize("since", ["x", "..", "a.b.c", "%00", "0.-1.0", "'", "9" * 5000])
-def test_a_strange_cursor_gives_everything(opened: MonitorServer, since: str) -> None:
-    assert "session" in state_of(opened, since)
+def test_a_strange_cursor_gives_everything(still: MonitorServer, since: str) -> None:
+    assert "session" in state_of(still, since)
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
-def test_nothing_can_be_changed(opened: MonitorServer, method: str) -> None:
-    status, headers, _ = ask(opened, "/", method)
+def test_nothing_can_be_changed(still: MonitorServer, method: str) -> None:
+    status, headers, _ = ask(still, "/", method)
     assert (status, headers["Allow"]) == (405, "GET, HEAD")
 
 
 @pytest.mark.parametrize("path", ["/", "/state.json", "/status.json", "/frame/1.jpg", "/nothing"])
-def test_head_is_answered_without_a_body(opened: MonitorServer, path: str) -> None:
-    status, headers, body = ask(opened, path, "HEAD")
-    assert status == ask(opened, path)[0]
+def test_head_is_answered_without_a_body(still: MonitorServer, path: str) -> None:
+    status, headers, body = ask(still, path, "HEAD")
+    assert status == ask(still, path)[0]
     assert int(headers["Content-Length"]) > 0
     assert body == b""
 
@@ -179,13 +193,13 @@ def test_head_is_answered_without_a_body(opened: MonitorServer, path: str) -> No
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:8707", "127.0.0.1.evil.example", "", "[::1", "localhost.evil"]
 )
-def test_a_name_that_another_site_points_here_is_refused(opened: MonitorServer, host: str) -> None:
-    assert ask(opened, "/state.json", Host=host)[0] == 421
+def test_a_name_that_another_site_points_here_is_refused(still: MonitorServer, host: str) -> None:
+    assert ask(still, "/state.json", Host=host)[0] == 421
 
 
 @pytest.mark.parametrize("host", ["localhost", "LOCALHOST:9000", "127.0.0.1:1", "[::1]:8707", "192.168.1.7"])
-def test_its_own_names_and_numbers_are_known(opened: MonitorServer, host: str) -> None:
-    assert ask(opened, "/state.json", Host=host)[0] == 200
+def test_its_own_names_and_numbers_are_known(still: MonitorServer, host: str) -> None:
+    assert ask(still, "/state.json", Host=host)[0] == 200
 
 
 def test_for_other_machines_the_address_holds_a_token(run: MadeUpRun) -> None:
@@ -210,10 +224,10 @@ def test_the_page_goes_where_the_package_goes() -> None:
     assert all(any(part.match(pattern) for pattern in named["acquisition.monitor"]) for part in parts)
 
 
-def test_a_large_answer_is_compressed_for_who_can_read_it(opened: MonitorServer) -> None:
-    _, headers, body = ask(opened, "/", Accept_Encoding="gzip")
+def test_a_large_answer_is_compressed_for_who_can_read_it(still: MonitorServer) -> None:
+    _, headers, body = ask(still, "/", Accept_Encoding="gzip")
     assert headers["Content-Encoding"] == "gzip"
-    assert gzip.decompress(body) == ask(opened, "/")[2]
+    assert gzip.decompress(body) == ask(still, "/")[2]
 
 
 def test_a_session_may_be_deleted_and_come_back_under_the_open_page(opened: MonitorServer, run: MadeUpRun) -> None:

@@ -200,7 +200,10 @@ class TestNotices:
         clock.sleep(60)
         notices.paused(sentence)
         assert told == ["paused", "resumed"]
-        clock.sleep(QUIET_S)
+        clock.sleep(QUIET_S - 61)
+        notices.paused(sentence)
+        assert told == ["paused", "resumed"]
+        clock.sleep(1)
         notices.paused(sentence)
         notices.paused(sentence)
         assert told == ["paused", "resumed", "paused"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -111,11 +112,13 @@ def facts(folder: Path) -> Rows:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("frame", [2, 7, 12])
-@pytest.mark.parametrize("happens", MISHAPS)
+@pytest.mark.parametrize(
+    ("happens", "frame"),
+    [*zip(MISHAPS, itertools.cycle((2, 7, 12)), strict=False), (deleted, 12), (log_deleted, 12), (replaced, 12)],
+)
 def test_a_lost_journal_ends_the_run_and_is_made_anew(lab: Lab, happens: Callable[[Path], object], frame: int) -> None:
     folder = lab.session.folder
-    assert len(lab.session.steps) == 12, "the last frame is one of those after which it happens"
+    assert len(lab.session.steps) == 12, "after the last frame it happens, too"
     with pytest.raises(LostJournalError, match="acquire rebuild"):
         run(lab, frame, happens)
     assert lab.camera.captures <= frame + 2, "noticed at the next frame"
@@ -237,8 +240,7 @@ def test_a_ledger_of_a_stranger_becomes_no_statement(lab: Lab, line: str) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mishap", [Path.unlink, lambda path: os.truncate(path, 9)])  # type: ignore[misc]
-@pytest.mark.parametrize("after", [4, 12])
+@pytest.mark.parametrize(("mishap", "after"), [(Path.unlink, 4), (lambda path: os.truncate(path, 9), 12)])  # type: ignore[misc]
 def test_a_frame_that_is_deleted_or_cut_is_taken_again(lab: Lab, mishap: Callable[[Path], object], after: int) -> None:
     folder = lab.session.folder
     assert run(lab, after, lambda folder: mishap(folder / "frames" / "0002_light_000.dng")).complete
@@ -259,31 +261,25 @@ def test_a_program_that_writes_the_journal_and_leaves_its_facts_alone_ends_no_ru
     assert facts(folder) == read_ledger(ledger_path(folder))
 
 
-@pytest.fixture
-def older(lab: Lab) -> Path:
-    """Return a complete session whose journal is one of before its light 1 was taken again."""
-    folder = lab.session.folder
+@pytest.mark.slow
+def test_no_command_believes_a_journal_that_the_ledger_contradicts(
+    lab: Lab, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is whole, sound, and says that the session is complete: by a frame that must not be used any more."""
+    older = lab.session.folder
     run(lab)
     lab.session.close()
-    journal = (folder / "journal.sqlite").read_bytes()
-    lab.session = Session.open_for_run(folder)
+    journal = (older / "journal.sqlite").read_bytes()
+    lab.session = Session.open_for_run(older)
     lab.session.retake("1")
     assert run(lab).complete
     lab.session.close()
-    (folder / "journal.sqlite").write_bytes(journal)
-    return folder
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", [["status"], ["report"], ["run", "LAB.toml"]])
-def test_no_command_believes_a_journal_that_the_ledger_contradicts(
-    older: Path, command: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is whole, sound, and says that the session is complete: by a frame that must not be used any more."""
+    (older / "journal.sqlite").write_bytes(journal)
     (older.parent / "LAB.toml").write_text(SETTINGS.to_toml())
     monkeypatch.chdir(older.parent)
-    assert main([*command, str(older)]) == 2
-    assert "acquire rebuild" in capsys.readouterr().err
+    for command in (["status"], ["report"], ["run", "LAB.toml"]):
+        assert main([*command, str(older)]) == 2
+        assert "acquire rebuild" in capsys.readouterr().err, command
     with pytest.raises(FormatError, match="lacks 4 frames"):
         Session.open(older)
     watch = SessionWatch(older)
@@ -316,8 +312,10 @@ def test_a_complete_session_whose_files_go_is_complete_no_more(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["chart.json", "illuminations.csv"])
-@pytest.mark.parametrize("mishap", [Path.unlink, lambda path: os.truncate(path, 9)])  # type: ignore[misc]
+@pytest.mark.parametrize(
+    ("name", "mishap"),
+    [("chart.json", Path.unlink), ("illuminations.csv", lambda path: os.truncate(path, 9))],  # type: ignore[misc]
+)
 def test_a_complete_session_without_its_chart_or_lights_says_what_is_lost(
     lab: Lab, name: str, mishap: Callable[[Path], object], capsys: pytest.CaptureFixture[str]
 ) -> None:

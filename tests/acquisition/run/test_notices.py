@@ -261,6 +261,21 @@ def test_a_service_manager_is_fed_within_half_of_its_time(manager: Manager, addr
     assert manager.got() == ["STOPPING=1\nSTATUS=complete: 0 of 6 frames left"]
 
 
+def test_a_dead_mans_switch_hears_each_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, told = SimulatedClock(), list[float]()
+
+    def tell(*_: object) -> None:
+        told.append(clock.monotonic() - begun)
+
+    monkeypatch.setattr(Notices, "tell", tell)
+    one, begun = Life("switch", "night", lambda sentence: None, clock, {}), clock.monotonic()
+    for _ in range(7):
+        one.sign("takes frames")
+        clock.sleep(ALIVE_S / 2)
+    assert told == [0, ALIVE_S, 2 * ALIVE_S, 3 * ALIVE_S]
+    one.close()
+
+
 @pytest.mark.parametrize(
     "environment", [{}, {"NOTIFY_SOCKET": "/nowhere/notify"}, {"NOTIFY_SOCKET": "vsock:2:1", "WATCHDOG_USEC": "soon"}]
 )

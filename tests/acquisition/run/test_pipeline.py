@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from acquisition.run.devices import PAUSE_S
+from acquisition.run.devices import PAUSE_S, HealthWatch
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import BLACK, WHITE, Colour
@@ -143,6 +143,31 @@ class TestRefusals:
         assert reason in frames[0].verdict
         assert (folder / frames[0].file).read_bytes() == bad
         assert len(lab.session.frames()) == 7
+
+    def test_all_of_the_projector_is_asked_behind_a_refused_frame(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        suspected: list[HealthWatch] = []
+
+        def suspect(watch: HealthWatch) -> None:
+            suspected.append(watch)
+
+        monkeypatch.setattr(HealthWatch, "suspect", suspect)
+        assert run(Lab(folder), ScriptedJudge({2: refused("another light")})).complete
+        assert len(suspected) == 1
+
+    def test_files_are_looked_for_behind_each_white_frame_and_in_the_end(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        looked: list[Session] = []
+
+        def look(session: Session) -> list[Any]:
+            looked.append(session)
+            return []
+
+        monkeypatch.setattr(Session, "lost_files", look)
+        assert run(Lab(folder, lights=FOUR, reference_every=2)).complete
+        assert len(looked) == 3 + 1
 
     def test_the_next_frame_is_under_way_when_one_is_refused(self, folder: Path) -> None:
         lab = Lab(folder)

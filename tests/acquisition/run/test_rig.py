@@ -12,7 +12,7 @@ import pytest
 from acquisition.run.plan import ask
 from acquisition.run.rig.lab import attached_devices
 from acquisition.run.rig.opening import open_rig
-from acquisition.run.rig.simulated import simulated_body, simulated_room
+from acquisition.run.rig.simulated import simulated_body, simulated_frame_bytes, simulated_room
 from acquisition.run.run import run_session
 from drivers.presenter import WHITE
 from drivers.raw.rawfile import read_raw
@@ -94,6 +94,8 @@ def test_a_session_taken_with_such_a_body_and_a_lens_without_contacts_is_its(tmp
         assert len(frames) == 2
         assert 'aperture = "none"' in session.settings_text()
         mosaic = read_raw(session.folder / frames[0].file)
+        # What a plan reckons with before there are frames.
+        assert simulated_frame_bytes(lab) == pytest.approx((session.folder / frames[0].file).stat().st_size, rel=0.02)
     assert mosaic.camera == "Canon EOS-1Ds Mark III"
     assert mosaic.counts.shape == (556, 800)
     assert mosaic.aperture is None

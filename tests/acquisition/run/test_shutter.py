@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import pytest
 
-from acquisition.run.devices import ENGRAVED_S, holds_whole_turns, require_whole_turns
+from acquisition.run.devices import ENGRAVED_S, holds_whole_turns, require_whole_turns, wheel_of
 from drivers.canon import SHUTTER
-from experiment.config import CameraSettings, ProjectorCable
+from experiment.config import CameraSettings, ProjectorCable, parse_lab
 from foundation.errors import ConfigurationError
 
 WHEEL = ProjectorCable()
@@ -52,3 +52,12 @@ def test_the_times_that_are_named_before_a_camera_is_asked_are_engraved() -> Non
 @pytest.mark.parametrize(("shutter_s", "whole"), [(1 / 60, True), (1 / 125, False), (0.0, False), (0.508, False)])
 def test_whole_turns(shutter_s: float, whole: bool) -> None:
     assert holds_whole_turns(shutter_s, PERIOD_S) is whole
+
+
+def test_the_wheel_before_the_camera_is_the_lab_s_or_the_simulated_room_s() -> None:
+    head = 'chart = "c"\nilluminations = "l"\n'
+    of_lab = "[lab.projector]\ncolour_wheel_hz = 120\n"
+    of_room = "[simulated.room]\nwheel_hz = 60\n"
+    rigs = [("lab", of_lab), ("simulated", of_room), ("simulated", of_lab), ("imported", of_lab)]
+    wheels = [wheel_of(parse_lab(f'rig = "{rig}"\n{head}{table}', "LAB.toml")) for rig, table in rigs]
+    assert wheels == [120, 60, 0, 0]

@@ -125,7 +125,7 @@ def test_what_hangs_is_named_while_it_hangs(
     lab, heads = Lab(tmp_path / "session"), list[Head]()
     owner = ExposureJudge if hangs == "judge" else type(lab.camera) if hangs == "expose" else type(lab.screen)
     real, calls = getattr(owner, hangs), [0]
-    watches, kinds, entered = list[RunWatch](), list[str](), threading.Condition()
+    watches, kinds, entered, expected = list[RunWatch](), list[str](), threading.Condition(), dict[str, float]()
 
     class Watched(RunWatch):
         def __init__(self, on_late: Callable[[str, datetime], object]) -> None:
@@ -134,6 +134,7 @@ def test_what_hangs_is_named_while_it_hangs(
 
         @contextmanager
         def step(self, device: str, doing: str, expected_s: float, kind: str) -> Generator[None]:
+            expected[kind] = expected_s
             with super().step(device, doing, expected_s, kind):
                 with entered:
                     kinds[:] = [kind]
@@ -162,3 +163,6 @@ def test_what_hangs_is_named_while_it_hangs(
     assert (head.state, head.cause) == ("late", cause)
     assert head.sentence.startswith("late since")
     assert not events(lab)
+    # Of half a second the camera's own dark frame takes as much again.
+    assert SETTINGS.camera.shutter_s == 0.5
+    assert expected.items() >= {"expose": 1 + 3.0, "download": 10.0, "judge": 5.0, "show": 2.0}.items()
