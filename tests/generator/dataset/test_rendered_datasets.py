@@ -286,6 +286,7 @@ def test_what_the_print_cannot_show_is_told(
     outside = np.average([float(row["outside"]) for row in rows], weights=pixels)
     assert 0 < outside < 1
     assert f"{100 * outside:.2g} % of the pixels are of colours that the print cannot show" in told
+    assert "--print managed" not in told, "that is for a computed table of ink codes"
 
 
 def test_faults_are_named() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import get_args
 
 import cv2
 import numpy as np
@@ -47,14 +46,17 @@ def explorer(make_table: MakeTable, tmp_path: Path) -> Explorer:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rendering", get_args(Rendering))
-@pytest.mark.parametrize("light", ["1", "1:.3+2:.7", "r=.25,b=.3", "4000K"])
+@pytest.mark.parametrize(
+    ("light", "rendering"),
+    [("1", "codes"), ("1:.3+2:.7", "colorimetric"), ("r=.25,b=.3", "codes"), ("4000K", "colorimetric")],
+)
 def test_the_command_makes_the_image_that_is_shown(explorer: Explorer, light: str, rendering: Rendering) -> None:
     shown = explorer.show(1, light)
     image = explorer.counts(1, light, rendering).copy()
     assert image.shape == (round(SIDE * 5 / 9), SIDE, 3)
     words = shlex.split(shown["commands"][rendering])
     assert words[0] == "generate"
+    assert words[words.index("--sources") + 1] == "my pictures/it's 1.png", "as it is called from here"
     assert main(words[1:]) == 0
     made = open_dataset("dataset")
     assert (made.read_image(made.entries[0]) == image).all()
@@ -153,4 +155,19 @@ def test_sample_pictures_are_made_once(tmp_path: Path) -> None:
     assert sample_folder(tmp_path / "kept") == folder
     assert before == {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
     for path in folder.iterdir():
-        assert len(np.unique(read_picture(path).reshape(-1, 3), axis=0)) >= 20
+        assert len(np.unique(read_picture(path) @ [1 << 16, 1 << 8, 1])) >= 20
+
+
+def test_sample_balls_are_lit_by_one_lamp(tmp_path: Path) -> None:
+    codes = read_picture(sample_folder(tmp_path) / "balls.png").astype(np.int64)
+    # The red ball: its surface in the middle, brighter towards the lamp on the upper left than away from it.
+    x, y, radius = 160, 395, 130
+    middle, near, far = (codes[y + part * radius // 2, x + part * radius // 2] for part in (0, -1, 1))
+    assert middle.argmax() == 0
+    assert near.sum() > middle.sum() > far.sum()
+    # Reflected like a mirror does half way between the lamp and the viewer, the lamp's own white.
+    lamp = np.array([-0.5, -0.65, 0.57]) / np.linalg.norm([-0.5, -0.65, 0.57])
+    half = lamp + np.array([0.0, 0.0, 1.0])
+    half /= np.linalg.norm(half)
+    shiny = codes[round(y + half[1] * radius), round(x + half[0] * radius)]
+    assert shiny.min() > 180

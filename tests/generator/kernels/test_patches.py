@@ -42,9 +42,10 @@ def patches() -> npt.NDArray[np.uint8]:
 
 
 def cells(image: npt.NDArray[np.generic]) -> _Array:
-    """Return the pixels (64, SIDE², 3) of each patch."""
-    blocks = image.reshape(8, SIDE, 8, SIDE, -1).transpose(0, 2, 1, 3, 4)
-    return np.asarray(blocks.reshape(64, SIDE * SIDE, -1), dtype=np.float64)
+    """Return the pixels (64, N, 3) of each of 8 x 8 patches."""
+    side = len(image) // 8
+    blocks = image.reshape(8, side, 8, side, -1).transpose(0, 2, 1, 3, 4)
+    return np.asarray(blocks.reshape(64, side * side, -1), dtype=np.float64)
 
 
 def cumulants(samples: npt.NDArray[np.uint16]) -> tuple[_Array, _Array, _Array]:
@@ -92,7 +93,8 @@ def test_under_several_lights(make_lut: Callable[..., Lut], patches: npt.NDArray
 def test_white_follows_the_ground_truth_of_every_pixel(make_lut: Callable[..., Lut]) -> None:
     """A white picture under masks: each block's mean chromaticity is the mean of the map there."""
     lut = make_lut()
-    white = np.full((SIDE * 8, SIDE * 8, 3), 255, np.uint8)
+    side = SIDE // 2
+    white = np.full((side * 8, side * 8, 3), 255, np.uint8)
     lighting = Lighting((plain(0), plain(3)), parse_masks("soft-edge:width=.6", 2, 4).maker(0))
     weights = lighting.weights_of(*white.shape[:2])
     tables = [mixture.samples(lut) for mixture in lighting.mixtures]

@@ -26,7 +26,7 @@ from generator.rendering.colorimetric import (
 )
 from generator.rendering.matrices import ColourMatrix, fitted_matrix, matrix_for
 from generator.rendering.print_inverse import corners, invert, nearest_to
-from generator.rendering.print_profiles import profile_of
+from generator.rendering.print_profiles import PrintProfile, profile_of
 from tests.generator.rendering.conftest import MakeTable
 from tests.generator.rendering.prints import MATRIX
 
@@ -83,6 +83,14 @@ def test_a_print_of_known_colours_is_met_where_it_can_be(make_table: MakeTable) 
     shown = (seen - seen[0].mean()) / (seen[-1].mean() - seen[0].mean())
     assert np.abs(shown - wanted)[inside].max() < 0.03
     assert rendering.map.distance[inside].mean() < 0.2
+
+
+@pytest.mark.parametrize(("blue_paper", "white"), [(0.85, 0.99 * 0.85), (0.9, 0.97 * 0.9)])
+def test_black_and_white_are_greys_that_mixtures_make(blue_paper: float, white: float) -> None:
+    """A box of colours, paper last: its greys end at the blue of its black, and short of its paper's blue."""
+    colours = np.stack(np.meshgrid([0.1, 0.9], [0.1, 0.9], [0.2, blue_paper], indexing="ij"), axis=-1).reshape(8, 3)
+    profile = PrintProfile(colours, np.ones(8, bool))
+    assert (profile.bits, profile.black, profile.white) == (1, pytest.approx(0.2), pytest.approx(white))
 
 
 def test_places_are_the_inverse_of_what_is_seen() -> None:
