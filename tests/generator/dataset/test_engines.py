@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import shutil
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from generator.dataset.making import SILENT, Callbacks, Workers, generate_datase
 from generator.dataset.plan import DatasetOptions
 from generator.lights.lighting import RandomLights
 from generator.pictures.sources import find_pictures, random_scenes
+from tests.generator.dataset.contents import contents
 
 pytestmark = pytest.mark.slow
 
@@ -25,15 +25,6 @@ if TYPE_CHECKING:
 
 IMAGES = 48
 SHARD = 8
-
-
-def contents(folder: Path) -> dict[str, str]:
-    """Return the hash of every file below `folder`."""
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
 
 
 def make(lut: Lut, out: Path, engine: str, workers: int, callbacks: Callbacks = SILENT) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import shutil
@@ -40,6 +39,7 @@ from generator.lights.lighting import ListedLights, RandomLights
 from generator.masks.making import parse_masks
 from generator.pictures.sources import Source, find_pictures, random_scenes
 from generator.rendering.black_points import BlackPoint
+from tests.generator.dataset.contents import contents
 from tests.generator.groups import grouped
 
 pytestmark = pytest.mark.slow
@@ -48,15 +48,6 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 SCENES = random_scenes(4, 24, 16, 8)
-
-
-def contents(folder: Path) -> dict[str, str]:
-    """Return the hash of every file below `folder`."""
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
 
 
 def make(lut: Lut, out: Path, scenes: int = 4, **options: Any) -> Dataset:

@@ -111,8 +111,8 @@ def test_places_are_the_inverse_of_what_is_seen() -> None:
 
 
 def test_black_is_as_dark_as_it_can_be_grey(make_table: MakeTable) -> None:
-    profile = profile_of(make_table(bits=4), 1)
-    lut = make_table(bits=4, name="again")
+    lut = make_table(bits=4)
+    profile = profile_of(lut, 1)
     assert ColorimetricRendering(lut, MINE).black(plain(1)) == pytest.approx(profile.black, rel=0.1)
 
     def redden(samples: npt.NDArray[np.uint16]) -> None:
