@@ -232,14 +232,17 @@ def save(path: Path, codes: npt.NDArray[np.uint8]) -> None:
     path.write_bytes(cv2.imencode(".png", codes[..., ::-1])[1].tobytes())
 
 
+PICTURES = 36
+
+
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a table and 60 pictures of 24 x 20 px, half of them reddish, half bluish."""
+    """Return a folder with a table and pictures of 24 x 20 px, half of them reddish, half bluish."""
     folder = tmp_path_factory.mktemp("likeness")
     make_table(folder / "lut", "one", (0, 1, 2, 3, 4))
     (folder / "pictures").mkdir()
     random = np.random.default_rng(8)
-    for number in range(60):
+    for number in range(PICTURES):
         tint = np.array([60, 0, -60] if number % 2 else [-60, 0, 60])
         codes = np.clip(random.integers(0, 256, (20, 24, 3)) + tint, 0, 255).astype(np.uint8)
         save(folder / "pictures" / f"{number:02d}.png", codes)
@@ -296,7 +299,7 @@ def test_pictures_lights_and_what_is_recorded(table: Lut, capsys: pytest.Capture
     printed = capsys.readouterr().out
     assert "lights: 0.0% of the 40 of real lie outside what lut can make" in printed
     assert "200 draws of" in printed
-    assert "of 60 measured" in printed
+    assert f"of {PICTURES} measured" in printed
     dataset = open_dataset("out")
     different = len({entry.source for entry in dataset.entries})
     assert f"out: 200 images of 200 pictures, {different} of them different, under " in printed
@@ -307,7 +310,7 @@ def test_pictures_lights_and_what_is_recorded(table: Lut, capsys: pytest.Capture
     options = recorded()
     assert options["like"]["file"] == "s.json"
     assert options["like"]["in"] == ["lights", "pictures", "exposure", "size"]
-    assert options["like"]["pictures"]["measured"] == 60
+    assert options["like"]["pictures"]["measured"] == PICTURES
     assert options["like"]["pictures"]["drawn"] == 200
     assert options["lights"]["distribution"] == "log kernels"
     with Path("out/images.csv").open() as stream:
@@ -317,10 +320,10 @@ def test_pictures_lights_and_what_is_recorded(table: Lut, capsys: pytest.Capture
         drawn[entry.source] = drawn.get(entry.source, 0) + 1
     for entry, row in zip(dataset.entries, rows, strict=True):
         assert row["image"] == entry.image
-        assert abs(drawn[entry.source] - 200 / 60 * float(row["weight"])) <= 1
+        assert abs(drawn[entry.source] - 200 / PICTURES * float(row["weight"])) <= 1
     # A picture drawn several times is under another light each time, and shares its name, hence its fold.
     assert len({entry.lights for entry in dataset.entries}) > 190
-    assert len({entry.source for entry in dataset.entries}) < 61
+    assert len({entry.source for entry in dataset.entries}) <= PICTURES
 
 
 def test_the_same_command_gives_the_same_bytes(table: Lut) -> None:
