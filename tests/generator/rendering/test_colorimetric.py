@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -219,6 +221,17 @@ def test_black_that_is_taken_out_leaves_means_and_white(make_table: MakeTable) -
 def test_the_reference_is_daylight_or_the_light_that_sees_most(make_table: MakeTable) -> None:
     assert reference_light(make_table(bits=1)) == 1
     assert reference_light(make_table(bits=1, lights=1, name="candle")) == 0
+
+
+def test_the_reference_is_near_in_reciprocal_kelvin_and_sees_every_channel() -> None:
+    def table(*lights: tuple[float, float]) -> Any:
+        """Return what is asked of a table of black bodies, each of so many kelvin and such a share of blue."""
+        bodies = [SimpleNamespace(index=place, cct_k=kelvin) for place, (kelvin, _) in enumerate(lights)]
+        return SimpleNamespace(white=np.array([[900, 1000, 1000 * blue] for _, blue in lights]), illuminations=bodies)
+
+    assert reference_light(table((4900, 0.5), (6500, 0.5))) == 1
+    assert reference_light(table((5600, 0.19), (3000, 0.2), (2000, 0.3))) == 1
+    assert reference_light(table((3000, 0.1), (5600, 0.19))) == 1
 
 
 def test_a_table_of_one_light(make_table: MakeTable) -> None:
