@@ -39,6 +39,7 @@ from generator.lights.choices import light_of
 from generator.lights.lighting import Mixture
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.black_points import KEEP, BlackPoint, parse_black_point, veil_of
+from generator.variation.exposing import add_noise
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -362,9 +363,6 @@ class Crops:
                 out=out,
             )
         if self.noise is not None:
-            # What measures noise also reads charts: workers that are spawned are not to wait for it.
-            from generator.variation.exposing import add_noise
-
             ratio = 1.0 if self.iso is None else self.iso.ratio
             wanted = self.noise if self.iso is None else self.noise.at(ratio, self.iso.sensor_electrons)
             white = self.lut.provenance.white_level

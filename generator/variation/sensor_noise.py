@@ -26,8 +26,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from calibration.radiometry.table_noise import noise_curve
-
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
@@ -105,6 +103,9 @@ def measured_noise(lut: Lut) -> SensorNoise:
     InputError
         As of `noise_curve`.
     """
+    # What measures noise also reads charts: who makes images alone is not to wait for its import.
+    from calibration.radiometry.table_noise import noise_curve
+
     curve = noise_curve(lut)
     if curve is None:
         return SensorNoise((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

@@ -27,44 +27,48 @@ def expected_means(bits: int, light: int) -> npt.NDArray[np.float64]:
     return 200 + 3000 * code * np.array([1 + 0.2 * light, 1.0, 1.4 - 0.2 * light])
 
 
+def lut_in(folder: Path, bits: int = 2, lights: int = 4, unfit: tuple[int, ...] = ()) -> Lut:
+    """Make a table with Poisson samples."""
+    folder.mkdir()
+    rng = np.random.default_rng(20190601)
+    writer = LutWriter(folder, lights, 8**bits, SAMPLES)
+    plan: list[Illumination] = []
+    white: list[npt.NDArray[np.float64]] = []
+    for light in range(lights):
+        means = expected_means(bits, light)
+        writer.put(light, rng.poisson(means[:, None, :].repeat(SAMPLES, axis=1)).astype(np.uint16))
+        is_body = light % 2 == 1
+        plan.append(
+            Illumination(
+                light,
+                "blackbody" if is_body else "uniform",
+                3000.0 + light if is_body else None,
+                Colour(9, 8, light),
+            )
+        )
+        white.append(means[-1])
+    writer.finish(
+        plan,
+        np.array(white),
+        Provenance(
+            camera="Test camera",
+            bits=bits,
+            white_level=8000,
+            session_sha256="1" * 64,
+            chart_sha256="2" * 64,
+            software="test 1",
+            unfit=[Unfit(colour=colour, cause="a test") for colour in unfit],
+        ),
+    )
+    return open_lut(folder)
+
+
 @pytest.fixture
 def make_lut(tmp_path: Path) -> MakeLut:
-    """Return a maker of tables with Poisson samples, in a folder of their own."""
+    """Return a maker of tables with Poisson samples, in folders of their own."""
 
     def make(bits: int = 2, lights: int = 4, unfit: tuple[int, ...] = (), name: str = "lut") -> Lut:
-        folder = tmp_path / name
-        folder.mkdir()
-        rng = np.random.default_rng(20190601)
-        writer = LutWriter(folder, lights, 8**bits, SAMPLES)
-        plan: list[Illumination] = []
-        white: list[npt.NDArray[np.float64]] = []
-        for light in range(lights):
-            means = expected_means(bits, light)
-            writer.put(light, rng.poisson(means[:, None, :].repeat(SAMPLES, axis=1)).astype(np.uint16))
-            is_body = light % 2 == 1
-            plan.append(
-                Illumination(
-                    light,
-                    "blackbody" if is_body else "uniform",
-                    3000.0 + light if is_body else None,
-                    Colour(9, 8, light),
-                )
-            )
-            white.append(means[-1])
-        writer.finish(
-            plan,
-            np.array(white),
-            Provenance(
-                camera="Test camera",
-                bits=bits,
-                white_level=8000,
-                session_sha256="1" * 64,
-                chart_sha256="2" * 64,
-                software="test 1",
-                unfit=[Unfit(colour=colour, cause="a test") for colour in unfit],
-            ),
-        )
-        return open_lut(folder)
+        return lut_in(tmp_path / name, bits, lights, unfit)
 
     return make
 

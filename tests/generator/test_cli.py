@@ -114,22 +114,21 @@ def test_random_and_nearest_lights_and_random_scenes(generate: Generate) -> None
 
 
 def test_layouts_parts_formats_and_several_lights(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
-    wish = ("--random-scenes", "12", "--size", "30x24", "--seed", "2")
+    wish = ("--random-scenes", "6", "--size", "30x24", "--seed", "2", "--no-preview")
     assert generate("lut", "a", *wish, "--layout", "webdataset", "--split", "50,50", "--format", "jxl") == 0
     printed = capsys.readouterr().out
     made = open_dataset("a")
     counts = made.description.splits
     assert f"{counts['train']} for train, 0 for validation, {counts['test']} for test" in printed
-    assert sum(counts.values()) == 12
+    assert sum(counts.values()) == 6
     assert sorted(path.name for path in Path("a").iterdir() if path.is_dir()) == ["splits", "test", "train"]
     assert generate("lut", "b", *wish, "--lights-per-image", "2", "--masks", "soft-edge", "--format", "exr") == 0
     several = open_dataset("b")
     assert all(len(entry.lights) == 2 for entry in several.entries)
-    assert len(list(Path("b/masks").iterdir())) == 24
+    assert len(list(Path("b/masks").iterdir())) == 12
     assert several.read_image(several.entries[0]).shape == (24, 30, 3)
-    assert generate("lut", "c", *wish, "--light", "0:0.5+2:0.5", "--light", "3", "--contact-sheet", "sheet.png") == 0
+    assert generate("lut", "c", *wish, "--light", "0:0.5+2:0.5", "--light", "3") == 0
     assert {entry.illumination for entry in open_dataset("c").entries} == {"0:0.5+2:0.5", "3"}
-    assert cv2.imread("sheet.png") is not None
 
 
 def test_a_sheet_that_could_not_be_written_is_made_alone(

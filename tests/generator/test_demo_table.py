@@ -32,11 +32,9 @@ def small(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_it_is_made_once_and_says_what_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_it_is_made_once_and_says_what_it_is(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = table_folder(Path("demo:"))
+    assert first.is_relative_to(folder)
     assert "computed table" in capsys.readouterr().out
     made = (first / "lut.json").stat().st_mtime_ns
     assert table_folder(Path("demo:")) == first

@@ -26,10 +26,9 @@ from generator.dataset.layouts import (
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.pictures.sources import random_scenes
+from tests.generator.conftest import lut_in
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from calibration.table.lut import Lut
     from generator.dataset.reader import Dataset
 
@@ -66,14 +65,16 @@ def dataset_in(out: Path, lut: Lut, layout: Layout) -> Dataset:
     return generate_dataset(lut, out, random_scenes(4, 24, 16, 8), [1, 0], seed=3, options=options)
 
 
-@pytest.fixture(params=get_args(Layout))
-def made(request: pytest.FixtureRequest, make_lut: Callable[..., Lut], tmp_path: Path) -> Dataset:
-    return dataset_in(tmp_path / "out", make_lut(), request.param)
+@pytest.fixture(scope="module", params=get_args(Layout))
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("cards")
+    return dataset_in(folder / "out", lut_in(folder / "lut"), request.param)
 
 
-@pytest.fixture
-def plain(make_lut: Callable[..., Lut], tmp_path: Path) -> Dataset:
-    return dataset_in(tmp_path / "out", make_lut(), "folder")
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("plain")
+    return dataset_in(folder / "out", lut_in(folder / "lut"), "folder")
 
 
 def place_of(made: Dataset) -> Path:

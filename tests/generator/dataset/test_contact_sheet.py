@@ -1,29 +1,54 @@
-"""The contact sheet of a dataset."""
+"""The contact sheet of a dataset: what is on it, and that it is within the page."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from matplotlib import text
 
-from generator.dataset.contact_sheet import contact_sheet
+from generator.dataset.contact_sheet import MAX_COLUMNS, MAX_ROWS, contact_sheet
+from generator.dataset.contact_sheet import _draw as draw  # pyright: ignore[reportPrivateUsage] - before it is painted
 from generator.dataset.layouts import Entry
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
-from generator.lights.lighting import RandomLights
+from generator.lights.lighting import LightChoice, ListedLights, RandomLights, mixture_of
 from generator.pictures.sources import random_scenes
 
 pytestmark = pytest.mark.slow
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
+
+    from matplotlib.figure import Figure
 
     from calibration.table.lut import Lut
+
+
+def made_of(lut: Lut, out: Path, scenes: int, lights: Sequence[int] | LightChoice) -> Dataset:
+    options = DatasetOptions(previews=False, rendering="codes")
+    return generate_dataset(lut, out, random_scenes(scenes, 24, 16), lights, options=options)
+
+
+def images_on(figure: Figure) -> int:
+    """Return how many pictures a sheet shows, each of which and each text is within the page and beside the others."""
+    pictures = [axes.get_position() for axes in figure.axes if axes.images]
+    for place, one in enumerate(pictures):
+        assert not any(one.overlaps(other) for other in pictures[:place])
+    for axes in figure.axes:
+        box = axes.get_position()
+        assert 0 < box.x0 < box.x1 < 1
+        assert 0 < box.y0 < box.y1 < 1
+    # Words begin where the first column does, or further to the right.
+    left = min(box.x0 for box in pictures)
+    for text in figure.texts:
+        x, y = text.get_position()
+        assert left - 1e-9 < x < 1
+        assert 0 < y < 1
+    return len(pictures)
 
 
 def test_a_contact_sheet_shows_rows_of_sources(
@@ -37,45 +62,44 @@ def test_a_contact_sheet_shows_rows_of_sources(
         return load(self, entry)
 
     monkeypatch.setattr(Dataset, "read_image", read)
-    made = generate_dataset(
-        make_lut(), tmp_path / "out", random_scenes(5, 24, 16), [0, 1, 2, 3], options=DatasetOptions(previews=False)
-    )
-    whole = contact_sheet(made)
-    assert len(shown) == 20
-    assert whole.dtype == np.uint8
+    made = made_of(make_lut(), tmp_path / "out", 5, [0, 1, 2, 3])
+    whole = draw(made, MAX_ROWS, MAX_COLUMNS)
+    assert len(shown) == images_on(whole) == 20
+    assert len(whole.axes) == 20 + 4, "a dot for each light above its column"
     shown.clear()
     part = contact_sheet(made, max_rows=3, max_columns=2)
     assert shown == ["000000.png", "000003.png", "000008.png", "000011.png", "000016.png", "000019.png"]
-    assert part.shape[0] < whole.shape[0]
-    assert part.shape[1] < whole.shape[1]
+    assert part.dtype == np.uint8
+    width, height = np.round(whole.get_size_inches() * whole.dpi)
+    assert part.shape[0] < height
+    assert part.shape[1] < width
 
 
-def test_images_of_one_light_a_picture_fill_a_grid(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_many_lights_as_many_are_shown_as_are_recognised(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+    lights = ListedLights(tuple(mixture_of({0: part, 1: 10 - part}) for part in range(1, 10)))
+    made = made_of(make_lut(), tmp_path / "out", 1, lights)
+    assert made.description.images == 9
+    assert images_on(draw(made, MAX_ROWS, MAX_COLUMNS)) == 8
+
+
+def test_images_of_one_light_a_picture_fill_a_grid(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     """Rows of one image each would be a narrow column with an empty page beside it."""
-    words: list[str] = []
-    make = text.Text.set_text
-
-    def noted(self: text.Text, s: Any) -> None:
-        words.append(str(s))
-        make(self, s)
-
-    monkeypatch.setattr(text.Text, "set_text", noted)
     lut = make_lut()
-    made = generate_dataset(lut, tmp_path / "out", random_scenes(30, 24, 16), RandomLights(1, 4, 0))
-    whole = contact_sheet(made)
-    assert 0.6 < whole.shape[0] / whole.shape[1] < 1.1
+    made = made_of(lut, tmp_path / "out", 30, RandomLights(1, 4, 0))
+    whole = draw(made, MAX_ROWS, MAX_COLUMNS)
+    words = [text.get_text() for text in whole.texts]
+    width, height = whole.get_size_inches()
+    assert images_on(whole) == 24
+    assert 0.6 < height / width < 1.1
     assert any("24 of 30 pictures shown" in word for word in words)
     names = [entry.source for entry in made.entries]
     assert [word for word in words if word in names] == [
         names[place] for place in np.linspace(0, 29, 24).round().astype(int)
     ]
-    words.clear()
-    few = contact_sheet(made, max_rows=2, max_columns=3)
-    assert few.shape[0] < whole.shape[0]
+    few = draw(made, 2, 3)
+    words = [text.get_text() for text in few.texts]
+    assert few.get_size_inches()[1] < height
     assert any("4 of 30 pictures shown" in word for word in words)
     assert any("each exposed for itself" in word for word in words)
-    words.clear()
-    contact_sheet(generate_dataset(lut, tmp_path / "rows", random_scenes(5, 24, 16), [0, 1, 2]), 2, 2)
-    assert any("; 4 of 15 images shown" in word for word in words)
+    rows = draw(made_of(lut, tmp_path / "rows", 5, [0, 1, 2]), 2, 2)
+    assert any("; 4 of 15 images shown" in text.get_text() for text in rows.texts)

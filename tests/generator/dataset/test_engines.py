@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import shutil
 from collections.abc import Callable
@@ -17,23 +16,15 @@ from generator.dataset.making import SILENT, Callbacks, Workers, generate_datase
 from generator.dataset.plan import DatasetOptions
 from generator.lights.lighting import RandomLights
 from generator.pictures.sources import find_pictures, random_scenes
+from tests.generator.dataset.contents import contents
 
 pytestmark = pytest.mark.slow
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-IMAGES = 96
+IMAGES = 48
 SHARD = 8
-
-
-def contents(folder: Path) -> dict[str, str]:
-    """Return the hash of every file below `folder`."""
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
 
 
 def make(lut: Lut, out: Path, engine: str, workers: int, callbacks: Callbacks = SILENT) -> None:
@@ -75,7 +66,8 @@ def test_a_killed_worker_changes_no_byte(undisturbed: tuple[Lut, dict[str, str]]
             victim.kill()
             killed.append(victim.pid)
 
-    make(lut, tmp_path / "out", "dask", 2, Callbacks(on_image=kill_one))
+    # The only one: what takes its place makes the rest.
+    make(lut, tmp_path / "out", "dask", 1, Callbacks(on_image=kill_one))
     assert len(killed) == 1
     assert contents(tmp_path / "out") == expected
     assert not list(tmp_path.glob(".out*"))
@@ -90,6 +82,14 @@ def test_a_cluster_of_somebody_else_s(
     from distributed import LocalCluster
 
     lut, expected = undisturbed
+    counted = iter(range(SHARD + 3))
+
+    def stop() -> None:
+        if next(counted, None) is None:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make(lut, tmp_path / "out", "local", 1, Callbacks(on_image=stop))
     with LocalCluster(
         n_workers=0,
         threads_per_worker=2,
@@ -100,13 +100,18 @@ def test_a_cluster_of_somebody_else_s(
     ) as cluster:
         address = cluster.scheduler_address.replace("tcp://", "dask://")
         said: list[str] = []
+        found: list[int] = []
+        reported: list[None] = []
 
         def start_one(sentence: str) -> None:
             said.append(sentence)
             cluster.scale(1)
 
-        make(lut, tmp_path / "out", address, 1, Callbacks(on_wait=start_one))
+        seen = Callbacks(on_done=found.append, on_image=lambda: reported.append(None), on_wait=start_one)
+        make(lut, tmp_path / "out", address, 1, seen)
         assert contents(tmp_path / "out") == expected
+        assert sum(found) > SHARD, "images of the shard that was begun count, too"
+        assert sum(found) + len(reported) == IMAGES
         hint = f"the Dask scheduler has no worker yet; start some with: dask worker {cluster.scheduler_address}"
         assert said == [hint]
         # A worker that finds another table at the same path says so.

@@ -86,6 +86,8 @@ def test_every_format_is_the_same_image_in_every_layout(make: Make, form: str) -
 
 READER = """
 import hashlib, json, sys
+# It does without PyTorch, whose import takes longer than all else.
+sys.modules["torch"] = None
 import webdataset
 for sample in webdataset.WebDataset(sys.argv[1:], shardshuffle=False):
     digests = {key: hashlib.sha256(sample[key]).hexdigest() for key in ("png", "preview.jpg")}
@@ -150,6 +152,10 @@ def test_hugging_face_reads_the_shards(make: Make, hugging_face: Any, tmp_path: 
             assert (row["source"], row["split"]) == (entry.source, part) == (entry.source, entry.split)
             assert row["truth"] == pytest.approx(entry.truth, abs=1e-9)
             assert [light["illumination"] for light in row["lights"]] == list(entry.lights)
+            details = json.loads(row["details"])
+            assert {name: f"{value:g}" if name != "cells" else value for name, value in details.items()} == (
+                made.details[entry.image]
+            )
     assert not entries
 
 
@@ -181,11 +187,12 @@ def test_a_shard_that_cannot_be_ended_is_given_up_quietly(
 def test_hugging_face_finds_the_parts_by_the_card(
     make: Make, hugging_face: Any, tmp_path: Path, layout: Layout
 ) -> None:
-    made = make(layout, split=(0.6, 0.0, 0.4), previews=False)
+    made = make(layout, split=(0.6, 0.0, 0.4), previews=False, rendering="codes")
     loaded = hugging_face.load_dataset(str(place_of(made)), cache_dir=str(tmp_path / "cache"))
     assert {part: rows.num_rows for part, rows in loaded.items()} == {
         part: images for part, images in made.description.splits.items() if images
     }
+    assert not {"preview", "details", "masks", "ground_truth"} & set(loaded["train"].column_names)
 
 
 def maps_in_folder(place: Path) -> list[bytes]:

@@ -21,6 +21,7 @@ from generator.dataset.reader import open_dataset
 from generator.lights.lighting import ListedLights, RandomLights, mixture_of
 from generator.pictures.sources import find_pictures, random_scenes, read_picture
 from generator.rendering.render import render
+from tests.generator.dataset.contents import contents
 
 pytestmark = pytest.mark.slow
 
@@ -45,15 +46,6 @@ def pictures(tmp_path: Path) -> Path:
         (folder / name).write_bytes(cv2.imencode(".png", coarse)[1].tobytes())
     (folder / "broken.jpg").write_bytes(b"no picture")
     return folder
-
-
-def contents(folder: Path) -> dict[str, str]:
-    """Return the hash of every file below `folder`."""
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
 
 
 def test_what_is_in_the_folder(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:

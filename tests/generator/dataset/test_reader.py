@@ -104,6 +104,19 @@ def test_a_ground_truth_that_is_no_light_is_named(small: Path, light: str) -> No
         open_dataset(small)
 
 
+def test_a_ground_truth_may_lack_a_channel_and_sums_to_one(small: Path) -> None:
+    table, truths = small / "ground_truth.csv", small / "gt.txt"
+    head, first, second = lines_of(table)
+    for blue in ("0.6", "0.6001", "0.5999"):
+        table.write_text("\n".join([head, first, ",".join([*second.split(",")[:3], "0", "0.4", blue])]))
+        truths.write_text("\n".join([lines_of(truths)[0], f"0 0.4 {blue}"]))
+        if blue == "0.6":
+            assert open_dataset(small).entries[1].truth == (0, 0.4, 0.6)
+        else:
+            with pytest.raises(FormatError, match=r"ground_truth\.csv, line 3"):
+                open_dataset(small)
+
+
 def test_a_table_that_is_no_csv_is_named(small: Path) -> None:
     table = small / "ground_truth.csv"
     table.write_text(table.read_text() + '"' + "x" * 200_000)

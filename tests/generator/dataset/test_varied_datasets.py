@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +26,7 @@ from generator.pictures.sources import Preparation, find_pictures, read_picture
 from generator.rendering.render import render
 from generator.variation.iso_speed import parse_iso
 from generator.variation.variation import Variation, parse_exposure, parse_gradient, varied_by
+from tests.generator.dataset.contents import contents
 
 pytestmark = pytest.mark.slow
 
@@ -68,14 +68,6 @@ def make(lut: Lut, pictures: Path, tmp_path: Path) -> Make:
         )
 
     return made
-
-
-def contents(folder: Path) -> dict[str, str]:
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
 
 
 def everything(lut: Lut) -> Variation:

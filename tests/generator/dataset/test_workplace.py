@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import shutil
@@ -40,6 +39,7 @@ from generator.lights.lighting import ListedLights, RandomLights
 from generator.masks.making import parse_masks
 from generator.pictures.sources import Source, find_pictures, random_scenes
 from generator.rendering.black_points import BlackPoint
+from tests.generator.dataset.contents import contents
 from tests.generator.groups import grouped
 
 pytestmark = pytest.mark.slow
@@ -48,15 +48,6 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 SCENES = random_scenes(4, 24, 16, 8)
-
-
-def contents(folder: Path) -> dict[str, str]:
-    """Return the hash of every file below `folder`."""
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
 
 
 def make(lut: Lut, out: Path, scenes: int = 4, **options: Any) -> Dataset:
@@ -160,20 +151,19 @@ def notes_of(out: Path) -> Path:
     return notes
 
 
-@pytest.mark.parametrize("workers", [Workers(), Workers(count=3), Workers("dask", 1)])
+@pytest.mark.parametrize("count", [1, 3])
 def test_finished_images_of_a_killed_shard_count(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: Workers
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    lut, out = make_lut(), tmp_path / "out"
+    lut, out, workers = make_lut(), tmp_path / "out", Workers(count=count)
     one_shard(lut, tmp_path / "whole")
-    killed_after(3, lambda: one_shard(lut, out, workers=Workers(count=workers.count)))
+    killed_after(3, lambda: one_shard(lut, out, workers=workers))
     noted = noted_images(out)
     assert 3 <= len(noted) < 8
-    assert workers.count > 1 or noted == [0, 1, 2]
+    assert count > 1 or noted == [0, 1, 2]
     found, reported, rendered = made_after(monkeypatch, lambda seen: one_shard(lut, out, seen, workers))
     assert (found, reported) == (len(noted), 8 - len(noted))
-    if workers.engine == "local":
-        assert rendered == sorted(set(range(8)) - set(noted))
+    assert rendered == sorted(set(range(8)) - set(noted))
     assert contents(out) == contents(tmp_path / "whole")
     assert not list(tmp_path.glob(".out*"))
 
@@ -296,14 +286,18 @@ def dies_at(step: int, below: Path, action: Callable[[], object]) -> bool:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
 
 
+STRIDE = 5
+"""Of a run's file operations every fifth is one that it is killed before: each takes two runs."""
+
+
 def test_a_kill_at_any_file_operation_is_gone_on_from(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     lut = make_lut()
     make(lut, tmp_path / "whole", 1, shard_images=1)
     below = tmp_path / "below"
-    step = 0
+    step = 1 - STRIDE
     killed = True
     while killed:
-        step += 1
+        step += STRIDE
         below.mkdir()
         killed = dies_at(step, below, lambda: make(lut, below / "out", 1, shard_images=1))
         with contextlib.suppress(InputError):  # "already exists", where all that was left were empty folders

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import get_args
 
 import cv2
 import numpy as np
@@ -47,14 +46,17 @@ def explorer(make_table: MakeTable, tmp_path: Path) -> Explorer:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rendering", get_args(Rendering))
-@pytest.mark.parametrize("light", ["1", "1:.3+2:.7", "r=.25,b=.3", "4000K"])
+@pytest.mark.parametrize(
+    ("light", "rendering"),
+    [("1", "codes"), ("1:.3+2:.7", "colorimetric"), ("r=.25,b=.3", "codes"), ("4000K", "colorimetric")],
+)
 def test_the_command_makes_the_image_that_is_shown(explorer: Explorer, light: str, rendering: Rendering) -> None:
     shown = explorer.show(1, light)
     image = explorer.counts(1, light, rendering).copy()
     assert image.shape == (round(SIDE * 5 / 9), SIDE, 3)
     words = shlex.split(shown["commands"][rendering])
     assert words[0] == "generate"
+    assert words[words.index("--sources") + 1] == "my pictures/it's 1.png", "as it is called from here"
     assert main(words[1:]) == 0
     made = open_dataset("dataset")
     assert (made.read_image(made.entries[0]) == image).all()
@@ -145,12 +147,60 @@ def test_only_the_newest_pictures_that_were_sent_are_kept(explorer: Explorer) ->
     assert explorer.show(numbers[1], "0")["picture"]["name"] == "1.png"
 
 
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return sample_folder(tmp_path_factory.mktemp("kept"))
+
+
 @pytest.mark.slow
-def test_sample_pictures_are_made_once(tmp_path: Path) -> None:
-    folder = sample_folder(tmp_path / "kept")
-    before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+def test_sample_pictures_are_made_once(samples: Path) -> None:
+    before = {path.name: path.stat().st_mtime_ns for path in samples.iterdir()}
     assert len(before) == 3
-    assert sample_folder(tmp_path / "kept") == folder
-    assert before == {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
-    for path in folder.iterdir():
-        assert len(np.unique(read_picture(path).reshape(-1, 3), axis=0)) >= 20
+    assert sample_folder(samples.parent) == samples
+    assert before == {path.name: path.stat().st_mtime_ns for path in samples.iterdir()}
+
+
+BALLS = [
+    [163, 166, 167, 166, 163, 159, 155, 151, 147],
+    [165, 169, 172, 178, 167, 161, 157, 152, 147],
+    [160, 134, 176, 201, 164, 134, 153, 183, 149],
+    [98, 70, 140, 164, 126, 129, 149, 108, 106],
+    [84, 35, 84, 102, 78, 103, 97, 78, 116],
+    [122, 97, 118, 99, 101, 62, 91, 142, 103],
+]
+"""Mean green codes of squares of 100 x 100 px."""
+
+
+@pytest.mark.slow
+def test_sample_pictures_are_what_they_are_said_to_be(samples: Path) -> None:
+    codes = read_picture(samples / "balls.png").astype(np.int64)
+    assert codes.shape == (600, 900, 3)
+    assert np.abs(codes[..., 1].reshape(6, 100, 9, 100).mean(axis=(1, 3)) - BALLS).max() < 1
+    # The red ball: its surface in the middle, brighter towards the lamp on the upper left than away from it.
+    x, y, radius = 160, 395, 130
+    middle, near, far = (codes[y + part * radius // 2, x + part * radius // 2] for part in (0, -1, 1))
+    assert middle.argmax() == 0
+    assert near.sum() > middle.sum() > far.sum()
+    # Reflected like a mirror does half way between the lamp and the viewer, the lamp's own white.
+    lamp = np.array([-0.5, -0.65, 0.57]) / np.linalg.norm([-0.5, -0.65, 0.57])
+    half = lamp + np.array([0.0, 0.0, 1.0])
+    half /= np.linalg.norm(half)
+    shiny = codes[round(y + half[1] * radius), round(x + half[0] * radius)]
+    assert shiny.min() > 180
+    patches = read_picture(samples / "patches.png")[75::150, 75::150].astype(np.int64)
+    *hues, greys = patches
+    # sRGB codes of i / 5 to the power of 2.2.
+    assert greys.tolist() == [[code] * 3 for code in (0, 48, 102, 154, 205, 255)]
+    # Red, yellow, green, cyan, blue, magenta; from row to row less saturated.
+    for row in hues:
+        assert [(patch > patch.mean()).tolist() for patch in row] == [
+            [hue in (0, 1, 5), hue in (1, 2, 3), hue in (3, 4, 5)] for hue in range(6)
+        ]
+    assert [np.ptp(row, axis=1).tolist() for row in hues] == [
+        [71, 97, 71, 97, 71, 97],
+        [45, 53, 45, 53, 45, 53],
+        [19, 19, 19, 19, 19, 19],
+    ]
+    blocks = read_picture(samples / "random.png").reshape(60, 10, 90, 10, 3)
+    assert (blocks == blocks[:, :1, :, :1]).all()
+    assert np.unique(blocks).size == 256

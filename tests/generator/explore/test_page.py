@@ -330,8 +330,7 @@ def test_a_picture_that_cannot_be_read_is_named_and_passed(tab: Tab, explorer: E
         forget_refusals(tab)
 
 
-@pytest.mark.parametrize("dark", [False, True])
-@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize(("width", "dark"), [(390, True), (1280, False)])
 def test_nothing_is_cut_faint_or_nameless(tab: Tab, explorer: Explorer, width: int, dark: bool) -> None:
     with shown(tab, explorer, width=width, dark=dark):
         tab.value("move([.25, .3])")

@@ -32,6 +32,7 @@ from generator.files import (
     encode_image,
     encode_preview,
     libraries_of,
+    require_plausible,
     suffix_of,
 )
 
@@ -196,6 +197,20 @@ def test_damaged_files_are_refused_by_name(form: Format, keep: int) -> None:
     data = encode_image(noisy(40, 40), form, METADATA)
     with pytest.raises(FormatError, match=r"images/000007"):
         decode_image(data[:keep], form, "images/000007")
+
+
+def test_a_png_may_claim_what_deflate_can_make_of_its_bytes() -> None:
+    """70 bytes of a file make 1032 times as many at most: 10 320 rows of one pixel of 16 bits and a byte of filter."""
+
+    def claiming(height: int, depth: int = 16) -> bytes:
+        head = struct.pack(">I4sIIBB", 13, b"IHDR", 1, height, depth, 2)
+        return (b"\x89PNG\r\n\x1a\n" + head).ljust(70, b"\0")
+
+    require_plausible(claiming(10_320), "it")
+    require_plausible(claiming(18_060, depth=8), "it")
+    for data in (claiming(10_321), claiming(18_061, depth=8)):
+        with pytest.raises(FormatError, match="it claims 1x1"):
+            require_plausible(data, "it")
 
 
 def test_a_file_of_eight_bits_is_refused() -> None:

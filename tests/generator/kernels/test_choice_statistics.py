@@ -9,18 +9,23 @@ from benchmarks import choices
 
 pytestmark = pytest.mark.slow
 
-DRAWS = 2 * choices.WIDTH * choices.HEIGHT
+HEIGHT = 256
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choices, "HEIGHT", HEIGHT)
 
 
 def test_choices_are_even_and_independent() -> None:
-    # 72 statistics of 17 million draws; by chance alone one seed in 10^5 would fail, and the seeds are fixed.
+    # 72 statistics of 2 million draws; by chance alone one seed in 10^5 would fail, and the seeds are fixed.
     # `python -m benchmarks.choices` does the same with 10^8.
-    assert choices.main(DRAWS) == 0
+    assert choices.main(choices.WIDTH * HEIGHT) == 0
 
 
 def one_round(seed: int, image: int, first_row: int) -> choices.Choices:
     """Return the choices of one round of multiplying and shifting over index xor key."""
-    y, x = np.arange(first_row, first_row + choices.HEIGHT, dtype=np.uint64)[:, None], np.arange(choices.WIDTH)
+    y, x = np.arange(first_row, first_row + HEIGHT, dtype=np.uint64)[:, None], np.arange(choices.WIDTH)
     h = (y << np.uint64(13) | x.astype(np.uint64)) ^ np.uint64(seed * 0x9E3779B9 + image * 0x85EBCA6B & 0xFFFFFFFF)
     h = (h ^ (h >> np.uint64(16))) * np.uint64(0x21F0AAAD) & np.uint64(0xFFFFFFFF)
     return (h * np.uint64(choices.SAMPLES) >> np.uint64(32)).astype(np.uint8)
@@ -28,4 +33,4 @@ def one_round(seed: int, image: int, first_row: int) -> choices.Choices:
 
 def test_one_round_of_mixing_does_not_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(choices, "choices", one_round)
-    assert choices.main(DRAWS // 2) == 1
+    assert choices.main(choices.WIDTH * HEIGHT) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Callable
+from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from hypothesis import strategies as st
 from foundation.errors import InputError
 from generator.kernels import vector as streaming
 from generator.kernels.choice import bits_of, readable
+from generator.kernels.mixing import mix_samples, mixed_table
+from generator.kernels.planar import draw_batch, draw_planar
+from generator.kernels.printing import draw_printed
 from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples
 from generator.rendering.render import render
 
@@ -133,8 +137,8 @@ LIMIT_24, LIMIT_624 = 77.0, 812.0
 
 @pytest.mark.slow
 def test_every_sample_is_drawn_equally_often() -> None:
-    drawn = choices(2019, 7, 3000, 4000).astype(np.int64)
-    assert drawn.size == 12_000_000
+    drawn = choices(2019, 7, 1500, 4000).astype(np.int64)
+    assert drawn.size == 6_000_000
     assert chi_square(drawn, 25) < LIMIT_24
     # Along rows, columns and each of the places that share words too.
     for place in range(16):
@@ -229,6 +233,17 @@ def test_wrong_shapes_and_numbers_are_named(picture: npt.NDArray[np.uint8]) -> N
         draw_samples(samples, picture, seed=-1)
     with pytest.raises(InputError, match="9 colours"):
         bits_of(9)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [draw_samples, draw_mosaic, draw_planar, draw_batch, draw_printed, mix_samples, mixed_table, render],
+)
+def test_what_is_not_said_is_image_0_of_seed_0(function: Callable[..., object]) -> None:
+    known = {"seed": 0, "seeds": 0, "image": 0, "images": 0, "first_row": 0, "threads": 1, "flip": False, "gain": 1}
+    said = {name: given.default for name, given in signature(function).parameters.items() if name in known}
+    assert said
+    assert said == {name: known[name] for name in said}
 
 
 @pytest.mark.slow

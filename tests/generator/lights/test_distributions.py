@@ -19,6 +19,7 @@ from generator.lights.distributions import (
     Gaussian,
     LogKernels,
     Uniform,
+    is_ground_truth,
     load_ground_truths,
     parse_distribution,
 )
@@ -193,13 +194,21 @@ def test_what_has_no_density_is_refused(truths: list[list[float]]) -> None:
         Fitted.of(np.array(truths, dtype=np.float64), "gt.csv")
 
 
+@pytest.mark.parametrize(
+    ("numbers", "is_one"),
+    [([0, 0, 1], True), ([0.5, 0.5, 0], True), ([0, 0, 0], False), ([2, -1, 1], False), ([1, 1], False)],
+)
+def test_a_ground_truth_has_three_parts_none_below_0(numbers: list[float], is_one: bool) -> None:
+    assert is_ground_truth(numbers) is is_one
+
+
 @pytest.mark.slow
 def test_drawn_lights_stay_in_the_gamut_and_keep_the_shape_there() -> None:
     choice = DrawnLights(GAMUT, Uniform(), 2, seed=4)
     assert isinstance(choice, LightChoice)
     assert choice.lights_each == 2
-    rb = whites(choice, 1500)
-    assert len(rb) == 3000
+    rb = whites(choice, 600)
+    assert len(rb) == 1200
     barycentric = np.linalg.solve(CORNERS.T, np.stack([rb[:, 0], 1 - rb.sum(axis=1), rb[:, 1]])).T
     assert barycentric.min() > -1e-6
     # Uniform over the triangle: the least of three shares has the distribution 1 − (1 − 3x)²; one failure in 10⁵.

@@ -21,20 +21,28 @@ CAMERAS: dict[str, npt.NDArray[np.float64]] = {
 """Sensitivities of two cameras in those bands."""
 
 
+def seen(camera: str, light: int) -> npt.NDArray[np.float64]:
+    """Return the counts (64, 3) of the cells of a table of 2 bits: the light that each reflects, as the camera sees it.
+
+    Black reflects a tenth, paper all.
+    """
+    index = np.arange(64)
+    reflected = 0.1 + 0.9 * np.stack([index >> 4 & 3, index >> 2 & 3, index & 3], axis=1) / 3
+    return 400 * (reflected * SPECTRA[light]) @ CAMERAS[camera].T
+
+
 def make_table(folder: Path, camera: str, order: tuple[int, ...], names: tuple[str, ...] = ()) -> Lut:
-    """Make a table of 2 bits without noise: every cell's samples are the light it reflects, as the camera sees it.
+    """Make a table of 2 bits without noise.
 
     Lights with names have spectra of their own, of one colour all of them.
     """
     folder.mkdir()
-    index = np.arange(64)
-    reflected = 0.1 + 0.9 * np.stack([index >> 4 & 3, index >> 2 & 3, index & 3], axis=1) / 3
     writer = LutWriter(folder, len(order), 64, 25)
     white: list[npt.NDArray[np.float64]] = []
     for place, light in enumerate(order):
-        seen = 400 * (reflected * SPECTRA[light]) @ CAMERAS[camera].T
-        writer.put(place, np.rint(seen)[:, None, :].repeat(25, axis=1).astype(np.uint16))
-        white.append(seen[-1])
+        counts = seen(camera, light)
+        writer.put(place, np.rint(counts)[:, None, :].repeat(25, axis=1).astype(np.uint16))
+        white.append(counts[-1])
     plan = [Illumination(place, "uniform", None, Colour(9, 8, light)) for place, light in enumerate(order)]
     if names:
         plan = [Illumination(place, "spectrum", None, Colour(9, 8, 7), name) for place, name in enumerate(names)]

@@ -6,6 +6,7 @@ import csv
 import json
 import pickle
 from collections import Counter
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from calibration.table.lut import open_lut
 from foundation.errors import InputError
 from generator.cli import main
 from generator.dataset.plan import DatasetOptions
@@ -33,7 +35,7 @@ from generator.likeness.real_data import (
 from generator.pictures.sources import Source, random_scenes
 from generator.rendering.black_points import BlackPoint
 from generator.statistics import RealStatistics, cell_means, numbers_of_cells
-from tests.generator.likeness.tables import make_table
+from tests.generator.likeness.tables import make_table, seen
 from tests.generator.stats_files import write_stats
 
 if TYPE_CHECKING:
@@ -230,35 +232,49 @@ def save(path: Path, codes: npt.NDArray[np.uint8]) -> None:
     path.write_bytes(cv2.imencode(".png", codes[..., ::-1])[1].tobytes())
 
 
-@pytest.fixture
-def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lut:
-    """Go to a folder with a table and 60 pictures of 24 x 20 px, half of them reddish, half bluish."""
-    lut = make_table(tmp_path / "lut", "one", (0, 1, 2, 3, 4))
-    (tmp_path / "pictures").mkdir()
+PICTURES = 36
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a table and pictures of 24 x 20 px, half of them reddish, half bluish."""
+    folder = tmp_path_factory.mktemp("likeness")
+    make_table(folder / "lut", "one", (0, 1, 2, 3, 4))
+    (folder / "pictures").mkdir()
     random = np.random.default_rng(8)
-    for number in range(60):
+    for number in range(PICTURES):
         tint = np.array([60, 0, -60] if number % 2 else [-60, 0, 60])
         codes = np.clip(random.integers(0, 256, (20, 24, 3)) + tint, 0, 255).astype(np.uint8)
-        save(tmp_path / "pictures" / f"{number:02d}.png", codes)
-    (tmp_path / "pictures" / "bad.png").write_bytes(b"?")
+        save(folder / "pictures" / f"{number:02d}.png", codes)
+    (folder / "pictures" / "bad.png").write_bytes(b"?")
+    return folder
+
+
+@pytest.fixture
+def table(kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lut:
+    """Go to a folder that leads to the table and the pictures."""
+    for name in ("lut", "pictures"):
+        (tmp_path / name).symlink_to(kept / name)
     monkeypatch.chdir(tmp_path)
-    return lut
+    return open_lut(Path("lut"))
 
 
-def real_numbers(lut: Lut, reddish: float, black_taken: float = 0.0) -> dict[str, npt.ArrayLike]:
+@cache
+def real_numbers(reddish: float, black_taken: float = 0.0) -> dict[str, npt.ArrayLike]:
     """Return numbers as of a real set of which that share is reddish, else like the pictures.
 
     Of the print's black, which is a tenth of white, that share is taken out of them.
     """
     random = np.random.default_rng(1)
+    cells = seen("one", 2)
+    white = cells[-1]
     values: dict[str, list[float]] = {}
     for number in range(100):
         tint = np.array([60, 0, -60] if number < 100 * reddish else [-60, 0, 60])
         codes = np.clip(random.integers(0, 256, (20, 24, 3)) + tint, 0, 255)
         index = (codes >> 6) @ np.array([16, 4, 1])
-        image = lut.samples[2].astype(float).mean(axis=1)[index]
-        image = (image - 0.1 * black_taken * lut.white[2]) / (1 - 0.1 * black_taken)
-        for name, value in numbers_of_cells(cell_means(image, lut.white[2]))[0].items():
+        image = (np.rint(cells)[index] - 0.1 * black_taken * white) / (1 - 0.1 * black_taken)
+        for name, value in numbers_of_cells(cell_means(image, white))[0].items():
             values.setdefault(name, []).append(value)
     return dict(values)
 
@@ -278,12 +294,12 @@ WISH = ("--sources", "pictures", "--no-preview", "--like", "s.json", "--random",
 
 def test_pictures_lights_and_what_is_recorded(table: Lut, capsys: pytest.CaptureFixture[str]) -> None:
     """Three quarters of the real images are reddish, so three quarters of the images are of reddish pictures."""
-    write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.75), sizes=[])
+    write_stats(Path("s.json"), lights_of(table), real_numbers(0.75), sizes=[])
     assert main(("lut", "out", *WISH, "--draw", "200", "--seed", "4")) == 0
     printed = capsys.readouterr().out
     assert "lights: 0.0% of the 40 of real lie outside what lut can make" in printed
     assert "200 draws of" in printed
-    assert "of 60 measured" in printed
+    assert f"of {PICTURES} measured" in printed
     dataset = open_dataset("out")
     different = len({entry.source for entry in dataset.entries})
     assert f"out: 200 images of 200 pictures, {different} of them different, under " in printed
@@ -294,7 +310,7 @@ def test_pictures_lights_and_what_is_recorded(table: Lut, capsys: pytest.Capture
     options = recorded()
     assert options["like"]["file"] == "s.json"
     assert options["like"]["in"] == ["lights", "pictures", "exposure", "size"]
-    assert options["like"]["pictures"]["measured"] == 60
+    assert options["like"]["pictures"]["measured"] == PICTURES
     assert options["like"]["pictures"]["drawn"] == 200
     assert options["lights"]["distribution"] == "log kernels"
     with Path("out/images.csv").open() as stream:
@@ -304,21 +320,21 @@ def test_pictures_lights_and_what_is_recorded(table: Lut, capsys: pytest.Capture
         drawn[entry.source] = drawn.get(entry.source, 0) + 1
     for entry, row in zip(dataset.entries, rows, strict=True):
         assert row["image"] == entry.image
-        assert abs(drawn[entry.source] - 200 / 60 * float(row["weight"])) <= 1
+        assert abs(drawn[entry.source] - 200 / PICTURES * float(row["weight"])) <= 1
     # A picture drawn several times is under another light each time, and shares its name, hence its fold.
     assert len({entry.lights for entry in dataset.entries}) > 190
-    assert len({entry.source for entry in dataset.entries}) < 61
+    assert len({entry.source for entry in dataset.entries}) <= PICTURES
 
 
 def test_the_same_command_gives_the_same_bytes(table: Lut) -> None:
-    write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.75))
+    write_stats(Path("s.json"), lights_of(table), real_numbers(0.75))
     for out, workers in (("a", "1"), ("b", "3")):
         assert main(("lut", out, *WISH, "--workers", workers, "--seed", "4")) == 0
     assert Path("a/SHA256SUMS").read_bytes() == Path("b/SHA256SUMS").read_bytes()
 
 
 def test_size_and_exposure(table: Lut, capsys: pytest.CaptureFixture[str]) -> None:
-    values = real_numbers(table, 0.5) | {"exposure": np.linspace(0.2, 0.6, 100)}
+    values = real_numbers(0.5) | {"exposure": np.linspace(0.2, 0.6, 100)}
     sizes = [{"width": 900, "height": 600, "images": 90}, {"width": 600, "height": 900, "images": 10}]
     write_stats(Path("s.json"), lights_of(table), values, sizes=sizes)
     assert main(("lut", "out", *WISH, "--seed", "4")) == 0
@@ -336,7 +352,7 @@ def test_size_and_exposure(table: Lut, capsys: pytest.CaptureFixture[str]) -> No
 
 def test_thumbnails_say_nothing_of_size(table: Lut, capsys: pytest.CaptureFixture[str]) -> None:
     data = {"name": "small", "layout": "thumbnails", "place": "", "images": 100}
-    write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.5), data=data)
+    write_stats(Path("s.json"), lights_of(table), real_numbers(0.5), data=data)
     assert main(("lut", "out", *WISH)) == 0
     printed = capsys.readouterr().out
     assert "size: small is of thumbnails" in printed
@@ -345,7 +361,7 @@ def test_thumbnails_say_nothing_of_size(table: Lut, capsys: pytest.CaptureFixtur
 
 
 def test_what_other_options_say_is_not_followed(table: Lut) -> None:
-    write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.5))
+    write_stats(Path("s.json"), lights_of(table), real_numbers(0.5))
     wish = ("--sources", "pictures", "--no-preview", "--like", "s.json")
     assert main(("lut", "out", *wish, "--illuminations", "1,2", "--max-side", "20", "--exposure", "1")) == 0
     assert recorded()["like"]["in"] == ["pictures"]
@@ -359,7 +375,7 @@ def test_lights_of_the_very_table_are_not_outside_by_what_a_file_rounds(
     table: Lut, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rounded: npt.NDArray[np.float64] = np.round(table.ground_truth, 6)
-    write_stats(Path("s.json"), rounded, real_numbers(table, 0.5))
+    write_stats(Path("s.json"), rounded, real_numbers(0.5))
     assert main(("lut", "out", *WISH, "--like-in", "lights")) == 0
     assert "lights: 0.0% of the 5 of real lie outside" in capsys.readouterr().out
 
@@ -367,14 +383,14 @@ def test_lights_of_the_very_table_are_not_outside_by_what_a_file_rounds(
 def test_lights_outside_the_gamut_are_counted_and_others_drawn(table: Lut, capsys: pytest.CaptureFixture[str]) -> None:
     far = np.array([[0.9, 0.05, 0.05], [0.89, 0.06, 0.05], [0.9, 0.06, 0.04], [0.88, 0.06, 0.06]])
     lights = np.concatenate([lights_of(table, 12), far])
-    write_stats(Path("s.json"), lights, real_numbers(table, 0.5))
+    write_stats(Path("s.json"), lights, real_numbers(0.5))
     assert main(("lut", "out", *WISH)) == 0
     assert "lights: 25.0% of the 16 of real lie outside what lut can make; others" in capsys.readouterr().out
     assert recorded()["like"]["lights"] == {"count": 16, "outside": 0.25}
     truths = np.array([entry.truth for entry in open_dataset("out").entries])
     nearest = [Gamut.of(table).match(truth, "nearest").angle for truth in truths]
     assert max(nearest) < 0.02
-    write_stats(Path("s.json"), far, real_numbers(table, 0.5))
+    write_stats(Path("s.json"), far, real_numbers(0.5))
     assert main(("lut", "none", *WISH)) == 2
     assert "of the distribution lies within what" in capsys.readouterr().err
 
@@ -392,12 +408,17 @@ def test_lights_outside_the_gamut_are_counted_and_others_drawn(table: Lut, capsy
 def test_options_that_do_not_go_together(
     table: Lut, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], told: str
 ) -> None:
-    write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.5))
+    write_stats(Path("s.json"), lights_of(table), real_numbers(0.5))
     assert main(("lut", "out", "--sources", "pictures", "--like", "s.json", *options)) == 2
     assert told in capsys.readouterr().err
-    assert main(("lut", "out", "--sources", "pictures", "--black-point", "like")) == 2
-    assert "give --like STATS.json" in capsys.readouterr().err
-    assert main(("lut", "out", "--sources", "pictures", "--draw", "5")) == 2
+
+
+@pytest.mark.parametrize("options", [("--black-point", "like"), ("--draw", "5")])
+def test_what_needs_a_real_set_asks_for_it(
+    table: Lut, capsys: pytest.CaptureFixture[str], options: tuple[str, str]
+) -> None:
+    del table
+    assert main(("lut", "out", "--sources", "pictures", *options)) == 2
     assert "give --like STATS.json" in capsys.readouterr().err
 
 
@@ -408,18 +429,18 @@ def test_files_that_cannot_be_followed(table: Lut, capsys: pytest.CaptureFixture
         return capsys.readouterr().err
 
     assert "s.json cannot be read as statistics" in refused()
-    write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.5), version=7)
+    write_stats(Path("s.json"), lights_of(table), real_numbers(0.5), version=7)
     assert "version 7; expected crop.statistics, version 1" in refused()
-    write_stats(Path("s.json"), [], real_numbers(table, 0.5))
+    write_stats(Path("s.json"), [], real_numbers(0.5))
     assert "lights of shape" in refused()
-    write_stats(Path("s.json"), lights_of(table, 2), real_numbers(table, 0.5))
+    write_stats(Path("s.json"), lights_of(table, 2), real_numbers(0.5))
     assert "no density fits the 2 lights of s.json" in refused()
     write_stats(Path("s.json"), lights_of(table), {"grey_red": [0.1, 0.2, 0.3]})
     assert "s.json has luminance_1 of 0 images" in refused()
 
 
 def test_an_encoded_and_a_small_real_set_are_told_of(table: Lut, capsys: pytest.CaptureFixture[str]) -> None:
-    values: dict[str, npt.ArrayLike] = {name: np.asarray(given)[:5] for name, given in real_numbers(table, 0.5).items()}
+    values: dict[str, npt.ArrayLike] = {name: np.asarray(given)[:5] for name, given in real_numbers(0.5).items()}
     values["luminance_50"] = np.full(5, 0.45)
     write_stats(Path("s.json"), lights_of(table), values)
     assert main(("lut", "out", *WISH)) == 0
@@ -433,7 +454,7 @@ def test_an_encoded_and_a_small_real_set_are_told_of(table: Lut, capsys: pytest.
 
 def test_pictures_are_measured_as_they_will_be_rendered(table: Lut) -> None:
     """Without the print's black, which is a tenth of white in this table, shadows are darker, and so measured."""
-    write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.5))
+    write_stats(Path("s.json"), lights_of(table), real_numbers(0.5))
     found: dict[str, float] = {}
     for black in ("keep", "compensate"):
         wish = ("--sources", "pictures", "--no-preview", "--like", "s.json", "--like-in", "pictures")
@@ -450,7 +471,7 @@ def test_pictures_are_measured_as_they_will_be_rendered(table: Lut) -> None:
 def test_shadows_are_made_like_the_real_ones_by_the_black_of_each_picture(
     table: Lut, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.5, black_taken=0.5))
+    write_stats(Path("s.json"), lights_of(table), real_numbers(0.5, black_taken=0.5))
     wish = ("--sources", "pictures", "--no-preview", "--like", "s.json", "--like-in", "pictures", "--draw", "150")
     wish += ("--rendering", "codes")
     away: dict[str, float] = {}

@@ -97,6 +97,8 @@ def test_what_is_refused(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "--max-side is 10, where first was made with 20" in refused("two", "out", *wish, *of, "--max-side", "10")
     assert "--like and --lights-of were both given" in refused("two", "out", *wish, *of, "--like", "s.json")
     assert "leave --random-scenes out" in refused("two", "out", *wish, *of, "--random-scenes", "1")
+    for more in (("--draw", "2"), ("--like-in", "lights")):
+        assert f"{more[0]} {more[1]} says what --like is to do" in refused("two", "out", *wish, *of, *more)
     (lab / "pictures" / "b.png").rename(lab / "b.png")
     assert "1 of the 3 pictures of first are not found: b.png" in refused("two", "out", *wish, *of)
     (lab / "pictures" / "a.png").rename(lab / "pictures" / "b.png")
@@ -153,14 +155,3 @@ def test_mixtures_of_spectra_are_refused_for_another_camera(
     capsys.readouterr()
     assert main(("same", "second", *wish, "--lights-of", "first")) == 2
     assert "their proportion is not known" in " ".join(capsys.readouterr().err.split())
-
-
-@pytest.mark.parametrize("more", [("--draw", "2"), ("--like-in", "lights")])
-def test_what_is_for_like_is_not_passed_over(
-    lab: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, str]
-) -> None:
-    del lab
-    wish = ("--sources", "pictures", "--no-preview")
-    assert main(("one", "first", *wish)) == 0
-    assert main(("two", "second", *wish, "--lights-of", "first", *more)) == 2
-    assert f"{more[0]} {more[1]} says what --like is to do" in capsys.readouterr().err

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,9 +28,9 @@ from generator.rendering.colorimetric import (
 )
 from generator.rendering.matrices import ColourMatrix, fitted_matrix, matrix_for
 from generator.rendering.print_inverse import corners, invert, nearest_to
-from generator.rendering.print_profiles import profile_of
+from generator.rendering.print_profiles import PrintProfile, profile_of
 from tests.generator.rendering.conftest import MakeTable
-from tests.generator.rendering.prints import MATRIX
+from tests.generator.rendering.prints import MATRIX, printed
 
 pytestmark = pytest.mark.slow
 
@@ -85,6 +87,14 @@ def test_a_print_of_known_colours_is_met_where_it_can_be(make_table: MakeTable) 
     assert rendering.map.distance[inside].mean() < 0.2
 
 
+@pytest.mark.parametrize(("blue_paper", "white"), [(0.85, 0.99 * 0.85), (0.9, 0.97 * 0.9)])
+def test_black_and_white_are_greys_that_mixtures_make(blue_paper: float, white: float) -> None:
+    """A box of colours, paper last: its greys end at the blue of its black, and short of its paper's blue."""
+    colours = np.stack(np.meshgrid([0.1, 0.9], [0.1, 0.9], [0.2, blue_paper], indexing="ij"), axis=-1).reshape(8, 3)
+    profile = PrintProfile(colours, np.ones(8, bool))
+    assert (profile.bits, profile.black, profile.white) == (1, pytest.approx(0.2), pytest.approx(white))
+
+
 def test_places_are_the_inverse_of_what_is_seen() -> None:
     bits = 3
     codes = np.stack([np.arange(512) >> 6, np.arange(512) >> 3 & 7, np.arange(512) & 7], axis=-1) / 7
@@ -102,9 +112,26 @@ def test_places_are_the_inverse_of_what_is_seen() -> None:
     assert np.median(missed) < 0.1 or ((found <= 0) | (found >= 7)).any(axis=1).mean() > 0.5
 
 
+def test_colours_in_a_print_and_beyond_it_are_found_where_they_always_were() -> None:
+    """A map that is found anew is to draw the same images: places to a hundredth of a cell."""
+    codes = np.array([[0.5, 0.5, 0.5], [0.2, 0.5, 0.3], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0.02, 0.02, 0.05]])
+    wanted = 0.05 + 0.9 * codes @ np.array([[0.9, 0.0, 0.0], [0.05, 0.9, 0.1], [0.05, 0.1, 0.9]])
+    found = invert(printed(3, tint=0.1), wanted.mean(axis=1), wanted, 3)
+    places = [
+        [4.815, 5.137, 5.623],
+        [0, 5.495, 4.307],
+        [6.775, 0, 0],
+        [0, 5.403, 1.061],
+        [0, 0, 6.476],
+        [6.996, 6.503, 0],
+        [1.303, 1.066, 2.087],
+    ]
+    np.testing.assert_allclose(found, places, atol=0.01)
+
+
 def test_black_is_as_dark_as_it_can_be_grey(make_table: MakeTable) -> None:
-    profile = profile_of(make_table(bits=4), 1)
-    lut = make_table(bits=4, name="again")
+    lut = make_table(bits=4)
+    profile = profile_of(lut, 1)
     assert ColorimetricRendering(lut, MINE).black(plain(1)) == pytest.approx(profile.black, rel=0.1)
 
     def redden(samples: npt.NDArray[np.uint16]) -> None:
@@ -194,6 +221,17 @@ def test_black_that_is_taken_out_leaves_means_and_white(make_table: MakeTable) -
 def test_the_reference_is_daylight_or_the_light_that_sees_most(make_table: MakeTable) -> None:
     assert reference_light(make_table(bits=1)) == 1
     assert reference_light(make_table(bits=1, lights=1, name="candle")) == 0
+
+
+def test_the_reference_is_near_in_reciprocal_kelvin_and_sees_every_channel() -> None:
+    def table(*lights: tuple[float, float]) -> Any:
+        """Return what is asked of a table of black bodies, each of so many kelvin and such a share of blue."""
+        bodies = [SimpleNamespace(index=place, cct_k=kelvin) for place, (kelvin, _) in enumerate(lights)]
+        return SimpleNamespace(white=np.array([[900, 1000, 1000 * blue] for _, blue in lights]), illuminations=bodies)
+
+    assert reference_light(table((4900, 0.5), (6500, 0.5))) == 1
+    assert reference_light(table((5600, 0.19), (3000, 0.2), (2000, 0.3))) == 1
+    assert reference_light(table((3000, 0.1), (5600, 0.19))) == 1
 
 
 def test_a_table_of_one_light(make_table: MakeTable) -> None:

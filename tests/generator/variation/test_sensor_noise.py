@@ -13,7 +13,7 @@ import pytest
 from calibration.citation import OriginRecord
 from calibration.table.lut import Lut
 from foundation.errors import InputError
-from generator.variation.iso_speed import known_of_table, parse_iso
+from generator.variation.iso_speed import IsoSpeed, known_of_table, parse_iso
 from generator.variation.sensor_noise import SensorNoise, Three, measured_noise
 from sim.world.sensors import BODIES
 
@@ -70,6 +70,15 @@ def test_too_few_cells_are_refused(make_lut: Callable[..., Lut]) -> None:
 def test_a_table_of_poisson_samples(make_lut: Callable[..., Lut]) -> None:
     noise = measured_noise(make_lut(bits=3))
     assert noise.shot == pytest.approx([1.0] * 3, rel=0.1)
+
+
+def test_speeds_are_any_numbers_above_0() -> None:
+    assert IsoSpeed(0.5, 0.25, 0.0).ratio == 2
+    for wrong in ((0.0, 100.0, 1.0), (100.0, 0.0, 1.0), (100.0, 100.0, -0.1), (100.0, 100.0, 1e6), (np.inf, 1.0, 1.0)):
+        with pytest.raises(InputError, match="expected numbers above 0"):
+            IsoSpeed(*wrong)
+    with pytest.raises(InputError, match="below the ISO 200"):
+        IsoSpeed(199.9, 200)
 
 
 def test_another_speed_of_the_simulated_bodies() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from foundation.errors import InputError
-from generator.masks.making import parse_masks
+from generator import philox
+from generator.masks.making import parse_masks, parse_shape
 from generator.variation.variation import AutomaticExposure, DrawnExposure, parse_exposure, parse_gradient
 
 
@@ -91,6 +93,16 @@ def test_light_falls_off_within_the_stops_asked_for() -> None:
     assert plain[0] == plain[1] == plain[2]
 
 
+def test_the_far_end_is_what_the_words_of_the_image_say() -> None:
+    """To the last digits: images made again are to be the same."""
+    gradient = parse_gradient("smooth:stops=3,least=.5,colour=.2")
+    for number in (0, 7):
+        level, red, blue = ((int(word) + 0.5) / 2**32 for word in philox.words(9, 0, 64, number, philox.GRADIENTS)[:3])
+        tint = np.exp(0.2 * (2 * np.array([red, 0.5, blue]) - 1))
+        wanted = 2 ** -(0.5 + 2.5 * level) * tint / tint.max()
+        assert gradient.of_image(9, number).end == pytest.approx(wanted, rel=1e-13)
+
+
 def test_the_shape_is_not_that_of_masks_of_the_same_seed() -> None:
     gradient = parse_gradient("smooth").of_image(7, 1)
     weights = gradient.weights(40, 60)
@@ -105,6 +117,37 @@ def test_a_folder_of_masks_is_no_gradient(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="'masks' is no kind of masks; name one of half-plane, soft-edge"):
         parse_gradient("masks:stops=1")
+
+
+@pytest.mark.parametrize(
+    ("parse", "kind", "others", "bounds"),
+    [
+        (parse_gradient, "smooth", "", {"stops": (0, 6), "colour": (0, 1)}),
+        (parse_gradient, "smooth", "stops=6,", {"least": (0, 6)}),
+        (parse_exposure, "stops", "high=6,", {"low": (-12, 6)}),
+        (parse_exposure, "stops", "low=-12,", {"high": (-12, 6)}),
+        (parse_exposure, "normal", "sd=1,", {"mean": (-12, 6)}),
+        (parse_exposure, "normal", "mean=0,", {"sd": (0, 6)}),
+        (parse_exposure, "clip", "most=8,", {"share": (0, 0.9)}),
+        (parse_exposure, "clip", "share=.1,", {"most": (0.01, 64)}),
+        (parse_exposure, "level", "share=.1,", {"low": (0.001, 1)}),
+        (parse_exposure, "level", "low=.5,", {"share": (0, 0.9)}),
+        (parse_exposure, "level", "share=.1,low=.001,", {"high": (0.001, 1)}),
+        (parse_shape, "half-plane", "", {"angle": (-360, 360), "width": (0, 1)}),
+        (parse_shape, "soft-edge", "", {"angle": (-360, 360), "width": (0, 1)}),
+        (parse_shape, "spots", "", {"count": (1, 20), "radius": (0.01, 1), "softness": (0, 2)}),
+        (parse_shape, "smooth", "", {"scale": (0.02, 2), "contrast": (0, 100)}),
+        (parse_shape, "window", "", {"columns": (1, 20), "rows": (1, 20), "softness": (0, 1)}),
+    ],
+)
+def test_numbers_are_taken_from_bound_to_bound(
+    parse: Callable[[str], object], kind: str, others: str, bounds: dict[str, tuple[float, float]]
+) -> None:
+    for name, ends in bounds.items():
+        for end, outwards in zip(ends, (-0.005, 0.005), strict=True):
+            parse(f"{kind}:{others}{name}={end}")
+            with pytest.raises(InputError, match=rf"from {ends[0]:g} to {ends[1]:g}"):
+                parse(f"{kind}:{others}{name}={end + outwards}")
 
 
 @pytest.mark.parametrize(
