@@ -56,8 +56,10 @@ def test_channels_exchanged_in_the_truths_of_several_methods_are_one_note() -> N
 def test_nothing_is_said_where_it_would_mean_nothing() -> None:
     assert notes(TRUTHS) == ()
     assert notes(TRUTHS[:, [1, 2, 0]]) == ()
-    assert notes(1 / TRUTHS, guessed=33) == ()
-    assert suspicions(NAMES[:7], TRUTHS[:7], [Result("Mine", 1 / TRUTHS[:7], {}, np.zeros(7, bool))]) == ()
+    assert (len(notes(1 / TRUTHS, guessed=32)), notes(1 / TRUTHS, guessed=33)) == (1, ())
+    for count, said in ((8, 1), (7, 0)):
+        few = Result("Mine", 1 / TRUTHS[:count], {}, np.zeros(count, bool))
+        assert len(suspicions(NAMES[:count], TRUTHS[:count], [few])) == said
 
 
 @pytest.mark.parametrize("path", [None, *available("benchmark/nus_canon_600d_64x64.npz")])
