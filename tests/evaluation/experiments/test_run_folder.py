@@ -129,11 +129,16 @@ class Killed(BaseException):
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results") / "out"
     run_methods(mixed_set(), METHODS, folder)
     assert not partial_path(folder).exists()
-    return content(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(whole: Path) -> dict[str, bytes]:
+    return content(whole)
 
 
 def test_the_files_of_a_results_folder(undisturbed: dict[str, bytes]) -> None:
@@ -262,9 +267,9 @@ def test_two_methods_of_one_name_are_refused() -> None:
         run_methods(mixed_set(), [METHODS[0], GrayEdge("Gray-world", 0, 2, 0)])
 
 
-def test_errors_are_read_back(tmp_path: Path) -> None:
-    made = run_methods(mixed_set(), METHODS, tmp_path / "out")
-    found = read_errors(tmp_path / "out")
+def test_errors_are_read_back(whole: Path) -> None:
+    made = run_methods(mixed_set(), METHODS)
+    found = read_errors(whole)
     assert list(found) == ["Gray-world", "White-Patch"]
     for result in made.results:
         read = found[result.method]
