@@ -201,7 +201,9 @@ def test_files_say_what_the_experiment_says(data: SceneSet, tmp_path: Path, clea
         )
 
 
-def test_codes_are_as_written_and_may_be_changed(data: SceneSet, tmp_path: Path) -> None:
+def test_codes_are_as_written_and_may_be_changed(
+    data: SceneSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     codes = tmp_path / "codes"
     assert main(["paper", "flash", data.place, "--out", str(codes), "--clear", "4"]) == 0
     written = cv2.imread(str(codes / "codes/b/three.png"), cv2.IMREAD_UNCHANGED)
@@ -212,6 +214,7 @@ def test_codes_are_as_written_and_may_be_changed(data: SceneSet, tmp_path: Path)
     (codes / "codes/one.png").unlink()
     cv2.imwrite(str(codes / "codes/one.jpg"), np.full((32, 40, 3), 128, np.uint8))
     assert main(["paper", "flash-inverse", str(codes), "--out", str(tmp_path / "linear")]) == 0
+    assert "4/4 images" in capsys.readouterr().err.splitlines()[-1]
     image, _ = open_scenes(str(tmp_path / "linear")).scenes[0].read()
     assert np.ptp(image) < 1e-4 * image.max()
 
