@@ -18,6 +18,7 @@ import pytest
 from evaluation.datasets.generated import GeneratedMixedScene, GeneratedScene, open_generated
 from evaluation.datasets.thumbnails import Thumbnail
 from evaluation.experiments.transfer.plan import (
+    NaiveScene,
     find_sources,
     naive_image,
     naive_scenes,
@@ -66,11 +67,15 @@ def _generated(maker_scenes: tuple[object, ...]) -> list[GeneratedScene]:
     return [scene for scene in maker_scenes if isinstance(scene, GeneratedScene)]
 
 
+def _counterparts(made: list[GeneratedScene], pictures: Path) -> tuple[NaiveScene, ...]:
+    found, missing = find_sources(made[0].dataset, pictures)
+    assert not missing
+    return naive_scenes(made, found)
+
+
 def test_a_table_that_is_naive_is_reproduced(maker: Maker) -> None:
     made = _generated(maker.make().scenes)
-    found, missing = find_sources(made[0].dataset, maker.pictures)
-    assert not missing
-    naive = naive_scenes(made, found)
+    naive = _counterparts(made, maker.pictures)
     assert [scene.name for scene in naive] == [scene.name for scene in made]
     for one, other in zip(naive, made, strict=True):
         np.testing.assert_array_equal(one.truth, other.truth)
@@ -93,8 +98,7 @@ def test_a_table_behind_a_matrix_is_reproduced_with_it_and_not_without(tmp_path:
 def test_mixtures_and_masks_of_lights_are_reproduced(maker: Maker) -> None:
     mixed = mixture_of({0: 1, 1: 3})
     (single, *_) = _generated(maker.make("mixed", ListedLights((mixed,))).scenes)
-    found, _ = find_sources(single.dataset, maker.pictures)
-    (naive, *_) = naive_scenes([single], found)
+    (naive,) = _counterparts([single], maker.pictures)
     np.testing.assert_allclose(naive.whites, [LIGHTS[0] / 4 + LIGHTS[1] * 3 / 4], rtol=1e-6)
     # The mixed table rounds each of its samples once more.
     np.testing.assert_allclose(naive.read()[0].astype(int), single.read()[0].astype(int), atol=2)
@@ -124,21 +128,18 @@ RANDOM_CROP = Preparation(crop=(9, 7), crop_at="random", seed=3)
 )
 def test_pictures_are_prepared_and_lit_as_they_were(maker: Maker, how: dict[str, Any], away: int) -> None:
     made = _generated(maker.make(**how).scenes)
-    found, _ = find_sources(made[0].dataset, maker.pictures)
-    for naive, scene in zip(naive_scenes(made, found), made, strict=True):
+    for naive, scene in zip(_counterparts(made, maker.pictures), made, strict=True):
         np.testing.assert_allclose(naive.read()[0].astype(int), scene.read()[0].astype(int), atol=away)
 
 
 def test_pictures_are_made_as_small_as_they_were(maker: Maker) -> None:
     made = _generated(maker.make(preparation=Preparation(max_side=12)).scenes)
-    found, _ = find_sources(made[0].dataset, maker.pictures)
-    assert naive_scenes(made, found)[0].read()[0].shape == made[0].read()[0].shape == (12, 12, 3)
+    assert _counterparts(made, maker.pictures)[0].read()[0].shape == made[0].read()[0].shape == (12, 12, 3)
 
 
 def test_every_crop_has_the_counterpart_of_its_own_place(maker: Maker) -> None:
     made = _generated(maker.make(preparation=Preparation(crop=(9, 7), crops=3)).scenes)
-    found, _ = find_sources(made[0].dataset, maker.pictures)
-    naive = [scene.read()[0].astype(int) for scene in naive_scenes(made, found)]
+    naive = [scene.read()[0].astype(int) for scene in _counterparts(made, maker.pictures)]
     for image, scene in zip(naive, made, strict=True):
         np.testing.assert_allclose(image, scene.read()[0].astype(int), atol=1)
     assert any(np.abs(image - naive[0]).max() > 500 for image in naive[2:6:2])
@@ -154,9 +155,8 @@ def test_light_that_falls_off_without_a_tint_does_so_in_the_counterpart(
         choice = SimultaneousLights(BOTH, 2, parse_masks("soft-edge:angle=70,width=.6", 2, 0))
     preparation = Preparation(crop=(16, 12), crops=2)
     made = _generated(maker.make(lights=choice, gradient=gradient, preparation=preparation, seed=0).scenes)
-    found, _ = find_sources(made[0].dataset, maker.pictures)
     unlike: list[int] = []
-    for naive, scene in zip(naive_scenes(made, found), made, strict=True):
+    for naive, scene in zip(_counterparts(made, maker.pictures), made, strict=True):
         expected = scene.read()[0].astype(int)
         np.testing.assert_allclose(naive.read()[0].astype(int), expected, atol=3)
         weights = scene.dataset.read_weights(scene.entry) if lights == "two" else np.ones((12, 16, 1), np.float32)
@@ -169,8 +169,7 @@ def test_light_that_falls_off_without_a_tint_does_so_in_the_counterpart(
 def test_a_counterpart_under_several_lights_has_their_maps(maker: Maker) -> None:
     choice = SimultaneousLights(BOTH, 2, parse_masks("soft-edge:angle=70,width=.6", 2, 0))
     (made, *_) = _generated(maker.make(lights=choice).scenes)
-    found, _ = find_sources(made.dataset, maker.pictures)
-    (naive,) = naive_scenes([made], found)
+    (naive,) = _counterparts([made], maker.pictures)
     assert isinstance(naive, MixedScene)
     assert isinstance(made, GeneratedMixedScene)
     np.testing.assert_array_equal(naive.lights, made.lights)
@@ -179,7 +178,7 @@ def test_a_counterpart_under_several_lights_has_their_maps(maker: Maker) -> None
     np.testing.assert_allclose(naive.read_truth_map(), light / light.sum(axis=2, keepdims=True), atol=1e-4)
     np.testing.assert_allclose(naive.truth, light.mean(axis=(0, 1)) / light.mean(axis=(0, 1)).sum(), atol=1e-4)
     (single, *_) = _generated(maker.make("single").scenes)
-    (plain,) = naive_scenes([single], found)
+    (plain,) = _counterparts([single], maker.pictures)
     assert not isinstance(plain, MixedScene)
 
 
@@ -191,7 +190,7 @@ def test_a_gradient_that_is_described_as_none_is_named(maker: Maker) -> None:
         record["options"]["variation"] = wrong
         described.write_text(json.dumps(record))
         (made, *_) = _generated(open_generated(maker.folder / "made").scenes)
-        (naive,) = naive_scenes([made], find_sources(made.dataset, maker.pictures)[0])
+        (naive,) = _counterparts([made], maker.pictures)
         with pytest.raises(FormatError, match=r"describes its variation as .*; make it again"):
             naive.read()
 
