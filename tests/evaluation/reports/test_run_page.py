@@ -183,4 +183,5 @@ def test_many_methods_and_images_make_a_page_that_closes() -> None:
     assert len(re.findall(r"src='data:image/jpeg", text)) == len(pictures)
     for words in ("White <Patch>", "as it was drawn", "MAE_illum", "1 of them under several lights", "mixed & <odd>"):
         assert words in found.text
+    assert "Shown are the first" not in found.text
     assert text == run_page(run, "recovery", pictures)
