@@ -374,20 +374,27 @@ def box_mask(shape: tuple[int, int], rows: slice, columns: slice) -> Mask:
     return mask
 
 
-def polygon_mask(shape: tuple[int, int], corners: npt.NDArray[np.float64]) -> Mask:
-    """Return a mask (H, W) bool of that shape, True in and on a polygon.
+def chart_mask(shape: tuple[int, int], corners: npt.NDArray[np.float64], path: str = "") -> Mask:
+    """Return a mask (H, W) bool of that shape, True in and on a chart; a FormatError where corners are far outside.
 
-    `corners`: (N, 2) float64, x then y, px, pixel centres at integers; rounded to whole pixels.
+    `corners`: (N, 2) float64, x then y, px, pixel centres at integers; rounded to whole pixels. `path`: of the image
+    or of the corners.
 
     Examples
     --------
-    >>> polygon_mask((3, 4), np.array([[1.0, 0.0], [2.0, 0.0], [2.0, 1.2], [1.0, 1.2]])).astype(int)
+    >>> chart_mask((3, 4), np.array([[1.0, 0.0], [2.0, 0.0], [2.0, 1.2], [1.0, 1.2]])).astype(int)
     array([[0, 1, 1, 0],
            [0, 1, 1, 0],
            [0, 0, 0, 0]])
     """
     import cv2
 
+    # The drawing of a line takes as long as the line is, and what does not fit into 32 bits wraps round.
+    if not (np.abs(corners) < 2 * max(shape)).all():
+        raise FormatError(
+            f"the chart of {path} has the corners {corners.tolist()}, far outside of an image of {shape[1]} × "
+            f"{shape[0]}; restore them from the data set's archive"
+        )
     mask = np.zeros(shape, dtype=np.uint8)
     cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], (1,))
     return np.asarray(mask, dtype=bool)

@@ -176,7 +176,7 @@ def _evolve(
     fitness = errors(population, used)
     for generation in range(settings.generations):
         best = np.argsort(fitness, kind="stable")[:_ELITE]
-        parents = rng.integers(0, count, (2, count - _ELITE, _TOURNAMENT))
+        parents = rng.integers(count, size=(2, count - _ELITE, _TOURNAMENT))
         first, second = np.take_along_axis(parents, fitness[parents].argmin(axis=2)[..., None], axis=2)[..., 0]
         mix = rng.uniform(-_BLEND, 1 + _BLEND, (count - _ELITE, len(genes)))
         children = population[first] + mix * (population[second] - population[first])

@@ -112,7 +112,7 @@ def _draw_planes(figure: Any, results: Sequence[Result], truths: npt.NDArray[np.
     panels = list(grid.flat)
     for axes in panels[len(results) :]:
         axes.remove()
-    for axes in panels[max(0, len(results) - columns) : len(results)]:
+    for axes in panels[len(results) - columns : len(results)]:
         # The lowest panel of each column has the labels, also above an empty place.
         axes.tick_params(labelbottom=True)
     figure.supxlabel("r = R / (R + G + B) of the true light", fontsize=9)

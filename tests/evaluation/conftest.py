@@ -1,4 +1,4 @@
-"""A small generated dataset, and real images for the tests of methods."""
+"""A small generated dataset."""
 
 from __future__ import annotations
 
@@ -14,16 +14,6 @@ from experiment.lights import Illumination
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.pictures.sources import random_scenes
-from tests.evaluation.real_images import Collection, collections
-
-MAKERS = collections()
-
-
-@pytest.fixture(scope="session", params=MAKERS)
-def collection(request: pytest.FixtureRequest) -> Collection:
-    """Return a collection of real images and their ground truths."""
-    return MAKERS[request.param]()
-
 
 LIGHTS = np.array([[2000.0, 3000, 1000], [1500, 3000, 2500]])
 

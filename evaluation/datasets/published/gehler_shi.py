@@ -32,10 +32,10 @@ from evaluation.datasets.files import (
     Folder,
     Mask,
     RawScene,
+    chart_mask,
     check_light,
     gather,
     numbers_in,
-    polygon_mask,
     present,
     read_text,
 )
@@ -98,7 +98,7 @@ class MacbethScene(RawScene):
             )
         height, width = image.shape[:2]
         corners = np.array([lines[number] for number in (1, 2, 4, 3)]) * [width / lines[0][0], height / lines[0][1]]
-        return polygon_mask((height, width), corners)
+        return chart_mask((height, width), corners, self.corners_path)
 
 
 def is_gehler_shi(folder: Folder) -> bool:

@@ -32,7 +32,7 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets.files import Folder, Light, Mask, RawScene, check_light, polygon_mask, read_text
+from evaluation.datasets.files import Folder, Light, Mask, RawScene, chart_mask, check_light, read_text
 from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.errors import FormatError, InputError, first_of
@@ -66,7 +66,7 @@ class LsmiScene(RawScene):
             return _read_mask(self.mask_path, (height, width))
         mask = np.zeros((height, width), dtype=bool)
         for chart in self.charts:
-            mask |= polygon_mask((height, width), np.array(chart))
+            mask |= chart_mask((height, width), np.array(chart), self.path)
         return mask
 
 

@@ -92,7 +92,7 @@ def _unfold(packed: bytes, at: int) -> bytes:
 
 
 def _elements(data: bytes, begin: int, end: int, order: str, padded: bool = True) -> Iterator[_Element]:
-    """Yield the elements of a part of the file; compressed ones are not padded to eight bytes."""
+    """Yield the elements of a part of the file; those of the file itself are not padded to eight bytes."""
     at = begin
     while at < end:
         if at + 8 > end:
@@ -108,7 +108,7 @@ def _elements(data: bytes, begin: int, end: int, order: str, padded: bool = True
             if first + size > end:
                 raise ValueError(f"byte {at}: an element of {size} bytes ends behind the file")
             at = first + size
-            if padded or kind != _COMPRESSED:
+            if padded:
                 at += -size % 8
         yield _Element(kind, first, first + size)
 

@@ -151,7 +151,7 @@ def lights_at_random(lut: Lut, count: int, seed: int) -> ChosenLights:
     )
 
 
-def rendered(lut: Lut, sources: Sequence[Source], lights: ChosenLights, seed: int = 0) -> tuple[RenderedScene, ...]:
+def rendered(lut: Lut, sources: Sequence[Source], lights: ChosenLights, seed: int) -> tuple[RenderedScene, ...]:
     """Return the scenes of pictures under the lights chosen for them."""
     if len(sources) != len(lights.numbers):
         raise InputError(f"{len(sources)} pictures have {len(lights.numbers)} lights, expected one each")

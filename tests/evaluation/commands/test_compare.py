@@ -168,6 +168,18 @@ def test_results_of_before_groups_were_kept_say_so(
     assert "of 16 images" in printed
 
 
+def test_results_without_ground_truths_are_told(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    path = Path(runs[1]) / "errors.csv"
+    path.write_text(path.read_text().replace(",truth_r,truth_g,truth_b", "").replace(",1,2,1,", ","))
+    told = f"{runs[1]} holds no ground truths: whether they agree is not known"
+    assert main(["compare", *runs]) == 0
+    printed = capsys.readouterr().out
+    assert told in printed
+    assert f"{runs[0]} holds no" not in printed
+    assert main(["compare", runs[1]]) == 0
+    assert told not in capsys.readouterr().out
+
+
 def test_images_without_a_light_are_told(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     path = Path(runs[0]) / "errors.csv"
     lines = path.read_text().splitlines()

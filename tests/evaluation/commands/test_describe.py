@@ -31,6 +31,7 @@ def test_one_set_and_its_file(dataset: Path, capsys: pytest.CaptureFixture[str])
     assert main(["describe", str(dataset), "--out", str(stats)]) == 0
     printed = capsys.readouterr().out
     assert "made: figures of 16 images" in printed
+    assert "None" not in printed
     assert "Chroma spread" in printed
     assert "│ made      │     16 │" in printed
     content = json.loads(stats.read_text())

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    scenes = world(30)
+    scenes = world(12)
     np.savez(
         tmp_path / "world.npz",
         images=np.stack([scene.image for scene in scenes]),
@@ -36,7 +36,7 @@ def test_a_model_is_trained_saved_and_used(data: Path, tmp_path: Path, capsys: p
     model = tmp_path / "models" / "cat.npz"
     assert main(["train", "smart-color-cat", str(data), "--out", str(model), "--seed", "4"]) == 0
     printed = capsys.readouterr().out
-    assert "Smart Color Cat, trained on all of world (thumbnails, 30 images, seed 4)" in printed
+    assert "Smart Color Cat, trained on all of world (thumbnails, 12 images, seed 4)" in printed
     assert "mask: pixels that are zero in every channel" in printed
     loaded = load_model(model)
     assert loaded.provenance is not None
@@ -61,11 +61,11 @@ def test_a_model_is_adapted(data: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["train", "kernel-ridge", str(tmp_path / "few.npz"), "--adapt", str(before), "--out", str(after)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "6 images, seed 0" in printed
-    assert "adapted from a model trained on all of world (thumbnails, 30 images, seed 0)" in printed
+    assert "adapted from a model trained on all of world (thumbnails, 12 images, seed 0)" in printed
     assert "before.npz answers with a share of" in printed
     # What either of both trainings has seen is no test.
     assert main(["run", str(data), "--method", str(after)]) == 0
-    assert ": 30 of 30 images were trained on" in " ".join(capsys.readouterr().out.split())
+    assert ": 12 of 12 images were trained on" in " ".join(capsys.readouterr().out.split())
     assert main(["train", "smart-color-cat", str(data), "--adapt", str(before), "--out", str(tmp_path / "no.npz")]) == 2
     assert "is of kernel-ridge, smart-color-cat was asked for" in " ".join(capsys.readouterr().err.split())
 
@@ -76,7 +76,7 @@ def test_a_model_is_tested_on_a_part_of_what_it_was_trained_on(
     with np.load(data) as content:
         half = {name: content[name][::2] for name in content.files}
     np.savez(tmp_path / "half.npz", **half)
-    for taught, tested, told in ((data, "half", "15 of 15"), (tmp_path / "half.npz", "world", "15 of 30")):
+    for taught, tested, told in ((data, "half", "6 of 6"), (tmp_path / "half.npz", "world", "6 of 12")):
         model, out = tmp_path / f"{tested}_model.npz", tmp_path / f"{tested}_results"
         assert main(["train", "smart-color-cat", str(taught), "--out", str(model)]) == 0
         assert main(["run", str(tmp_path / f"{tested}.npz"), "--method", str(model), "--out", str(out)]) == 0
@@ -139,7 +139,7 @@ def test_all_leaves_out_what_is_not_installed_and_says_why(
     ("arguments", "why"),
     [
         (["cv", "oracle", "DATA"], "'oracle' is no method that learns"),
-        (["cv", "smart-color-cat", "DATA", "--folds", "31"], "each fold holds an image of its own; 2 to 30"),
+        (["cv", "smart-color-cat", "DATA", "--folds", "13"], "each fold holds an image of its own; 2 to 12"),
         (["cv", "smart-color-cat", "DATA", "--folds", "0.5"], "'0.5', expected a number from 2, or a CSV file"),
         (["cv", "smart-color-cat", "DATA", "--folds", "three"], "'three', expected a number from 2, or a CSV file"),
         (["cv", "smart-color-cat", "DATA", "--folds", "none.csv"], "none.csv"),

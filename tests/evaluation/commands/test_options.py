@@ -176,20 +176,8 @@ def app(seen: list[object]) -> typer.Typer:
 
 def test_what_is_given_arrives() -> None:
     seen: list[object] = []
-    words = [
-        "set",
-        "--layout",
-        "nus8",
-        "--camera",
-        "SonyA57",
-        "--black",
-        "128",
-        "--saturation",
-        "4000.5",
-        "--count",
-        "5",
-    ]
-    done = CliRunner().invoke(app(seen), [*words, "--subset", "test", "--truth", "left", "--partial"])
+    words = "set --layout nus8 --camera SonyA57 --black 128 --saturation 4000.5 --count 5"
+    done = CliRunner().invoke(app(seen), f"{words} --subset test --truth left --partial".split())
     assert done.exit_code == 0, done.output
     assert seen == ["set", 5, DataReading("nus8", "SonyA57", "test", "left", 128.0, 4000.5, True)]
     reading = seen[2]

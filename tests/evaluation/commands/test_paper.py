@@ -183,24 +183,14 @@ def test_reduction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.testing.assert_array_equal(strip[26:46, 36:66], codes & 0b11100000)
 
 
-@pytest.mark.parametrize(
-    ("words", "made"),
-    [
-        ("paper reduction noise.png --out out", "out/report.html"),
-        ("run photos.npz --csv out.csv", "out.csv"),
-    ],
-)
-def test_what_was_computed_is_kept_where_the_reader_of_the_output_left(
-    words: str, made: str, thumbnails: Path, tmp_path: Path
-) -> None:
+def test_what_was_computed_is_kept_where_the_reader_of_the_output_left(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((20, 30, 3), dtype=np.uint8)).save(tmp_path / "noise.png")
-    assert thumbnails.parent == tmp_path
     reader, writer = os.pipe()
     os.close(reader)
-    call = [sys.executable, "-m", "evaluation.cli", *words.split()]
+    call = [sys.executable, "-m", "evaluation.cli", "paper", "reduction", "noise.png", "--out", "out"]
     done = subprocess.run(call, cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
-    assert (done.returncode, (tmp_path / made).is_file()) == (0, True), done.stderr
+    assert (done.returncode, (tmp_path / "out" / "report.html").is_file()) == (0, True), done.stderr
 
 
 def test_chromaticities(
@@ -229,6 +219,10 @@ def test_chromaticities(
         (
             ("table1", "nowhere", "--pictures", ".", "--lights-like", "x.csv", "--sizes", "12,big"),
             "'big' is no side of an image",
+        ),
+        (
+            ("table1", "nowhere", "--pictures", ".", "--lights-like", "x.csv", "--hot", "1000001"),
+            "'1000001' is no share",
         ),
         (("bits", "nowhere.npz", "--out", "taken"), "taken already exists"),
     ],

@@ -13,7 +13,6 @@ import pytest
 from evaluation.cli import main
 from evaluation.datasets import open_scenes
 from evaluation.metrics import recovery_error, summarise
-from tests.data_files import available
 
 HOW_TO = Path(__file__).parents[3] / "docs" / "how-to" / "evaluate.md"
 
@@ -98,14 +97,6 @@ def test_what_a_method_raises_is_one_sentence(
     assert "error: Wrong fails on image 0.png: IndexError: index 999 is out of bounds" in message
     assert "(wrong.py, line 5); correct it and run again" in message
     assert not out.exists()
-
-
-def test_the_published_figures_of_plain_methods(capsys: pytest.CaptureFixture[str]) -> None:
-    # Where the thumbnails of NUS are; the figures came with them (Gray-world with its border differs by design).
-    for path in available("benchmark/nus_canon_1ds_mk3_64x64.npz"):
-        assert main(["run", str(path), "--methods", "shades-of-gray", "--error", "recovery", "--json"]) == 0
-        row = next(row for row in json.loads(capsys.readouterr().out)["errors"] if row["error"] == "recovery")
-        assert (row["mean"], row["median"]) == pytest.approx((4.51, 3.37), abs=0.06)
 
 
 @pytest.mark.slow

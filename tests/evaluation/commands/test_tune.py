@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,10 @@ from evaluation.cli import main
 
 
 @pytest.mark.slow
-def test_a_family_is_tuned_and_its_setting_evaluated(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_family_is_tuned_and_its_setting_evaluated(
+    make_dataset: Callable[[int, int], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset = make_dataset(48, 32)
     out = dataset.parent / "settings.csv"
     assert main(["tune", "shades-of-gray", str(dataset), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
@@ -32,9 +36,10 @@ def test_a_family_is_tuned_and_its_setting_evaluated(dataset: Path, capsys: pyte
 
 
 @pytest.mark.slow
-def test_errors_stand_beside(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_stand_beside(make_dataset: Callable[[int, int], Path], capsys: pytest.CaptureFixture[str]) -> None:
+    dataset = make_dataset(48, 32)
     out = dataset.parent / "settings.csv"
-    assert main(["tune", "gray-edge-1@48", str(dataset), "--errors", "recovery", "--out", str(out)]) == 0
+    assert main(["tune", "shades-of-gray@24", str(dataset), "--errors", "recovery", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "recovery angular error, degrees" in printed
     assert "ground truths: not used for the choice, shown beside it only" in printed

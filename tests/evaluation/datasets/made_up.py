@@ -32,13 +32,21 @@ def image_of(height: int, width: int, colour: Sequence[int] = COLOUR) -> npt.NDA
 def write_png(path: Path, image: Image) -> None:
     """Write an image (H, W, 3) uint16 or uint8, red first, by another library than reads it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(_png(image.tobytes(), image.shape, image.dtype.name))
+    path.write_bytes(_png(image))
+
+
+def write_large_png(path: Path, height: int, width: int) -> None:
+    """Write what `image_of` makes; copies of a data set have the same large images in every test."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(_large_png(height, width))
 
 
 @lru_cache(maxsize=8)
-def _png(values: bytes, shape: tuple[int, ...], kind: str) -> bytes:
-    """Return the file of an image; copies of a data set have the same large images in every test."""
-    image = np.frombuffer(values, kind).reshape(shape)
+def _large_png(height: int, width: int) -> bytes:
+    return _png(image_of(height, width))
+
+
+def _png(image: Image) -> bytes:
     done, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
     assert done
     return data.tobytes()
@@ -67,7 +75,7 @@ def cells(names: Sequence[str]) -> npt.NDArray[Any]:
 def cube_plus(folder: Path) -> None:
     """Write three images of 1060 × 2060 px in which 10 × 10 px lie in the rectangle of the cube."""
     for name in ("1.PNG", "2.PNG", "PNG_3_9/3.PNG"):
-        write_png(folder / name, image_of(1060, 2060))
+        write_large_png(folder / name, 1060, 2060)
     (folder / "cube+_gt.txt").write_text("0.1 0.5 0.4\n0.2 0.5 0.3\n0.3 0.5 0.2\n")
     (folder / "cube+_left_gt.txt").write_text("0.25 0.5 0.25\n" * 3)
 
@@ -80,7 +88,7 @@ CUBE_PLUS_PLUS_HEAD = "image," + ",".join(
 def cube_plus_plus(folder: Path) -> None:
     """Write two images, the second without a mean light; the first with a white level of its own."""
     for name in ("00_0001", "00_0002"):
-        write_png(folder / "PNG" / f"{name}.png", image_of(1728, 2592))
+        write_large_png(folder / "PNG" / f"{name}.png", 1728, 2592)
     rest = "0.1,0.5,0.4,0.2,0.5,0.3,0.11,0.5,0.39,0.21,0.5,0.29"
     (folder / "gt.csv").write_text(f"{CUBE_PLUS_PLUS_HEAD}\n00_0001,0.15,0.5,0.35,{rest}\n00_0002,,,,{rest}\n")
     (folder / "properties.csv").write_text(

@@ -61,7 +61,7 @@ def test_a_damaged_file_is_our_error(name: str, file: str, tmp_path: Path) -> No
     whole = path.read_bytes()
     use(place, copy.partial)
 
-    @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(damages())
     def damage(how: tuple[float, bytes, bool]) -> None:
         where, instead, cut = how

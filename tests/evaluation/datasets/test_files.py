@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from evaluation.datasets.files import Folder, decode_image, natural, polygon_mask, present, read_rows, subtract_black
+from evaluation.datasets.files import Folder, chart_mask, decode_image, natural, present, read_rows, subtract_black
 from foundation.errors import FormatError
 from tests.data_files import shipped
 from tests.evaluation.datasets.made_up import image_of, write_png, write_tiff
@@ -84,9 +84,18 @@ def test_one_byte_that_is_wrong_is_noticed(tmp_path: Path) -> None:
 
 def test_a_polygon_given_the_other_way_round_is_the_same() -> None:
     corners = np.array([[1.0, 1], [6, 2], [5, 6], [0, 5]])
-    np.testing.assert_array_equal(polygon_mask((8, 8), corners), polygon_mask((8, 8), corners[::-1]))
-    assert polygon_mask((8, 8), corners)[3, 3]
-    assert not polygon_mask((8, 8), corners)[0, 7]
+    np.testing.assert_array_equal(chart_mask((8, 8), corners), chart_mask((8, 8), corners[::-1]))
+    assert chart_mask((8, 8), corners)[3, 3]
+    assert not chart_mask((8, 8), corners)[0, 7]
+
+
+@pytest.mark.parametrize("x", [16.0, -16.0, 1e12, np.inf, np.nan])
+def test_a_chart_far_outside_of_its_image_is_refused(x: float) -> None:
+    corners = np.array([[1.0, 1], [15.9, 2], [5, -15.9], [0, 5]])
+    assert chart_mask((5, 8), corners, "a.png").any()
+    corners[2, 0] = x
+    with pytest.raises(FormatError, match=r"chart of a\.png .* of an image of 8 × 5"):
+        chart_mask((5, 8), corners, "a.png")
 
 
 def test_numbers_in_names_sort_by_value() -> None:

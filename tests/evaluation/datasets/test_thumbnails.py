@@ -10,8 +10,6 @@ import pytest
 
 from evaluation.datasets import DataOptions, open_scenes
 from foundation.errors import FormatError
-from tests.data_files import available
-from tests.evaluation.datasets import contract
 from tests.evaluation.datasets.made_up import thumbnails
 
 SOME = {"images": np.ones((2, 4, 5, 3), np.float32), "gt": np.ones((2, 3)), "names": ["a", "b"]}
@@ -62,11 +60,3 @@ def test_values_below_black_are_black_and_counted(tmp_path: Path) -> None:
     assert [scene.name for scene in found.scenes] == ["a", "b"]
     assert found.scenes[1].read()[0][0, 0].tolist() == [0, 2, 3]
     assert "1 values below it are taken as 0" in found.treatment["black level"]
-
-
-@pytest.mark.parametrize("path", available("benchmark/nus_canon_600d_64x64.npz"))
-def test_real_thumbnails(path: Path) -> None:
-    scenes = open_scenes(path).scenes
-    assert len(scenes) == 200
-    for scene in scenes[::50]:
-        contract.check_scene(scene)

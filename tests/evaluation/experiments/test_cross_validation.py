@@ -114,7 +114,7 @@ def test_no_image_is_estimated_by_a_model_that_knows_it() -> None:
 
 
 def test_the_model_of_a_fold_is_that_of_the_other_scenes() -> None:
-    learner = RegressionTrees()
+    learner = RegressionTrees(windows=2)
     (result,) = cross_validate(SCENES, [learner], FOLDS, seed=5)
     for fold in range(3):
         method = learner.fit([scene for scene, where in zip(SCENES, FOLDS, strict=True) if where != fold], seed=5)
@@ -126,7 +126,7 @@ def test_each_image_is_read_once_for_all_folds_and_learners() -> None:
     log: list[str] = []
     scenes = [Counted(scene.name, scene.truth, scene.image, log=log) for scene in SCENES]
     steps: list[int] = []
-    learners = [RegressionTrees(), RegressionTrees(windows=3)]
+    learners = [RegressionTrees(windows=2), RegressionTrees(windows=3)]
     results = cross_validate(scenes, learners, FOLDS, on_scene=lambda: steps.append(1))
     assert sorted(log) == sorted(scene.name for scene in SCENES)
     assert len(steps) == len(SCENES)
@@ -137,7 +137,7 @@ def test_each_image_is_read_once_for_all_folds_and_learners() -> None:
 
 def test_an_image_without_a_usable_pixel_counts_and_is_marked() -> None:
     black = replace(SCENES[3], image=np.zeros_like(SCENES[3].image))
-    (result,) = cross_validate([*SCENES[:3], black, *SCENES[4:]], [RegressionTrees()], FOLDS)
+    (result,) = cross_validate([*SCENES[:3], black, *SCENES[4:]], [RegressionTrees(windows=1)], FOLDS)
     assert result.guessed.tolist() == [place == 3 for place in range(24)]
     np.testing.assert_allclose(result.estimates[3], 3**-0.5)
     assert result.errors["recovery"][3] > 1

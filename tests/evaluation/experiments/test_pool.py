@@ -118,14 +118,10 @@ def test_an_image_that_would_count_twice_is_refused() -> None:
     rows = row("cross-validation", errors(9))
     with pytest.raises(InputError, match=r"8\.png is a test image of a and of b"):
         pool_transfers([part("a", rows), part("b", rows, first=8)])
+    with pytest.raises(InputError, match=r"0\.png is a test image of a and of a"):
+        pool_transfers([part("a", rows), part("a", rows)])
     with pytest.raises(InputError, match="no results to pool"):
         pool_transfers([])
-
-
-def test_a_folder_that_is_named_twice_is_refused() -> None:
-    same = part("a", row("cross-validation", errors(9)))
-    with pytest.raises(InputError, match=r"0\.png is a test image of a and of a"):
-        pool_transfers([same, same])
 
 
 def test_conditions_that_differ_are_told() -> None:

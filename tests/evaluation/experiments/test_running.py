@@ -101,6 +101,19 @@ def test_a_mistake_in_this_suite_keeps_its_traceback(monkeypatch: pytest.MonkeyP
     assert caught.value.__notes__ == ["while Gray-world was on wall 0.png"]
 
 
+def test_nothing_to_evaluate_is_said() -> None:
+    with pytest.raises(InputError, match="0 methods on 3 images"):
+        evaluate(walls(3), [])
+
+
+@pytest.mark.parametrize("light", [(0, 0, 0), (np.nan, 1, 1), (np.inf, 1, 1), (1, 1, -1)])
+def test_a_scene_without_a_light_is_named_before_the_work(light: tuple[float, ...]) -> None:
+    read: list[str] = []
+    with pytest.raises(InputError, match=r"the ground truth of dark\.png is .*, expected red, green and blue"):
+        evaluate([*walls(1, read), Wall("dark.png", np.array(light))], [GRAY_WORLD])
+    assert not read
+
+
 class Destroys:
     """A stranger's method that uses the image it is given as its own."""
 

@@ -10,13 +10,20 @@ import numpy.typing as npt
 
 from evaluation.learning.convnet import ConvNet
 from evaluation.learning.feature_learner import FeatureLearner
+from evaluation.learning.log_chroma import LogChroma
+from evaluation.learning.regression_trees import RegressionTrees
 from evaluation.learning.standard import standard_learners
 
 SIZE = 32
 """Width and height of scenes, px."""
 
-LEARNERS: dict[str, FeatureLearner] = {**standard_learners(), "convnet": ConvNet(working_size=SIZE)}
-"""All methods; the network's square is no larger than the scenes, three quarters of it would be black."""
+LEARNERS: dict[str, FeatureLearner] = {
+    **standard_learners(),
+    "convnet": ConvNet(working_size=SIZE, epochs=40),
+    "log-chroma": LogChroma(pretraining=8, training=24),
+    "regression-trees": RegressionTrees(windows=3),
+}
+"""All methods; three train for less long, and the network's square is no larger than the scenes."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from foundation.errors import FormatError
 from tests.evaluation.learning.made_up_world import LEARNERS, MadeUp, world
 from tests.evaluation.learning.stories import story
 
-ELSEWHERE, HERE, TEST = world(60, cast=0.4), world(12, seed=2), world(12, seed=1)
+ELSEWHERE, HERE, TEST = world(40, cast=0.4), world(8, seed=2), world(8, seed=1)
 
 
 def of(scenes: list[MadeUp], method: LearnedMethod) -> npt.NDArray[np.float64]:

@@ -19,7 +19,7 @@ from tests.evaluation.learning.stories import story
 
 pytestmark = pytest.mark.slow
 
-TRAIN, TEST = world(90), world(40, seed=1)
+TRAIN, TEST = world(60), world(30, seed=1)
 LOOKING = {key: learner for key, learner in LEARNERS.items() if key != "constant-light"}
 """All that look at images; the constant light has tests of its own."""
 

@@ -193,6 +193,7 @@ UNFIT: list[tuple[Change, str]] = [
     (put("trained_on", np.zeros((12, 2))), "trained_on is float64"),
     (lambda arrays, _: arrays["value"].fill(np.nan), "not finite"),
     (lambda arrays, _: arrays["left"].fill(200), "lead nowhere"),
+    (lambda arrays, _: arrays.update(left=arrays["left"].astype(np.float32)), "branches that are no whole numbers"),
     (tell(format="croplab model 9"), "croplab model 9"),
     (tell(method="oracle"), "'oracle'; known are"),
     (tell(settings={"depth": 3}), "settings depth; expected"),
@@ -225,10 +226,4 @@ def test_what_python_cannot_unpack_is_refused(saved: Path) -> None:
     content[content.index(b"PK\x01\x02") + 8] |= 1 << 5
     saved.write_bytes(content)
     with pytest.raises(FormatError, match=r"is no whole model file: .*patched data"):
-        load_model(saved)
-
-
-def test_branches_that_are_no_whole_numbers_are_refused(saved: Path) -> None:
-    rewrite(saved, lambda arrays, _: arrays.update(left=arrays["left"].astype(np.float32)))
-    with pytest.raises(FormatError, match="branches that are no whole numbers"):
         load_model(saved)

@@ -83,6 +83,7 @@ def test_smart_color_cat_is_exact_where_its_assumption_holds() -> None:
     features[:, 100], features[:, 400] = 1 - truths[:, 0], truths[:, 0]
     model = SmartColorCat().fit_features(features[:40], truths[:40])
     assert len(model.weights) in CHOICES
+    assert [*CHOICES] == sorted(bins for bins in CHOICES if FINE % bins == 0 and 3 <= bins <= 60)
     assert recovery_error(model.lights(features[40:]), truths[40:]).max() < 0.3
 
 

@@ -102,11 +102,3 @@ def test_nearest_known_lights_are_averaged() -> None:
 def test_no_patches_are_refused(patches: int) -> None:
     with pytest.raises(ValueError, match="expected 1 or more"):
         patches_of("pca", patches)
-
-
-def test_the_greyest_pixels_are_those_of_the_lowest_index() -> None:
-    index = np.random.default_rng(3).permutation(100).reshape(10, 10).astype(np.float32)
-    chosen = gray_pixels.greyest(index, index != 3, 0.05)
-    assert sorted(index[chosen].tolist()) == [0, 1, 2, 4, 5]
-    assert gray_pixels.greyest(index, index != 3, 1.0).sum() == 99
-    assert not gray_pixels.greyest(index, np.zeros((10, 10), bool), 0.05).any()

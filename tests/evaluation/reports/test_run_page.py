@@ -142,7 +142,7 @@ def test_the_curve_reaches_its_shares(monkeypatch: pytest.MonkeyPatch) -> None:
     def keep(draw: Any, *arguments: Any, inches: Any) -> bytes:
         from matplotlib.figure import Figure
 
-        figure: Any = Figure()
+        figure: Any = Figure(figsize=inches)
         draw(figure, *arguments)
         drawn.append(figure)
         return b""
@@ -158,6 +158,13 @@ def test_the_curve_reaches_its_shares(monkeypatch: pytest.MonkeyPatch) -> None:
     # The largest error, that of the first light, is drawn last.
     np.testing.assert_allclose(points.get_offsets()[-1], (0.25, 0.5))
     assert points.get_array()[-1] == 4
+    assert (points.norm.vmin, points.norm.vmax) == (0, 4)
+    error_planes([result_of([4, 1, 3, 2], name) for name in "abcde"], np.eye(4, 3) + 0.1, "recovery")
+    *panels_drawn, _ = drawn[2].axes
+    assert [axes.get_title() for axes in panels_drawn] == list("abcde")
+    # The lowest of each of three columns has numbers below it.
+    assert [axes.xaxis.get_tick_params()["labelbottom"] for axes in panels_drawn] == [False, False, True, True, True]
+    assert [tuple(figure.get_size_inches()) for figure in drawn[1:]] == [(4.6, 3.6), pytest.approx((8.6, 5.9))]
 
 
 @pytest.mark.slow
@@ -176,4 +183,5 @@ def test_many_methods_and_images_make_a_page_that_closes() -> None:
     assert len(re.findall(r"src='data:image/jpeg", text)) == len(pictures)
     for words in ("White <Patch>", "as it was drawn", "MAE_illum", "1 of them under several lights", "mixed & <odd>"):
         assert words in found.text
+    assert "Shown are the first" not in found.text
     assert text == run_page(run, "recovery", pictures)

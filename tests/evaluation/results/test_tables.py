@@ -14,7 +14,7 @@ import pytest
 from evaluation.experiments.running import evaluate
 from evaluation.metrics import recovery_error, summarise
 from evaluation.reports.table_output import table_to_latex
-from evaluation.results.result import Subject, table_csv
+from evaluation.results.result import Subject, images_csv, table_csv
 from evaluation.results.tables import Table, lights_tables, statistics_rows, summary_table, table_to_csv
 from evaluation.scene import MixedScene, Scene
 from tests.evaluation.made_up import MixedWall, walls
@@ -107,6 +107,18 @@ def test_an_image_of_which_nothing_is_judged_is_left_out_and_counted(monkeypatch
     assert any(note.startswith("1 images have no pixel whose light is known") for note in several.notes)
     row = next(row for row in statistics_rows(subject_of(scenes), results).rows if row[1] == "pixel_rgb")
     assert row[3] == 1
+
+
+def test_the_tables_of_methods_and_of_images_as_text() -> None:
+    scenes = walls(6)
+    results = evaluate(scenes, [White()])
+    (row,) = csv.DictReader(table_csv(results, "recovery").splitlines())
+    assert list(row) == ["method", "mean", "median", "trimean", "best25", "worst25", "avg", "no_estimate"]
+    assert float(row["mean"]) == pytest.approx(results[0].errors["recovery"].mean(), abs=1e-6)
+    images = list(csv.DictReader(images_csv(scenes, results).splitlines()))
+    assert [image["image"] for image in images] == [scene.name for scene in scenes]
+    errors = [float(image["reproduction"]) for image in images]
+    np.testing.assert_allclose(errors, results[0].errors["reproduction"], atol=1e-6)
 
 
 def test_causes_are_named_few_at_a_time() -> None:

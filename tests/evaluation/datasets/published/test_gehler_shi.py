@@ -55,6 +55,10 @@ def test_the_truth_of_shi_must_be_asked_for(copy: Path) -> None:
     (copy / "ColorCheckerData.mat").unlink()
     with pytest.raises(InputError, match=r"ColorCheckerData\.mat.*colorconstancy\.com.*--truth"):
         open_scenes(copy, options=SOME)
+    # The corners of charts below tell the data set by themselves.
+    (copy / "real_illum_568..mat").unlink()
+    with pytest.raises(InputError, match=r"has no ColorCheckerData\.mat"):
+        open_scenes(copy, options=SOME)
 
 
 def test_one_camera(copy: Path) -> None:

@@ -27,6 +27,7 @@ from evaluation.experiments.paper.colour_reduction import (
     bits_removed,
     bits_table,
     clear_bits,
+    read_table,
     reduce_colours,
     reduction_strip,
     reduction_table,
@@ -35,7 +36,7 @@ from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
-from generator.files import fit_flash
+from generator.files import Flash, fit_flash
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +201,9 @@ def test_files_say_what_the_experiment_says(data: SceneSet, tmp_path: Path, clea
         )
 
 
-def test_codes_are_as_written_and_may_be_changed(data: SceneSet, tmp_path: Path) -> None:
+def test_codes_are_as_written_and_may_be_changed(
+    data: SceneSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     codes = tmp_path / "codes"
     assert main(["paper", "flash", data.place, "--out", str(codes), "--clear", "4"]) == 0
     written = cv2.imread(str(codes / "codes/b/three.png"), cv2.IMREAD_UNCHANGED)
@@ -211,6 +214,7 @@ def test_codes_are_as_written_and_may_be_changed(data: SceneSet, tmp_path: Path)
     (codes / "codes/one.png").unlink()
     cv2.imwrite(str(codes / "codes/one.jpg"), np.full((32, 40, 3), 128, np.uint8))
     assert main(["paper", "flash-inverse", str(codes), "--out", str(tmp_path / "linear")]) == 0
+    assert "4/4 images" in capsys.readouterr().err.splitlines()[-1]
     image, _ = open_scenes(str(tmp_path / "linear")).scenes[0].read()
     assert np.ptp(image) < 1e-4 * image.max()
 
@@ -234,6 +238,15 @@ def test_damage_is_told(data: SceneSet, tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["paper", "flash-inverse", str(codes), "--out", str(tmp_path / "linear")]) == 2
     assert told in capsys.readouterr().err
     assert not (tmp_path / "linear").exists()
+
+
+def test_numbers_of_the_operator_are_above_0_and_may_be_below_1(data: SceneSet, tmp_path: Path) -> None:
+    codes = tmp_path / "codes"
+    assert main(["paper", "flash", data.place, "--out", str(codes)]) == 0
+    for column in ("k", "scale", "gamma", "largest"):
+        _set(codes, column, "0.5")
+    (first, *_) = read_table(codes)
+    assert (first.operator, first.largest) == (Flash(0.5, 0.5, 0.5), 0.5)
 
 
 def _set(folder: Path, column: str, value: str) -> None:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from evaluation.experiments.paper import reporting
 from evaluation.experiments.paper.colour_reduction import bits_methods, bits_removed
-from evaluation.experiments.paper.reporting import standalone
+from evaluation.experiments.paper.reporting import chromaticity_rows, coverage_table, standalone
 from evaluation.experiments.paper.table1 import SizeRow
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
 from tests.evaluation.experiments.paper.test_colour_reduction import Photo, photo
@@ -67,6 +67,7 @@ def test_lights_and_ground_truths_lie_at_their_chromaticities(make_table: TableM
     assert left.get_position().x1 < right.get_position().x0
     for axes in (left, right):
         uniform, mine, bodies = axes.collections
+        assert [one.get_label() for one in (uniform, bodies)] == ["uniform (2)", "black bodies (2)"]
         np.testing.assert_allclose(uniform.get_offsets(), RB[:2], atol=1e-6)
         np.testing.assert_allclose(bodies.get_offsets(), RB[2:], atol=1e-6)
         np.testing.assert_allclose(sorted(mine.get_offsets().tolist()), sorted(RB[:2].tolist()), atol=1e-4)
@@ -76,6 +77,28 @@ def test_lights_and_ground_truths_lie_at_their_chromaticities(make_table: TableM
         assert (low, high) == pytest.approx((0, 1.04 * RB.max()))
 
 
+def test_they_are_the_lights_of_the_table(make_table: TableMaker) -> None:
+    lut = make_table("Canon EOS 550D")
+    rows = chromaticity_rows([lut]).rows
+    for row, (red, green, blue) in zip(rows, LIGHTS.tolist(), strict=True):
+        assert row[4:] == pytest.approx((red / (red + green + blue), blue / (red + green + blue)), abs=1e-6)
+    assert [row[2] for row in rows] == ["uniform", "uniform", "blackbody", "blackbody"]
+    assert rows[2][:4] == ("Canon EOS 550D", 2, "blackbody", 3002.0)
+
+
+def test_the_distance_of_ground_truths(make_table: TableMaker) -> None:
+    lut = make_table("Test")
+    turned = LIGHTS[:2].copy()
+    turned[0, 2] += 100
+    table = coverage_table([lut], {"near": LIGHTS[:2], "off": turned})
+    off = np.degrees(np.arccos(LIGHTS[0] @ turned[0] / np.linalg.norm(LIGHTS[0]) / np.linalg.norm(turned[0])))
+    assert [row[:4] for row in table.rows] == [("Test", "near", 2, 2), ("Test", "off", 2, 2)]
+    assert table.rows[0][4:] == pytest.approx([0, 0, 0], abs=1e-5)
+    assert table.rows[1][4:] == pytest.approx([off / 2, off, off], abs=1e-5)
+
+
 def test_places_of_dots_are_cut_to_what_can_be_seen() -> None:
     svg = b'<svg><use xlink:href="#m" x="12.3456" y="7.89" style=""/><path d="M 1.2345 2"/></svg>'
-    assert b'<use xlink:href="#m" x="12.3" y="7.8" style=""/><path d="M 1.2345 2"/>' in standalone(svg)
+    made = standalone(svg)
+    assert b'<use xlink:href="#m" x="12.3" y="7.8" style=""/><path d="M 1.2345 2"/>' in made
+    assert b"@media (prefers-color-scheme: dark)" in made

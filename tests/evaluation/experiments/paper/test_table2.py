@@ -69,6 +69,8 @@ def test_the_tables() -> None:
     found = table2(REAL, MADE, {"regression-trees": MeanLight(), "mine": MeanLight("Mine")}, FOLDS)
     real, generated, ratios = table2_tables(found, "recovery", "Cube+")
     assert [row[0] for row in real.rows] == ["Mean light", "paper", "Mine"]
+    for table, result in ((real, found[0].real), (generated, found[0].generated)):
+        assert table.rows[0][1:] == result.summary("recovery").as_tuple()
     assert real.rows[1][1:] == (1.57, 0.89, 1.04, 0.20, 4.15, 1.04)
     assert generated.rows[1][1:] == (2.54, 1.66, 1.89, 0.45, 6.07, 1.85)
     expected = found[0].generated.summary("recovery").median / found[0].real.summary("recovery").median
