@@ -153,7 +153,11 @@ def blank_pictures() -> Generator[None]:
 @pytest.fixture
 def lens_unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no chart show the lens where nothing asks for it: of 512 colours it takes a third of a small build."""
-    monkeypatch.setattr("calibration.pipeline.baseline.unsuitable", lambda chart: "not measured in this test")
+
+    def unsuitable(chart: Chart) -> str:
+        return "not measured in this test"
+
+    monkeypatch.setattr("calibration.pipeline.baseline.unsuitable", unsuitable)
 
 
 RENDERED_BYTES = 100_000_000
