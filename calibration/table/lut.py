@@ -297,12 +297,14 @@ def map_samples(path: Path, lights: int, bits: int) -> npt.NDArray[np.uint16]:
     except Exception as error:
         # The head is a Python literal, which fails in many ways.
         raise FormatError(f"cannot read {path}: {error}; restore it from a copy, or build the table again") from error
-    if dtype != np.dtype("<u2") or columns_first or shape[:2] != (lights, 8**bits) or shape[3:] != (3,):
+    plain = dtype == np.dtype("<u2") and not columns_first and len(shape) == 4
+    if not plain or shape[:2] != (lights, 8**bits) or not 0 < shape[2] <= MOST_SAMPLES or shape[3] != 3:
         raise FormatError(
-            f"{path} holds {dtype} {shape}, expected uint16 ({lights}, {8**bits}, samples, 3); build the table again"
+            f"{path} holds {dtype} {shape}, expected uint16 ({lights}, {8**bits}, samples, 3) of 1 to {MOST_SAMPLES} "
+            "samples; build the table again"
         )
     expected = offset + math.prod(shape) * 2
-    if size != expected or not 0 < shape[2] <= MOST_SAMPLES:
+    if size != expected:
         raise FormatError(f"{path} has {size} bytes, {expected} expected; restore it from a copy, or build it again")
     return np.memmap(path, dtype, "r", offset, shape)
 

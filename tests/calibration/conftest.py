@@ -10,9 +10,9 @@ from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from calibration.verdict import BuildResult
 from experiment.session.folder import Session
-from tests.calibration.lab import LIGHTS, Lab, blank_pictures, hang, rendered_once, take
+from tests.calibration.lab import LIGHTS, Lab, blank_pictures, hang, lens_unmeasured, rendered_once, take
 
-__all__ = ["built", "lab", "rendered_once", "session"]
+__all__ = ["built", "lab", "lens_unmeasured", "rendered_once", "session"]
 
 
 @pytest.fixture(scope="session")

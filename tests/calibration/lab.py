@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pytest
 
 from benchmarks.sessions import record_session
+from calibration.registration.register import Registration, register
 from calibration.report.report import report_json
 from calibration.table.lut import REPORT_JSON
 from calibration.verdict import BuildResult
@@ -32,7 +33,7 @@ from experiment.session.records import ACCEPTED, SessionStep
 from sim.camera.film import write_dng
 from sim.world.disturbances import Situation
 from sim.world.rendering import Print
-from sim.world.sensors import BODIES
+from sim.world.sensors import BODIES, Body, Rectangle
 from sim.world.world import Room, World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
@@ -96,10 +97,20 @@ def hang(bits: int = 3, page: str = "A5", body: str = "Test", seed: int = 1, roo
     return Lab(chart, World(sheet, BODIES[body], Room(waviness_mm=0.5) if room is None else room))
 
 
-def hang_chart(chart: Chart, body: str, room: Room) -> Lab:
+def hang_chart(chart: Chart, body: str | Body, room: Room) -> Lab:
     """Return a lab with a chart of one's own."""
     picture = drawing(chart)
-    return Lab(chart, World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), BODIES[body], room))
+    seen_by = BODIES[body] if isinstance(body, str) else body
+    return Lab(chart, World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), seen_by, room))
+
+
+QUARTER = replace(
+    BODIES["EOS 550D"],
+    sensor=(1784, 2742),
+    visible=Rectangle(51, 142, 1733, 2600),
+    masked=(Rectangle(0, 0, 1784, 140),),
+)
+"""A frame of half an EOS 550D's sides: ten times the photosites of the Test body."""
 
 
 def take(
@@ -139,16 +150,50 @@ def blank_pictures() -> Generator[None]:
         yield
 
 
+@pytest.fixture
+def lens_unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no chart show the lens where nothing asks for it: of 512 colours it takes a third of a small build."""
+
+    def unsuitable(chart: Chart) -> str:
+        return "not measured in this test"
+
+    monkeypatch.setattr("calibration.pipeline.baseline.unsuitable", unsuitable)
+
+
 RENDERED_BYTES = 100_000_000
 """Of renderings that are kept: sixteen of the Test body."""
 
 Rendering = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 _rendered: dict[tuple[object, ...], Rendering] = {}
 
+REGISTERED_FRAMES = 8
+"""Frames whose registration is kept."""
+
+_registered: dict[tuple[object, ...], Registration] = {}
+
+
+def registered_once(
+    mosaic: Mosaic, chart: Chart, what: str, corners: npt.ArrayLike | None, near: Registration | None
+) -> Registration:
+    """Register a frame, of equal ones the first alone: a session's first frame is that of each build."""
+    counts = hashlib.sha256(mosaic.sensor.tobytes()).digest()
+    key = (counts, mosaic.pattern, mosaic.black.tobytes(), mosaic.visible, mosaic.masked, chart.sha256, str(corners))
+    if near is not None or key not in _registered:
+        found = register(mosaic, chart, what, corners, near)
+        if near is not None:
+            return found
+        _registered[key] = found
+        while len(_registered) > REGISTERED_FRAMES:
+            del _registered[next(iter(_registered))]
+    return _registered[key]
+
 
 @pytest.fixture(scope="module", autouse=True)
 def rendered_once() -> Generator[None]:
-    """Render worlds that are equal once a process: the same charts hang in the same rooms in hundreds of tests."""
+    """Render worlds that are equal once a process, and register frames that are.
+
+    The same charts hang in the same rooms in hundreds of tests.
+    """
     render = World._lit  # pyright: ignore[reportPrivateUsage]
 
     def kept(self: World, situation: Situation) -> Rendering:
@@ -171,6 +216,7 @@ def rendered_once() -> Generator[None]:
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(World, "_lit", kept)
+        patched.setattr("calibration.pipeline.frames.register", registered_once)
         yield
 
 

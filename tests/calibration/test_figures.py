@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from acquisition.judge import limits as judge
@@ -58,9 +60,10 @@ def test_figures_are_listed_in_the_order_of_their_definitions() -> None:
 @pytest.mark.slow
 def test_a_name_stands_in_its_figure() -> None:
     """A figure has one home: at most two other files hold its name, as a key or a word of their own."""
-    texts = {path: path.read_text() for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
+    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    words = {path: set(re.findall(r"(?<=[\"'])\w+(?=[\"'])", path.read_text())) for path in files}
     for figure in FIGURES:
-        found = [path for path, text in texts.items() if re.search(rf"[\"']{figure.name}[\"']", text)]
+        found = [path for path in files if figure.name in words[path]]
         assert 1 <= len(found) <= 3, (figure.name, found)
 
 
@@ -90,6 +93,20 @@ def test_some_figures_are_asked_more_than_others() -> None:
 def test_a_check_that_saw_nothing_forecasts_nothing() -> None:
     nothing = CheckMeasurements()
     assert [figure.name for figure in FIGURES if figure.forecast is not None and figure.forecast(nothing)] == []
+
+
+@pytest.mark.parametrize(
+    ("cells", "measured", "left_in", "told"),
+    [(4096, True, False, True), (4095, True, False, False), (512, True, True, True), (4096, False, True, False)],
+)
+def test_what_a_lens_leaves_is_a_figure_where_cells_are_enough_to_tell_it(
+    cells: int, measured: bool, left_in: bool, told: bool
+) -> None:
+    table: Any = SimpleNamespace(
+        registration=SimpleNamespace(mismatched_cells=np.zeros(cells)),
+        lens=SimpleNamespace(measured=measured, is_left_in=left_in, left=0.003, left_worst=0.02),
+    )
+    assert geometry.CORRECTION_RESIDUAL.measure(table) == (0.003 if told else None)
 
 
 def test_larger_cells_may_be_softer() -> None:

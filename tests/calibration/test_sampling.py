@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from calibration.kernels import window_shares
@@ -48,6 +48,12 @@ def test_samples_are_pixels_of_the_half_size_picture(lab: Lab, tmp_path: Path) -
 
 
 @given(st.floats(-10, 60), st.floats(-10, 60))
+@example(2, 2)
+@example(47, 37)
+@example(1, 20)
+@example(20, 1)
+@example(48, 20)
+@example(20, 38)
 def test_a_patch_is_inside_when_all_its_pixels_are(x: float, y: float) -> None:
     sites = sites_at(np.array([[x, y]]), (40, 50))
     column, row = int(np.rint(x)), int(np.rint(y))

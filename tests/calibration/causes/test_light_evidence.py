@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from types import SimpleNamespace
 from typing import Any, cast
@@ -9,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from calibration.causes.gathering import sum_evidence
+from calibration.causes.gathering import name_evidence, sum_evidence
 from calibration.causes.rules import COLOUR_WHEEL, MIXED, OTHER_BRIGHTNESS, UNKNOWN, Cause, decide
 from calibration.checks.frame_consistency import origin_figures
 from calibration.measurements import TableMeasurements
@@ -18,6 +19,7 @@ from experiment.session.records import ACCEPTED, FrameRecord
 
 STEADY = np.ones((3, 3))
 TO_AND_FRO = np.array([[1, 1, 1], [1.02, 1, 0.98], [1, 1, 1]])
+AWAY = np.array([[1, 1, 1], [1.01, 1, 1], [1.02, 1, 1]])
 
 
 def record(light: int) -> FrameRecord:
@@ -50,6 +52,9 @@ def table(off: tuple[float, float, float], white: np.ndarray[Any, Any] = STEADY)
         # White itself differs by as much.
         ((1.03, 1.0, 1.0), TO_AND_FRO, COLOUR_WHEEL, None),
         ((1.03, 1.0, 0.97), TO_AND_FRO, COLOUR_WHEEL, None),
+        # White's own colour goes two thirds as far.
+        ((1.03, 1.0, 1.0), AWAY, UNKNOWN, None),
+        ((1.05, 1.0, 1.0), AWAY, OTHER_BRIGHTNESS, 0),
     ],
 )
 def test_a_primary_s_frame_is_told_by_how_white_differs(
@@ -77,3 +82,44 @@ def test_frames_of_another_iso_speed_are_held_against_the_settings(
 ) -> None:
     frames = [(record(number), FrameOrigin(iso=iso)) for number, iso in enumerate(speeds)]
     assert [one.record.illumination for one in origin_figures(frames, asked).other_iso] == others
+
+
+@pytest.mark.parametrize(
+    ("off_codes", "seen_as", "exchanges", "named", "right"),
+    [
+        # Light 1 is far from its codes and another's; 2 is as far as is allowed.
+        ((0.0, 9.0, 2.0), (-1, 0, 1), [], ["light 1"], False),
+        ((0.0, 9.0, 2.0), (-1, -1, -1), [], ["light 1"], True),
+        # The fourth and fifth are white frames.
+        (None, (-1, -1, -1), [(0, 4)], ["light 0", "white 1"], False),
+        ((0.0, 0.0, 9.0), (-1, -1, -1), [(0, 3)], ["light 0", "light 2", "white 0"], False),
+    ],
+)
+def test_lights_that_are_not_what_their_codes_give_are_named(
+    off_codes: tuple[float, ...] | None,
+    seen_as: tuple[int, ...],
+    exchanges: list[tuple[int, int]],
+    named: list[str],
+    right: bool,
+) -> None:
+    whites = [SimpleNamespace(record=replace(record(number), kind="white", illumination=None)) for number in range(2)]
+    for number, frame in enumerate(whites):
+        frame.record = replace(frame.record, file=f"white {number}")
+        frame.paper = SimpleNamespace(white=np.ones(3))
+        frame.exposure = 0.5
+    lights = [SimpleNamespace(record=replace(record(light), file=f"light {light}"), exposure=0.5) for light in range(3)]
+    codes = SimpleNamespace(
+        exchanges=tuple(SimpleNamespace(one=one, other=other) for one, other in exchanges),
+        seen_as=np.array(seen_as),
+        off_deg=np.array([0.5, 9.5, 2.5]),
+    )
+    made: Any = SimpleNamespace(
+        frames=[*lights, *whites],
+        white_frames=whites,
+        session=SimpleNamespace(lights=3),
+        lights=SimpleNamespace(codes=codes, off_codes_deg=None if off_codes is None else np.array(off_codes)),
+    )
+    gathered = name_evidence(made, 2.0)
+    assert [one.file for one in gathered.frames] == named
+    assert gathered.evidence.off_codes_deg == 9.5
+    assert (gathered.evidence.named_right == 0) == (not right)

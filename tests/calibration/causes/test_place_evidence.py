@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 
 from calibration.causes import gathering
-from calibration.causes.gathering import covered_deviation
+from calibration.causes.gathering import PrintPlace, covered_deviation
+from experiment.measures.paper import FieldResidual
 
 
 @pytest.mark.parametrize(
@@ -41,3 +43,35 @@ def test_cells_about_a_place_that_hold_a_hot_photosite() -> None:
     # Nothing is known without dark frames of these cells, or where no cell lies.
     assert np.isnan(share([], 3.0))
     assert np.isnan(share([5, 0, 0, 7], 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What the references of a frame show, and its file."""
+
+    paper: SimpleNamespace
+    record: SimpleNamespace
+
+
+def test_references_that_are_off_where_no_stain_lies_have_a_place_of_no_size(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def white(number: int, rim: float) -> Any:
+        left = FieldResidual((30.0, 40.0), (-0.05, -0.05, -0.05), 0.1, rim, 0.6)
+        paper = SimpleNamespace(left=left, spread=np.array([0.1, 0.01 * number, 0.1]), white=np.array([1.0, 9.0, 2.0]))
+        return Frame(paper, SimpleNamespace(file=f"{number}.dng"))
+
+    def no_spots(stains: object) -> list[object]:
+        return []
+
+    monkeypatch.setattr(gathering, "spots_of", no_spots)
+    stains = SimpleNamespace(places_mm=np.array([[0.0, 0], [100, 80]]))
+    whites = [white(number, rim) for number, rim in enumerate((0.0, -0.2, 0.0, 0.0))]
+    table: Any = SimpleNamespace(white_frames=whites, cells=SimpleNamespace(stains=stains))
+    gathered = gathering.reference_evidence(table, 0.02)
+    assert gathered is not None
+    # The frame whose strongest channel, green, is furthest off.
+    assert gathered.places == (PrintPlace("3.dng", 30.0, 40.0, 0.0),)
+    assert gathered.frames == ()
+    known = gathered.evidence
+    assert (known.frames, known.white_residual, known.rim, known.radial, known.rim_frames) == (4, 1, 0, 0.6, 0.25)

@@ -144,9 +144,9 @@ def test_a_bump_before_the_interruption_and_the_lens_are_remembered(tmp_path: Pa
     def frame(step: SessionStep) -> bytes:
         return (bumped if step.number >= 3 else lab).dng(step.colour, step.number)
 
-    with take(lab, tmp_path / "session", renumbered(LIGHTS[3:9]), frame=frame) as session:
+    with take(lab, tmp_path / "session", renumbered(LIGHTS[3:7]), frame=frame) as session:
         build(session, tmp_path / "whole")
-        interrupted_at(session, tmp_path / "lut", 5)
+        interrupted_at(session, tmp_path / "lut", 4)
         result = build(session, tmp_path / "lut")
     assert [figures.reregistered for figures in result.figures.frames].count(True) == 1
     assert files(tmp_path / "lut") == files(tmp_path / "whole")

@@ -8,11 +8,15 @@ from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from calibration.pipeline.baseline import select_frames, stated_origin
+from calibration.pipeline.frames import usable_means
+from calibration.sampling import sites_at
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
+from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination
 from experiment.session.folder import ReceivedFile, Session
@@ -80,3 +84,13 @@ def test_damaged_settings_are_told_where_a_table_is_made(
         assert stated_origin(session).rig is None
     assert "session.toml" in caplog.text
     assert "neither its origin" in caplog.text
+
+
+def test_patches_that_are_cut_off_or_clipped_have_no_mean() -> None:
+    samples = np.arange(4 * 25 * 3, dtype=np.float32).reshape(4, 25, 3)
+    sites = sites_at(np.array([[10.0, 10], [1, 10], [20, 20], [20, 10]]), (40, 40))
+    limit = round(CLIPPING_SHARE * 10_000)
+    assert limit == CLIPPING_SHARE * 10_000
+    means = usable_means(samples, np.array([limit - 1, 50, limit, 50], dtype=np.uint16), sites, 10_000)
+    assert np.isnan(means).all(axis=1).tolist() == [False, True, True, False]
+    np.testing.assert_allclose(means[[0, 3]], samples[[0, 3]].mean(axis=1))

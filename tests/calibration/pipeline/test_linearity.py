@@ -144,6 +144,7 @@ def test_the_table_says_how_linear_its_camera_is(
         assert (tmp_path / "lut" / name).read_bytes() == (built.lut / name).read_bytes()
 
 
+@pytest.mark.usefixtures("lens_unmeasured")
 def test_a_sensor_that_bends_is_remarked_on(session: Session, lab: Lab, tmp_path: Path) -> None:
     result = check(session, linearity=write_series(lab, tmp_path / "series", knee))
     row = next(row for row in result.verdict.rows if row.figure.name == "linearity")
@@ -151,6 +152,7 @@ def test_a_sensor_that_bends_is_remarked_on(session: Session, lab: Lab, tmp_path
     assert 0.01 < row.value < 0.05
 
 
+@pytest.mark.usefixtures("lens_unmeasured")
 def test_what_is_no_series_is_refused(
     session: Session, lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -170,6 +172,7 @@ def test_what_is_no_series_is_refused(
     assert "0.dng cannot be read as a raw file" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("lens_unmeasured")
 def test_a_chart_that_stands_elsewhere_is_refused(session: Session, tmp_path: Path) -> None:
     moved = hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
     with pytest.raises(FormatError, match=r"0\.dng: the chart"):

@@ -47,12 +47,13 @@ def test_three_by_three_are_the_inner_samples_of_five_by_five(
     assert small.figures.sensor.transfer.noisy.sum() <= 1
 
 
-def test_a_window_larger_than_the_cells_is_said(session: Session, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("lens_unmeasured")
+def test_a_window_larger_than_the_cells_is_said(session: Session, built: BuildResult) -> None:
     result = check(session, BuildOptions(9))
     assert "bleed" in {row.figure.name for row in result.verdict.refused}
     note = next(row.note for row in report_summary(result.figures) if row.name == "Window")
     assert note.startswith("too large: ")
-    plain = next(row.note for row in report_summary(check(session).figures) if row.name == "Window")
+    plain = next(row.note for row in report_summary(built.figures) if row.name == "Window")
     assert plain.startswith("up to 5×5")
 
 

@@ -18,7 +18,7 @@ from sim.world.world import Room
 from tests.calibration.causes.rooms import BRIGHT, Counts, taken
 from tests.calibration.lab import LIGHTS, SETTINGS, hang, renumbered, take
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("lens_unmeasured")]
 
 LIGHT = renumbered(LIGHTS[5:6])
 
@@ -26,7 +26,7 @@ LIGHT = renumbered(LIGHTS[5:6])
 @pytest.mark.parametrize(
     ("profile", "paper", "least", "most"),
     # A managed print is neutral to the eye under D50; a camera under a projector sees 1 to 2.4 degrees of it.
-    [("unmanaged", "poster", 4.0, 5.0), ("unmanaged", "glossy", 6.0, 8.5), ("managed", "poster", 0.3, 2.5)],
+    [("unmanaged", "glossy", 6.0, 8.5), ("managed", "poster", 0.3, 2.5)],
 )
 def test_the_tint_of_greys_tells_a_managed_print(
     profile: ProfileName, paper: PaperName, least: float, most: float, tmp_path: Path

@@ -20,7 +20,7 @@ from foundation.errors import QualityError
 from tests.calibration.lab import LIGHTS, Lab, hang, take
 from tests.json_of import json_of
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn", "lens_unmeasured")]
 
 STRICT = (replace(next(limit for limit in FIGURES if limit.name == "darkest_counts"), refuse=60_000.0),)
 
@@ -53,6 +53,7 @@ def test_a_refused_table_leaves_its_report_alone(short: Session, tmp_path: Path)
     with pytest.raises(QualityError, match="Bare paper under the darkest"):
         build(short, tmp_path / "lut", report=write_report, judged_by=STRICT)
     assert list(tmp_path.iterdir()) == [tmp_path / "lut.refused"] == [refused_folder(tmp_path / "lut")]
+    assert "The table can be used" not in (tmp_path / "lut.refused" / "report.html").read_text()
     kept = sorted(path.name for path in (tmp_path / "lut.refused").iterdir())
     assert kept == ["report.html", "report.json"]
     assert json.loads((tmp_path / "lut.refused" / "report.json").read_text())["verdict"] == "refuse"

@@ -20,7 +20,7 @@ from experiment.session.records import Judgement, SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, Paint, figures_alone, take
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn", "lens_unmeasured")]
 
 SHORT = LIGHTS[:3]
 COMMAND = "acquire run LAB.toml SESSION --retake bad"

@@ -15,7 +15,7 @@ from calibration.verdict import judged_values, remark
 from experiment.chart.layout import design_chart
 from experiment.lights import plan_illuminations
 from sim.world.world import Room
-from tests.calibration.lab import LIGHTS, SETTINGS, hang_chart, renumbered, take
+from tests.calibration.lab import LIGHTS, QUARTER, SETTINGS, blank_pictures, hang_chart, renumbered, take
 
 pytestmark = pytest.mark.slow
 
@@ -28,7 +28,8 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
     with take(lab, tmp_path / "session", LIGHT) as session:
         result = build(session, tmp_path / "lut")
         if bits == 1:
-            write_report(result, session, tmp_path)
+            with blank_pictures():
+                write_report(result, session, tmp_path)
     # One light alone does not show how linear the sensor is.
     assert {row.figure.name for row in result.verdict.remarks} == {"linearity_known"}
     assert not result.verdict.refused
@@ -38,6 +39,7 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
     if bits == 1:
         report = (tmp_path / "report.html").read_text()
         assert "The course of the session" in report
+        assert "The table can be used" in report
         assert "<h2>The print</h2>" not in report
     table = open_lut(tmp_path / "lut")
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
@@ -45,13 +47,13 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
     assert table.samples[0].mean(axis=1) / table.white[0] == pytest.approx(true, abs=0.02)
 
 
-def test_cells_of_a_hundred_pixels_are_found_well_enough(tmp_path: Path) -> None:
-    lab = hang_chart(design_chart(2), "EOS 550D", Room())
+def test_large_cells_are_found_well_enough(tmp_path: Path) -> None:
+    lab = hang_chart(design_chart(1), QUARTER, Room())
     mosaic = lab.mosaic(tmp_path)
     found = register(mosaic, lab.chart)
     error = found.to_pixels(lab.chart.centres_mm) - lab.truth_px(lab.chart.centres_mm, mosaic)
-    assert found.cell_px > 100
-    assert found.clearance > 20
+    assert found.cell_px > 50
+    assert found.clearance > 14
     assert np.linalg.norm(error, axis=1).max() < 0.05 * found.cell_px
 
 

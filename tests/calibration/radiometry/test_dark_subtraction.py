@@ -138,6 +138,16 @@ def test_light_adds_when_the_dark_is_out(room: Lab, subtracted: BuildResult) -> 
     assert note.endswith("; subtracted from samples and ground truth")
 
 
+def test_what_is_left_of_the_dark_light_is_as_large_a_share_of_any_cell(subtracted: BuildResult) -> None:
+    """It is what a cell reflects of it; above paper it is no more than paper's."""
+    figures = subtracted.figures
+    (darkness,) = (one for one in figures.budget.components if one.name == "darkness")
+    darker = (figures.cells.levels < 0.9).all(axis=1)
+    assert darker.sum() > 30
+    assert (np.ptp(darkness.cells[darker], axis=0) < 1e-9 * darkness.cells[darker].max(axis=0)).all()
+    assert darkness.cells[darker].min() > 0
+
+
 def test_samples_keep_their_noise(room: Lab, subtracted: BuildResult) -> None:
     assert subtracted.lut is not None
     light = next(light for light in LIGHTS if light.colour.red == light.colour.green == light.colour.blue == 255)

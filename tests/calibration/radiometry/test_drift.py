@@ -74,6 +74,13 @@ def test_the_mean_of_a_cell_is_not_rounded(level: int, samples: int) -> None:
         assert mean == pytest.approx(counts.mean(axis=1) / gain, abs=0.12), gain
 
 
+def test_what_sixteen_bits_do_not_hold_is_their_largest() -> None:
+    counts = np.full((1, 9, 3), 60_000, dtype=np.uint16)
+    found = corrected(counts, np.array([1.0, 0.95, 0.5]))
+    assert found[0].max(axis=0).tolist() == [60_000, 63_158, 65_535]
+    assert found[0, :, 2].min() == 65_535
+
+
 @given(st.lists(st.floats(0.5, 1.0), min_size=3, max_size=3), st.integers(0, 2**32 - 1))
 def test_every_count_comes_back_exactly(gain: list[float], seed: int) -> None:
     stored = np.array([float(f"{value:.6f}") for value in gain])

@@ -137,6 +137,16 @@ def test_a_dim_primary_tells_nothing() -> None:
     assert Primaries.of((0, 1, 2), dim, [np.ones((10, 3)) for _ in range(3)], RANDOM.random((10, 2))) is None
 
 
+def test_counts_below_black_are_no_light() -> None:
+    even = FlatField(PAGE, ((), (), ()))
+    papers = [Paper(even, white, np.ones(3), 9, np.zeros(3)) for white in 900 * np.eye(3) - 0.4 * (1 - np.eye(3)) + 0.2]
+    cells = [np.array([[-3.0, 0.5, 70.0]])] * 3
+    found = Primaries.of((0, 1, 2), papers, cells, np.array([[1.0, 1.0]]))
+    assert found is not None
+    np.testing.assert_allclose(found.paper, 900.2 * np.eye(3))
+    np.testing.assert_allclose(found.cells, [[[0, 0.5, 70]]] * 3)
+
+
 def test_the_brightest_pure_lights_are_chosen() -> None:
     lights = plan_illuminations(3, (3000,))
     found = pure_lights(lights)
@@ -150,6 +160,7 @@ def test_the_brightest_pure_lights_are_chosen() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("lens_unmeasured")
 def test_a_session_of_unlike_primaries_is_told_true(tmp_path: Path) -> None:
     room = Room(waviness_mm=0.5, projector_falloff=0.3, primary_difference=0.4, response_spread=0.0)
     lab = hang(room=room)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from calibration.figures.radiometry import UNFIT_SHARE
-from calibration.registration.register import register
+from calibration.registration.register import Registration, register
 from drivers.presenter import Colour
 from drivers.raw.rawfile import CHANNELS, Mosaic
 from experiment.chart.layout import paper_chart
@@ -18,7 +18,7 @@ from experiment.chart.model import Chart
 from experiment.framing.field import field_mm
 from foundation.errors import RegistrationError
 from sim.world.world import Room
-from tests.calibration.lab import Lab, hang_chart
+from tests.calibration.lab import QUARTER, Lab, hang_chart
 
 pytestmark = pytest.mark.slow
 
@@ -28,6 +28,17 @@ SMALL = paper_chart("A6", 3)
 @pytest.fixture(scope="module")
 def plain() -> Lab:
     return hang_chart(SMALL, "Test", Room(waviness_mm=0.5))
+
+
+@pytest.fixture(scope="module")
+def white(plain: Lab, tmp_path_factory: pytest.TempPathFactory) -> Mosaic:
+    """Return a frame of the lab in white light."""
+    return plain.mosaic(tmp_path_factory.mktemp("white"))
+
+
+@pytest.fixture(scope="module")
+def registered(plain: Lab, white: Mosaic) -> Registration:
+    return register(white, plain.chart)
 
 
 def miss(lab: Lab, mosaic: Mosaic, chart: Chart | None = None) -> npt.NDArray[np.float64]:
@@ -88,12 +99,10 @@ def test_a_curl_is_not_taken_for_distortion(tmp_path: Path) -> None:
     assert not registration.uncertain(SMALL.centres_mm).any()
 
 
-def test_a_flat_sheet_has_no_uncertain_cell(plain: Lab, tmp_path: Path) -> None:
-    mosaic = plain.mosaic(tmp_path)
-    registration = register(mosaic, SMALL)
-    assert not registration.uncertain(SMALL.centres_mm).any()
-    error = np.linalg.norm(registration.to_pixels(SMALL.centres_mm) - plain.truth_px(SMALL.centres_mm, mosaic), axis=1)
-    assert (error < 3 * registration.uncertainty_px(SMALL.centres_mm)).all()
+def test_a_flat_sheet_has_no_uncertain_cell(plain: Lab, white: Mosaic, registered: Registration) -> None:
+    assert not registered.uncertain(SMALL.centres_mm).any()
+    error = np.linalg.norm(registered.to_pixels(SMALL.centres_mm) - plain.truth_px(SMALL.centres_mm, white), axis=1)
+    assert (error < 3 * registered.uncertainty_px(SMALL.centres_mm)).all()
 
 
 def test_upside_down_is_the_same_chart(tmp_path: Path) -> None:
@@ -103,7 +112,7 @@ def test_upside_down_is_the_same_chart(tmp_path: Path) -> None:
 
 def test_a_large_grid_on_a_sheet_that_waves_by_six_millimetres(tmp_path: Path) -> None:
     """The paper's whole grid is in `benchmarks.plain`."""
-    lab = hang_chart(paper_chart("A3", 4), "EOS 550D", Room(waviness_mm=6.0, seed=3))
+    lab = hang_chart(paper_chart("A3", 4), QUARTER, Room(waviness_mm=6.0, seed=3))
     mosaic = lab.mosaic(tmp_path)
     registration = register(mosaic, lab.chart)
     truth = lab.truth_px(lab.chart.centres_mm, mosaic)
@@ -115,28 +124,28 @@ def test_a_large_grid_on_a_sheet_that_waves_by_six_millimetres(tmp_path: Path) -
     assert registration.agreement > 0.999
 
 
-def test_red_light_registers_where_the_session_knows_the_way_up(plain: Lab, tmp_path: Path) -> None:
-    white = register(plain.mosaic(tmp_path), plain.chart)
+def test_red_light_registers_where_the_session_knows_the_way_up(
+    plain: Lab, registered: Registration, tmp_path: Path
+) -> None:
     mosaic = plain.mosaic(tmp_path, Colour(255, 0, 0), key=2)
-    places = register(mosaic, plain.chart, near=white).to_pixels(plain.chart.centres_mm)
+    places = register(mosaic, plain.chart, near=registered).to_pixels(plain.chart.centres_mm)
     assert np.abs(places - plain.truth_px(plain.chart.centres_mm, mosaic)).max() < 0.5
 
 
-def test_stated_corners_find_the_same_places(plain: Lab, tmp_path: Path) -> None:
-    mosaic = plain.mosaic(tmp_path)
-    stated = plain.truth_px(field_mm(plain.chart), mosaic) + np.array([(6, -5), (-4, 6), (3, 4), (-6, -3)])
-    by_itself = register(mosaic, plain.chart).to_pixels(plain.chart.centres_mm)
-    by_corners = register(mosaic, plain.chart, corners=stated).to_pixels(plain.chart.centres_mm)
+def test_stated_corners_find_the_same_places(plain: Lab, white: Mosaic, registered: Registration) -> None:
+    stated = plain.truth_px(field_mm(plain.chart), white) + np.array([(6, -5), (-4, 6), (3, 4), (-6, -3)])
+    by_itself = registered.to_pixels(plain.chart.centres_mm)
+    by_corners = register(white, plain.chart, corners=stated).to_pixels(plain.chart.centres_mm)
     assert np.abs(by_itself - by_corners).max() < 0.1
 
 
-def test_another_order_of_colours_is_refused(plain: Lab, tmp_path: Path) -> None:
+def test_another_order_of_colours_is_refused(plain: Lab, white: Mosaic) -> None:
     shuffled = replace(plain.chart, colours=np.random.default_rng(1).permutation(plain.chart.colours))
     with pytest.raises(RegistrationError, match=r"chart\.json"):
-        register(plain.mosaic(tmp_path), shuffled)
+        register(white, shuffled)
 
 
-def test_a_field_displaced_by_one_cell_is_refused(plain: Lab, tmp_path: Path) -> None:
+def test_a_field_displaced_by_one_cell_is_refused(plain: Lab, white: Mosaic) -> None:
     """The outline fits, and every block of cells looks smooth as it should: only the colours' level shows it.
 
     A slip along y is found on large charts alone: with two rows of blocks it looks like an ink that reacts to blue.
@@ -145,7 +154,7 @@ def test_a_field_displaced_by_one_cell_is_refused(plain: Lab, tmp_path: Path) ->
     grid = plain.chart.colours.reshape(-1, columns)
     other = replace(plain.chart, colours=np.roll(grid, 1, axis=1).reshape(-1))
     with pytest.raises(RegistrationError, match="cells beside them"):
-        register(plain.mosaic(tmp_path), other)
+        register(white, other)
 
 
 def test_a_covered_half_is_refused(plain: Lab, tmp_path: Path) -> None:

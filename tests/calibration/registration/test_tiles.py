@@ -90,3 +90,21 @@ def test_a_block_that_moves_otherwise_than_its_neighbours_does_not_count() -> No
     found = FoundBlocks(centres, moves, score)
     counted = found.information(moves, np.array([50.0, 50.0]), 10.0)[:, 0, 0] > 0
     assert np.flatnonzero(~counted).tolist() == [3, 7]
+
+
+def test_patches_cover_elements_by_their_shares_up_to_the_border() -> None:
+    """A patch of 2.5 × 2 elements whose left half element lies in the first column, and one that is cut off."""
+    raster = Raster.of(np.zeros(2), np.ones(2), np.array([12, 6]))
+    cover = raster.coverage(np.array([[1.75, 2.0], [11.5, 6.0]]), np.array([[2.5, 2.0], [2.0, 2.0]])).toarray()
+    first, second = cover[:, 0].reshape(6, 12), cover[:, 1].reshape(6, 12)
+    expected = np.zeros((6, 12))
+    expected[1:3, :3] = [0.5, 1, 1]
+    np.testing.assert_allclose(first, expected)
+    assert np.argwhere(second).tolist() == [[5, 10], [5, 11]]
+    assert second[5].tolist()[10:] == [0.5, 1]
+    # A fifth of a cell of ten elements about both, at least one.
+    for per_cell, reach in ((10, 2), (2, 1)):
+        near = raster.near(raster.coverage(np.array([[6.5, 3.5]]), np.array([[1.0, 1.0]])), per_cell)
+        assert np.argwhere(near).tolist() == [
+            [y, x] for y in range(max(0, 3 - reach), min(6, 4 + reach)) for x in range(6 - reach, 7 + reach)
+        ]

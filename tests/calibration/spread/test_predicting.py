@@ -33,6 +33,18 @@ def test_neighbours_say_all_of_smooth_colours_and_residuals_are_linear() -> None
     assert both == pytest.approx(sum(neighbour_residual(part, 3) for part in random))
 
 
+@pytest.mark.slow
+def test_a_full_chart_s_cell_is_held_against_the_mean_of_both_neighbours_along_each_axis() -> None:
+    cube = np.random.default_rng(2).normal(size=(32, 32, 32, 2))
+    total, axes = np.zeros_like(cube), np.zeros((32, 32, 32, 1))
+    for axis in range(3):
+        moved, counted = np.moveaxis(cube, axis, 0), np.moveaxis(axes, axis, 0)
+        np.moveaxis(total, axis, 0)[1:-1] += moved[1:-1] - (moved[:-2] + moved[2:]) / 2
+        counted[1:-1] += 1
+    expected = total / np.maximum(axes, 1)
+    np.testing.assert_allclose(neighbour_residual(cube.reshape(-1, 2), 5).reshape(cube.shape), expected, atol=1e-12)
+
+
 @pytest.mark.parametrize("bend", [0.0, 0.2])
 def test_few_cells_leave_little_but_their_noise_where_black_replaces_inks(bend: float) -> None:
     noise = 0.002

@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 
-from calibration.table.lut import LutWriter, Provenance, open_lut
+from calibration.table.lut import LutWriter, Provenance, map_samples, open_lut
 from calibration.table.verification import find_faults
 from foundation.errors import FormatError, InputError, StorageError
 from tests.calibration.table.tables import FRAMES, LIGHTS, flip, write
@@ -73,6 +74,31 @@ def test_samples_that_have_changed_are_not_used(tmp_path: Path) -> None:
         assert changed.light_samples(light).shape == (8, 25, 3)
     with pytest.raises(FormatError, match=r"samples\.npy: .* light 2 .*build-lut --verify"):
         changed.light_samples(2)
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "order"),
+    [
+        ((2, 8, 1025, 3), "<u2", "C"),
+        ((2, 8, 0, 3), "<u2", "C"),
+        ((3, 8, 9, 3), "<u2", "C"),
+        ((2, 64, 9, 3), "<u2", "C"),
+        ((2, 8, 9, 4), "<u2", "C"),
+        ((2, 8, 9), "<u2", "C"),
+        ((2, 8, 9, 3), ">u2", "C"),
+        ((2, 8, 9, 3), "<u4", "C"),
+        ((2, 8, 9, 3), "<u2", "F"),
+    ],
+)
+def test_samples_of_another_form_are_not_mapped(
+    shape: tuple[int, ...], kind: str, order: Literal["C", "F"], tmp_path: Path
+) -> None:
+    np.save(tmp_path / "samples.npy", np.zeros(shape, kind, order=order))
+    with pytest.raises(FormatError, match=r"expected uint16 \(2, 8, samples, 3\) of 1 to 1024 samples"):
+        map_samples(tmp_path / "samples.npy", 2, 1)
+    most = np.arange(2 * 8 * 1024 * 3, dtype="<u2").reshape(2, 8, 1024, 3)
+    np.save(tmp_path / "most.npy", most)
+    assert np.array_equal(map_samples(tmp_path / "most.npy", 2, 1), most)
 
 
 def test_a_table_in_the_making_is_not_read(tmp_path: Path) -> None:
