@@ -14,8 +14,7 @@ from __future__ import annotations
 import itertools
 import threading
 
-from drivers.links.link import Link
-from drivers.links.network import LOOPBACK, TcpServer
+from drivers.links.network import LOOPBACK, TcpLink, TcpServer
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.ip import (
     PORT,
@@ -76,7 +75,7 @@ class PtpIpService:
         self._guard = threading.Lock()
         self._initiator: _Initiator | None = None
 
-    def handle(self, link: Link) -> None:
+    def handle(self, link: TcpLink) -> None:
         """Serve one connection, command or event, until it ends."""
         channel = Channel(link)
         try:
@@ -84,7 +83,7 @@ class PtpIpService:
                 case InitCommandRequest():
                     self._serve_commands(channel)
                 case InitEventRequest(number):
-                    self._serve_events(channel, number)
+                    self._serve_events(channel, link, number)
                 case _:
                     _send(channel, InitFail(FailReason.UNSPECIFIED))
         except ProtocolError as error:
@@ -121,14 +120,14 @@ class PtpIpService:
             with self._guard:
                 self._initiator = None
 
-    def _serve_events(self, channel: Channel, number: int) -> None:
+    def _serve_events(self, channel: Channel, link: TcpLink, number: int) -> None:
         with self._guard:
             initiator = self._initiator
         if initiator is None or initiator.number != number:
             _send(channel, InitFail(FailReason.REJECTED))
             return
         _send(channel, InitEventAck())
-        initiator.join(channel)
+        initiator.join(channel, link)
         while True:
             try:
                 packet = channel.next(_TIMEOUT_S)
@@ -183,6 +182,8 @@ class _Initiator:
         self.command = command
         self.cancelled: int | None = None
         self._event: Channel | None = None
+        self._event_link: TcpLink | None = None
+        self._is_over = False
         self._waiting: list[Packet] = []
         self._guard = threading.Lock()
 
@@ -190,10 +191,13 @@ class _Initiator:
         """Return whether this transaction was given up."""
         return self.cancelled == transaction
 
-    def join(self, event: Channel) -> None:
+    def join(self, event: Channel, link: TcpLink) -> None:
         """Take the second connection, and send on it what came up before."""
         with self._guard:
-            self._event = event
+            self._event, self._event_link = event, link
+            if self._is_over:
+                link.hang_up()
+                return
             for packet in self._waiting:
                 _send(event, packet)
             self._waiting.clear()
@@ -207,10 +211,11 @@ class _Initiator:
                 _send(self._event, packet)
 
     def hang_up(self) -> None:
-        """Close the event connection; the command connection is its handler's."""
+        """End the event connection, which its handler, woken by it, closes; the command connection is its handler's."""
         with self._guard:
-            if self._event is not None:
-                self._event.close()
+            self._is_over = True
+            if self._event_link is not None:
+                self._event_link.hang_up()
 
 
 def _send(channel: Channel, packet: Packet) -> None:

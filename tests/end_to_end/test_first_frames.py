@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from acquisition.run.run import run_session
+from drivers.presenter import BLACK
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
-from experiment.lights import plan_illuminations, save_illuminations
+from experiment.lights import Illumination, plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, VOIDED, Attempt
 from foundation.errors import InputError, QualityError
@@ -38,6 +39,8 @@ wheel_hz = 60
 transfer = 2.2
 """
 
+LIGHTS = 6
+
 
 @dataclass(frozen=True)
 class Run:
@@ -56,18 +59,23 @@ class Run:
         return Counter(attempt.verdict for attempt in self.attempts)
 
 
-def run(folder: Path, *events: Mapping[str, object], more: str = "", lights: int = 6) -> Run:
+def run(folder: Path, *events: Mapping[str, object]) -> Run:
     """Take a session of some lights of the plan in a room where events happen."""
+    make_lab(folder, *events)
+    return again(folder)
+
+
+def make_lab(folder: Path, *events: Mapping[str, object]) -> None:
+    """Write LAB.toml, chart and lights."""
     design_chart(3, "A7").save(folder / "chart.json")
     plan = plan_illuminations()
     order: list[int] = np.random.default_rng(3).permutation(len(plan)).tolist()
-    some = [replace(plan[k], index=n) for n, k in enumerate(order[:lights])]
+    some = [replace(plan[k], index=n) for n, k in enumerate(order[:LIGHTS])]
     save_illuminations(some, folder / "illuminations.csv")
     listed = ", ".join(
         "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in event.items()) + "}" for event in events
     )
-    (folder / "LAB.toml").write_text(LAB.format(events=listed) + more)
-    return again(folder)
+    (folder / "LAB.toml").write_text(LAB.format(events=listed))
 
 
 def again(folder: Path) -> Run:
@@ -83,15 +91,6 @@ def again(folder: Path) -> Run:
         return Run(tuple(said), end, tuple(session.journal.attempts()))
 
 
-def test_a_picture_that_stays_one_frame_late_ends_the_run(tmp_path: Path) -> None:
-    late = {"what": "half-changed", "place": [-9, -9, 9, 9], "from_frame": 28, "to_frame": 10_000}
-    taken = run(tmp_path, late, lights=12)
-    assert "when it is mended run the same command again" in taken.end
-    assert taken.verdicts["refused"] < 20
-    assert len(of(taken.said, "paused")) == 1
-    assert not of(taken.said, "resumed")
-
-
 def of(said: Sequence[str], word: str) -> list[str]:
     return [sentence for sentence in said if sentence.startswith(f"{word}: ")]
 
@@ -100,9 +99,7 @@ def of(said: Sequence[str], word: str) -> list[str]:
     ("frame", "event"),
     [
         (0, {"what": "lamp step", "percent": -3}),
-        (0, {"what": "defocus", "px": 1}),
         (2, {"what": "pop-up", "place": [-9, -9, 9, 9], "colour": [250, 250, 0]}),
-        (4, {"what": "lamp step", "percent": 0, "rgb": [0, 0, -10]}),
     ],
 )
 def test_a_first_frame_that_is_the_odd_one_is_taken_again(tmp_path: Path, frame: int, event: dict[str, object]) -> None:
@@ -159,10 +156,8 @@ def test_the_lamps_level_of_a_run_that_is_taken_up_is_said(tmp_path: Path) -> No
 
 
 def test_a_light_that_is_none_is_said_before_anything_moves(tmp_path: Path) -> None:
-    run(tmp_path, lights=1)
-    (tmp_path / "illuminations.csv").write_text(
-        (tmp_path / "illuminations.csv").read_text().splitlines()[0] + "\n0,uniform,,0,0,0\n"
-    )
+    make_lab(tmp_path)
+    save_illuminations([Illumination(0, "uniform", None, BLACK)], tmp_path / "illuminations.csv")
     with pytest.raises(InputError, match=r"light 0 has the codes 0, 0, 0: no frame .* take it out"):
         run_session(load_lab(tmp_path / "LAB.toml"), tmp_path / "another", lambda done, total: None)
     assert not (tmp_path / "another").exists()

@@ -35,10 +35,13 @@ TRIED_ELSEWHERE = {
     # tests/calibration/pipeline/test_held_against_itself.py
     "other-camera", "red-blue", "warm-cool", "white-red", "white-reference-red", "half-exposed", "half-exposed-whites",
     "red-missing",
-    # tests/calibration/causes/test_sessions.py
-    "hand-in-white", "hand-in-light", "broad-glare", "stain", "defocus", "hot-photosite",
+    # tests/calibration/causes/test_sessions.py, and a fainter one of these
+    "hand-in-white", "hand-in-light", "shadow-on-primary", "broad-glare", "mild-glare", "stain", "defocus",
+    "hot-photosite",
     # tests/end_to_end/test_trust.py
     "other-print", "bump",
+    # Here, with a primary in place of a dim light
+    "mixed-dim",
     # tests/calibration/pipeline/test_stray_light.py
     "leak",
     # tests/calibration/pipeline/test_held_against_itself.py, test_print_and_sensor.py; tests/calibration/registration

@@ -40,6 +40,7 @@ from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjec
 from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer
 from sim.world.world import World
 from tests.drivers.display.x_servers import virtual_screen
+from tests.end_to_end.conftest import make_lab
 from tests.found_texts import files_with
 
 pytestmark = pytest.mark.slow
@@ -60,14 +61,22 @@ def simulated_display(display: str | int | None, clock: Clock) -> SimulatedPrese
     return SimulatedPresenter(Screen(), clock)
 
 
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the session that the simulated lab takes in that room."""
+    lab = make_lab(tmp_path_factory.mktemp("simulated"))
+    lab.write_text(lab.read_text() + ROOM)
+    assert run_session(load_lab(lab), lab.parent / "session", lambda done, total: None).complete
+    return lab.parent / "session"
+
+
 @pytest.mark.parametrize("cables", ["network", "usb and serial"])
 def test_a_real_lab_takes_the_frames_of_the_simulated_one(
-    lab: Path, cables: str, monkeypatch: pytest.MonkeyPatch
+    lab: Path, simulated: Path, cables: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = lab.parent
     lab.write_text(lab.read_text() + ROOM)
     settings = load_lab(lab)
-    assert run_session(settings, folder / "simulated", lambda done, total: None).complete
     with ExitStack() as opened:
         screen = opened.enter_context(virtual_screen(folder, "320x240"))
         monkeypatch.setenv("DISPLAY", screen.display)
@@ -107,12 +116,12 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
         assert beamer.power() is not Power.ON, "a complete session switches the lamp off"
         assert look() == Colour(0, 0, 0), "the screen is black when the lab is left"
     assert files_with(folder / "real", PASSWORD) == []
-    with Session.open(folder / "simulated") as simulated, Session.open(folder / "real") as real:
-        pairs = list(zip(simulated.frames(), real.frames(), strict=True))
+    with Session.open(simulated) as there, Session.open(folder / "real") as real:
+        pairs = list(zip(there.frames(), real.frames(), strict=True))
         assert len(pairs) == FRAMES
         for ours, theirs in pairs:
             assert (ours.kind, ours.illumination) == (theirs.kind, theirs.illumination)
-            one = read_raw(simulated.folder / ours.file)
+            one = read_raw(there.folder / ours.file)
             other = read_raw(real.folder / theirs.file)
             np.testing.assert_array_equal(one.sensor, other.sensor)
             assert theirs.taken_at > OPENING

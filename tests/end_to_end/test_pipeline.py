@@ -162,38 +162,6 @@ def test_an_interrupted_session_gives_the_same_table(lab: Path, undisturbed: Pat
         assert (tables[0] / name).read_bytes() == (tables[1] / name).read_bytes(), name
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (("calibration.cli", "empty", "out"), "no session"),
-        (("calibration.cli", "session", "lut"), "already exists"),
-        (("generator.cli", "session", "out", "--sources", "pictures"), "no table"),
-        (("generator.cli", "lut", "pictures", "--sources", "pictures"), "already exists"),
-        (("generator.cli", "lut", "out", "--sources", "empty"), ""),
-        (("generator.cli", "lut", "out", "--sources", "nowhere"), "nowhere"),
-        (("generator.cli", "lut", "out", "--sources", "pictures", "--illuminations", "99"), "99"),
-        (("evaluation.cli", "session"), ""),
-    ],
-)
-def test_what_cannot_be_used_is_one_sentence(
-    built: Path,
-    pictures: Path,
-    run: Run,
-    arguments: tuple[str, ...],
-    expected: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    (built / "empty").mkdir(exist_ok=True)
-    before = sorted(built.iterdir())
-    monkeypatch.chdir(built)
-    assert run(*arguments) == 2
-    message = capsys.readouterr().err.strip().splitlines()[-1]
-    assert message.startswith("error: ")
-    assert expected in message
-    assert sorted(built.iterdir()) == before, "nothing new, nothing lost"
-
-
 def test_a_table_of_another_version_is_named(built: Path, lut: Lut, tmp_path: Path) -> None:
     head = json.loads((built / "lut" / "lut.json").read_text())
     head["version"] = 2

@@ -16,6 +16,7 @@ from experiment.config import load_lab
 from experiment.lights import Illumination, load_illuminations
 from experiment.session.folder import Session
 from experiment.session.repair import held_secrets
+from tests.end_to_end.conftest import make_lab
 from tests.found_texts import files_with
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
@@ -25,7 +26,7 @@ TOKEN = "ntfy-t0ken-path"
 
 LAB = """
 rig = "simulated"
-chart = "chart/chart.json"
+chart = "chart.json"
 illuminations = "illuminations.csv"
 [judge]
 response = false
@@ -53,10 +54,7 @@ def lab(tmp_path: Path) -> Path:
         port = free.getsockname()[1]
     folder = tmp_path / "private"
     folder.mkdir()
-    assert command("acquisition.cli", "chart", folder / "chart", "--bits", 2, "--no-tiff") == 0
-    lights = folder / "illuminations.csv"
-    assert command("acquisition.cli", "illuminations", lights, "--grid", 1, "--blackbodies", "2500:7500:2500") == 0
-    path = folder / "LAB.toml"
+    path = make_lab(folder)
     path.write_text(LAB.format(notify=f"http://u:{PASSWORD}@127.0.0.1:{port}/{TOKEN}?auth={TOKEN}", password=PASSWORD))
     return path
 
@@ -120,4 +118,4 @@ def test_the_secrets_of_an_older_session_are_told_and_taken_out(
 
 
 def _designed(lab: Path) -> tuple[Chart, tuple[Illumination, ...]]:
-    return load_chart(lab.parent / "chart" / "chart.json"), load_illuminations(lab.parent / "illuminations.csv")
+    return load_chart(lab.parent / "chart.json"), load_illuminations(lab.parent / "illuminations.csv")

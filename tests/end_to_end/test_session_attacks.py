@@ -127,8 +127,9 @@ def test_a_session_that_another_run_makes_meanwhile_is_not_to_be_removed(
     assert counted_once(folder)
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
-@pytest.mark.parametrize(("part", "said"), [("previews", "preview: "), ("report.html", "report: ")])
+@pytest.mark.parametrize(
+    ("part", "said", "code"), [("previews", "preview: ", errno.ENOSPC), ("report.html", "report: ", errno.EIO)]
+)
 def test_what_is_derived_and_cannot_be_written_is_said_once_and_costs_no_frame(
     lab: Path, part: str, said: str, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,4 +1,4 @@
-"""Twenty runs killed at random operations and times; `python -m benchmarks.session_kills` kills ten thousand."""
+"""A dozen runs killed at random operations and times; `python -m benchmarks.session_kills` kills ten thousand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.session_kills import KilledSessions
 
-KILLS = 20
+KILLS = 12
 
 pytestmark = [
     pytest.mark.slow,

@@ -28,7 +28,6 @@ from drivers.raw.rawfile import read_raw
 from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from experiment.session.folder import Session
-from experiment.session.journal import Journal
 from foundation.errors import StorageError
 from sim.camera.bodies import EOS_BODIES
 
@@ -43,8 +42,6 @@ FORKS.set_forkserver_preload([__name__, "acquisition.run.run", "acquisition.run.
 PLACES = {
     "renaming": (Path, "replace"),
     "committing": (Session, "commit"),
-    "deriving": (Session, "write_frames_csv"),
-    "beginning": (Journal, "begin"),
 }
 
 
@@ -94,7 +91,7 @@ def test_a_session_holds_every_frame_of_the_plan(
     assert run("run", lab, session) == 0, "a complete session is complete again"
 
 
-@pytest.mark.parametrize(("place", "count"), [("renaming", 1), ("committing", 4), ("deriving", 2), ("beginning", 8)])
+@pytest.mark.parametrize(("place", "count"), [("renaming", 1), ("committing", 4)])
 def test_a_killed_session_ends_in_the_same_frames(
     lab: Path, undisturbed: Path, frame_hashes: Hashes, place: str, count: int
 ) -> None:

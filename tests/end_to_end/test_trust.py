@@ -26,7 +26,6 @@ from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.colorimetry import angles_deg
 from foundation.errors import QualityError
-from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 
 pytestmark = pytest.mark.slow
@@ -251,14 +250,4 @@ def test_frames_that_clip_list_their_cells(lab: Lab, tmp_path: Path) -> None:
     table = open_lut(tmp_path / "lut")
     fit = table.samples[:, errors.clean]
     assert fit.max() < 1.2 * result.figures.sensor.white_level
-    assert wrong(errors) < WRONG
-
-
-def test_a_softer_picture_is_registered_as_well(tmp_path: Path) -> None:
-    """0.8 px of the lens's blur: whether samples suffer depends on the cells' size, their places do not."""
-    soft = hang(room=Room(waviness_mm=0.5, blur_px=0.8))
-    with take(soft, tmp_path / "session", FEW) as session:
-        result, errors = compared_with_truth(soft, session, tmp_path)
-    offset = result.figures.registration.to_pixels(soft.chart.centres_mm) - soft.world.project(soft.chart.centres_mm)
-    assert np.sqrt((offset**2).sum(axis=1).mean()) < 0.05
     assert wrong(errors) < WRONG

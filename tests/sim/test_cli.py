@@ -101,6 +101,7 @@ def test_a_taken_udp_port_is_one_line(capsys: pytest.CaptureFixture[str]) -> Non
         ["projector", "--pjlink", "0", "--udp", "70000"],
         ["projector", "--pjlink", "0", "--notify", "here"],
         ["projector", "--pjlink", "0", "--notify", "127.0.0.1:0"],
+        ["projector", "--pjlink", "0", "--notify", "127.0.0.1:65536"],
         ["camera"],
         ["toaster"],
         ["camera", "--port", "0", "--usbip", "0"],

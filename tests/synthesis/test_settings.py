@@ -58,6 +58,14 @@ def test_a_body_of_the_lab_and_one_of_sensitivities_are_found() -> None:
     assert find_body("EOS 550D") is not None
     assert find_body("EOS 550D") == BODIES["EOS 550D"]
     assert {name: body.camera for name, body in FACTS.items()} == {name: name.replace("_", " ") for name in FACTS}
+    # One of them counts up to the last number of its bits.
+    assert {name: find_body(name) for name in FACTS} == FACTS
+    # Millions of effective photosites that Canon states.
+    stated = {"600D": 18.0, "200D": 24.2, "1Ds_Mark_III": 21.1, "5D_Mark_II": 21.1, "5DS": 50.6}
+    for name, body in FACTS.items():
+        rows, columns = body.visible.height, body.visible.width
+        assert rows * columns / 1e6 == pytest.approx(stated[name[len("Canon_EOS_") :]], rel=0.01)
+        assert columns / rows == pytest.approx(1.5, rel=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -177,6 +177,12 @@ def test_an_event_connection_of_nobody_is_rejected(server: TcpServer, joined: tu
     stranger.close()
 
 
+def test_who_leaves_by_one_connection_has_left_by_both(joined: tuple[Client, Client]) -> None:
+    command, event = joined
+    command.close()
+    assert event.is_over()
+
+
 def test_garbage_ends_a_connection_and_frees_the_device(server: TcpServer, device: Echo) -> None:
     first = Client(server)
     assert first.greet()[0] == 2

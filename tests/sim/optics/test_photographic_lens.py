@@ -84,6 +84,8 @@ def test_the_two_lenses_have_the_contrast_they_are_named_for(
 def test_the_kernel_has_the_transfer_that_is_stated() -> None:
     """Against the closed form of a two-dimensional exponential, at frequencies below a third of the sampling's."""
     kernel = PhotographicLens((100, 100), 0.1, 3.0, 0, 0, 0).kernel().astype(np.float64)
+    np.testing.assert_allclose(kernel, kernel[::-1], rtol=1e-6)
+    np.testing.assert_allclose(kernel, kernel.T, rtol=1e-6)
     across = np.arange(len(kernel)) - len(kernel) // 2
     for frequency in (0.02, 0.05, 0.1, 0.2, 0.3):
         found = (kernel.sum(axis=0) * np.cos(2 * np.pi * frequency * across)).sum()

@@ -223,6 +223,9 @@ def test_a_projected_picture_lights_each_place_by_its_own(bare: World) -> None:
     np.testing.assert_allclose(at(bare, 0.25, 0.25, frame), at(bare, 0.25, 0.25, red), atol=1)
     np.testing.assert_allclose(at(bare, 0.75, 0.75, frame), 0.25 * at(bare, 0.75, 0.75, white), atol=1)
     np.testing.assert_allclose(at(bare, 0.75, 0.25, frame), 0, atol=1)
+    # The middle of the picture is that of the page, and it changes there.
+    np.testing.assert_allclose(at(bare, 0.48, 0.48, frame), at(bare, 0.48, 0.48, red), atol=1)
+    np.testing.assert_allclose(at(bare, 0.52, 0.52, frame), 0.25 * at(bare, 0.52, 0.52, white), atol=1)
     plain = lit(np.full((1, 1, 3), 0.5, dtype=np.float32))
     np.testing.assert_allclose(plain, lit(np.full((9, 16, 3), 0.5, dtype=np.float32)), atol=1)
     np.testing.assert_allclose(at(bare, 0.5, 0.5, plain), 0.5 * at(bare, 0.5, 0.5, white), atol=1)
@@ -311,6 +314,7 @@ def test_a_seed_draws_the_same_events() -> None:
     everything = drawn(1, 100, 200).events
     assert {event.what for event in everything} == set(KINDS)
     assert all(1 <= event.from_frame < 100 for event in everything)
+    assert {event.to_frame for event in everything if isinstance(event, LampDrift | SensorWarming)} == {100}
 
 
 def test_what_a_real_screen_does_itself_is_not_pretended() -> None:

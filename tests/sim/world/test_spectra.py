@@ -35,14 +35,16 @@ PAPER_NAMES: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 ALL_CODES = np.array(list(product(range(0, 256, 8), repeat=3)), dtype=np.uint8)
 
 
-def absolute_lab(reflectance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return CIELAB (N, 3) under D50 relative to an ideal white, as instruments measure prints."""
+def absolute_lab(reflectance: NDArray[np.float64], bare: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Return CIELAB (N, 3) under D50 relative to an ideal white, as instruments measure prints; or to a paper's."""
     shape = colour.SpectralShape(380, 780, 5)
     observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape).values
     light = observer * colour.SDS_ILLUMINANTS["D50"].copy().align(shape).values[:, None]
     white = light.sum(axis=0)
     chromaticity = (white / white.sum())[:2]
-    return np.asarray(colour.XYZ_to_Lab(reflectance @ light / white[1], chromaticity), dtype=np.float64)
+    paper_xyz = white if bare is None else bare @ light
+    xyz = reflectance @ light / paper_xyz * white / white[1]
+    return np.asarray(colour.XYZ_to_Lab(xyz, chromaticity), dtype=np.float64)
 
 
 def measured(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -178,6 +180,13 @@ SOLID_LAB: dict[PaperName, list[list[int]]] = {
     "glossy": [[95, -1, -2], [51, -38, -58], [50, 82, -17], [89, -4, 109], [49, 72, 67], [41, -80, 34], [15, 43, -65],
                [5, 2, -4]],
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("on", PAPER_NAMES)
+def test_colours_relative_to_paper_are_those_of_the_published_observer_and_light(on: PaperName) -> None:
+    reflectance = print_reflectance(SOLID_CODES, on)
+    expected = absolute_lab(reflectance, paper(on).white)
+    np.testing.assert_allclose(relative_lab(reflectance, on), expected, atol=0.05)
 
 
 @pytest.mark.parametrize("on", SOLID_LAB)

@@ -224,6 +224,15 @@ def test_masked_borders_and_darkness_are_black_with_read_noise(world: World, iso
     check_normal(visible(dark, body), body.black, deviation)
 
 
+def test_what_lies_beside_the_picture_is_dark_on_all_sides(plain_world: World) -> None:
+    body = replace(BODIES["Test"], visible=Rectangle(60, 80, 400, 600), masked=())
+    frame = World(plain_world.sheet, body, plain_world.room).expose(WHITE, REFERENCE_EXPOSURE, key=(4,))
+    deviation = math.hypot(body.noise_dn(100), math.sqrt(1 / 12))
+    for border in (frame[:60], frame[460:], frame[60:460, :80], frame[60:460, 680:]):
+        check_normal(border, body.black, deviation)
+    assert visible(frame, body).mean() > 1.5 * body.black
+
+
 def check_normal(counts: NDArray[np.number], mean: float, deviation: float) -> None:
     assert abs(counts.mean() - mean) < SIX_SIGMA * deviation / math.sqrt(counts.size)
     assert abs(counts.std() / deviation - 1) < SIX_SIGMA / math.sqrt(2 * counts.size)
