@@ -10,7 +10,6 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 
 from calibration.comparison.comparing import CellDifferences
 from calibration.comparison.report import draw_map
@@ -20,6 +19,13 @@ from drivers.raw.rawfile import Mosaic
 from drivers.raw.storage import Area
 from experiment.chart.layout import design_chart
 from experiment.measures.stains import Stains
+
+
+def new_figure() -> Any:
+    """Return an empty figure: Matplotlib is imported where one is drawn."""
+    from matplotlib.figure import Figure
+
+    return Figure()
 
 
 def mosaic_of(
@@ -72,7 +78,7 @@ def test_what_a_print_is_off_by_is_drawn_in_per_cent_where_its_cells_lie() -> No
     deviation = np.linspace(-0.02, 0.03, len(CELLS))
     off = np.stack([deviation, deviation / 2, 0 * deviation], axis=-1)
     stained = np.arange(len(CELLS)) == 5
-    figure = Figure()
+    figure = new_figure()
     draw_print(figure, CHART, Stains(off, np.full_like(off, 1e-6), off, stained, np.ones_like(off), CELLS))
     axes = figure.axes[0]
     (squares,) = axes.collections
@@ -90,7 +96,7 @@ def test_what_cells_of_two_tables_differ_by_is_drawn_in_the_channel_that_differs
     offset = np.array([0.001, -0.002, 0.0])
     count = np.ones((len(CELLS), 3), dtype=np.int64)
     cells = CellDifferences(count, mean, none, none, none, count, none, (), (), 1.0, 0.0, 0.0, offset)
-    figure = Figure()
+    figure = new_figure()
     draw_map(figure, CHART, cells)
     axes = figure.axes[0]
     (squares,) = axes.collections
@@ -104,7 +110,7 @@ def test_what_cells_of_two_tables_differ_by_is_drawn_in_the_channel_that_differs
 def test_lights_are_drawn_at_their_chromaticities_in_the_triangle_of_all() -> None:
     codes = np.array([[255.0, 0, 0], [255, 255, 255], [0, 0, 0], [0, 0, 255]])
     white = np.array([[600.0, 300, 100], [200, 500, 300], [0, 0, 0], [100, 300, 600]])
-    figure = Figure()
+    figure = new_figure()
     draw_chromaticities(figure, codes, np.array([False, True, False, False]), white, "seen", worst=0)
     for axes, places in zip(
         figure.axes, [[(1, 0), (0, 1), (1 / 3, 1 / 3)], *[[(0.6, 0.1), (0.1, 0.6), (0.2, 0.3)]] * 2], strict=True
@@ -124,7 +130,7 @@ def test_a_cell_is_outlined_at_its_corners_and_its_samples_about_its_middle() ->
     def seen(points_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         return 10 * points_mm
 
-    axes: Any = Figure().add_subplot()
+    axes: Any = new_figure().add_subplot()
     axes.plot = plot
     chart: Any = SimpleNamespace(cell_mm=(4, 2), centres_mm=np.array([[6.0, 5.0], [40.0, 5.0]]))
     registration: Any = SimpleNamespace(cell_px=20, to_pixels=seen)
