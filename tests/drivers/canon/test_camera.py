@@ -399,11 +399,8 @@ def goes_on(lab: Lab, frames: int = 3) -> None:
 @pytest.mark.parametrize(
     ("answer", "times"),
     [
-        (ResponseCode.DEVICE_BUSY, 1),
         (ResponseCode.DEVICE_BUSY, 7),
-        (ResponseCode.GENERAL_ERROR, 1),
         (ResponseCode.GENERAL_ERROR, 3),
-        (ResponseCode.SESSION_NOT_OPEN, 1),
         (ResponseCode.SESSION_NOT_OPEN, 2),
     ],
 )
