@@ -85,6 +85,7 @@ def test_the_window_is_half_of_the_smallest_patch(bits: int, page: str, window: 
     assert window_px(lab.chart, placed(lab, tmp_path)) == window
 
 
+@pytest.mark.slow
 def test_levels_are_means_about_the_points_and_tell_what_clips(tmp_path: Path) -> None:
     lab = hang()
     place = placed(lab, tmp_path)

@@ -8,6 +8,7 @@ import pytest
 from calibration.sampling import photon_transfer
 
 
+@pytest.mark.slow
 def test_gain_and_read_noise_are_found() -> None:
     random = np.random.default_rng(4)
     level = random.uniform(20, 9000, (6000, 3))

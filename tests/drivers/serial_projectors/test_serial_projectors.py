@@ -635,7 +635,7 @@ def test_nec_bits_of_the_manual_s_table() -> None:
             data[place] = 1 << bit
             part = bits.get(bit, "OTHER")
             expected = Fault(part.lower(), Severity.ERROR if part.isupper() else Severity.WARNING)
-            assert parse_errors(data) == (expected,), f"byte {place}, bit {bit}"
+            assert parse_errors(bytes(data)) == (expected,), f"byte {place}, bit {bit}"
 
 
 @pytest.mark.parametrize(

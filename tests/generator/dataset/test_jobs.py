@@ -106,6 +106,7 @@ class TestFullScale:
         assert main(("lut", "out", "--sources", "pictures", "--scale", "full", "--format", "dng")) == 2
         assert "counts of dng are not stretched: the file says what white is" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_software_that_knows_nothing_of_it_refuses_it(self, lut: Lut) -> None:
         """By the version, which readers of version 2 hold against 2; a later one is refused by this software, too."""
         assert main(("lut", "full", "--sources", "pictures", "--scale", "full")) == 0
