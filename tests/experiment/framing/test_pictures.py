@@ -18,7 +18,7 @@ from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
 from experiment.framing.field import field_mm
 from experiment.framing.finding import Framing, annotated_png, apparent_sizes, find_chart, small_parts_warning
-from experiment.framing.pictures import gauge_boxes, shift_between
+from experiment.framing.pictures import gauge_boxes, preview_jpeg, shift_between
 from sim.world.world import Room
 from tests.calibration.lab import Lab, hang, hang_chart
 from tests.data_files import shipped
@@ -206,3 +206,20 @@ def test_a_photograph_without_the_chart_says_what_was_looked_for(chart: Chart) -
     strip = seen[-30:]
     assert (strip.max(axis=2) < 30).mean() > 0.5
     assert (strip[..., 1] - strip[..., 0] > 100).sum() > 100
+
+
+def test_a_preview_is_brightened_to_a_hundredth_of_white_and_marks_what_deviates(white: Mosaic) -> None:
+    def preview(share: float, boxes: tuple[tuple[int, int, int, int], ...] = ()) -> npt.NDArray[np.int64]:
+        even = replace(white, counts=np.full_like(white.counts, 1000 + round(10_000 * share)))
+        return picture(preview_jpeg(even, np.full((2, 2), 1000.0), np.full(3, 10_000.0), (), boxes, ""))
+
+    height, width = white.block_planes().shape[2:]
+    assert preview(0.5).shape == (height, width, 3)
+    # The picture shows the square root of the signal.
+    for share, grey in ((0.5, 255), (0.01, 255), (0.0025, 127), (0.0004, 51)):
+        assert np.abs(preview(share) - grey).max() <= 1
+    marked = preview(0.0025, ((40, 20, 60, 50),))
+    red = marked[..., 2] - marked[..., 1] > 60
+    rows, columns = np.flatnonzero(red.any(axis=1)), np.flatnonzero(red.any(axis=0))
+    assert (columns[0], rows[0], columns[-1], rows[-1]) == pytest.approx((40, 20, 59, 49), abs=1)
+    assert not red[25:45, 45:55].any()
