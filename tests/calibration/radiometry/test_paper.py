@@ -200,7 +200,7 @@ def test_what_a_field_leaves_is_told_by_share_rim_and_rings() -> None:
     assert left.at_mm in {(x, y) for x, y in PLACES[:4].tolist()}
     assert left.radial < 0.15
     away = np.linalg.norm(PLACES - np.array(PAGE) / 2, axis=1)
-    fall_off = 0.01 - 0.03 * (away / away.max()) ** 2
+    fall_off = -0.03 * (away / away.max()) ** 2
     left = residual(np.stack([fall_off] * 3, axis=1), PLACES, PAGE, 1)
     assert left.rim == pytest.approx(fall_off[np.argsort(away)[-40:]].mean())
     assert 0.95 < left.radial <= 1
