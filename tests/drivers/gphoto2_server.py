@@ -1,12 +1,15 @@
 """A simulated EOS in a process of its own, for an initiator that keeps the interpreter of its process to itself.
 
-``python -m tests.drivers.gphoto2_server PORT MODE`` prints its address, then a line for each exposure; it ends when
-its standard input does.
+``python -m tests.drivers.gphoto2_server`` takes lines ``PORT MODE``, for each of which it prints the address of a body,
+then a line for each exposure, until the line ``end``, which it answers by ``ended``. Each body is a fork, since the
+imports take half a second.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
 from dataclasses import asdict, replace
 from datetime import datetime
@@ -32,9 +35,13 @@ class ReportedFilm(SeededFilm):
         return size
 
 
-def main() -> None:
-    """Serve until standard input ends."""
-    port, mode = sys.argv[1:]
+def _end(number: int, frame: object) -> None:
+    sys.exit()
+
+
+def serve(port: int, mode: str) -> None:
+    """Serve one body until SIGTERM comes."""
+    signal.signal(signal.SIGTERM, _end)
     body = replace(EOS_550D, write_s=0.02)
     if mode == "no contacts":
         body = replace(body, aperture_codes=())
@@ -42,10 +49,24 @@ def main() -> None:
     if mode == "unprepared":
         eos.turn_dial(AeMode.APERTURE_PRIORITY)
         eos.switch_focus(automatic=True)
-    with serve_ptpip(eos, int(port)) as server:
+    with serve_ptpip(eos, port) as server:
         host, number = server.address
         print(f"ptpip:{host}:{number}:{number}", flush=True)
-        sys.stdin.read()
+        while True:
+            signal.pause()
+
+
+def main() -> None:
+    """Serve one body after another until standard input ends."""
+    pid = 0
+    for line in sys.stdin:
+        if line == "end\n":
+            os.kill(pid, signal.SIGTERM)
+            os.waitpid(pid, 0)
+            print("ended", flush=True)
+        elif not (pid := os.fork()):
+            port, _, mode = line.strip().partition(" ")
+            serve(int(port), mode)
 
 
 if __name__ == "__main__":

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import os
+import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import IO, Any
 
 import pytest
 
@@ -30,71 +32,126 @@ def power(number):
     return number ** {exponent}
 """
 SQUARED = """
-import sys
 from kernels.square import square
-print("numba" in sys.modules)
 from numba.core import event
 with event.install_recorder("numba:compile") as compilations:
     print(square(5), bool(compilations.buffer))
 """
+FORKS = """
+import json, os, sys
+import numba.core.event
+numba.njit(lambda number: number**2)(5)
+for line in sys.stdin:
+    program, settings = json.loads(line)
+    if not (pid := os.fork()):
+        os.environ.update(settings)
+        numba.config.reload_config()
+        exec(program, {})
+        sys.stdout.flush()
+        os._exit(0)
+    print("ended with", os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
+"""
+"""Runs each program that it is given in a process in which numba has compiled something: to get ready for the first
+time takes it a second."""
+
 ROOT = Path(__file__).parents[2]
 
 
-def _copied(folder: Path) -> None:
-    """Put a copy of the decorator, and a room for a kernel, in a folder."""
+class Kernels:
+    """A copy of the decorator beside a kernel, and programs that call it.
+
+    Attributes
+    ----------
+    cache
+        Where code is kept.
+    """
+
+    def __init__(self, folder: Path, forks: IO[str], said: IO[str]) -> None:
+        self.folder, self._forks, self._said = folder, forks, said
+        self.cache = folder / "cache"
+
+    def write_power(self, exponent: int) -> None:
+        """Write the file that the kernel's code is in part compiled from."""
+        (self.folder / "kernels" / "power.py").write_text(POWER.format(exponent=exponent))
+
+    def run(self, program: str, **settings: str) -> list[str]:
+        """Run a program, which is on no terminal, and return the lines that it prints and complains with."""
+        self._forks.write(json.dumps([program, settings]) + "\n")
+        self._forks.flush()
+        lines = list(iter(lambda: self._said.readline().rstrip("\n"), "ended with 0"))
+        assert not any(line.startswith("ended with") for line in lines), "the program failed"
+        return lines
+
+    def code(self) -> list[Path]:
+        """Return the files of kept code."""
+        return list(self.cache.rglob("*.code"))
+
+
+def environment(folder: Path) -> dict[str, str]:
+    return {"PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a copy of the decorator and a kernel."""
+    folder = tmp_path_factory.mktemp("compiled")
     shutil.copytree(ROOT / "foundation", folder / "foundation", ignore=shutil.ignore_patterns("__pycache__"))
     (folder / "kernels").mkdir()
     (folder / "kernels" / "__init__.py").touch()
     (folder / "kernels" / "square.py").write_text(SQUARE.format(module="kernels.power"))
+    return folder
 
 
-def _run(folder: Path, program: str, **more: str) -> tuple[str, str]:
-    """Run a program in such a folder; return what it says."""
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=folder,
-        env={"PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(folder / "cache"), **more},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return done.stdout, done.stderr
+@pytest.fixture(scope="module")
+def process(folder: Path) -> Iterator[Kernels]:
+    command = [sys.executable, "-c", FORKS]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(command, cwd=folder, env=environment(folder), text=True, **pipes) as process:
+        assert process.stdin
+        assert process.stdout
+        yield Kernels(folder, process.stdin, process.stdout)
+        process.stdin.close()
 
 
-def test_code_is_kept_for_its_very_sources_and_setting_while_it_is_whole(tmp_path: Path) -> None:
+@pytest.fixture
+def kernels(process: Kernels) -> Kernels:
+    """Return the kernel as it was before anything was compiled."""
+    shutil.rmtree(process.cache, ignore_errors=True)
+    process.write_power(2)
+    return process
+
+
+def test_code_is_kept_for_its_very_sources_and_setting_while_it_is_whole(kernels: Kernels) -> None:
     # Beside a copy of the decorator's files: numba by itself would go on with the old code.
-    _copied(tmp_path)
-    (tmp_path / "kernels" / "power.py").write_text(POWER.format(exponent=2))
-    assert _run(tmp_path, SQUARED) == ("False\n25 True\n", "")
-    (kept,) = (tmp_path / "cache").rglob("*.code")
+    assert kernels.run(SQUARED) == ["25 True"]
+    (kept,) = kernels.code()
     whole = kept.read_bytes()
     for damaged in (whole[:-1], b"x" + whole[1:]):
         kept.write_bytes(damaged)
-        assert _run(tmp_path, SQUARED) == ("False\n25 True\n", "")
-    assert _run(tmp_path, SQUARED) == ("False\n25 False\n", ""), "the next start compiles nothing"
-    assert _run(tmp_path, SQUARED, NUMBA_OPT="1") == ("False\n25 True\n", "")
-    assert len(list((tmp_path / "cache").rglob("*.code"))) == 1, "made anew, and kept in its place"
-    assert _run(tmp_path, SQUARED, NUMBA_CPU_NAME="generic") == ("False\n25 True\n", "")
-    assert len(list((tmp_path / "cache").rglob("*.code"))) == 2, "another processor's is kept beside it"
-    (tmp_path / "kernels" / "power.py").write_text(POWER.format(exponent=3))
-    assert _run(tmp_path, SQUARED) == ("False\n125 True\n", ""), "a file that was compiled into it has changed"
+        assert kernels.run(SQUARED) == ["25 True"]
+    assert kernels.run(SQUARED) == ["25 False"], "the next start compiles nothing"
+    assert kernels.run(SQUARED, NUMBA_OPT="1") == ["25 True"]
+    assert kernels.code() == [kept], "made anew, and kept in its place"
+    assert kernels.run(SQUARED, NUMBA_CPU_NAME="generic") == ["25 True"]
+    assert len(kernels.code()) == 2, "another processor's is kept beside it"
+    kernels.write_power(3)
+    assert kernels.run(SQUARED) == ["125 True"], "a file that was compiled into it has changed"
 
 
-PICKLED = """
-import copy, pickle
+IMPORTED = """
+import copy, pickle, sys
 from kernels.square import square
 assert pickle.loads(pickle.dumps(square)) is square and copy.deepcopy([square]) == [square]
+print("numba" in sys.modules)
 """
 
 
-def test_a_compiled_function_is_pickled_by_its_name(tmp_path: Path) -> None:
-    _copied(tmp_path)
-    (tmp_path / "kernels" / "power.py").write_text(POWER.format(exponent=2))
-    assert _run(tmp_path, PICKLED) == ("", "")
+def test_a_compiled_function_is_pickled_by_its_name_and_imported_without_numba(folder: Path) -> None:
+    program = [sys.executable, "-c", IMPORTED]
+    assert subprocess.check_output(program, cwd=folder, env=environment(folder), text=True) == "False\n"
 
 
 NO_FOLDER = """
-import importlib, sys
 import numba
 from numba.core import caching
 
@@ -104,38 +161,19 @@ class Nowhere:
         return None
 
 caching.CacheImpl._locator_classes = [Nowhere]
+from kernels.square import square
 try:
-    numba.njit(cache=True)(lambda number: number)
+    numba.njit(cache=True)(square.py_func)
 except RuntimeError as error:
     assert "cannot cache" in str(error)
-else:
-    sys.exit("numba still finds a folder for its cache")
-for module in sys.argv[1:]:
-    importlib.import_module(module)
-from foundation.compiled import compiled
-assert compiled(double)(21) == 42
+    print(square(5))
 """
 
 
-def test_every_compiled_function_is_there_where_nothing_can_be_kept(tmp_path: Path) -> None:
+def test_a_compiled_function_is_there_where_nothing_can_be_kept(kernels: Kernels) -> None:
     """Numba refuses to make a cached function where neither the package's folder nor the home folder is writable."""
-    modules = [
-        ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        for package in ("sim", "calibration", "generator")
-        for path in sorted((ROOT / package).rglob("*.py"))
-        if "foundation.compiled" in path.read_text()
-    ]
-    assert "sim.world.rendering" in modules
-    script = tmp_path / "script.py"
-    script.write_text("def double(number):\n    return 2 * number\n" + NO_FOLDER)
-    done = subprocess.run(
-        [sys.executable, script, *modules],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert kernels.run(NO_FOLDER) == ["25"]
+    assert kernels.code() == []
 
 
 def test_only_the_decorator_keeps_machine_code() -> None:
@@ -167,11 +205,6 @@ print(said.count(b"compiling for this processor"))
 """
 
 
-def test_the_first_start_says_on_a_terminal_why_it_takes_long(tmp_path: Path) -> None:
-    _copied(tmp_path)
-    (tmp_path / "kernels" / "power.py").write_text(POWER.format(exponent=2))
-    assert _run(tmp_path, ANNOUNCED) == ("1\n", "")
-    assert _run(tmp_path, ANNOUNCED) == ("0\n", ""), "nothing is compiled the second time"
-    (tmp_path / "kernels" / "power.py").write_text(POWER.format(exponent=3))
-    # Compiled anew, but into a file that nobody watches.
-    assert _run(tmp_path, "from kernels.square import square; print(square(5))") == ("125\n", "")
+def test_the_first_start_says_on_a_terminal_why_it_takes_long(kernels: Kernels) -> None:
+    assert kernels.run(ANNOUNCED) == ["1"]
+    assert kernels.run(ANNOUNCED) == ["0"], "nothing is compiled the second time"

@@ -142,7 +142,7 @@ def asked(link: socket.socket) -> bytes:
     link.sendall(b"GET /here HTTP/1.1\r\nHost: localhost\r\n\r\n")
     answer = http.client.HTTPResponse(link)
     answer.begin()
-    assert answer.status == 200
+    assert (answer.status, answer.getheader("Content-Type")) == (200, "text/plain")
     return answer.read()
 
 

@@ -11,10 +11,11 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from foundation import pages
-from foundation.plots import FAINT, GRID, INK, PAPER, SERIES, png_of, svg_of
+from foundation.plots import FAINT, GRID, INK, PAPER, SERIES, draw_squares, png_of, svg_of
 
 VOID = {"meta", "img", "br", "link"}
 
@@ -205,3 +206,16 @@ def test_logarithmic_axes_have_plain_numbers(drawn_by: Callable[[Callable[[Any],
     ]
     assert len(found) > 2
     assert not [text for text in found if "$" in text]
+
+
+@pytest.mark.parametrize(("side_mm", "points"), [(5.0, 7.2), (0.5, 1.2)])
+def test_squares_lie_where_they_are_and_are_as_large_where_that_can_be_seen(side_mm: float, points: float) -> None:
+    from matplotlib.figure import Figure
+
+    axes = Figure().subplots()
+    places = np.array([[10.0, 20.0], [150.0, 90.0]])
+    # 4 inches are 288 points, for 200 mm.
+    squares = draw_squares(axes, (200.0, 100.0), places, side_mm, np.array([1.0, 2.0]), 4.0)
+    assert squares.get_offsets().tolist() == places.tolist()
+    assert squares.get_sizes() == pytest.approx([points**2])
+    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 200), (100, 0))

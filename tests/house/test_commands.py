@@ -15,10 +15,10 @@ import pytest
 from typer.main import get_command
 
 from croplab import COMMANDS
+from foundation.version import PACKAGES
 
 pytestmark = pytest.mark.slow
 
-ROOMS = ("drivers", "sim", "experiment", "calibration", "acquisition", "synthesis", "generator", "evaluation")
 HEAVY = (
     *("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),
     *("distributed", "pyarrow", "torch", "zarr"),
@@ -63,10 +63,11 @@ def test_the_command_is_installed(command: str) -> None:
 
 
 @pytest.mark.parametrize("module", COMMANDS.values())
-def test_the_module_is_the_command(module: str) -> None:
+def test_the_module_is_the_command_and_an_unknown_option_the_users_fault(module: str) -> None:
     done = subprocess.run([sys.executable, "-m", module, "--unknown"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "--unknown" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("module", COMMANDS.values())
@@ -77,43 +78,28 @@ def test_help_tells_the_exit_codes_and_loads_nothing_heavy(module: str) -> None:
     assert done.stderr.splitlines()[-1] == "LOADED"
 
 
-@pytest.fixture(params=[(module, path) for module in COMMANDS.values() for path in paths_of(module)], ids=str)
-def shown(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> tuple[Any, str]:
-    """Return a command or subcommand and its help as it is shown, every run of blanks as one."""
-    module, path = request.param
+@pytest.mark.parametrize(
+    ("module", "path"), [(module, path) for module in COMMANDS.values() for path in paths_of(module)], ids=str
+)
+def test_help_shows_all_that_is_written_and_what_is_read_and_how_it_ends(
+    module: str, path: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     room = import_module(module)
     monkeypatch.setenv("COLUMNS", "1000")
     assert room.main([*path, "--help"]) == 0
-    return dict(commands_of(get_command(room.app)))[path], " ".join(capsys.readouterr().out.split())
-
-
-def test_help_shows_all_that_is_written_of_every_option(shown: tuple[Any, str]) -> None:
-    command, text = shown
+    command, text = dict(commands_of(get_command(room.app)))[path], " ".join(capsys.readouterr().out.split())
     for option in command.params:
         # Rich takes what stands in brackets for its own unless a backslash is before it.
         written = (getattr(option, "help", None) or "").replace("\\[", "[")
         assert " ".join(written.split()) in text, option.name
-
-
-def test_help_says_what_is_read_and_written_and_how_it_ends(shown: tuple[Any, str]) -> None:
-    command, text = shown
     assert re.search(r"Exit codes?: |Exit code 2 when ", text)
     if not hasattr(command, "commands"):
         assert "Reads " in text
         assert re.search(r"\bwrites ", text, re.IGNORECASE)
 
 
-@pytest.mark.parametrize("module", COMMANDS.values())
-def test_an_unknown_option_is_the_users_fault(module: str) -> None:
-    done = call(module, "--no-such-option")
-    assert done.returncode == 2
-    assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("module", COMMANDS.values())
-def test_a_mistake_of_ours_shows_a_plain_traceback(module: str) -> None:
+def test_a_mistake_of_ours_shows_a_plain_traceback() -> None:
+    module, *others = COMMANDS.values()
     code = (
         f"from {module} import app\n@app.command()\ndef fail():\n    raise ValueError('our mistake')\n"
         "from foundation.console import run\nrun(lambda: app(['fail']))"
@@ -122,8 +108,10 @@ def test_a_mistake_of_ours_shows_a_plain_traceback(module: str) -> None:
     assert done.returncode == 1
     assert done.stderr.startswith("Traceback (most recent call last):")
     assert done.stderr.endswith("\nValueError: our mistake\n")
+    for other in others:
+        assert not import_module(other).app.pretty_exceptions_enable
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_every_name_of_ours_has_one_owner(room: str) -> None:
-    assert set(importlib.metadata.packages_distributions()[room]) == {"croplab"}
+def test_every_name_of_ours_has_one_owner() -> None:
+    owners = importlib.metadata.packages_distributions()
+    assert {room: set(owners[room]) for room in PACKAGES} == {room: {"croplab"} for room in PACKAGES}

@@ -230,12 +230,12 @@ def test_a_reason_is_seen(source: str, reasoned: bool) -> None:
     assert all(found) is reasoned
 
 
+# For all packages at once: reading them takes seconds.
 @pytest.mark.slow
-@pytest.mark.parametrize("package", PACKAGES)
-def test_public_array_functions_state_shape_and_dtype(package: str) -> None:
-    assert without_shape(package) == []
+def test_public_array_functions_state_shape_and_dtype() -> None:
+    assert [one for package in PACKAGES for one in without_shape(package)] == []
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_numeric_constants_state_their_reason(package: str) -> None:
-    assert without_reason(package) == []
+@pytest.mark.slow
+def test_numeric_constants_state_their_reason() -> None:
+    assert [one for package in PACKAGES for one in without_reason(package)] == []

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
-
 from docs.figures import ROOT, figures, read_plan
 
-DRAWN = figures()
 
-
-@pytest.mark.parametrize("file", DRAWN, ids=lambda file: file.name)
-def test_a_figure_is_drawn_from_what_is(file: Path) -> None:
-    assert file.read_text(encoding="utf-8") == DRAWN[file], "out of date; run python docs/figures.py and commit"
+def test_the_figures_are_drawn_from_what_is() -> None:
+    old = [file.name for file, drawn in figures().items() if file.read_text(encoding="utf-8") != drawn]
+    assert old == [], "out of date; run python docs/figures.py and commit"
 
 
 def test_every_room_is_explained() -> None:

@@ -35,6 +35,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     assert not circle, f"imports go round: {' <- '.join(circle)}; move what both need to a module below them"
 
 
+@pytest.mark.slow
 def test_a_public_class_name_has_one_home() -> None:
     homes: defaultdict[str, list[str]] = defaultdict(list)
     for source in (source for package in PACKAGES for source in sources(package)):

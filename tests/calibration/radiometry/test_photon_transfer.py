@@ -13,6 +13,7 @@ from calibration.sampling import photon_transfer
 from foundation.errors import InputError
 
 
+@pytest.mark.slow
 def test_gain_and_read_noise_are_found() -> None:
     random = np.random.default_rng(4)
     level = random.uniform(20, 9000, (6000, 3))

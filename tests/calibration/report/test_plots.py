@@ -12,7 +12,6 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 
 from calibration.budget import Budget, Component
 from calibration.causes.gathering import PrintPlace
@@ -45,7 +44,9 @@ from experiment.measures.stains import Stains
 
 
 def drawn(draw: Callable[..., None], *arguments: Any) -> Any:
-    """Return the figure that is drawn, which nobody renders."""
+    """Return the figure that is drawn, which nobody renders; Matplotlib is imported where one is."""
+    from matplotlib.figure import Figure
+
     figure: Any = Figure()
     draw(figure, *arguments)
     return figure
@@ -161,7 +162,7 @@ def test_a_cell_is_outlined_at_its_corners_and_its_samples_about_its_middle() ->
     def seen(points_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         return 10 * points_mm
 
-    axes: Any = Figure().add_subplot()
+    axes: Any = drawn(lambda figure: figure.add_subplot()).axes[0]
     axes.plot = plot
     chart: Any = SimpleNamespace(cell_mm=(4, 2), centres_mm=np.array([[6.0, 5.0], [40.0, 5.0]]))
     registration: Any = SimpleNamespace(cell_px=20, to_pixels=seen)
@@ -422,7 +423,7 @@ def test_a_course_in_which_nothing_happens_has_no_ring_and_one_of_few_colours_sa
 
 def test_a_name_at_the_edge_of_a_plot_is_turned_inwards() -> None:
     for x, y, ha, text in ((0.69, 0.69, "left", (8, 8)), (0.71, 0.71, "right", (-8, -14))):
-        axes: Any = Figure().add_subplot()
+        axes: Any = drawn(lambda figure: figure.add_subplot()).axes[0]
         axes.set(xlim=(10, 30), ylim=(-5, 5))
         place = (10 + 20 * x, -5 + 10 * y)
         plots._ring(axes, *place, "here")  # pyright: ignore[reportPrivateUsage]

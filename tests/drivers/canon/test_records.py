@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from enum import IntEnum
 from itertools import pairwise
 
 import pytest
@@ -31,7 +32,15 @@ from drivers.canon import (
     Scale,
     TransferRequest,
 )
-from drivers.ptp.codes import CameraStatus, CaptureDestination, EosEvent, ObjectFormat, Property
+from drivers.ptp.codes import (
+    CameraStatus,
+    CaptureDestination,
+    EosEvent,
+    ObjectFormat,
+    Operation,
+    Property,
+    ResponseCode,
+)
 from foundation.errors import InputError, ProtocolError
 from tests.drivers.ptp import examples
 
@@ -442,3 +451,16 @@ def test_a_code_in_no_table_has_a_label() -> None:
 
 def test_codes_read_well() -> None:
     assert [APERTURE.label(code) for code in (0x25, 0x28, 0xF1)] == ["3.5", "4", "code 0xf1"]
+
+
+def test_codes_lie_where_the_standard_and_the_makers_have_them() -> None:
+    """The upper byte of a code says of what it is, and whose."""
+    blocks: dict[type[IntEnum], set[int]] = {
+        Operation: {0x10, 0x91},
+        ResponseCode: {0x20, 0xA0, 0xA1},
+        EosEvent: {0x00, 0xC1},
+        Property: {0x50, 0xD1, 0xD3, 0xD4},
+    }
+    for codes, upper in blocks.items():
+        assert {code >> 8 for code in codes} == upper
+        assert len(codes) == len(codes.__members__), "none has two names"

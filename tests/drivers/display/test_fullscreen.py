@@ -510,6 +510,12 @@ def test_a_gamma_ramp_that_was_never_written_is_none(screen: FullScreen, monkeyp
     noise = np.random.default_rng(1).random((3, 256))
     monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor: noise)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
     assert ramps(screen) == []
+    straight = np.linspace(0, 1, 256)
+    bend = np.sin(np.pi * straight) / 255
+    # Drivers end a ramp at 255/256 or at 1; a bend of two codes is one.
+    for ramp, told in ((straight * 255 / 256, 0), (straight - bend, 0), (straight - 2 * bend, 1)):
+        monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor, ramp=ramp: [ramp] * 3)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+        assert len(ramps(screen)) == told
     monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor: [np.linspace(1, 0, 256)] * 3)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
     assert len(ramps(screen)) == 1, "inverted colours are somebody's wish"
 

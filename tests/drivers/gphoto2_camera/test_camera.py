@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 import json
 import os
+import select
 import subprocess
 import sys
 from collections.abc import Generator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import IO, Any
 
 import pytest
 
@@ -35,55 +37,69 @@ class FarFilm(SeededFilm):
         super().__init__(FILM_BYTES)
         self._reports = reports
         self._rest = b""
-        os.set_blocking(reports, False)
 
     def catch_up(self) -> None:
-        with suppress(BlockingIOError):
-            while piece := os.read(self._reports, 4096):
-                self._rest += piece
+        while select.select([self._reports], [], [], 0)[0] and (piece := os.read(self._reports, 4096)):
+            self._rest += piece
         *lines, self._rest = self._rest.split(b"\n")
         for line in lines:
             self.expose(ExposureSettings(**json.loads(line)), SystemClock().now(), io.BytesIO())
 
 
-@contextmanager
-def served(port: int = 0, mode: str = "prepared") -> Generator[tuple[str, FarFilm]]:
-    """Serve a simulated EOS; give libgphoto2's name of its port, and its film."""
-    with subprocess.Popen(
-        [sys.executable, "-m", "tests.drivers.gphoto2_server", str(port), mode],
-        cwd=Path(__file__).parents[3],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    ) as process:
+class Bodies:
+    """Simulated bodies in another process, one at a time."""
+
+    def __init__(self, orders: IO[bytes], reports: IO[bytes]) -> None:
+        self._orders, self._reports = orders, reports
+
+    @contextmanager
+    def served(self, port: int = 0, mode: str = "prepared") -> Generator[tuple[str, FarFilm]]:
+        """Serve a simulated EOS; give libgphoto2's name of its port, and its film."""
+        self._order(f"{port} {mode}")
+        try:
+            yield self._reports.readline().decode().strip(), FarFilm(self._reports.fileno())
+        finally:
+            self._order("end")
+            assert any(line == b"ended\n" for line in self._reports)
+
+    def _order(self, line: str) -> None:
+        self._orders.write(f"{line}\n".encode())
+        self._orders.flush()
+
+
+@pytest.fixture(scope="module")
+def bodies() -> Generator[Bodies]:
+    command = [sys.executable, "-m", "tests.drivers.gphoto2_server"]
+    folder = Path(__file__).parents[3]
+    # Lines are looked for with nothing kept back: a film reads the same pipe.
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "bufsize": 0}
+    with subprocess.Popen(command, cwd=folder, **pipes) as process:
         assert process.stdin is not None
         assert process.stdout is not None
-        try:
-            yield process.stdout.readline().decode().strip(), FarFilm(process.stdout.fileno())
-        finally:
-            process.stdin.close()
-            process.wait(10)
+        yield Bodies(process.stdin, process.stdout)
+        process.stdin.close()
 
 
 class TestContract(CameraContract):
     @pytest.fixture
-    def bench(self) -> Generator[Bench]:
-        with served() as (port, film):
+    def bench(self, bodies: Bodies) -> Generator[Bench]:
+        with bodies.served() as (port, film):
             camera = Gphoto2Camera(port, MODEL)
             identity = CameraIdentity("Canon Inc.", "Canon EOS 550D", "0000000001", "3-1.0.9")
             yield Bench(camera, film, identity, SystemClock().now, keeps_names=False, develop=film.catch_up)
             camera.close()
 
 
-def test_a_body_that_is_not_set_up_is_refused_with_all_reasons_at_once() -> None:
-    with served(mode="unprepared") as (port, _):
+def test_a_body_that_is_not_set_up_is_refused_with_all_reasons_at_once(bodies: Bodies) -> None:
+    with bodies.served(mode="unprepared") as (port, _):
         camera = Gphoto2Camera(port, MODEL)
         with pytest.raises(DeviceRefused, match=r"autoexposuremode is AV.*focusmode is One Shot"):
             camera.configure(SETTINGS)
         camera.close()
 
 
-def test_a_lens_without_contacts_takes_frames_and_no_aperture() -> None:
-    with served(mode="no contacts") as (port, film):
+def test_a_lens_without_contacts_takes_frames_and_no_aperture(bodies: Bodies) -> None:
+    with bodies.served(mode="no contacts") as (port, film):
         camera = Gphoto2Camera(port, MODEL)
         with pytest.raises(DeviceRefused, match=r'aperture .* cannot be set.*set aperture = "none"'):
             camera.configure(SETTINGS)
@@ -97,13 +113,13 @@ def test_a_lens_without_contacts_takes_frames_and_no_aperture() -> None:
     assert film.settings == [bare]
 
 
-def test_a_lost_connection_is_renewed_by_the_next_call() -> None:
-    with served() as (port, _):
+def test_a_lost_connection_is_renewed_by_the_next_call(bodies: Bodies) -> None:
+    with bodies.served() as (port, _):
         camera = Gphoto2Camera(port, MODEL)
         camera.configure(SETTINGS)
     with pytest.raises(DeviceError):
         capture(camera, io.BytesIO())
-    with served(int(port.rpartition(":")[2])) as (_, film):
+    with bodies.served(int(port.rpartition(":")[2])) as (_, film):
         into = io.BytesIO()
         capture(camera, into)
         film.catch_up()

@@ -125,9 +125,10 @@ def test_collects_for_thirty_seconds_and_names_each_once() -> None:
 
 def test_ends_as_soon_as_enough_have_answered() -> None:
     clock = SimulatedClock()
-    network = PaperNetwork(clock, (0.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"))
+    clock.sleep(1000)  # a search counts from its own begin
+    network = PaperNetwork(clock, (1000.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"))
     assert [found.host for found in look(network, clock, enough=1)] == ["192.168.1.20"]
-    assert clock.monotonic() == pytest.approx(0.5)
+    assert clock.monotonic() == pytest.approx(1000.5)
     assert len(network.sent) == 1
 
 

@@ -484,6 +484,7 @@ def test_a_garbled_byte_in_a_response_is_never_taken_for_another_message(at: int
     assert at in (6, 7) or done.response.ok
 
 
+@pytest.mark.slow
 def test_a_flood_of_events_does_not_keep_us() -> None:
     transport = UsbTransport(camera(), SimulatedClock())
     transport.transact(PtpRequest(RAISE, 1, (5000,)), timeout=PATIENCE_S)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -118,8 +119,10 @@ def test_masked_columns_of_a_cr3() -> None:
 
 def test_columns_at_the_edge_that_are_not_black_are_left_out() -> None:
     # LibRaw's table: EOS R10 168 columns, of which the first 16 and the last 48 are none; R5 Mark II 258, 128.
-    assert masked("Canon EOS R10", 168, Cr3()) == (Area(36, 16, 4020, 104),)
-    assert masked("Canon EOS R5m2", 258, Cr3()) == (Area(36, 128, 4020, 126),)
+    for camera in ("Canon EOS R10", "Canon EOS R6m2", "Canon EOS R6 Mark II"):
+        assert masked(camera, 168, Cr3()) == (Area(36, 16, 4020, 104),)
+    for camera in ("Canon EOS R5m2", "Canon EOS R5 Mark II"):
+        assert masked(camera, 258, Cr3()) == (Area(36, 128, 4020, 126),)
 
 
 def test_a_sensor_without_columns_beside_its_picture_has_none() -> None:
@@ -144,3 +147,17 @@ def test_a_file_that_libraw_cannot_decode_is_an_error(tmp_path: Path, capfd: pyt
         with pytest.raises(FormatError, match=says):
             read_raw(path)
     assert capfd.readouterr() == ("", "")
+
+
+def test_what_dcraw_shows_a_row_more_of_ends_at_the_sensor_s_lower_edge() -> None:
+    for (rows, columns), visible in rawfile._ONE_ROW_MORE:  # pyright: ignore[reportPrivateUsage]
+        assert visible.top + visible.height == rows
+        assert 4 * visible.height // 3 <= visible.width < columns
+        assert visible.left + visible.width <= columns
+
+
+@given(st.lists(st.tuples(st.floats(-9, 9), st.integers(1, 4)), min_size=1))
+def test_a_median_of_counted_values_is_numpy_s(counted: list[tuple[float, int]]) -> None:
+    values, numbers = np.array([one for one, _ in counted]), np.array([number for _, number in counted])
+    found = rawfile._median(values, numbers)  # pyright: ignore[reportPrivateUsage]
+    assert found == pytest.approx(np.median(np.repeat(values, numbers)), abs=1e-12)

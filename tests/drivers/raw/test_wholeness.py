@@ -246,6 +246,8 @@ def test_darkness_and_too_much_light_are_no_holes() -> None:
     dark = np.random.default_rng(2).normal(64, 8, (SIDE, 2 * SIDE)).clip(0).astype(np.uint16)
     dark[:, 7] = 0  # a dead column
     assert filled_fault(dark, np.full((2, 2), 64.0), 4095) is None
+    assert filled_fault(np.full_like(dark, 32), np.full((2, 2), 64.0), 4095) is None, "half of black is not below it"
+    assert filled_fault(np.full_like(dark, 31), np.full((2, 2), 64.0), 4095) is not None
     # Black is subtracted in some bodies, and half of the noise with it.
     assert filled_fault(np.maximum(dark, 64) - 64, np.zeros((2, 2)), 4095) is None
     assert filled_fault(np.full_like(dark, 65535), np.zeros((2, 2)), 65535) is None

@@ -49,6 +49,7 @@ def rewrite(path: Path, change: Change) -> None:
     np.savez(path, **arrays)
 
 
+@pytest.mark.slow
 def test_the_story_is_kept_and_told(saved: Path) -> None:
     method = load_model(saved)
     assert method.name == "Regression trees (simple features) (trained on Cube+)"

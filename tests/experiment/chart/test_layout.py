@@ -29,13 +29,13 @@ pytestmark = pytest.mark.slow
 PX_MM = 25.4 / 600
 MARGIN_MM = 8.0
 
-# bits 4 and 5 are large: a few seeds say as much.
+# bits 4 and 5 are large: one seed says as much.
 charts = st.builds(
     cache(design_chart),
     bits=st.sampled_from([1, 2, 3]),
     page=st.just(None),
     seed=st.integers(0, 2**32),
-) | st.builds(cache(design_chart), bits=st.sampled_from([4, 5]), page=st.just(None), seed=st.integers(0, 2))
+) | st.builds(cache(design_chart), bits=st.sampled_from([4, 5]), page=st.just(None), seed=st.just(1))
 
 
 def slots_px(chart: Chart) -> npt.NDArray[np.int64]:
@@ -211,9 +211,7 @@ def test_spread_chooses_as_many_as_asked_among_the_allowed(
     assert not (chosen & ~allowed).any()
 
 
-@pytest.mark.parametrize(
-    ("bits", "page", "pixels"), [(5, "A1", 85), (5, "A2", 60), (4, "A3", 120), (3, (100.0, 500.0), 125), (5, "A3", 40)]
-)
+@pytest.mark.parametrize(("bits", "page", "pixels"), [(4, "A3", 120), (3, (100.0, 500.0), 125), (5, "A3", 40)])
 def test_cells_shrink_to_whole_pixels_on_a_page_too_small(
     bits: int, page: str | tuple[float, float], pixels: int
 ) -> None:

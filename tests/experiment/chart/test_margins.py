@@ -108,6 +108,9 @@ def test_every_hundred_millimetres_of_the_paper_s_chart_are_numbered(a0: Chart) 
     for mm in range(0, 1200, 100):
         expected = text_boxes(str(mm))
         here = numbers[np.abs((numbers[:, 0] + numbers[:, 2]) / 2 - left - mm / PX_MM) < 80]
+        # Below the middle of its tick, which is 4 px wide.
+        first = left + round(mm / PX_MM) + 2 - expected[:, 2].max() // 2
+        assert here[:, 0].min() == first + expected[:, 0].min()
         assert sorted((here - here[:, :2].min(axis=0)[[0, 1, 0, 1]]).tolist()) == sorted(
             (expected - expected[:, :2].min(axis=0)[[0, 1, 0, 1]]).tolist()
         )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import re
 import shutil
+import struct
 import subprocess
 import zlib
 from collections.abc import Callable
@@ -182,6 +183,22 @@ def test_the_output_profile_is_of_an_output_device() -> None:
     needed = "desc cprt wtpt A2B0 A2B1 A2B2 B2A0 B2A1 B2A2 gamt"
     assert tags == {name.encode() for name in needed.split()}
     assert srgb_output_profile() == profile
+
+
+@pytest.mark.parametrize("make", [srgb_output_profile, srgb_display_profile])
+def test_a_profile_s_name_is_as_long_as_readers_expect(make: Callable[[], bytes]) -> None:
+    # ICC.1:2001-04, 6.5.17: signature, reserved, length, text with its NUL, then 8, 3 and 67 bytes of no other scripts.
+    profile = make()
+    place, size = next(
+        struct.unpack(">2I", profile[at + 4 : at + 12])
+        for at in range(132, 132 + 12 * int.from_bytes(profile[128:132], "big"), 12)
+        if profile[at : at + 4] == b"desc"
+    )
+    data = profile[place : place + size]
+    length = int.from_bytes(data[8:12], "big")
+    assert data[:8] == b"desc" + bytes(4)
+    assert data[12 : 12 + length].endswith(b"\0")
+    assert data[12 + length :] == bytes(8 + 3 + 67)
 
 
 def test_the_tagged_tiff_has_the_codes_of_the_untagged_one(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.presenter import BLACK, WHITE, Colour
+from drivers.presenter import BLACK, Colour
 from drivers.raw.rawfile import CHANNELS, Mosaic, Plane, channel_offset_px, phases, plane_of, read_raw, strongest_plane
 from experiment.chart.model import Chart
 from experiment.framing.finding import find_chart, find_tags
@@ -81,9 +81,7 @@ def test_pose_is_told(chart: Chart, tmp_path: Path) -> None:
     assert framing.residual_px < 0.3
 
 
-@pytest.mark.parametrize(
-    ("blur", "roll_deg", "good_to"), [(0.4, 0.0, 0.02), (0.6, 1.7, 0.02), (0.9, 180.6, 0.02), (1.2, 0.0, 0.06)]
-)
+@pytest.mark.parametrize(("blur", "roll_deg", "good_to"), [(0.4, 1.7, 0.02), (0.9, 180.6, 0.02), (1.2, 0.0, 0.06)])
 def test_blur_is_measured(chart: Chart, tmp_path: Path, blur: float, roll_deg: float, good_to: float) -> None:
     mosaic = hang(room=replace(FLAT, blur_px=blur, roll_deg=roll_deg)).mosaic(tmp_path)
     # A photosite is half a pixel wide (σ = 0.5/√12) and the two greens lie 0.25 px to either side.
@@ -97,7 +95,7 @@ def test_blur_of_red_lacks_the_greens_spacing(chart: Chart, tmp_path: Path) -> N
     assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=0.02)
 
 
-@pytest.mark.parametrize("colour", [WHITE, Colour(255, 0, 0), Colour(0, 0, 255), Colour(60, 60, 60)])
+@pytest.mark.parametrize("colour", [Colour(255, 0, 0), Colour(60, 60, 60)])
 def test_a_still_chart_does_not_move(chart: Chart, lab: Lab, white: Mosaic, tmp_path: Path, colour: Colour) -> None:
     framing = find_chart(white, chart)
     later = strongest_plane(lab.mosaic(tmp_path, colour, key=2))

@@ -18,7 +18,7 @@ from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
 from experiment.framing.field import field_mm
 from experiment.framing.finding import Framing, annotated_png, apparent_sizes, find_chart, small_parts_warning
-from experiment.framing.pictures import gauge_boxes, shift_between
+from experiment.framing.pictures import gauge_boxes, preview_jpeg, shift_between
 from sim.world.world import Room
 from tests.calibration.lab import Lab, hang, hang_chart
 from tests.data_files import shipped
@@ -49,7 +49,7 @@ def moved(plane: Plane, dx: float, dy: float) -> Plane:
     return replace(plane, values=values.astype(np.float32))
 
 
-@pytest.mark.parametrize("colour", [WHITE, Colour(255, 0, 0), Colour(0, 255, 0), Colour(0, 0, 255), Colour(60, 60, 60)])
+@pytest.mark.parametrize("colour", [Colour(255, 0, 0), Colour(0, 0, 255), Colour(60, 60, 60)])
 def test_a_still_field_does_not_move(white: Mosaic, framing: Framing, tmp_path: Path, colour: Colour) -> None:
     later = strongest_plane(lab_of(FILL).mosaic(tmp_path, colour, key=2))
     shift = shift_between(plane_of(white, later.channel), framing, later)
@@ -112,19 +112,31 @@ def test_only_the_boxes_are_looked_at(white: Mosaic, framing: Framing) -> None:
     assert (one.dx, one.dy, one.largest_px, one.gauges) == (other.dx, other.dy, other.largest_px, other.gauges)
 
 
-@pytest.mark.parametrize("colour", [WHITE, Colour(0, 0, 255)])
-@pytest.mark.parametrize("blur_px", [0.4, 0.5, 0.7, 0.85])
-@pytest.mark.parametrize("tags", [True, False])
-def test_a_softer_frame_is_measured(tmp_path: Path, colour: Colour, blur_px: float, tags: bool) -> None:
+SOFT = replace(FILL, blur_px=0.5)
+
+
+@cache
+def hung(tags: bool, blur_px: float) -> Lab:
+    room = replace(SOFT, blur_px=blur_px)
+    return hang(room=room) if tags else hang_chart(CHART, "Test", room)
+
+
+@pytest.mark.parametrize(
+    ("tags", "blur_px", "colour"),
+    [
+        (True, 0.4, WHITE),
+        (True, 0.85, Colour(0, 0, 255)),
+        (False, 0.85, WHITE),
+        (False, 0.7, Colour(0, 0, 255)),
+        (False, 0.5, WHITE),
+    ],
+)
+def test_a_softer_frame_is_measured(tmp_path: Path, tags: bool, blur_px: float, colour: Colour) -> None:
     """Photosites and lens add by their variances, so the difference is that of the lens alone."""
-    room = replace(FILL, blur_px=0.5)
-    sharp, soft = (
-        hang(room=each) if tags else hang_chart(CHART, "Test", each) for each in (room, replace(room, blur_px=blur_px))
-    )
-    before = sharp.mosaic(tmp_path)
-    later = strongest_plane(soft.mosaic(tmp_path, colour, key=2))
-    shift = shift_between(plane_of(before, later.channel), find_chart(before, sharp.chart), later)
-    true = blur_px**2 - 0.5**2
+    before = hung(tags, SOFT.blur_px).mosaic(tmp_path)
+    later = strongest_plane(hung(tags, blur_px).mosaic(tmp_path, colour, key=2))
+    shift = shift_between(plane_of(before, later.channel), find_chart(before, hung(tags, SOFT.blur_px).chart), later)
+    true = blur_px**2 - SOFT.blur_px**2
     assert shift.blur_growth_px2 == pytest.approx(true, rel=0.35, abs=0.05)
 
 
@@ -194,3 +206,20 @@ def test_a_photograph_without_the_chart_says_what_was_looked_for(chart: Chart) -
     strip = seen[-30:]
     assert (strip.max(axis=2) < 30).mean() > 0.5
     assert (strip[..., 1] - strip[..., 0] > 100).sum() > 100
+
+
+def test_a_preview_is_brightened_to_a_hundredth_of_white_and_marks_what_deviates(white: Mosaic) -> None:
+    def preview(share: float, boxes: tuple[tuple[int, int, int, int], ...] = ()) -> npt.NDArray[np.int64]:
+        even = replace(white, counts=np.full_like(white.counts, 1000 + round(10_000 * share)))
+        return picture(preview_jpeg(even, np.full((2, 2), 1000.0), np.full(3, 10_000.0), (), boxes, ""))
+
+    height, width = white.block_planes().shape[2:]
+    assert preview(0.5).shape == (height, width, 3)
+    # The picture shows the square root of the signal.
+    for share, grey in ((0.5, 255), (0.01, 255), (0.0025, 127), (0.0004, 51)):
+        assert np.abs(preview(share) - grey).max() <= 1
+    marked = preview(0.0025, ((40, 20, 60, 50),))
+    red = marked[..., 2] - marked[..., 1] > 60
+    rows, columns = np.flatnonzero(red.any(axis=1)), np.flatnonzero(red.any(axis=0))
+    assert (columns[0], rows[0], columns[-1], rows[-1]) == pytest.approx((40, 20, 59, 49), abs=1)
+    assert not red[25:45, 45:55].any()

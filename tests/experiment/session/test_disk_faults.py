@@ -107,17 +107,17 @@ def night() -> Generator[Night]:
 
 
 def test_a_call_that_fails_once(night: Night) -> None:
-    # Every third of four hundred, so that each of opening, reading, syncing and closing has its turn.
-    assert night.sweep([errno.EIO], lasting=False, every=3) > 20
+    # Every fifth of four hundred, so that each of opening, reading, syncing and closing has its turn.
+    assert night.sweep([errno.EIO], lasting=False, every=5) > 10
 
 
 def test_a_disk_that_fails_from_some_call_on(night: Night) -> None:
-    assert night.sweep([errno.EIO], lasting=True, every=4) > 20
+    assert night.sweep([errno.EIO], lasting=True, every=7) > 20
 
 
 def test_each_other_fault_of_a_disk(night: Night) -> None:
     others = [number for number in DISK_FAULTS if number != errno.EIO]
-    assert night.sweep(others, lasting=True, every=23) > 20
+    assert night.sweep(others, lasting=True, every=41) > 20
 
 
 def test_a_journal_that_is_damaged_is_called_so(night: Night) -> None:

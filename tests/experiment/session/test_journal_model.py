@@ -171,20 +171,12 @@ def test_a_journal_is_what_was_written(operations: list[tuple[str, Any]]) -> Non
 
 
 KILLED = """
-import os, signal, sqlite3, sys
+import itertools, os, signal, sqlite3, sys
 from pathlib import Path
 from experiment.session.journal import Journal
-from tests.experiment.session.test_journal_model import night
+from tests.experiment.session.test_journal_model import STEPS, night
 
 statements = 0
-
-def deadly(statement):
-    global statements
-    statements += 1
-    if statements == int(sys.argv[2]):
-        os.kill(os.getpid(), signal.SIGKILL)
-
-path = Path(sys.argv[1])
 connect = sqlite3.connect
 
 def watched(*given, **named):
@@ -192,16 +184,31 @@ def watched(*given, **named):
     connection.set_trace_callback(deadly)
     return connection
 
-sqlite3.connect = watched
-done = path.with_name("done")
-journal = Journal.open_for_run(path)
-for number, act in enumerate(night(journal)):
-    act()
-    done.write_text(str(number + 1))
-journal.close()
-print(statements)
+def deadly(statement):
+    global statements
+    statements += 1
+    if statements == number:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+for number in itertools.count(int(sys.argv[2]), int(sys.argv[2])):
+    path = Path(sys.argv[1]) / str(number) / "journal.sqlite"
+    path.parent.mkdir()
+    Journal.create(path, STEPS)
+    if not (pid := os.fork()):
+        sqlite3.connect = watched
+        journal = Journal.open_for_run(path)
+        for done, act in enumerate(night(journal), 1):
+            act()
+            path.with_name("done").write_text(str(done))
+        journal.close()
+        os._exit(0)
+    ended = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    print(number, ended, flush=True)
+    if ended != -signal.SIGKILL:
+        break
 """
-"""Writes a short night and is killed before the n-th statement that SQLite is given, whichever it is."""
+"""Writes a short night and is killed before the n-th, 2n-th … statement that SQLite is given, until one is left alive;
+each in a fork, since the imports take longer than the night."""
 
 GOOD = Judgement((Check("light", 0.1, None, 1.0, "%"), Check("movement", 0.0, None, 0.5, "px")), (1.0, 2.0, 3.0), b"m")
 
@@ -239,16 +246,14 @@ def test_a_kill_at_any_statement_leaves_the_last_transaction_or_the_one_before(t
         for act in night(model):
             act()
             states.append(state_after(model))
-    number = 0
-    while True:
-        number += 7  # every seventh of some ninety: the seven kinds of statements of a commit come in all places
+    # Every seventh of some ninety: the seven kinds of statements of a commit come in all places.
+    said = subprocess.check_output([sys.executable, "-c", KILLED, str(tmp_path), "7"], text=True)
+    *killed, (last, code) = ([int(word) for word in line.split()] for line in said.splitlines())
+    assert {ended for _, ended in killed} == {-signal.SIGKILL}
+    assert code == 0
+    assert last > 35
+    for number, _ in killed:
         path = tmp_path / f"{number}" / "journal.sqlite"
-        path.parent.mkdir()
-        Journal.create(path, STEPS)
-        ended = subprocess.run([sys.executable, "-c", KILLED, str(path), str(number)], capture_output=True, check=False)
-        if ended.returncode == 0:
-            break
-        assert ended.returncode == -signal.SIGKILL, ended.stderr
         done = path.with_name("done")
         finished = int(done.read_text() or 0) if done.exists() else 0
         with closing(Journal.open(path)) as reader:
@@ -259,4 +264,3 @@ def test_a_kill_at_any_statement_leaves_the_last_transaction_or_the_one_before(t
         with closing(sqlite3.connect(path)) as bare:
             assert bare.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         assert {file.name for file in path.parent.iterdir()} - {"done"} == {"journal.sqlite"}
-    assert number > 35

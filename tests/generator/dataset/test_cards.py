@@ -115,6 +115,7 @@ def test_sizes_are_the_hubs(images: int, name: str) -> None:
     assert size_category(images) == name
 
 
+@pytest.mark.slow
 def test_the_datasheet_has_its_sections_and_marks_what_is_open(made: Dataset) -> None:
     text = datasheet(made.description)
     assert tuple(re.findall(r"^## (.+)$", text, re.MULTILINE)) == SECTIONS

@@ -12,7 +12,6 @@ import struct
 import zlib
 from pathlib import Path
 
-import colour
 import cv2
 import imagecodecs
 import numpy as np
@@ -33,13 +32,13 @@ from generator.pictures.sources import (
     read_picture,
     to_srgb,
 )
-from tests.generator.pictures.icc import gamma_profile
+from tests.generator.pictures.icc import ADOBE_RGB, PROPHOTO_RGB, gamma_profile
 from tests.generator.pictures.oiio_files import write
 
 Codes = npt.NDArray[np.uint8]
 
-ADOBE_RGB = gamma_profile("Adobe RGB stand-in", 563 / 256, colour.RGB_COLOURSPACES["Adobe RGB (1998)"])
-PROPHOTO = gamma_profile("ProPhoto stand-in", 1.8, colour.RGB_COLOURSPACES["ProPhoto RGB"])
+ADOBE = gamma_profile("Adobe RGB stand-in", 563 / 256, ADOBE_RGB)
+PROPHOTO = gamma_profile("ProPhoto stand-in", 1.8, PROPHOTO_RGB)
 
 
 def save(path: Path, codes: Codes, icc: bytes | None) -> Path:
@@ -54,13 +53,16 @@ def dull() -> Codes:
     return np.random.default_rng(3).integers(90, 170, (16, 16, 3)).astype(np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("icc", "space"),
-    [(ADOBE_RGB, "Adobe RGB (1998)"), (PROPHOTO, "ProPhoto RGB")],
+    [(ADOBE, "Adobe RGB (1998)"), (PROPHOTO, "ProPhoto RGB")],
     ids=["adobe", "prophoto"],
 )
 @pytest.mark.parametrize("suffix", ["png", "tif", "jpg"])
 def test_codes_of_another_space_are_converted(tmp_path: Path, dull: Codes, icc: bytes, space: str, suffix: str) -> None:
+    import colour
+
     grey = np.full_like(dull, 120) if suffix == "jpg" else dull
     path = save(tmp_path / f"picture.{suffix}", grey, icc)
     reading = open_picture(path)
@@ -77,7 +79,7 @@ def test_codes_of_another_space_are_converted(tmp_path: Path, dull: Codes, icc: 
 
 
 def test_profiles_are_ignored_when_asked(tmp_path: Path, dull: Codes) -> None:
-    path = save(tmp_path / "picture.png", dull, ADOBE_RGB)
+    path = save(tmp_path / "picture.png", dull, ADOBE)
     reading = open_picture(path, Preparation(profiles="ignore"))
     np.testing.assert_array_equal(reading.picture, dull)
     assert reading.profile == "ignored, taken as sRGB"
@@ -95,7 +97,7 @@ def test_no_profile_is_said(tmp_path: Path, dull: Codes) -> None:
     assert open_picture(save(tmp_path / "picture.png", dull, None)).profile == "none, taken as sRGB"
 
 
-@pytest.mark.parametrize("icc", [b"", b"nonsense", ADOBE_RGB[:200]])
+@pytest.mark.parametrize("icc", [b"", b"nonsense", ADOBE[:200]])
 def test_a_damaged_profile_costs_no_picture(dull: Codes, icc: bytes) -> None:
     codes, word = to_srgb(dull, icc)
     np.testing.assert_array_equal(codes, dull)
@@ -111,7 +113,7 @@ def png_with(path: Path, codes: Codes, profile: bytes) -> bytes:
     return plain[:33] + whole + plain[33:]
 
 
-@pytest.mark.parametrize("profile", [b"rubbish", zlib.compress(b"no profile" * 30), zlib.compress(ADOBE_RGB[:200])])
+@pytest.mark.parametrize("profile", [b"rubbish", zlib.compress(b"no profile" * 30), zlib.compress(ADOBE[:200])])
 def test_a_profile_that_the_reader_drops_is_noted(tmp_path: Path, dull: Codes, profile: bytes) -> None:
     path = tmp_path / "picture.png"
     path.write_bytes(png_with(path, dull, profile))
@@ -119,7 +121,7 @@ def test_a_profile_that_the_reader_drops_is_noted(tmp_path: Path, dull: Codes, p
     np.testing.assert_array_equal(reading.picture, dull)
     assert reading.profile.startswith("damaged")
     assert reading.notes == (PROFILE_UNUSED,)
-    path.write_bytes(png_with(path, dull, zlib.compress(ADOBE_RGB)))
+    path.write_bytes(png_with(path, dull, zlib.compress(ADOBE)))
     assert open_picture(path).profile.endswith("converted to sRGB")
 
 
@@ -151,7 +153,7 @@ def test_a_camera_s_adobe_rgb_is_converted(
         np.testing.assert_array_equal(reading.picture, ignored.picture)
         assert reading.profile == "none, taken as sRGB"
         return
-    wanted, _ = to_srgb(ignored.picture, ADOBE_RGB)
+    wanted, _ = to_srgb(ignored.picture, ADOBE)
     assert np.abs(reading.picture.astype(int) - wanted).max() <= 1
     assert np.abs(reading.picture.astype(int) - ignored.picture).max() > 10
     assert reading.profile == "Adobe RGB (1998) by EXIF, converted to sRGB"
@@ -268,7 +270,7 @@ def test_codes_are_those_of_the_picture(avif_path: Path) -> None:
 
 @needs_avif
 def test_a_profile_is_converted(tmp_path: Path) -> None:
-    wide = gamma_profile("wide", 2.2, colour.RGB_COLOURSPACES["Adobe RGB (1998)"])
+    wide = gamma_profile("wide", 2.2, ADOBE_RGB)
     Image.fromarray(SMOOTH).save(tmp_path / "wide.avif", quality=95, subsampling="4:4:4", icc_profile=wide)
     Image.fromarray(SMOOTH).save(tmp_path / "wide.png", icc_profile=wide)
     read, other = open_picture(tmp_path / "wide.avif"), open_picture(tmp_path / "wide.png")

@@ -8,7 +8,6 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 
-import colour
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -37,6 +36,8 @@ ALL_CODES = np.array(list(product(range(0, 256, 8), repeat=3)), dtype=np.uint8)
 
 def absolute_lab(reflectance: NDArray[np.float64], bare: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return CIELAB (N, 3) under D50 relative to an ideal white, as instruments measure prints; or to a paper's."""
+    import colour
+
     shape = colour.SpectralShape(380, 780, 5)
     observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape).values
     light = observer * colour.SDS_ILLUMINANTS["D50"].copy().align(shape).values[:, None]
@@ -182,6 +183,7 @@ SOLID_LAB: dict[PaperName, list[list[int]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", PAPER_NAMES)
 def test_colours_relative_to_paper_are_those_of_the_published_observer_and_light(on: PaperName) -> None:
     reflectance = print_reflectance(SOLID_CODES, on)
@@ -189,8 +191,11 @@ def test_colours_relative_to_paper_are_those_of_the_published_observer_and_light
     np.testing.assert_allclose(relative_lab(reflectance, on), expected, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", SOLID_LAB)
 def test_solids_of_photo_papers_look_like_measured_ones(on: PaperName) -> None:
+    import colour
+
     white = relative_lab(print_reflectance([[255] * 3], on), on)
     np.testing.assert_allclose(white, [[100, 0, 0]], atol=1e-6)
     lab = absolute_lab(print_reflectance(SOLID_CODES, on))
@@ -204,6 +209,7 @@ def test_solids_of_photo_papers_look_like_measured_ones(on: PaperName) -> None:
 DENSITIES: dict[PaperName, tuple[float, float]] = {"poster": (1.4, 1.55), "matt": (1.6, 1.8), "glossy": (2.1, 2.42)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", DENSITIES)
 def test_black_is_as_dense_as_published(on: PaperName) -> None:
     lightness = float(absolute_lab(print_reflectance([[0, 0, 0]], on))[0, 0])
@@ -217,6 +223,7 @@ def test_black_is_as_dense_as_published(on: PaperName) -> None:
 HULLS: dict[PaperName, tuple[float, float]] = {"matt": (4.6e5, 5.4e5), "glossy": (5.8e5, 7.9e5)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", HULLS)
 def test_the_gamut_is_as_large_as_that_of_measured_prints(on: PaperName) -> None:
     steps = np.array(list(product(np.linspace(0, 255, 9), repeat=3)))

@@ -278,7 +278,7 @@ def test_the_lamps_light_scales_the_picture_but_not_the_rooms_own() -> None:
     np.testing.assert_allclose(world.signal(WHITE, REFERENCE_EXPOSURE, lamp=0), full * (0.001 / 1.001), rtol=1e-4)
 
 
-@pytest.mark.parametrize(("shutter_s", "percent"), [(1 / 60, 7), (1 / 8, 8.7), (0.25, 0.47), (0.5, 0.24), (1.0, 0.11)])
+@pytest.mark.parametrize(("shutter_s", "percent"), [(1 / 60, 7), (1 / 8, 8.7), (1.0, 0.11)])
 def test_a_colour_wheel_shakes_the_colour_of_short_exposures(shutter_s: float, percent: float) -> None:
     """Against an independent simulation of R/G with 0.5 ms of jitter and one turn in 1/60 s."""
     sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
