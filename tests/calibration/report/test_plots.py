@@ -154,10 +154,10 @@ def test_lights_are_drawn_at_their_chromaticities_in_the_triangle_of_all() -> No
 
 
 def test_a_cell_is_outlined_at_its_corners_and_its_samples_about_its_middle() -> None:
-    drawn: list[list[tuple[float, float]]] = []
+    lines: list[list[tuple[float, float]]] = []
 
     def plot(x: npt.ArrayLike, y: npt.ArrayLike, **_: object) -> None:
-        drawn.append([(float(one), float(other)) for one, other in zip(np.asarray(x), np.asarray(y), strict=True)])
+        lines.append([(float(one), float(other)) for one, other in zip(np.asarray(x), np.asarray(y), strict=True)])
 
     def seen(points_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         return 10 * points_mm
@@ -169,7 +169,7 @@ def test_a_cell_is_outlined_at_its_corners_and_its_samples_about_its_middle() ->
     picture, places = np.zeros((100, 500, 3), np.float32), np.array([[60.0, 50.0], [400.0, 50.0]])
     magnified = plots._magnified  # pyright: ignore[reportPrivateUsage]
     magnified(axes, picture, places[0], 30.0, chart, registration, places, 5)
-    cell, samples = drawn
+    cell, samples = lines
     assert cell == [(40, 40), (80, 40), (80, 60), (40, 60), (40, 40)]
     assert samples == [(57.5, 47.5), (62.5, 47.5), (62.5, 52.5), (57.5, 52.5), (57.5, 47.5)]
 

@@ -58,7 +58,7 @@ def test_response_frames_come_after_the_first_pair_and_are_taken_for_nothing_els
     assert all(step.illumination is None and max(step.colour) < 255 for step in response)
     assert response[0].stem == "0002_response"
     assert len(set(RESPONSE)) == len(RESPONSE)
-    lit = [sum(code > 0 for code in colour.codes) for colour in RESPONSE]
+    lit = [sum(code > 0 for code in colour) for colour in RESPONSE]
     assert lit == [1] * 3 + [3] * 12 + [2] * 3 + [1] * 3, "primaries, greys, pairs of primaries, primaries at half code"
 
 
