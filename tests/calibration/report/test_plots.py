@@ -52,6 +52,13 @@ def drawn(draw: Callable[..., None], *arguments: Any) -> Any:
     return figure
 
 
+def empty_axes() -> Any:
+    """Return axes on which nothing is drawn yet."""
+    from matplotlib.figure import Figure
+
+    return Figure().add_subplot()
+
+
 def mosaic_of(
     counts: np.ndarray[tuple[int, int], np.dtype[np.uint16]], pattern: str, masked: tuple[Area, ...] = ()
 ) -> Mosaic:
@@ -162,7 +169,7 @@ def test_a_cell_is_outlined_at_its_corners_and_its_samples_about_its_middle() ->
     def seen(points_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         return 10 * points_mm
 
-    axes: Any = drawn(lambda figure: figure.add_subplot()).axes[0]
+    axes: Any = empty_axes()
     axes.plot = plot
     chart: Any = SimpleNamespace(cell_mm=(4, 2), centres_mm=np.array([[6.0, 5.0], [40.0, 5.0]]))
     registration: Any = SimpleNamespace(cell_px=20, to_pixels=seen)
@@ -423,7 +430,7 @@ def test_a_course_in_which_nothing_happens_has_no_ring_and_one_of_few_colours_sa
 
 def test_a_name_at_the_edge_of_a_plot_is_turned_inwards() -> None:
     for x, y, ha, text in ((0.69, 0.69, "left", (8, 8)), (0.71, 0.71, "right", (-8, -14))):
-        axes: Any = drawn(lambda figure: figure.add_subplot()).axes[0]
+        axes: Any = empty_axes()
         axes.set(xlim=(10, 30), ylim=(-5, 5))
         place = (10 + 20 * x, -5 + 10 * y)
         plots._ring(axes, *place, "here")  # pyright: ignore[reportPrivateUsage]

@@ -200,7 +200,7 @@ def test_kernel_ridge_refuses_a_power_of_brightness_that_is_none(power: float) -
 @pytest.mark.parametrize("learner", [KernelRidge, LogChroma])
 def test_counts_of_the_largest_working_size_are_not_cut(learner: type[KernelRidge | LogChroma]) -> None:
     image = np.full((255, 255, 3), RED, np.float32)
-    own = {"brightness": 0.0} if learner is KernelRidge else {}
+    own: dict[str, Any] = {"brightness": 0.0} if learner is KernelRidge else {}
     counts: Any = learner(working_size=255, **own).features(image)
     assert counts.max() == 255 * 255
     with pytest.raises(ValueError, match="a working size of 256 px; expected 1 to 255"):
