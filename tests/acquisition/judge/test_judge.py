@@ -110,7 +110,7 @@ def test_another_light_of_the_plan_is_named(taught: Bench) -> None:
     other = lab.lights[300].colour
     seen = lab.show(lab.counts(lab.light(*other)), lab.light(*ORANGE))
     assert cause(seen) == "light"
-    assert str(other) in seen.reason
+    assert str(tuple(other)) in seen.reason
 
 
 @pytest.mark.parametrize(("codes", "pixels"), [(ORANGE, 0.3), (DEEP_BLUE, 1.0), (DEEP_BLUE, 3.0), (ORANGE, 8.0)])
