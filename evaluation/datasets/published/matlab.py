@@ -34,6 +34,8 @@ _NUMERIC: Final = frozenset(range(6, 16))
 """Classes mxDOUBLE_CLASS to mxUINT64_CLASS."""
 _COMPLEX: Final = 0x0800
 """Flag of an array that has imaginary parts."""
+_EMPTY_LINES: Final = 1000
+"""Lines of text that may have no bytes: SciPy makes a string of each, and a damaged file may say billions."""
 _DEEPEST: Final = 20
 """Deepest nesting of cells that is followed; ground truths have two."""
 _LARGEST: Final = 1 << 28
@@ -144,6 +146,9 @@ def _check_array(data: bytes, array: _Element, order: str, depth: int) -> None:
         _check_numbers(values[2:], 1 + is_complex, None, _SIZES)
     elif kind == _CHAR:
         _check_numbers(values, 1, None, _TEXT)
+        rows, size = math.prod(sides[:-1]), values[0].end - values[0].begin
+        if rows > size + _EMPTY_LINES:
+            raise ValueError(f"byte {dimensions.begin}: {rows} lines of text in {size} bytes")
     elif kind in _NUMERIC:
         _check_numbers(values, 1 + is_complex, count, _SIZES)
     else:

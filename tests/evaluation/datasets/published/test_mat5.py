@@ -77,6 +77,14 @@ def test_a_type_that_scipy_would_follow_out_of_its_table_is_refused() -> None:
         check_mat5(plain[:at] + struct.pack("<I", 12345) + plain[at + 4 :])
 
 
+def test_lines_of_text_that_have_no_bytes_are_refused() -> None:
+    plain = written(False, {"none": np.array([""])})
+    at = plain.index(struct.pack("<IIii", 5, 8, 0, 0))
+    check_mat5(plain[: at + 8] + struct.pack("<ii", 1000, 0) + plain[at + 16 :])
+    with pytest.raises(ValueError, match="1001 lines of text in 0 bytes"):
+        check_mat5(plain[: at + 8] + struct.pack("<ii", 1001, 0) + plain[at + 16 :])
+
+
 def test_values_that_are_not_as_many_as_the_dimensions_are_refused() -> None:
     plain = written(False, {"gt": np.array([[0.25, 0.5, 0.75]])})
     at = plain.index(struct.pack("<ii", 1, 3))
