@@ -7,11 +7,11 @@ mean in logarithms, the first with the weight w.
 What was learned elsewhere is taken to be worth as much as W images, `WORTH`, however many it was learned of. Methods
 that learn of both together let each of the N weigh by that; and w begins with stacking (L. Breiman, "Stacked
 regressions", Machine Learning 24, 1996) under a prior. The least sum of errors on the N, each estimated by models that
-have not seen it, would choose it, and on twenty images choose badly; so that much is added for a w other than
-W / (W + N) as `STRENGTH` images would. The models that are compared are both worse than what they stand for: the one
-is not yet tuned, the other has learned of fewer than N. What was learned elsewhere does not grow better with N: so w is
-multiplied by W⁴ / (W⁴ + N⁴), and from twice W on little is left of it whatever stacking says. No image that is tested
-on has a part in it.
+have not seen it, would choose it, and on twenty images choose badly; so that much is added for a w other than expected
+as `STRENGTH` images would: expected is W / (W + N), and 1 where the first was tuned, and so knows the N as well. The
+models that are compared are both worse than what they stand for: the one is not yet tuned, the other has learned of
+fewer than N. What was learned elsewhere does not grow better with N: so w is multiplied by W⁴ / (W⁴ + N⁴), and from
+twice W on little is left of it whatever stacking says. No image that is tested on has a part in it.
 
 `WORTH`, `STRENGTH` and how each method tunes were chosen by docs/transfer.md#what-was-chosen-and-on-what.
 """
@@ -83,14 +83,15 @@ def adapt(taught: LearnedMethod, alone: LearnedAlone, worth: float = WORTH) -> L
     if not worth > 0:
         return alone.method
     elsewhere, count = taught.model, len(alone.features)
-    share = worth / (worth + count)
+    # What was adapted before has two models, each of another camera: it is taken as it is.
+    tuned = elsewhere
+    if not isinstance(elsewhere, BlendedModel):
+        tuned = taught.learner.tune(elsewhere, alone.features, alone.truths, worth, alone.seed)
+    share = worth / (worth + count) if tuned is elsewhere else 1.0
     if alone.held_out is not None:
         share = stacked_share(elsewhere.lights(alone.features), alone.held_out, alone.truths, share)
     share *= worth**4 / (worth**4 + count**4)
-    # What was adapted before has two models, each of another camera: it is taken as it is.
-    if not isinstance(elsewhere, BlendedModel):
-        elsewhere = taught.learner.tune(elsewhere, alone.features, alone.truths, worth, alone.seed)
-    return replace(taught, model=BlendedModel(elsewhere, alone.method.model, np.array(share)))
+    return replace(taught, model=BlendedModel(tuned, alone.method.model, np.array(share)))
 
 
 def stacked_share(

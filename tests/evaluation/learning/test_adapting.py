@@ -100,6 +100,15 @@ def test_the_share_is_the_prior_where_the_two_agree_and_within_0_and_1() -> None
     assert stacked_share(far, beyond, truths, 0.0) == 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "expected"), [("kernel-ridge", 1.0), ("constant-light", 200 / 202)])
+def test_what_was_tuned_knows_the_images_already(name: str, expected: float) -> None:
+    # Two images are too few to choose: the opinion stands, less what falls with their number.
+    found = adapted(LEARNERS[name].fit(ELSEWHERE), HERE[:2]).model
+    assert isinstance(found, BlendedModel)
+    assert found.share == pytest.approx(expected * 200**4 / (200**4 + 2**4), rel=1e-12)
+
+
 def test_a_damaged_share_is_refused(tmp_path: Path) -> None:
     learner = LEARNERS["kernel-ridge"]
     method = adapted(learner.fit(ELSEWHERE[:5]), HERE)

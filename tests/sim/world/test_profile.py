@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from functools import cache
 from itertools import product
+from typing import Any
 
 import colour
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sim import spectral
 from sim.spectral import (
     PaperName,
     ProfileName,
@@ -129,3 +131,11 @@ def test_an_unmanaged_print_sends_codes_as_they_are_and_unknown_names_are_refuse
         printed_reflectance(CODES, "icc")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="paper 'silk': known are poster, matt, glossy"):
         printed_reflectance(CODES, "managed", "silk")  # pyright: ignore[reportArgumentType]
+
+
+def test_srgb_under_d50_is_the_adapted_matrix_of_its_primaries() -> None:
+    space = colour.RGB_COLOURSPACES["sRGB"]
+    whites: Any = [colour.xy_to_XYZ(xy) for xy in (space.whitepoint, (0.3457, 0.3585))]
+    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(*whites, transform="Bradford")
+    found = spectral._SRGB_TO_D50  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(found, adapt @ space.matrix_RGB_to_XYZ, atol=2e-4)
