@@ -118,3 +118,9 @@ def test_the_live_judge_follows_a_lasting_change_as_far_as_a_table_is_made() -> 
     assert judge.LAMP_TOTAL == 15.0
     assert judge.LIGHT_FOLLOWED_DEG == 2.0
     assert judge.ADDED_LEAST == 0.004
+
+
+@pytest.mark.parametrize(("frames", "expected"), [(1, None), (2, 1.0), (5, 1.0)])
+def test_white_frames_are_counted_where_there_is_more_than_one_frame(frames: int, expected: float | None) -> None:
+    table: Any = SimpleNamespace(white_frames=("white",), frames=("frame",) * frames)
+    assert radiometry.WHITE_FRAMES.measure(table) == expected

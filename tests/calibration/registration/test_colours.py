@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.registration.colours import agreement, mismatched, slipped_parts
+from calibration.registration.colours import ColourModel, agreement, mismatched, slipped_parts
 from experiment.chart.layout import A_SERIES_MM, design_chart
 
 PAPER = np.array([8000.0, 9000.0, 7000.0])
@@ -69,3 +69,14 @@ def test_a_part_with_the_colours_of_its_neighbours_is_found(slipped: bool) -> No
     assert places.tolist() == ([[8.0, 24.0]] if slipped else [])
     # Parts at the rim lack a neighbour to compare with.
     assert 1 <= parts <= 6
+
+
+def test_light_on_the_page_is_a_polynomial_of_second_order() -> None:
+    light = np.arange(18.0).reshape(6, 3)
+    points = np.array([[25.0, 150.0], [80.0, 60.0]])
+    # A page of 100 x 200 mm: -1 at its left and upper edge, 1 at the others.
+    x, y = np.array([-0.5, 0.6]), np.array([0.5, -0.4])
+    expected = light[0] + np.outer(x, light[1]) + np.outer(y, light[2])
+    expected += np.outer(x**2, light[3]) + np.outer(x * y, light[4]) + np.outer(y**2, light[5])
+    model = ColourModel(1, np.zeros((4, 3)), light, (100.0, 200.0))
+    np.testing.assert_allclose(model.light_at(points), expected)

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from calibration.table.lut import LutWriter, Provenance, map_samples, open_lut
+from calibration.table.lut import MOST_WHITE, LutWriter, Provenance, map_samples, open_lut
 from calibration.table.verification import find_faults
 from foundation.errors import FormatError, InputError, StorageError
 from tests.calibration.table.tables import FRAMES, LIGHTS, flip, write
@@ -24,6 +24,17 @@ def test_the_hashes_are_those_of_the_files(tmp_path: Path) -> None:
     assert record["lights_sha256"] == [hashlib.sha256(slab.tobytes()).hexdigest() for slab in lut.samples]
     assert list(lut.frames) == FRAMES
     assert find_faults(lut) == []
+
+
+@pytest.mark.parametrize("wrong", [0, -1, MOST_WHITE, "nan"])
+def test_a_ground_truth_that_was_not_measured_is_refused(wrong: object, tmp_path: Path) -> None:
+    path = write(tmp_path / "lut").folder / "illuminations.csv"
+    header, first, *others = path.read_text().splitlines()
+    row = first.split(",")
+    row[header.split(",").index("white_g")] = str(wrong)
+    path.write_text("\n".join([header, ",".join(row), *others, ""]))
+    with pytest.raises(FormatError, match=f"not between 0 and {MOST_WHITE}"):
+        open_lut(path.parent)
 
 
 def test_a_disk_that_forgets_is_noticed(tmp_path: Path) -> None:

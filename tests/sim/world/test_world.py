@@ -6,9 +6,10 @@ Probabilities of a false alarm are about one in a million for each statistical t
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import product
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
+from foundation.errors import ConfigurationError
+from sim.world import sensors
 from sim.world.rendering import Print
 from sim.world.sensors import BODIES, Body, Rectangle
 from sim.world.world import REFERENCE_EXPOSURE, Room, World
@@ -457,3 +460,19 @@ def test_hot_photosites_add_to_light_and_leave_all_others_as_they_were() -> None
 
 def squares_sheet() -> Print:
     return Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("changed", "allowed"),
+    [
+        ({"read_noise_dn": 0.0, "sensor_noise_e": 0.0}, True),
+        ({"read_noise_dn": -0.01, "sensor_noise_e": 0.0}, False),
+        ({"electrons_per_dn": 0.0}, False),
+        ({"black": -1}, False),
+        ({"black": 0}, True),
+    ],
+)
+def test_numbers_that_no_sensor_has_are_refused(changed: dict[str, Any], allowed: bool) -> None:
+    require = sensors._require_sensor  # pyright: ignore[reportPrivateUsage]
+    with nullcontext() if allowed else pytest.raises(ConfigurationError, match=f"body.{next(iter(changed))} is"):
+        require(replace(BODIES["Test"], **changed), "lab.toml", "body")
