@@ -77,11 +77,13 @@ def train(
     require_free_file(out, "the model")
     require_installed(learner)
     known = None if adapt is None else _model_to_adapt(adapt, method, data)
-    if known is not None and known.learner != learner:
-        raise InputError(
-            f"{adapt} is of {known.learner.key}, {'other settings' if known.learner.key == learner.key else method} "
-            f"was asked for; name a model of the same method and settings"
-        )
+    if known is not None:
+        if known.learner.key != learner.key:
+            raise InputError(
+                f"{adapt} is of {known.learner.key}, {method} was asked for; name a model of the same method"
+            )
+        # With the settings of then, which those of today need not be.
+        learner = known.learner
     found = reading.open(data)
     truths = truths_of(found.scenes)
     count = len(found.scenes)

@@ -80,6 +80,8 @@ def adapt(taught: LearnedMethod, alone: LearnedAlone, worth: float = WORTH) -> L
 
     `worth`: images that the former is taken to be worth, 0 for nothing: then the latter is returned.
     """
+    if taught.learner != alone.method.learner:
+        raise ValueError(f"{taught.learner} was learned elsewhere, {alone.method.learner} here; expected the same")
     if not worth > 0:
         return alone.method
     elsewhere, count = taught.model, len(alone.features)

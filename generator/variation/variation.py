@@ -458,5 +458,5 @@ class Variation:
 def varied_by(
     lut: Lut, exposure: ExposureChoice | None = None, gradient: Gradient | None = None, iso: IsoSpeed | None = None
 ) -> Variation:
-    """Return the variation of images of a table, whose noise is measured."""
+    """Return the variation of images of a table, whose noise is measured; one of the three must be given."""
     return Variation(exposure, gradient, iso, noise=measured_noise(lut))

@@ -44,6 +44,9 @@ _SLANTED_DEG: Final = 30.0
 """Direction of a push, clockwise from the right: along neither axis."""
 
 
+_Code = Annotated[int, Field(ge=0, le=255)]
+
+
 @dataclass(frozen=True)
 class Moment:
     """When a frame is exposed, and what is ordered.
@@ -143,7 +146,7 @@ class PopUp(Disturbance):
 
     what: Literal["pop-up"] = "pop-up"
     place: Place = (0.55, 0.05, 0.9, 0.3)
-    colour: tuple[int, int, int] = (255, 136, 0)
+    colour: tuple[_Code, _Code, _Code] = (255, 136, 0)
     share: float = 1.0
 
     def changed(self, situation: Situation, moment: Moment) -> Situation:
@@ -449,6 +452,8 @@ def _said_of(fault: ErrorDetails) -> str:
 _EXPECTED: Final = {
     "float_": "a number",
     "int_": "a whole number",
+    "greater_than_equal": "a code from 0 to 255",
+    "less_than_equal": "a code from 0 to 255",
     "bool_": "true or false",
     "tuple_type": "a list of numbers",
     "too_": "a shorter list",

@@ -295,6 +295,8 @@ def test_every_event_is_there_when_said_and_leaves_other_frames_as_they_are(bare
         ("bump", "simulated.events[0] = 'bump'"),
         ({"what": "bump", "size": 3}, "simulated.events[0].size"),
         ({"what": "pop-up", "colour": [1, 2]}, "simulated.events[0].colour"),
+        ({"what": "pop-up", "colour": [-1, 0, 0]}, "simulated.events[0].colour"),
+        ({"what": "pop-up", "colour": [0, 0, 256]}, "= 256: a code from 0 to 255 is expected; correct it"),
         ({"what": "lamp drift"}, "to_frame or to_s: one of them must be given"),
         ({"what": "person", "from_frame": 5, "to_frame": 3}, "ends with to_frame = 3 before it begins"),
     ],
