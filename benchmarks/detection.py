@@ -53,7 +53,7 @@ def neighbours(model: ProjectorModel, plan: Sequence[Illumination]) -> tuple[int
         pairs |= {(min(k, n), max(k, n)) for n in near if codes[n] == codes[k]}
     lights = {one for pair in pairs for one in pair}
     following = sum((k, k + 1) in pairs for k in range(len(plan) - 1))
-    return len(lights), following, [f"{plan[a].colour} and {plan[b].colour}" for a, b in sorted(pairs)]
+    return len(lights), following, [f"{tuple(plan[a].colour)} and {tuple(plan[b].colour)}" for a, b in sorted(pairs)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

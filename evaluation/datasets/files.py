@@ -374,7 +374,7 @@ def box_mask(shape: tuple[int, int], rows: slice, columns: slice) -> Mask:
     return mask
 
 
-def chart_mask(shape: tuple[int, int], corners: npt.NDArray[np.float64], path: str = "") -> Mask:
+def chart_mask(shape: tuple[int, int], corners: npt.NDArray[np.float64], path: str) -> Mask:
     """Return a mask (H, W) bool of that shape, True in and on a chart; a FormatError where corners are far outside.
 
     `corners`: (N, 2) float64, x then y, px, pixel centres at integers; rounded to whole pixels. `path`: of the image
@@ -382,7 +382,7 @@ def chart_mask(shape: tuple[int, int], corners: npt.NDArray[np.float64], path: s
 
     Examples
     --------
-    >>> chart_mask((3, 4), np.array([[1.0, 0.0], [2.0, 0.0], [2.0, 1.2], [1.0, 1.2]])).astype(int)
+    >>> chart_mask((3, 4), np.array([[1.0, 0.0], [2.0, 0.0], [2.0, 1.2], [1.0, 1.2]]), "a.png").astype(int)
     array([[0, 1, 1, 0],
            [0, 1, 1, 0],
            [0, 0, 0, 0]])

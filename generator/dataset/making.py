@@ -468,8 +468,7 @@ def _taken_up(image: FinishedImage) -> Sample:
 def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
     options = job.options
     lightings = job.choice.lightings_of(job.position * options.crops)
-    tints = options.variation is not None and options.variation.tints
-    maps = tints or any(lighting.masks is not None for lighting in lightings)
+    maps = options.tints or any(lighting.masks is not None for lighting in lightings)
     return open_writer(options.layout, place.files, job.shard, Beside(options.previews, maps, options.has_details))
 
 
@@ -633,11 +632,10 @@ def _photographed(
     most = white_level if options.variation is None else LARGEST_COUNT
     taken = source.black_taken
     image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
-    varied, tints = Varied(), False
+    varied = Varied()
     if options.variation is not None:
         varied = options.variation.apply(image, white_level, job.seed, number)
-        tints = options.variation.tints
-    light = _image_light(lut, lighting, weights, varied, tints)
+    light = _image_light(lut, lighting, weights, varied, options.tints)
     stored, level = (image, white_level) if options.scale == "table" else (to_full_scale(image, white_level), FULL)
     metadata = ImageMetadata(level, light.truth, lut.provenance.camera)
     files: list[tuple[str, str, Pieces]] = [

@@ -133,6 +133,11 @@ class DatasetOptions:
         return self.variation is not None or self.crops > 1 or self.weighted or self.is_rendered
 
     @property
+    def tints(self) -> bool:
+        """Whether the light of an image changes its colour over it, so that images have maps of it."""
+        return self.variation is not None and self.variation.tints
+
+    @property
     def is_rendered(self) -> bool:
         """Whether images are not rendered by codes with the print's black kept."""
         return self.rendering != "codes" or self.black_point.kind != "keep"
@@ -326,12 +331,7 @@ class Plan:
             )
         if self.total > 1 << 32:
             raise InputError(f"{self.total} images are more than a dataset holds, 2^32; make several, each with a seed")
-        variation = self.options.variation
-        if (
-            variation is not None
-            and variation.tints
-            and any(lighting.masks for lighting in self.choice.lightings_of(0))
-        ):
+        if self.options.tints and any(lighting.masks for lighting in self.choice.lightings_of(0)):
             raise InputError(
                 "a gradient with a colour and several lights an image were both asked for, but masks tell either; "
                 "leave out colour, or ask for one light"

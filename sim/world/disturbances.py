@@ -45,6 +45,7 @@ _SLANTED_DEG: Final = 30.0
 
 
 _Code = Annotated[int, Field(ge=0, le=255)]
+"""A code of a colour, as files of settings give it."""
 
 
 @dataclass(frozen=True)

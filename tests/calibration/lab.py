@@ -82,6 +82,11 @@ class Lab:
         aside = np.array([mosaic.visible.left - visible.left, mosaic.visible.top - visible.top]) / 2
         return self.world.project(points_mm) - aside
 
+    def miss_px(self, mosaic: Mosaic) -> npt.NDArray[np.float64]:
+        """Return how far the registered cells lie from the truth, px."""
+        places = register(mosaic, self.chart).to_pixels(self.chart.centres_mm)
+        return np.linalg.norm(places - self.truth_px(self.chart.centres_mm, mosaic), axis=1)
+
 
 @cache
 def designed(bits: int, page: str, seed: int) -> tuple[Chart, Print]:

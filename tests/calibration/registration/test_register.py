@@ -35,25 +35,18 @@ def registered(lab: Lab, white: Mosaic) -> Registration:
     return register(white, lab.chart)
 
 
-def miss(lab: Lab, mosaic: Mosaic) -> npt.NDArray[np.float64]:
-    """Return how far the registered cells lie from the truth, px."""
-    registration = register(mosaic, lab.chart)
-    places = registration.to_pixels(lab.chart.centres_mm)
-    return np.linalg.norm(places - lab.truth_px(lab.chart.centres_mm, mosaic), axis=1)
-
-
 def test_a_chart_of_4096_colours_in_the_default_room(tmp_path: Path) -> None:
     """Its cells are as large as a whole chart's on a whole frame, which `benchmarks.rooms` registers."""
     lab = hang_chart(design_chart(4, A_SERIES_MM["A2"]), QUARTER, Room())
     mosaic = lab.mosaic(tmp_path)
-    error = miss(lab, mosaic)
+    error = lab.miss_px(mosaic)
     assert np.sqrt(np.mean(error**2)) < 0.05
     assert error.max() < 0.3
 
 
 @pytest.mark.parametrize("colour", [WHITE, Colour(255, 0, 0), Colour(0, 0, 255), Colour(90, 60, 20)])
 def test_every_light_registers(lab: Lab, tmp_path: Path, colour: Colour) -> None:
-    error = miss(lab, lab.mosaic(tmp_path, colour))
+    error = lab.miss_px(lab.mosaic(tmp_path, colour))
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert error.max() < 0.6
 
@@ -61,7 +54,7 @@ def test_every_light_registers(lab: Lab, tmp_path: Path, colour: Colour) -> None
 @pytest.mark.parametrize(("bits", "page", "roll"), [(1, "A7", 180.0), (2, "A6", 0.5), (3, "A5", 180.0)])
 def test_small_charts_upright_and_upside_down(tmp_path: Path, bits: int, page: str, roll: float) -> None:
     lab = hang(bits, page, room=Room(waviness_mm=0.5, roll_deg=roll))
-    error = miss(lab, lab.mosaic(tmp_path))
+    error = lab.miss_px(lab.mosaic(tmp_path))
     assert np.sqrt(np.mean(error**2)) < 0.15
     assert error.max() < 0.6
 

@@ -14,7 +14,6 @@ from calibration.registration.register import Registration, register
 from drivers.presenter import Colour
 from drivers.raw.rawfile import CHANNELS, Mosaic
 from experiment.chart.layout import paper_chart
-from experiment.chart.model import Chart
 from experiment.framing.field import field_mm
 from foundation.errors import RegistrationError
 from sim.world.world import Room
@@ -41,15 +40,9 @@ def registered(plain: Lab, white: Mosaic) -> Registration:
     return register(white, plain.chart)
 
 
-def miss(lab: Lab, mosaic: Mosaic, chart: Chart | None = None) -> npt.NDArray[np.float64]:
-    """Return how far the registered cells lie from the truth, px."""
-    places = register(mosaic, chart or lab.chart).to_pixels(lab.chart.centres_mm)
-    return np.linalg.norm(np.asarray(places - lab.truth_px(lab.chart.centres_mm, mosaic)), axis=1)
-
-
 @pytest.mark.parametrize("colour", [Colour(110, 70, 20), Colour(0, 0, 255)])
 def test_every_light_that_shows_which_way_up_registers(plain: Lab, tmp_path: Path, colour: Colour) -> None:
-    error = miss(plain, plain.mosaic(tmp_path, colour))
+    error = plain.miss_px(plain.mosaic(tmp_path, colour))
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert error.max() < 0.4
 
@@ -107,7 +100,7 @@ def test_a_flat_sheet_has_no_uncertain_cell(plain: Lab, white: Mosaic, registere
 
 def test_upside_down_is_the_same_chart(tmp_path: Path) -> None:
     lab = hang_chart(SMALL, "Test", Room(waviness_mm=0.5, roll_deg=180.0))
-    assert miss(lab, lab.mosaic(tmp_path)).max() < 0.4
+    assert lab.miss_px(lab.mosaic(tmp_path)).max() < 0.4
 
 
 def test_a_large_grid_on_a_sheet_that_waves_by_six_millimetres(tmp_path: Path) -> None:
