@@ -33,6 +33,8 @@ class JoinedLink:
         coming = self._incoming
         with self._changed:
             if not self._changed.wait_for(lambda: coming.waiting or coming.closed or self._outgoing.closed, timeout):
+                if not timeout:
+                    return b""
                 raise LinkTimeout("nothing came")
             taken, coming.waiting = coming.waiting[:limit], coming.waiting[limit:]
         if not taken or self._outgoing.closed:

@@ -26,7 +26,10 @@ class Link(Protocol):
         ...
 
     def read(self, limit: int, timeout: float) -> bytes:
-        """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first."""
+        """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first.
+
+        A timeout of 0 asks whether something is there: it brings b"" where nothing is, and is no fault.
+        """
         ...
 
     def close(self) -> None:
@@ -81,12 +84,14 @@ class PeerLink:
             self._incoming += self._peer.receive(data)
 
     def read(self, limit: int, timeout: float) -> bytes:
-        """Return up to `limit` bytes of what the peer has answered."""
+        """Return up to `limit` bytes of what the peer has answered; b"" if there is nothing and `timeout` is 0."""
         if not self._open:
             raise LinkClosed("this end of the simulated cable was closed; open a new connection")
         if not self._incoming:
             if self._peer.closed:
                 raise LinkClosed("the simulated device hung up; open a new connection")
+            if not timeout:
+                return b""
             raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s")
         taken = bytes(self._incoming[:limit])
         del self._incoming[:limit]
@@ -230,9 +235,12 @@ class Exchange:
             if remaining < 0:
                 raise self._silent(wait)
             try:
-                self._rest += link.read(MAX_MESSAGE, remaining)
+                came = link.read(MAX_MESSAGE, remaining)
             except LinkTimeout as error:
                 raise self._silent(wait) from error
+            if not came:
+                raise self._silent(wait)
+            self._rest += came
             remaining = deadline - self._clock.monotonic()
         message, length = taken
         _log.debug("received %r", self._rest[:length])
@@ -243,9 +251,7 @@ class Exchange:
         self._rest = b""
         # Whoever never stops talking is met by the limit of the next message.
         for _ in range(MAX_MESSAGE):
-            try:
-                link.read(MAX_MESSAGE, 0.0)
-            except LinkTimeout:
+            if not link.read(MAX_MESSAGE, 0.0):
                 return
 
     def _silent(self, wait: float) -> LinkTimeout:

@@ -61,10 +61,12 @@ class TcpLink:
             raise self._translated(error, f"{self._far_end} takes no data for {timeout:g} s") from error
 
     def read(self, limit: int, timeout: float) -> bytes:
-        """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first."""
+        """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first; see `Link.read`."""
         try:
             self._limit(timeout)
             data = self._socket.recv(limit)
+        except BlockingIOError:
+            return b""
         except OSError as error:
             raise self._translated(error, f"{self._far_end} sent nothing for {timeout:g} s") from error
         if not data:

@@ -58,7 +58,7 @@ class SerialLink:
             raise self._late(timeout)
 
     def read(self, limit: int, timeout: float) -> bytes:
-        """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first."""
+        """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first; see `Link.read`."""
         try:
             if self._port.timeout != timeout:
                 self._port.timeout = timeout
@@ -68,7 +68,7 @@ class SerialLink:
         # pyserial lets a TypeError through when the port is closed while it is read.
         except (OSError, TypeError) as error:
             raise self._lost(error) from error
-        if not data:
+        if not data and timeout:
             raise LinkTimeout(
                 f"{self._device} brought nothing for {timeout:g} s; check the cable, and that the device is on"
             )

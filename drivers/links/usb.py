@@ -52,8 +52,8 @@ class Pipe(Enum):
 class UsbPipes(Protocol):
     """The open, claimed interface of one device.
 
-    Every method raises `LinkTimeout` when nothing happened in time, `LinkClosed` when the device is gone, and, where
-    it transfers, `PipeStalled`.
+    Every method but `interrupt_read` raises `LinkTimeout` when nothing happened in time; all raise `LinkClosed` when
+    the device is gone, and, where they transfer, `PipeStalled`.
     """
 
     @property
@@ -83,7 +83,7 @@ class UsbPipes(Protocol):
         ...
 
     def interrupt_read(self, timeout: float) -> bytes:
-        """Return the next packet of the interrupt pipe."""
+        """Return the next packet of the interrupt pipe; b"" where none comes in time, as most often."""
         ...
 
     def control_out(self, request: int, data: bytes, timeout: float) -> None:
@@ -307,10 +307,15 @@ class OpenUsbDevice(_ClaimedDevice):
             return self._device.read(self._interface.addresses[Pipe.BULK_IN], limit, _milliseconds(timeout)).tobytes()
 
     def interrupt_read(self, timeout: float) -> bytes:
-        """Return the next packet of the interrupt pipe."""
+        """Return the next packet of the interrupt pipe; b"" where none comes in time."""
         with self._transfer(f"has no event for {timeout:g} s"):
             address = self._interface.addresses[Pipe.INTERRUPT_IN]
-            return self._device.read(address, self._interface.interrupt_size, _milliseconds(timeout)).tobytes()
+            try:
+                return self._device.read(address, self._interface.interrupt_size, _milliseconds(timeout)).tobytes()
+            except usb.core.USBError as error:
+                if isinstance(error, usb.core.USBTimeoutError) or error.errno == errno.ETIMEDOUT:
+                    return b""
+                raise
 
     def control_out(self, request: int, data: bytes, timeout: float) -> None:
         """Send a request of the interface's class on the control pipe."""

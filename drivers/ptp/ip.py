@@ -402,7 +402,10 @@ class Channel:
     def next(self, timeout: float) -> Packet:
         """Return the next packet, waiting `timeout` seconds for each of its bytes."""
         while not self._packets:
-            self._packets.extend(self._cutter.feed(self._link.read(READ, timeout)))
+            piece = self._link.read(READ, timeout)
+            if not piece:
+                raise LinkTimeout("no packet waits")
+            self._packets.extend(self._cutter.feed(piece))
         return self._packets.popleft()
 
     def close(self) -> None:

@@ -309,10 +309,10 @@ class UsbTransport(CableTransport):
         while len(events) < MAX_EVENTS:
             try:
                 piece = self._pipes.interrupt_read(self._pipes.polling_s)
-            except LinkTimeout:
-                break
             except PipeStalled:
                 self._pipes.clear_halt(Pipe.INTERRUPT_IN)
+                break
+            if not piece:
                 break
             try:
                 messages = self._events_reader.feed(piece)
@@ -320,8 +320,6 @@ class UsbTransport(CableTransport):
                 self._events_reader = ContainerReader(self._pipes.packet_size)
                 raise
             events += [message for message in messages if isinstance(message, PtpEvent)]
-            if not piece:
-                break
         return tuple(events)
 
     def reset(self) -> None:

@@ -71,6 +71,7 @@ def test_a_peer_answers_without_waiting() -> None:
     link = PeerLink(_Echo())
     link.write(b"you", 0.0)
     assert link.read(100, 3600.0) == b"hello you"
+    assert link.read(100, 0.0) == b""
     with pytest.raises(LinkTimeout, match="3600 s"):
         link.read(100, 3600.0)
 

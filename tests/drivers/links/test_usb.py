@@ -138,6 +138,7 @@ def test_errors_of_the_bus_become_ours() -> None:
     pipes = open_usb(backend=bus)
     with pytest.raises(LinkTimeout, match="1234"):
         pipes.bulk_read(512, 0.001)
+    assert pipes.interrupt_read(0.001) == b""
     device.halt(BULK_IN)
     with pytest.raises(PipeStalled):
         pipes.bulk_read(512, 0.001)
@@ -149,6 +150,8 @@ def test_errors_of_the_bus_become_ours() -> None:
     bus.unplug(device)
     with pytest.raises(LinkClosed, match="check cable"):
         pipes.bulk_write(b"x", 0.001)
+    with pytest.raises(LinkClosed, match="check cable"):
+        pipes.interrupt_read(0.001)
     pipes.close()
     with pytest.raises(LinkClosed, match="closed"):
         pipes.bulk_write(b"x", 0.001)

@@ -63,9 +63,9 @@ class Deaf(Dribbling):
 
     def read(self, limit: int, timeout: float) -> bytes:
         data = self.good.read(limit, timeout)
-        if self._left == 0:
+        if self._left == 0 and data:
             raise LinkTimeout(f"swallowed {data!r} on purpose")
-        self._left -= 1
+        self._left -= bool(data)
         return data
 
 
@@ -79,6 +79,8 @@ class Slow(Dribbling):
 
     def read(self, limit: int, timeout: float) -> bytes:
         self._clock.sleep(min(self._seconds, timeout))
+        if not timeout:
+            return b""
         if timeout < self._seconds:
             raise LinkTimeout(f"an answer takes {self._seconds:g} s on purpose")
         return self.good.read(limit, timeout)

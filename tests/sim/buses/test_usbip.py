@@ -54,7 +54,10 @@ class UsbIpPipes:
         return self._submit(1, 1, limit, b"", b"", timeout)
 
     def interrupt_read(self, timeout: float) -> bytes:
-        return self._submit(1, 3, 8, b"", b"", timeout)
+        try:
+            return self._submit(1, 3, 8, b"", b"", timeout)
+        except LinkTimeout:
+            return b""
 
     def control_out(self, request: int, data: bytes, timeout: float) -> None:
         self._submit(0, 0, len(data), struct.pack("<BBHHH", 0x21, request, 0, 0, len(data)), data, timeout)
@@ -217,10 +220,9 @@ class _Once:
         self._good = good
 
     def read(self, limit: int, timeout: float) -> bytes:
-        try:
-            return self._good.read(limit, 0.0)
-        except LinkTimeout:
-            raise LinkClosed("the end of the conversation") from None
+        if data := self._good.read(limit, 0.0):
+            return data
+        raise LinkClosed("the end of the conversation")
 
     def write(self, data: bytes, timeout: float) -> None:
         self._good.write(data, timeout)
