@@ -46,7 +46,8 @@ from drivers.raw.rawfile import frame_black, read_raw
 from experiment.chart.layout import design_chart
 from experiment.chart.printing import drawing
 from experiment.lights import plan_illuminations
-from experiment.session.folder import ReceivedFile, Session
+from experiment.session.folder import Session
+from experiment.session.journal import ReceivedFile
 from experiment.session.records import Judgement, plan_steps
 from sim.camera.film import write_dng
 from sim.optics import MILD_SHOULDERS
@@ -104,7 +105,7 @@ def take(folder: Path, body: str = "EOS 550D", cr2: bool = False, lights: int = 
         received = ReceivedFile(
             folder / file, len(data), hashlib.sha256(data).hexdigest(), CapturedFrame(Path(file).name, len(data), at)
         )
-        session.commit(attempt, received, Judgement(()), exposure_s=REFERENCE_EXPOSURE.shutter_s, ended_at=at)
+        session.journal.commit(attempt, received, Judgement(()), exposure_s=REFERENCE_EXPOSURE.shutter_s, ended_at=at)
     return session, world
 
 

@@ -24,8 +24,9 @@ from threading import Event, Thread
 from typing import Any
 
 from acquisition.monitor.serving import open_monitor
+from drivers.camera import CapturedFrame
 from experiment.lights import plan_illuminations, save_illuminations
-from experiment.session.journal import JOURNAL_FILE, Journal
+from experiment.session.journal import JOURNAL_FILE, Journal, ReceivedFile
 from experiment.session.records import RESPONSE, Check, Judgement, SessionStep, plan_steps
 
 ATTEMPTS = 800
@@ -65,14 +66,13 @@ class _Night:
         attempt = self.journal.begin(step, f"frames/{step.stem}", at)
         self.journal.commit(
             attempt,
-            file=f"frames/{step.stem}.cr2",
-            size=1,
-            sha256="0" * 64,
-            taken_at=at,
+            ReceivedFile(
+                self.journal.path.parent / f"frames/{step.stem}.cr2", 1, "0" * 64, CapturedFrame("1.cr2", 1, at)
+            ),
+            Judgement(checks, (1000.5, 2000.25, 1500.75), bytes(4000)),
+            {"show": 0.01, "settle": 0.2, "expose": 0.6, "download": 0.8, "save": 0.3, "judge": 0.5},
             exposure_s=0.5,
             ended_at=at + timedelta(seconds=3),
-            judgement=Judgement(checks, (1000.5, 2000.25, 1500.75), bytes(4000)),
-            timings={"show": 0.01, "settle": 0.2, "expose": 0.6, "download": 0.8, "save": 0.3, "judge": 0.5},
         )
 
     def beat(self) -> None:

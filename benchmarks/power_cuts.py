@@ -36,7 +36,8 @@ from typing import Any
 from benchmarks.session_kills import LIGHTS, SETTINGS, STEPS, contents, in_child, killed_at_operation, take
 from experiment.chart.layout import design_chart
 from experiment.session.folder import Session
-from experiment.session.journal import Journal
+from experiment.session.journal import Journal, ReceivedFile
+from experiment.session.records import Judgement
 
 CUTS = 200
 """Cuts that are made unless more are asked for: a few minutes on a quiet machine."""
@@ -256,11 +257,13 @@ class _LoggedCommits:
     def __enter__(self) -> None:
         real, log = self._real, self._log
 
-        def commit(journal: Journal, attempt: int, **named: Any) -> None:
-            real(journal, attempt, **named)
-            if named["judgement"].accepted:
+        def commit(
+            journal: Journal, attempt: int, received: ReceivedFile, judgement: Judgement, *given: Any, **named: Any
+        ) -> None:
+            real(journal, attempt, received, judgement, *given, **named)
+            if judgement.accepted:
                 with log.open("a") as stream:
-                    stream.write(f"{named['sha256']}\n")
+                    stream.write(f"{received.sha256}\n")
 
         setattr(Journal, "commit", commit)  # noqa: B010  # another signature, for this process alone
 

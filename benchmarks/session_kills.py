@@ -48,8 +48,8 @@ from drivers.projector import Power
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
 from experiment.lights import Illumination
-from experiment.session.folder import IncomingFile, Session, rebuild_journal
-from experiment.session.journal import Journal, ledger_path, settled_frames
+from experiment.session.folder import Session, rebuild_journal
+from experiment.session.journal import IncomingFile, Journal, ledger_path, settled_frames
 from experiment.session.records import ACCEPTED, VOIDED, Check, Judgement, SessionStep, plan_steps
 from experiment.session.repair import unsound_files
 from foundation.clock import OPENING, SimulatedClock
@@ -150,8 +150,8 @@ OPERATIONS: tuple[tuple[Any, str], ...] = (
     *((os, name) for name in ("fsync", "replace", "unlink", "close")),
     *((Journal, name) for name in ("begin", "commit", "note", "beat", "add_steps")),
     *((SmallLab, name) for name in ("show", "verify", "expose", "download")),
-    *((Session, name) for name in ("incoming", "commit", "write_frames_csv", "set_aside_strays")),
-    *((IncomingFile, "complete"), (LightJudge, "judge"), (StepQueue, "accept")),
+    *((Session, name) for name in ("write_frames_csv", "set_aside_strays")),
+    *((IncomingFile, "__init__"), (IncomingFile, "complete"), (LightJudge, "judge"), (StepQueue, "accept")),
 )
 """Where a run is killed: before or after a call."""
 

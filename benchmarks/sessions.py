@@ -35,7 +35,8 @@ from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 from experiment.framing.pictures import STILL_PX
 from experiment.lights import Illumination
-from experiment.session.folder import ReceivedFile, Session
+from experiment.session.folder import Session
+from experiment.session.journal import ReceivedFile
 from experiment.session.records import Judgement, SessionStep, plan_steps
 from foundation.colorimetry import angles_deg
 from sim.camera.film import write_dng
@@ -192,7 +193,7 @@ def record_session(
             captured = CapturedFrame(path.name, len(data), at)
             received = ReceivedFile(path, len(data), hashlib.sha256(data).hexdigest(), captured)
             judgement = Judgement.of_reason("exposure", None if reason is None else reason(step))
-            session.commit(attempt, received, judgement, exposure_s=SETTINGS.shutter_s, ended_at=at)
+            session.journal.commit(attempt, received, judgement, exposure_s=SETTINGS.shutter_s, ended_at=at)
         session.write_frames_csv()
     return Session.open(folder)
 

@@ -173,7 +173,7 @@ def _take_over(
         reason = frame.verdict.removeprefix(REFUSED).removeprefix(":").strip() or "for no reason that is listed"
     else:
         reason = judge_file(received.path, frame.kind, settings)
-    session.commit(
+    session.journal.commit(
         attempt,
         received,
         Judgement.of_reason("exposure" if not frame.verdict else "list", reason),

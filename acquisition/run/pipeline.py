@@ -56,7 +56,8 @@ from acquisition.run.devices import (
 )
 from drivers.presenter import Colour, ReadsBack
 from experiment.config import JudgeSettings, LabSettings
-from experiment.session.folder import ReceivedFile, Session
+from experiment.session.folder import Session
+from experiment.session.journal import IncomingFile, ReceivedFile
 from experiment.session.records import (
     ACCEPTED,
     DOUBT,
@@ -427,7 +428,7 @@ def _is_of_disk(fault: CropError) -> bool:
 
 def _download(job: Job, frame: Exposed) -> Callable[[], ReceivedFile]:
     """Let the camera write the frame exposed last into `frames/`, under a hidden name; return what completes it."""
-    incoming = job.session.incoming(frame.stem)
+    incoming = IncomingFile(job.session.frames_folder / frame.stem)
     try:
         with job.watch.step(_CAMERA, f"sends {step_name(frame.step)} to the disk", DOWNLOAD_S, "download"):
             captured = job.devices.camera.download(incoming.stream)
@@ -491,7 +492,7 @@ class Verdicts:
         """Journal a verdict; `under_way`: the frames behind it, whose verdicts are not known."""
         job, step, judgement = self._job, frame.step, saved.judgement
         job.on_disk(
-            lambda: job.session.commit(
+            lambda: job.session.journal.commit(
                 frame.number,
                 saved.received,
                 judgement,

@@ -5,7 +5,6 @@ Rules that hold inside:
 - A frame counts as taken when its raw file is complete on disk (written, flushed, renamed) *and* its journal row is
   committed, in that order. Whatever a crash leaves between the two is set aside, never counted, never deleted.
 - The journal (`experiment.session.journal`) is the truth; `frames.csv` is derived from it.
-- A raw file may be downloaded in one thread and made whole in another (`IncomingFile`).
 - Nothing here touches a device; readers of a session need nothing else from this package than its folder, plan and
   journal, the chart and the illuminations.
 """
@@ -16,14 +15,13 @@ import csv
 import io
 import os
 import sqlite3
-import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO, Final, TypeVar
+from typing import BinaryIO, Final, TypeVar
 
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -33,7 +31,9 @@ from experiment.session.journal import (
     JOURNAL_FILE,
     MOST_BYTES,
     PATIENCE_S,
+    IncomingFile,
     Journal,
+    ReceivedFile,
     ledger_path,
     lost_files,
     open_journal,
@@ -41,7 +41,7 @@ from experiment.session.journal import (
     time_text,
     without_journal,
 )
-from experiment.session.records import AcceptedFile, FrameRecord, Judgement, SessionStep
+from experiment.session.records import AcceptedFile, FrameRecord, SessionStep
 from experiment.session.repair import (
     BAD,
     lights_text,
@@ -50,7 +50,7 @@ from experiment.session.repair import (
     require_frames_folder,
     unsound_files,
 )
-from foundation.errors import DeviceError, FormatError, InputError, StorageError
+from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import (
     held_folder,
     is_partial,
@@ -59,9 +59,7 @@ from foundation.files import (
     require_free,
     require_plain_folder,
     storage_error,
-    stream_sha256,
     unmounted_at,
-    whole_file,
     whole_folder,
     write_whole,
 )
@@ -101,6 +99,8 @@ class Session:
 
     def __init__(self, folder: Path, journal: Journal, hold: ExitStack | None = None) -> None:
         self.folder = folder
+        self.frames_folder: Final = folder / "frames"
+        """Where the raw files are, exactly as the camera wrote them."""
         self.journal = journal
         self._hold = hold
         require_plain_folder(folder, MOST_BYTES, ("frames", "previews"))
@@ -129,11 +129,6 @@ class Session:
     def frames_are_known_whole(self) -> bool:
         """Whether each frame was decoded to its end when it was taken, which older software did not do."""
         return _DECODED in self.journal.records()
-
-    @property
-    def frames_folder(self) -> Path:
-        """Where the raw files are, exactly as the camera wrote them."""
-        return self.folder / "frames"
 
     @classmethod
     def create(
@@ -221,38 +216,8 @@ class Session:
 
     def receive(self, stem: str, fill: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
         """Let a raw file be written into `frames/`; it is complete and on the disk when this returns."""
-        with self.incoming(stem) as incoming:
+        with IncomingFile(self.frames_folder / stem) as incoming:
             return incoming.complete(fill(incoming.stream))
-
-    def incoming(self, stem: str) -> IncomingFile:
-        """Return a raw file to be filled, for which `receive` is too simple; see `IncomingFile`."""
-        return IncomingFile(self.frames_folder / stem)
-
-    def commit(
-        self,
-        attempt: int,
-        received: ReceivedFile,
-        judgement: Judgement,
-        timings: Mapping[str, float] | None = None,
-        *,
-        exposure_s: float,
-        ended_at: datetime,
-    ) -> None:
-        """Note that an attempt's raw file is complete and how it was judged; only now does the frame count.
-
-        `exposure_s`: the exposure asked for, seconds.
-        """
-        self.journal.commit(
-            attempt,
-            file=received.path.relative_to(self.folder).as_posix(),
-            size=received.size,
-            sha256=received.sha256,
-            taken_at=received.captured.released_at,
-            exposure_s=exposure_s,
-            ended_at=ended_at,
-            judgement=judgement,
-            timings=timings,
-        )
 
     def add_steps(self, steps: Sequence[SessionStep]) -> None:
         """Put steps at the end of the plan; their numbers must be free."""
@@ -369,67 +334,6 @@ class Session:
                 path.rename(target)
                 moved.append(target)
         return moved
-
-
-@dataclass(frozen=True)
-class ReceivedFile:
-    """A raw file that is complete on the disk, not yet counted."""
-
-    path: Path
-    size: int
-    sha256: str
-    captured: CapturedFrame
-
-
-class _Abandoned(Exception):
-    """Ends a file that is not wanted."""
-
-
-class IncomingFile:
-    """A raw file in the making under a hidden name; gone at the end of a `with` block unless it was completed."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._final = path
-        # A folder that is gone means a disk that was unmounted: what lies under its name is another one.
-        self._file = whole_file(path, lambda: self._final, make=False)
-        self._open = True
-        self.stream: BinaryIO = self._file.__enter__()
-
-    def __enter__(self) -> IncomingFile:
-        return self
-
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        if error is None:
-            self.abandon()
-        else:
-            self._leave(kind, error, trace)
-
-    def complete(self, captured: CapturedFrame) -> ReceivedFile:
-        """Check the size, hash, flush and rename the file; from any thread."""
-        try:
-            size = self.stream.seek(0, 2)
-            if size != captured.size or size == 0:
-                raise DeviceError(
-                    f"{captured.name}: the camera says {captured.size} bytes, {size} arrived; the frame is taken again"
-                )
-            self.stream.seek(0)
-            sha256 = stream_sha256(self.stream)
-            self._final = self._path.with_name(self._path.name + Path(captured.name).suffix.lower())
-        except BaseException:
-            self._leave(*sys.exc_info())
-            raise
-        self._leave(None, None, None)
-        return ReceivedFile(self._final, size, sha256, captured)
-
-    def abandon(self) -> None:
-        """Remove the file unless it was completed; a second call does nothing."""
-        self._leave(_Abandoned, _Abandoned(), None)
-
-    def _leave(self, kind: Any, error: Any, trace: Any) -> None:
-        if self._open:
-            self._open = False
-            self._file.__exit__(kind, error, trace)
 
 
 def session_exists(folder: Path) -> bool:

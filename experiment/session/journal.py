@@ -23,6 +23,7 @@ Rules that hold inside:
   before the journal commits the same, so that the lines hold all that the journal holds, and at most one transaction
   more. A later row of the same key changes the columns that it names. Signs of life, and where the session lies, are no
   facts and are not kept. What a crash cut off is the last line alone, and is no fact.
+- A raw file may be downloaded in one thread and made whole in another (`IncomingFile`), before its row is committed.
 
 Which raw files are really there, `experiment.session.folder` knows.
 
@@ -40,6 +41,7 @@ import os
 import shlex
 import shutil
 import sqlite3
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -47,9 +49,10 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, TypeVar, cast
+from typing import Any, BinaryIO, Final, TypeVar, cast
 from urllib.parse import quote
 
+from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.session.heartbeat import INVENTED_NUMBERS, Heartbeat, Process, RunState, SessionPlace, file_system_of
 from experiment.session.records import (
@@ -68,7 +71,7 @@ from experiment.session.records import (
     SessionEvent,
     SessionStep,
 )
-from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError, counted
+from foundation.errors import RUN_AGAIN, DeviceError, FormatError, InputError, StorageError, counted
 from foundation.files import (
     disk_remedy_of,
     is_inside_name,
@@ -77,7 +80,9 @@ from foundation.files import (
     reading_error,
     require_plain_folder,
     storage_error,
+    stream_sha256,
     sync_folder,
+    whole_file,
     write_whole,
 )
 
@@ -90,6 +95,67 @@ _AMONG = "IN (SELECT value FROM json_each(?))"
 PATIENCE_S = 600.0
 """How long a write waits for another program's unless the caller says otherwise: as long as a run waits for a device by
 default (`sequence.patience_s`)."""
+
+
+@dataclass(frozen=True)
+class ReceivedFile:
+    """A raw file that is complete on the disk, not yet counted."""
+
+    path: Path
+    size: int
+    sha256: str
+    captured: CapturedFrame
+
+
+class _Abandoned(Exception):
+    """Ends a file that is not wanted."""
+
+
+class IncomingFile:
+    """A raw file in the making under a hidden name; gone at the end of a `with` block unless it was completed."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._final = path
+        # A folder that is gone means a disk that was unmounted: what lies under its name is another one.
+        self._file = whole_file(path, lambda: self._final, make=False)
+        self._open = True
+        self.stream: BinaryIO = self._file.__enter__()
+
+    def __enter__(self) -> IncomingFile:
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        if error is None:
+            self.abandon()
+        else:
+            self._leave(kind, error, trace)
+
+    def complete(self, captured: CapturedFrame) -> ReceivedFile:
+        """Check the size, hash, flush and rename the file; from any thread."""
+        try:
+            size = self.stream.seek(0, 2)
+            if size != captured.size or size == 0:
+                raise DeviceError(
+                    f"{captured.name}: the camera says {captured.size} bytes, {size} arrived; the frame is taken again"
+                )
+            self.stream.seek(0)
+            sha256 = stream_sha256(self.stream)
+            self._final = self._path.with_name(self._path.name + Path(captured.name).suffix.lower())
+        except BaseException:
+            self._leave(*sys.exc_info())
+            raise
+        self._leave(None, None, None)
+        return ReceivedFile(self._final, size, sha256, captured)
+
+    def abandon(self) -> None:
+        """Remove the file unless it was completed; a second call does nothing."""
+        self._leave(_Abandoned, _Abandoned(), None)
+
+    def _leave(self, kind: Any, error: Any, trace: Any) -> None:
+        if self._open:
+            self._open = False
+            self._file.__exit__(kind, error, trace)
 
 
 class Journal:
@@ -203,23 +269,21 @@ class Journal:
     def commit(
         self,
         attempt: int,
-        *,
-        file: str,
-        size: int,
-        sha256: str,
-        taken_at: datetime,
-        exposure_s: float,
-        ended_at: datetime,
+        received: ReceivedFile,
         judgement: Judgement,
         timings: Mapping[str, float] | None = None,
+        *,
+        exposure_s: float,
+        ended_at: datetime,
     ) -> None:
         """Note that an attempt's raw file is complete and how it was judged; only now does the frame count.
 
-        `file`, `size`, `sha256`: the raw file, relative to the session's folder, its bytes and their hash.
         `exposure_s`: the exposure asked for, seconds.
         """
+        file = received.path.relative_to(self.path.parent).as_posix()
         verdict = ACCEPTED if judgement.accepted else REFUSED
-        row = {"file": file, "size": size, "sha256": sha256, "taken_at": time_text(taken_at), "exposure_s": exposure_s}
+        row = {"file": file, "size": received.size, "sha256": received.sha256, "exposure_s": exposure_s}
+        row |= {"taken_at": time_text(received.captured.released_at)}
         row |= {"ended_at": time_text(ended_at), "verdict": verdict, "reason": judgement.reason}
         red, green, blue = judgement.seen or (None, None, None)
         measured = {"attempt": attempt, "red": red, "green": green, "blue": blue, "data": judgement.measurement}

@@ -28,6 +28,7 @@ from drivers.raw.rawfile import read_raw
 from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from experiment.session.folder import Session
+from experiment.session.journal import Journal
 from foundation.errors import StorageError
 from sim.camera.bodies import EOS_BODIES
 
@@ -41,7 +42,7 @@ FORKS.set_forkserver_preload([__name__, "acquisition.run.run", "acquisition.run.
 
 PLACES = {
     "renaming": (Path, "replace"),
-    "committing": (Session, "commit"),
+    "committing": (Journal, "commit"),
 }
 
 
@@ -166,16 +167,16 @@ def test_a_run_that_is_told_to_end_closes_its_devices(
     spy(CanonEos, "camera")
     spy(PjLinkProjector, "projector")
     spy(Session, "journal")
-    commit = Session.commit
+    commit = Journal.commit
 
-    def told_to_end(self: Session, *given: Any, **named: Any) -> None:
+    def told_to_end(self: Journal, *given: Any, **named: Any) -> None:
         commit(self, *given, **named)
         os.kill(os.getpid(), number)
 
     session = lab.parent / "session"
     before = signal.getsignal(number)
     with monkeypatch.context() as patched:
-        patched.setattr(Session, "commit", told_to_end)
+        patched.setattr(Journal, "commit", told_to_end)
         assert run("run", lab, session) == 130
     assert "interrupted; run the same command again to go on" in capsys.readouterr().err
     assert set(closed) == {"camera", "projector", "journal"}

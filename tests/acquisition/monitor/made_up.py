@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.lights import Illumination, plan_illuminations, save_illuminations
-from experiment.session.journal import JOURNAL_FILE, Journal
+from experiment.session.journal import JOURNAL_FILE, Journal, ReceivedFile
 from experiment.session.records import RESPONSE, Check, Judgement, SessionStep, plan_steps
 from foundation.colorimetry import decode_srgb
 
@@ -95,14 +96,11 @@ class MadeUpRun:
         raw.write_bytes(b"raw")
         self.journal.commit(
             attempt,
-            file=f"frames/{stem}.cr2",
-            size=3,
-            sha256="0" * 64,
-            taken_at=self.clock - timedelta(seconds=2),
+            ReceivedFile(raw, 3, "0" * 64, CapturedFrame(raw.name, 3, self.clock - timedelta(seconds=2))),
+            Judgement(checks, self.seen(step)),
+            {"settle": 0.2, "expose": 0.55, "download": 0.9, "save": 0.2, "wait": 1.4e-5},
             exposure_s=0.5,
             ended_at=self.clock,
-            judgement=Judgement(checks, self.seen(step)),
-            timings={"settle": 0.2, "expose": 0.55, "download": 0.9, "save": 0.2, "wait": 1.4e-5},
         )
         if self.previews:
             colour = step.colour

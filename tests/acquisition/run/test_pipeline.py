@@ -17,6 +17,7 @@ from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
 from experiment.lights import Illumination
 from experiment.session.folder import Session
+from experiment.session.journal import IncomingFile, Journal
 from experiment.session.records import Check, Judgement, SessionStep, link_steps
 from foundation.console import Ending
 from foundation.errors import DeviceError, DeviceFault, LinkTimeout, QualityError, StorageError
@@ -390,18 +391,13 @@ class TestFaults:
         lab = Lab(folder, {3: DeviceError("lost")})
         full = failing(StorageError("No space left on device"), calls=range(2, 5))
         if place == "download":
-            monkeypatch.setattr(Session, "incoming", full(Session.incoming))
+            monkeypatch.setattr("acquisition.run.pipeline.IncomingFile", full(IncomingFile))
         elif place == "save":
-            from experiment.session.folder import IncomingFile
-
             monkeypatch.setattr(IncomingFile, "complete", full(IncomingFile.complete, IncomingFile.abandon))
-        elif place == "commit":
-            monkeypatch.setattr(Session, "commit", full(Session.commit))
         else:
-            journal = type(lab.session.journal)
-            first = {"begin": range(2, 5), "fail": range(3)}[place]
-            full = failing(StorageError("No space left on device"), calls=first)
-            monkeypatch.setattr(journal, place, full(getattr(journal, place)))
+            if place == "fail":
+                full = failing(StorageError("No space left on device"), calls=range(3))
+            monkeypatch.setattr(Journal, place, full(getattr(Journal, place)))
         said: list[str] = []
         assert run(lab, announce=said.append).complete
         assert any("No space left" in sentence for sentence in said)
@@ -411,8 +407,6 @@ class TestFaults:
             assert lab.camera.captures == 7, "the frame in the camera was not lost"
 
     def test_a_disk_that_never_saves_ends_the_run(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        from experiment.session.folder import IncomingFile
-
         lab = Lab(folder)
         broken = failing(StorageError("Input/output error"), calls=range(100_000))
         monkeypatch.setattr(IncomingFile, "complete", broken(IncomingFile.complete, IncomingFile.abandon))
@@ -431,7 +425,7 @@ class TestFaults:
             commits += 1
             raise (RuntimeError if commits == 1 else StorageError)(f"fault {commits}")
 
-        monkeypatch.setattr(Session, "commit", broken)
+        monkeypatch.setattr(Journal, "commit", broken)
         quick = SETTINGS.model_copy(update={"sequence": SETTINGS.sequence.model_copy(update={"patience_s": 0.0})})
         with pytest.raises(RuntimeError, match="fault 1") as raised:
             take_session(lab.session, lab.devices, quick)

@@ -213,7 +213,7 @@ def test_a_machine_whose_clock_was_set_back_between_two_runs_is_told(folder: Pat
     assert clock_note(lab.session, session_clock(lab.session)) == ""
     attempt = lab.session.journal.begin(lab.session.steps[0], "frames/a", ahead)
     received = lab.session.receive("a", lambda into: CapturedFrame("a.cr2", into.write(b"a"), ahead))
-    lab.session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=ahead)
+    lab.session.journal.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=ahead)
     clock = session_clock(lab.session)
     assert clock.now() >= ahead, "what is taken now lies behind it"
     said = clock_note(lab.session, clock)

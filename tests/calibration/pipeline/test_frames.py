@@ -19,7 +19,8 @@ from drivers.presenter import Colour
 from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination
-from experiment.session.folder import ReceivedFile, Session
+from experiment.session.folder import Session
+from experiment.session.journal import ReceivedFile
 from experiment.session.records import Judgement, plan_steps
 
 AT = datetime(2024, 3, 1, 23, 0, tzinfo=UTC)
@@ -40,7 +41,7 @@ def taken(tmp_path: Path) -> Callable[[Sequence[float]], Session]:
                 path.write_bytes(data)
                 captured = CapturedFrame(path.name, len(data), at)
                 received = ReceivedFile(path, len(data), hashlib.sha256(data).hexdigest(), captured)
-                session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=at)
+                session.journal.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=at)
         return Session.open_for_run(tmp_path / "s")
 
     return make

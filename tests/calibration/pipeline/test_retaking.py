@@ -15,7 +15,8 @@ import pytest
 from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from drivers.camera import CapturedFrame
-from experiment.session.folder import ReceivedFile, Session
+from experiment.session.folder import Session
+from experiment.session.journal import ReceivedFile
 from experiment.session.records import Judgement, SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, Paint, figures_alone, take
@@ -61,7 +62,7 @@ def take_again(lab: Lab, folder: Path) -> list[str]:
             path.write_bytes(data)
             captured = CapturedFrame(path.name, len(data), at)
             received = ReceivedFile(path, len(data), hashlib.sha256(data).hexdigest(), captured)
-            session.commit(attempt, received, Judgement(()), exposure_s=SETTINGS.shutter_s, ended_at=at)
+            session.journal.commit(attempt, received, Judgement(()), exposure_s=SETTINGS.shutter_s, ended_at=at)
     return [step.stem for step in steps]
 
 

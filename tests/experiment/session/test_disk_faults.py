@@ -41,7 +41,7 @@ def save(session: Session, number: int) -> None:
     step = session.steps[number]
     attempt = session.journal.begin(step, f"frames/{step.stem}", AT)
     received = session.receive(step.stem, capture(FRAMES[number]))
-    session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=AT)
+    session.journal.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=AT)
 
 
 class Night:

@@ -45,7 +45,7 @@ def take(session: Session, number: int, content: bytes, reason: str = "") -> Non
     attempt = session.journal.begin(step, f"frames/{step.stem}", NOW)
     received = session.receive(step.stem, lambda into: CapturedFrame("IMG_1.CR2", into.write(content), NOW))
     judgement = Judgement.of_reason("exposure", reason or None)
-    session.commit(attempt, received, judgement, exposure_s=0.5, ended_at=NOW)
+    session.journal.commit(attempt, received, judgement, exposure_s=0.5, ended_at=NOW)
 
 
 def test_frames_csv_is_as_the_format_says(session: Session) -> None:

@@ -13,10 +13,18 @@ from pathlib import Path
 
 import pytest
 
+from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session import journal as journals
-from experiment.session.journal import JOURNAL_VERSION, Journal, create_file, require_sound_rows, time_text
+from experiment.session.journal import (
+    JOURNAL_VERSION,
+    Journal,
+    ReceivedFile,
+    create_file,
+    require_sound_rows,
+    time_text,
+)
 from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, Judgement, SessionEvent, plan_steps
 from foundation.errors import FormatError, StorageError
 
@@ -74,16 +82,11 @@ def path(tmp_path: Path) -> Path:
 
 
 def commit(journal: Journal, attempt: int, reason: str = "") -> None:
-    journal.commit(
-        attempt,
-        file=f"frames/{attempt}.cr2",
-        size=10 * attempt,
-        sha256="00",
-        taken_at=NOW,
-        exposure_s=0.5,
-        ended_at=NOW + timedelta(seconds=2),
-        judgement=Judgement.of_reason("exposure", reason or None),
+    received = ReceivedFile(
+        journal.path.parent / f"frames/{attempt}.cr2", 10 * attempt, "00", CapturedFrame("a.cr2", 10 * attempt, NOW)
     )
+    judgement = Judgement.of_reason("exposure", reason or None)
+    journal.commit(attempt, received, judgement, exposure_s=0.5, ended_at=NOW + timedelta(seconds=2))
 
 
 def test_what_is_written_is_read_again(path: Path) -> None:

@@ -18,9 +18,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.lights import Illumination
-from experiment.session.journal import Journal
+from experiment.session.journal import Journal, ReceivedFile
 from experiment.session.records import AttemptDetails, Check, Judgement, SessionStep, link_steps, plan_steps
 
 pytestmark = pytest.mark.slow
@@ -82,10 +83,9 @@ def apply(what: str, value: Any, journal: Journal, model: Model, at: datetime) -
         model.rows.append(Row(step))
     elif what == "commit" and open_rows:
         number = open_rows[-1]
-        journal.commit(
-            number, file=f"frames/{number}.cr2", size=number, sha256=f"{number:064d}", taken_at=at, exposure_s=0.5,
-            ended_at=at, judgement=value, timings={"settle": float(number)},
-        )  # fmt: skip
+        path = journal.path.parent / f"frames/{number}.cr2"
+        received = ReceivedFile(path, number, f"{number:064d}", CapturedFrame("a.cr2", number, at))
+        journal.commit(number, received, value, {"settle": float(number)}, exposure_s=0.5, ended_at=at)
         row = model.rows[number - 1]
         row.judgement = value
         row.reason = next((check.reason for check in value.checks if check.reason), "")
@@ -217,10 +217,9 @@ def night(journal: Journal) -> list[Callable[[], object]]:
     """Return what is done to a journal in a short night, one transaction each."""
 
     def commit(number: int) -> None:
-        journal.commit(
-            number, file=f"frames/{number}.cr2", size=1, sha256="0" * 64, taken_at=BEGUN, exposure_s=0.5,
-            ended_at=BEGUN, judgement=GOOD, timings={"settle": 1.0},
-        )  # fmt: skip
+        path = journal.path.parent / f"frames/{number}.cr2"
+        received = ReceivedFile(path, 1, "0" * 64, CapturedFrame("a.cr2", 1, BEGUN))
+        journal.commit(number, received, GOOD, {"settle": 1.0}, exposure_s=0.5, ended_at=BEGUN)
 
     return [
         lambda: journal.begin(STEPS[0], "frames/0", BEGUN),

@@ -109,7 +109,7 @@ def test_it_is_taken_up(folder: Path) -> None:
                 received = session.receive(
                     step.stem, lambda into, name=step.stem: CapturedFrame("a.cr2", into.write(name.encode()), NOW)
                 )
-                session.commit(attempt, received, Judgement(()), {"settle": 0.2}, exposure_s=0.5, ended_at=NOW)
+                session.journal.commit(attempt, received, Judgement(()), {"settle": 0.2}, exposure_s=0.5, ended_at=NOW)
         session.write_frames_csv()
         assert session.done_steps() == set(range(6))
     assert version(folder) == 2

@@ -44,7 +44,7 @@ def take_what_is_left(session: Session) -> list[int]:
         content = f"frame {stem}".encode()
         attempt = session.journal.begin(step, f"frames/{stem}", NOW)
         received = session.receive(stem, lambda into, data=content: CapturedFrame("a.cr2", into.write(data), NOW))
-        session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
+        session.journal.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
     return [step.number for step in left]
 
 
@@ -52,7 +52,7 @@ def take_again(session: Session, number: int) -> Path:
     """Take one more accepted frame of a step; return its file."""
     attempt = session.journal.begin(session.steps[number], "frames/again", NOW)
     received = session.receive("again", lambda into: CapturedFrame("a.cr2", into.write(b"again"), NOW))
-    session.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
+    session.journal.commit(attempt, received, Judgement(()), exposure_s=0.5, ended_at=NOW)
     return received.path
 
 

@@ -22,7 +22,8 @@ from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session import records
-from experiment.session.folder import IncomingFile, ReceivedFile, Session
+from experiment.session.folder import Session
+from experiment.session.journal import IncomingFile, ReceivedFile
 from experiment.session.records import (
     AHEAD,
     TRANSITIONS,
@@ -180,7 +181,7 @@ def session(tmp_path: Path) -> Generator[Session]:
 def watched(session: Session, watch: Watch, patch: pytest.MonkeyPatch) -> Generator[Devices]:
     """Yield the simulated lab's devices, and let `watch` follow what session and sequencer do."""
     journal = session.journal
-    begin, commit, fail, void = journal.begin, session.commit, journal.fail, journal.void
+    begin, commit, fail, void = journal.begin, journal.commit, journal.fail, journal.void
     following = StepQueue.next
 
     def wanting(agenda: StepQueue) -> SessionStep | None:
@@ -211,7 +212,7 @@ def watched(session: Session, watch: Watch, patch: pytest.MonkeyPatch) -> Genera
     with patch.context() as patched, open_rig(SETTINGS, session.chart, session) as devices:
         patched.setattr(StepQueue, "next", wanting)
         patched.setattr(journal, "begin", beginning)
-        patched.setattr(session, "commit", committing)
+        patched.setattr(journal, "commit", committing)
         patched.setattr(journal, "fail", failing)
         patched.setattr(journal, "void", voiding)
         yield replace(

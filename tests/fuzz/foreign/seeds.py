@@ -101,7 +101,7 @@ def _session(folder: Path) -> None:
             checks = (Check("light", 0.1, None, 0.5, "degrees", ""),)
             judgement = Judgement(checks, seen=(1.0, 2.0, 3.0))
             received = session.receive(stem, fill)
-            session.commit(attempt, received, judgement, {"expose": 0.5}, exposure_s=0.5, ended_at=at)
+            session.journal.commit(attempt, received, judgement, {"expose": 0.5}, exposure_s=0.5, ended_at=at)
         session.journal.note(at, "paused", "a test")
         session.journal.beat("ended", "it ended", at)
         session.journal.record("camera", "Test")
