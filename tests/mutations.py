@@ -3,10 +3,11 @@
 `python -m tests.mutations [--count 60] [--seed 1] [--results FILE]` changes one place at a time in a copy of the
 repository (a comparison, an operator, a number), runs the tests that can reach it, and prints one JSON object
 a mutation and one for the whole. Every place is as likely, so that packages have their share by size. A mutation is
-killed where a test fails or does not end, and passes without it. Tests are tried from near to far, by the
-imports that lead from them to the module, quick ones first, until one fails or `--limit` seconds are over: what
-survives these is said to survive. `--results` keeps what was tried, so that a run that was stopped goes on;
-`--again` tries what survived there once more, wherever its line is now.
+killed where a test fails or does not end, and passes without it. Which tests run a place is found first, by one run
+of them all that notes the lines of each (a quarter of an hour), which is kept in `build/mutations` until the product or
+the tests change. They are tried from the quickest on until one fails or `--limit` seconds are over: what survives these
+is said to survive. `--results` keeps what was tried, so that a run that was stopped goes on; `--again` tries what
+survived there once more, wherever its line is now.
 
 Not drawn are annotations, messages, numbers that are an index, and what only type checkers read.
 """
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import hashlib
 import json
 import os
 import random
@@ -26,7 +28,7 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -35,10 +37,15 @@ from pathlib import Path
 from queue import Queue
 from typing import Any
 
-import grimp
+import pytest
+from coverage import Coverage, CoverageData
+from coverage.data import combine_parallel_data
 
 ROOT = Path(__file__).parents[1]
 PACKAGES: list[str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["root_packages"]
+TRACED_INTO = "CROP_TRACED_INTO"
+"""Names the folder to a run of pytest that has this file as a plugin, in which it keeps the lines of each test."""
+
 ENDLESS_S = 90
 """Time after which a test is said not to end: half as long again as the slowest takes beside others."""
 
@@ -170,74 +177,161 @@ def _rows(results: Path | None) -> list[dict[str, Any]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
+class Covered:
+    """Which lines of the product each test runs, and how long it takes; made once for a state of the product.
+
+    `folder`: where it is kept. Coverage.py sees the lines that the interpreter runs, in the tests' own process: those
+    of compiled functions, and what is run once, on import, are looked for by their names.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if not (folder / "lines").exists():
+            _trace(folder)
+        self._data = CoverageData(str(folder / "lines"))
+        self._data.read()
+        self._copy = folder / "copy"
+        self.seconds: dict[str, float] = json.loads((folder / "seconds.json").read_text(encoding="utf-8"))
+
+    def tests_of(self, mutation: Mutation) -> list[str]:
+        """Return the tests that run a mutation's place, or else what is named there; the quickest first."""
+        lines = range(mutation.line, mutation.last_line + 1)
+        found = self._running(mutation.file, lines)
+        sought, names = set[str](), [] if found else [_name_around(mutation.file, mutation.line)]
+        while names and not found:
+            sought.update(names)
+            users = [place for name in names for place in _uses(name)]
+            found = set[str]().union(*(self._running(file, [line]) for file, line in users))
+            names = sorted({_name_around(file, line) for file, line in users} - sought)
+        near = f"test_{Path(mutation.file).stem}.py::"
+        return sorted(found, key=lambda test: self.seconds.get(test, 1.0) * (0.3 if near in test else 1.0))
+
+    def _running(self, file: str, lines: Iterable[int]) -> set[str]:
+        known = self._lines(file)
+        return {test for line in lines for test in known.get(line, ()) if test}
+
+    @cache  # noqa: B019 - there is one as long as the program runs
+    def _lines(self, file: str) -> dict[int, list[str]]:
+        return self._data.contexts_by_lineno(str(self._copy / file))
+
+
+def _trace(folder: Path) -> None:
+    """Run all tests in a copy of the checkout, and keep in a folder which lines each of them ran."""
+    shutil.rmtree(folder, ignore_errors=True)
+    copy = copied(folder / "copy")
+    plugged = ["-p", "tests.mutations", "-n", "auto", "--dist", "worksteal", "-q"]
+    subprocess.run(
+        [sys.executable, "-m", "pytest", *plugged, "--tb=no"],
+        cwd=copy,
+        # Without what it forbids, each worker of pytest would compile every test anew.
+        env=_environment(copy) | {TRACED_INTO: str(folder.absolute()), "PYTHONDONTWRITEBYTECODE": ""},
+        stdout=sys.stderr,
+        check=False,
+    )
+    whole = CoverageData(str(folder / "lines"))
+    combine_parallel_data(whole)
+    shutil.rmtree(copy)
+
+
+def pytest_configure(config: Any) -> None:
+    """Begin to note which lines run, where pytest has this file as a plugin."""
+    folder = Path(os.environ[TRACED_INTO])
+    measured = Coverage(folder / "lines", data_suffix=True, source_pkgs=PACKAGES, messages=False)
+    measured.set_option("run:disable_warnings", ["module-not-imported", "no-data-collected", "module-not-measured"])
+    config.pluginmanager.register(_Tracer(measured, folder, hasattr(config, "workerinput")))
+
+
+class _Tracer:
+    """Tells coverage.py which test runs, and notes how long each takes."""
+
+    def __init__(self, measured: Coverage, folder: Path, is_worker: bool) -> None:
+        self._measured, self._folder, self._is_worker = measured, folder, is_worker
+        self._seconds = dict[str, float]()
+        measured.start()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, Any, Any]:
+        self._measured.switch_context(item.nodeid)
+        done = yield
+        self._measured.switch_context("")
+        return done
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self._seconds[report.nodeid] = self._seconds.get(report.nodeid, 0.0) + report.duration
+
+    def pytest_sessionfinish(self) -> None:
+        self._measured.stop()
+        self._measured.save()
+        if not self._is_worker:
+            (self._folder / "seconds.json").write_text(json.dumps(self._seconds), encoding="utf-8")
+
+
+def _digest() -> str:
+    """Return a hash of product and tests."""
+    digest = hashlib.sha256()
+    for folder in (*PACKAGES, "tests"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            digest.update(f"{path.relative_to(ROOT)}\0{path.stat().st_size}\0".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
 @cache
-def _imported_by_tests() -> dict[Path, dict[str, int]]:
-    """Return each test file with the names it imports (0), and those that helpers and conftest.py import for it (1)."""
-    tests = ROOT / "tests"
-    named = dict[Path, set[str]]()
-    for path in tests.rglob("*.py"):
-        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-        froms = [one for one in nodes if isinstance(one, ast.ImportFrom) and one.module]
-        named[path] = {f"{one.module}.{alias.name}" for one in froms for alias in one.names}
-        named[path] |= {one.module for one in froms if one.module}
-        named[path] |= {alias.name for one in nodes if isinstance(one, ast.Import) for alias in one.names}
-    found = dict[Path, dict[str, int]]()
-    for path in sorted(one for one in named if one.name.startswith("test_")):
-        waiting = [path, *(folder / "conftest.py" for folder in path.parents if folder.is_relative_to(tests))]
-        for one in waiting:
-            helpers = {ROOT.joinpath(*name.split(".")).with_suffix(".py") for name in named.get(one, ())}
-            waiting += sorted((helpers & named.keys()) - {*waiting})
-        behind = set[str]().union(*(named.get(one, ()) for one in waiting))
-        found[path] = dict.fromkeys(behind, 1) | dict.fromkeys(named[path], 0)
+def _parsed(file: str) -> ast.Module:
+    return ast.parse((ROOT / file).read_text(encoding="utf-8"))
+
+
+@cache
+def _name_around(file: str, line: int) -> str:
+    """Return what a line of a file belongs to: a constant, or the innermost function or class."""
+    name = ""
+    for node in ast.walk(_parsed(file)):
+        match node:
+            case ast.FunctionDef(name=found) | ast.ClassDef(name=found):
+                pass
+            case ast.Assign(targets=[ast.Name(id=found), *_]) | ast.AnnAssign(target=ast.Name(id=found)):
+                pass
+            case _:
+                continue
+        # What ast.walk comes to later lies further inside.
+        if node.lineno <= line <= (node.end_lineno or node.lineno):
+            name = found
+    return name
+
+
+@cache
+def _uses(name: str) -> list[tuple[str, int]]:
+    """Return the places, file and line, at which the product uses a name."""
+    found: list[tuple[str, int]] = []
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            file = str(path.relative_to(ROOT))
+            for node in ast.walk(_parsed(file)) if name and name in path.read_text(encoding="utf-8") else ():
+                match node:
+                    case ast.Name(id=used, ctx=ast.Load()) | ast.Attribute(attr=used) if used == name:
+                        found.append((file, node.lineno))
+                    case _:
+                        pass
     return found
 
 
-@cache
-def _imports() -> grimp.ImportGraph:
-    return grimp.build_graph(PACKAGES[0], *PACKAGES[1:])
-
-
-def stages(mutation: Mutation) -> list[tuple[str, list[str]]]:
-    """Return the test files to try, each lot with the option that says which of its tests, from near to far."""
-    module = mutation.file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-    room = ROOT / "tests" / Path(mutation.file).parent
-    distance = {module: 0}
-    waiting = [module]
-    for name in waiting:
-        nearer = _imports().find_modules_that_directly_import(name) - distance.keys()
-        distance |= dict.fromkeys(nearer, distance[name] + 1)
-        waiting += sorted(nearer)
-    lots: tuple[list[str], ...] = ([], [], [])
-    for path, names in _imported_by_tests().items():
-        steps = min((distance[name] + further for name, further in names.items() if name in distance), default=None)
-        in_room = path.is_relative_to(room)
-        if steps == 0 or (in_room and path.stem == f"test_{Path(mutation.file).stem}"):
-            lots[0].append(str(path.relative_to(ROOT)))
-        elif steps is not None or in_room:
-            lots[1 if in_room or steps == 1 else 2].append(str(path.relative_to(ROOT)))
-    for lot in lots:
-        lot.sort(key=lambda file: not (ROOT / file).is_relative_to(room))
-    order = (("not slow", 0), ("not slow", 1), ("slow", 0), ("not slow", 2), ("slow", 1), ("slow", 2))
-    return [(which, lots[near]) for which, near in order if lots[near]]
-
-
-def killed_by(mutation: Mutation, folder: Path, limit_s: float, left_out: tuple[str, ...] = ()) -> str:
+def killed_by(
+    mutation: Mutation, covered: Covered, folder: Path, limit_s: float, left_out: tuple[str, ...] = ()
+) -> str:
     """Return the first test that notices a mutation in a copy of the checkout; "" where none does in the time.
 
     `left_out`: tests that are not asked, since they fail without it, too.
     """
     end_s = time.monotonic() + limit_s
+    asked = [test for test in covered.tests_of(mutation) if test not in left_out]
+    if not asked:
+        print(f"{mutation.file}:{mutation.line}: no test runs it", file=sys.stderr)
+        return ""
+    (folder / "asked").write_text("\n".join(asked), encoding="utf-8")
     known_text = mutation.apply(folder)
-    deselected = [f"--deselect={test}" for test in left_out]
     try:
-        for which, files in stages(mutation):
-            code, failed = tested(folder, ["-m", which, *deselected, *files], end_s - time.monotonic())
-            if code == "no time":
-                print(f"{mutation.file}:{mutation.line}: time was over before all tests were tried", file=sys.stderr)
-                return ""
-            if code not in (0, 5):
-                break
-        else:
+        code, failed = tested(folder, ["@asked"], limit_s)
+        if code == "no time":
+            print(f"{mutation.file}:{mutation.line}: time was over before all tests were tried", file=sys.stderr)
+        if code in ("no time", 0):
             return ""
     finally:
         (folder / mutation.file).write_text(known_text, encoding="utf-8")
@@ -246,7 +340,7 @@ def killed_by(mutation: Mutation, folder: Path, limit_s: float, left_out: tuple[
     if tested(folder, [failed], 2 * ENDLESS_S)[0] == 0:
         return failed
     print(f"{failed} fails in a copy of the repository, and is left out", file=sys.stderr)
-    return killed_by(mutation, folder, end_s - time.monotonic(), (*left_out, failed))
+    return killed_by(mutation, covered, folder, end_s - time.monotonic(), (*left_out, failed))
 
 
 def tested(folder: Path, words: list[str], limit_s: float) -> tuple[int | str, str]:
@@ -255,13 +349,7 @@ def tested(folder: Path, words: list[str], limit_s: float) -> tuple[int | str, s
     running = subprocess.Popen(
         [sys.executable, "-m", "pytest", "-x", "-vv", "-rE", "--tb=no", "-p", "no:cacheprovider", *endless, *words],
         cwd=folder,
-        env=os.environ
-        | {
-            "PYTHONPATH": str(folder),
-            "PYTHONDONTWRITEBYTECODE": "1",
-            "PYTHONUNBUFFERED": "1",
-            "NUMBA_CACHE_DIR": str(folder / ".compiled"),
-        },
+        env=_environment(folder),
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
@@ -278,6 +366,16 @@ def tested(folder: Path, words: list[str], limit_s: float) -> tuple[int | str, s
     # One line a test, with its outcome once it has ended; a file that cannot be imported stands in the summary alone.
     about = STOPPED_AT.findall(said)
     return running.returncode, "".join(about[-1]) if about else ""
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    """Return what programs are started with that run in a copy of the checkout."""
+    return os.environ | {
+        "PYTHONPATH": str(folder),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONUNBUFFERED": "1",
+        "NUMBA_CACHE_DIR": str(folder / ".compiled"),
+    }
 
 
 def copied(folder: Path) -> Path:
@@ -307,6 +405,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for one in mutations:
             print(f"{one.file}:{one.line}: {one.before}  ->  {one.after}")
         return 0
+    covered = Covered(ROOT / "build/mutations" / _digest())
     known = {} if given.again else {Mutation(**row["mutation"]): row["killed by"] for row in _rows(given.results)}
     with tempfile.TemporaryDirectory() as scratch:
         free: Queue[Path] = Queue()
@@ -318,7 +417,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return bool(known[mutation])
             folder = free.get()
             try:
-                by = killed_by(mutation, folder, given.limit)
+                by = killed_by(mutation, covered, folder, given.limit)
             finally:
                 free.put(folder)
             row = json.dumps({"mutation": asdict(mutation), "killed by": by or None})

@@ -132,7 +132,7 @@ class DatasetOptions:
         """Whether options do something to each image that is recorded of it: `images.csv` lists it then."""
         return self.variation is not None or self.crops > 1 or self.weighted or self.is_rendered
 
-    @property
+    @cached_property
     def tints(self) -> bool:
         """Whether the light of an image changes its colour over it, so that images have maps of it."""
         return self.variation is not None and self.variation.tints
