@@ -12,7 +12,7 @@ groups of 16 that are transposed first, which costs 4 shuffles a vector, where l
 would cost 2 cycles a tap. `OUTPUTS` neighbouring vectors are found at a time. From tap to tap the neighbours they need
 move on by one, so a tap loads two vectors, not two for each of them: what bounds the loop is additions and
 multiplications, not loads. Taps that lie symmetrically are combined before they are multiplied: a derivative of
-constant whole numbers is exactly zero.
+constant whole numbers is exactly zero. Short kernels of three orders at a time are the exception, see `beside_all`.
 """
 
 from __future__ import annotations
@@ -68,11 +68,14 @@ def _emit(
     weights: Sequence[Any],
     reach: Any,
     kinds: Sequence[int],
+    *,
+    side_by_side: bool = False,
 ) -> list[list[Any]]:
-    """Return the filtered vectors at `source` and after, `OUTPUTS` neighbours, for each kind.
+    """Return the filtered vectors at `source` and after for each kind.
 
     Neighbours lie `step` bytes apart; `weights` are addresses of reach + 1 float32 a kind. Read are `reach` neighbours
-    before the first and after the last vector.
+    before the first and after the last vector. The vectors are `OUTPUTS` neighbours, or the three vectors of `CHUNK`
+    interleaved pixels side by side, whose neighbours are loaded from wherever they begin.
     """
     from numba.core import cgutils
 
@@ -86,8 +89,9 @@ def _emit(
     def times(number: Any, count: int) -> Any:
         return builder.mul(number, ir.Constant(I64, count))
 
-    outputs = range(OUTPUTS)
-    centre = [load(builder, builder.add(source, times(step, at)), 0, FLOATS) for at in outputs]
+    outputs = range(3 if side_by_side else OUTPUTS)
+    apart = ir.Constant(I64, LINE) if side_by_side else step
+    centre = [load(builder, builder.add(source, times(apart, at)), 0, FLOATS) for at in outputs]
     sums: list[list[Any]] = []
     for kind, table in zip(kinds, weights, strict=True):
         first = broadcast(builder, load(builder, table, 0, F32), FLOATS)
@@ -100,11 +104,15 @@ def _emit(
         tap = builder.add(loop.index, ir.Constant(I64, 1))
         offset = builder.mul(tap, step)
         below, above = builder.sub(source, offset), builder.add(last, offset)
-        low = [load(builder, below, 0, FLOATS), *[builder.load(slot) for slot in lows[:-1]]]
-        high = [*[builder.load(slot) for slot in highs[1:]], load(builder, above, 0, FLOATS)]
-        for slots, values in ((lows, low), (highs, high)):
-            for slot, value in zip(slots, values, strict=True):
-                builder.store(value, slot)
+        if side_by_side:
+            low = [load(builder, below, LINE * at, FLOATS) for at in outputs]
+            high = [load(builder, builder.add(source, offset), LINE * at, FLOATS) for at in outputs]
+        else:
+            low = [load(builder, below, 0, FLOATS), *[builder.load(slot) for slot in lows[:-1]]]
+            high = [*[builder.load(slot) for slot in highs[1:]], load(builder, above, 0, FLOATS)]
+            for slots, values in ((lows, low), (highs, high)):
+                for slot, value in zip(slots, values, strict=True):
+                    builder.store(value, slot)
         factors = [
             broadcast(builder, load(builder, builder.add(table, times(tap, _BYTES)), 0, F32), FLOATS)
             for table in weights
@@ -161,6 +169,31 @@ def across_all(
     """Write four pixels of 16 rows, smoothed, derived once and derived twice."""
     del typing, source, reach, even, odd, bend, smooth, slope, curve
     return _across((EVEN, ODD, BEND))
+
+
+@intrinsic
+def beside_all(
+    typing: Any,
+    source: Any,
+    reach: Any,
+    even: Any,
+    odd: Any,
+    bend: Any,
+    smooth: Any,
+    slope: Any,
+    curve: Any,
+    column: Any,
+) -> Any:
+    """Write 16 interleaved pixels of a row, smoothed, derived once and twice, as vectors `column` bytes apart."""
+    del typing, source, reach, even, odd, bend, smooth, slope, curve, column
+
+    def emit(builder: Any, source: Any, reach: Any, *places: Any) -> None:
+        step = ir.Constant(I64, 3 * _BYTES)
+        found = _emit(builder, source, step, places[:3], reach, (EVEN, ODD, BEND), side_by_side=True)
+        for values, target in zip(found, places[3:-1], strict=True):
+            _write(builder, values, target, places[-1])
+
+    return void(emit, *[ADDRESS] * 9)
 
 
 @intrinsic
@@ -266,6 +299,9 @@ def transpose(typing: Any, source: Any, pitch: Any, target: Any) -> Any:
 
 GROUP: Final = LANES
 """Rows that are filtered along x at a time: one a lane."""
+NEAR: Final = 9
+"""Reach of kernels up to which rows are not transposed for order 2: its four transpositions a vector take longer than
+loads that begin between two cache lines. Orders 0 and 1 have two and three, and are not faster so."""
 STRETCH: Final = 4 * 3 * CHUNK
 """Numbers of a row that are converted before they are transposed: 16 rows of them take 12 KB of the nearest cache."""
 
@@ -306,6 +342,53 @@ def _turn_rows(
         turned[at] = turned[before + at % 3]
     for at in range(end - 3 * left, turned.shape[0]):
         turned[at] = turned[at - 3]
+
+
+@compiled
+def _convert_row(
+    image: npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64],
+    scale: float,
+    y: int,
+    left: int,
+    line: npt.NDArray[np.float32],
+) -> None:
+    """Write a row of an image (H, 3 W) times `scale`, from pixel `left` on, to `line` (3 P,) float32.
+
+    Beyond the image stand copies of its first and last pixels and of its last row.
+    """
+    height, length = image.shape
+    begin = max(0, 3 * left)
+    end = min(length, 3 * left + line.size)
+    values = image[min(y, height - 1), begin:end]
+    before = begin - 3 * left
+    inside = line[before : before + end - begin]
+    if scale == 1:
+        for j in range(values.size):
+            inside[j] = np.float32(values[j])
+    else:
+        for j in range(values.size):
+            inside[j] = np.float32(values[j] * scale)
+    for at in range(before):
+        line[at] = inside[at % 3]
+    for at in range(before + inside.size, line.size):
+        line[at] = line[at - 3]
+
+
+@compiled
+def _filter_row(
+    row: int, weights: npt.NDArray[np.float32], line: npt.NDArray[np.float32], columns: npt.NDArray[np.float32]
+) -> None:
+    """Filter a row, as `_convert_row` wrote it from `reach` pixels before the tile on, to a row of three columns."""
+    reach = weights.shape[1] - 1
+    even = weights.ctypes.data
+    odd = even + weights.shape[1] * _BYTES
+    bend = odd + weights.shape[1] * _BYTES
+    column = columns.shape[2] * LINE
+    field = columns.shape[1] * column
+    for at in range(0, columns.shape[1], 3):
+        source = line.ctypes.data + 3 * reach * _BYTES + at * LINE
+        smooth = columns.ctypes.data + at * column + row * LINE
+        beside_all(source, reach, even, odd, bend, smooth, smooth + field, smooth + 2 * field, column)
 
 
 @compiled
@@ -350,7 +433,14 @@ def filter_rows(
             first = columns.ctypes.data + at * column
             for row in range(done - start):
                 copy_line(first + (row + rows) * LINE, first + row * LINE)
+    line = turned.reshape(-1)[: columns.shape[1] * LANES + 6 * reach]
     while done < min(height, top + rows + reach):
+        if order == 2 and reach <= NEAR:
+            for row in range(GROUP):
+                _convert_row(image, scale, done + row, left - reach, line)
+                _filter_row(done + row - start, weights, line, columns)
+            done += GROUP
+            continue
         _turn_rows(image, scale, done, left - reach, lines, turned)
         to = columns.ctypes.data + (done - start) * LINE
         for at in range(0, columns.shape[1], 3):
