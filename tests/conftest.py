@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import re
@@ -38,17 +39,14 @@ sys.modules.setdefault("triton", None)  # pyright: ignore[reportArgumentType]
 # Ten thousand tests stay to the end, and are looked through by the garbage collector again and again as they become
 # more: a sixth of the time that reading them takes.
 gc.disable()
+# At the end bindings of C++ look whether anything of theirs is left.
+atexit.register(gc.unfreeze)
 
 
 def pytest_collection_finish() -> None:
     """Collect garbage from here on, but for what has come by now."""
     gc.freeze()
     gc.enable()
-
-
-def pytest_unconfigure() -> None:
-    """Let what ends with the process be collected, which bindings of C++ look after."""
-    gc.unfreeze()
 
 
 SLOW_FILE = re.compile(r"^pytestmark = (\[\s*)?pytest\.mark\.slow\b", re.MULTILINE)
