@@ -17,6 +17,7 @@ from drivers.presenter import Colour
 from experiment.config import JudgeSettings, parse_lab
 from experiment.framing.pictures import Shift
 from experiment.session.records import TOP, Check, SessionStep
+from tests.acquisition.judge.test_projector_model import at
 from tests.acquisition.judge.test_references import DARK, PRIMARIES, WHITE, begun, known, measured
 
 # pyright: reportPrivateUsage=false
@@ -167,6 +168,22 @@ def test_a_light_of_another_colour_is_lived_with_where_it_is_shown_twice(
     reason, added = light.cause(blue < 1, 0.01, again=again)
     assert (said in reason) if said else not reason
     assert added == 0
+
+
+def test_light_from_elsewhere_is_asked_for_where_what_is_off_is_light_alone() -> None:
+    def said(light: judge._SeenLight) -> str:
+        return light.cause(True, 0.01, again=False)[0]
+
+    # A tenth of the frame before, which was brighter in red and green.
+    brighter = said(seen_light((1.05, 1.02, 1), before=((TOP, TOP, 9), (1.5, 1.2, 1))))
+    assert "remain in this one" in brighter
+    assert "light from elsewhere" in brighter
+    assert "elsewhere" not in said(seen_light((0.9, 0.9, 0.1), (TOP, TOP, 0), ((0, 0, TOP), (0, 0, 1))))
+    # Another light of the plan, with more blue or with less than ordered.
+    more = seen_light((1, 1, at(120)), (TOP, TOP, 0), plan=((TOP, TOP, 120),))
+    less = seen_light((1, at(213), at(213)), plan=((TOP, 213, 213),))
+    assert ["does other light fall" in said(light) for light in (more, less)] == [True, False]
+    assert all("another light is seen" in said(light) for light in (more, less))
 
 
 def test_brighter_light_of_one_colour_is_the_rooms_where_that_fits_better() -> None:
