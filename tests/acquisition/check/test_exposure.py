@@ -13,6 +13,7 @@ from acquisition.check.frames import (
     best_of,
     fitting_times,
     judge_exposure,
+    level_of,
     measure_saturation,
     search,
 )
@@ -101,3 +102,41 @@ def test_a_share_of_a_stated_saturation_is_not_called_good() -> None:
     found = judge_exposure(tried(1.4, 0.5, TIMES), Saturation(15831, False, 15831), TIMES, PERIOD_S, recorded=False)
     assert found.grade == "remark"
     assert "as the file states, not measured" in found.said
+
+
+@pytest.mark.parametrize(
+    ("trials", "said"),
+    [
+        ([(0.5, 0.3), (1.0, 0.7)], "set camera.shutter_s = 1 (tried: 70 %)"),
+        (
+            [(0.5, 0.3), (1.0, 1.0)],
+            "camera.shutter_s = 0.5, gives 30 %: set a lower f-number or a higher ISO speed, or a",
+        ),
+        ([(0.5, 0.9), (0.25, 0.85)], "gives 85 %: set a higher f-number or a lower ISO speed, or dim the projector"),
+        ([(0.5, 1.0), (0.25, 1.0)], "even the shortest, 0.25 s, saturates: set a higher f-number"),
+    ],
+)
+def test_where_no_time_suits_lens_or_speed_are_named(trials: list[tuple[float, float]], said: str) -> None:
+    tried = [Trial(time, (0.1, level, 0.2), level >= 0.95) for time, level in trials]
+    found = judge_exposure(tried, Saturation(13584, True, 15831), TIMES, PERIOD_S, recorded=False)
+    assert said in found.remedy
+    assert ("proposed_shutter_s" in found.details) == ("tried" in said)
+    recorded = judge_exposure(tried, Saturation(13584, True, 15831), TIMES, PERIOD_S, recorded=True)
+    assert "take another session" in recorded.remedy
+    without = judge_exposure(tried, Saturation(13584, True, 15831), [], PERIOD_S, recorded=False)
+    assert "lists no shutter times" in without.remedy
+
+
+def test_a_trial_is_of_the_strongest_channel_above_black() -> None:
+    shot = photographed(1000, 1.0, 13584)
+    white = np.array([2000.0, 11536 * 0.985, 300.0])
+    for counts, clipped in ((white, True), (white * 0.99, False)):
+        trial = level_of(shot, Saturation(13584, True, 15831), counts)
+        assert trial.level == pytest.approx(tuple(counts / (13584 - BLACK)))
+        assert (trial.highest, trial.clipped) == (max(trial.level), clipped)
+
+
+def test_times_that_hold_whole_turns_up_to_half_a_minute_are_offered() -> None:
+    offered = [31.0, 30.0, 0.5, 1 / 50, 1 / 60, 1 / 120]
+    assert fitting_times(offered, PERIOD_S) == [1 / 60, 0.5, 30.0]
+    assert fitting_times(offered, None) == [1 / 120, 1 / 60, 1 / 50, 0.5, 30.0]

@@ -200,6 +200,17 @@ def test_check_and_build_agree_on_every_figure_that_both_know(name: str, said: C
     assert not differing
 
 
+@pytest.mark.parametrize("name", ["sharp", "lit room"])
+def test_what_the_check_measures_is_what_the_build_measures(name: str, said: Callable[[str], Said]) -> None:
+    """Bleed is a steep function of blur, and the spread is of the noise of one frame."""
+    found = said(name)
+    assert found.forecast is not None
+    assert len(found.forecast.figures.keys() & found.figures.keys()) == 11
+    for figure, value in found.forecast.figures.items():
+        near = {"bleed": 0.4, "reference_spread": 0.2}.get(figure, 0.02)
+        assert value == pytest.approx(found.figures[figure], rel=near), figure
+
+
 @pytest.mark.parametrize("name", [name for name, case in ROOMS.items() if case.expected != "any"])
 def test_the_forecast_verdict_is_what_the_room_deserves(name: str, said: Callable[[str], Said]) -> None:
     found, expected = said(name), ROOMS[name].expected

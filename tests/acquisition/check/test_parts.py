@@ -121,7 +121,9 @@ def test_hot_photosites_are_counted() -> None:
     random = np.random.default_rng(2)
     dark = np.rint(2048 + 4 * random.standard_normal((600, 800))).astype(np.uint16)
     dark[25::50, 30::80] += 60
+    # Lit unevenly: what leaks of it is taken off before anything stands out.
     white = np.full_like(dark, 9000)
+    white[:, ::4] = white[:, 1::4] = 1000
     for share in (0.0, 0.01):
         lit = np.rint(dark + share * white).astype(np.uint16)
         found = judge_hot(mosaic(lit), share, mosaic(white))
@@ -198,12 +200,17 @@ def test_a_series_goes_from_dim_to_nearly_saturated() -> None:
 
 
 def test_a_body_that_takes_dark_frames_of_its_own_is_told() -> None:
-    plain = [(0.5, 2.5), (0.5, 2.6), (4.0, 6.1)]
-    assert judge_noise_reduction(plain).grade == "good"
-    doubled = [(0.5, 2.5), (0.5, 2.6), (4.0, 10.1)]
-    assert judge_noise_reduction(doubled).grade == "remark"
-    assert judge_noise_reduction([(0.1, 2.0), (0.5, 2.5)]).grade == "not checked"
-    assert judge_noise_reduction([]).grade == "not checked"
+    def found(longest: float, took: float) -> Finding:
+        return judge_noise_reduction([(0.5, 2.5), (longest, took), (0.5, 2.7), (0.5, 2.6), (2.0, 9.0)])
+
+    # Beside 0.5 s, 2.1 s more; beside 4 s the same, or 4 s more than that; half of it is let pass.
+    assert found(4.0, 6.1).value == pytest.approx(0.0)
+    doubled = found(4.0, 10.1)
+    assert (doubled.value, doubled.grade) == (pytest.approx(4.0 / 3.5), "remark")
+    assert [found(4.0, 6.1 + 3.5 * share).grade for share in (0.49, 0.51)] == ["good", "remark"]
+    for few in ([], [(0.1, 2.0), (0.99, 4.0)], [(0.51, 2.0), (2.0, 4.0)]):
+        assert judge_noise_reduction(few).grade == "not checked"
+    assert judge_noise_reduction([(0.25, 2.0), (1.0, 4.0)]).grade == "remark"
 
 
 def test_a_full_picture_that_is_dimmed_is_told() -> None:

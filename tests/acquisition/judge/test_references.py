@@ -9,10 +9,10 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.judge import judge as judge_module
-from acquisition.judge import limits, state
+from acquisition.judge import limits
 from acquisition.judge.judge import MOST_RESTARTS, judge_dark, judge_first_frames, judge_first_primary, judge_white
 from acquisition.judge.measure import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Frame, FramePlaces, Measured, Noise
-from acquisition.judge.state import Basis, Codes, Examined, JudgeState, ProjectorModel, Seen
+from acquisition.judge.state import Basis, Codes, Examined, JudgeState, Seen
 from drivers.presenter import Colour
 from experiment.config import JudgeSettings
 from experiment.session.records import TOP, Check, SessionStep
@@ -305,12 +305,6 @@ def test_more_light_is_no_room_s_light_where_the_lamp_scatters_as_much() -> None
     assert found[0] == pytest.approx(0.08, abs=0.01)
 
 
-def test_of_black_a_model_foretells_nothing_but_stray_light() -> None:
-    expected = ProjectorModel.unknown().predict((0, 0, 0))
-    assert expected.amounts.tolist() == [0, 0, 0]
-    np.testing.assert_allclose(expected.covariance, 3e-4**2 * np.eye(3))
-
-
 @pytest.mark.parametrize(
     ("rested", "candidate", "rests"),
     [(False, (np.nan, np.nan), (0.0, 0.0)), (False, (0.35, 0.0), (0.3, 0.0)), (True, (np.nan, np.nan), (0.3, 0.0))],
@@ -324,14 +318,6 @@ def test_a_chart_s_place_of_rest_is_another_only_if_it_is_shown_twice_or_after_a
     after = before.after(LIGHT, Examined(frame, None, True)).moved_px
     assert after is not None
     assert after.tolist() == list(rests)
-
-
-def test_of_a_curve_a_small_part_is_the_primary_s_own() -> None:
-    nodes = len(state._NODES)  # pyright: ignore[reportPrivateUsage]
-    covariance = ProjectorModel.unknown().covariance
-    own, shared = covariance[:nodes, :nodes], covariance[:nodes, nodes : 2 * nodes]
-    np.testing.assert_allclose(own, covariance[nodes : 2 * nodes, nodes : 2 * nodes])
-    np.testing.assert_allclose(shared, own * (1 - 0.15**2))
 
 
 def test_tiles_begin_at_the_frame_s_first_block_and_end_at_its_last() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import Any
 
 import pytest
 
+from acquisition.run import pipeline
 from acquisition.run.devices import PAUSE_S, HealthWatch
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
+from experiment.config import JudgeSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import IncomingFile, Journal
@@ -70,6 +73,36 @@ def test_light_in_the_room_is_doubted_once_and_lastingly(folder: Path, percent: 
     assert sum(step.kind == "dark" for step in judge.judged) > 1
     assert len(outcome.doubts) == doubted
     assert all(f"{percent} % of white" in doubt for doubt in outcome.doubts)
+
+
+@pytest.mark.parametrize(
+    ("step", "checks", "said"),
+    [
+        ("light", {"movement": 0.21}, "moved: the chart lies 0.21 px from where it was"),
+        ("light", {"movement": 0.19}, ""),
+        ("light", {"lamp": 4.0}, ""),
+        ("light", {"lamp beyond": -4.0}, "level: the light is 4.0 % weaker"),
+        ("light", {"lamp beyond": 4.0}, "level: the light is 4.0 % stronger"),
+        ("link", {"lamp": 1.1}, "level: the light is 1.1 % stronger"),
+        ("link", {"lamp": -1.1}, "level: the light is 1.1 % weaker"),
+        ("link", {"lamp": 0.9}, ""),
+        ("response", {"lamp": 1.1}, ""),  # before any light there is no run that it links
+    ],
+)
+def test_a_change_is_told_that_the_run_follows(step: str, checks: dict[str, float], said: str) -> None:
+    grey = Colour(250, 250, 250)
+    first, light = SessionStep(3, "response", None, grey), SessionStep(5, "light", 0, grey)
+    link = replace(first, number=9)
+    limits = {"movement": 0.2, "lamp": 9.0, "lamp beyond": 3.0}
+    found = pipeline._followed_changes(  # pyright: ignore[reportPrivateUsage]
+        {"light": light, "response": first, "link": link}[step],
+        Judgement(tuple(Check(name.split()[0], value, -limits[name], limits[name]) for name, value in checks.items())),
+        (first, light, link),
+        JudgeSettings(),
+    )
+    what, _, words = said.partition(": ")
+    assert [one for one, _ in found] == ([what] if said else [])
+    assert all(words in sentence for _, sentence in found)
 
 
 def run(lab: Lab, judge: ScriptedJudge | None = None, **more: Any) -> RunOutcome:

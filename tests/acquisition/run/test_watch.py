@@ -13,7 +13,7 @@ import pytest
 from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.view import Head, read_session
 from acquisition.run import devices, run
-from acquisition.run.devices import GAP_S, LATE_S, LATE_TIMES, RunWatch
+from acquisition.run.devices import RunWatch
 from acquisition.run.run import take_session
 from drivers.presenter import Colour
 from tests.acquisition.run.scripted import SETTINGS, Lab
@@ -33,10 +33,10 @@ def test_a_jump_is_told_once() -> None:
     time = Time()
     watch = RunWatch(elapsed=time)
     assert watch.gap_s() == 0
-    time.now += GAP_S
+    time.now += 10
     assert watch.gap_s() == 0, "a busy machine"
-    time.now += 343
-    assert watch.gap_s() == 343
+    time.now += 11
+    assert watch.gap_s() == 11
     assert watch.gap_s() == 0
 
 
@@ -93,20 +93,25 @@ def test_a_step_that_takes_too_long_is_told_once_with_its_device() -> None:
             watch.look()
 
     with watch.step("the camera", "exposes light 3", 4.0, "expose"):
-        pass_s(LATE_TIMES * 4 + LATE_S)
+        pass_s(3 * 4 + 10)
         assert not told
+        pass_s(1)
+        assert len(told) == 1
         pass_s(300)
         assert len(told) == 1
     assert "the camera exposes light 3, for which 4 s is expected" in told[0]
     pass_s(300)
     with watch.step("the camera", "exposes light 4", 4.0, "expose"):
-        pass_s(LATE_TIMES * 4 + LATE_S + 1)
+        pass_s(3 * 4 + 10 + 1)
     assert len(told) == 2, "what was late tells nothing of how long it takes"
     with watch.step("the camera", "sends light 4", 4.0, "download"):
         pass_s(20)
     with watch.step("the camera", "sends light 5", 4.0, "download"):
-        pass_s(LATE_TIMES * 20 + LATE_S)
+        pass_s(3 * 20 + 10)
     assert len(told) == 2, "a slow cable stays slow"
+    with watch.step("the screen", "shows light 6", 0.5, "show"):
+        pass_s(12)
+    assert "for which 0.5 s is expected" in told[2]
 
 
 def test_a_machine_that_slept_makes_no_step_late() -> None:

@@ -243,8 +243,10 @@ def results(heard: bytes) -> list[tuple[int, int, int, bytes]]:
     heard = heard[8 + 312 :]
     found: list[tuple[int, int, int, bytes]] = []
     while heard:
-        command, number, device, direction, endpoint, status, actual, *_ = URB.unpack_from(heard)
+        command, number, device, direction, endpoint, status, actual, *rest = URB.unpack_from(heard)
         assert (device, direction, endpoint) == (0, 0, 0)
+        assert rest == [0, 0, 0, bytes(8)], "no isochronous transfer"
+        assert command == 3 or actual == 0
         body = actual if command == 3 and number < 100 else 0
         found.append((command, number, status - (1 << 32) if status >> 31 else status, heard[48 : 48 + body]))
         heard = heard[48 + body :]

@@ -18,9 +18,10 @@ import tifffile
 from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
-from drivers.raw.rawfile import read_raw
+from drivers.raw.rawfile import camera_matrix, read_raw
+from sim.camera import film
 from sim.camera.film import write_dng
-from sim.world.sensors import BODIES, Body
+from sim.world.sensors import BODIES, Body, find_body
 
 pytestmark = pytest.mark.slow
 
@@ -120,6 +121,52 @@ def test_the_tags_of_a_550d_file_are_those_of_the_standard() -> None:
     assert (kind, count) == (5, 3)
     neutral = matrix @ [0.9505, 1, 1.089]
     np.testing.assert_allclose(fractions(value), neutral / neutral[1], rtol=1e-3)
+
+
+def test_colours_of_bodies_are_those_that_libraw_has_and_of_unknown_ones_srgb_s() -> None:
+    for sensitivities, numbers in film._COLOUR_MATRICES.items():  # pyright: ignore[reportPrivateUsage]
+        theirs = camera_matrix(sensitivities.replace("_", " "))
+        assert theirs is not None
+        np.testing.assert_allclose(np.array(numbers).reshape(3, 3) / 1e4, theirs, atol=1e-6)
+    # IEC 61966-2-1: linear sRGB to XYZ.
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    unknown = np.array(film._LINEAR_SRGB).reshape(3, 3) / 1e4  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(unknown @ to_xyz, np.eye(3), atol=2e-4)
+
+
+# Columns and rows of the maker's pixels (of the first two as dcraw 9.28 shows them), width of the sensor in mm, black.
+SENSORS = {
+    "EOS 550D": (5202, 3465, 22.3, 2048),
+    "EOS 6D Mark II": (6264, 4180, 35.9, 2048),
+    "Canon_EOS_600D": (5202, 3465, 22.3, 2048),
+    "Canon_EOS_200D": (6000, 4000, 22.3, 2048),
+    "Canon_EOS-1Ds_Mark_III": (5616, 3744, 36.0, 1024),
+    "Canon_EOS_5D_Mark_II": (5616, 3744, 36.0, 1024),
+    "Canon_EOS_5DS": (8688, 5792, 36.0, 2048),
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_bodies_have_the_sizes_of_their_makers_and_noise_as_such_sensors_have(name: str) -> None:
+    columns, rows, width_mm, black = SENSORS[name]
+    body = find_body(name)
+    top, left, height, width = body.visible
+    assert (width, height, body.black, body.bits, body.pattern) == (columns, rows, black, 14, "RGGB")
+    # Canons have some fifty masked rows above, and more than a hundred masked columns at the left.
+    assert body.sensor == (top + height, left + width)
+    assert 40 < top < 60
+    assert 110 < left < 150
+    assert body.masked == ((0, 0, body.sensor[0], left - 2),)
+    assert 0.82 < body.saturation / 2**14 <= 1
+    # Full wells by area, read noise, and its part before the amplifier, of sensors of these generations (EMVA 1288).
+    full_e = (body.saturation - body.black) * body.electrons_per_dn
+    assert 1000 < full_e / (1000 * width_mm / columns) ** 2 < 2500
+    assert 10 < body.read_noise_dn * body.electrons_per_dn < 30
+    assert 2 < body.sensor_noise_e < 4
+    assert body.gain_e(400) == body.electrons_per_dn / 4
+    # At ISO 100 all of the read noise; at high speeds what arises before the amplifier, over the smaller gain.
+    assert body.noise_dn(100) == pytest.approx(body.read_noise_dn)
+    assert body.noise_dn(10**6) * body.gain_e(10**6) == pytest.approx(body.sensor_noise_e, rel=1e-3)
 
 
 def test_the_exif_directory_holds_the_exposure() -> None:

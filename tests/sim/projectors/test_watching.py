@@ -26,6 +26,7 @@ from sim.projectors.watching import (
     LampState,
     ScreenPlace,
     Screenshots,
+    ThrownLight,
     ask,
     picture_light,
 )
@@ -263,3 +264,17 @@ def test_screenshots_are_of_the_place_and_come_back_with_the_server(tmp_path: Pa
             whole.take()
         with pytest.raises(DeviceError, match=f"check {server.display}"):
             whole.take()
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ([[0.25]], "plain picture, mean light 0.250 0.250 0.250, lamp 0.70"),
+        ([[0.25, 0.2509]], "plain picture, mean light 0.250 0.250 0.250, lamp 0.70"),
+        ([[0.2], [0.6]], "not plain picture, mean light 0.400 0.400 0.400, lamp 0.70"),
+        ([[0.2, 0.2, 0.8]], "not plain picture, mean light 0.400 0.400 0.400, lamp 0.70"),
+    ],
+)
+def test_light_is_told_as_plain_where_its_picture_is_alike_everywhere(rows: list[list[float]], said: str) -> None:
+    picture = np.repeat(np.array(rows, dtype=np.float32)[..., None], 3, axis=2)
+    assert str(ThrownLight(picture, 0.7)) == said

@@ -85,9 +85,11 @@ def altered(place: str, value: Any) -> dict[str, Any]:
         (document(low=420), "its wavelengths are 420 to 720, 400 to 700 nm at least"),
         (document(low=0.39, high=0.72, step=0.01), "convert them to nanometres"),
         (altered("390", [0, 0, 0.3]), "B still has 30% of its peak at its last wavelength, 390 nm"),
+        (altered("720", [0.051, 0, 0]), "R still has 5% of its peak at its last wavelength, 720 nm"),
     ],
 )
 def test_what_cannot_be_a_cameras_is_refused(content: Any, message: str) -> None:
+    assert parsed(altered("720", [0.05, 0, 0])).curves[-1, 0] == 0.05, "so much may be left at the end"
     with pytest.raises(FormatError, match=message) as refused:
         parsed(content)
     assert str(refused.value).startswith("m1.json")

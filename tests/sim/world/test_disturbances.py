@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+import json
+import re
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -283,6 +285,57 @@ def test_every_event_is_there_when_said_and_leaves_other_frames_as_they_are(bare
     assert [event.is_there(Moment(frame)) for frame in range(2, 5)] == [False, True, True]
     undisturbed = taken(bare, colour=GREEN, frame=2)
     np.testing.assert_array_equal(taken(bare, event, colour=GREEN, frame=2), undisturbed)
+
+
+@pytest.mark.parametrize(
+    ("limits", "moments"),
+    [
+        ({"from_frame": 4, "to_frame": 8}, {(3, 0): None, (4, 0): 0.0, (6, 0): 0.5, (8, 0): 1.0, (20, 0): 1.0}),
+        ({"from_s": 10.0, "to_s": 30.0}, {(0, 9.9): None, (0, 10): 0.0, (0, 15): 0.25, (0, 30): 1.0, (0, 99): 1.0}),
+        ({"to_s": 40.0}, {(0, 0): 0.0, (0, 10): 0.25}),
+        ({"from_frame": 4, "to_frame": 4}, {(4, 0): 0.0, (5, 0): 1.0}),
+    ],
+)
+def test_what_is_gradual_grows_evenly_to_its_end_and_stays(
+    limits: dict[str, Any], moments: dict[tuple[int, float], float | None]
+) -> None:
+    for (frame, at_s), grown in moments.items():
+        drift = LampDrift(percent=-20, rgb=(0, 0, 50), **limits)
+        happens = Disturbances((drift, SensorWarming(dn=8, **limits)))
+        situation = happens.situation(Moment(frame, at_s))
+        less = 1 - 0.2 * (grown or 0)
+        assert situation.lamp == pytest.approx((less, less, less * (1 + 0.5 * (grown or 0))))
+        assert situation.black_dn == pytest.approx(8 * (grown or 0))
+        assert len(happens.at(Moment(frame, at_s))) == (0 if grown is None else 2)
+
+
+def test_events_of_one_kind_add_up() -> None:
+    situation = Disturbances(
+        (Bump(px=2, direction_deg=90, turn_deg=1), Bump(px=1, mm=3, direction_deg=0, turn_deg=2), Defocus(px=3),
+         Defocus(px=4), AmbientStep(percent=1), AmbientStep(percent=2, rgb=(3, 0, 0)), LampStep(), LampStep(percent=10))
+    ).situation(Moment(0))  # fmt: skip
+    assert (situation.bump_px, situation.bump_mm) == (pytest.approx((1, 2)), pytest.approx((3, 0)))
+    assert (situation.turn_deg, situation.defocus_px) == (3, 5)
+    assert situation.ambient == pytest.approx((0.07, 0.01, 0.01))
+    assert situation.lamp == pytest.approx((0.99,) * 3)
+
+
+def test_what_is_not_said_of_an_event_is_as_documented() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "lab.md").read_text(encoding="utf-8")
+    table = page.partition("| what | keys and their defaults |")[2].partition("## ")[0]
+    kinds = {kind.what: kind for kind in get_args(AnyDisturbance)}
+    compared = 0
+    for line in table.splitlines():
+        named, _, described = line.strip("| ").partition("|")
+        events = [kinds[name] for name in re.findall("`(.*?)`", named)]
+        for key, value in re.findall(r"`(\w+) = ([^`]+)`", described):
+            # The first that has the key; of two that have it, each its own.
+            event = next(one for one in events if key in one.__dataclass_fields__)
+            events = [*events[1:], event] if len(events) > 1 else events
+            default: Any = event.__dataclass_fields__[key].default
+            assert json.loads(json.dumps(default)) == json.loads(value), (event.what, key)
+            compared += 1
+    assert compared == 15
 
 
 @pytest.mark.parametrize(

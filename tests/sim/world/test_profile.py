@@ -100,7 +100,7 @@ def test_no_ink_code_comes_nearer_than_the_profile_s() -> None:
             hue = off[..., 2] * along[0] - off[..., 1] * along[1]
             return np.sqrt((off**2).sum(axis=-1) + 3 * hue**2)
 
-        assert float(away(found)) < float(away(every).min()) + 0.5
+        assert float(away(found)) < float(away(every).min()) + 0.01
 
 
 @pytest.mark.parametrize("on", PAPERS)

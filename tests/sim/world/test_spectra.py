@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.spatial import ConvexHull
 
 from sim.spectral import (
@@ -229,6 +230,68 @@ def test_the_gamut_is_as_large_as_that_of_measured_prints(on: PaperName) -> None
     steps = np.array(list(product(np.linspace(0, 255, 9), repeat=3)))
     low, high = HULLS[on]
     assert low < ConvexHull(absolute_lab(print_reflectance(steps, on))).volume < high
+
+
+def test_diodes_have_the_peaks_and_widths_that_are_stated() -> None:
+    fine = np.arange(400, 700, 0.1)
+    for power, peak, width in zip(projector_primaries("led"), (633, 515, 451), (19, 34, 22), strict=True):
+        shape = CubicSpline(WAVELENGTHS_NM, power)(fine)
+        assert fine[shape.argmax()] == pytest.approx(peak, abs=1)
+        assert 0.1 * np.count_nonzero(shape > shape.max() / 2) == pytest.approx(width, abs=1)
+
+
+def test_the_mercury_lamp_has_its_lines_behind_three_filters() -> None:
+    red, green, blue = projector_primaries("uhp")
+    whole = red + green + blue
+    inner = (whole[1:-1] > whole[:-2]) & (whole[1:-1] > whole[2:])
+    lines = WAVELENGTHS_NM[1:-1][inner]
+    # The yellow one lies in the notch between green and red.
+    assert all(np.abs(lines - line).min() <= 5 for line in (436, 546)), lines
+    # Blue up to 493 nm, green from 505 to 568 nm, red from 600 nm, with edges of some nm between them.
+    for power, low, high in ((blue, 0, 493), (green, 505, 568), (red, 600, 900)):
+        inside = (low <= WAVELENGTHS_NM) & (high >= WAVELENGTHS_NM)
+        near = (low - 10 <= WAVELENGTHS_NM) & (high + 10 >= WAVELENGTHS_NM)
+        assert power[inside].sum() > 0.93 * power.sum()
+        assert power[near].sum() > 0.99 * power.sum()
+
+
+@pytest.mark.parametrize(
+    ("on", "grey", "coverage"),
+    [("poster", 0.0, (0.64, 0.9)), ("poster", 127.5, (0.41, 0.225)), ("matt", 0.0, (0.5, 1.0)),
+     ("glossy", 127.5, (0.375, 0.25)), ("poster", 255.0, (0.0, 0.0))],
+)  # fmt: skip
+def test_black_ink_grows_with_the_square_of_grey_and_takes_the_place_of_a_share_of_the_others(
+    on: PaperName, grey: float, coverage: tuple[float, float]
+) -> None:
+    each, black = coverage
+    np.testing.assert_allclose(ink_coverage([grey] * 3, on), [each, each, each, black])
+    np.testing.assert_allclose(ink_coverage([255, grey, 0], on), [0, 1 - grey / 255, 1, 0])
+
+
+@pytest.mark.parametrize("on", PAPER_NAMES)
+def test_inks_lie_over_each_other_by_chance_and_light_spreads_between_them(on: PaperName) -> None:
+    """A half covered is 0.64 covered for dots that grow; Demichel's shares, mixed in the root (Yule-Nielsen, n = 2)."""
+    chosen = paper(on)
+    below = (chosen.white - chosen.surface) / (1 - chosen.surface)
+    cyan, magenta = chosen.inks[0], chosen.inks[1]
+    mixed = np.sqrt(below) * (
+        0.36 * 0.36
+        + 0.64 * 0.36 * (10 ** (-cyan / 2) + 10 ** (-magenta / 2))
+        + 0.64 * 0.64 * 10 ** (-(cyan + magenta) / 2)
+    )
+    seen = print_reflectance([[127.5, 127.5, 255]], on)[0]
+    np.testing.assert_allclose(seen, chosen.surface + (1 - chosen.surface) * mixed**2)
+
+
+def test_solid_inks_of_the_poster_have_the_densities_that_are_stated() -> None:
+    cyan, magenta, yellow, black = paper("poster").inks
+
+    def at(nm: float, ink: NDArray[np.float64]) -> float:
+        return float(ink[nm == WAVELENGTHS_NM][0])
+
+    seen = [at(450, yellow), at(490, yellow), at(540, magenta), at(450, magenta), at(700, cyan) / cyan.max()]
+    np.testing.assert_allclose(seen, [1.25, 0.625, 1.17, 0.2, 0.5], atol=0.1)
+    assert np.ptp(black) == 0
 
 
 @pytest.mark.parametrize("on", SOLID_LAB)

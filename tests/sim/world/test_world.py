@@ -20,7 +20,7 @@ from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import ConfigurationError
 from sim.world import sensors
 from sim.world.rendering import Print
-from sim.world.sensors import BODIES, Body, Rectangle
+from sim.world.sensors import BODIES, Body, HotPattern, Rectangle
 from sim.world.world import REFERENCE_EXPOSURE, Room, World
 
 pytestmark = pytest.mark.slow
@@ -447,15 +447,25 @@ def test_hot_photosites_are_few_the_same_in_all_frames_and_grow_with_time_and_ga
 
 
 def test_hot_photosites_add_to_light_and_leave_all_others_as_they_were() -> None:
-    cold = World(squares_sheet(), BODIES["Test"], replace(HOT, hot_per_million=0.0))
-    hot = World(squares_sheet(), BODIES["Test"], HOT)
+    near = replace(HOT, fill=1.4)
+    cold = World(squares_sheet(), BODIES["Test"], replace(near, hot_per_million=0.0))
+    hot = World(squares_sheet(), BODIES["Test"], near)
+    drawn = hot.hot
+    # In the corners of what sees light, too, and beside them.
+    top, left, height, width = BODIES["Test"].visible
+    corners = [
+        (row, column) for row in (top - 1, top, top + height - 1) for column in (left - 1, left, left + width - 1)
+    ]
+    rows, columns = np.array(sorted([*zip(drawn.rows.tolist(), drawn.columns.tolist(), strict=True), *corners])).T
+    hot.hot = HotPattern(rows, columns, np.full(len(rows), 2000.0))
     plain, lit = (world.expose(WHITE, REFERENCE_EXPOSURE, key=(7,)).astype(np.int64) for world in (cold, hot))
     changed = np.zeros(plain.shape, dtype=bool)
     changed[hot.hot.rows, hot.hot.columns] = True
     assert np.array_equal(plain[~changed], lit[~changed])
+    assert (plain[top : top + height, left : left + width] > 4000).all()
     added = np.minimum(0.5 * hot.hot.dn_per_s, 13584 - plain[changed])
     assert (np.abs(lit[changed] - plain[changed] - added) < 0.2 * added + 60).all()
-    assert not np.array_equal(World(squares_sheet(), BODIES["Test"], replace(HOT, seed=1)).hot.rows, hot.hot.rows)
+    assert not np.array_equal(World(squares_sheet(), BODIES["Test"], replace(HOT, seed=1)).hot.rows, drawn.rows)
 
 
 def squares_sheet() -> Print:
