@@ -25,6 +25,7 @@ from calibration.comparison.comparing import (
     differing_cells,
     differing_lights,
     geometry_difference,
+    recorded_drift,
 )
 
 _Array = npt.NDArray[np.float64]
@@ -210,3 +211,15 @@ def test_what_shift_turn_and_scale_leave_is_a_bend() -> None:
     found = geometry_difference(places, bent)
     assert found.bent_px == pytest.approx(np.sqrt((4 * 2 + 16) / 5), rel=0.02)
     assert found.shift_px == pytest.approx((0, 0))
+
+
+def test_drift_that_is_applied_or_not_of_these_lights_is_not_used() -> None:
+    def drift(gains: npt.ArrayLike, **more: object) -> _Array:
+        done = {"name": "drift", "per_light": np.asarray(gains).tolist(), **more}
+        lut: Any = SimpleNamespace(white=WHITE, provenance=SimpleNamespace(corrections=[{"name": "black"}, done]))
+        return recorded_drift(lut)
+
+    gains = np.linspace(0.9, 1.1, 12).reshape(4, 3)
+    np.testing.assert_array_equal(drift(gains), gains)
+    for unused in (drift(gains, applied=True), drift(gains[:3]), drift(gains - 0.9), drift(gains, name="field")):
+        np.testing.assert_array_equal(unused, np.ones((4, 3)))
