@@ -151,12 +151,13 @@ def test_few_covered_cells_are_told_by_the_frames_in_which_they_are() -> None:
         Frame("white", number=2),
         Frame(consistency=covered(*cells), number=3, blur_px=0.7),
         Frame(consistency=covered((7, -0.4)), number=4),
+        Frame("white", number=5),
     ]
     table = session(frames, cells=SimpleNamespace(stains=stains({44: -0.1, 120: 0.1})))
     found = disturbed_evidence(table, 0.0)
     assert found is not None
     known = found.evidence
-    assert (known.frames, known.showing, known.even_showing, known.in_first) == (4, 1 / 2, 1 / 2, 0)
+    assert (known.frames, known.showing, known.even_showing, known.in_first) == (5, 2 / 5, 1 / 3, 0)
     assert (known.spot, known.share, known.deviation) == pytest.approx((2 / 3, 3 / 200, -0.3))
     assert (known.scatter, known.softer) == pytest.approx((0.02, 0.2))
     assert numbers(found) == ["3", "4"]
