@@ -110,8 +110,8 @@ def test_light_around_patches_is_that_of_each_part_of_the_slots_about_them() -> 
     def along(kernel: int, length: float, at: float) -> _Array:
         """Return the shares (25,) between those of whole pitches and half offsets, bilinearly."""
         table = shares[kernel]
-        by_offset = [[np.interp(at, offsets, table[p, :, part]) for part in range(25)] for p in range(3)]
-        return np.array([np.interp(length, pitches, np.array(by_offset)[:, part]) for part in range(25)])
+        by_pitch = np.array([[float(np.interp(at, offsets, table[p, :, k])) for p in range(3)] for k in range(25)])
+        return np.array([float(np.interp(length, pitches, row)) for row in by_pitch])
 
     expected_weights, expected_others = np.zeros((2, 25, 3)), np.zeros((2, 3, 3))
     for patch, channel, kernel in np.ndindex(2, 3, 2):

@@ -25,6 +25,7 @@ from calibration.causes.gathering import (
     light_evidence,
     movement_evidence,
     noisy_evidence,
+    reference_evidence,
     scatter_evidence,
     spot_evidence,
     stray_evidence,
@@ -166,11 +167,15 @@ def test_few_covered_cells_are_told_by_the_frames_in_which_they_are() -> None:
     assert [place.size_mm for place in found.places] == pytest.approx(sizes)
     assert [(place.x_mm, place.y_mm) for place in found.places] == [(45, 20), (0, 60), (70, 0)]
     assert disturbed_evidence(session(frames[:3]), 0.0) is None
+    # Four of the five others show it.
+    most = [Frame(), *(Frame(consistency=covered((44, -0.2)), number=n) for n in range(1, 5)), Frame(number=5)]
+    found = disturbed_evidence(session(most), 0.0)
+    assert found is not None
+    assert found.evidence.in_first == 1
     many = [Frame(consistency=covered((44, -0.2)), number=number) for number in range(MOST_PLACES + 3)]
     found = disturbed_evidence(session(many), 0.0)
     assert found is not None
-    assert (len(found.places), len(found.frames)) == (MOST_PLACES, MOST_PLACES + 3)
-    assert found.evidence.in_first == 1
+    assert (len(found.places), len(found.frames)) == (12, 15)
 
 
 def test_a_spot_is_told_by_its_colour_and_by_the_white_frames_whose_references_show_it() -> None:
@@ -201,12 +206,55 @@ def test_a_spot_is_told_by_its_colour_and_by_the_white_frames_whose_references_s
     assert spot_evidence(session(frames), 0.0) is None
 
 
+@pytest.mark.parametrize(
+    ("residual", "frames", "residuals", "shown"),
+    [
+        # A faint spot: references are off from two hundredths on, whatever half of it is.
+        (0.02, (0.0, 0.0, 0.0), 1 / 4, ["1"]),
+        (0.0199, (0.0, 0.0, 0.0), 0, []),
+        # Frames that differ there are named where a white one does, and the first alone where all do.
+        (0.0, (0.02, 0.0, 0.0), 0, ["1"]),
+        (0.0, (0.0, 0.0, 0.02), 0, []),
+        (0.0, (0.02, 0.02, 0.02), 0, ["0"]),
+    ],
+)
+def test_a_spot_s_frames_are_those_that_show_it(
+    residual: float, frames: tuple[float, ...], residuals: float, shown: list[str]
+) -> None:
+    left = FieldResidual((45.0, 25.0), (-residual, 0, 0))
+    taken = [
+        Frame("white"),
+        Frame("white", block(frames[0], (45.0, 25.0)), left, number=1),
+        Frame("white", block(frames[1], (45.0, 25.0)), number=2),
+        Frame("light", block(frames[2], (45.0, 25.0)), number=3),
+        Frame("white", block(frames[1], (45.0, 25.0)), number=4),
+    ]
+    cells = SimpleNamespace(stains=stains(dict.fromkeys((44, 45, 64, 65), -0.03)))
+    found = spot_evidence(session(taken, cells=cells), 0.0)
+    assert found is not None
+    assert (found.evidence.white_residual, found.evidence.some_whites) == (residuals, float(residuals > 0))
+    assert numbers(found) == shown
+
+
+@pytest.mark.parametrize(("away", "near"), [(3.9, True), (4.1, False)])
+def test_references_that_are_off_are_told_by_a_spot_within_four_cells(away: float, near: bool) -> None:
+    cells = SimpleNamespace(stains=stains(dict.fromkeys((44, 45, 64, 65), -0.08)))
+    off = FieldResidual((50.0 + away * CELL_MM, 20.0), (-0.05, 0, 0), 0.1, -0.01, 0.5)
+    taken = [Frame("white", left=off), Frame("white", left=off, number=1)]
+    found = reference_evidence(session(taken, cells=cells), 0.0)
+    assert found is not None
+    assert (found.evidence.spot == 1) == near
+    assert (found.evidence.deviation, found.evidence.rim) == (-0.08 if near else -0.05, -0.01)
+
+
 def test_references_tell_of_what_lies_near_them_in_other_white_frames() -> None:
     off = FieldResidual((45.0, 25.0), (0.0, -0.06, -0.03), 0.2)
     # A quarter of the print's diagonal is 52.6 mm.
     frames = [Frame("white", left=off), Frame("white", left=FieldResidual((97.0, 25.0), (-0.03, 0, 0)), number=1),
               Frame("white", left=FieldResidual((98.0, 25.0), (-0.05, 0, 0), rim=-0.1), number=2),
               Frame("white", left=FieldResidual((45.0, 25.0), (-0.029, 0, 0)), number=3)]  # fmt: skip
+    two, _ = gathering._of_residuals(session(frames[:2]), frames[0])  # pyright: ignore[reportPrivateUsage, reportArgumentType]
+    assert two["white_residual"] == 1
     known, places = gathering._of_residuals(session(frames), frames[0])  # pyright: ignore[reportPrivateUsage, reportArgumentType]
     assert known == pytest.approx(
         {"white_residual": 0.5, "deviation": -0.06, "tint": 0.5, "share": 0.2, "rim_frames": 0.25}
@@ -230,7 +278,12 @@ def test_references_tell_of_what_lies_near_them_in_other_white_frames() -> None:
 def test_a_frame_as_a_whole_is_told_with_those_beyond_the_limit(
     evidence: Any, frame: dict[str, Any], limit: float, shown: list[str]
 ) -> None:
-    least = {"consistency": FrameConsistency(scatter=0.04), "blur_px": 0.85, "shift_px": 0.6, "reregistered": True}
+    least: dict[str, Any] = {
+        "consistency": FrameConsistency(scatter=0.04),
+        "blur_px": 0.85,
+        "shift_px": 0.6,
+        "reregistered": True,
+    }
     frames = [Frame(), Frame(number=1, **{key: least[key] for key in frame}), Frame(number=2, **frame), Frame(number=3)]
     found = evidence(session(frames), limit)
     assert numbers(found) == shown
@@ -274,6 +327,8 @@ def test_whites_colour_scatters_where_it_goes_no_further_than_it_comes_back() ->
     assert scatter(0, 0.02, 0) == pytest.approx(0.02 / np.sqrt(3))
     assert scatter(0, 0.02) == 0
     assert scatter(0, 0.01, 0.04) == 0, "a drift"
+    flicker = [Frame("white", white=(value, value, value)) for value in (1.0, 1.1, 1.0)]
+    assert gathering._colour_scatter(session(flicker)) == pytest.approx(0, abs=1e-12)  # pyright: ignore[reportPrivateUsage]
 
 
 def test_a_drift_is_told_by_what_lies_on_the_print_in_a_white_frame() -> None:
@@ -306,7 +361,7 @@ def test_unfit_cells_are_told_by_what_most_of_them_are() -> None:
     # Waves in pixels of cells of ten; what comes from beyond a cell, by the blur and by the lens.
     assert known.waves_px == pytest.approx(0.3)
     assert known.beyond_cell == pytest.approx(0.0132 + 0.01, abs=2e-3)
-    assert found.places == tuple(PrintPlace("0.dng", *PLACES[colour].tolist(), 0.0) for colour in (40, 44))
+    assert [(place.x_mm, place.y_mm, place.size_mm) for place in found.places] == [(0, 20, 0), (40, 20, 0)]
     assert unfit_evidence(session(frames, cells=unfit("stained", "lit")), 0) is None, "no spot, no evidence"
     unknown = unfit_evidence(session(frames, cells=unfit("lit")), 0)
     assert unknown is not None

@@ -129,7 +129,7 @@ def bent(level: npt.ArrayLike) -> Superposition:
 def between(level: float) -> _Array:
     """Return the weights of the nodes at a level, linear between them and from 0 to the first."""
     hats = np.eye(len(NODES) + 1)[1:]
-    return np.array([np.interp(level / FULL, [0, *NODES], hat) for hat in hats])
+    return np.array([float(np.interp(level / FULL, [0, *NODES], hat)) for hat in hats])
 
 
 def test_an_error_is_what_counts_lack_beside_those_of_a_reference() -> None:
@@ -173,8 +173,8 @@ def test_predictors_are_codes_of_cells_and_one_level_for_references_of_a_colour(
     # A polynomial of the fourth degree in the codes, and none of the fifth.
     for power, exact in (((1, 2, 1), True), ((0, 0, 4), True), ((0, 3, 2), False)):
         value = np.prod((rgb / 255) ** power, axis=1)
-        left = value - codes @ np.linalg.lstsq(codes, value, rcond=None)[0]
-        assert (np.abs(left).max() < 1e-9) == exact
+        fitted = np.asarray(codes @ np.linalg.lstsq(codes, value, rcond=None)[0], dtype=np.float64)
+        assert np.allclose(fitted, value, atol=1e-9) == exact
 
 
 def test_priors_are_averaged_by_how_likely_they_make_what_is_seen() -> None:
@@ -182,11 +182,13 @@ def test_priors_are_averaged_by_how_likely_they_make_what_is_seen() -> None:
     design, value = random.normal(size=(40, 5)), random.normal(size=40)
     priors = [(np.diag(1 / np.full(5, size) ** 2), odds) for size, odds in ((0.1, 0.6), (1.0, 0.3), (3.0, 0.1))]
     mean, covariance = _posterior(design.T @ design, design.T @ value, priors)
-    likely, means, covariances = [], [], []
+    likely: list[float] = []
+    means: list[_Array] = []
+    covariances: list[_Array] = []
     for prior, odds in priors:
         of_values = np.eye(40) + design @ np.linalg.inv(prior) @ design.T
-        inverse = np.linalg.inv(design.T @ design + prior)
-        likely.append(odds * stats.multivariate_normal(np.zeros(40), of_values).pdf(value))
+        inverse = np.asarray(np.linalg.inv(design.T @ design + prior), dtype=np.float64)
+        likely.append(odds * float(stats.multivariate_normal(np.zeros(40), of_values).pdf(value)))
         means.append(inverse @ design.T @ value)
         covariances.append(inverse)
     weights = np.array(likely) / sum(likely)

@@ -62,7 +62,7 @@ def test_a_kernel_brings_the_tails_beyond_a_cell_half_a_pixel_off_its_middle() -
     worst, mean = correction._beyond_cell(around)  # pyright: ignore[reportPrivateUsage]
     for kernel, sigma in enumerate((1.5, 3.0, 6.0)):
         at = np.array([-2.0, -1, 0, 1, 2]) + 0.5
-        inside = stats.norm(at, sigma).cdf(4.5) - stats.norm(at, sigma).cdf(-4.5)
+        inside = np.asarray(stats.norm(at, sigma).cdf(4.5) - stats.norm(at, sigma).cdf(-4.5), dtype=np.float64)
         assert worst[kernel] == pytest.approx(1 - inside[-1] ** 2)
         assert mean[kernel] == pytest.approx(1 - float(np.outer(inside, inside).mean()))
 
