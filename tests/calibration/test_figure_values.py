@@ -270,30 +270,38 @@ def test_frames_beyond_a_limit_are_asked_for(figure: Any, limit: float, files: l
     assert (None if found is None else [record.file.removesuffix(".dng") for record in found]) == files
 
 
+def worst(figure: Any, made: Any) -> Any:
+    return figure.worst(made, CHART)
+
+
+def where(figure: Any, made: Any, accepted: float) -> Any:
+    return figure.where(made, accepted)
+
+
 def test_a_figure_names_its_worst() -> None:
     made = table(codes=codes(exchanges=pairs(6)))
-    assert light.OFF_CODES_DEG.worst(made, CHART).light == 2
-    assert light.OFF_BRIGHTNESS.worst(made, CHART).file == "3.dng"
-    assert light.OFF_BRIGHTNESS.worst(table(codes=codes(off_brightness=np.zeros(3))), CHART) is None
-    assert radiometry.SOFTER_BLEED.worst(made, CHART).file == "3.dng"
-    assert radiometry.FRAME_SCATTER.worst(made, CHART).file == "2.dng"
-    assert radiometry.UNLIKE_BLOCK.worst(made, CHART).place == PrintPlace("1.dng", 3.0, 4.0, 9.0)
-    assert truth.REFERENCES_USED.worst(made, CHART).file == "4.dng"
-    assert truth.REFERENCE_SPREAD.worst(made, CHART).file == "4.dng"
+    assert worst(light.OFF_CODES_DEG, made).light == 2
+    assert worst(light.OFF_BRIGHTNESS, made).file == "3.dng"
+    assert worst(light.OFF_BRIGHTNESS, table(codes=codes(off_brightness=np.zeros(3)))) is None
+    assert worst(radiometry.SOFTER_BLEED, made).file == "3.dng"
+    assert worst(radiometry.FRAME_SCATTER, made).file == "2.dng"
+    assert worst(radiometry.UNLIKE_BLOCK, made).place == PrintPlace("1.dng", 3.0, 4.0, 9.0)
+    assert worst(truth.REFERENCES_USED, made).file == "4.dng"
+    assert worst(truth.REFERENCE_SPREAD, made).file == "4.dng"
     assert truth.TRUTH_WORST_DEG.measure(made) == 0.9
     assert (
-        truth.BRIGHTEST_SHARE.worst(made, CHART).light,
-        truth.DARKEST_COUNTS.worst(made, CHART).light,
+        worst(truth.BRIGHTEST_SHARE, made).light,
+        worst(truth.DARKEST_COUNTS, made).light,
     ) == (1, 2)
     one = table(white=WHITE[:1])
-    assert truth.BRIGHTEST_SHARE.worst(one, CHART) is truth.DARKEST_COUNTS.worst(one, CHART) is None
+    assert worst(truth.BRIGHTEST_SHARE, one) is worst(truth.DARKEST_COUNTS, one) is None
     x, y = CHART.centres_mm[CHART.cell_of_colour[511]].tolist()
-    assert truth.NOISY_SHARE.worst(made, CHART).place == PrintPlace("0.dng", x, y, 0.0)
+    assert worst(truth.NOISY_SHARE, made).place == PrintPlace("0.dng", x, y, 0.0)
     # Four pairs are named of six, white frames after the lights.
-    said = light.EXCHANGED_LIGHTS.where(made, 0.0)
+    said = where(light.EXCHANGED_LIGHTS, made, 0.0)
     assert "light 2 and white frame 0" in said
     assert said.endswith("(and 2 pairs more), 2.5° apart in the first pair")
-    assert "more" not in light.EXCHANGED_LIGHTS.where(table(codes=codes(exchanges=pairs(4))), 0.0)
-    assert light.OFF_BRIGHTNESS.where(made, 0.1) == "light 2 by -50 %, light 0 by +25 %"
-    assert light.REPEATED_FILES.where(table(frames=TWICE), 0.0) == "4.dng is 0.dng"
-    assert light.CHECKED_SHARE.where(made, 0.0) == "2 of 3"
+    assert "more" not in where(light.EXCHANGED_LIGHTS, table(codes=codes(exchanges=pairs(4))), 0.0)
+    assert where(light.OFF_BRIGHTNESS, made, 0.1) == "light 2 by -50 %, light 0 by +25 %"
+    assert where(light.REPEATED_FILES, table(frames=TWICE), 0.0) == "4.dng is 0.dng"
+    assert where(light.CHECKED_SHARE, made, 0.0) == "2 of 3"

@@ -110,8 +110,10 @@ def test_light_around_patches_is_that_of_each_part_of_the_slots_about_them() -> 
     def along(kernel: int, length: float, at: float) -> _Array:
         """Return the shares (25,) between those of whole pitches and half offsets, bilinearly."""
         table = shares[kernel]
-        by_pitch = np.array([[float(np.interp(at, offsets, table[p, :, k])) for p in range(3)] for k in range(25)])
-        return np.array([float(np.interp(length, pitches, row)) for row in by_pitch])
+        whole, rest = divmod(float(np.clip(length - 8, 0, 1.999)), 1)
+        left, part = divmod(float(np.clip(at + 0.5, 0, 0.999)) * 2, 1)
+        near = table[int(whole) : int(whole) + 2, int(left) : int(left) + 2]
+        return np.einsum("p,o,pok->k", [1 - rest, rest], [1 - part, part], near)
 
     expected_weights, expected_others = np.zeros((2, 25, 3)), np.zeros((2, 3, 3))
     for patch, channel, kernel in np.ndindex(2, 3, 2):

@@ -129,7 +129,8 @@ def bent(level: npt.ArrayLike) -> Superposition:
 def between(level: float) -> _Array:
     """Return the weights of the nodes at a level, linear between them and from 0 to the first."""
     hats = np.eye(len(NODES) + 1)[1:]
-    return np.array([float(np.interp(level / FULL, [0, *NODES], hat)) for hat in hats])
+    values: list[list[float]] = hats.tolist()
+    return np.array([float(np.interp(level / FULL, [0, *NODES], hat)) for hat in values])
 
 
 def test_an_error_is_what_counts_lack_beside_those_of_a_reference() -> None:
