@@ -287,3 +287,31 @@ def test_far_light_is_shared_among_slots_as_a_gaussian_lies_over_them(scale: flo
     between = stats.norm(0, scale).cdf(np.arange(-reach, reach + 2) - 0.5)
     np.testing.assert_allclose(taps, np.diff(between) / np.diff(between).sum(), rtol=1e-5)
     assert taps.sum() == pytest.approx(1)
+
+
+def test_shares_are_the_mean_of_what_is_supposed_and_err_by_how_that_differs() -> None:
+    random = np.random.default_rng(7)
+    roots = random.normal(size=(2, TERMS, 2 * TERMS))
+    matrices, vector = roots @ roots.swapaxes(1, 2), random.normal(size=TERMS) + 1
+    covariances = np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+    weights, kept = np.array([0.3, 0.7]), np.arange(0, TERMS, 2)
+    lenses = fitting._Lenses(matrices, vector, covariances, weights, matrices[0])  # pyright: ignore[reportPrivateUsage]
+    mean, covariance = lenses.shares(kept)
+    one, other = (fitting._positive(matrix, vector, kept)[0] for matrix in matrices)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(mean, 0.3 * one + 0.7 * other, atol=1e-7)
+    # Of two values that differ by d, with these weights, the variance is .21 d².
+    expected = 0.3 * covariances[0] + 0.7 * covariances[1] + 0.21 * np.outer(one - other, one - other)
+    np.testing.assert_allclose(covariance, expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("scatters", [False, True])
+def test_wide_light_is_as_usual_as_lenses_have_it_on_average(scatters: bool) -> None:
+    supposed = fitting._supposed_lenses(True)  # pyright: ignore[reportPrivateUsage]
+    chosen = [lens for lens in supposed if lens.near == 1.0] if scatters else supposed
+    odds = np.array([lens.odds for lens in chosen])
+    usual = np.average([fitting._usual_shares(3, lens) for lens in chosen], axis=0, weights=odds)  # pyright: ignore[reportPrivateUsage]
+    # Of the veil and the two widest kernels.
+    wide = np.zeros(TERMS, np.bool_)
+    wide[np.concatenate(far_groups()[-3:])] = True
+    found = fitting._usual_wide_light(3, scatters)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(found, np.where(wide[:, None] & wide, usual, 0.0), atol=1e-15)
