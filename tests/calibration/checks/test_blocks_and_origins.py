@@ -21,7 +21,8 @@ from drivers.raw.rawfile import FrameOrigin
     [(32, 24, 6, 4), (64, 64, 11, 11), (24, 16, 5, 3), (16, 10, 4, 2)],
 )
 def test_blocks_are_squares_of_as_many_cells_as_noise_asks_for(across: int, down: int, columns: int, rows: int) -> None:
-    cells = np.stack(np.meshgrid(np.arange(across) * 10.0 + 5, np.arange(down) * 10.0 + 7), axis=-1).reshape(-1, 2)
+    x, y = np.meshgrid(np.arange(across) * 10.0 + 5, np.arange(down) * 10.0 + 7)
+    cells = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
     block, middles, area = frame_consistency._blocks(cells)
     width, height = (across - 1) * 10 / columns, (down - 1) * 10 / rows
     assert area == pytest.approx(width * height)

@@ -15,7 +15,6 @@ from scipy import stats
 from calibration.comparison import comparing
 from calibration.comparison.comparing import (
     CELL_FLOOR,
-    CHANCE,
     GROUPS,
     CellDifferences,
     LightDifferences,
@@ -99,7 +98,7 @@ def test_cells_differ_over_their_own_whites_in_units_of_their_noise(
     one, other, lights, cells = found
     # By Welch and Satterthwaite, 4 and 9 samples of one variance have so many freedoms.
     freedoms = (1 / 4 + 1 / 9) ** 2 / ((1 / 4) ** 2 / 3 + (1 / 9) ** 2 / 8)
-    widening = stats.t(freedoms).std()
+    widening = float(stats.t(freedoms).std())
     share, variance = np.full((4, 8, 3), np.nan), np.full((4, 8, 3), np.nan)
     for light, colour, channel in np.ndindex(4, 6, 3):
         seen = [each.samples[light, colour, :, channel].astype(float) for each in (one, other)]
@@ -177,13 +176,14 @@ def cells_with(mean: _Array, noise: float, score: float = 1.0) -> CellDifference
 
 
 def test_what_is_beyond_noise_is_beyond_both_its_errors_and_what_is_called_none() -> None:
-    # χ² of two freedoms over two, with the errors' own error, in any of four lights.
-    most = comparing.ERROR_OF_ERRORS * np.sqrt(stats.chi2(2).isf(CHANCE / 4) / 2)
+    # χ² of two freedoms over two, with the errors' own error, at a chance of one in a hundred in any of four lights.
+    most = 1.3 * np.sqrt(float(stats.chi2(2).isf(0.01 / 4)) / 2)
     lights = lights_with(
         angle_deg=[0.0051, 0.0049, 0.02, 0.03], angle_score=[1.01 * most, 1.01 * most, 0.99 * most, 1.01 * most]
     )
     assert differing_lights(lights).tolist() == [3, 0]
-    # Six standard errors and what is called a stain, less the offset of all.
+    # Six standard errors and the two per cent of a stain, less the offset of all.
+    assert CELL_FLOOR == 0.02
     mean = np.array(
         [[0.1, 0, CELL_FLOOR * 1.01], [0.1 - 2 * CELL_FLOOR, 0, 0], [0.1, 0.99 * CELL_FLOOR, 0], [0.1, 0, 0]]
     )

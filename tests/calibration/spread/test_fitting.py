@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -223,7 +224,7 @@ def test_far_shares_hand_on_half_and_channels_share_them() -> None:
     handed = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0.5, 1, 0], [0, 0.25, 0.5, 1]]) * steps
     sizes = handed @ handed.T
     *far, veil = far_groups()
-    for one, other in np.ndindex(4, 4):
+    for one, other in product(range(4), repeat=2):
         block = few[np.ix_(far[one], far[other])]
         assert block[0, 0] == pytest.approx(sizes[one, other])
         assert block[0, 1] == pytest.approx(sizes[one, other] * (1 - 0.6**2))
@@ -239,7 +240,7 @@ def test_far_shares_hand_on_half_and_channels_share_them() -> None:
     usual = fitting._usual_shares(3, fitting._Lens(power=3.0, far=0.5, far_apart=0.6))  # pyright: ignore[reportPrivateUsage]
     law[len(NEAR_PX) :] *= 0.5
     groups = [group for group in groups_of_terms() if len(group) == 3][:-1]
-    for one, other in np.ndindex(len(groups), len(groups)):
+    for one, other in product(range(len(groups)), repeat=2):
         both = 0.04**2 * law[one] * law[other]
         alone = 0.35**2 * both if one == other else 0.0
         block = usual[np.ix_(groups[one], groups[other])]
