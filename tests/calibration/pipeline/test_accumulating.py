@@ -102,6 +102,19 @@ def test_photosites_and_stains_make_a_cell_unfit() -> None:
     found = causes(replace(done, even_sum=even))
     assert [cause.split(":")[0] for cause in found.values()] == ["dead", "uneven"]
     assert list(found) == [6, 7]
+    # Of cells of less than 300 counts, on the mean of the frames, none is told to be dead.
+    dim = np.where(even == 499, 240, 500).astype(np.float32)
+    assert causes(replace(done, even_sum=dim)) == {}
+
+
+def test_stains_are_looked_for_in_the_mean_of_even_frames_with_the_field_divided_out() -> None:
+    done = empty()
+    field = np.linspace(0.5, 1.5, CELLS)[:, None] * np.ones(3)
+    # Of eight colours nothing is known but what was judged.
+    done.baseline.chart.bits, done.baseline.points = 1, SimpleNamespace(cells_mm=np.zeros((CELLS, 2)))
+    found = done.stains(field)
+    assert not found.known
+    np.testing.assert_allclose(found.level, 500 / field)
 
 
 def test_cells_that_something_covers_are_unfit_under_the_lights_of_their_frames() -> None:
