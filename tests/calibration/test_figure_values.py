@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from calibration.causes.gathering import PrintPlace
-from calibration.figures import light, radiometry, truth
+from calibration.figures import geometry, light, radiometry, truth
+from calibration.figures.figure import CheckMeasurements
 from calibration.radiometry.superposition import NODES, Superposition
 from experiment.chart.layout import design_chart
 
@@ -85,8 +86,13 @@ def table(**more: object) -> Any:
         "dark_frames": SimpleNamespace(light=np.array([50.0, 9, 2]), lights=(), files=()),
         "dark_share": 0.01,
         "dark_change": 0.003,
-        "registration": SimpleNamespace(mismatched_cells=np.zeros(512, np.bool_)),
-        "cells": SimpleNamespace(unfit=()),
+        "registration": SimpleNamespace(
+            mismatched_cells=np.zeros(512, np.bool_), cell_px=17.0, blur_px=2.2, marks_rms_px=0.3, lens_residual_px=1.2,
+            block_rms_px=0.06, clearance=3.0, agreement=0.99, blocks=SimpleNamespace(good=np.arange(8) > 0),
+            framing=SimpleNamespace(field=None, tags=(1, 2, 3), missing=(4,)),
+        ),
+        "lens": SimpleNamespace(uncorrected_in_worst=0.01),
+        "cells": SimpleNamespace(unfit=(), window=5),
         "session": SimpleNamespace(
             lights=3, white_references=100, registered_file="0.dng", codes=((255, 0, 0), (0, 90, 0), (255, 255, 255))
         ),
@@ -204,6 +210,15 @@ AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.arra
         (radiometry.DISTURBED_CELLS, {"registration": SimpleNamespace(mismatched_cells=np.zeros(69))}, None),
         (radiometry.REGISTERED_ANEW, {}, 2),
         (radiometry.OTHER_CAMERA, {"origins": FOREIGN}, 1),
+        (geometry.TAGS_FOUND, {}, 3 / 4),
+        (geometry.CELL_PX, {}, 17),
+        # 17 / 2 less two pixels and three quarters is 2.61 times the blur; and what the lens brings.
+        (geometry.BLEED, {}, 0.00449 + 0.01),
+        (geometry.TAG_RESIDUAL_PX, {}, 1.2),
+        (geometry.TAG_FINAL_PX, {}, 0.1),
+        (geometry.BLOCK_RESIDUAL_PX, {}, 0.02),
+        (geometry.BLOCKS_GOOD, {}, 7 / 8),
+        (geometry.AGREEMENT, {}, 0.99),
         (truth.NOISE_MISFIT, {}, 0.2),
         (truth.NOISY_SHARE, {}, 4 / 512),
         (truth.REFERENCES_USED, {}, 0.76),
@@ -305,3 +320,9 @@ def test_a_figure_names_its_worst() -> None:
     assert where(light.OFF_BRIGHTNESS, made, 0.1) == "light 2 by -50 %, light 0 by +25 %"
     assert where(light.REPEATED_FILES, table(frames=TWICE), 0.0) == "4.dng is 0.dng"
     assert where(light.CHECKED_SHARE, made, 0.0) == "2 of 3"
+
+
+def test_a_check_forecasts_bleed_of_a_cell_and_a_blur_that_it_saw() -> None:
+    forecast: Any = geometry.BLEED.forecast
+    assert forecast(CheckMeasurements(cell_px=17.0, blur_px=2.2)) == pytest.approx(0.00449, rel=1e-2)
+    assert forecast(CheckMeasurements(cell_px=17.0)) is forecast(CheckMeasurements(blur_px=2.2)) is None
