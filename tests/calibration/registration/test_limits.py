@@ -16,7 +16,8 @@ from calibration.registration.geometry import Lens
 from calibration.registration.matching import Blocks, PlaceErrors
 from calibration.registration.register import Registration
 from calibration.registration.tiles import Raster
-from experiment.chart.layout import design_chart
+from experiment.chart.layout import design_chart, paper_chart
+from experiment.framing.field import SIDE_POINTS, FoundField, field_mm
 from foundation.errors import RegistrationError
 
 # pyright: reportPrivateUsage=false
@@ -127,3 +128,24 @@ def test_a_block_s_score_sinks_with_its_mismatched_cells() -> None:
     bad[cells] = True
     found = registering._without_mismatched_cells(blocks, bad, CHART)
     assert found.score == pytest.approx([0.8 * (1 - len(cells) / first.sum()), 0.9])
+
+
+def test_an_outline_is_completed_where_it_was_not_found_with_normals_that_point_outwards() -> None:
+    chart = paper_chart("A4", 4)
+    corners = field_mm(chart)
+    lens = Lens(np.array([[2.0, 0, 30], [0, 3.0, 40], [0, 0, 1]]), np.zeros(2), 1000.0, np.zeros(4))
+    share = (np.arange(SIDE_POINTS) + 0.5)[:, None] / SIDE_POINTS
+    sides = [start + share * (end - start) for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    # The second side, at the right, was not found; nor was half of the third, below.
+    known = np.concatenate([sides[0], sides[2][: SIDE_POINTS // 2], sides[3]])
+    field = FoundField(np.zeros((4, 2)), np.eye(3), known, np.zeros_like(known), np.zeros_like(known), 1.0)
+    found = registering._completed(field, lens, chart)
+    added, normals = found.outline_mm[len(known) :], found.normals[len(known) :]
+    np.testing.assert_array_equal(found.outline_mm[: len(known)], known)
+    np.testing.assert_allclose(found.outline_px[len(known) :], lens.to_pixels(added))
+    right = np.isclose(added[:, 0], corners[:, 0].max())
+    np.testing.assert_allclose(normals[right], np.tile([1.0, 0], (right.sum(), 1)), atol=1e-9)
+    np.testing.assert_allclose(normals[~right], np.tile([0, 1.0], ((~right).sum(), 1)), atol=1e-9)
+    # But for points within two steps of those that were found, at either end.
+    assert right.sum() == pytest.approx(SIDE_POINTS, abs=4)
+    assert (~right).sum() == pytest.approx(SIDE_POINTS // 2, abs=4)
