@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from calibration.pipeline import frames as framing
 from calibration.pipeline.baseline import select_frames, stated_origin
-from calibration.pipeline.frames import Baseline, movement_of, usable_means
+from calibration.pipeline.frames import Baseline, beyond_print, movement_of, usable_means
 from calibration.sampling import sites_at
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -138,3 +139,14 @@ def test_a_movement_is_the_cells_median_and_its_largest_that_of_the_cell_that_mo
 
     shift = movement_of(baseline(), seen([(0, 0)] * 3), seen([(1, -2), (1.5, -3), (6, 8)]))
     assert (shift.dx, shift.dy, shift.largest_px, shift.gauges) == (1.5, -2, 10, 3)
+
+
+def test_what_lies_behind_the_print_is_the_mean_of_places_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gathered(mosaic: object, black: object, sites: Any) -> npt.NDArray[np.float64]:
+        return np.arange(3.0 * len(sites.rows)).reshape(-1, 3)
+
+    monkeypatch.setattr(framing, "gather_means", gathered)
+    decoded: Any = SimpleNamespace(mosaic=None, black=None)
+    places = np.array([[10.0, 10], [20, 20]])
+    assert beyond_print(decoded, sites_at(places, (40, 40))).tolist() == [1.5, 2.5, 3.5]
+    assert beyond_print(decoded, sites_at(places[:0], (40, 40))).tolist() == [0, 0, 0]
