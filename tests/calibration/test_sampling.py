@@ -8,17 +8,22 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from scipy import integrate, stats
 
-from calibration.kernels import window_shares
 from calibration.report.plots import half_size
 from calibration.sampling import (
     WINDOWS,
     bleed,
     gather,
+    gather_means,
     gather_values,
     has_dead_photosite,
     largest_window,
+    mean_bleed,
+    median_of_variance,
+    noise_levels,
     patch_means,
+    rim_difference,
     sample_noise,
     sites_at,
     table_values,
@@ -167,11 +172,63 @@ def test_the_largest_windows_are_those_of_the_table_of_arrangements() -> None:
     assert [bleed(10.2, 0.7, window) for window in WINDOWS] == sorted(bleed(10.2, 0.7, window) for window in WINDOWS)
 
 
-def test_all_of_a_kernel_s_light_comes_from_some_part_of_the_slots() -> None:
-    pitches, offsets = np.array([9.0, 12.5]), np.array([-1.0, 0.0, 1.0])
-    shares = np.full((2, 3, 25), np.nan)
-    window_shares(2.0, pitches, offsets, 5, shares)
-    assert (shares >= 0).all()
-    np.testing.assert_allclose(shares.sum(axis=2), 1)
-    # As much from the left of one side as from the right of the other.
-    np.testing.assert_allclose(shares[:, 0], shares[:, 2, ::-1], atol=1e-12)
+@pytest.mark.parametrize("window", WINDOWS)
+def test_what_comes_from_beyond_a_cell_is_the_gaussian_s_tails(window: int) -> None:
+    cell_px, blur_px = 11.0, 1.4
+    # A quarter of a pixel of registration and half of one of rounding towards the nearer edge.
+    nearest = cell_px / 2 - (window // 2 + 0.75)
+    tail, _ = integrate.quad(stats.norm(0, blur_px).pdf, nearest, 40)
+    assert bleed(cell_px, blur_px, window) == pytest.approx(tail, rel=1e-6)
+    # Pixel by pixel and along both axes: what is inside along both is the cell's own.
+    x = np.arange(window) - window // 2
+    inside = stats.norm(x, blur_px).cdf(cell_px / 2) - stats.norm(x, blur_px).cdf(-cell_px / 2)
+    expected = 1 - float(np.outer(inside, inside).mean())
+    assert mean_bleed(cell_px, np.array([1e-9, blur_px]), window) == pytest.approx([0, expected], abs=1e-12)
+
+
+def test_rim_and_middle_are_means_over_their_pixels_with_the_noise_of_means() -> None:
+    window = np.arange(25.0).reshape(5, 5) ** 2
+    inner = window[1:4, 1:4]
+    rim = (window.sum() - inner.sum()) / 16
+    difference, sigma = rim_difference(np.repeat(window.reshape(1, 25, 1), 3, axis=2), np.array([[1.0, 2, 4]]))
+    assert difference == pytest.approx(np.full((1, 3), abs(rim - inner.mean())))
+    assert sigma == pytest.approx(np.array([[1, 2, 4]]) * np.sqrt(1 / 9 + 1 / 16))
+
+
+def test_a_dead_photosite_has_less_than_half_and_halves_what_two_greens_have() -> None:
+    samples = np.full((7, 25, 3), 400.0)
+    for patch, (channel, level) in enumerate([(0, 199), (0, 201), (1, 299), (1, 301), (2, 199), (2, 201)]):
+        samples[patch, 12, channel] = level
+    assert has_dead_photosite(samples).tolist() == [True, False, True, False, True, False, False]
+    # Half of 300 counts or less is not told from noise.
+    assert not has_dead_photosite(samples * 0.75).any()
+    assert has_dead_photosite(samples * 0.76)[0]
+
+
+def test_noise_at_a_level_is_the_median_of_like_cells_over_that_of_chi_square() -> None:
+    random = np.random.default_rng(7)
+    level = random.permutation(np.arange(96.0))
+    for degrees in (8, 24, 80):
+        assert median_of_variance(degrees) == pytest.approx(stats.chi2(degrees).median() / degrees, rel=2e-3)
+    at, seen = noise_levels(level, 2 * level + 1, 25)
+    # Sixteen cells a level.
+    groups = np.arange(96.0).reshape(6, 16)
+    assert at == pytest.approx(np.median(groups, axis=1))
+    assert seen == pytest.approx((2 * at + 1) / median_of_variance(24))
+    assert [len(noise_levels(level[:n], level[:n], 25)[0]) for n in (96, 79, 48)] == [6, 4, 4]
+    many = np.arange(16.0 * 60)
+    assert [len(noise_levels(many, many, 25, 1, most)[0]) for most in (48, 32)] == [48, 32]
+
+
+def test_means_of_counts_are_those_of_their_samples(lab: Lab, tmp_path: Path) -> None:
+    mosaic = lab.mosaic(tmp_path)
+    black = np.array([[2048.25, 2047.5], [2049.0, 2048.0]])
+    height, width = half_size(mosaic, black).shape[:2]
+    sites = sites_at(np.random.default_rng(8).random((80, 2)) * (width - 1, height - 1), (height, width), 7)
+    samples, _ = gather(mosaic, black, sites)
+    assert not sites.inside.all()
+    np.testing.assert_allclose(gather_means(mosaic, black, sites), samples.mean(axis=1, dtype=np.float64), atol=1e-3)
+    # Neighbours on the sensor one after another, in stripes as high as a window.
+    stripe = sites.rows[sites.order] // 7
+    assert (np.diff(stripe) >= 0).all()
+    assert (np.diff(sites.columns[sites.order])[np.diff(stripe) == 0] >= 0).all()

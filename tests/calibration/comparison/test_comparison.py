@@ -18,7 +18,6 @@ from calibration.comparison.comparing import (
     compare,
     geometry_difference,
     light_pairs,
-    recorded_drift,
 )
 from calibration.comparison.report import cells_csv, comparison_json, lights_csv, lines, write_comparison
 from calibration.table.lut import Lut, LutWriter, Provenance, open_lut, references_csv
@@ -258,7 +257,3 @@ def test_a_chart_that_hung_elsewhere_is_measured() -> None:
     assert found.shift_px == pytest.approx((3.0, -2.0))
     assert (found.turned_deg, found.scale) == pytest.approx((0.2, 0.001))
     assert found.bent_px == pytest.approx(0, abs=1e-9)
-
-
-def test_drift_that_is_not_of_these_lights_is_not_used(one: Lut) -> None:
-    assert (recorded_drift(one) == 1).all()

@@ -158,6 +158,13 @@ def test_the_brightest_pure_lights_are_chosen() -> None:
     ]
     assert pure_lights([light for light in lights if light.kind == "cct"]) is None
 
+    def chosen(*codes: tuple[int, int, int]) -> tuple[int, int, int] | None:
+        return pure_lights([Illumination(n, "uniform", None, Colour(*code)) for n, code in enumerate(codes)])
+
+    # Of equal ones the first; black is none of them.
+    assert chosen((200, 0, 0), (255, 0, 0), (255, 0, 0), (0, 9, 0), (0, 0, 9), (255, 9, 0)) == (1, 3, 4)
+    assert chosen((0, 0, 0), (0, 255, 0), (0, 0, 255)) is None
+
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("lens_unmeasured")

@@ -7,8 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy import stats
 
-from calibration.radiometry.superposition import NODES, Superposition, printed_predictors, superposition
+from calibration.radiometry.superposition import (
+    NODES,
+    Superposition,
+    _posterior,  # pyright: ignore[reportPrivateUsage]
+    printed_predictors,
+    superposition,
+)
 
 _Array = npt.NDArray[np.float64]
 
@@ -110,3 +117,82 @@ def test_a_factor_common_to_all_counts_is_no_error_of_a_direction() -> None:
     level = np.array(NODES) * FULL
     found = Superposition(FULL, 0.02 * level, np.zeros((len(NODES), len(NODES))), None)
     assert found.white_covariance(np.array([[500.0, 3000.0, 9000.0]])) == pytest.approx(0, abs=1e-12)
+
+
+def bent(level: npt.ArrayLike) -> Superposition:
+    """Return a sensor that lacks 1 % of the square of the share of saturation, known to some counts at each node."""
+    nodes = np.array(NODES)
+    root = np.random.default_rng(1).normal(0, 2, (len(NODES), len(NODES)))
+    return Superposition(FULL, np.asarray(level) * -0.01 * nodes**2, root @ root.T, None)
+
+
+def between(level: float) -> _Array:
+    """Return the weights of the nodes at a level, linear between them and from 0 to the first."""
+    hats = np.eye(len(NODES) + 1)[1:]
+    values: list[list[float]] = hats.tolist()
+    return np.array([float(np.interp(level / FULL, [0, *NODES], hat)) for hat in values])
+
+
+def test_an_error_is_what_counts_lack_beside_those_of_a_reference() -> None:
+    found = bent(FULL)
+    for level, reference in ((0.37 * FULL, 0.81 * FULL), (0.3 * NODES[0] * FULL, 0.5 * FULL), (2 * FULL, 0.2 * FULL)):
+        one, other = (between(at) / at for at in (level, reference))
+        off, variance = found.beside(np.array([level]), np.array([reference]))
+        assert off[0] == pytest.approx((one - other) @ found.deviation)
+        assert variance[0] == pytest.approx((one - other) @ found.covariance @ (one - other))
+        assert found.errors(np.array([level]), np.array([reference]))[0] == pytest.approx(off[0] ** 2 + variance[0])
+    white = np.array([4000.0, 9000, 800])
+    weights = np.array([between(level) / level for level in white])
+    off = weights @ found.deviation - (weights @ found.deviation).mean()
+    expected = weights @ found.covariance @ weights.T + np.outer(off, off)
+    np.testing.assert_allclose(found.white_covariance(white[None])[0], expected)
+    written = found.to_json()
+    assert written["deviation"] == pytest.approx((-0.01 * np.array(NODES)).tolist(), rel=1e-3)
+    levels = np.array(NODES) * FULL
+    assert written["standard_error"] == pytest.approx((np.sqrt(np.diag(found.covariance)) / levels).tolist(), rel=1e-3)
+    assert written["measured"]
+
+
+def test_what_is_usual_bends_by_a_hundredth_and_loses_some_counts_near_black() -> None:
+    """One per cent at saturation, .05 % of it near black, .03 % at every level, and no part that is a straight line."""
+    share = np.array(NODES)
+    usual = Superposition.usual(FULL).covariance / FULL**2
+    shapes = [0.01 * share**2, 0.01 * share**3, *(0.0005 * (1 - np.exp(-share / scale)) for scale in (0.0005, 0.002))]
+    relative = [shape / share - np.mean(shape / share) for shape in shapes]
+    expected = sum((np.outer(one, one) for one in relative), 0.0003**2 * np.eye(len(share)))
+    np.testing.assert_allclose(usual / np.outer(share, share), expected, rtol=1e-9)
+
+
+def test_predictors_are_codes_of_cells_and_one_level_for_references_of_a_colour() -> None:
+    rgb = np.random.default_rng(3).integers(0, 256, (80, 3))
+    found = printed_predictors(rgb, np.array([1, 0, 1]))
+    codes, references = found[:80], found[80:]
+    assert found.shape == (83, 35 + 2)
+    assert not codes[:, 35:].any()
+    assert not references[:, :35].any()
+    assert references[:, 35:].tolist() == [[0, 1], [1, 0], [0, 1]]
+    # A polynomial of the fourth degree in the codes, and none of the fifth.
+    for power, exact in (((1, 2, 1), True), ((0, 0, 4), True), ((0, 3, 2), False)):
+        value = np.prod((rgb / 255) ** power, axis=1)
+        fitted = np.asarray(codes @ np.linalg.lstsq(codes, value, rcond=None)[0], dtype=np.float64)
+        assert np.allclose(fitted, value, atol=1e-9) == exact
+
+
+def test_priors_are_averaged_by_how_likely_they_make_what_is_seen() -> None:
+    random = np.random.default_rng(2)
+    design, value = random.normal(size=(40, 5)), random.normal(size=40)
+    priors = [(np.diag(1 / np.full(5, size) ** 2), odds) for size, odds in ((0.1, 0.6), (1.0, 0.3), (3.0, 0.1))]
+    mean, covariance = _posterior(design.T @ design, design.T @ value, priors)
+    likely: list[float] = []
+    means: list[_Array] = []
+    covariances: list[_Array] = []
+    for prior, odds in priors:
+        of_values = np.eye(40) + design @ np.linalg.inv(prior) @ design.T
+        inverse = np.asarray(np.linalg.inv(design.T @ design + prior), dtype=np.float64)
+        likely.append(odds * float(stats.multivariate_normal(np.zeros(40), of_values).pdf(value)))
+        means.append(inverse @ design.T @ value)
+        covariances.append(inverse)
+    weights = np.array(likely) / sum(likely)
+    np.testing.assert_allclose(mean, weights @ means)
+    spread = sum(w * (c + np.outer(m - mean, m - mean)) for w, m, c in zip(weights, means, covariances, strict=True))
+    np.testing.assert_allclose(covariance, spread)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.registration.colours import ColourModel, agreement, mismatched, slipped_parts
+from calibration.registration.colours import ColourModel, agreement, fit_colours, mismatched, slipped_parts
 from experiment.chart.layout import A_SERIES_MM, design_chart
 
 PAPER = np.array([8000.0, 9000.0, 7000.0])
@@ -80,3 +80,61 @@ def test_light_on_the_page_is_a_polynomial_of_second_order() -> None:
     expected += np.outer(x**2, light[3]) + np.outer(x * y, light[4]) + np.outer(y**2, light[5])
     model = ColourModel(1, np.zeros((4, 3)), light, (100.0, 200.0))
     np.testing.assert_allclose(model.light_at(points), expected)
+
+
+@pytest.mark.parametrize(
+    ("patches", "finely", "degree"),
+    [(59, False, 1), (60, False, 2), (199, False, 2), (200, False, 3), (1999, True, 3), (2000, True, 6),
+     (3999, True, 6), (4000, True, 8), (4000, False, 3)],
+)  # fmt: skip
+def test_colours_are_a_polynomial_that_patches_suffice_for_times_a_light(
+    patches: int, finely: bool, degree: int
+) -> None:
+    random = np.random.default_rng(6)
+    page = (300.0, 200.0)
+    rgb, points = random.uniform(0, 255, (patches, 3)), random.uniform(0, 1, (patches, 2)) * page
+    r, g, b = (rgb / 255).T
+    flat = np.stack([900 + 4000 * r + 300 * g, 500 + 300 * r + 5000 * g + 200 * b, 300 + 100 * g + 3000 * b], axis=1)
+    x, y = (2 * points / page - 1).T
+    light = 1 + 0.1 * x - 0.05 * y + 0.03 * x * y - 0.04 * x**2
+    seen = flat * light[:, None] * (1, 1.2, 0.8)
+    spoilt = seen.copy()
+    spoilt[::25] *= 0.3
+    model = fit_colours(rgb, points, spoilt, page, finely)
+    assert model.degree == degree
+    np.testing.assert_allclose(model.seen(rgb, points), seen, rtol=0.02)
+    # The light's mean is 1 where patches are; what is left is colour.
+    np.testing.assert_allclose(model.light_at(points).mean(axis=0), 1, rtol=1e-9)
+    np.testing.assert_allclose(model.flat(rgb) * model.light_at(points), model.seen(rgb, points))
+
+
+def test_a_cell_is_mismatched_that_is_off_by_both_its_usual_error_and_a_share_of_paper() -> None:
+    chart = design_chart(2, A_SERIES_MM["A7"], 1)
+    cells = chart.colour_count
+    random = np.random.default_rng(7)
+    expected = random.uniform(0.1, 1, (cells + 30, 3)) * PAPER
+    usual = 0.004 * PAPER
+    off = usual * np.where(random.random((cells + 30, 3)) < 0.5, -1, 1) * np.linspace(0.5, 1.5, cells + 30)[:, None]
+    # A deviation of which half the cells have less is .67 of a normal one's standard deviation.
+    sigma = 1.4826 * np.median(np.abs(off), axis=0)
+    far = {0: 0.079, 1: 0.081, 20: -0.081, 40: 0.5}
+    for cell, share in far.items():
+        off[cell, cell % 3] = share * PAPER[cell % 3]
+    assert (10 * sigma < 0.079 * PAPER).all()
+    found = mismatched(expected + off, expected, PAPER, chart)
+    assert np.flatnonzero(found).tolist() == [1, 20, 40]
+    # Where the model errs more usually, ten times that decides.
+    for times, cell_found in ((9.9, False), (10.1, True)):
+        off = 0.02 * PAPER * np.ones((cells + 30, 3))
+        off[5, 0] = times * 1.4826 * 0.02 * PAPER[0]
+        assert mismatched(expected + off, expected, PAPER, chart)[5] == cell_found
+
+
+def test_agreement_is_the_mean_correlation_of_channels_with_a_third_of_the_light() -> None:
+    random = np.random.default_rng(8)
+    expected = random.uniform(0.5, 1.5, (400, 3))
+    seen = expected * [1000, 330, 280] + random.normal(0, 1, (400, 3)) * [100, 100, 5000]
+    seen *= [1, 1, 270 / np.median(seen[:, 2])]
+    assert np.median(seen, axis=0)[1] > 300
+    kept = [np.corrcoef(seen[:, channel], expected[:, channel])[0, 1] for channel in (0, 1)]
+    assert agreement(seen, expected) == pytest.approx(np.mean(kept))

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from calibration.spread import predicting
 from calibration.spread.predicting import LevelModel, neighbour_residual
 
 _Array = npt.NDArray[np.float64]
@@ -84,3 +85,31 @@ def test_a_cell_that_cannot_be_used_says_nothing_of_others() -> None:
     left = LevelModel.of(spoilt, usable, 3).residual_of(spoilt)
     assert np.abs(np.delete(left, 100)).max() < 1e-3
     assert left[100] > 0.1
+
+
+def test_a_small_chart_s_cell_is_held_against_its_neighbours_less_the_curvature_of_the_codes_beside() -> None:
+    random = np.random.default_rng(4)
+    cube = random.normal(size=(8, 8, 8))
+    found = neighbour_residual(cube.reshape(-1, 1), 3).reshape(cube.shape)
+    for place in ((0, 0, 0), (7, 0, 3), (3, 3, 3), (1, 6, 7), *random.integers(0, 8, (40, 3)).tolist()):
+        left: list[float] = []
+        for axis in (axis for axis in range(3) if 0 < place[axis] < 7):
+            before, at, after = (np.take(cube, place[axis] + step, axis) for step in (-1, 0, 1))
+            # Two codes to each side across the axis; at the cube's faces the last stand for those beyond.
+            bend = np.pad(at - (before + after) / 2, 2, mode="edge")
+            row, column = np.delete(place, axis).tolist()
+            square = bend[row : row + 5, column : column + 5]
+            left.append(square[2, 2] - (square.sum() - square[2, 2]) / 24)
+        assert found[tuple(place)] == pytest.approx(np.mean(left) if left else 0)
+
+
+def test_roots_of_levels_are_alike_as_matern_s_function_of_codes_and_their_largest_has_it() -> None:
+    found = predicting._covariance(3)  # pyright: ignore[reportPrivateUsage]
+    # A step of one code in one ink, in the largest, from black to white, and none.
+    for one, other in (((4, 2, 1), (4, 2, 2)), ((4, 2, 1), (5, 2, 1)), ((0, 0, 0), (7, 7, 7)), ((3, 3, 3), (3, 3, 3))):
+        a, b = (np.array([*codes, max(codes)]) for codes in (one, other))
+        r = np.linalg.norm(a - b) / 16
+        matern = (1 + np.sqrt(5) * r + 5 / 3 * r**2) * np.exp(-np.sqrt(5) * r)
+        unknown = 1e4 * (1 + (a - 3.5) @ (b - 3.5))
+        place = tuple(codes[0] * 64 + codes[1] * 8 + codes[2] for codes in (one, other))
+        assert found[place] == pytest.approx(matern + unknown, abs=1e-9)

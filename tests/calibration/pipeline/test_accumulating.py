@@ -1,0 +1,157 @@
+"""What frames leave behind when they are taken in, and the first cause for which a cell is unfit, at each limit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from calibration.checks.frame_consistency import FrameConsistency
+from calibration.pipeline.frames import Accumulator, MeasuredFrame, disturbed_cells
+from calibration.radiometry.dark_frames import DarkFrameFigures, HotPixels
+from calibration.spread.added_light import AddedLight
+from drivers.raw.rawfile import CLIPPING_SHARE
+from experiment.measures.stains import Stains
+
+CELLS = 64
+SATURATION = 10_000
+NO_LIGHT = np.zeros((CELLS, 3))
+
+
+def empty() -> Any:
+    """Return what was taken in of two even frames of 500 counts, with a noise of 20 counts in each."""
+    baseline = SimpleNamespace(
+        chart=SimpleNamespace(colour_count=CELLS), levels=np.full((CELLS, 3), 0.5), options=SimpleNamespace()
+    )
+    unknown: Any = None
+    return Accumulator(
+        session=unknown, selected=unknown, baseline=baseline, figures=(), saturation=SATURATION, registered=unknown,  # pyright: ignore[reportArgumentType]
+        dark=None, estimate=unknown, hot=HotPixels.none(CELLS, 25), highest=np.full(CELLS, 500, np.uint16),
+        highest_at=np.zeros(CELLS, np.int64), outside=np.zeros(CELLS, np.bool_), covered=np.zeros(CELLS, np.bool_),
+        place_error=np.zeros(CELLS), even_sum=np.full((CELLS, 25, 3), 1000, np.float32),
+        even_noise2=np.full((CELLS, 3), 800.0), even_frames=2,
+    )  # fmt: skip
+
+
+def clean() -> Stains:
+    return Stains(NO_LIGHT, NO_LIGHT, NO_LIGHT, np.zeros(CELLS, np.bool_), NO_LIGHT + 1, np.zeros((CELLS, 2)))
+
+
+def frame(light: int | None, disturbed: dict[int, float], alone: tuple[int, ...] = ()) -> Any:
+    consistency = FrameConsistency(disturbed=tuple(disturbed.items()), alone=alone)
+    return SimpleNamespace(record=SimpleNamespace(illumination=light), consistency=consistency)
+
+
+def at(cell: int, value: float, *others: int) -> npt.NDArray[np.float64]:
+    found = np.zeros(CELLS)
+    found[[cell, *others]] = value
+    return found
+
+
+def causes(
+    done: Any, stains: Stains | None = None, frames: tuple[Any, ...] = (), added: AddedLight | None = None
+) -> Any:
+    found = done.unfit(stains or clean(), frames, added or AddedLight.none(CELLS))
+    return {one.colour: one.cause for one in found}
+
+
+def test_each_cause_makes_a_cell_unfit_from_its_limit_on() -> None:
+    done, limit = empty(), round(CLIPPING_SHARE * SATURATION)
+    assert causes(done) == {}
+    highest = np.full(CELLS, 500, np.uint16)
+    highest[[3, 4, 5]] = limit, limit - 1, limit
+    clipped = causes(replace(done, highest=highest, highest_at=np.where(np.arange(CELLS) == 5, -1, 0)))
+    assert {colour: cause.split(",")[0] for colour, cause in clipped.items()} == {
+        3: f"clipped: {limit} counts under light 0", 5: f"clipped: {limit} counts under white",
+    }  # fmt: skip
+    assert list(causes(replace(done, outside=at(7, 1).astype(bool), covered=at(8, 1).astype(bool)))) == [7, 8]
+    assert list(causes(replace(done, place_error=at(9, 0.5) + at(10, 0.51)))) == [10]
+    # A twentieth of a cell's level of .5, beyond four standard errors.
+    lit = AddedLight(NO_LIGHT.copy(), np.full((CELLS, 3), 0.001))
+    lit.share[[11, 12], 1] = 0.0289, 0.0291
+    assert list(causes(done, added=lit)) == [12]
+    assert "5.0%" in causes(done, added=lit)[12]
+
+
+def test_photosites_and_stains_make_a_cell_unfit() -> None:
+    done = empty()
+    stained = replace(clean(), stained=at(3, 1).astype(bool), deviation=np.stack([at(3, -0.04)] * 3, axis=1))
+    assert causes(done, stained) == {
+        3: "stained: it is, or its surroundings are, 4.0% darker than their codes elsewhere on the print"
+    }
+    hot = HotPixels.none(CELLS, 25)
+    hot.least[...] = 0
+    hot.least[5, 7, 1] = 900
+    noise = np.full(3, 5.0)
+    dark: Any = SimpleNamespace(file="dark")
+    figures = DarkFrameFigures(dark, np.zeros((2, 2)), np.zeros(3), np.zeros(3), noise)
+    assert causes(replace(done, figures=(figures,), hot=hot)) == {
+        5: "hot: a photosite stands out by 900 counts in every dark frame"
+    }
+    even = done.even_sum.copy()
+    even[6, 12, 0] = 499
+    # A rim that differs by 5 %: the noise of the mean of two frames is 14 counts, and that of the difference 6.
+    rim = np.ones((5, 5), np.bool_)
+    rim[1:4, 1:4] = False
+    even[7, rim.ravel(), 2] += 70
+    even[8, rim.ravel(), 2] += 50
+    found = causes(replace(done, even_sum=even))
+    assert [cause.split(":")[0] for cause in found.values()] == ["dead", "uneven"]
+    assert list(found) == [6, 7]
+    # Of cells of less than 300 counts, on the mean of the frames, none is told to be dead.
+    dim = np.where(even == 499, 240, 500).astype(np.float32)
+    assert causes(replace(done, even_sum=dim)) == {}
+
+
+def test_stains_are_looked_for_in_the_mean_of_even_frames_with_the_field_divided_out() -> None:
+    done = empty()
+    field = np.linspace(0.5, 1.5, CELLS)[:, None] * np.ones(3)
+    # Of eight colours nothing is known but what was judged.
+    done.baseline.chart.bits, done.baseline.points = 1, SimpleNamespace(cells_mm=np.zeros((CELLS, 2)))
+    found = done.stains(field)
+    assert not found.known
+    np.testing.assert_allclose(found.level, 500 / field)
+
+
+def test_cells_that_something_covers_are_unfit_under_the_lights_of_their_frames() -> None:
+    frames = (
+        frame(2, {3: -0.1, 4: 0.0}), frame(5, {3: 0.3}), frame(None, {9: 0.5}, (10,)), frame(6, {}, (11,)),
+    )  # fmt: skip
+    assert disturbed_cells(frames) == {3: [(2, -0.1), (5, 0.3)], 4: [(2, 0.0)]}
+    found = causes(empty(), frames=frames)
+    assert found[3].startswith("disturbed: under light 5 and 1 more it is 30.0% brighter than its code gives")
+    assert found[4].startswith("disturbed: under light 2 it is too dark to be compared")
+    assert found[11].startswith("unlike: under light 6")
+    assert list(found) == [3, 4, 11]
+
+
+def test_the_first_cause_counts() -> None:
+    done = replace(empty(), outside=at(3, 1).astype(bool), covered=at(3, 1, 4).astype(bool), place_error=at(3, 1, 4, 5))
+    assert [cause.split(":")[0] for cause in causes(done).values()] == ["outside", "covered", "misplaced"]
+
+
+def test_a_frame_adds_its_highest_counts_and_an_even_one_its_samples() -> None:
+    unknown: Any = None
+
+    def measured(light: int | None, saturation: int, samples: float | None) -> MeasuredFrame:
+        highest = np.full(CELLS, 500, np.uint16)
+        highest[[1, 2]] = 499, 600 + (light or 0)
+        figures: Any = SimpleNamespace(record=SimpleNamespace(illumination=light))
+        kept = None if samples is None else np.full((CELLS, 25, 3), samples, np.float32)
+        noise = None if samples is None else np.full((CELLS, 3), 30.0)
+        return MeasuredFrame(figures, unknown, saturation, unknown, highest, np.arange(CELLS) != 7, kept, noise)
+
+    done = empty().with_frame(measured(3, 9000, None)).with_frame(measured(None, 9500, 700.0))
+    assert (done.saturation, done.even_frames, len(done.figures)) == (9000, 3, 2)
+    assert (done.highest[[0, 1, 2]].tolist(), done.highest_at[[0, 1, 2]].tolist()) == ([500, 500, 603], [0, 0, 3])
+    assert np.flatnonzero(done.outside).tolist() == [7]
+    assert (done.even_sum == 1700).all()
+    assert (done.even_noise2 == 800 + 900).all()
+    # The noise of one sample over the brightest cells' level, both means of three frames.
+    assert done.noise() == pytest.approx(np.full(3, np.sqrt(1700 / 3) / (1700 / 3)))
+    brighter = empty().with_frame(measured(None, 9500, None))
+    assert brighter.highest_at[2] == -1

@@ -1,0 +1,328 @@
+"""What figures measure of a made-up table, where they are None, what they name, and which frames they ask for."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibration.causes.gathering import PrintPlace
+from calibration.figures import geometry, light, radiometry, truth
+from calibration.figures.figure import CheckMeasurements
+from calibration.radiometry.superposition import NODES, Superposition
+from experiment.chart.layout import design_chart
+
+CHART = design_chart(3, "A7")
+KINDS = ("white", "light", "light", "light", "white")
+WHITE = np.array([[600.0, 900, 100], [5000, 60, 40], [50, 30, 295]])
+NONE = Superposition.usual(10_000.0)
+
+
+def frame(number: int, **more: object) -> Any:
+    """Return the n-th of five frames: white, three lights, white."""
+    kind = KINDS[number]
+    found: dict[str, Any] = {
+        "record": SimpleNamespace(
+            kind=kind, illumination=number - 1 if kind == "light" else None, file=f"{number}.dng", sha256=f"{number}"
+        ),
+        "paper": SimpleNamespace(
+            white=np.array([4000.0, 9000, 2000]), references=80 - number, spread=np.array([9, 1 + number, 9]) / 1000
+        ),
+        "blur_px": 0.5 + 0.1 * (number == 3),
+        "consistency": SimpleNamespace(
+            scatter=0.01 * (number == 2), block=0.02 * (number == 1), at_mm=(3.0, 4.0), extent_mm=9.0,
+            disturbed=((7, 0.1), (8, 0.1)) if number in (0, 2) else ((8, 0.1), (9, 0.1)) if number == 3 else (),
+        ),
+        "reregistered": number > 2,
+    }  # fmt: skip
+    return SimpleNamespace(**found | more)
+
+
+def codes(**more: object) -> Any:
+    """Return how three lights agree with their codes: the last is off."""
+    found: dict[str, Any] = {
+        "off_deg": np.array([0.0, 1.0, 3.0]),
+        "off_brightness": np.array([0.2, 0.0, 0.4]),
+        "brightness": np.array([0.25, 0.01, -0.5]),
+        "exchanges": (),
+        "held": np.array([True, True, False]),
+        "exchange_deg": 1.5,
+        "misfit": 0.75,
+    }
+    return SimpleNamespace(**found | more)
+
+
+def pairs(count: int) -> tuple[Any, ...]:
+    return tuple(SimpleNamespace(one=number, other=number + 1, angle_deg=2.5 - number) for number in range(count))
+
+
+def table(**more: object) -> Any:
+    """Return a table of five frames."""
+
+    def lights_off_codes(limit: float) -> list[int]:
+        return np.flatnonzero(found["lights"].off_codes_deg > limit).tolist()
+
+    def added_bleed(one: Any) -> float:
+        return one.blur_px - 0.5
+
+    frames = tuple(frame(number) for number in range(5))
+    lights: dict[str, Any] = {
+        "codes": codes(), "off_codes_deg": np.array([0.0, 1.0, 3.0]), "white_frames": None, "drift": None,
+        "subtracted": None, "additivity": None, "stray": None, "white": WHITE, "brightest": WHITE.max(axis=0),
+        "lights_off_codes": lights_off_codes,
+    }  # fmt: skip
+    found: dict[str, Any] = {
+        "frames": frames,
+        "white_frames": [frames[0], frames[4]],
+        "white_drift": 0.02,
+        "white_scatter": np.array([0.001, 0.001, 0.001]),
+        "origins": SimpleNamespace(other_camera=(), other_exposure=(), other_lens=(), other_iso=()),
+        "sensor": SimpleNamespace(
+            linearity=None, superposition=NONE, white_level=10_000, saturation_measured=True,
+            transfer=SimpleNamespace(misfit=np.array([0.1, 0.2, 0]), noisy=np.arange(512) < 4, ratio=np.arange(512)),
+        ),
+        "dark_frames": SimpleNamespace(light=np.array([50.0, 9, 2]), lights=(), files=()),
+        "dark_share": 0.01,
+        "dark_change": 0.003,
+        "registration": SimpleNamespace(
+            mismatched_cells=np.zeros(512, np.bool_), cell_px=17.0, blur_px=2.2, marks_rms_px=0.3, lens_residual_px=1.2,
+            block_rms_px=0.06, clearance=3.0, agreement=0.99, blocks=SimpleNamespace(good=np.arange(8) > 0),
+            framing=SimpleNamespace(field=None, tags=(1, 2, 3), missing=(4,)),
+        ),
+        "lens": SimpleNamespace(uncorrected_in_worst=0.01),
+        "cells": SimpleNamespace(unfit=(), window=5),
+        "session": SimpleNamespace(
+            lights=3, white_references=100, registered_file="0.dng", codes=((255, 0, 0), (0, 90, 0), (255, 255, 255))
+        ),
+        "added_bleed": added_bleed,
+        "primaries": None,
+        "budget": SimpleNamespace(expanded_deg=np.array([0.2, 0.9, 0.4])),
+    }  # fmt: skip
+    for name, value in more.items():
+        if name in lights and name != "white_frames":
+            lights[name] = value
+        elif name == "as_whites":
+            lights["white_frames"] = value
+        else:
+            found[name] = value
+    found["lights"] = SimpleNamespace(**lights)
+    return SimpleNamespace(**found)
+
+
+def off(*values: float, error: float = 0.0) -> Any:
+    return SimpleNamespace(off=np.array(values), error=np.full(3, error))
+
+
+def unlike(frames: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return frames of which the last is the first's file again."""
+    return (*frames[:4], frame(4, record=SimpleNamespace(kind="white", illumination=None, file="4.dng", sha256="0")))
+
+
+TWICE = unlike(table().frames)
+FOREIGN = SimpleNamespace(other_camera=("one",), other_exposure=(), other_lens=(), other_iso=())
+TINTED = (table().frames[0], frame(4, paper=SimpleNamespace(white=np.array([4000.0, 9000, 2200]))))
+SUBTRACTED = np.ones((3, 3))
+AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.array([0.2, 0.1]))
+
+
+@pytest.mark.parametrize(
+    ("figure", "more", "value"),
+    [
+        (light.REPEATED_FILES, {}, 0),
+        (light.REPEATED_FILES, {"frames": TWICE}, 1),
+        (light.WHITE_DRIFT, {}, 0.02),
+        (light.WHITE_DRIFT, {"drift": SimpleNamespace(left=0.001)}, None),
+        (light.WHITE_DRIFT, {"white_frames": [TWICE[0], TWICE[4]]}, None),
+        (light.DRIFT_LEFT, {}, None),
+        (light.DRIFT_LEFT, {"drift": SimpleNamespace(left=0.001)}, 0.001),
+        (light.DRIFT_LEFT, {"drift": SimpleNamespace(left=0.001), "white_frames": [TWICE[0]]}, None),
+        (light.WHITE_DRIFT_DEG, {}, 0),
+        # The angle between (4, 9, 2) and (4, 9, 2.2).
+        (light.WHITE_DRIFT_DEG, {"white_frames": TINTED}, 1.1129),
+        (light.WHITE_DRIFT_DEG, {"white_frames": TINTED[:1]}, None),
+        (light.LEAK_SHARE, {}, 0.01),
+        (light.LEAK_SHARE, {"subtracted": SUBTRACTED}, None),
+        (light.LEAK_SHARE, {"dark_share": np.nan}, None),
+        (light.DARK_DRIFT, {}, None),
+        (light.DARK_DRIFT, {"dark_frames": SimpleNamespace(lights=(1,))}, None),
+        (light.DARK_DRIFT, {"dark_frames": SimpleNamespace(lights=(1, 2))}, 0.003),
+        (light.STRAY_SHARE, {}, None),
+        (light.STRAY_SHARE, {"stray": SimpleNamespace(share=0.004)}, 0.004),
+        (light.STRAY_SHARE, {"stray": SimpleNamespace(share=0.004), "origins": FOREIGN}, None),
+        (light.STRAY_SHARE, {"stray": SimpleNamespace(share=0.004), "codes": codes(exchanges=pairs(1))}, None),
+        (light.LINEARITY_KNOWN, {}, 0),
+        # White has more, or less, than the sum of the primaries, in the channel that is furthest off.
+        (light.ADDITIVITY, {}, None),
+        (light.ADDITIVITY, {"additivity": off(-0.03, -0.01, 0.02), "off_codes_deg": None}, 0.03),
+        (light.ADDITIVITY, {"additivity": off(-0.03, -0.01, 0.02)}, None),
+        (light.ADDITIVITY, {"additivity": off(0.03, 0.01, 0.02), "off_codes_deg": None}, 0),
+        (light.WHITE_DEFICIT, {"additivity": off(-0.03, -0.01, 0.02), "off_codes_deg": None}, 0.02),
+        (light.WHITE_DEFICIT, {"additivity": off(-0.03, -0.01, 0.0), "off_codes_deg": np.zeros(3)}, 0),
+        # Half of what white has beyond the primaries, less two of its scatter, as far as there was so much dark light.
+        (light.TOO_DARK, {"additivity": off(-0.02, -0.016, -0.01), "off_codes_deg": None}, None),
+        (
+            light.TOO_DARK,
+            {"additivity": off(-0.02, -0.016, -0.01), "off_codes_deg": None, "subtracted": SUBTRACTED},
+            0.008,
+        ),
+        (light.TOO_DARK, {"additivity": off(-0.02, 0.001, -0.01), "off_codes_deg": None, "subtracted": SUBTRACTED}, 0),
+        (
+            light.TOO_DARK,
+            {"additivity": off(-0.028, -0.016, -0.01), "off_codes_deg": None, "subtracted": SUBTRACTED},
+            0,
+        ),
+        (
+            light.TOO_DARK,
+            {"additivity": off(-0.026, -0.016, -0.01), "off_codes_deg": None, "subtracted": SUBTRACTED},
+            0.011,
+        ),
+        # What was subtracted too much is no light of the projector's.
+        (
+            light.ADDITIVITY,
+            {"additivity": off(-0.02, -0.016, -0.01), "off_codes_deg": None, "subtracted": SUBTRACTED},
+            None,
+        ),
+        (light.OFF_CODES_DEG, {}, 3),
+        (light.OFF_CODES_DEG, {"off_codes_deg": None}, None),
+        (light.OFF_BRIGHTNESS, {}, 0.4),
+        (light.OFF_BRIGHTNESS, {"codes": None}, None),
+        (light.EXCHANGED_LIGHTS, {"codes": codes(exchanges=pairs(2))}, 2),
+        (light.CODE_MISFIT, {}, 0.75),
+        (light.EXCHANGE_DEG, {}, 1.5),
+        (light.CHECKED_SHARE, {}, 2 / 3),
+        (light.WHITE_FRAME_DEG, {}, None),
+        (light.WHITE_FRAME_DEG, {"as_whites": AS_WHITES}, 4),
+        (light.WHITE_FRAME_BRIGHTNESS, {"as_whites": AS_WHITES}, 0.2),
+        # Red and green have a frame of their own, whatever the code.
+        (light.PRIMARIES_LACKING, {}, 1),
+        (light.PRIMARIES_LACKING, {"session": SimpleNamespace(codes=((9, 9, 9), (0, 0, 0)))}, 0),
+        (light.PRIMARIES_LACKING, {"codes": None}, None),
+        (radiometry.UNFIT_SHARE, {"cells": SimpleNamespace(unfit=(1, 2, 3, 4))}, 4 / 512),
+        (radiometry.SOFTER_BLEED, {}, 0.1),
+        (radiometry.FRAME_SCATTER, {}, 0.01),
+        (radiometry.UNLIKE_BLOCK, {}, 0.02),
+        (radiometry.UNLIKE_BLOCK, {"registration": SimpleNamespace(mismatched_cells=np.zeros(69))}, None),
+        (radiometry.UNLIKE_BLOCK, {"registration": SimpleNamespace(mismatched_cells=np.zeros(70))}, 0.02),
+        # Cells of lights' frames, each once.
+        (radiometry.DISTURBED_CELLS, {}, 3),
+        (radiometry.DISTURBED_CELLS, {"registration": SimpleNamespace(mismatched_cells=np.zeros(69))}, None),
+        (radiometry.REGISTERED_ANEW, {}, 2),
+        (radiometry.OTHER_CAMERA, {"origins": FOREIGN}, 1),
+        (geometry.TAGS_FOUND, {}, 3 / 4),
+        (geometry.CELL_PX, {}, 17),
+        # 17 / 2 less two pixels and three quarters is 2.61 times the blur; and what the lens brings.
+        (geometry.BLEED, {}, 0.00449 + 0.01),
+        (geometry.TAG_RESIDUAL_PX, {}, 1.2),
+        (geometry.TAG_FINAL_PX, {}, 0.1),
+        (geometry.BLOCK_RESIDUAL_PX, {}, 0.02),
+        (geometry.BLOCKS_GOOD, {}, 7 / 8),
+        (geometry.AGREEMENT, {}, 0.99),
+        (truth.NOISE_MISFIT, {}, 0.2),
+        (truth.NOISY_SHARE, {}, 4 / 512),
+        (truth.REFERENCES_USED, {}, 0.76),
+        # Of the strongest channel, green.
+        (truth.REFERENCE_SPREAD, {}, 0.005),
+        (truth.TRUTH_MEDIAN_DEG, {}, 0.4),
+        (truth.TRUTH_WORST_DEG, {}, 0.9),
+        (truth.BRIGHTEST_SHARE, {}, 0.5),
+        (truth.DARKEST_COUNTS, {}, 295),
+    ],
+)
+def test_a_figure_measures(figure: Any, more: dict[str, Any], value: float | None) -> None:
+    assert figure.measure(table(**more)) == (None if value is None else pytest.approx(value, rel=1e-3))
+
+
+def test_a_bend_is_what_counts_lack_for_certain_over_paper_s_levels() -> None:
+    nodes = np.array(NODES)
+    for lack, error in ((0.03, 0.0), (0.03, 0.002)):
+        found = Superposition(
+            10_000.0, -lack * nodes**2 * 10_000, (error * nodes * 10_000) ** 2 * np.eye(len(nodes)), None
+        )
+        sensor = SimpleNamespace(linearity=None, superposition=found)
+        made = table(sensor=sensor, off_codes_deg=None)
+        level = np.geomspace(10_000 * NODES[1], 5000, 30)
+        relative = found.relative(level)[0]
+        bend = np.abs(relative - relative[-1])
+        doubt = 2 * np.sqrt(found.beside(level, np.full(30, 5000.0))[1])
+        assert light.LINEARITY.measure(made) == pytest.approx(np.maximum(bend - doubt, 0).max(), abs=1e-9)
+        assert bend.max() == pytest.approx(lack * (0.5 - NODES[1]), rel=0.05)
+        assert light.LINEARITY_KNOWN.measure(made) == 1
+        # Lights that are not what they are called tell nothing.
+        assert light.LINEARITY.measure(table(sensor=sensor)) is None
+    assert light.LINEARITY.measure(table(off_codes_deg=None)) is None
+    series = SimpleNamespace(worst=0.02, range=(0.1, 0.9), files=("a",))
+    assert light.LINEARITY.measure(table(sensor=SimpleNamespace(linearity=series, superposition=NONE))) == 0.02
+
+
+@pytest.mark.parametrize(
+    ("figure", "limit", "files"),
+    [
+        (light.OFF_CODES_DEG, 1.0, ["3"]),
+        (light.OFF_CODES_DEG, 0.9, ["2", "3"]),
+        (light.OFF_BRIGHTNESS, 0.2, ["3"]),
+        (light.OFF_BRIGHTNESS, 0.1, ["1", "3"]),
+        (light.WHITE_FRAME_DEG, 1.0, ["4"]),
+        (light.WHITE_FRAME_BRIGHTNESS, 0.1, ["0"]),
+        (radiometry.SOFTER_BLEED, 0.05, ["3"]),
+        (radiometry.FRAME_SCATTER, 0.01, []),
+        (radiometry.FRAME_SCATTER, 0.009, ["2"]),
+        (radiometry.UNLIKE_BLOCK, 0.01, ["1"]),
+        # Where every frame is beyond, it is none of single ones.
+        (radiometry.UNLIKE_BLOCK, -1.0, None),
+        (radiometry.OTHER_EXPOSURE, 0.1, ["1", "2"]),
+        (radiometry.OTHER_EXPOSURE, 0.01, ["1", "2", "3"]),
+    ],
+)
+def test_frames_beyond_a_limit_are_asked_for(figure: Any, limit: float, files: list[str] | None) -> None:
+    made = table(as_whites=AS_WHITES)
+    ratios = {1: 1.2, 2: 1 / 1.2, 3: 1 / 1.05}
+    made.origins.other_exposure = tuple(
+        SimpleNamespace(record=made.frames[number].record, ratio=ratio) for number, ratio in ratios.items()
+    )
+    found = figure.retake(made, limit)
+    assert (None if found is None else [record.file.removesuffix(".dng") for record in found]) == files
+
+
+def worst(figure: Any, made: Any) -> Any:
+    return figure.worst(made, CHART)
+
+
+def where(figure: Any, made: Any, accepted: float) -> Any:
+    return figure.where(made, accepted)
+
+
+def test_a_figure_names_its_worst() -> None:
+    made = table(codes=codes(exchanges=pairs(6)))
+    assert worst(light.OFF_CODES_DEG, made).light == 2
+    assert worst(light.OFF_BRIGHTNESS, made).file == "3.dng"
+    assert worst(light.OFF_BRIGHTNESS, table(codes=codes(off_brightness=np.zeros(3)))) is None
+    assert worst(radiometry.SOFTER_BLEED, made).file == "3.dng"
+    assert worst(radiometry.FRAME_SCATTER, made).file == "2.dng"
+    assert worst(radiometry.UNLIKE_BLOCK, made).place == PrintPlace("1.dng", 3.0, 4.0, 9.0)
+    assert worst(truth.REFERENCES_USED, made).file == "4.dng"
+    assert worst(truth.REFERENCE_SPREAD, made).file == "4.dng"
+    assert truth.TRUTH_WORST_DEG.measure(made) == 0.9
+    assert (
+        worst(truth.BRIGHTEST_SHARE, made).light,
+        worst(truth.DARKEST_COUNTS, made).light,
+    ) == (1, 2)
+    one = table(white=WHITE[:1])
+    assert worst(truth.BRIGHTEST_SHARE, one) is worst(truth.DARKEST_COUNTS, one) is None
+    x, y = CHART.centres_mm[CHART.cell_of_colour[511]].tolist()
+    assert worst(truth.NOISY_SHARE, made).place == PrintPlace("0.dng", x, y, 0.0)
+    # Four pairs are named of six, white frames after the lights.
+    said = where(light.EXCHANGED_LIGHTS, made, 0.0)
+    assert "light 2 and white frame 0" in said
+    assert said.endswith("(and 2 pairs more), 2.5° apart in the first pair")
+    assert "more" not in where(light.EXCHANGED_LIGHTS, table(codes=codes(exchanges=pairs(4))), 0.0)
+    assert where(light.OFF_BRIGHTNESS, made, 0.1) == "light 2 by -50 %, light 0 by +25 %"
+    assert where(light.REPEATED_FILES, table(frames=TWICE), 0.0) == "4.dng is 0.dng"
+    assert where(light.CHECKED_SHARE, made, 0.0) == "2 of 3"
+
+
+def test_a_check_forecasts_bleed_of_a_cell_and_a_blur_that_it_saw() -> None:
+    forecast: Any = geometry.BLEED.forecast
+    assert forecast(CheckMeasurements(cell_px=17.0, blur_px=2.2)) == pytest.approx(0.00449, rel=1e-2)
+    assert forecast(CheckMeasurements(cell_px=17.0)) is forecast(CheckMeasurements(blur_px=2.2)) is None
