@@ -196,12 +196,14 @@ class Covered:
         """Return the tests that run a mutation's place, or else what is named there; the quickest first."""
         lines = range(mutation.line, mutation.last_line + 1)
         found = self._running(mutation.file, lines)
-        sought, names = set[str](), [] if found else [_name_around(mutation.file, mutation.line)]
-        while names and not found:
-            sought.update(names)
-            users = [place for name in names for place in _uses(name)]
-            found = set[str]().union(*(self._running(file, [line]) for file, line in users))
-            names = sorted({_name_around(file, line) for file, line in users} - sought)
+        sought = [] if found else [_name_around(mutation.file, mutation.line)]
+        for name in sought:
+            for file, line in _uses(name):
+                tests = self._running(file, [line])
+                found |= tests
+                around = _name_around(file, line)
+                if not tests and around not in sought:
+                    sought.append(around)
         near = f"test_{Path(mutation.file).stem}.py::"
         return sorted(found, key=lambda test: self.seconds.get(test, 1.0) * (0.3 if near in test else 1.0))
 
