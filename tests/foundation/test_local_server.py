@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import http.client
+import io
 import ipaddress
 import re
 import socket
+import sys
 import threading
 from contextlib import AbstractContextManager, ExitStack, suppress
 from typing import Any
@@ -143,6 +145,30 @@ def test_a_reader_finds_the_address_in_what_is_printed() -> None:
     assert (across.min(), len(rows[0]) - 1 - across.max(), down.min()) == (4, 4, 4)
     # Two rows make a line of text.
     assert len(rows) - 1 - down.max() == 4 + (down.max() - down.min() + 1) % 2
+
+
+@pytest.mark.parametrize(
+    ("host", "terminal", "encoding", "is_shown"),
+    [
+        ("0.0.0.0", True, "UTF-8", True),
+        ("0.0.0.0", True, "latin-1", False),
+        ("0.0.0.0", False, "utf-8", False),
+        ("127.0.0.1", True, "utf-8", False),
+    ],
+)
+def test_a_terminal_that_has_the_characters_shows_others_the_code(
+    monkeypatch: pytest.MonkeyPatch, host: str, terminal: bool, encoding: str, is_shown: bool
+) -> None:
+    shown = io.TextIOWrapper(io.BytesIO(), encoding, errors="replace")
+    monkeypatch.setattr(shown, "isatty", lambda: terminal)
+    monkeypatch.setattr(sys, "stdout", shown)
+    with Echo(host, 0) as server:
+        monkeypatch.setattr(server, "serve_forever", lambda: None)
+        server.serve("nothing", "can look")
+    shown.seek(0)
+    lines = shown.read().splitlines()
+    assert (len(lines) > 9) is is_shown
+    assert lines[0].endswith(" shows nothing; Ctrl-C ends it")
 
 
 def test_it_fits_a_terminal_of_80_columns() -> None:
