@@ -19,6 +19,7 @@ from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import (
     is_partial,
     make_folder,
+    open_inside,
     partial_path,
     read_csv,
     read_whole,
@@ -416,3 +417,34 @@ def test_a_place_that_cannot_be_written_is_found_before_the_work(
     monkeypatch.setattr("tempfile.TemporaryFile", refused)
     with pytest.raises(StorageError, match=said):
         require_free_file(tmp_path / "no" / "model.npz", "the model")
+
+
+BLOCK, MOST_HOLES = 1 << 16, 1 << 30
+
+
+@pytest.mark.parametrize(
+    ("blocks", "size"),
+    [
+        ([MOST_HOLES], MOST_HOLES + BLOCK),
+        ([MOST_HOLES // 2, MOST_HOLES + BLOCK], MOST_HOLES + 2 * BLOCK),
+        ([0], MOST_HOLES + BLOCK),
+    ],
+)
+def test_a_file_may_have_holes_of_a_gibibyte_together(tmp_path: Path, blocks: list[int], size: int) -> None:
+    """A few bytes can claim more than anybody can read."""
+    path = tmp_path / "samples.npy"
+    with path.open("wb") as stream:
+        for block in blocks:
+            stream.seek(block)
+            stream.write(bytes([7]) * BLOCK)
+        stream.truncate(size)
+        if path.stat().st_blocks * 512 >= size:
+            pytest.skip("the file system makes no holes")
+    with open_inside(tmp_path, path.name) as opened:
+        assert opened.tell() == 0
+    os.truncate(path, size + BLOCK)
+    with (
+        pytest.raises(FormatError, match=f"claims {size + BLOCK} bytes and holds at most {len(blocks) * BLOCK};"),
+        open_inside(tmp_path, path.name),
+    ):
+        pass

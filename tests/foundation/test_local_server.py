@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import http.client
+import io
 import ipaddress
 import re
 import socket
+import sys
 import threading
 from contextlib import AbstractContextManager, ExitStack, suppress
 from typing import Any
@@ -95,6 +97,31 @@ def test_where_others_reach_it() -> None:
     assert all(name and "0.0.0.0" not in name for name in reachable_addresses("0.0.0.0"))
 
 
+class Probe:
+    """A socket of a machine whose routes lead to a network of both families."""
+
+    def __init__(self, family: socket.AddressFamily, kind: socket.SocketKind) -> None:
+        assert kind == socket.SOCK_DGRAM, "nothing is to be sent"
+        self.own = "192.168.1.7" if family == socket.AF_INET else "fd00::7"
+
+    def __enter__(self) -> Probe:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def connect(self, address: tuple[str, int]) -> None:
+        assert ipaddress.ip_address(address[0]).version == ipaddress.ip_address(self.own).version
+
+    def getsockname(self) -> tuple[str, int]:
+        return self.own, 40000
+
+
+def test_who_listens_everywhere_is_reached_by_what_his_routes_lead_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "socket", Probe)
+    assert reachable_addresses("0.0.0.0") == ("192.168.1.7",)
+    assert reachable_addresses("::") == ("192.168.1.7", "[fd00::7]")
+
+
 def test_without_a_network_it_goes_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     def unreachable(self: socket.socket, address: object) -> None:
         raise OSError("Network is unreachable")
@@ -114,8 +141,34 @@ def test_a_reader_finds_the_address_in_what_is_printed() -> None:
     picture = np.kron(np.array(rows, np.uint8) * 255, np.ones((8, 8), np.uint8))
     assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == ADDRESS
     # ISO/IEC 18004, 6.3.8: four light modules on each side.
-    assert all(all(row[:4]) and all(row[-4:]) for row in rows)
-    assert all(all(row) for row in rows[:4] + rows[-4:])
+    down, across = np.nonzero(np.array(rows) == 0)
+    assert (across.min(), len(rows[0]) - 1 - across.max(), down.min()) == (4, 4, 4)
+    # Two rows make a line of text.
+    assert len(rows) - 1 - down.max() == 4 + (down.max() - down.min() + 1) % 2
+
+
+@pytest.mark.parametrize(
+    ("host", "terminal", "encoding", "is_shown"),
+    [
+        ("0.0.0.0", True, "UTF-8", True),
+        ("0.0.0.0", True, "latin-1", False),
+        ("0.0.0.0", False, "utf-8", False),
+        ("127.0.0.1", True, "utf-8", False),
+    ],
+)
+def test_a_terminal_that_has_the_characters_shows_others_the_code(
+    monkeypatch: pytest.MonkeyPatch, host: str, terminal: bool, encoding: str, is_shown: bool
+) -> None:
+    shown = io.TextIOWrapper(io.BytesIO(), encoding, errors="replace")
+    monkeypatch.setattr(shown, "isatty", lambda: terminal)
+    monkeypatch.setattr(sys, "stdout", shown)
+    with Echo(host, 0) as server:
+        monkeypatch.setattr(server, "serve_forever", lambda: None)
+        server.serve("nothing", "can look")
+    shown.seek(0)
+    lines = shown.read().splitlines()
+    assert (len(lines) > 9) is is_shown
+    assert lines[0].endswith(" shows nothing; Ctrl-C ends it")
 
 
 def test_it_fits_a_terminal_of_80_columns() -> None:

@@ -74,6 +74,27 @@ def test_a_set_names_several_and_daylight_any_temperature() -> None:
     assert np.abs(light.power - d65.power).max() < 0.01
 
 
+def test_daylight_is_defined_from_4000_to_25000_kelvin() -> None:
+    assert [light.name for light in read_lights("daylight:4000,daylight:25000K").lights] == [
+        "daylight 4000K",
+        "daylight 25000K",
+    ]
+    for beyond in ("3999", "25001"):
+        with pytest.raises(InputError, match=f"daylight of {beyond} K"):
+            read_lights(f"daylight:{beyond}")
+
+
+@pytest.mark.parametrize(("at", "is_light"), [(395, False), (400, True), (700, True), (705, False)])
+def test_a_light_has_power_somewhere_from_400_to_700_nm(at: int, is_light: bool) -> None:
+    text = table(hall=0.0).replace(f"{at},0.0", f"{at},3.0")
+    if is_light:
+        (light,) = parse_spectra(text.encode(), "lamps.csv")
+        np.testing.assert_array_equal(light.power, at == WAVELENGTHS_NM)
+        return
+    with pytest.raises(FormatError, match="dark from 400 to 700 nm"):
+        parse_spectra(text.encode(), "lamps.csv")
+
+
 def test_spectra_that_are_no_black_bodies_have_names_and_no_temperature() -> None:
     (light,) = illuminations_of(read_lights("D65").lights)
     assert (light.kind, light.cct_k, light.name, light.colour) == ("spectrum", None, "D65", (255, 255, 255))

@@ -51,7 +51,24 @@ def test_the_command_line_comes_before_the_file() -> None:
 
 
 def test_without_a_file_all_is_as_in_the_simulated_lab() -> None:
-    assert load_settings(None) == TableSettings()
+    usual = load_settings(None)
+    assert usual == TableSettings()
+    assert (usual.seed, usual.window, usual.chart.bits, usual.chart.seed, usual.exposure.iso) == (1, 5, 5, 1, 100)
+
+
+@pytest.mark.parametrize(
+    ("section", "name", "least", "most"),
+    [("exposure", "iso", 50, 25600), ("chart", "bits", 1, 5), ("chart", "seed", 0, None), ("", "seed", 0, None)],
+)
+def test_numbers_at_their_limits_and_beyond(section: str, name: str, least: int, most: int | None) -> None:
+    def parsed(number: int) -> TableSettings:
+        return parse_settings({section: {name: number}} if section else {name: number}, "here")
+
+    for limit, beyond in ((least, least - 1), *([(most, most + 1)] if most else [])):
+        settings = parsed(limit)
+        assert getattr(getattr(settings, section) if section else settings, name) == limit
+        with pytest.raises(ConfigurationError, match=rf"{name} = {beyond}"):
+            parsed(beyond)
 
 
 def test_a_body_of_the_lab_and_one_of_sensitivities_are_found() -> None:

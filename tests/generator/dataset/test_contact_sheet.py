@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,14 +28,21 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
-def made_of(lut: Lut, out: Path, scenes: int, lights: Sequence[int] | LightChoice) -> Dataset:
+def made_of(
+    lut: Lut, out: Path, scenes: int, lights: Sequence[int] | LightChoice, size: tuple[int, int] = (24, 16)
+) -> Dataset:
     options = DatasetOptions(previews=False, rendering="codes")
-    return generate_dataset(lut, out, random_scenes(scenes, 24, 16), lights, options=options)
+    return generate_dataset(lut, out, random_scenes(scenes, *size), lights, options=options)
 
 
 def images_on(figure: Figure) -> int:
     """Return how many pictures a sheet shows, each of which and each text is within the page and beside the others."""
     pictures = [axes.get_position() for axes in figure.axes if axes.images]
+    for axes in figure.axes:
+        # Pictures are not stretched, and a light's dot is round.
+        box, shown = axes.get_position(), np.asarray(axes.images[0].get_array() if axes.images else [[0]])
+        width, height = figure.get_size_inches()
+        assert (box.height * height) / (box.width * width) == pytest.approx(shown.shape[0] / shown.shape[1])
     for place, one in enumerate(pictures):
         assert not any(one.overlaps(other) for other in pictures[:place])
     for axes in figure.axes:
@@ -79,7 +86,16 @@ def test_of_many_lights_as_many_are_shown_as_are_recognised(make_lut: Callable[.
     lights = ListedLights(tuple(mixture_of({0: part, 1: 10 - part}) for part in range(1, 10)))
     made = made_of(make_lut(), tmp_path / "out", 1, lights)
     assert made.description.images == 9
-    assert images_on(draw(made, MAX_ROWS, MAX_COLUMNS)) == 8
+    sheet = draw(made, MAX_ROWS, MAX_COLUMNS)
+    assert images_on(sheet) == 8
+    # A mixture has its chromaticity for a name, and for a colour what its lights' codes make together in linear light.
+    assert made.entries[0].lights == ("0:0.1+1:0.9",)
+    truth = made.entries[0].truths[0]
+    words = [text.get_text() for text in sheet.texts]
+    assert f"r {truth[0]:.2f} b {truth[2]:.2f}".replace(" 0.", " .") in words
+    dot: Any = next(axes.patches[0] for axes in sheet.axes if axes.patches)
+    # Their codes are 9, 8, 0 and 9, 8, 1, and a display's light goes with the power 2.2 of its codes.
+    assert np.multiply(dot.get_facecolor()[:3], 255) == pytest.approx([9, 8, 0.9 ** (1 / 2.2)])
 
 
 def test_images_of_one_light_a_picture_fill_a_grid(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
@@ -103,3 +119,34 @@ def test_images_of_one_light_a_picture_fill_a_grid(make_lut: Callable[..., Lut],
     assert any("each exposed for itself" in word for word in words)
     rows = draw(made_of(lut, tmp_path / "rows", 5, [0, 1, 2]), 2, 2)
     assert any("; 4 of 15 images shown" in text.get_text() for text in rows.texts)
+
+
+@pytest.mark.parametrize(("lights", "columns"), [([1], [0]), ([1, 3], [0, 1])])
+def test_lights_are_named_once_above_what_they_light(
+    make_lut: Callable[..., Lut], tmp_path: Path, lights: list[int], columns: list[int]
+) -> None:
+    """The rows of a grid have one light, and columns one each: it stands above the first picture of each."""
+    made = made_of(make_lut(), tmp_path / "out", 6, lights)
+    sheet = draw(made, MAX_ROWS, MAX_COLUMNS)
+    names = {light.label for light in made.description.lights}
+    pictures = [axes.get_position() for axes in sheet.axes if axes.images]
+    found = [text.get_position() for text in sheet.texts if text.get_text() in names]
+    assert images_on(sheet) == 6 * len(lights)
+    assert len(found) == len(columns) == len(sheet.axes) - len(pictures)
+    for (x, y), column in zip(found, columns, strict=True):
+        assert pictures[column].x0 < x < pictures[column].x1
+        assert y > pictures[column].y1
+    assert f"{len(lights)} light{'s' * (len(lights) > 1)}," in " ".join(text.get_text() for text in sheet.texts)
+
+
+def test_names_and_lights_stand_below_their_pictures(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+    made = made_of(make_lut(), tmp_path / "out", 12, RandomLights(1, 4, 0), size=(16, 24))
+    sheet = draw(made, MAX_ROWS, MAX_COLUMNS)
+    assert images_on(sheet) == 12
+    pictures = [axes.get_position() for axes in sheet.axes if axes.images]
+    words = [(text.get_text(), *text.get_position()) for text in sheet.texts]
+    labels = {str(light.illumination): light.label for light in made.description.lights}
+    for entry, box in zip(made.entries, pictures, strict=True):
+        below = [other.y1 for other in pictures if other.y1 < box.y0]
+        near = [word for word, x, y in words if box.x0 <= x < box.x0 + 0.2 and max(below, default=0) < y < box.y0]
+        assert near[:2] == [labels[entry.lights[0]], entry.source]

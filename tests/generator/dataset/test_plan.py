@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 
 from foundation.errors import InputError
 from generator.dataset.making import generate_dataset, parse_share, split_of
-from generator.dataset.plan import DatasetOptions, parse_split
-from generator.pictures.sources import find_pictures
+from generator.dataset.plan import DatasetOptions, Plan, exact_parts, parse_split
+from generator.lights.lighting import ListedLights
+from generator.pictures.sources import find_pictures, random_scenes
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -81,6 +82,20 @@ def test_parts_are_of_sources_and_stay_when_others_come(make_lut: Callable[..., 
     assert {name: now[name] for name in parts} == parts
 
 
+def test_what_is_in_a_picture_decides_its_part_only_where_it_has_a_copy(tmp_path: Path) -> None:
+    found: list[tuple[str, ...]] = []
+    for times in (1, 2):
+        for number in range(16):
+            (tmp_path / f"{number:02d}.png").write_bytes(bytes([number]) * times * (1 + number))
+        found.append(exact_parts(find_pictures([tmp_path]), (0.5, 0.25, 0.25), 3))
+    assert found[0] == found[1]
+    assert Counter(found[0]) == {"train": 8, "validation": 4, "test": 4}
+    for number in range(6):
+        (tmp_path / f"{number:02d}.png").write_bytes((tmp_path / "09.png").read_bytes())
+    parts = exact_parts(find_pictures([tmp_path]), (0.5, 0.25, 0.25), 3)
+    assert {*parts[:6], parts[9]} == {"train"}, "the only part that has room for seven"
+
+
 @pytest.mark.parametrize(
     ("text", "shares"),
     [
@@ -89,13 +104,14 @@ def test_parts_are_of_sources_and_stay_when_others_come(make_lut: Callable[..., 
         ("3,1", (0.75, 0.0, 0.25)),
         ("66.6,33.4", (0.666, 0, 0.334)),
         ("0,0,1", (0, 0, 1)),
+        ("0.3333333,0.6666666", (1 / 3, 0, 2 / 3)),
     ],
 )
 def test_shares_as_they_are_written(text: str, shares: tuple[float, float, float]) -> None:
     assert parse_split(text) == pytest.approx(shares)
 
 
-@pytest.mark.parametrize("text", [".7,.2", "0.5,0.1,0.1", "1.5,1"])
+@pytest.mark.parametrize("text", [".7,.2", "0.5,0.1,0.1", "1.5,1", "0.5,0.500002", "66.66665,33.3335"])
 def test_shares_that_leave_pictures_over_are_refused(text: str) -> None:
     with pytest.raises(InputError, match="every picture is put into a part"):
         parse_split(text)
@@ -112,3 +128,47 @@ def test_shares_of_the_work() -> None:
     for text in ("16/16", "3", "-1/4", "a/b", "3/"):
         with pytest.raises(InputError, match="I/N"):
             parse_share(text)
+
+
+@pytest.mark.parametrize(
+    ("most", "beyond"),
+    [
+        ({"bits": 1}, {"bits": 0}),
+        ({"bits": 8}, {"bits": 9}),
+        ({"crops": 1}, {"crops": 0}),
+        ({"shard_images": 1}, {"shard_images": 0}),
+        ({"split": (0.5, 0.0, 0.5 + 5e-7)}, {"split": (0.5, 0.0, 0.5 + 2e-6)}),
+        ({"split": (1.0, 0.0, 0.0), "split_exact": True}, {"split_exact": True}),
+        ({"split": (0.0, 1.0, 0.0)}, {"split": (-0.1, 1.1, 0.0)}),
+        ({"split": (0.0, 0.0, 1.0)}, {"split": (0.5, 0.5)}),
+    ],
+)
+def test_options_at_their_limits_and_beyond(most: dict[str, Any], beyond: dict[str, Any]) -> None:
+    assert most.items() <= vars(DatasetOptions(**most)).items()
+    with pytest.raises(InputError):
+        DatasetOptions(**beyond)
+
+
+def test_a_plan_at_its_limits_and_beyond(make_lut: Callable[..., Lut]) -> None:
+    lut = make_lut(bits=2)
+
+    def plan(crops: int = 1, **options: Any) -> Plan:
+        return Plan(lut, random_scenes(1, 4, 4), ListedLights((0, 1)), 0, DatasetOptions(crops=crops, **options))
+
+    full = plan(1 << 31, shard_images=1000)
+    assert (full.total, full.shards, full.images_of(full.shards - 1)) == (1 << 32, 4_294_968, 296)
+    plan(rendering="codes", bits=2)
+    plan(rendering="colorimetric", bits=3)
+    with pytest.raises(InputError, match="4294967298 images"):
+        plan((1 << 31) + 1)
+    with pytest.raises(InputError, match="3 bits"):
+        plan(rendering="codes", bits=3)
+
+
+def test_a_shard_takes_the_pictures_that_its_images_show(make_lut: Callable[..., Lut]) -> None:
+    """Images 0 to 9 are of two lights of five pictures; three of them make a shard, and the last has one."""
+    scenes = random_scenes(5, 4, 4)
+    plan = Plan(make_lut(), scenes, ListedLights((0, 3)), 0, DatasetOptions(shard_images=3))
+    jobs = [plan.job(shard) for shard in range(plan.shards)]
+    assert [(job.first, job.stop, job.position) for job in jobs] == [(0, 3, 0), (3, 6, 1), (6, 9, 3), (9, 10, 4)]
+    assert [[source.name[-1] for source in job.sources] for job in jobs] == [list("01"), list("12"), list("34"), ["4"]]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, QualityError
@@ -302,7 +303,23 @@ def test_a_black_that_is_spoilt_is_named_and_makes_no_flat_image(make_table: Mak
         ColorimetricRendering(make_table(change=spoil), MINE).seen(plain(1))
 
 
-def test_brightness_and_chromaticity_are_axes_of_a_right_angle() -> None:
-    axes = print_inverse._AXES  # pyright: ignore[reportPrivateUsage]
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    assert np.ptp(axes[0]) == 0
+def test_what_is_missed_and_its_slopes_are_those_of_the_print_between_its_cells() -> None:
+    side, rng = 4, np.random.default_rng(8)
+    colours, target = rng.uniform(0.1, 1, (side**3, 3)), np.log([0.3, 0.5, 0.4])
+    cells = colours.reshape(side, side, side, 3)
+    print_at = RegularGridInterpolator([np.arange(side)] * 3, cells, bounds_error=False, fill_value=None)
+    # Brightness counts half of what chromaticity does; each is seen along axes of length 1.
+    scale = np.array([[0.5**0.5 / 3**0.5] * 3, [0.5**0.5, 0, -(0.5**0.5)], [6**-0.5, -2 * 6**-0.5, 6**-0.5]])
+    np.testing.assert_allclose(print_inverse._SCALE, scale)  # pyright: ignore[reportPrivateUsage]
+
+    def missed(place: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        return scale @ (np.log(print_at(place)[0]) - target)
+
+    for place in [*rng.uniform(0.1, 2.9, (9, 3)), np.zeros(3), np.full(3, 3.0)]:
+        miss, slopes = np.empty(3), np.empty((3, 3))
+        square = print_inverse._look(colours, place, target, side, scale, miss, slopes)  # pyright: ignore[reportPrivateUsage]
+        np.testing.assert_allclose(miss, missed(place))
+        assert square == pytest.approx((miss**2).sum())
+        steps = 1e-5 * np.eye(3)
+        expected = [(missed(place + step) - missed(place - step)) / 2e-5 for step in steps]
+        np.testing.assert_allclose(slopes, np.transpose(expected), atol=1e-6)
