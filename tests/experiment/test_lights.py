@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -230,8 +231,12 @@ def test_the_figure_shows_each_light_at_its_chromaticity(plan: tuple[Illuminatio
 def test_the_figure_is_a_triangle_in_which_five_black_bodies_are_named(
     plan: tuple[Illumination, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    drawn: list[Any] = []
+
+    def keep(figure: Figure, *_given: object, **_named: object) -> None:
+        drawn.append(figure)
+
+    monkeypatch.setattr(Figure, "savefig", keep)
     plot_illuminations(plan, tmp_path / "lights.svg")
     (axes,) = drawn[0].axes
     assert np.asarray(axes.lines[0].get_xydata()).tolist() == [[0, 0], [1, 0], [0, 1], [0, 0]]
