@@ -270,10 +270,74 @@ def test_what_cannot_be_corners_is_refused(given: Sequence[str], message: str) -
         parse_corners(given)
 
 
-@pytest.mark.parametrize("off_px", [-1.2, -0.3, 0.0, 0.4, 0.9])
-def test_a_blurred_step_is_found_where_it_is(off_px: float) -> None:
-    across = field._REFINE_ACROSS_PX  # pyright: ignore[reportPrivateUsage]
-    profile = 0.2 + 0.5 * ndtr((across - off_px) / 0.8)
-    off, rise = field._fitted_step(profile[None], 0.8)  # pyright: ignore[reportPrivateUsage]
-    assert off[0] == pytest.approx(off_px, abs=0.01)
-    assert rise[0] == pytest.approx(0.5, abs=0.01)
+def test_a_blurred_step_is_found_to_a_hundredth_beside_cells_that_slope() -> None:
+    across = np.arange(-3.5, 2.1, 0.5)
+    expected = np.array([[-1.2, 0.5], [0.0, 0.2], [0.37, 0.9], [1.1, 0.4]])
+    at, height = expected.T[..., None]
+    profiles = 0.3 + height * ndtr((across - at) / 0.8) + 0.02 * np.minimum(across, 0)
+    off, rise = field._fitted_step(np.asarray(profiles), 0.8)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(np.stack([off, rise], axis=1), expected, atol=0.01)
+
+
+def test_a_curve_goes_through_most_of_the_points() -> None:
+    along = np.linspace(0, 1, 80)
+    x = 2 * along - 1
+    off = 1 + 0.5 * x - 2 * 0.5 * (3 * x**2 - 1)
+    off[::4] += 9
+    curve, fits = field.robust_curve(along, off, 3)
+    np.testing.assert_allclose(curve, [1, 0.5, -2, 0], atol=1e-4)
+    np.testing.assert_array_equal(fits, np.arange(80) % 4 != 0)
+
+
+def test_sides_bend_outwards_and_meet_in_corners() -> None:
+    corners = np.array([[10.0, 20], [110, 30], [100, 90], [5, 80]])
+    curve = np.array([1.0, -0.5, -2])
+    ends = np.roll(corners, -1, axis=0)
+    middle = corners.mean(axis=0)
+    share = np.linspace(0, 1, 41)
+    for start, end in zip(corners, ends, strict=True):
+        normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+        assert np.linalg.norm(normal) == pytest.approx(1)
+        assert normal @ (end - start) == pytest.approx(0)
+        assert normal @ (start - middle) > 0
+        bent = field._bent(share, curve, start, end)  # pyright: ignore[reportPrivateUsage]
+        # At its ends a Legendre series is the sum of its terms with alternating and with equal signs.
+        np.testing.assert_allclose(bent[[0, -1]], [start - 0.5 * normal, end - 1.5 * normal])
+        np.testing.assert_allclose(bent[20], (start + end) / 2 + 2 * normal)
+        found = field._curve_between(start, end, bent, 2)  # pyright: ignore[reportPrivateUsage]
+        np.testing.assert_allclose(found, curve, atol=1e-9)
+    sides = [start + share[3:-5, None] * (end - start) for start, end in zip(corners, ends, strict=True)]
+    np.testing.assert_allclose(field._corners_of(sides), corners)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(field._sum(np.array([1.0, 2]), np.array([3.0])), [4, 2])  # pyright: ignore[reportPrivateUsage]
+
+
+def test_outlines_are_the_same_whichever_corner_they_begin_with() -> None:
+    corners = np.array([[10.0, 20], [110, 30], [100, 90], [5, 80]])
+    for turn in range(4):
+        moved = np.roll(corners, turn, axis=0) + np.array([2.9, -2.9])
+        assert field.same_corners(corners, moved, 3.0)
+        assert not field.same_corners(corners, moved, 2.8)
+    assert not field.same_corners(corners, corners[::-1], 3.0)
+
+
+def test_a_step_on_a_profile_is_where_it_rises_to_paper() -> None:
+    across = np.arange(-24, 24.01, 0.5)
+    at = np.array([-6.2, 0.0, 3.3])
+    rows = np.repeat(0.3 + 0.7 * ndtr((across - at[:, None]) / 0.7), 3, axis=0).astype(np.float32)
+    # Beyond the margin it is dark again, and a mark stands in the margin.
+    rows[:, across > 16] = 0.1
+    off, strength = field._edges(rows, across, 1e3)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(off[1::3], at, atol=0.05)
+    # A step of 0.7 between two sigma to either side, its own blur and that of the profile taken together.
+    wide = float(np.hypot(0.7, 1.0))
+    np.testing.assert_allclose(strength[1::3], 0.7 * (2 * ndtr(1 / wide) - 1), atol=0.02)
+
+
+@pytest.mark.parametrize(("side", "is_taken"), [(190, False), (194, True)])
+def test_corners_by_hand_are_192_raw_pixels_apart(side: int, is_taken: bool) -> None:
+    texts = ["100,100", f"{100 + side},100", f"{100 + side},400", "100,400"]
+    if is_taken:
+        assert field.parse_corners(texts)[0] == (49.75, 49.75)
+    else:
+        with pytest.raises(InputError, match=f"too close together: {side} pixels, at least 192"):
+            field.parse_corners(texts)
