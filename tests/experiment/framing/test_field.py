@@ -273,9 +273,9 @@ def test_what_cannot_be_corners_is_refused(given: Sequence[str], message: str) -
 def test_a_blurred_step_is_found_to_a_hundredth_beside_cells_that_slope() -> None:
     across = np.arange(-3.5, 2.1, 0.5)
     expected = np.array([[-1.2, 0.5], [0.0, 0.2], [0.37, 0.9], [1.1, 0.4]])
-    at, height = expected.T[..., None]
-    profiles = 0.3 + height * ndtr((across - at) / 0.8) + 0.02 * np.minimum(across, 0)
-    off, rise = field._fitted_step(np.asarray(profiles), 0.8)  # pyright: ignore[reportPrivateUsage]
+    at, height = expected[:, :1], expected[:, 1:]
+    profiles = np.asarray(0.3 + height * ndtr((across - at) / 0.8) + 0.02 * np.minimum(across, 0), dtype=np.float64)
+    off, rise = field._fitted_step(profiles, 0.8)  # pyright: ignore[reportPrivateUsage]
     np.testing.assert_allclose(np.stack([off, rise], axis=1), expected, atol=0.01)
 
 
@@ -341,3 +341,53 @@ def test_corners_by_hand_are_192_raw_pixels_apart(side: int, is_taken: bool) -> 
     else:
         with pytest.raises(InputError, match=f"too close together: {side} pixels, at least 192"):
             field.parse_corners(texts)
+
+
+QUAD = np.array([[61.0, 52], [341, 40], [352, 262], [50, 250]])
+"""Corners of a dark field on white paper, px."""
+
+
+def painted(level: float = 1000, offset: tuple[float, float] = (0, 0), moved: float = 0) -> Plane:
+    """Return a picture of that field, blurred by a pixel, as a plane shows it; its edge lies `moved` px further out."""
+    y, x = np.mgrid[:300, :400].astype(np.float64)
+    away = np.full(x.shape, -np.inf)
+    for start, end in zip(QUAD, np.roll(QUAD, -1, axis=0), strict=True):
+        normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+        away = np.maximum(away, (x + offset[0] - start[0]) * normal[0] + (y + offset[1] - start[1]) * normal[1])
+    return Plane("G", (level * (0.4 + 0.6 * ndtr(away - moved))).astype(np.float32), offset)
+
+
+def test_the_outline_of_a_field_is_traced_from_a_guess() -> None:
+    picture = field.PreparedPicture.of([painted(), painted(600), painted(5)])
+    # The third colour carries too little light to be looked at.
+    assert (picture.channels, picture.bright, picture.factor) == ((0, 1), (True, True), 1)
+    assert any(field.same_corners(quad, QUAD, 6) for quad in picture.quads())
+    found = field.trace_outline(picture, QUAD + np.array([[9, -7], [-8, 10], [6, 6], [10, 9]]))
+    assert found is not None
+    np.testing.assert_allclose(found.corners_px, QUAD, atol=0.2)
+    for side, (start, end) in enumerate(zip(QUAD, np.roll(QUAD, -1, axis=0), strict=True)):
+        normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+        assert len(found.sides_px[side]) == len(found.normals[side]) > 120
+        np.testing.assert_allclose(found.normals[side], np.tile(normal, (len(found.normals[side]), 1)), atol=0.01)
+        # At its ends a side is blurred with its neighbours.
+        off = np.abs((found.sides_px[side] - start) @ normal)
+        assert off.max() < 0.5
+        assert off[5:-5].max() < 0.1
+        along = (found.sides_px[side] - start) @ (end - start) / float((end - start) @ (end - start))
+        assert along.min() < 0.05
+        assert along.max() > 0.95
+        assert (np.diff(along) > 0).all()
+    # None where a side has no edge, or is too short for what is looked at around it.
+    assert field.trace_outline(picture, QUAD + np.array([60, 0])) is None
+    assert field.trace_outline(picture, QUAD[0] + (QUAD - QUAD[0]) * 0.25) is None
+
+
+def test_each_plane_s_edge_is_found_where_it_lies_in_it() -> None:
+    start, end = QUAD[:2]
+    normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+    places = start + np.linspace(0.1, 0.9, 30)[:, None] * (end - start)
+    planes = [painted(), painted(500, (0.25, -0.25), 0.4), painted(5), painted(800, (0, 0), 2.5)]
+    found, heights = refine_edges(planes, places, np.tile(normal, (30, 1)), 1.0)
+    np.testing.assert_allclose((found - places) @ normal, np.repeat([[0], [0.4], [0], [0]], 30, axis=1), atol=0.05)
+    # Of paper 0.6; of what is dark, or too far from where it is looked for, nothing is known.
+    np.testing.assert_allclose(heights, np.repeat([[0.6], [0.6], [0], [0]], 30, axis=1), atol=0.05)
