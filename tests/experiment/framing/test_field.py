@@ -357,10 +357,26 @@ def painted(level: float = 1000, offset: tuple[float, float] = (0, 0), moved: fl
     return Plane("G", (level * (0.4 + 0.6 * ndtr(away - moved))).astype(np.float32), offset)
 
 
-def test_the_outline_of_a_field_is_traced_from_a_guess() -> None:
-    picture = field.PreparedPicture.of([painted(), painted(600), painted(5)])
+@pytest.mark.parametrize(("small", "factor"), [(640, 1), (200, 2)])
+def test_the_outline_of_a_field_is_traced_from_a_guess(
+    small: int, factor: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(field, "_SMALL_WIDTH_PX", small)
+    picture = field.PreparedPicture.of([painted(), painted(600, (0.25, -0.25)), painted(29)])
     # The third colour carries too little light to be looked at.
-    assert (picture.channels, picture.bright, picture.factor) == ((0, 1), (True, True), 1)
+    assert (picture.channels, picture.bright, picture.factor) == ((0, 1), (True, True), factor)
+    assert picture.paleness.shape == (300 // factor, 400 // factor)
+    # Paper is 1, and cells near it four tenths; a place keeps its place on the small raster.
+    pale = picture.pale_at(np.array([[[30.0, 20]], [[200, 56]], [[380, 280]]])).ravel()
+    np.testing.assert_allclose(pale, [1, 0.4, 1], atol=0.06)
+    np.testing.assert_allclose(picture.small(np.array([[0.5, 0.5], [10, 20]])) * factor + (factor - 1) / 2,
+                               [[0.5, 0.5], [10, 20]])  # fmt: skip
+    high, wide = picture.paleness.shape
+    for box, is_outer in (((1, 1, wide - 3, high - 3), False), ((0, 1, 9, 9), True), ((1, 0, 9, 9), True),
+                          ((wide - 9, 1, wide - 1, 9), True), ((1, high - 9, 9, high - 1), True)):  # fmt: skip
+        left, top, right, bottom = box
+        outline = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])[:, None]
+        assert picture._touches_border(outline) is is_outer  # pyright: ignore[reportPrivateUsage]
     assert any(field.same_corners(quad, QUAD, 6) for quad in picture.quads())
     found = field.trace_outline(picture, QUAD + np.array([[9, -7], [-8, 10], [6, 6], [10, 9]]))
     assert found is not None
