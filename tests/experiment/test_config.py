@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,16 +16,73 @@ from acquisition.run.devices import require_whole_turns
 from experiment.config import LabSettings, load_lab, parse_lab
 from foundation.errors import ConfigurationError, FormatError
 from foundation.secret_texts import target_label
+from sim.world.world import Room
 
 MINIMAL = 'rig = "simulated"\nchart = "c/chart.json"\nilluminations = "lights.csv"\n'
 
 
 def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     lab = tmp_path / "LAB.toml"
-    lab.write_text(MINIMAL)
+    lab.write_text(MINIMAL + '[replay]\nsession = "recorded/"\n')
     settings = load_lab(lab)
+    assert settings.replay is not None
+    assert settings.replay.session == tmp_path.resolve() / "recorded"
     assert settings.chart == tmp_path.resolve() / "c/chart.json"
     assert settings.illuminations == tmp_path.resolve() / "lights.csv"
+
+
+def test_keys_that_are_left_out_have_the_value_that_the_documentation_shows() -> None:
+    text = (Path(__file__).parents[2] / "docs/lab.md").read_text(encoding="utf-8").split("```")[1].removeprefix("toml")
+    top, *sections = text.split("\n[")
+    assert len(sections) == 13
+    for section in sections:
+        name = section.partition("]")[0]
+        if name == "replay":
+            continue
+        if name not in ("simulated.room", "simulated.camera"):
+            assert parse_lab(f"{top}\n[{section}", "LAB.toml") == parse_lab(top, "LAB.toml"), name
+            # What is left out of the list has no value.
+            shown = set(re.findall(r"^(?:# )?(\w+) =", section, re.MULTILINE)) | set(re.findall(r"\w+", section))
+            settings = attrgetter(name)(parse_lab(top, "LAB.toml"))
+            assert {key for key, value in settings if value not in (None, {}, ())} <= shown, name
+    room: dict[str, Any] = parse_lab(text.split("[simulated.camera]")[0], "LAB.toml").simulated.room
+    assert Room(**room) == Room()
+    # The port of PTP/IP, as IANA has it.
+    assert parse_lab(top, "LAB.toml").lab.camera.port == 15740
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "least", "most", "beyond"),
+    [
+        ("camera", "iso", 1, 10**6, (0,)),
+        ("camera", "shutter_s", 1e-4, 1e4, (0.0,)),
+        ("camera", "aperture", 0.01, 1e4, (0.0,)),
+        ("sequence", "settle_s", 0.0, 1e4, (-0.1,)),
+        ("sequence", "reference_every", 1, 10**6, (0,)),
+        ("sequence", "attempts", 1, 20, (0, 21)),
+        ("sequence", "patience_s", 0.0, math.inf, (-0.1,)),
+        ("sequence", "seed", 0, 10**9, (-1,)),
+        ("sequence", "refused_gb", 1e-3, math.inf, (0.0,)),
+        ("judge", "moved_px", 0.0, 1e4, (-0.1,)),
+        ("simulated", "seed", 0, 10**9, (-1,)),
+        ("lab.camera", "port", 1, 65535, (0, 65536)),
+        ("lab.camera", "event_port", 1, 65535, (0, 65536)),
+        ("lab.projector", "port", 1, 65535, (0, 65536)),
+        ("lab.projector", "baud", 300, 10**6, (299,)),
+        ("lab.projector", "refresh_hz", 0.01, 1e4, (0.0,)),
+        ("lab.projector", "colour_wheel_hz", 0.0, 1e4, (-0.1,)),
+        ("lab.light", "port", 1, 65535, (0, 65536)),
+    ],
+)
+def test_numbers_are_taken_up_to_their_limits(
+    section: str, key: str, least: float, most: float, beyond: tuple[float, ...]
+) -> None:
+    for value in (least, most):
+        settings = parse_lab(f"{MINIMAL}[{section}]\n{key} = {value}\n", "LAB.toml")
+        assert attrgetter(f"{section}.{key}")(settings) == value
+    for value in beyond:
+        with pytest.raises(ConfigurationError, match=rf"{section}\.{key} = {value}"):
+            parse_lab(f"{MINIMAL}[{section}]\n{key} = {value}\n", "LAB.toml")
 
 
 def test_settings_as_used_read_back_equal() -> None:
@@ -196,6 +256,7 @@ def test_no_secret_gets_into_the_session(target: str, label: str) -> None:
     [
         ('notify = "curl \'s3cret"', "sequence.notify = …: No closing quotation"),
         ('notify = "https:///s3cret"', "a URL names a host"),
+        ('notify = "https://x:0/s3cret"', "a URL names a host"),
         ('notify = "https://s3cret:99999/"', "sequence.notify = …: Port out of range"),
         ('notify = "https://x/s3cret word"', "a URL has no spaces"),
         ('notify = ["s3cret"]', "sequence.notify = …: a text was expected"),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 from acquisition.cli import main
 from drivers.presenter import Colour
@@ -88,6 +90,8 @@ def test_temperatures_are_read() -> None:
     assert parse_ccts("6500:6500:1") == (6500,)
     assert parse_ccts("2856, 6504") == (2856, 6504)
     assert parse_ccts("") == ()
+    assert parse_ccts("1000,100000") == (1000, 100000)
+    assert len(parse_ccts("1000:10999:1")) == 10_000
 
 
 @pytest.mark.parametrize(
@@ -101,7 +105,9 @@ def test_temperatures_are_read() -> None:
         ("2000:inf:200", "inf K is not within"),
         ("2000:3000", "expected FIRST:LAST:STEP"),
         ("warm", "expected FIRST:LAST:STEP"),
-        ("500", "500 K is not within"),
+        ("999", "999 K is not within"),
+        ("100001", "100001 K is not within"),
+        ("1000:11000:1", "in at most 10000 temperatures"),
     ],
 )
 def test_temperatures_that_are_none_are_refused(text: str, said: str) -> None:
@@ -219,6 +225,38 @@ def test_the_figure_shows_each_light_at_its_chromaticity(plan: tuple[Illuminatio
     first = path.read_bytes()
     plot_illuminations(plan, path)
     assert path.read_bytes() == first
+
+
+@pytest.mark.slow
+def test_the_figure_is_a_triangle_in_which_five_black_bodies_are_named(
+    plan: tuple[Illumination, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+
+    def keep(figure: Figure, *_given: object, **_named: object) -> None:
+        drawn.append(figure)
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    plot_illuminations(plan, tmp_path / "lights.svg")
+    (axes,) = drawn[0].axes
+    assert np.asarray(axes.lines[0].get_xydata()).tolist() == [[0, 0], [1, 0], [0, 1], [0, 0]]
+    for limits in (axes.get_xlim(), axes.get_ylim()):
+        assert -0.1 < limits[0] < 0
+        assert 1 < limits[1] < 1.1
+    linear = decode_srgb(np.array(codes(plan)) / 255)
+    chromaticities = (linear / linear.sum(axis=1, keepdims=True))[:, [0, 2]]
+    uniform, bodies = (np.asarray(points.get_offsets()) for points in axes.collections)
+    np.testing.assert_allclose(uniform, chromaticities[:666])
+    np.testing.assert_allclose(bodies, chromaticities[666:])
+    # Black bodies lie on top, and their names beyond the triangle's long side, straight away from it.
+    assert axes.collections[0].get_zorder() < axes.collections[1].get_zorder()
+    names = {text.get_text(): text for text in axes.texts}
+    assert [*names] == ["2000 K", "3000 K", "4000 K", "6000 K", "10000 K"]
+    for name, text in names.items():
+        place = chromaticities[666 + (int(name.removesuffix(" K")) - 2000) // 200]
+        x, y = text.get_position()
+        assert 1.01 < x + y < 1.1
+        assert (x - place[0], 1) == pytest.approx((y - place[1], 1))
 
 
 @pytest.mark.slow

@@ -132,6 +132,14 @@ def test_runs_without_a_common_method(runs: tuple[str, str], capsys: pytest.Capt
     assert "ground truths of im 0 in A (first) and C (second) are 19.47 degrees apart" in capsys.readouterr().err
 
 
+def test_runs_of_one_method_each_are_compared_by_it(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    for folder, left_out in zip(runs, (",A,", ",B <i>,"), strict=True):
+        path = Path(folder) / "errors.csv"
+        path.write_text("\n".join(line for line in path.read_text().splitlines() if left_out not in line) + "\n")
+    assert main(["compare", *runs]) == 0
+    assert "B <i> (first) errs less than A (second) on 0 of 29 images" in capsys.readouterr().out
+
+
 def test_runs_of_the_command_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("one", "two"):
         wish = ("--method", "white-patch", "--method", "gray-world", "--out", str(tmp_path / name))

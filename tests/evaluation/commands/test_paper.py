@@ -216,13 +216,16 @@ def test_chromaticities(
         (("bits", "nowhere.npz"), "nowhere.npz is no dataset"),
         (("reduction", "nowhere.png"), "there is no such file"),
         (("chromaticities", "nowhere"), "nowhere is no table"),
-        (
-            ("table1", "nowhere", "--pictures", ".", "--lights-like", "x.csv", "--sizes", "12,big"),
-            "'big' is no side of an image",
-        ),
-        (
-            ("table1", "nowhere", "--pictures", ".", "--lights-like", "x.csv", "--hot", "1000001"),
-            "'1000001' is no share",
+        *(
+            (("table1", "nowhere", "--pictures", ".", "--lights-like", "x.csv", option, given), message)
+            for option, given, message in (
+                ("--sizes", "12,big", "'big' is no side of an image"),
+                ("--sizes", "1,65535", "nowhere is no table"),
+                ("--sizes", "0", "'0' is no side of an image"),
+                ("--sizes", "65536", "'65536' is no side of an image"),
+                ("--hot", "1,1000000", "nowhere is no table"),
+                ("--hot", "1000001", "'1000001' is no share"),
+            )
         ),
         (("bits", "nowhere.npz", "--out", "taken"), "taken already exists"),
     ],

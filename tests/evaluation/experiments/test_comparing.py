@@ -132,6 +132,55 @@ def test_largest_differences_come_first_and_equal_errors_never() -> None:
     assert largest_differences(made, 1) == [1]
 
 
+def test_what_is_the_same_but_for_rounding_is_the_same() -> None:
+    lights, base = np.ones((3, 3)), np.full(3, 5.0)
+    for off_deg, is_same in ((0.009, True), (0.011, False)):
+        # Away from white by an angle: its tangent times the length of 1 1 1, across it.
+        turned = lights + np.tan(np.radians(off_deg)) * np.sqrt(3 / 2) * np.array([1, -1, 0])
+        one, other = errors("abc", base, lights), errors("abc", base, turned)
+        if is_same:
+            match(one, other, ("A", "B"), "recovery")
+        else:
+            with pytest.raises(InputError, match="those of 3 of 3"):
+                match(one, other, ("A", "B"), "recovery")
+    # Files hold six decimals, so that the last may differ by one on either side.
+    found = signed_rank(np.add(base, [1.9e-6, 2.1e-6, -2.1e-6]), base)
+    assert (found.wins, found.losses, found.ties) == (1, 1, 1)
+    made = match(errors("abc", np.add(base, [1.9e-6, 2.1e-6, 0])), errors("abc", base), ("", ""), "reproduction")
+    assert largest_differences(made) == [1]
+
+
+def test_lists_end_where_they_would_be_too_long() -> None:
+    one, other = errors("abcdefghijkl", np.arange(12.0) + 2), errors("abcdefghijkl", np.ones(12))
+    (made,) = compare([match(one, other, ("A", "B"), "reproduction")])
+    rows = comparing.images_table(made).rows
+    assert [row[0] for row in rows] == [*"lkjihgfedc"]
+    assert rows[0] == ("l", 13, 1, 12)
+    for images, told in (("bcdef", "b, c, d, e, f"), ("bcdefg", "b, c, d, e, f and 1 more")):
+        lacking = match(errors(f"a{images}", np.ones(len(images) + 1)), errors("a", [1]), ("A", "B"), "recovery")
+        assert missing_images(lacking)[0].endswith(f"left out here: {told}")
+
+
+def test_what_chance_explains_is_not_significant_at_its_level() -> None:
+    one, other = errors("abcdefgh", np.arange(8.0) + 2), errors("abcdefgh", np.ones(8))
+    (made,) = compare([match(one, other, ("A", "B"), "reproduction")])
+    for p, is_told in ((0.0499, True), (0.0501, False)):
+        said = verdict(replace(made, p_holm=p))
+        assert ("not significant" not in said) == is_told
+    # More errors of A on all: B errs less, and the effect is 1.
+    assert verdict(made).endswith("B errs less (Holm-corrected p = 0.0078, effect +1.00).")
+
+
+def test_labels_are_piled_up_from_the_edge_to_the_middle_of_their_quarter() -> None:
+    # Errors of 2, 2.02 and 2.5 lie 330 ln(y) / ln(100) points above an axis from 1 to 100: 49.67, 50.38, 65.66; a
+    # label stands 3 above, or 8.5 above that before it: at 52.67, 61.17, 69.67. Above the middle likewise, downwards.
+    low = np.array([2, 2.5, 2.02])
+    x, y = np.concatenate([low, 100 / low, [50, 2]]), np.concatenate([low, 100 / low, [2, 50]])
+    rises = comparing._rises(x, y, 1.0, 100.0)  # pyright: ignore[reportPrivateUsage]
+    expected = [3, 69.67 - 65.66, 61.17 - 50.38, 3, 266.33 - 264.34, 274.83 - 279.62, 3, 3]
+    np.testing.assert_allclose(rises, expected, atol=0.011)
+
+
 @pytest.mark.slow
 def test_images_of_one_picture_are_one_case() -> None:
     """What 40 lights show of 12 pictures is 12 cases: false alarms stay rare, which by image they do not."""

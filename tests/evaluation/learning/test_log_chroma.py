@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from evaluation.learning import log_chroma
 from evaluation.learning.log_chroma import BINS, LogChroma, crossentropy, fold, likelihood, moments
 from evaluation.metrics import recovery_error
 from foundation.errors import InputError
@@ -53,6 +54,43 @@ def test_folding_keeps_every_count_and_place() -> None:
     assert wide[0, 0, 35, 63] == 0.75
     assert wide[0, 0, 3, 31] == 0.25
     assert not narrow[0, 1].any()
+
+
+def test_chromas_are_counted_in_bins_of_a_32nd_on_a_torus_of_four() -> None:
+    # u = ln(g / r) and v = ln(g / b), in 32nds: (3, -2), and (65, -64), which lies a torus of 128 from (65, 64).
+    steps = np.array([[-3, 0, 2], [-65, 0, 64], [0, 0, 0], [0, 0, 0]], dtype=np.float64) / 32
+    pixels = (np.exp(steps) * [[0.5], [0.5], [2**-8], [0.9]]).astype(np.float32)
+    pixels[3, 1] = 2**-8.001
+    counts = log_chroma._histogram(pixels, 2.0**-8)  # pyright: ignore[reportPrivateUsage]
+    assert counts.sum() == 3
+    assert (counts[3, 126], counts[65, 64], counts[0, 0]) == (1, 1, 1)
+    assert counts.dtype == np.uint16
+
+
+def test_deviations_are_from_the_usable_of_eight_neighbours() -> None:
+    random = np.random.default_rng(0)
+    image, used = random.random((5, 6, 3)).astype(np.float32), random.random((5, 6)) < 0.6
+    used[:2, :3] = False
+    found = log_chroma._deviations(image, used)  # pyright: ignore[reportPrivateUsage]
+    for row, column in np.ndindex(5, 6):
+        near = [
+            np.abs(image[y, x] - image[row, column])
+            for y in range(max(row - 1, 0), min(row + 2, 5))
+            for x in range(max(column - 1, 0), min(column + 2, 6))
+            if used[y, x] and (y, x) != (row, column)
+        ]
+        np.testing.assert_allclose(found[row, column], np.mean(near, axis=0) if near else 0, rtol=1e-5, atol=1e-7)
+
+
+def test_the_penalty_of_what_is_scaled_is_its_squared_length() -> None:
+    scaled = np.random.default_rng(1).normal(0, 1, (BINS, BINS))
+    spectrum = np.fft.rfft2(scaled) * log_chroma._scale(0.3, 0.002)  # pyright: ignore[reportPrivateUsage]
+    # The authors' penalty of a filter: its squares, and an eighth of its squared differences, of all coefficients.
+    full = np.fft.fft2(np.fft.irfft2(spectrum, s=(BINS, BINS)))
+    turn = np.abs(1 - np.exp(2j * np.pi * np.arange(BINS) / BINS)) ** 2
+    penalty = (np.abs(full) ** 2 * (0.3 * (turn[:, None] + turn) / 8 + 0.002)).sum()
+    assert penalty == pytest.approx(((scaled - scaled.mean()) ** 2).sum(), rel=1e-9)
+    assert abs(full[0, 0]) < 1e-9
 
 
 def relit(count: int, reds: npt.NDArray[np.float64], seed: int = 0) -> list[Any]:

@@ -129,6 +129,43 @@ def test_a_black_image_and_a_light_without_a_channel(value: float) -> None:
     assert len(developed(Black("black", np.array([1.0, 1, 0])), [np.array([0.0, 1, 1])])) == 1
 
 
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [((340, 400), (170, 200)), ((85, 100), (170, 200)), ((100, 600), (50, 300)), ((1, 1000), (1, 300))],
+)
+def test_pictures_are_170_px_high_and_300_wide_at_most(shape: tuple[int, int], size: tuple[int, int]) -> None:
+    class Sized(Wall):
+        def read(self) -> tuple[npt.NDArray[np.float32], None]:
+            return np.ones((*shape, 3), np.float32), None
+
+    (jpeg,) = developed(Sized("sized", np.ones(3)), [np.ones(3)])
+    row = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert row is not None
+    assert row.shape == (size[0], 3 * size[1] + 2 * 6, 3)
+
+
+def test_the_98th_percentile_becomes_white_and_what_is_masked_by_half_is_grey() -> None:
+    class Ramp(Wall):
+        def read(self) -> Any:
+            image = np.repeat(np.linspace(0, 1, 200, dtype=np.float32)[None, :, None], 170, axis=0)
+            mask = np.zeros((170, 200), bool)
+            mask[:20] = True
+            return np.repeat(image, 3, axis=2) * np.array([2, 1, 0.5], np.float32), mask
+
+    (jpeg,) = developed(Ramp("ramp", np.array([2, 1, 0.5])), [np.array([1, 1, 0.5])])
+    raw, seen, right = panels(jpeg)
+    middle = right[100, :, 1]
+    # sRGB of half of white is 188 (IEC 61966-2-1); white is reached two hundredths before the end.
+    assert middle[round(0.98 * 199 / 2)] == pytest.approx(188, abs=3)
+    assert middle[round(0.94 * 199)] < 252 <= middle[round(0.98 * 199)]
+    # By an estimate with half the red, red stays twice as bright: a quarter of white, 137, is then a half.
+    at = round(0.98 * 199 / 4)
+    assert right[100, at] == pytest.approx([137] * 3, abs=4)
+    assert seen[100, at] == pytest.approx([188, 137, 137], abs=5)
+    assert raw[100, at] == pytest.approx([188, 137, 99], abs=5)
+    assert right[4, 20:180] == pytest.approx(np.full((160, 3), 118), abs=3)
+
+
 def test_worst_and_median_images_are_chosen() -> None:
     worst, middle = chosen_images(result_of([5, 1, 9, 3, 2, 8, 4]), "recovery")
     assert worst == (2, 5, 0)
@@ -136,6 +173,7 @@ def test_worst_and_median_images_are_chosen() -> None:
     assert chosen_images(result_of([1.0]), "recovery") == ((0,), ())
 
 
+@pytest.mark.slow
 def test_the_curve_reaches_its_shares(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Any] = []
 
@@ -165,6 +203,30 @@ def test_the_curve_reaches_its_shares(monkeypatch: pytest.MonkeyPatch) -> None:
     # The lowest of each of three columns has numbers below it.
     assert [axes.xaxis.get_tick_params()["labelbottom"] for axes in panels_drawn] == [False, False, True, True, True]
     assert [tuple(figure.get_size_inches()) for figure in drawn[1:]] == [(4.6, 3.6), pytest.approx((8.6, 5.9))]
+    # The axis ends at the 98th percentile of all errors, colours at the 95th: of 1 to 100 at 98.5 and 95.5.
+    many = [result_of(range(start, 101, 2)) for start in (1, 2)]
+    error_curves(many, "recovery")
+    axes = drawn[3].axes[0]
+    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 98.5), (0, 100))
+    error_planes(many, np.random.default_rng(0).random((50, 3)), "recovery")
+    points = drawn[4].axes[0].collections[0]
+    assert (points.norm.vmax, points.get_rasterized()) == (95.5, False)
+    # A few steps say what a long curve is, and what would be thousands of circles becomes a picture.
+    error_curves([result_of(range(1, 1501))], "recovery")
+    assert len(drawn[5].axes[0].lines[0].get_xdata()) == 301
+    for count, is_picture in ((1500, False), (1501, True)):
+        error_planes([result_of(range(count))] * 2, np.ones((count, 3)), "recovery")
+        assert drawn[-1].axes[0].collections[0].get_rasterized() is is_picture
+    # Twelve panels at most; four stand two by two.
+    for count, columns, rows in ((2, 2, 1), (3, 3, 1), (4, 2, 2), (7, 3, 3), (13, 3, 4)):
+        error_planes([result_of([1, 2], str(number)) for number in range(count)], np.ones((2, 3)), "recovery")
+        *shown, _ = drawn[-1].axes
+        assert len(shown) == min(count, 12)
+        assert shown[0].get_subplotspec().get_gridspec().get_geometry() == (rows, columns)
+        assert drawn[-1].get_size_inches() == pytest.approx((8.6, 0.7 + 7.8 / columns * rows))
+    # No error at all still leaves an axis.
+    error_curves([result_of([0, 0])], "recovery")
+    assert drawn[-1].axes[0].get_xlim() == (0, 1e-3)
 
 
 @pytest.mark.slow

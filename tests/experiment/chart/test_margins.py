@@ -15,9 +15,12 @@ from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.margins import (
     GAP_PX,
     Margins,
+    Side,
     bar_boxes,
     edge_boxes,
     margin_marks,
+    number_every_mm,
+    ruler_ticks,
     star_boxes,
     target_boxes,
     text_boxes,
@@ -126,6 +129,8 @@ def test_bars_are_as_wide_as_their_gaps() -> None:
     apart = bars[1:, 0, 0] - bars[:-1, -1, 2]
     assert apart.tolist() == [max(int(group[0, 2] - group[0, 0]), 12) for group in bars[:-1]]
     assert [int(group[0, 2] - group[0, 0]) for group in bars] == [30, 20, 15, 12, 10, 8, 6, 5, 4, 3, 2, 1]
+    # 3.2 mm long: several pixels of a half-size image of A0.
+    assert {*(bars[..., 3] - bars[..., 1]).ravel().tolist()} == {75}
     # 12 px are 0.98 line pairs a millimetre, 6 px twice as many: what the proof page names.
     assert abs(600 / 25.4 / 24 - 0.98) < 0.01
 
@@ -152,6 +157,99 @@ def test_marks_have_air_between_them(apart: int, free: bool) -> None:
     there = np.array([[110 + apart, 1940, 150, 1960]])
     margins = Margins(np.array([100, 100, 1900, 1900]), (2000, 2000), there)
     assert margins.put("bottom", mark) is free
+
+
+NOTHING = np.empty((0, 4), dtype=np.int64)
+FIELD = np.array([500, 600, 2500, 2000])
+"""A field on a sheet of 3000 × 2600 px, with as much margin on all sides as anything needs."""
+
+
+def picture_of(boxes: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Return what boxes print on that sheet, (2600, 3000) bool."""
+    seen = np.zeros((2600, 3000), bool)
+    for left, top, right, bottom in boxes.tolist():
+        assert left < right
+        assert top < bottom
+        seen[top:bottom, left:right] = True
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("side", "expected"),
+    [
+        ("bottom", [[510, 2040, 530, 2090], [510, 2040, 570, 2050]]),
+        ("top", [[510, 510, 530, 560], [510, 550, 570, 560]]),
+        ("left", [[410, 610, 460, 630], [450, 610, 460, 670]]),
+        ("right", [[2540, 610, 2590, 630], [2540, 610, 2550, 670]]),
+    ],
+)
+def test_a_margin_runs_along_the_field_and_outwards(side: Side, expected: list[list[int]]) -> None:
+    margins = Margins(FIELD, (3000, 2600), NOTHING)
+    # An L whose long stroke leads away from the field, the short one along it.
+    assert margins.put(side, np.array([[10, 40, 30, 90], [10, 40, 70, 50]]))
+    assert margins.boxes.tolist() == expected
+    assert margins.length(side) == (2000 if side in ("top", "bottom") else 1400)
+    # As near to the field as 35 px, and no nearer.
+    near = [Margins(FIELD, (3000, 2600), NOTHING).put(side, np.array([[0, v, 10, 90]])) for v in (34, 35)]
+    assert near == [False, True]
+
+
+def test_rulers_are_read_from_below_and_from_the_right() -> None:
+    margins = Margins(FIELD, (3000, 2600), NOTHING)
+    assert margins.ruler("bottom")
+    assert margins.ruler("left")
+    seen = picture_of(margins.boxes)
+    number = np.zeros((60, 60), bool)
+    for left, top, right, bottom in text_boxes("20").tolist():
+        number[top:bottom, left:right] = True
+    high, wide = (int(end) for end in text_boxes("20")[:, [3, 2]].max(axis=0))
+    number = number[:high, :wide]
+    # 20 mm are 472 px; the middle of the number is that of the tick, which is 4 px wide.
+    first = 472 + 2 - wide // 2
+    np.testing.assert_array_equal(seen[2100 : 2100 + high, 500 + first : 500 + first + wide], number)
+    down = 600 + first
+    # Turned so that it is read upwards, its foot towards the field.
+    np.testing.assert_array_equal(seen[down : down + wide, 400 - high : 400], np.rot90(number))
+    ticks = {mm: int(seen[2035:2100, 500 + round(mm / PX_MM) + 1].sum()) for mm in (0, 1, 5, 10, 15, 20)}
+    assert ticks == {0: 60, 1: 24, 5: 36, 10: 47, 15: 36, 20: 47}
+
+
+def test_a_long_ruler_has_a_number_at_every_hundred_millimetres() -> None:
+    # 300 mm are 7086.6 px.
+    assert [number_every_mm(length) for length in (100, 7086, 7087, 30000)] == [10, 10, 100, 100]
+    # A tick that does not find room whole is left out: that of 10 mm begins at 236.
+    assert [len(ruler_ticks(length)) for length in (3, 4, 239, 240)] == [0, 1, 10, 11]
+
+
+def test_the_sheet_is_cut_along_its_edges() -> None:
+    margins = Margins(FIELD, (3000, 2600), NOTHING)
+    margins.crop_marks()
+    seen = picture_of(margins.boxes)
+    corner = np.zeros((1300, 1500), bool)
+    corner[:5, :120] = corner[:120, :5] = True
+    np.testing.assert_array_equal(seen[:1300, :1500], corner)
+    for turned in (seen[::-1], seen[:, ::-1]):
+        np.testing.assert_array_equal(turned, seen)
+
+
+def test_targets_stand_at_both_ends_and_in_the_middle() -> None:
+    targets, field = target_boxes(), np.array([500, 600, 7500, 6600])
+    long = int(targets[:, 2].max())
+    marks = margin_marks(field, (8000, 7200), NOTHING, ())
+    right = marks[(marks[:, 0] >= 7535) & (marks[:, 1] >= 600) & (marks[:, 3] <= 6600)]
+    pieces = np.split(right, len(right) // len(targets))
+    assert len(pieces) == 3
+    starts = [int(piece[:, 1].min()) - 600 for piece in pieces]
+    # The last where the first free place is from the end less the targets and 35 px of air on.
+    assert starts == [0, (6000 - long - 35) // 2, 6000 - long - 35]
+    for piece, start in zip(pieces, starts, strict=True):
+        turned = np.stack(
+            [7500 + targets[:, 1], 600 + start + targets[:, 0], 7500 + targets[:, 3], 600 + start + targets[:, 2]], 1
+        )
+        np.testing.assert_array_equal(piece, turned)
+    above = marks[(marks[:, 3] <= 565) & (marks[:, 0] >= 500) & (marks[:, 2] <= 7500)]
+    assert len(above) == 3 * len(targets)
+    assert (int(above[:, 0].min()), int(above[:, 2].max())) == (500, 7500 - 35)
 
 
 def test_what_finds_no_room_is_left_out_and_the_rest_stays() -> None:

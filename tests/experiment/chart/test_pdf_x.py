@@ -173,32 +173,84 @@ def test_a_profile_is_srgb_to_little_cms(make: Callable[[], bytes]) -> None:
     assert np.abs(through(reference, profile, "RGB") - codes).max() <= 1
 
 
-def test_the_output_profile_is_of_an_output_device() -> None:
-    profile = srgb_output_profile()
-    # ICC.1:2001-04, 6.1: size, class, spaces; 6.3: the tags that a table-based output profile has.
-    assert int.from_bytes(profile[:4], "big") == len(profile)
-    assert profile[12:24] == b"prtrRGB XYZ "
+def tags_of(profile: bytes) -> dict[str, bytes]:
+    """Return the tags of a profile, which lie behind their table, on multiples of four bytes (ICC.1:2001-04, 6.2)."""
     count = int.from_bytes(profile[128:132], "big")
-    tags = {profile[132 + 12 * k : 136 + 12 * k] for k in range(count)}
-    needed = "desc cprt wtpt A2B0 A2B1 A2B2 B2A0 B2A1 B2A2 gamt"
-    assert tags == {name.encode() for name in needed.split()}
-    assert srgb_output_profile() == profile
+    found: dict[str, bytes] = {}
+    for at in range(132, 132 + 12 * count, 12):
+        name, place, size = struct.unpack(">4s2I", profile[at : at + 12])
+        assert place % 4 == 0
+        assert 132 + 12 * count <= place <= place + size <= len(profile)
+        found[name.decode()] = profile[place : place + size]
+    assert len(found) == count
+    return found
 
 
-@pytest.mark.parametrize("make", [srgb_output_profile, srgb_display_profile])
-def test_a_profile_s_name_is_as_long_as_readers_expect(make: Callable[[], bytes]) -> None:
-    # ICC.1:2001-04, 6.5.17: signature, reserved, length, text with its NUL, then 8, 3 and 67 bytes of no other scripts.
+D50 = struct.pack(">3I", 0xF6D6, 0x10000, 0xD32D)
+"""The illuminant as the standard gives it in hexadecimal (6.1.11)."""
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "needed"),
+    [
+        (srgb_output_profile, b"prtr", "desc cprt wtpt A2B0 A2B1 A2B2 B2A0 B2A1 B2A2 gamt"),
+        (srgb_display_profile, b"mntr", "desc cprt wtpt rXYZ gXYZ bXYZ rTRC gTRC bTRC"),
+    ],
+)
+def test_a_profile_has_the_bytes_of_the_standard(make: Callable[[], bytes], kind: bytes, needed: str) -> None:
     profile = make()
-    place, size = next(
-        struct.unpack(">2I", profile[at + 4 : at + 12])
-        for at in range(132, 132 + 12 * int.from_bytes(profile[128:132], "big"), 12)
-        if profile[at : at + 4] == b"desc"
-    )
-    data = profile[place : place + size]
-    length = int.from_bytes(data[8:12], "big")
-    assert data[:8] == b"desc" + bytes(4)
-    assert data[12 : 12 + length].endswith(b"\0")
-    assert data[12 + length :] == bytes(8 + 3 + 67)
+    # ICC.1:2001-04, 6.1: size, version 2.4, class, spaces, date, signature, intent relative to the medium, D50.
+    head = struct.pack(">I4xI", len(profile), 0x02400000) + kind + b"RGB XYZ " + struct.pack(">6H", 2000, 1, 1, 0, 0, 0)
+    assert profile[:128] == head + b"acsp" + bytes(24) + struct.pack(">I", 1) + D50 + bytes(48)
+    tags = tags_of(profile)
+    assert {*tags} == {*needed.split()}
+    assert tags["wtpt"] == b"XYZ " + bytes(4) + D50
+    # 6.5.18 and 6.5.17: signature, reserved, text with its NUL; a description is of its length and without other
+    # scripts, which take 8, 3 and 67 bytes.
+    assert tags["cprt"] == b"text" + bytes(4) + b"No copyright, use freely\0"
+    told = tags["desc"][12:-78]
+    assert told.endswith(b"\0")
+    assert tags["desc"] == b"desc" + bytes(4) + struct.pack(">I", len(told)) + told + bytes(78)
+    assert make() == profile
+
+
+def test_the_tables_of_the_output_profile_are_exact() -> None:
+    tags = tags_of(srgb_output_profile())
+    one = [65536, 0, 0, 0, 65536, 0, 0, 0, 65536]
+    for name, channels, grid, curves in (("A2B0", 3, 2, (4096, 2)), ("B2A0", 3, 2, (2, 4096)), ("gamt", 1, 17, (2, 2))):
+        data = tags[name]
+        # 6.5.8: channels, points a side, matrix, entries of the curves before and after; then these and the table.
+        assert data[:12] == b"mft2" + bytes(4) + bytes([3, channels, grid, 0])
+        assert struct.unpack(">2H", data[48:52]) == curves
+        assert len(data) == 52 + 2 * (3 * curves[0] + channels * grid**3 + channels * curves[1])
+        if name != "B2A0":
+            assert [*struct.unpack(">9i", data[12:48])] == one
+    # A point of the gamut's table is marked where its XYZ, up to 1.99997, is that of no code (IEC 61966-2-1, at D50).
+    inverse = [[3.1339, -1.6169, -0.4906], [-0.9788, 1.9161, 0.0335], [0.0719, -0.2290, 1.4052]]
+    side = np.arange(17) / 16 * 65535 / 32768
+    xyz = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1)
+    rgb: npt.NDArray[np.float64] = xyz @ np.array(inverse).T
+    # What lies on the cube's surface to a thousandth is left to rounding, but for black.
+    clear = np.asarray(((np.abs(rgb) > 0.001) & (np.abs(rgb - 1) > 0.001)).all(axis=-1))
+    clear[0, 0, 0] = True
+    marked = np.frombuffer(tags["gamt"][52 + 12 : -4], ">u2").reshape(17, 17, 17)
+    outside = np.asarray(((rgb < 0) | (rgb > 1)).any(axis=-1))
+    np.testing.assert_array_equal(marked[clear] > 0, outside[clear])
+    assert clear.sum() > 4800
+    assert 0 < (marked == 0).sum() < 100
+
+
+def test_the_display_profile_has_the_published_primaries() -> None:
+    tags = tags_of(srgb_display_profile())
+    # Those of sRGB adapted to D50 by Bradford's transform, as in the ICC's own profile.
+    for name, expected in (
+        ("rXYZ", (0.43607, 0.22249, 0.01392)),
+        ("gXYZ", (0.38515, 0.71687, 0.09708)),
+        ("bXYZ", (0.14307, 0.06061, 0.71410)),
+    ):
+        assert np.frombuffer(tags[name][8:], ">i4") / 65536 == pytest.approx(expected, abs=2e-4)
+    assert struct.unpack(">4s4xI", tags["rTRC"][:12]) == (b"curv", 1024)
+    assert len(tags["rTRC"]) == 12 + 2 * 1024
 
 
 def test_the_tagged_tiff_has_the_codes_of_the_untagged_one(tmp_path: Path) -> None:

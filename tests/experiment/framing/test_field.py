@@ -270,10 +270,140 @@ def test_what_cannot_be_corners_is_refused(given: Sequence[str], message: str) -
         parse_corners(given)
 
 
-@pytest.mark.parametrize("off_px", [-1.2, -0.3, 0.0, 0.4, 0.9])
-def test_a_blurred_step_is_found_where_it_is(off_px: float) -> None:
-    across = field._REFINE_ACROSS_PX  # pyright: ignore[reportPrivateUsage]
-    profile = 0.2 + 0.5 * ndtr((across - off_px) / 0.8)
-    off, rise = field._fitted_step(profile[None], 0.8)  # pyright: ignore[reportPrivateUsage]
-    assert off[0] == pytest.approx(off_px, abs=0.01)
-    assert rise[0] == pytest.approx(0.5, abs=0.01)
+def test_a_blurred_step_is_found_to_a_hundredth_beside_cells_that_slope() -> None:
+    across = np.arange(-3.5, 2.1, 0.5)
+    expected = np.array([[-1.2, 0.5], [0.0, 0.2], [0.37, 0.9], [1.1, 0.4]])
+    at, height = expected[:, :1], expected[:, 1:]
+    profiles = np.asarray(0.3 + height * ndtr((across - at) / 0.8) + 0.02 * np.minimum(across, 0), dtype=np.float64)
+    off, rise = field._fitted_step(profiles, 0.8)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(np.stack([off, rise], axis=1), expected, atol=0.01)
+
+
+def test_a_curve_goes_through_most_of_the_points() -> None:
+    along = np.linspace(0, 1, 80)
+    x = 2 * along - 1
+    off = 1 + 0.5 * x - 2 * 0.5 * (3 * x**2 - 1)
+    off[::4] += 9
+    curve, fits = field.robust_curve(along, off, 3)
+    np.testing.assert_allclose(curve, [1, 0.5, -2, 0], atol=1e-4)
+    np.testing.assert_array_equal(fits, np.arange(80) % 4 != 0)
+
+
+def test_sides_bend_outwards_and_meet_in_corners() -> None:
+    corners = np.array([[10.0, 20], [110, 30], [100, 90], [5, 80]])
+    curve = np.array([1.0, -0.5, -2])
+    ends = np.roll(corners, -1, axis=0)
+    middle = corners.mean(axis=0)
+    share = np.linspace(0, 1, 41)
+    for start, end in zip(corners, ends, strict=True):
+        normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+        assert np.linalg.norm(normal) == pytest.approx(1)
+        assert normal @ (end - start) == pytest.approx(0)
+        assert normal @ (start - middle) > 0
+        bent = field._bent(share, curve, start, end)  # pyright: ignore[reportPrivateUsage]
+        # At its ends a Legendre series is the sum of its terms with alternating and with equal signs.
+        np.testing.assert_allclose(bent[[0, -1]], [start - 0.5 * normal, end - 1.5 * normal])
+        np.testing.assert_allclose(bent[20], (start + end) / 2 + 2 * normal)
+        found = field._curve_between(start, end, bent, 2)  # pyright: ignore[reportPrivateUsage]
+        np.testing.assert_allclose(found, curve, atol=1e-9)
+    sides = [start + share[3:-5, None] * (end - start) for start, end in zip(corners, ends, strict=True)]
+    np.testing.assert_allclose(field._corners_of(sides), corners)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(field._sum(np.array([1.0, 2]), np.array([3.0])), [4, 2])  # pyright: ignore[reportPrivateUsage]
+
+
+def test_outlines_are_the_same_whichever_corner_they_begin_with() -> None:
+    corners = np.array([[10.0, 20], [110, 30], [100, 90], [5, 80]])
+    for turn in range(4):
+        moved = np.roll(corners, turn, axis=0) + np.array([2.9, -2.9])
+        assert field.same_corners(corners, moved, 3.0)
+        assert not field.same_corners(corners, moved, 2.8)
+    assert not field.same_corners(corners, corners[::-1], 3.0)
+
+
+def test_a_step_on_a_profile_is_where_it_rises_to_paper() -> None:
+    across = np.arange(-24, 24.01, 0.5)
+    at = np.array([-6.2, 0.0, 3.3])
+    rows = np.repeat(0.3 + 0.7 * ndtr((across - at[:, None]) / 0.7), 3, axis=0).astype(np.float32)
+    # Beyond the margin it is dark again, and a mark stands in the margin.
+    rows[:, across > 16] = 0.1
+    off, strength = field._edges(rows, across, 1e3)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(off[1::3], at, atol=0.05)
+    # A step of 0.7 between two sigma to either side, its own blur and that of the profile taken together.
+    wide = float(np.hypot(0.7, 1.0))
+    np.testing.assert_allclose(strength[1::3], 0.7 * (2 * ndtr(1 / wide) - 1), atol=0.02)
+
+
+@pytest.mark.parametrize(("side", "is_taken"), [(190, False), (194, True)])
+def test_corners_by_hand_are_192_raw_pixels_apart(side: int, is_taken: bool) -> None:
+    texts = ["100,100", f"{100 + side},100", f"{100 + side},400", "100,400"]
+    if is_taken:
+        assert field.parse_corners(texts)[0] == (49.75, 49.75)
+    else:
+        with pytest.raises(InputError, match=f"too close together: {side} pixels, at least 192"):
+            field.parse_corners(texts)
+
+
+QUAD = np.array([[61.0, 52], [341, 40], [352, 262], [50, 250]])
+"""Corners of a dark field on white paper, px."""
+
+
+def painted(level: float = 1000, offset: tuple[float, float] = (0, 0), moved: float = 0) -> Plane:
+    """Return a picture of that field, blurred by a pixel, as a plane shows it; its edge lies `moved` px further out."""
+    y, x = np.mgrid[:300, :400].astype(np.float64)
+    away = np.full(x.shape, -np.inf)
+    for start, end in zip(QUAD, np.roll(QUAD, -1, axis=0), strict=True):
+        normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+        away = np.maximum(away, (x + offset[0] - start[0]) * normal[0] + (y + offset[1] - start[1]) * normal[1])
+    return Plane("G", (level * (0.4 + 0.6 * ndtr(away - moved))).astype(np.float32), offset)
+
+
+@pytest.mark.parametrize(("small", "factor"), [(640, 1), (200, 2)])
+def test_the_outline_of_a_field_is_traced_from_a_guess(
+    small: int, factor: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(field, "_SMALL_WIDTH_PX", small)
+    picture = field.PreparedPicture.of([painted(), painted(600, (0.25, -0.25)), painted(29)])
+    # The third colour carries too little light to be looked at.
+    assert (picture.channels, picture.bright, picture.factor) == ((0, 1), (True, True), factor)
+    assert picture.paleness.shape == (300 // factor, 400 // factor)
+    # Paper is 1, and cells near it four tenths; a place keeps its place on the small raster.
+    pale = picture.pale_at(np.array([[[30.0, 20]], [[200, 56]], [[380, 280]]])).ravel()
+    np.testing.assert_allclose(pale, [1, 0.4, 1], atol=0.06)
+    np.testing.assert_allclose(picture.small(np.array([[0.5, 0.5], [10, 20]])) * factor + (factor - 1) / 2,
+                               [[0.5, 0.5], [10, 20]])  # fmt: skip
+    high, wide = picture.paleness.shape
+    for box, is_outer in (((1, 1, wide - 3, high - 3), False), ((0, 1, 9, 9), True), ((1, 0, 9, 9), True),
+                          ((wide - 9, 1, wide - 1, 9), True), ((1, high - 9, 9, high - 1), True)):  # fmt: skip
+        left, top, right, bottom = box
+        outline = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])[:, None]
+        assert picture._touches_border(outline) is is_outer  # pyright: ignore[reportPrivateUsage]
+    assert any(field.same_corners(quad, QUAD, 6) for quad in picture.quads())
+    found = field.trace_outline(picture, QUAD + np.array([[9, -7], [-8, 10], [6, 6], [10, 9]]))
+    assert found is not None
+    np.testing.assert_allclose(found.corners_px, QUAD, atol=0.2)
+    for side, (start, end) in enumerate(zip(QUAD, np.roll(QUAD, -1, axis=0), strict=True)):
+        normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+        assert len(found.sides_px[side]) == len(found.normals[side]) > 120
+        np.testing.assert_allclose(found.normals[side], np.tile(normal, (len(found.normals[side]), 1)), atol=0.01)
+        # At its ends a side is blurred with its neighbours.
+        off = np.abs((found.sides_px[side] - start) @ normal)
+        assert off.max() < 0.5
+        assert off[5:-5].max() < 0.1
+        along = (found.sides_px[side] - start) @ (end - start) / float((end - start) @ (end - start))
+        assert along.min() < 0.05
+        assert along.max() > 0.95
+        assert (np.diff(along) > 0).all()
+    # None where a side has no edge, or is too short for what is looked at around it.
+    assert field.trace_outline(picture, QUAD + np.array([60, 0])) is None
+    assert field.trace_outline(picture, QUAD[0] + (QUAD - QUAD[0]) * 0.25) is None
+
+
+def test_each_plane_s_edge_is_found_where_it_lies_in_it() -> None:
+    start, end = QUAD[:2]
+    normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+    places = start + np.linspace(0.1, 0.9, 30)[:, None] * (end - start)
+    planes = [painted(), painted(500, (0.25, -0.25), 0.4), painted(5), painted(800, (0, 0), 2.5)]
+    found, heights = refine_edges(planes, places, np.tile(normal, (30, 1)), 1.0)
+    np.testing.assert_allclose((found - places) @ normal, np.repeat([[0], [0.4], [0], [0]], 30, axis=1), atol=0.05)
+    # Of paper 0.6; of what is dark, or too far from where it is looked for, nothing is known.
+    np.testing.assert_allclose(heights, np.repeat([[0.6], [0.6], [0], [0]], 30, axis=1), atol=0.05)

@@ -12,7 +12,9 @@ import pytest
 from drivers.presenter import BLACK, Colour
 from drivers.raw.rawfile import CHANNELS, Mosaic, Plane, channel_offset_px, phases, plane_of, read_raw, strongest_plane
 from experiment.chart.model import Chart
-from experiment.framing.finding import find_chart, find_tags
+from experiment.framing import finding
+from experiment.framing.finding import FoundTag, find_chart, find_tags
+from experiment.framing.homography import project, rms, robust_homography
 from experiment.framing.pictures import blur_px, shift_between
 from foundation.errors import RegistrationError
 from sim.world.world import Room
@@ -187,3 +189,54 @@ def test_noise_alone_has_no_tags() -> None:
 
 def test_channels_are_in_the_order_of_samples() -> None:
     assert CHANNELS == ("R", "G", "B")
+
+
+@pytest.mark.parametrize(
+    ("page", "rows", "fill", "inside", "rotation"),
+    [
+        ((40, 20), ((2, 0, 50), (0, 2, 10)), 0.4, True, 0),
+        ((30, 20), ((0, -3, 150), (3, 0, 5)), 0.9, True, 90),
+        ((30, 20), ((-3, 0, 150), (0, -3, 80)), 0.6, True, 180),
+        # Half a pixel beyond the middle of the outermost ones the picture ends.
+        ((100, 50), ((1, 0, -0.5), (0, 1, -0.5)), 0.5, True, 0),
+        ((100, 50), ((1, 0, -0.6), (0, 1, 0)), 0.5, False, 0),
+        ((100, 50), ((1, 0, 0), (0, 1, -0.6)), 0.5, False, 0),
+        ((100, 50), ((1, 0, 99.5), (0, 1, 49.5)), 0.5, True, 0),
+        ((100, 50), ((1, 0, 99.6), (0, 1, 0)), 0.5, False, 0),
+        ((100, 50), ((1, 0, 0), (0, 1, 49.6)), 0.5, False, 0),
+    ],
+)
+def test_a_pose_is_read_off_the_homography(
+    chart: Chart,
+    page: tuple[float, float],
+    rows: tuple[tuple[float, ...], ...],
+    fill: float,
+    inside: bool,
+    rotation: float,
+) -> None:
+    plane = Plane("G", np.zeros((100, 200), np.float32), (0.0, 0.0))
+    homography = np.array([*rows, (0, 0, 1)], dtype=np.float64)
+    found = finding._pose(homography, replace(chart, page_mm=page), plane)  # pyright: ignore[reportPrivateUsage]
+    assert found == (pytest.approx(fill), inside, pytest.approx(rotation))
+
+
+def test_a_tag_is_its_corners_and_a_residual_its_length() -> None:
+    tag = FoundTag(3, np.array([[0.0, 0], [4, 0], [4, 2], [0, 2]]), 50.0)
+    assert (tag.centre_px.tolist(), tag.side_px) == ([2, 1], 3)
+    assert rms(np.array([[3.0, 4], [0, 0]])) == pytest.approx(12.5**0.5)
+    assert rms(np.zeros((0, 2))) == 0
+
+
+def test_pairs_that_do_not_fit_have_no_say() -> None:
+    points = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1).reshape(-1, 2)
+    true = np.array([[20, 3, 5], [-2, 25, 9], [0.01, 0.02, 1]])
+    places = project(true, points)
+    # By hand: the point (2, 1) goes to (48, 30) over 1.04.
+    assert places[7] == pytest.approx([48 / 1.04, 30 / 1.04])
+    places[[2, 9]] += [30, -30]
+    found, fits = robust_homography(points, places, 1.0)
+    np.testing.assert_allclose(found / found[2, 2], true, atol=1e-6)
+    assert np.flatnonzero(~fits).tolist() == [2, 9]
+    line = np.stack([np.arange(8.0), np.arange(8.0)], axis=1)
+    nothing, none = robust_homography(line, line, 1.0)
+    assert (nothing.tolist(), none.any()) == (np.eye(3).tolist(), False)

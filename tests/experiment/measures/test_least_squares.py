@@ -12,6 +12,7 @@ from experiment.measures.least_squares import (
     code_polynomial,
     code_powers,
     held_out_squares,
+    least_absolute_line,
     least_squares,
     light_terms,
     linear_combinations,
@@ -44,8 +45,9 @@ def test_terms_are_products_of_legendre_polynomials() -> None:
 @pytest.mark.parametrize("around", [False, True])
 def test_shapes_of_light_are_nested_and_orthogonal_over_the_page(around: bool) -> None:
     terms, counts = light_terms(PAGE, around)
-    assert counts[:3] == (1, 3, 6)
-    assert counts[-1] == terms.shape[1] == (10 if around else 31)
+    # A constant, a slope, a bend; then powers of the distance from a centre that is free, before what no axis explains.
+    assert counts == ((1, 3, 6, 10) if around else (1, 3, 6, 9, 12, 14, 18, 21, 31))
+    assert terms.shape[1] == counts[-1]
     norm = np.array([1 / ((2 * i + 1) * (2 * j + 1)) for i, j in page_powers(8)])
     assert terms.T @ (terms * norm[:, None]) == pytest.approx(np.eye(terms.shape[1]), abs=1e-9)
     # Each count holds all of a lower one, and the highest order is as it is said.
@@ -73,7 +75,18 @@ def test_without_outliers_the_fit_is_least_squares(unknowns: int) -> None:
     plain = np.linalg.lstsq(design, values)[0]
     assert solution == pytest.approx(plain, abs=1e-8)
     assert residual == pytest.approx(values - design @ plain, abs=1e-8)
-    assert weights.max() <= 1
+    # Tukey's biweight, cut at six robust standard deviations.
+    sigma = float(np.median(np.abs(residual))) / 0.674490
+    assert weights == pytest.approx(np.maximum(1 - (residual / (6 * sigma)) ** 2, 0) ** 2, abs=1e-5)
+
+
+def test_a_few_points_do_not_decide_where_a_line_lies() -> None:
+    x = np.linspace(0, 1, 40)
+    y = 0.25 + 0.5 * x
+    y[::5] += np.linspace(0.1, 3, 8)
+    assert least_absolute_line(x, y) == pytest.approx((0.25, 0.5), abs=2e-4)
+    # Where nothing else is known it is that of least squares.
+    assert least_absolute_line(x[:2], np.array([1.0, 3.0])) == pytest.approx((1, 78))
 
 
 def test_weights_count_as_repetitions() -> None:

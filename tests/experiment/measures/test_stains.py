@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from experiment.measures.stains import Stains, added_light, find_stains, light_of_spot, spots_of
+from experiment.measures import stains as module
+from experiment.measures.stains import Stains, added_light, find_stains, joined_cells, light_of_spot, spots_of
 
 _Array = npt.NDArray[np.float64]
 SIDE = 16
@@ -69,3 +70,97 @@ def test_light_and_what_is_kept_are_told_apart(added: float) -> None:
     found, kept = light_of_spot(stains, spots_of(stains)[0], 1)
     assert found == pytest.approx(added, rel=0.15)
     assert kept == pytest.approx(0.95, abs=0.02)
+
+
+def reflected(cells: int, kept: float, added: float) -> Stains:
+    """Return 64 × 64 cells, of which so many and two rings about them show `kept` of their light and some more."""
+    random = np.random.default_rng(1)
+    own = random.uniform(0.2, 1, 4096)
+    own[:100] = 1  # Paper white is the 99th percentile.
+    places = np.column_stack(np.divmod(np.arange(4096), 64)) * 5.0
+    spot = np.zeros(4096, bool)
+    spot[30 * 64 + 20 : 30 * 64 + 20 + cells] = True
+    away = np.linalg.norm(places[:, None] - places[spot], axis=2).min(axis=1)
+    seen = np.where(away < 13, kept * own + added, own)
+    alone = np.repeat((seen / own - 1)[:, None], 3, axis=1)
+    error = np.full((4096, 3), 1e-3)
+    return Stains(np.where(spot[:, None], alone, 0), error, alone, spot, np.repeat(1000 * seen[:, None], 3, 1), places)
+
+
+@pytest.mark.parametrize(
+    ("cells", "kept", "is_counted"), [(20, 1, False), (21, 1, True), (30, 0.86, True), (30, 0.84, False)]
+)
+def test_a_reflection_is_of_half_a_per_cent_of_the_cells_which_keep_their_own(
+    cells: int, kept: float, is_counted: bool
+) -> None:
+    assert added_light(reflected(cells, kept, 0.2)) == pytest.approx(0.2 if is_counted else 0, abs=1e-6)
+
+
+def test_a_line_is_through_six_cells_that_are_not_black() -> None:
+    stains = reflected(30, 0.9, 0.05)
+    there = np.flatnonzero(stains.stained)
+    for count, expected in ((6, (0.05, 0.9)), (5, (np.nan, np.nan))):
+        assert light_of_spot(stains, there[:count], 2) == pytest.approx(expected, nan_ok=True, abs=1e-6)
+    stains.alone[there[:25]] = np.nan
+    stains.alone[there[20:25]] = -0.99
+    assert np.isnan(light_of_spot(stains, there, 0)).all()
+    stains.alone[there[0]] = stains.alone[there[25]]
+    stains.level[there[0]] = stains.level[there[25]]
+    assert light_of_spot(stains, there, 0) == pytest.approx((0.05, 0.9), abs=1e-6)
+
+
+def test_cells_with_one_between_them_are_of_one_place() -> None:
+    groups = joined_cells(reflected(20, 1, 0), np.array([0, 2, 5, 9, 11, 2 * 64 + 11]))
+    assert [group.tolist() for group in groups] == [[9, 11, 2 * 64 + 11], [0, 2], [5]]
+
+
+def test_what_deviates_is_large_and_significant() -> None:
+    deviation = np.array([[0, -0.0101, 0], [0, 0.0099, 0], [0.0101, 0, 0], [0.0101, 0, 0], [np.nan, 0.03, 0]])
+    error = np.array([1e-3, 1e-3, 0.0017, 0.00168, 1e-3])[:, None] * np.ones(3)
+    made = Stains(deviation, error, 2 * deviation, np.zeros(5, bool), np.ones((5, 3)), np.zeros((5, 2)))
+    assert made.doubtful.tolist() == [True, False, False, True, True]
+    assert made.largest_deviation().tolist() == [-0.0101, 0.0099, 0.0101, 0.0101, 0.03]
+    assert [made.deviation_of(cell) for cell in (0, 4)] == [-0.0202, 0.06]
+
+
+def test_charts_of_four_levels_are_not_judged() -> None:
+    known: list[bool] = []
+    for bits in (2, 3):
+        codes = np.stack(np.meshgrid(*[np.linspace(0, 1, 1 << bits)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        places = np.column_stack(np.divmod(np.random.default_rng(0).permutation(len(codes)), 8)) * 5.0
+        known.append(find_stains(6000 * (0.1 + 0.9 * codes**2.2), places, bits).known)
+    assert known == [False, True]
+
+
+def test_a_neighbourhood_is_the_mean_of_five_cells_or_more_of_which_none_is_far_off() -> None:
+    # Usual is .01 over the 0.6745 of a normal distribution; a cell that is farther off than four of it counts as these.
+    logs = np.full((13, 3), np.nan)
+    logs[:5] = np.array([-0.02, -0.01, 0, 0.01, 0.5])[:, None]
+    near = np.array([[*range(13)], [0, 1, 2, 3, *range(5, 13), 5]])
+    mean, error = module._of_neighbourhoods(logs, near)  # pyright: ignore[reportPrivateUsage]
+    usual = 0.01 / 0.674490
+    bounded = np.array([-0.02, -0.01, 0, 0.01, 4 * usual])
+    assert mean[0] == pytest.approx([np.expm1(bounded.mean())] * 3, rel=1e-5)
+    assert error[0] == pytest.approx([bounded.std(ddof=1) / 5**0.5] * 3, rel=1e-5)
+    assert np.isnan(mean[1]).all()
+    assert np.isnan(error[1]).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_curvature_is_the_median_of_nine_codes_beside_or_more(axis: int) -> None:
+    random = np.random.default_rng(axis)
+    cube = random.normal(0, 1, (7, 7, 7, 3))
+    cube[random.random(cube.shape) < 0.55] = np.nan
+    found = np.moveaxis(module._beside(cube, axis), axis, 0)  # pyright: ignore[reportPrivateUsage]
+    given = np.moveaxis(cube, axis, 0)
+    expected = np.full_like(given, np.nan)
+    counts = np.zeros(given.shape, int)
+    for place in np.ndindex(given.shape):
+        value, row, column, channel = place
+        beside = given[value, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3, channel]
+        known = beside[np.isfinite(beside)]
+        counts[place] = len(known)
+        if len(known) >= 9:
+            expected[place] = np.median(known)
+    assert {8, 9, 10, 11} <= {*counts.ravel().tolist()}
+    np.testing.assert_allclose(found, expected)

@@ -5,11 +5,27 @@ Durations as people read them.
 
 from __future__ import annotations
 
+from datetime import datetime
+
 import pytest
 
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.lights import Illumination
-from experiment.session.records import RESPONSE, SessionStep, duration_text, link_steps, plan_steps
+from experiment.session.records import (
+    RESPONSE,
+    Attempt,
+    Check,
+    FrameRecord,
+    SessionEvent,
+    SessionStep,
+    TimedAttempt,
+    doubts_of,
+    duration_text,
+    last_moment,
+    link_steps,
+    plan_steps,
+    time_left,
+)
 
 
 @pytest.mark.parametrize(
@@ -18,6 +34,42 @@ from experiment.session.records import RESPONSE, SessionStep, duration_text, lin
 )
 def test_durations_read_well(seconds: float | None, text: str) -> None:
     assert duration_text(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "is_beyond"),
+    [(1, 1, 2, False), (2, 1, 2, False), (0.9, 1, 2, True), (2.1, 1, 2, True), (9, 1, None, False), (0, None, 2, False),
+     (0.9, 1, None, True), (2.1, None, 2, True), (None, 1, 2, False), (5, None, None, False)],
+)  # fmt: skip
+def test_a_value_is_beyond_the_limits_that_it_has(
+    value: float | None, low: float | None, high: float | None, is_beyond: bool
+) -> None:
+    assert Check("movement", value, low, high).is_beyond is is_beyond
+
+
+def test_the_time_left_is_that_of_the_last_fifty_attempts() -> None:
+    night = [*[TimedAttempt(1000, gained=False)] * 30, *[TimedAttempt(6, gained=True)] * 25]
+    # Of fifty half gave their frame; the median interval is that of both.
+    assert time_left(night, 10) == (1000 + 6) / 2 * 2 * 10
+    assert time_left(night, 0) == 0
+    assert time_left(night[:30], 10) is None
+    assert time_left([TimedAttempt(None, gained=True)], 10) is None
+
+
+def test_a_session_is_told_by_what_gave_frames_and_by_its_doubts() -> None:
+    moments = [datetime(2026, 1, 1, hour) for hour in range(4)]
+
+    def attempt(ended: datetime | None, taken: datetime | None) -> Attempt:
+        return Attempt(1, 1, "light", 0, "a.cr2", moments[0], ended, taken, None, "")
+
+    attempts = [attempt(moments[2], moments[1]), attempt(moments[3], None), attempt(None, moments[3])]
+    assert [one.has_frame for one in attempts] == [True, False, True]
+    assert last_moment(attempts) == moments[2]
+    assert last_moment(attempts[1:]) is None
+    events = [SessionEvent(moments[0], what, detail, 1) for what, detail in (("doubt", "b"), ("start", "x"))]
+    assert doubts_of([*events, SessionEvent(moments[1], "doubt", "a", 2), *events]) == ["b", "a"]
+    for verdict, accepted in (("accepted", True), ("refused: dark", False)):
+        assert FrameRecord("light", 0, "a.cr2", "", moments[0], 0.5, verdict).accepted is accepted
 
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))

@@ -18,6 +18,7 @@ from scipy.sparse import csc_array
 
 from evaluation.datasets.published import matlab
 from evaluation.datasets.published.matlab import check_mat5
+from foundation.errors import FormatError
 
 pytestmark = pytest.mark.slow
 
@@ -97,3 +98,131 @@ def test_a_bomb_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     packed = zlib.compress(bytes((1 << 16) + 1), 9)
     with pytest.raises(ValueError, match="holds more than"):
         check_mat5(PLAIN[:128] + struct.pack("<II", 15, len(packed)) + packed)
+
+
+# Type codes, sizes and classes as in "MAT-File Format", R2019b, chapter 1.
+NUMBERS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8}
+TEXTS = {**NUMBERS, 16: 1, 17: 2, 18: 4}
+CELL, STRUCT, CHAR, SPARSE, DOUBLE, UINT64 = 1, 2, 4, 5, 6, 15
+COMPLEX = 0x0800
+
+
+def element(kind: int, data: bytes) -> bytes:
+    return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+
+def array(flags: int, sides: tuple[int, ...], *values: bytes) -> bytes:
+    """Return an array of class and flags, its dimensions, and the elements of its values."""
+    told = element(6, struct.pack("<II", flags, 0)) + element(5, struct.pack(f"<{len(sides)}i", *sides))
+    return element(14, told + element(1, b"a") + b"".join(values))
+
+
+def fields(length: int, names: bytes, *arrays: bytes) -> bytes:
+    return array(STRUCT, (1, 1), struct.pack("<HHi", 5, 4, length), element(1, names), *arrays)
+
+
+def nested(depth: int) -> bytes:
+    return array(CELL, (1, 1), nested(depth - 1)) if depth else array(DOUBLE, (0, 0), element(9, b""))
+
+
+def refused(part: bytes) -> str:
+    """Return why a file is refused whose one variable is given; "" if it is not."""
+    try:
+        check_mat5(PLAIN[:128] + part)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+def test_values_take_the_bytes_of_their_type() -> None:
+    for kind in range(25):
+        size = NUMBERS.get(kind, 0)
+        given = {count: refused(array(DOUBLE, (1, 3), element(kind, bytes(count)))) for count in range(33)}
+        assert [count for count, why in given.items() if not why] == ([3 * size] if size else []), kind
+        if not size:
+            assert f"values of type {kind}, expected numbers" in given[24]
+        lines = [count for count in range(9) if not refused(array(CHAR, (1, 3), element(kind, bytes(count))))]
+        assert lines == ([*range(0, 9, TEXTS[kind])] if kind in TEXTS else []), kind
+
+
+def test_arrays_are_of_a_known_class_and_have_its_parts() -> None:
+    part, place, empty = element(9, bytes(24)), element(5, bytes(12)), array(DOUBLE, (0, 0), element(9, b""))
+    passed = [kind for kind in range(40) if not refused(array(kind, (1, 3), part))]
+    assert passed == [CHAR, *range(DOUBLE, UINT64 + 1)]
+    passed = [count for count in range(5) if not refused(array(DOUBLE | COMPLEX, (3, 1), *[part] * count))]
+    assert passed == [2]
+    for flags, wanted in ((SPARSE, 1), (SPARSE | COMPLEX, 2)):
+        passed = [count for count in range(5) if not refused(array(flags, (3, 3), place, place, *[part] * count))]
+        assert passed == [wanted]
+    assert "values of type 9" in refused(array(SPARSE, (3, 3), part, place, part))
+    passed = [count for count in range(9) if not refused(array(CELL, (2, 3), *[empty] * count))]
+    assert passed == [6]
+    assert "of type 9 in a cell" in refused(array(CELL, (1, 1), part))
+    assert not refused(array(CELL, (0, 0)))
+    assert not refused(array(DOUBLE, (1, 3, 1), part))
+    assert not refused(fields(1, b"x", empty))
+    assert "12 bytes, each 5" in refused(fields(5, bytes(12), empty, empty, empty))
+    assert "each 0" in refused(fields(0, bytes(12)))
+    passed = [count for count in range(9) if not refused(fields(4, bytes(12), *[empty] * count))]
+    assert passed == [3]
+    assert not refused(nested(20))
+    assert "more than 20 deep" in refused(nested(21))
+
+
+def test_tags_flags_and_dimensions_are_whole() -> None:
+    name, value, flags = element(1, b"a"), element(9, bytes(8)), element(6, struct.pack("<II", DOUBLE, 0))
+    sides = element(5, struct.pack("<ii", 1, 1))
+    for parts, why in (
+        ([flags, sides, name, value], ""),
+        ([flags, sides], "an array of 2 parts"),
+        ([element(6, bytes(4)), sides, name, value], "no flags"),
+        ([element(5, bytes(8)), sides, name, value], "no flags"),
+        ([flags, element(5, bytes(4)), name, value], "no dimensions"),
+        ([flags, element(5, bytes(10)), name, value], "no dimensions"),
+        ([flags, element(6, bytes(8)), name, value], "no dimensions"),
+        ([flags, element(5, struct.pack("<ii", 1, -1)), name, value], "the dimensions are [1, -1]"),
+        ([flags, sides, element(2, b"a"), value], "no name"),
+        # The name in a small element: four bytes at most.
+        ([flags, sides, struct.pack("<HH4s", 1, 4, b"long"), value], ""),
+        ([flags, sides, struct.pack("<HH4s", 1, 5, b"long"), value], "a small element of 5 bytes"),
+        ([flags, sides, name, value, bytes(7)], "7 bytes are left"),
+    ):
+        found = refused(struct.pack("<II", 14, sum(map(len, parts))) + b"".join(parts))
+        assert (why in found) if why else not found, (why, found)
+    assert not refused(element(14, b""))
+    assert "of type 9, expected an array" in refused(value)
+    assert "does not hold one array" in refused(element(15, zlib.compress(nested(0) + nested(0))))
+    with pytest.raises(ValueError, match="it has 127 bytes"):
+        check_mat5(PLAIN[:127])
+    with pytest.raises(ValueError, match="the order of bytes is b'XX'"):
+        check_mat5(PLAIN[:126] + b"XX")
+
+
+def test_variables_are_what_is_expected_of_them() -> None:
+    content = {
+        "lights": np.arange(6).reshape(2, 3),
+        "flat": np.arange(3),
+        "bad": np.array([[1, 2, np.inf]]),
+        "words": np.array([["a", "b", "c"]]),
+        "level": np.array([[128]], np.uint16),
+        "zero": np.array([[0.0]]),
+        "minus": np.array([[-1.0]]),
+        "names": np.array([[np.array(["a.png "])], [np.array([["b"]])]], dtype=object),
+        "numbers": np.array([[np.array([1])]], dtype=object),
+    }
+    path = Path("gt.mat")
+    np.testing.assert_array_equal(matlab.table(content, "lights", path, 3), [[0, 1, 2], [3, 4, 5]])
+    for name, columns in (("lights", 2), ("flat", 3), ("bad", 3), ("words", 3), ("none", 3)):
+        with pytest.raises(FormatError, match=rf"gt\.mat.*{name}"):
+            matlab.table(content, name, path, columns)
+    assert (matlab.scalar(content, "level", path), matlab.scalar(content, "zero", path)) == (128, 0)
+    for name in ("flat", "minus", "words", "none"):
+        with pytest.raises(FormatError, match=rf"gt\.mat.*{name}"):
+            matlab.scalar(content, name, path)
+    with pytest.raises(FormatError, match="has it, expected none among them"):
+        matlab.scalar({"__header__": b"", "it": 1}, "none", path)
+    assert matlab.strings(content, "names", path) == ["a.png", "b"]
+    assert matlab.strings(content, "none", path) is None
+    for name in ("numbers", "lights"):
+        with pytest.raises(FormatError, match=f"{name} holds .*, expected names"):
+            matlab.strings(content, name, path)

@@ -10,6 +10,7 @@ import pytest
 from scipy.io import loadmat
 
 from evaluation.datasets import DataOptions, open_scenes
+from evaluation.datasets.published import nus8 as published
 from foundation.errors import FormatError, InputError
 from tests.evaluation.datasets.made_up import image_of, nus8, write_mat, write_png
 
@@ -47,6 +48,13 @@ def test_levels_mask_and_truth_of_each_camera(copy: Path) -> None:
     assert data.treatment["black level"].endswith("NikonD5200 0, SonyA57 128")
     assert data.treatment["images"] == "NikonD5200 2 (published: 200), SonyA57 2 (published: 268)"
     assert data.treatment["saturation"].endswith("NikonD5200 15892, SonyA57 4093")
+
+
+def test_the_published_numbers_are_those_of_the_whole_set() -> None:
+    # The authors' page: eight cameras, 1736 images; with the ninth 1853, as in the list of their ground truths.
+    counts = dict(published._PUBLISHED)  # pyright: ignore[reportPrivateUsage]
+    assert (len(counts), counts.pop("NikonD40"), sum(counts.values())) == (9, 117, 1736)
+    assert counts["Canon1DsMkIII"] == 259
 
 
 def test_one_camera(copy: Path) -> None:
@@ -188,6 +196,38 @@ def test_text_files_of_all_cameras_in_one_folder(copy: Path) -> None:
     mask = open_scenes(copy).scenes[2].read()[1]
     assert mask is not None
     assert mask.sum() == 3 * 5
+
+
+def test_boxes_that_have_half_of_both_in_common_are_of_one_chart(copy: Path) -> None:
+    # The table's chart has 3 × 5 px; of 30 that hold it it is half, of 40 it is less.
+    folder = write_masks(copy, "1,2,9,2", "1,1,0.4,7")
+    assert "edges at most 5 px apart" in open_scenes(copy / "SonyA57").treatment["mask"]
+    (folder / "SonyA57_0001_mask.txt").write_text("1,1,9,3")
+    with pytest.raises(FormatError, match="expected the same chart in both"):
+        open_scenes(copy / "SonyA57")
+
+
+def test_a_text_file_is_rounded_as_imcrop_does(tmp_path: Path) -> None:
+    (tmp_path / "mask.txt").write_text("0.2,1.5,3,2.9")
+    assert published.read_mask(tmp_path / "mask.txt") == (2, 4, 1, 3)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "is_taken"),
+    [(-2, 8, True), (-3, 8, False), (1, 10, True), (1, 11, False), (2, 2, True), (3, 2, False), (0, 0, False),
+     (8, 8, True), (9, 10, False)],
+)  # fmt: skip
+def test_a_chart_goes_over_the_edge_by_two_pixels_at_most(first: int, last: int, is_taken: bool) -> None:
+    inside = np.zeros(8, bool)
+    inside[max(first - 1, 0) : last] = True
+    for box, across in (((first, last, 1, 8), False), ((1, 8, first, last), True)):
+        scene = published.ChartScene("a", "a.png", (1.0, 1.0, 1.0), 0.0, None, box)
+        if is_taken:
+            seen = scene.mask(np.zeros((8, 8, 3), np.uint16))
+            np.testing.assert_array_equal(seen.T if across else seen, np.repeat(inside[:, None], 8, axis=1))
+        else:
+            with pytest.raises(FormatError, match=r"a\.png is 8 × 8, but its chart is in"):
+                scene.mask(np.zeros((8, 8, 3), np.uint16))
 
 
 @pytest.mark.parametrize("text", ["", "1,2,3", "1,2,0,4", "1,2,nan,4", "1e308,1,1e308,4", "left,right"])

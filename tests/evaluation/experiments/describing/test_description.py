@@ -150,6 +150,51 @@ def test_no_curve_is_fitted_where_there_is_none() -> None:
     assert [curve.levels for curve in photon_transfer([])] == [(), (), ()]
 
 
+def levels(signals: list[float], sigmas: list[float], blocks: int = 40) -> list[npt.NDArray[np.float64]]:
+    """Return the blocks of levels of signal that show a noise each, the same in all of them."""
+    given = np.repeat(np.stack([signals, np.multiply(sigmas, 0.7325)], axis=1), blocks, axis=0)
+    return [np.repeat(given[..., None], 3, axis=2)]
+
+
+def test_a_curve_is_of_four_levels_of_thirty_blocks_that_span_a_factor_of_four() -> None:
+    signals = [1.0, 1.6, 2.5, 4.0]
+    for given, blocks, is_fitted in (
+        (signals, 40, True),
+        (signals, 30, True),
+        (signals, 29, False),
+        ([1.0, 2.5, 6.0], 40, False),
+        ([1.0, 1.6, 2.5, 3.99], 40, False),
+    ):
+        curve = photon_transfer(levels(given, list(np.sqrt(0.04 + 0.01 * np.array(given))), blocks))[0]
+        assert (curve.gain is not None) == is_fitted, (given, blocks)
+        if is_fitted:
+            assert (curve.read, curve.gain, curve.misfit) == pytest.approx((0.2, 0.01, 0), abs=1e-9)
+            assert [level.blocks for level in curve.levels] == [blocks] * 4
+
+
+def test_a_curve_holds_where_it_is_off_by_a_quarter_at_most() -> None:
+    off = np.array([1, -1, -1, 1, 1, -1, -1, 1])
+    misfits: dict[bool, list[float]] = {True: [], False: []}
+    for part in np.linspace(0.15, 0.35, 41):
+        curve = photon_transfer(levels(list(np.geomspace(1, 10, 8)), list(0.1 * np.exp(part * off))))[1]
+        assert curve.misfit is not None
+        misfits[curve.gain is not None].append(curve.misfit)
+    assert 0.24 < max(misfits[True]) <= 0.25 < min(misfits[False]) < 0.26
+
+
+def test_the_noise_of_an_image_is_of_ten_blocks_brighter_than_the_least() -> None:
+    (blocks,) = levels([1.0, 2.0], [0.03, 0.02], 10)
+    assert relative_noise(blocks, 1.0) == pytest.approx(0.01)
+    assert np.isnan(relative_noise(blocks[:-1], 1.0))
+    # In an image it is told by what is brighter than a tenth of its 99th percentile.
+    random = np.random.default_rng(6)
+    image = np.repeat(np.repeat([[0.099, 1.0]], 80, axis=0), 40, axis=1)[..., None] * np.ones(3)
+    image[:, 40:] += 0.02 * random.normal(size=(80, 40, 3))
+    assert measure_scene(Made("a", np.ones(3), image, 10.0)).values["noise"] == pytest.approx(0.02, rel=0.15)
+    image[:, :40] = 0.15
+    assert measure_scene(Made("a", np.ones(3), image, 10.0)).values["noise"] < 1e-9
+
+
 def lights_at(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return lights whose ln(R/G) and ln(B/G) are given."""
     return np.exp(np.stack([points[:, 0], np.zeros(len(points)), points[:, 1]], axis=1)) * 5

@@ -5,16 +5,37 @@ What is said of two descriptions before they are compared.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from evaluation.experiments.describing import DataDescription, describe, figures
-from evaluation.experiments.describing.description import QUANTITIES, read_statistics, statistics_to_json
-from evaluation.experiments.describing.report import FigureCompared, compare_figures, seen_notes, sentence
+from evaluation.experiments.describing import DataDescription, describe, figures, report
+from evaluation.experiments.describing.description import (
+    QUANTITIES,
+    NoiseCurve,
+    NoiseLevel,
+    energy_distance,
+    read_statistics,
+    statistics_to_json,
+)
+from evaluation.experiments.describing.report import (
+    FigureCompared,
+    Verdict,
+    compare_figures,
+    compared_tables,
+    figures_table,
+    lights_table,
+    seen_notes,
+    sentence,
+    sizes_table,
+)
 from generator.likeness.real_data import TITLES
+from generator.statistics import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
 from tests.evaluation.experiments.describing.scenes import random_set
 
 pytestmark = pytest.mark.slow
@@ -69,12 +90,6 @@ def test_a_ratio_to_nothing_is_none() -> None:
     assert sentence(found, ("a", "b")).endswith("no ratio to a figure that is 0.")
 
 
-def test_figures_of_too_few_images_are_left_out() -> None:
-    real = describe(random_set("real", 20))
-    rare = {**real.values, "noise": np.array([0.1, 0.1, *[np.nan] * 18])}
-    assert "noise" not in compared(replace(real, values=rare), real)
-
-
 def test_intervals_of_spreads_are_those_of_normal_distributions() -> None:
     random = np.random.default_rng(5)
     real = describe(random_set("real", 3))
@@ -103,3 +118,159 @@ def test_only_images_that_share_a_picture_make_intervals_too_narrow(tmp_path: Pa
     assert read.groups == 2
     (told,) = [note for note in seen_notes(alone, read) if "too narrow" in note]
     assert told.startswith(f"The {len(alone.images)} images of shared are of 2 pictures or places")
+
+
+QUANTITY = {quantity.name: quantity for quantity in QUANTITIES}
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "change", "verdict"),
+    [
+        # A ratio of 1/1.25 to 1.25, both ends included; the interval says whether it is sure.
+        ("edges", 1, (1.0, 0.8, 1.25), "yes"),
+        ("edges", 1, (0.8, 0.8, 1.0), "yes"),
+        ("edges", 1, (1.25, 1.0, 1.25), "yes"),
+        ("edges", 1, (1.0, 0.79, 1.1), "yes?"),
+        ("edges", 1, (1.0, 0.9, 1.26), "yes?"),
+        ("edges", 1, (0.79, 0.7, 0.8), "no?"),
+        ("edges", 1, (0.79, 0.7, 0.799), "no"),
+        ("edges", 1, (1.26, 1.25, 1.3), "no?"),
+        ("edges", 1, (1.26, 1.251, 1.3), "no"),
+        ("edges", 1, (np.nan, np.nan, np.nan), None),
+        # A difference of a quarter of the scale.
+        ("light_red", 2, (0.5, -0.5, 0.5), "yes"),
+        ("light_red", 2, (-0.5, -0.51, 0.4), "yes?"),
+        ("light_red", 2, (0.51, 0.5, 0.6), "no?"),
+        ("light_red", 2, (-0.51, -0.6, -0.501), "no"),
+    ],
+)
+def test_a_figure_is_alike_within_a_quarter(
+    name: str, scale: float, change: tuple[float, float, float], verdict: Verdict | None
+) -> None:
+    assert report._verdict(QUANTITY[name], change, scale) == verdict  # pyright: ignore[reportPrivateUsage]
+    made = FigureCompared(QUANTITY[name], 3.0, 4.0, change, scale, 0.1, 0.5, verdict)
+    told = sentence(made, ("a", "b"))
+    ends = {
+        "yes": "within 25%.",
+        "yes?": "within 25%, but other images might not be.",
+        "no?": "not within 25%, but other images might be.",
+        "no": "not within 25%.",
+        None: "no ratio to a figure that is 0.",
+    }
+    assert told.endswith(f", {ends[verdict]}" if verdict else f": {ends[verdict]}")
+    if name == "light_red":
+        assert f"{abs(change[0]) / 2:.0%} of its spread there" in told
+    (table,) = compared_tables([made], ("a", "b"))
+    assert table.columns[4] == ("Difference" if name == "light_red" else "Ratio")
+    row = dict(zip(table.columns, table.rows[0], strict=True))
+    assert (row["a"], row["b"], row["Within 25%"], row["KS"], row["p"]) == (3, 4, verdict, 0.1, 0.5)
+
+
+def test_three_images_make_a_figure() -> None:
+    real = describe(random_set("real", 20))
+    for count, is_there in ((2, False), (3, True)):
+        rare = {**real.values, "edges": np.array([*np.linspace(0.1, 0.2, count), *[np.nan] * (20 - count)])}
+        assert ("edges" in compared(replace(real, values=rare), real)) is is_there
+
+
+def drawn_by(draw: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return the axes that a figure of the report consists of."""
+    kept: list[Any] = []
+
+    def keep(draw: Callable[[Any], None], *, inches: tuple[float, float]) -> bytes:
+        figure = Figure(figsize=inches)
+        draw(figure)
+        kept.append(figure)
+        return b"<svg></svg>"
+
+    monkeypatch.setattr(report, "svg_of", keep)
+    draw()
+    return kept[0].axes
+
+
+def test_figures_show_what_the_descriptions_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, other = describe(random_set("a", 12)), describe(random_set("b", 12, seed=1))
+    lights = np.random.default_rng(0).dirichlet((9, 9, 9), 3001)
+    one = replace(one, lights=lights)
+    other = replace(other, lights=lights[:3000])
+    (axes,) = drawn_by(lambda: report._luminance((one, other)), monkeypatch)  # pyright: ignore[reportPrivateUsage]
+    for patch, made in zip(axes.patches, (one, other), strict=True):
+        values, edges, _ = patch.get_data()
+        np.testing.assert_allclose(values, 100 * made.luminance)
+        np.testing.assert_allclose(np.log10(edges), LUMINANCE_EDGES)
+    assert (axes.get_xscale(), axes.get_ylim()[0]) == ("log", 0)
+    both = drawn_by(lambda: report._chroma((one, other)), monkeypatch)  # pyright: ignore[reportPrivateUsage]
+    top = max(one.chroma.max(), other.chroma.max())
+    for axes, made in zip(both, (one, other), strict=True):
+        (image,) = axes.images
+        # The first axis of the histogram, ln(R/G), goes to the right, the other upwards; both on one scale.
+        np.testing.assert_allclose(image.get_array().data, made.chroma.T**0.4)
+        assert image.get_extent() == [CHROMA_EDGES[0], CHROMA_EDGES[-1], CHROMA_EDGES[0], CHROMA_EDGES[-1]]
+        assert image.origin == "lower"
+        assert image.get_clim() == pytest.approx((0, top**0.4))
+        assert [line.get_xydata()[0].tolist() for line in axes.lines] == [[0, 0], [0, 0]]
+        assert axes.get_subplotspec().get_gridspec().get_geometry() == (1, 2)
+    (axes,) = drawn_by(lambda: report._lights((one, other)), monkeypatch)  # pyright: ignore[reportPrivateUsage]
+    few, all_ = (np.asarray(points.get_offsets()) for points in axes.collections)
+    np.testing.assert_allclose(few, lights[::2, [0, 2]])
+    np.testing.assert_allclose(all_, lights[:3000, [0, 2]])
+
+
+def test_the_figure_of_noise_shows_the_fitted_curve(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = tuple(NoiseLevel(signal, 0.1 * signal, 40) for signal in (0.01, 0.1, 1.0))
+    plain = describe(random_set("a", 3))
+    fitted = replace(plain, noise=(NoiseCurve(()), NoiseCurve(levels, 0.03, 0.16, 0.1), NoiseCurve(())))
+    bare = replace(plain, noise=(NoiseCurve(()), NoiseCurve(levels[:2]), NoiseCurve(())))
+    (axes,) = drawn_by(lambda: report._noise((fitted, bare)), monkeypatch)  # pyright: ignore[reportPrivateUsage]
+    points, curve, others = axes.lines
+    np.testing.assert_allclose(points.get_xydata(), [[0.01, 0.001], [0.1, 0.01], [1, 0.1]])
+    np.testing.assert_allclose(others.get_xydata(), [[0.01, 0.001], [0.1, 0.01]])
+    signal, sigma = curve.get_xydata().T
+    np.testing.assert_allclose(signal[[0, -1]], [0.01, 1])
+    np.testing.assert_allclose(sigma**2, 0.03**2 + 0.16 * signal)
+    other_unit = replace(fitted, noise_unit="another")
+    (axes,) = drawn_by(lambda: report._noise((bare, other_unit)), monkeypatch)  # pyright: ignore[reportPrivateUsage]
+    assert len(axes.lines) == 1
+    nothing = replace(plain, noise=(NoiseCurve(()),) * 3)
+    assert report._noise((nothing,)) == []  # pyright: ignore[reportPrivateUsage]
+
+
+def test_six_sizes_are_listed_and_the_others_counted() -> None:
+    plain = replace(describe(random_set("a", 3)), mixed=2, masked=0.123)
+    sizes = tuple((width, 10, 9 - width) for width in range(1, 9))
+    for count, last in ((6, ("6 x 10", 3)), (8, ("2 other sizes", 3))):
+        table = sizes_table(replace(plain, sizes=sizes[:count]))
+        assert table.rows[0] == ("1 x 10", 8)
+        assert (len(table.rows), table.rows[-1]) == (min(count, 7), last)
+        assert table.notes == ("2 images under several lights; 12.3% of the pixels are masked.",)
+
+
+def test_tables_have_quartiles_of_images_and_the_distance_of_lights() -> None:
+    made, other = describe(random_set("a", 12)), describe(random_set("b", 12, seed=1))
+    rows = {row[0]: row[1:] for row in figures_table(made).rows}
+    known = made.values["edges"]
+    low, high = np.percentile(known, [25, 75], method="hazen")
+    assert rows["Mean edge"] == ("median", pytest.approx(np.median(known)), low, high, 12)
+    assert rows["Spread of lights, red"][2:4] == (None, None)
+    assert rows["Exposure"] == ("median", None, None, None, 0)
+    table = lights_table([made, other])
+    assert [row[:2] for row in table.rows] == [("a", 12), ("b", 12)]
+    share, p = energy_distance(log_chroma(made.lights), log_chroma(other.lights))
+    assert f"{share:.3f} of its largest" in table.notes[1]
+    assert f"p = {p:.3f}" in table.notes[1]
+    assert len(lights_table([made]).notes) == 1
+
+
+def test_what_makes_descriptions_less_comparable_is_said() -> None:
+    made = describe(random_set("a", 3))
+    small = replace(made, name="small", sizes=((100, 64, 1), (100, 63, 2)), side=64)
+    enough = replace(made, name="enough", sizes=((64, 64, 3),), side=64)
+    assert [note[:28] for note in seen_notes(small, enough)] == ["Images of small have fewer t"]
+    assert (
+        "enough was seen at 64 x 64 cells at most, full at full size"
+        in seen_notes(enough, replace(enough, name="full", side=0))[0]
+    )
+    known = {**made.values, "edges": np.full(3, np.nan)}
+    assert seen_notes(replace(enough, values=known), enough) == (
+        "Known of one of the two only, and left out: Mean edge.",
+    )

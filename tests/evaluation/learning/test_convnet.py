@@ -1,0 +1,134 @@
+"""The network against a few lines of NumPy: what it sees, how it weighs, how it is lit anew, where it begins."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.signal import correlate
+
+from evaluation.learning import convnet
+from evaluation.learning.convnet import ConvNet, ConvNetModel
+
+pytestmark = pytest.mark.slow
+
+torch: Any = pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
+
+
+def convolved(
+    layer: npt.NDArray[np.float64], weights: npt.NDArray[Any], bias: npt.NDArray[Any], step: int
+) -> npt.NDArray[np.float64]:
+    """Return the sums (O, h, w) of an image (I, H, W) correlated with (O, I, K, K), zeros around it."""
+    reach = weights.shape[2] // 2
+    padded = np.pad(layer, ((0, 0), (reach, reach), (reach, reach)))
+    found: Any = [correlate(padded, kernel, mode="valid")[0, ::step, ::step] for kernel in weights.astype(np.float64)]
+    return np.asarray(found + bias[:, None, None].astype(np.float64))
+
+
+def light_by_numpy(weights: dict[str, npt.NDArray[Any]], image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the light of an image (H, W, 4): R, G, B, usable; H and W multiples of four."""
+    colours, used = np.moveaxis(image[..., :3], 2, 0), image[..., 3]
+    mean = colours.sum() / (3 * used.sum())
+    layer = np.concatenate([np.sqrt(colours / mean), used[None]])
+    for number, step in ((1, 2), (2, 2), (3, 1)):
+        layer = np.maximum(convolved(layer, weights[f"weight{number}"], weights[f"bias{number}"], step), 0)
+    local = convolved(layer, weights["weight4"], weights["bias4"], 1)
+    height, width = used.shape
+    share = used.reshape(height // 4, 4, width // 4, 4).mean(axis=(1, 3))
+    # FC4, equations 4 to 6: local lights times confidence, summed. Confidence is above 0, a light e^-3 to e^3.
+    confidence = np.logaddexp(0, local[3]) * share
+    light = (np.exp(np.clip(local[:3], -3, 3)) * confidence).sum(axis=(1, 2))
+    return light / light.sum()
+
+
+def random_weights(size: float) -> dict[str, npt.NDArray[np.float32]]:
+    random = np.random.default_rng(3)
+    shapes = convnet._shapes(3)  # pyright: ignore[reportPrivateUsage]
+    return {name: random.normal(0, size, shape).astype(np.float32) for name, shape in shapes.items()}
+
+
+@pytest.mark.parametrize("size", [0.15, 0.4])
+def test_local_lights_are_weighed_by_confidence(size: float) -> None:
+    weights = random_weights(size)
+    image = np.random.default_rng(4).uniform(0.05, 1, (16, 12, 4)).astype(np.float16)
+    image[..., 3] = 1
+    image[3:9, 5:] = 0
+    (found,) = ConvNetModel(weights).lights(image[None])
+    np.testing.assert_allclose(found, light_by_numpy(dict(weights), image.astype(np.float64)), rtol=1e-4)
+    assert ConvNet(width=3).restore(dict(weights)).arrays().keys() == weights.keys()
+    for damage in (weights["bias4"][:3], weights["bias4"].astype(np.float64), np.full(4, np.nan, np.float32)):
+        with pytest.raises(ValueError, match="bias4"):
+            ConvNet(width=3).restore({**weights, "bias4": damage})
+
+
+def test_what_is_smaller_than_the_square_is_framed_by_what_is_not_usable() -> None:
+    image = np.full((20, 40, 3), 0.5, np.float32)
+    framed = ConvNet(working_size=64).features(image)
+    assert framed is not None
+    assert framed.shape == (64, 64, 4)
+    assert framed[:20, :40].min() == framed.max() == 1
+    assert not framed[20:].any()
+    assert not framed[:, 40:].any()
+
+
+def test_images_are_lit_anew_by_a_tenth_and_flipped_half_the_time() -> None:
+    generator = torch.Generator().manual_seed(0)
+    plain = torch.rand((400, 4, 2, 3), generator=generator) + 0.1
+    plain[:, 3] = 1
+    lights = torch.ones((400, 3))
+    flipped: list[bool] = []
+    for _ in range(40):
+        seen, wanted = convnet._lit_anew(torch, plain, lights, generator)  # pyright: ignore[reportPrivateUsage]
+        gains = wanted.numpy()
+        assert 0.9 <= gains.min() < 0.901
+        assert 1.099 < gains.max() <= 1.1
+        assert abs(gains.mean() - 1) < 0.01
+        parts = (seen / plain).numpy(), (seen / plain.flip(3)).numpy()
+        expected = np.concatenate([gains, np.ones((400, 1))], axis=1)[:, :, None, None]
+        same = [bool(np.allclose(part, expected, rtol=1e-5)) for part in parts]
+        assert sum(same) == 1
+        flipped.append(same[1])
+    assert 8 < sum(flipped) < 32
+
+
+def test_the_network_begins_as_he_draws_it() -> None:
+    weights = convnet._initial(torch, 16, torch.Generator().manual_seed(0))  # pyright: ignore[reportPrivateUsage]
+    for name, inputs, part in (
+        ("weight1", 4 * 25, 1),
+        ("weight2", 16 * 9, 1),
+        ("weight3", 32 * 9, 1),
+        ("weight4", 32, 0.1),
+    ):
+        drawn = weights[name].detach().numpy()
+        assert drawn[0].size == inputs
+        assert drawn.std() == pytest.approx(part * (2 / inputs) ** 0.5, rel=0.2)
+    assert [name for name in weights if not weights[name].detach().numpy().any()] == [
+        "bias1",
+        "bias2",
+        "bias3",
+        "bias4",
+    ]
+    assert [weights[f"weight{number}"].shape[0] for number in (1, 2, 3, 4)] == [16, 32, 32, 4]
+
+
+def test_the_loss_is_the_angle() -> None:
+    found = torch.tensor([[1.0, 0, 0], [2**-0.5, 2**-0.5, 0], [0, 0, 1]])
+    wanted = torch.tensor([[0, 3.0, 0], [5, 0, 0], [0, 0, 2]])
+    angles = convnet._angle(torch, found, wanted).numpy()  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(angles, [np.pi / 2, np.pi / 4, 0], atol=1e-5)
+
+
+def test_tuning_has_a_quarter_of_the_epochs_and_of_the_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, float]] = []
+
+    def keep(_self: object, _weights: object, _features: object, _truths: object, *rest: Any) -> None:
+        asked.append(rest[:2])
+
+    monkeypatch.setattr(ConvNet, "_trained", keep)
+    images, lights, model = np.ones((2, 8, 8, 4), np.float16), np.ones((2, 3)), ConvNetModel(random_weights(0.1))
+    for epochs in (40, 3):
+        ConvNet(epochs=epochs, rate=0.004).fit_features(images, lights)
+        ConvNet(epochs=epochs, rate=0.004).tune(model, images, lights, worth=1)
+    assert asked == [(40, 0.004), (10, 0.001), (3, 0.004), (1, 0.001)]
