@@ -463,6 +463,7 @@ def test_errors_alone_means_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
     assert printed.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_flags_may_stand_behind_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from acquisition.cli import main
 

@@ -46,6 +46,7 @@ except AttributeError:
     assert done.stdout == "done\n", done.stderr
 
 
+@pytest.mark.slow
 def test_a_method_beside_such_a_file_is_loaded_and_hides_nothing(tmp_path: Path) -> None:
     (tmp_path / "generator.py").write_text("raise SystemExit('hidden')\n")
     method = tmp_path / "mine.py"

@@ -195,6 +195,7 @@ def test_a_screen_or_projector_that_is_not_there_ends_with_3(
     assert f"nothing listens at 127.0.0.1:{port}" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_projector_takes_its_time_as_told() -> None:
     options = ["--warm-up", "0", "--cool-down", "0", "--class", "1", "--answer-after", "0.01"]
     with subprocess.Popen([*SIM, "projector", "--pjlink", "0", *options], stdout=subprocess.PIPE, text=True) as process:

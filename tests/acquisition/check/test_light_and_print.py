@@ -150,6 +150,7 @@ def test_a_reference_that_is_not_as_others_of_its_code_is_off() -> None:
     assert judge_print(state, CHART, 0.49).grade == "not checked"
 
 
+@pytest.mark.slow
 def test_cells_that_are_off_together_are_one_spot_and_in_a_row_a_crease() -> None:
     chart = design_chart(3)
     codes = np.stack(np.unravel_index(np.arange(512), (8, 8, 8)), axis=1) / 7

@@ -112,6 +112,7 @@ def test_levels_are_means_about_the_points_and_tell_what_clips(tmp_path: Path) -
         assert (found.mean[3, 0] > 1300) == clips
 
 
+@pytest.mark.slow
 def test_a_window_that_is_cut_by_the_frame_is_not_read(tmp_path: Path) -> None:
     """By a map of which a millimetre is a pixel."""
     lab = hang()

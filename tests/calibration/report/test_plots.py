@@ -270,6 +270,7 @@ def test_the_registered_chart_is_drawn_over_its_frame() -> None:
         assert len(crop.lines) == 2 * near.sum() > 40
 
 
+@pytest.mark.slow
 def test_worst_cells_are_drawn_in_the_order_of_their_unevenness() -> None:
     picture = np.random.default_rng(3).normal(500, 1, (400, 500, 3)).astype(np.float32)
     at = 4 * np.asarray(CHART.centres_mm) + 20

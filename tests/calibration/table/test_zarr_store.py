@@ -66,6 +66,7 @@ def test_there_and_back(lut: Lut, tmp_path: Path, place: str) -> None:
         fetch(url, tmp_path / "back")
 
 
+@pytest.mark.slow
 def test_one_light_a_chunk_and_32_an_object(lut: Lut, tmp_path: Path) -> None:
     publish(lut, str(tmp_path / "published"))
     described = json.loads((tmp_path / "published" / "zarr.json").read_text())
@@ -176,6 +177,7 @@ def test_a_published_truth_that_was_edited_is_refused(lut: Lut, tmp_path: Path) 
     assert not (tmp_path / "back").exists()
 
 
+@pytest.mark.slow
 def test_a_table_is_the_one_that_was_told_of(lut: Lut, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     url = str(tmp_path / "published")
     publish(lut, url)

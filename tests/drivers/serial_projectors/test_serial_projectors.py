@@ -163,6 +163,7 @@ class TestOverTheNetwork(ProjectorContract):
 
 
 @on_posix
+@pytest.mark.slow
 class TestOverAPseudoTerminal(ProjectorContract):
     @pytest.fixture(params=NAMES)
     def bench(self, request: pytest.FixtureRequest) -> Iterator[Bench]:

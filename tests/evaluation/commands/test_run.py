@@ -76,6 +76,7 @@ def test_estimates_of_another_program(thumbnails: Path, tmp_path: Path, capsys: 
     assert "Gray-world" not in out  # Nothing but what was asked for.
 
 
+@pytest.mark.slow
 def test_every_statistic_is_printed_on_request(thumbnails: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", str(thumbnails), "--methods", "white-patch", "--statistics", "all"]) == 0
     out = capsys.readouterr().out

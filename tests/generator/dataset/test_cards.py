@@ -200,6 +200,7 @@ def test_the_titles_lights_are_the_tables(plain: Dataset) -> None:
     assert "under 4 lights" in card(plain.description)
 
 
+@pytest.mark.slow
 def test_croissant_names_what_is_there(made: Dataset) -> None:
     """MLCommons Croissant 1.0: resources have their hash, fields a source that exists."""
     root = place_of(made)

@@ -226,6 +226,7 @@ class TestAskedForTwice:
         assert main(("lut", "pictures", "--sources", "pictures")) == 2
         assert "pictures already exists" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_of_another_table_too(
         self, lut: Lut, make_lut: Callable[..., Lut], capsys: pytest.CaptureFixture[str]
     ) -> None:

@@ -93,6 +93,7 @@ def test_the_kernel_has_the_transfer_that_is_stated() -> None:
         assert found == pytest.approx(stated, abs=0.005)
 
 
+@pytest.mark.slow
 def test_shoulders_spread_a_share_of_a_squares_light_as_the_profile_says() -> None:
     """Around a white square on black, against the profile integrated over the square's picture."""
     side, share, scale = 6.0, 0.1, 3.0
