@@ -81,7 +81,9 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(ROOT / name, folder / name, ignore=IGNORED)
         for data in (ROOT / name).rglob("data"):
             (folder / data.relative_to(ROOT)).symlink_to(data)
-    shutil.copy(ROOT / "pyproject.toml", folder)
+    (folder / "docs").mkdir()
+    for name in ("pyproject.toml", "docs/lab.md"):
+        shutil.copy(ROOT / name, folder / name)
     for example in EXAMPLES:
         for path, text in example.files().items():
             (folder / path).write_text(text, encoding="utf-8")
