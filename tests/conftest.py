@@ -52,7 +52,7 @@ def pytest_collection_finish() -> None:
 SLOW_FILE = re.compile(r"^pytestmark = (\[\s*)?pytest\.mark\.slow\b", re.MULTILINE)
 """What marks all tests of a file."""
 
-WHOLE_EXAMPLES, QUICK_EXAMPLES = 50, 20
+WHOLE_EXAMPLES, QUICK_EXAMPLES = 30, 12
 """Examples of each property in `make test`, others each time, and in `make quick`, whose properties took a third of a
 minute at a hundred; tests that need more say so."""
 
