@@ -102,10 +102,17 @@ def test_the_ground_truth_is_the_rooms_white(lut: Lut, built: Path) -> None:
     assert degrees.max() <= 0.5
 
 
-def test_a_generated_patch_has_the_tables_mean(lut: Lut, built: Path, pictures: Path, run: Run) -> None:
+@pytest.fixture(scope="module")
+def dataset(built: Path, pictures: Path, run: Run) -> Path:
+    """Return a dataset of the pictures under two lights."""
     out = built / "dataset"
     wish = ("--sources", pictures, "--illuminations", "3,5", "--seed", 4, "--rendering", "codes")
     assert run("generator.cli", built / "lut", out, *wish) == 0
+    return out
+
+
+def test_a_generated_patch_has_the_tables_mean(lut: Lut, dataset: Path) -> None:
+    out = dataset
     with (out / "ground_truth.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 4, "two pictures under two lights; the broken one is left out"
@@ -140,8 +147,8 @@ def test_the_same_seed_gives_the_same_bytes(built: Path, pictures: Path, run: Ru
     assert not set(images) & set(hashes[0].values())
 
 
-def test_the_dataset_can_be_evaluated(built: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("evaluation.cli", built / "dataset") == 0
+def test_the_dataset_can_be_evaluated(dataset: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("evaluation.cli", dataset) == 0
     assert "Gray-world" in capsys.readouterr().out
 
 

@@ -9,7 +9,8 @@ import pytest
 
 from drivers.raw.rawfile import camera_matrix as of_libraw
 from foundation.errors import InputError
-from generator.rendering.matrices import camera_matrix, cameras, choose_matrix
+from generator.rendering.matrices import camera_matrix, cameras, choose_matrix, fit_matrix
+from generator.rendering.print_profiles import PrintProfile
 from sim.world.sensors import BODIES, FACTS, Body
 
 
@@ -79,3 +80,18 @@ def test_files(tmp_path: Path) -> None:
             choose_matrix(str(path))
     with pytest.raises(InputError, match=r"'Pinhole' is neither a file nor a camera.*Canon EOS 550D"):
         choose_matrix("Pinhole")
+
+
+def test_a_matrix_is_fitted_between_the_print_s_black_and_its_paper() -> None:
+    rows = np.array([[0.7, 0.2, 0.1], [0.1, 0.8, 0.1], [0.05, 0.25, 0.7]])
+    black, paper = np.array([0.02, 0.03, 0.04]), np.array([0.9, 0.95, 0.85])
+    codes = np.array([(i >> 4, i >> 2 & 3, i & 3) for i in range(64)]) / 3
+    linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    colours = black + (paper - black) * (linear @ rows.T)
+    found, residual = fit_matrix(PrintProfile(colours, np.ones(64, np.bool_)))
+    np.testing.assert_allclose(found, rows, atol=1e-9)
+    assert residual == pytest.approx(0, abs=1e-5)
+    # Every colour off by as many degrees, about the grey axis, but for black and paper.
+    turned = colours + 0.05 * np.linalg.norm(colours, axis=1, keepdims=True) * np.array([1, 0, -1]) / np.sqrt(2)
+    turned[[0, -1]] = colours[[0, -1]]
+    assert 1 < fit_matrix(PrintProfile(turned, np.ones(64, np.bool_)))[1] < 4
