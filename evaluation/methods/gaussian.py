@@ -26,7 +26,7 @@ import numpy.typing as npt
 from llvmlite import ir
 
 from evaluation.scene import Image
-from foundation.compiled import compiled, intrinsic
+from foundation.compiled import compiled, inlined, intrinsic
 from generator.kernels.vector import ADDRESS, F32, FLOATS, I32, I64, LANES, LINE, broadcast, constant, load, store, void
 
 OUTPUTS: Final = 4
@@ -306,6 +306,21 @@ STRETCH: Final = 4 * 3 * CHUNK
 """Numbers of a row that are converted before they are transposed: 16 rows of them take 12 KB of the nearest cache."""
 
 
+@inlined
+def _convert(
+    values: npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64],
+    scale: float,
+    line: npt.NDArray[np.float32],
+) -> None:
+    """Write values (N,) times `scale` to `line` (N,) float32."""
+    if scale == 1:
+        for j in range(values.size):
+            line[j] = np.float32(values[j])
+    else:
+        for j in range(values.size):
+            line[j] = np.float32(values[j] * scale)
+
+
 @compiled
 def _turn_rows(
     image: npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64],
@@ -328,13 +343,7 @@ def _turn_rows(
         count = min(STRETCH, end - start)
         for row in range(GROUP):
             values = image[min(top + row, height - 1), start : start + count]
-            line = lines[row, :count]
-            if scale == 1:
-                for j in range(count):
-                    line[j] = np.float32(values[j])
-            else:
-                for j in range(count):
-                    line[j] = np.float32(values[j] * scale)
+            _convert(values, scale, lines[row, :count])
         for at in range(0, count, LANES):
             target = turned.ctypes.data + (start - 3 * left + at) * LINE
             transpose(lines.ctypes.data + at * _BYTES, STRETCH * _BYTES, target)
@@ -362,12 +371,7 @@ def _convert_row(
     values = image[min(y, height - 1), begin:end]
     before = begin - 3 * left
     inside = line[before : before + end - begin]
-    if scale == 1:
-        for j in range(values.size):
-            inside[j] = np.float32(values[j])
-    else:
-        for j in range(values.size):
-            inside[j] = np.float32(values[j] * scale)
+    _convert(values, scale, inside)
     for at in range(before):
         line[at] = inside[at % 3]
     for at in range(before + inside.size, line.size):
