@@ -75,7 +75,8 @@ def init(
     """
     from importlib.resources import files
 
-    from foundation.files import make_folder, require_free, write_whole
+    from foundation.files import make_folder, write_whole
+    from foundation.folders import require_free
 
     settings, print_folder, lights = lab / "LAB.toml", lab / "chart", lab / "illuminations.csv"
     require_free(settings, "the settings")
@@ -128,7 +129,7 @@ def chart(
     from experiment.chart.printing import save_pdf, save_preview, save_tiff
     from experiment.chart.proof import save_instructions, save_proof
     from experiment.framing.finding import small_parts_warning
-    from foundation.files import whole_folder
+    from foundation.folders import whole_folder
 
     if arrangement is Arrangement.PAPER:
         if cell_mm is not None:
@@ -194,7 +195,7 @@ def illuminations(
     from collections import Counter
 
     from experiment.lights import parse_ccts, plan_illuminations, plot_illuminations, save_illuminations
-    from foundation.files import require_free
+    from foundation.folders import require_free
 
     plot = out.with_suffix(".png")
     if plot == out:
@@ -432,7 +433,7 @@ def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) ->
     """
     from experiment.session.folder import busy_sentence, rebuild_journal
     from experiment.session.journal import JOURNAL_FILE
-    from foundation.files import held_folder
+    from foundation.folders import held_folder
 
     with held_folder(session, busy_sentence(session)):
         attempts = rebuild_journal(session)

@@ -36,15 +36,16 @@ import numpy.typing as npt
 import skimage.data
 
 from benchmarks import words_given
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, Provenance, open_lut
+from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
 from foundation.compiled import compiled
-from generator.kernels.choice import SCRATCH_BYTES, choose_group, row_keys
+from generator.kernels.choice import SCRATCH_BYTES, choose_group, prefetch_once, row_keys
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_planar
 from generator.kernels.printing import NODES, PrintedLight, draw_printed
 from generator.kernels.rendering import draw_mosaic, draw_samples
-from generator.kernels.vector import GROUP, LINE, copy8, offset_at, prefetch_once
+from generator.kernels.vector import GROUP, LINE, copy8, offset_at
 from generator.masks.making import parse_masks
 from generator.rendering.black_points import Veil, without_veil
 

@@ -21,14 +21,15 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, Provenance, open_lut
+from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
 from foundation.console import run
 from foundation.errors import DeviceError
 from generator.dataset.making import Workers, generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.lights.lighting import RandomLights
-from generator.pictures.sources import random_scenes
+from generator.pictures.random_scenes import random_scenes
 
 IMAGES = 10_000
 LIGHTS = 2

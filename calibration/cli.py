@@ -465,7 +465,7 @@ def _compare(
     from calibration.comparison.comparing import chart_of, compare, table_of
     from calibration.comparison.report import comparison_json, lines
     from experiment.chart.model import load_chart
-    from foundation.files import require_free
+    from foundation.folders import require_free
 
     if out is not None:
         require_free(out, "the comparison")

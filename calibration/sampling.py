@@ -22,7 +22,7 @@ import numpy.typing as npt
 from numpy import uint64
 
 from drivers.raw.rawfile import CHANNELS, Mosaic, phases
-from experiment.framing.pictures import MAX_BLUR_PX
+from experiment.framing.sharpness import MAX_BLUR_PX
 from foundation.compiled import compiled, inlined
 
 UNEVEN_SHARE = 0.01

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.dataset.making import Callbacks, Workers, generate_dataset
+    from generator.dataset.making import Workers, generate_dataset
     from generator.dataset.plan import DatasetOptions
     from generator.dataset.reader import open_dataset
+    from generator.dataset.shards import Callbacks
     from generator.files import flash
     from generator.kernels.mixing import mix_samples, mixed_table
     from generator.kernels.planar import draw_batch, draw_planar

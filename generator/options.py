@@ -110,7 +110,8 @@ class PictureOptions:
 
     def find(self, seed: int) -> tuple[Source, ...]:
         """Return the sources: pictures that are found, then random ones."""
-        from generator.pictures.sources import find_pictures, random_scenes
+        from generator.pictures.random_scenes import random_scenes
+        from generator.pictures.sources import find_pictures
 
         preparation = self.preparation(seed)
         places = self.sources or []
@@ -691,7 +692,7 @@ def _drawn(
 
 def _black_under(lut: Lut, light: int, rendered: DatasetOptions) -> BlackShares:
     """Return the print's black under a light of the table; a QualityError where it is as bright as half of white."""
-    from generator.dataset.making import rendering_of
+    from generator.dataset.shards import rendering_of
     from generator.lights.lighting import plain
     from generator.likeness.real_data import BlackShares
     from generator.rendering.black_points import veil_of
@@ -707,8 +708,8 @@ def _photograph(
     lut: Lut, light: int, rendered: DatasetOptions, seed: int, picture: npt.NDArray[np.uint8], number: int
 ) -> npt.NDArray[np.uint16]:
     """Return the raw image of a picture as the dataset renders it, under one of the table's lights."""
-    from generator.dataset.making import photograph
-    from generator.kernels.choice import replace_unfit_colours
+    from generator.dataset.shards import photograph
+    from generator.kernels.unfit import replace_unfit_colours
     from generator.lights.lighting import Lighting, plain
     from generator.pictures.sources import keep_bits
 

@@ -27,7 +27,8 @@ from calibration.pipeline.frames import ChartPoints, usable_means
 from calibration.radiometry.drift import corrections
 from calibration.radiometry.primaries import Primaries
 from calibration.sampling import Sites, gather, gather_values, patch_means
-from calibration.table.lut import REFERENCES, LutWriter, Provenance, Unfit, frames_sha256, references_csv
+from calibration.table.lut import REFERENCES, Provenance, Unfit, frames_sha256
+from calibration.table.writing import LutWriter, references_csv
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.chart.model import Chart
@@ -35,7 +36,7 @@ from experiment.lights import Illumination
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
 from foundation.compiled import ordered_map
 from foundation.errors import QualityError, StorageError
-from foundation.files import require_free, whole_folder
+from foundation.folders import require_free, whole_folder
 from foundation.version import software
 from sim.world.rendering import Print
 from sim.world.sensors import Body

@@ -26,7 +26,7 @@ from drivers.raw.rawfile import CHANNELS, CLIPPING_SHARE, Mosaic, frame_black, p
 from experiment.chart.model import Chart
 from experiment.framing.finding import MIN_MODULE_PX, Framing
 from experiment.framing.homography import project
-from experiment.framing.pictures import edge_blurs
+from experiment.framing.sharpness import edge_blurs
 from experiment.measures.sensor import HIGHEST, LOWEST, deviations
 from foundation.errors import DeviceError, StorageError, counted
 from foundation.robust import sigma_of

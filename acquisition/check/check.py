@@ -66,7 +66,7 @@ from drivers.raw.rawfile import frame_black
 from experiment.chart.model import Chart, load_chart
 from experiment.config import LabSettings
 from experiment.framing.field import Corners
-from experiment.framing.pictures import blur_px
+from experiment.framing.sharpness import blur_px
 from experiment.lights import Illumination, load_illuminations
 from experiment.measures.paper import Paper, PaperReader
 from experiment.measures.stains import Stains, find_stains

@@ -17,7 +17,7 @@ from acquisition.check.frames import ChartMeasurements, CheckFrames
 from acquisition.check.light_and_print import Spot, light_share
 from experiment.chart.model import Chart
 from experiment.framing.finding import annotated_png
-from experiment.framing.pictures import MAX_BLUR_PX
+from experiment.framing.sharpness import MAX_BLUR_PX
 
 COLOURS = {"fault": "#b42318", "remark": "#b54708", "not checked": "#667085", "good": "#027a48"}
 """Of the grades: dark enough to be read on white."""

@@ -22,7 +22,7 @@ therefore has an uncertainty, which is large before the response frames, and hon
 
 Sources: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 2.22 to 2.26 (tone
 curves are Gaussian processes on nodes); Kalman's filter in Joseph's form with a linearised overlap (extended). Overlap
-as in `calibration.checks.light_codes`: functions of the least of two and of three codes.
+as in `calibration.checks.projector_model`: functions of the least of two and of three codes.
 
 T tiles, S strips.
 """

@@ -67,7 +67,8 @@ from drivers.camera import Camera
 from drivers.presenter import BLACK, Colour, Presenter
 from drivers.projector import Power, Projector, ReportsPictureFault, Severity
 from experiment.config import CameraSettings, LabSettings, ProjectorCable, SequenceSettings
-from experiment.session.journal import HeldJournalError, LostJournalError
+from experiment.session.journal import LostJournalError
+from experiment.session.opening import HeldJournalError
 from experiment.session.records import duration_text
 from foundation import errors
 from foundation.clock import Clock, elapsed_s

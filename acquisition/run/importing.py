@@ -23,7 +23,8 @@ from experiment.lights import Illumination, load_illuminations
 from experiment.session.folder import FRAME_COLUMNS, Session
 from experiment.session.records import ACCEPTED, REFUSED, FrameKind, Judgement, SessionStep
 from foundation.errors import FormatError
-from foundation.files import file_sha256, read_csv, require_free
+from foundation.files import file_sha256, read_csv
+from foundation.folders import require_free
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,8 @@ from calibration.comparison.comparing import (
 )
 from experiment.chart.model import Chart
 from foundation.errors import first_of
-from foundation.files import whole_folder, write_whole
+from foundation.files import write_whole
+from foundation.folders import whole_folder
 from foundation.pages import figure, heading, note, page, table, verdict
 from foundation.plots import FAINT, INK, MARK, draw_squares, png_of
 from foundation.records import to_plain

@@ -18,20 +18,15 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
-import shutil
-import zipfile
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import Figure
@@ -45,6 +40,7 @@ from calibration.pipeline.baseline import (
     with_primaries,
     with_superposition,
 )
+from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
 from calibration.pipeline.collecting import check_figures, read_linearity, table_figures
 from calibration.pipeline.frames import (
     PAPER_OPTIONS,
@@ -69,13 +65,11 @@ from calibration.table.lut import (
     REPORT_JSON,
     REPORT_PAGE,
     REPORT_VERSION,
-    SAMPLES,
     UNCERTAINTY,
-    LutWriter,
     Provenance,
     frames_sha256,
-    references_csv,
 )
+from calibration.table.writing import LutWriter, references_csv
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
 from experiment.framing.finding import annotated_png
 from experiment.framing.pictures import Shift
@@ -83,16 +77,7 @@ from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.compiled import processor_count
 from foundation.errors import CropError, FormatError, QualityError, RegistrationError, counted, first_of
-from foundation.files import (
-    clear_folder,
-    held_folder,
-    partial_path,
-    publish_folder,
-    require_free,
-    storage_error,
-    sync_folder,
-    write_whole,
-)
+from foundation.files import write_whole
 from foundation.records import to_plain
 from foundation.version import software
 
@@ -105,11 +90,6 @@ CHECKPOINT_EVERY = 16
 METHOD = 17
 """Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods."""
 
-CHECKPOINT = "checkpoint.npz"
-"""Name of the checkpoint in the hidden folder."""
-
-_TEXT = "text"
-"""Name of the array that holds all that is no array, as JSON."""
 
 MOST_THREADS = 8
 """Each thread holds a raw file and its counts, 110 MB for a 6D Mark II: more would not stay below 2 GB."""
@@ -464,92 +444,3 @@ def _writer(
             return writer, stored
     unfinished.begin_anew()
     return LutWriter(unfinished.folder, *shape), None
-
-
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """How far a table has come.
-
-    - `identity`: what it is made of and by what; a build goes on from a checkpoint of the same identity only.
-    - `frames`: what names each frame taken in, in their order.
-    - `values`: anything JSON can hold; numbers are restored to the last bit.
-    - `arrays`: arrays of plain numbers, by name.
-    """
-
-    identity: dict[str, Any]
-    frames: list[str]
-    values: dict[str, Any]
-    arrays: dict[str, npt.NDArray[Any]]
-
-
-class UnfinishedTable:
-    """The hidden folder of a table that is being made; made by `unfinished_table`."""
-
-    def __init__(self, folder: Path, out: Path) -> None:
-        self.folder = folder
-        self.out = out
-        self._keep = True
-
-    def load(self, identity: dict[str, Any], frames: list[str]) -> Checkpoint | None:
-        """Return how far an earlier program came; None where there is no checkpoint, or it was made of something else.
-
-        A build goes on from a checkpoint of the same identity that took in the first of its `frames`.
-        """
-        if not (self.folder / SAMPLES).is_file():
-            return None
-        try:
-            with np.load(self.folder / CHECKPOINT, allow_pickle=False) as stored:
-                arrays: dict[str, npt.NDArray[Any]] = {name: stored[name] for name in stored.files}
-            text = json.loads(arrays.pop(_TEXT).tobytes())
-            found = Checkpoint(text["identity"], text["frames"], text["values"], arrays)
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
-            return None
-        began = bool(found.frames) and found.frames == frames[: len(found.frames)]
-        return found if began and found.identity == identity else None
-
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Replace the checkpoint."""
-        content = {"identity": checkpoint.identity, "frames": checkpoint.frames, "values": checkpoint.values}
-        text = np.frombuffer(json.dumps(content).encode(), dtype=np.uint8)
-        stream = io.BytesIO()
-        np.savez(stream, allow_pickle=False, **{**checkpoint.arrays, _TEXT: text})
-        write_whole(self.folder / CHECKPOINT, stream.getvalue())
-
-    def begin_anew(self) -> None:
-        """Empty the folder."""
-        clear_folder(self.folder)
-
-    def discard(self) -> None:
-        """Leave nothing behind when the block ends, since going on would lead to the same end."""
-        self._keep = False
-
-    def publish(self) -> None:
-        """Give the table its final name."""
-        require_free(self.out, "the table")
-        try:
-            (self.folder / CHECKPOINT).unlink(missing_ok=True)
-            sync_folder(self.folder)
-        except OSError as error:
-            raise storage_error(self.out, error) from error
-        publish_folder(self.folder, self.out, "the table")
-
-    @property
-    def worth_keeping(self) -> bool:
-        """Whether a later program could go on from here."""
-        return self._keep and (self.folder / CHECKPOINT).is_file()
-
-
-@contextmanager
-def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
-    """Open, or make, the hidden folder of the table `out`; what is not published stays if it holds a checkpoint."""
-    require_free(out, "the table")
-    folder = partial_path(out)
-    busy = f"{out} is being made by another program; wait for it, or name another place"
-    with held_folder(folder, busy, of=out):
-        unfinished = UnfinishedTable(folder, out)
-        try:
-            yield unfinished
-        finally:
-            if folder.is_dir() and not unfinished.worth_keeping:
-                with contextlib.suppress(OSError):
-                    shutil.rmtree(folder)

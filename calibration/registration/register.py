@@ -28,7 +28,7 @@ from experiment.chart.model import Chart
 from experiment.framing.field import SIDE_POINTS, FoundField, field_mm, refine_edges
 from experiment.framing.finding import MIN_CELL_PX, Framing, find_chart
 from experiment.framing.homography import rms
-from experiment.framing.pictures import blur_px
+from experiment.framing.sharpness import blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
 

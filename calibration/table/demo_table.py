@@ -9,7 +9,8 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from foundation.errors import InputError, StorageError
-from foundation.files import cache_folder, sha256_of
+from foundation.files import sha256_of
+from foundation.folders import cache_folder
 from foundation.version import software
 
 DEMO: Final = "demo:"
@@ -26,7 +27,7 @@ BITS: Final = 4
 def table_folder(given: Path, cache: Path | None = None) -> Path:
     """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there.
 
-    `cache`: where the table is kept; None for `foundation.files.cache_folder`.
+    `cache`: where the table is kept; None for `foundation.folders.cache_folder`.
     """
     if str(given) != DEMO:
         return given

@@ -1,4 +1,4 @@
-"""The look-up table on disk: written whole with its description, and opened for reading.
+"""The look-up table on disk: what lies in it, and how it is opened for reading.
 
 A LUT folder holds `samples.npy` (uint16 little-endian, C order, [light, colour, sample, RGB]), `illuminations.csv`
 (the lights and their ground truth), `lut.json` (provenance), `frames.csv` (the frames it was made from), and
@@ -20,13 +20,11 @@ import csv
 import hashlib
 import io
 import math
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
@@ -34,8 +32,8 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from calibration.citation import OriginRecord
-from experiment.lights import COLUMNS, NAME, Illumination, load_illuminations
-from foundation.errors import FormatError, InputError, StorageError, kind_of
+from experiment.lights import Illumination, load_illuminations
+from foundation.errors import FormatError, InputError, kind_of
 from foundation.files import (
     file_sha256,
     partial_path,
@@ -43,8 +41,6 @@ from foundation.files import (
     reading_error,
     require_plain_folder,
     sha256_of,
-    storage_error,
-    write_whole,
 )
 from foundation.records import Record, from_json
 
@@ -247,17 +243,6 @@ def frames_sha256(frames: Sequence[SourceFrame]) -> str:
     """Return the hash that names a session: SHA-256 over kind, light and hash of each frame used, a line each."""
     lines = [f"{frame.kind},{frame.illumination},{frame.sha256}\n" for frame in frames]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
-
-
-def frames_csv(frames: Sequence[SourceFrame]) -> str:
-    """Return the text of `frames.csv`."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(FRAME_FIELDS)
-    for frame in frames:
-        illumination = "" if frame.illumination is None else frame.illumination
-        writer.writerow([frame.kind, illumination, frame.file, frame.sha256])
-    return text.getvalue()
 
 
 def load_frames(path: Path) -> tuple[SourceFrame, ...]:
@@ -595,138 +580,3 @@ def require_lut(given: object) -> None:
     """Refuse what is no table, such as the path of one, or a picture in its place."""
     if not isinstance(given, Lut):
         raise InputError(f"the table is {kind_of(given)}, expected a Lut, which open_lut(FOLDER) returns, as first")
-
-
-class LutWriter:
-    """Fills a new LUT folder light by light; the folder is the caller's to rename into place.
-
-    The samples' whole size is claimed at the start, so that a full disk is met before the work and not in its midst.
-
-    `sha256`: SHA-256 of the samples of each light that was put, by its number.
-    """
-
-    def __init__(
-        self, folder: Path, lights: int, colours: int, samples: int, written: dict[int, str] | None = None
-    ) -> None:
-        self._folder = folder
-        self._path = folder / SAMPLES
-        self._shape = (lights, colours, samples, 3)
-        self._size = colours * samples * 6
-        self.sha256: dict[int, str] = dict(written or {})
-        header = io.BytesIO()
-        np.lib.format.write_array_header_1_0(header, {"descr": "<u2", "fortran_order": False, "shape": self._shape})
-        self._offset = len(header.getvalue())
-        try:
-            with self._path.open("wb" if written is None else "r+b") as stream:
-                stream.write(header.getvalue())
-                stream.flush()
-                os.posix_fallocate(stream.fileno(), self._offset, lights * self._size)
-        except OSError as error:
-            raise storage_error(self._path, error) from error
-
-    def put(self, light: int, samples: npt.NDArray[np.uint16]) -> None:
-        """Store the samples (colours, samples, 3) uint16 of light number `light`."""
-        data = np.ascontiguousarray(np.broadcast_to(samples, self._shape[1:]), dtype="<u2").tobytes()
-        try:
-            with self._path.open("r+b") as stream:
-                stream.seek(self._offset + light * self._size)
-                stream.write(data)
-        except OSError as error:
-            raise storage_error(self._path, error) from error
-        self.sha256[light] = sha256_of(data)
-
-    def get(self, light: int) -> npt.NDArray[np.uint16]:
-        """Return the samples (colours, samples, 3) uint16 that were put for light number `light`, from the disk."""
-        return np.array(np.load(self._path, mmap_mode="r", allow_pickle=False)[light])
-
-    def flush(self) -> None:
-        """Wait until the disk holds what was put (`fsync`)."""
-        try:
-            with self._path.open("r+b") as stream:
-                os.fsync(stream.fileno())
-        except OSError as error:
-            raise storage_error(self._path, error) from error
-
-    def damaged(self) -> list[int]:
-        """Return the lights whose samples on the disk are not what was put."""
-        samples = np.load(self._path, mmap_mode="r", allow_pickle=False)
-        return [light for light, known in self.sha256.items() if light_sha256(samples[light]) != known]
-
-    def finish(
-        self,
-        illuminations: Sequence[Illumination],
-        white: npt.NDArray[np.float64],
-        provenance: Provenance,
-        frames: Sequence[SourceFrame] = (),
-        files: Mapping[str, str] = MappingProxyType({}),
-    ) -> None:
-        """Write the frames, the ground truth, the hashes and the provenance; after this the folder is a table.
-
-        A report of the table must be in the folder by now: its hash is written too.
-
-        `white`: (L, 3) float64, the ground truth.
-        """
-        self.flush()
-        whole, lights = samples_sha256(self._path, np.load(self._path, mmap_mode="r", allow_pickle=False))
-        lost = [light for light, known in self.sha256.items() if lights[light] != known]
-        if lost:
-            raise StorageError(
-                f"{self._path}: the samples of lights {', '.join(map(str, lost[:10]))} read back are not those "
-                "written; check the disk, then build the table on another"
-            )
-        truth = _ground_truth_csv(illuminations, white)
-        write_whole(self._folder / ILLUMINATIONS, truth)
-        if frames:
-            write_whole(self._folder / FRAMES, frames_csv(frames))
-        for name, text in files.items():
-            write_whole(self._folder / name, text)
-        hashes = {
-            "files_sha256": {name: sha256_of(text.encode()) for name, text in files.items()},
-            "samples_sha256": whole,
-            "illuminations_sha256": sha256_of(truth.encode()),
-            "lights_sha256": lights,
-            "has_sums": True,
-        }
-        described = provenance.model_copy(update=hashes).to_json()
-        write_whole(self._folder / SUMS, sums_of(self._folder, whole, sha256_of(described.encode())))
-        write_whole(self._folder / PROVENANCE, described)
-
-
-def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[np.float64]) -> str:
-    """Return the text of `illuminations.csv`: the lights with their whites (L, 3), six decimals."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    named = any(light.name is not None for light in illuminations)
-    writer.writerow([*COLUMNS, *WHITE_COLUMNS, *([NAME] if named else [])])
-    for light, values in zip(illuminations, white, strict=True):
-        writer.writerow(
-            [
-                light.index,
-                light.kind,
-                "" if light.cct_k is None else f"{light.cct_k:g}",
-                *light.colour,
-                *(f"{value:.6f}" for value in values),
-                *([light.name or ""] if named else []),
-            ]
-        )
-    return text.getvalue()
-
-
-def references_csv(names: Sequence[str], white: _Array, white_error: _Array, greys: _Array, errors: _Array) -> str:
-    """Return the text of `references.csv`: every light's white, then its greys.
-
-    `white`, `white_error`: (L, 3), units of the samples. `greys`, `errors`: (L, G, 3), the same units; NaN is left
-    empty.
-    """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(REFERENCE_COLUMNS)
-
-    def row(light: int, name: str, value: _Array, error: _Array) -> None:
-        writer.writerow([light, name, *("" if np.isnan(v) else f"{v:.6f}" for v in (*value.tolist(), *error.tolist()))])
-
-    for light in range(len(white)):
-        row(light, "white", white[light], white_error[light])
-        for number, name in enumerate(names):
-            row(light, name, greys[light, number], errors[light, number])
-    return text.getvalue()

@@ -56,15 +56,8 @@ from calibration.table.lut import (
 )
 from experiment.lights import load_illuminations
 from foundation.errors import CropError, FormatError, InputError, StorageError
-from foundation.files import (
-    file_sha256,
-    parse_json_object,
-    require_free,
-    require_plain_tree,
-    storage_error,
-    whole_folder,
-    write_whole,
-)
+from foundation.files import file_sha256, parse_json_object, require_plain_tree, storage_error, write_whole
+from foundation.folders import require_free, whole_folder
 
 FORMAT: Final = "crop.lut.published"
 

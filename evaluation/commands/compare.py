@@ -67,7 +67,7 @@ def compare(
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.files import read_errors
     from foundation.errors import InputError
-    from foundation.files import require_free
+    from foundation.folders import require_free
 
     if len(results) > 2:
         raise InputError(f"{len(results)} results; compare two, or the methods of one")

@@ -74,7 +74,8 @@ def cv(
     from evaluation.results.tables import summary_table
     from foundation.compiled import processor_count
     from foundation.console import orderly_end
-    from foundation.files import require_free, require_free_file, write_whole
+    from foundation.files import write_whole
+    from foundation.folders import require_free, require_free_file
 
     require_order("cv", method, data)
     others, left_out = choose_beside_constant(method)

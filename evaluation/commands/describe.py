@@ -58,7 +58,8 @@ def describe(
     from evaluation.reports.table_output import show_notes, show_tables
     from foundation.compiled import processor_count
     from foundation.errors import InputError
-    from foundation.files import require_free_file, write_whole
+    from foundation.files import write_whole
+    from foundation.folders import require_free_file
 
     for path, what in ((out, "the statistics"), (report, "the page")):
         if path is not None:

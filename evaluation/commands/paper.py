@@ -435,7 +435,7 @@ def _numbers(text: str, what: str, most: float) -> list[float]:
 
 def _require_free(out: Path | None) -> None:
     """Refuse a folder that is taken before the work begins."""
-    from foundation.files import require_free
+    from foundation.folders import require_free
 
     if out is not None:
         require_free(out, "the report")

@@ -43,7 +43,7 @@ def pool(
     from evaluation.experiments.pool import make_tables, pool_transfers, read_transfer, save_pool
     from evaluation.reports.table_output import show_notes, show_tables
     from foundation.errors import InputError
-    from foundation.files import require_free
+    from foundation.folders import require_free
 
     if out is not None:
         require_free(out, "the results")

@@ -104,7 +104,7 @@ def run(
 
 def _require_free(csv: Path | None, images: Path | None, out: Path | None) -> None:
     from foundation.errors import InputError
-    from foundation.files import require_free, require_free_file
+    from foundation.folders import require_free, require_free_file
 
     for path, what in ((csv, "the table"), (images, "the images' errors")):
         if path is not None:

@@ -60,7 +60,7 @@ def train(
     from foundation.clock import SystemClock
     from foundation.compiled import processor_count
     from foundation.errors import InputError
-    from foundation.files import require_free_file
+    from foundation.folders import require_free_file
 
     require_order("train", method, data)
     learners = choose_learners([method])

@@ -137,7 +137,7 @@ def transfer(
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
     from foundation.compiled import processor_count
-    from foundation.files import require_free
+    from foundation.folders import require_free
 
     if out is not None:
         require_free(out, "the results")

@@ -53,7 +53,8 @@ def tune(
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.tables import table_to_csv
     from foundation.compiled import processor_count
-    from foundation.files import require_free_file, write_whole
+    from foundation.files import write_whole
+    from foundation.folders import require_free_file
 
     settings_of(family)  # A family that is none is told before a data set is opened.
     if out is not None:

@@ -30,7 +30,7 @@ from evaluation.results.tables import PAPER_COLUMNS, Table, table_to_csv
 from foundation import pages
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted
-from foundation.files import whole_folder
+from foundation.folders import whole_folder
 from foundation.plots import FAINT, INK, SERIES, svg_of
 
 FLOOR_DEG: Final = 0.01

@@ -51,7 +51,8 @@ from evaluation.results.result import Result
 from evaluation.results.tables import Cell, Table, table_to_csv
 from foundation import pages
 from foundation.errors import FormatError, InputError, counted, first_of
-from foundation.files import read_csv, whole_folder, write_whole
+from foundation.files import read_csv, write_whole
+from foundation.folders import whole_folder
 from foundation.plots import standalone
 from foundation.version import software
 

@@ -38,16 +38,8 @@ from evaluation.results.tables import lights_tables, statistics_rows, summary_ta
 from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.compiled import ordered_map
 from foundation.errors import InputError, first_of
-from foundation.files import (
-    clear_folder,
-    held_folder,
-    make_folder,
-    partial_path,
-    publish_folder,
-    require_free,
-    storage_error,
-    write_whole,
-)
+from foundation.files import make_folder, partial_path, storage_error, write_whole
+from foundation.folders import clear_folder, held_folder, publish_folder, require_free
 from foundation.records import from_plain, to_plain
 from foundation.version import software
 

@@ -28,7 +28,8 @@ from evaluation.methods.method import Method
 from evaluation.scene import Scene, SceneSet
 from foundation.clock import Clock
 from foundation.errors import FormatError, InputError
-from foundation.files import require_free_file, sha256_of, whole_file
+from foundation.files import sha256_of, whole_file
+from foundation.folders import require_free_file
 from foundation.records import from_plain, to_plain
 from foundation.version import software
 

@@ -29,7 +29,6 @@ from experiment.chart.model import Chart, load_chart
 from experiment.lights import Illumination, load_illuminations, save_illuminations
 from experiment.session.journal import (
     JOURNAL_FILE,
-    MOST_BYTES,
     PATIENCE_S,
     IncomingFile,
     Journal,
@@ -41,6 +40,7 @@ from experiment.session.journal import (
     time_text,
     without_journal,
 )
+from experiment.session.opening import MOST_BYTES
 from experiment.session.records import AcceptedFile, FrameRecord, SessionStep
 from experiment.session.repair import (
     BAD,
@@ -51,18 +51,8 @@ from experiment.session.repair import (
     unsound_files,
 )
 from foundation.errors import FormatError, InputError, StorageError
-from foundation.files import (
-    held_folder,
-    is_partial,
-    read_text,
-    reading_error,
-    require_free,
-    require_plain_folder,
-    storage_error,
-    unmounted_at,
-    whole_folder,
-    write_whole,
-)
+from foundation.files import is_partial, read_text, reading_error, require_plain_folder, storage_error, write_whole
+from foundation.folders import held_folder, require_free, unmounted_at, whole_folder
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""

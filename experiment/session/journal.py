@@ -33,16 +33,12 @@ Sources: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvant
 from __future__ import annotations
 
 import base64
-import errno
-import fcntl
 import json
 import logging
 import os
 import shlex
-import shutil
 import sqlite3
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -50,11 +46,26 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeVar, cast
-from urllib.parse import quote
 
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.session.heartbeat import INVENTED_NUMBERS, Heartbeat, Process, RunState, SessionPlace, file_system_of
+from experiment.session.opening import (
+    JOURNAL_VERSION,
+    Retry,
+    beside,
+    close_after_run,
+    connect_to_read,
+    connect_to_write,
+    create_file,
+    is_busy,
+    open_for_run,
+    open_to_read,
+    reading_fault,
+    restoring,
+    set_aside,
+    writing_error,
+)
 from experiment.session.records import (
     ACCEPTED,
     FAILED,
@@ -71,14 +82,12 @@ from experiment.session.records import (
     SessionEvent,
     SessionStep,
 )
-from foundation.errors import RUN_AGAIN, DeviceError, FormatError, InputError, StorageError, counted
+from foundation.errors import DeviceError, FormatError, StorageError, counted
 from foundation.files import (
-    disk_remedy_of,
     is_inside_name,
     open_inside,
     partial_path,
     reading_error,
-    require_plain_folder,
     storage_error,
     stream_sha256,
     sync_folder,
@@ -164,9 +173,7 @@ class Journal:
     `retry`: with which other programs are waited for; None for a reader, for whom SQLite waits.
     """
 
-    def __init__(
-        self, path: Path, connection: sqlite3.Connection, version: int, retry: _LockRetry | None = None
-    ) -> None:
+    def __init__(self, path: Path, connection: sqlite3.Connection, version: int, retry: Retry | None = None) -> None:
         self.path = path
         self._connection = connection
         self._version = version
@@ -208,7 +215,7 @@ class Journal:
             connection.execute("BEGIN")
             _insert_rows(connection, rows)
         Journal.open(copy).close()
-        _set_aside(path)
+        set_aside(path)
         copy.replace(path)
         sync_folder(path.parent)
 
@@ -217,7 +224,7 @@ class Journal:
         try:
             rows = self._retry.run(lambda: rows_of(self._connection))
         except sqlite3.DatabaseError as error:
-            raise _reading_fault(self.path, error) from error
+            raise reading_fault(self.path, error) from error
         self._ledger = _Ledger(ledger, rows)
         self._guard = _JournalGuard(self.path, self._ledger)
 
@@ -232,7 +239,7 @@ class Journal:
         if self._ledger is not None:
             self._ledger.close()
         if self._writes:
-            _close_after_run(self._connection)
+            close_after_run(self._connection)
         else:
             self._connection.close()
 
@@ -465,7 +472,7 @@ class Journal:
         try:
             return self._retry.run(lambda: self._connection.execute(query, values).fetchall())
         except sqlite3.DatabaseError as error:
-            raise _reading_fault(self.path, error) from error
+            raise reading_fault(self.path, error) from error
 
     @contextmanager
     def _writing(self) -> Generator[_Change]:
@@ -494,7 +501,7 @@ class Journal:
                 self._ledger.keep()
             raise
         except sqlite3.DatabaseError as error:
-            raise _writing_error(self.path, error) from error
+            raise writing_error(self.path, error) from error
         finally:
             with suppress(sqlite3.Error):
                 if self._connection.in_transaction:
@@ -536,12 +543,12 @@ def _has_size(path: Path, size: int) -> bool:
 def without_journal(folder: Path) -> str:
     """Return what is said, and what helps, where a session's journal is gone."""
     path = folder / JOURNAL_FILE
-    return f"{folder} holds the frames of a session, and its journal {path.name} is gone; {_restoring(path)}"
+    return f"{folder} holds the frames of a session, and its journal {path.name} is gone; {restoring(path)}"
 
 
 def beat_beside(path: Path, state: RunState, sentence: str, until: datetime) -> None:
     """Give a sign of life from another thread than the one that has the journal open; none where that fails."""
-    with suppress(sqlite3.Error), closing(_connect_to_write(path)) as connection:
+    with suppress(sqlite3.Error), closing(connect_to_write(path)) as connection:
         connection.execute("BEGIN IMMEDIATE")
         _put_beat(connection, path, state, sentence, until)
         connection.execute("COMMIT")
@@ -653,11 +660,11 @@ class _JournalGuard:
     def require_whole(self) -> None:
         """Raise `LostJournalError` where the journal, as everybody else reads it, does not hold what the run wrote."""
         try:
-            with closing(_connect_to_read(self._path)) as connection:
+            with closing(connect_to_read(self._path)) as connection:
                 sound = connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
                 same = sound and rows_of(connection) == self._ledger.rows()
         except sqlite3.DatabaseError as error:
-            fault = _reading_fault(self._path, error)
+            fault = reading_fault(self._path, error)
             if isinstance(fault, StorageError):
                 raise fault from error
             same = False
@@ -683,98 +690,6 @@ class _JournalGuard:
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
-JOURNAL_VERSION = 2
-"""`PRAGMA user_version` of the journals that this software writes (docs/formats.md); version 1 is read."""
-
-_READABLE = (1, JOURNAL_VERSION)
-"""Versions that can be read; a run brings the older one up to date by adding what is missing."""
-
-TRY_S = 1.0
-"""How long SQLite itself waits for another program before it gives the control back: as long as Ctrl-C may wait."""
-
-READING_LIMIT_S = 10.0
-"""How long a reader waits where the journal is not in write-ahead mode: a commit takes milliseconds, a disk may stall
-for seconds."""
-
-_MOST_VALUE_BYTES: Final = 64 << 20
-"""Longest text, blob or row that SQLite makes of a journal: what the judge keeps of a frame is some 100 kilobytes."""
-
-MOST_BYTES: Final = {"chart.json": 256 << 20, "illuminations.csv": 16 << 20, "session.toml": 1 << 20}
-"""Largest sizes of what is read whole beside a journal: forty times those of 707 lights and 32 768 colours."""
-
-_VERSION_1 = """
-CREATE TABLE attempts (
-    id INTEGER PRIMARY KEY,
-    step INTEGER NOT NULL,
-    kind TEXT NOT NULL,
-    illumination INTEGER,
-    file TEXT NOT NULL,
-    started_at TEXT NOT NULL,
-    ended_at TEXT,
-    taken_at TEXT,
-    exposure_s REAL,
-    size INTEGER,
-    sha256 TEXT,
-    verdict TEXT,
-    reason TEXT NOT NULL DEFAULT ''
-);
-CREATE TABLE plan (
-    step INTEGER PRIMARY KEY, kind TEXT NOT NULL, illumination INTEGER,
-    red INTEGER NOT NULL, green INTEGER NOT NULL, blue INTEGER NOT NULL
-);
-CREATE TABLE events (id INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, detail TEXT NOT NULL);
-"""
-
-_VERSION_2 = """
-CREATE TABLE IF NOT EXISTS checks (
-    attempt INTEGER NOT NULL, position INTEGER NOT NULL, name TEXT NOT NULL,
-    value REAL, low REAL, high REAL, unit TEXT NOT NULL, reason TEXT NOT NULL,
-    PRIMARY KEY (attempt, position)
-);
-CREATE TABLE IF NOT EXISTS measurements (
-    attempt INTEGER PRIMARY KEY, red REAL, green REAL, blue REAL, data BLOB NOT NULL,
-    voids INTEGER NOT NULL, lasting INTEGER NOT NULL
-);
-CREATE TABLE IF NOT EXISTS timings (
-    attempt INTEGER NOT NULL, name TEXT NOT NULL, seconds REAL NOT NULL, PRIMARY KEY (attempt, name)
-);
-CREATE TABLE IF NOT EXISTS heartbeat (
-    id INTEGER PRIMARY KEY CHECK (id = 1), at TEXT NOT NULL, pid INTEGER NOT NULL, started TEXT NOT NULL,
-    host TEXT NOT NULL, boot TEXT NOT NULL, state TEXT NOT NULL, sentence TEXT NOT NULL, until TEXT NOT NULL
-);
-CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
-"""
-
-_CANNOT_IN_PLACE = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
-"""What SQLite answers where it would have to write in order to read."""
-
-_NO_LOCKS = {errno.ENOLCK, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EBADF}
-"""What a file system answers that has no locks (fcntl(2); Lustre, FUSE, NFS without its lock service)."""
-
-_READABLE_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
-"""Faults of a disk that can be read all the same."""
-
-_SIDE_FILES = ("-wal", "-shm", "-journal")
-"""What SQLite keeps beside a journal, by suffix."""
-
-_PROBE_BYTES = 65536
-"""As much as a commit writes, with the pages of its log."""
-
-_NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "ceph", "fuse.glusterfs", "lustre"}
-"""File systems on which several machines work and share no memory, as /proc/self/mounts names them."""
-
-
-def _restoring(path: Path) -> str:
-    """Return what helps where a journal is damaged or gone."""
-    # A disk that does not tell has a fault of its own, which is said before this.
-    if os.path.isfile(path.with_name("ledger.jsonl")):  # noqa: PTH113 - it never raises
-        return f"acquire rebuild {shlex.quote(str(path.parent))} makes it anew from ledger.jsonl"
-    return "restore it from a copy"
-
-
-class HeldJournalError(StorageError):
-    """Another program held the journal for as long as a write waits: waiting once more would only double that."""
-
 
 class LostJournalError(StorageError):
     """The journal that a run has open is not the one on the disk any more: waiting does not bring it back."""
@@ -795,459 +710,11 @@ class _LockRetry:
             try:
                 return attempt()
             except sqlite3.OperationalError as error:
-                if not _is_busy(error) or time.monotonic() - begun >= self._seconds:
+                if not is_busy(error) or time.monotonic() - begun >= self._seconds:
                     raise
                 if not announced:
                     self._announce(f"another program holds {self._path}; the run goes on when it has finished")
                     announced = True
-
-
-def _is_busy(error: sqlite3.DatabaseError) -> bool:
-    """Return whether another program holds the journal, so that waiting helps."""
-    return _primary_code(error) == sqlite3.SQLITE_BUSY
-
-
-def create_file(path: Path) -> sqlite3.Connection:
-    """Return a connection to a new journal with its tables and nothing in them."""
-    try:
-        connection = _connect(path, "rwc")
-        _execute_all(connection, _VERSION_1 + _VERSION_2, JOURNAL_VERSION)
-    except sqlite3.DatabaseError as error:
-        raise StorageError(f"cannot write {path}: {error}; free space or choose another disk") from error
-    return connection
-
-
-def _connect_to_read(path: Path) -> sqlite3.Connection:
-    """Return a connection that cannot write to a journal that this program has open and trusts."""
-    return _connect(path, "ro")
-
-
-def _connect_to_write(path: Path) -> sqlite3.Connection:
-    """Return one more connection to a journal that this program has open, for another thread."""
-    return _connect(path, "rw")
-
-
-def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
-    """Return a connection that cannot write, and the journal's version."""
-    require_plain_folder(path.parent, MOST_BYTES)
-    try:
-        # A run has all three; without the third nobody is at work, and reading in place would make it.
-        if _is_write_ahead(path) and not beside(path, "-shm").exists():
-            connection = _copied(path)
-        else:
-            connection = _opened_or_copied(path)
-        return connection, _checked(path, connection)
-    except (OSError, sqlite3.DatabaseError) as error:
-        raise _reading_fault(path, error) from error
-
-
-def open_for_run(path: Path, retry: _LockRetry) -> sqlite3.Connection:
-    """Return a connection that writes, after bringing the journal up to this version and into write-ahead mode.
-
-    The caller holds the session's folder, so that no other run is at work. Who else writes is waited for.
-    """
-    require_plain_folder(path.parent, MOST_BYTES)
-    try:
-        connection = retry.run(lambda: _connect(path, "rw"))
-        version = retry.run(lambda: _checked(path, connection))
-    except (OSError, sqlite3.DatabaseError) as error:
-        raise _reading_fault(path, error) from error
-    try:
-        with suppress(OSError):  # Left by a run that was killed while it made a copy.
-            partial_path(path).unlink(missing_ok=True)
-        if not _on_network(path):
-            connection = _in_write_ahead(path, connection, retry)
-        if version < JOURNAL_VERSION:
-            retry.run(lambda: _execute_all(connection, _VERSION_2, JOURNAL_VERSION))
-    except OSError as error:
-        connection.close()
-        raise storage_error(path, error) from error
-    except sqlite3.DatabaseError as error:
-        connection.close()
-        raise _writing_error(path, error) from error
-    return connection
-
-
-def _close_after_run(connection: sqlite3.Connection) -> None:
-    """Put the journal back to one file unless somebody reads it, and close it; a second call does nothing."""
-    try:
-        connection.execute("PRAGMA journal_mode = DELETE").fetchall()
-    except sqlite3.Error:
-        pass  # Somebody reads it, the disk is gone, or it is closed: the next run or reader copes with what is there.
-    finally:
-        connection.close()
-
-
-def _set_aside(path: Path) -> None:
-    """Give a journal that is not to be used any more, and what SQLite keeps beside it, names that nothing reads."""
-    number = 1
-    while any(beside(path, f"{suffix}.{number}.lost").exists() for suffix in ("", *_SIDE_FILES)):
-        number += 1
-    for suffix in ("", *_SIDE_FILES):
-        with suppress(FileNotFoundError):
-            beside(path, suffix).rename(beside(path, f"{suffix}.{number}.lost"))
-
-
-def _connect(path: Path, mode: str) -> sqlite3.Connection:
-    """Return a connection; without locks where the file system has none."""
-    try:
-        return _connect_with(path, mode)
-    except sqlite3.OperationalError:
-        if not _is_lockless(path):
-            raise
-    _log.warning("%s: this file system has no locks; see to it that no other program writes it", path)
-    return _connect_with(path, f"{mode}&nolock=1")
-
-
-def _connect_with(path: Path, parameters: str) -> sqlite3.Connection:
-    connection = sqlite3.connect(
-        f"file:{quote(os.fsencode(path.absolute()))}?mode={parameters}",
-        uri=True,
-        timeout=READING_LIMIT_S if parameters.startswith("ro") else TRY_S,
-        isolation_level=None,
-    )
-    try:
-        # A committed row must survive a power cut: it is what makes a frame count.
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchall()
-    except sqlite3.DatabaseError:
-        connection.close()
-        raise
-    except UnicodeDecodeError as error:
-        # The message of SQLite quotes the damaged schema byte by byte.
-        connection.close()
-        raise sqlite3.DatabaseError(f"malformed database schema, which is no text: {error.reason}") from error
-    return connection
-
-
-def _is_lockless(path: Path) -> bool:
-    """Return whether the file system refuses locks altogether.
-
-    Only asked where no connection could be opened: closing a file gives up all locks that the process has on it.
-    """
-    try:
-        with path.open("rb") as stream:
-            fcntl.lockf(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError as error:
-        return error.errno in _NO_LOCKS
-    return False
-
-
-def _opened_or_copied(path: Path) -> sqlite3.Connection:
-    """Return a reader of the file in its place, or of a copy where SQLite would have to write in order to read."""
-    try:
-        return _connect(path, "ro")
-    except sqlite3.OperationalError as error:
-        if _primary_code(error) not in _CANNOT_IN_PLACE:
-            raise
-        return _copied(path)
-
-
-def _copied(path: Path) -> sqlite3.Connection:
-    """Return a reader of a copy in memory, with what its side files hold."""
-    memory = sqlite3.connect(":memory:", isolation_level=None)
-    with tempfile.TemporaryDirectory(prefix="crop-") as scratch:
-        copy = Path(scratch) / path.name
-        for suffix in ("", "-wal", "-journal"):
-            if (source := beside(path, suffix)).exists() or not suffix:
-                shutil.copyfile(source, beside(copy, suffix))
-        with closing(_connect(copy, "rw")) as connection:
-            connection.backup(memory)
-    memory.execute("PRAGMA query_only = ON")
-    return memory
-
-
-def _is_write_ahead(path: Path) -> bool:
-    """Return whether the file's header says write-ahead mode (sqlite.org/fileformat.html, 1.3.3: offset 18 is 2).
-
-    Only asked while no `-shm` is there: closing a file gives up all locks that the process has on it.
-    """
-    if beside(path, "-shm").exists():
-        return True
-    with path.open("rb") as stream:
-        return stream.read(20)[18:] == b"\x02\x02"
-
-
-def _in_write_ahead(path: Path, connection: sqlite3.Connection, retry: _LockRetry) -> sqlite3.Connection:
-    """Return a connection in write-ahead mode, where the file system allows it.
-
-    The mode cannot be changed while somebody reads. A reader who will not end keeps the file that he has, under no
-    name; the run goes on with a copy.
-    """
-    try:
-        connection.execute("PRAGMA journal_mode = WAL").fetchall()
-    except sqlite3.OperationalError as error:
-        if not _is_busy(error):
-            raise
-        copy = partial_path(path)
-        # No other writer may be at work meanwhile.
-        retry.run(lambda: connection.execute("BEGIN IMMEDIATE"))
-        with closing(_connect(path, "ro")) as source, closing(_connect(copy, "rwc")) as target:
-            source.backup(target)
-        connection.execute("ROLLBACK")
-        connection.close()
-        copy.replace(path)
-        sync_folder(path.parent)
-        renewed = _connect(path, "rw")
-        renewed.execute("PRAGMA journal_mode = WAL").fetchall()
-        return renewed
-    return connection
-
-
-def _on_network(path: Path) -> bool:
-    """Return whether the file lies on a file system that several machines work on; False where that is not known."""
-    return file_system_of(path) in _NETWORK
-
-
-def beside(path: Path, suffix: str) -> Path:
-    """Return the file that SQLite keeps beside a journal under a suffix."""
-    return path.with_name(path.name + suffix)
-
-
-def _execute_all(connection: sqlite3.Connection, statements: str, version: int) -> None:
-    """Execute statements and set the version, all or nothing."""
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        for statement in statements.split(";"):
-            connection.execute(statement)
-        connection.execute(f"PRAGMA user_version = {version}")
-        connection.execute("COMMIT")
-    except BaseException:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
-        raise
-
-
-def _checked(path: Path, connection: sqlite3.Connection) -> int:
-    """Return the journal's version; close the connection and refuse what is not known or lacks a table."""
-    try:
-        # Bounds what SQLite makes of a stranger's file, and lets nothing in its schema do more than hold rows.
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_VALUE_BYTES)
-        connection.execute("PRAGMA trusted_schema = OFF")
-        _require_plain_schema(path, connection)
-        version = connection.execute("PRAGMA user_version").fetchone()[0]
-        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if not version and not tables:
-            raise FormatError(f"{path} is damaged: it is empty; {_restoring(path)}")
-        if version not in _READABLE:
-            raise FormatError(
-                f"{path} is of version {version}, this software reads {_READABLE[0]} and {_READABLE[-1]}; "
-                "use the software that wrote it"
-            )
-        if lacking := set(_tables_of(version)) - tables:
-            raise FormatError(
-                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; {_restoring(path)}"
-            )
-        require_sound_rows(path, connection, version)
-    except BaseException:
-        connection.close()
-        raise
-    return version
-
-
-def _reading_fault(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
-    """Return why a journal cannot be read, and what helps.
-
-    SQLite calls a file damaged whose disk does not read it, and a copy must not take the place of a sound journal: so
-    the disk is tried, and the file checked again.
-    """
-    if isinstance(error, OSError):
-        gone = isinstance(error, FileNotFoundError)
-        return reading_error(path, error, _restoring(path) if gone else "check its permissions")
-    if _is_busy(error):
-        return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
-    code = _primary_code(error)
-    fault = _disk_fault(path)
-    # Where permissions are in the way, the disk is not.
-    openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy_of(fault) is not None)
-    failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and openable)
-    if fault is not None and (failed or fault.errno not in _READABLE_FAULTS):
-        return reading_error(path, fault, "check the permissions of its folder")
-    if failed or (_is_damage(error) and _is_sound(path)):
-        return StorageError(
-            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, {RUN_AGAIN}"
-        )
-    if not _is_damage(error):
-        return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
-    return FormatError(f"{path} is damaged: {error}; {_restoring(path)}")
-
-
-def _writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | InputError | StorageError:
-    """Return why a journal cannot be written, and what helps; the disk itself is asked what ails it."""
-    if _is_busy(error):
-        return HeldJournalError(
-            f"cannot write {path}: {error}; end the other program that holds the session, then run the same command "
-            "again"
-        )
-    if (fault := _disk_fault(path)) is not None:
-        return storage_error(path, fault)
-    if _primary_code(error) == sqlite3.SQLITE_FULL:
-        remedy = "free space"
-    elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
-        remedy = "see that the folder may be written and the disk is there"
-    elif _is_damage(error) and not _is_sound(path):
-        return FormatError(f"{path} is damaged: {error}; {_restoring(path)}")
-    else:
-        remedy = "check the disk and its cable"
-    return StorageError(f"cannot write {path}: {error}; {remedy}, {RUN_AGAIN}")
-
-
-def _disk_fault(path: Path) -> OSError | None:
-    """Return what the disk answers when something is written beside the journal; None if it does not mind."""
-    try:
-        # Without a name, so that nothing is left behind.
-        with tempfile.TemporaryFile(dir=path.parent, buffering=0) as stream:
-            stream.write(bytes(_PROBE_BYTES))
-            os.fsync(stream.fileno())
-    except OSError as error:
-        return error
-    return None
-
-
-def _is_damage(error: sqlite3.DatabaseError) -> bool:
-    return _primary_code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-
-
-def _is_sound(path: Path) -> bool:
-    """Return whether a journal that was called damaged is whole, read once more."""
-    try:
-        with closing(_connect(path, "ro")) as connection:
-            return connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
-    except sqlite3.DatabaseError:
-        return False
-
-
-def _primary_code(error: sqlite3.DatabaseError) -> int:
-    return getattr(error, "sqlite_errorcode", 0) & 0xFF
-
-
-_DAMAGED: Final = "it is damaged, or not to be trusted"
-
-_WHOLE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 1000000000"
-_MAYBE_WHOLE = "({0} IS NULL OR " + _WHOLE + ")"
-_CODE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 255"
-_SIZE = "({0} IS NULL OR (typeof({0}) = 'integer' AND {0} >= 0))"
-_TEXT = "typeof({0}) = 'text' AND length({0}) < 100000"
-_MAYBE_TEXT = "({0} IS NULL OR " + _TEXT + ")"
-_REAL = "typeof({0}) IN ('real', 'integer') AND abs({0}) < 9e300"
-_MAYBE_REAL = "({0} IS NULL OR typeof({0}) IN ('real', 'integer'))"
-_MOMENT = "[0-9][0-9][0-9][0-9]-[01][0-9]-[0-3][0-9]T[0-2][0-9]:[0-5][0-9]:[0-5][0-9]"
-_ZONE = "[+-][0-9][0-9]:[0-9][0-9]"
-_FORMS = f"{{0}} GLOB '{_MOMENT}.{6 * '[0-9]'}{_ZONE}' OR {{0}} GLOB '{_MOMENT}{_ZONE}'"
-# SQLite ends a text at a zero byte, takes 30 February for 2 March, and knows the zones that there are.
-_TIME = (
-    f"typeof({{0}}) = 'text' AND ({_FORMS}) AND length(CAST({{0}} AS BLOB)) = length({{0}}) "
-    "AND {0} BETWEEN '1970' AND '9999' AND datetime({0}) IS NOT NULL "
-    "AND strftime('%Y-%m-%dT%H:%M:%S', substr({0}, 1, 19), '+0 seconds') = substr({0}, 1, 19)"
-)
-_MAYBE_TIME = "({0} IS NULL OR {0} = '' OR (" + _TIME + "))"
-_SHA256 = "({0} IS NULL OR (typeof({0}) = 'text' AND length({0}) <= 64 AND {0} NOT GLOB '*[^0-9a-f]*'))"
-
-_COLUMNS: Final = {
-    "plan": {
-        "step": _WHOLE,
-        "kind": _TEXT,
-        "illumination": _MAYBE_WHOLE,
-        "red": _CODE,
-        "green": _CODE,
-        "blue": _CODE,
-    },
-    "attempts": {
-        "id": _WHOLE,
-        "step": _WHOLE,
-        "kind": _TEXT,
-        "illumination": _MAYBE_WHOLE,
-        "file": _TEXT,
-        "started_at": _TIME,
-        "ended_at": _MAYBE_TIME,
-        "taken_at": _MAYBE_TIME,
-        "exposure_s": _MAYBE_REAL,
-        "size": _SIZE,
-        "sha256": _SHA256,
-        "verdict": _MAYBE_TEXT,
-        "reason": _TEXT,
-    },
-    "events": {"id": _WHOLE, "at": _TIME, "what": _TEXT, "detail": _TEXT},
-    "checks": {
-        "attempt": _WHOLE,
-        "position": _WHOLE,
-        "name": _TEXT,
-        "value": _MAYBE_REAL,
-        "low": _MAYBE_REAL,
-        "high": _MAYBE_REAL,
-        "unit": _TEXT,
-        "reason": _TEXT,
-    },
-    "measurements": {
-        "attempt": _WHOLE,
-        "red": _MAYBE_REAL,
-        "green": _MAYBE_REAL,
-        "blue": _MAYBE_REAL,
-        "data": "typeof({0}) = 'blob'",
-        "voids": _WHOLE,
-        "lasting": _WHOLE,
-    },
-    "timings": {"attempt": _WHOLE, "name": _TEXT, "seconds": _REAL},
-    "heartbeat": {
-        "id": _WHOLE,
-        "at": _TIME,
-        "pid": "typeof({0}) = 'integer'",
-        "started": _TEXT,
-        "host": _TEXT,
-        "boot": _TEXT,
-        "state": _TEXT,
-        "sentence": _TEXT,
-        "until": _TIME,
-    },
-    "records": {"key": _TEXT, "text": _TEXT},
-}
-"""What a row must fulfil, by table (those of version 1 first) and column; times as `datetime.fromisoformat` reads
-them."""
-
-_TOGETHER: Final = {
-    # A frame that has a hash was taken at a time with an exposure (0 where nobody knows), and has a verdict.
-    "attempts": "(sha256 IS NULL OR (taken_at <> '' AND exposure_s BETWEEN 0 AND 1e9 AND size IS NOT NULL "
-    "AND verdict IS NOT NULL))",
-    "measurements": "(red IS NULL OR (green IS NOT NULL AND blue IS NOT NULL))",
-}
-
-
-def _tables_of(version: int) -> list[str]:
-    return list(_COLUMNS)[: 3 if version == 1 else None]
-
-
-def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
-    """Refuse a journal with views, triggers, virtual tables or computed columns; a FormatError names it."""
-    for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
-        plain = kind == "table" and not str(sql or "").lstrip().upper().startswith("CREATE VIRTUAL")
-        # SQLite makes an index of each primary key, without a text.
-        if not (plain or (kind == "index" and sql is None)):
-            raise FormatError(
-                f"{path} holds the {kind} {str(name)[:80]!r}, which no journal has; {_DAMAGED}; {_restoring(path)}"
-            )
-
-
-def require_sound_rows(path: Path, connection: sqlite3.Connection, version: int) -> None:
-    """Refuse a journal with values that no run writes; costs milliseconds."""
-    for table in _tables_of(version):
-        columns = {row[1]: row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")}
-        lacking = _COLUMNS[table].keys() - columns.keys()
-        if lacking or any(columns.values()):
-            raise FormatError(
-                f"{path}: the columns of {table} are not those of a journal; {_DAMAGED}; {_restoring(path)}"
-            )
-        sound = " AND ".join([f"({form.format(column)})" for column, form in _COLUMNS[table].items()])
-        together = _TOGETHER.get(table, "1")
-        query = f"SELECT COUNT(*) FROM {table} WHERE ({sound} AND {together}) IS NOT TRUE"
-        if found := connection.execute(query).fetchone()[0]:
-            raise FormatError(
-                f"{path}: {found} rows of {table} hold values that no run writes; {_DAMAGED}; {_restoring(path)}"
-            )
-    for (file,) in connection.execute("SELECT DISTINCT file FROM attempts"):
-        if not is_inside_name(file):
-            raise FormatError(
-                f"{path} names the file {file[:200]!r}, which is none of the session; {_DAMAGED}; {_restoring(path)}"
-            )
 
 
 LEDGER_FILE: Final = "ledger.jsonl"

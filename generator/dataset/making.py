@@ -1,663 +1,68 @@
 """Making a dataset: whole, in shares beside other programs, and out of the shards of all shares; and the place of it.
 
-Shards are made by threads of this program, or by the workers of a Dask cluster. Either takes the shards that are not
-done and returns when they are, whatever died meanwhile. A shard is made from its sources to the record that says it is
-done: pictures are read, photographed and written.
+Shards (`generator.dataset.shards`) are made by threads of this program, or by the workers of a Dask cluster. Either
+takes the shards that are not done and returns when they are, whatever died meanwhile.
 
-The place where a dataset is made (`Workplace`): work that was interrupted is continued there, and the dataset appears
-whole. On a disk everything happens in the hidden folder `.OUT.partial`: `dataset-ID/`, with the plan's identifier,
-fills with files, and `plan/` has the plan, the records of the shards that are done, and of those that are not a line
-for each image whose files are written. At the end `dataset-ID/` gets its name by one rename, then the rest is removed.
-An object store has no rename: the files are written where they stay, plan and records below `OUT/.plan/`, and
-`dataset.json`, written last, makes a dataset of them.
-
-Rules that hold inside, of shards:
-
-- A shard's bytes depend on its job alone: not on the workers, on other shards, or on how often it is made.
-- Its record is written last, when all else has been synchronised with the disk: a shard with a record is whole. The
-  program may be killed at any instruction, and any number of programs may make the same shard at once.
-- Of a shard without a record, an image counts whose files are there with the hashes that were noted when they were
-  written, and whose source is as it was. The bytes of the others do not depend on it.
-- At most about three pictures are in memory for each worker.
-
-Of places:
+Rules that hold inside, of the place where a dataset is made:
 
 - A place belongs to one plan. Another plan is refused with a message that says how the two differ. A worker of a plan
   that was removed may still be alive: its records bear the identifier of its plan, so they are never taken for ours.
 - A program that makes the whole dataset locks the folder alone; programs that make shares of it share the lock.
 - A place without a finished image is of no use later and is removed when the work fails; so is one without a finished
   shard where the command is at fault, which has to be another then.
-- The lines of images are not synchronised with the disk and may be cut: each bears its own hash and those of its files,
-  and what does not agree with them is made again. An object store cannot add to a file, and has no such lines.
-
-An image under one light has that light's ground truth, however its intensity falls off. Where it falls off with a tint
-(`generator.variation.variation`) the light stands in the records twice, as it is at the near and at the far end, and
-masks and maps say how much of either reaches a pixel.
 """
 
 from __future__ import annotations
 
 import contextlib
-import csv
 import hashlib
-import io
 import json
-import math
 import re
 import shutil
 import threading
-from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from itertools import islice
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, cast
 
-import numpy as np
-import numpy.typing as npt
-
 from foundation.errors import CropError, DeviceError, FormatError, InputError, first_of
-from foundation.files import (
-    HashingWriter,
-    clear_folder,
-    held_folder,
-    partial_path,
-    publish_folder,
-    require_free,
-    sha256_of,
-    storage_error,
-    stream_sha256,
-)
-from foundation.records import from_json
-from foundation.version import software
-from generator.dataset.layouts import (
-    CARD,
-    COMPLETED_BY_HAND,
-    CROISSANT,
-    DATASHEET,
-    GROUND_TRUTH,
-    GROUND_TRUTH_COLUMNS,
-    IMAGES,
-    SOURCE_COLUMNS,
-    SOURCES,
-    SPLITS,
-    STRETCHED_VERSION,
-    SUMS,
-    TRUTHS,
-    UNCERTAINTY_COLUMN,
-    VERSION,
-    Beside,
-    Description,
-    Details,
-    FinishedImage,
-    ImageRecord,
-    Light,
-    LightRow,
-    RenderingSummary,
-    Sample,
-    ShardRecord,
-    ShardWriter,
-    Skipped,
-    SourceRecord,
-    Split,
-    TableRecord,
-    Triple,
-    card,
-    croissant,
-    datasheet,
-    image_key,
-    open_writer,
-    shard_key,
-)
-from generator.dataset.plan import DatasetOptions, Plan, ShardJob, versions
+from foundation.files import partial_path, storage_error
+from foundation.folders import clear_folder, held_folder, require_free
+from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, load_description, open_dataset
-from generator.files import suffix_of
+from generator.dataset.shards import (
+    DONE,
+    IMAGE_NOTES,
+    NOTES,
+    PLAN,
+    RECORDS,
+    SILENT,
+    Callbacks,
+    NothingMadeError,
+    PlanIdentity,
+    ShardCancelled,
+    ShardDone,
+    Workplace,
+    assemble,
+    make_elsewhere,
+    make_shard,
+    remove_notes,
+)
 from generator.lights.choices import listed_lights
-from generator.lights.lighting import LightChoice, Lighting, Mixture
-from generator.pictures.sources import Cut, Picture, Source, hash_since, keep_bits
-from generator.stores import DESCRIPTION, LocalStore, Pieces, RemoteStore, Store, is_remote, local_path, open_store
-from generator.variation.variation import Varied
+from generator.lights.lighting import LightChoice, Mixture
+from generator.pictures.sources import Source, hash_since
+from generator.stores import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
 
 if TYPE_CHECKING:
     import distributed
 
     from calibration.table.lut import Lut
     from generator.rendering import Rendering
-    from generator.rendering.colorimetric import ColorimetricRendering
-
-PLAN: Final = "plan.json"
-RECORDS: Final = "shards"
-_NOTES: Final = ".plan"
-_DONE: Final = ".json"
-_IMAGES: Final = ".images"
-PlanIdentity = Mapping[str, Any]
-
-_threads: Final = threading.local()
-
-TINY_PX: Final = 16
-"""A shorter side below which a picture is noted: icons and failed downloads are so small, photographs never are."""
-
-
-_WORD: Final = 1 << 64
-"""Values of the eight bytes of a hash that place a source among the parts."""
-
-
-def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
-    """Return the part of the dataset that a source belongs to.
-
-    Decided by the seed and the source's content, or its name where it has no file, and by no other source, so that two
-    copies of one file, whatever their names, are in the same part. The shares hold on average.
-
-    `shares`: of train, validation and test; sum 1. None leaves it undivided.
-    """
-    if shares is None:
-        return None
-    word = hashlib.sha256(f"split {seed} {sha256 or name}".encode()).digest()[:8]
-    place = int.from_bytes(word, "big") / _WORD
-    bound = 0.0
-    for part, share in zip(SPLITS, shares, strict=True):
-        bound += share
-        if place < bound and share:
-            return part
-    return max(zip(shares, SPLITS, strict=True))[1]
-
-
-def light_of(lut: Lut, light: int) -> Light:
-    """Return the record of light number `light` of the table."""
-    shown, expanded = lut.illuminations[light], lut.truth_uncertainty_deg
-    red, green, blue = (float(part) for part in lut.white[light])
-    return Light(
-        illumination=light,
-        kind=shown.kind,
-        cct_k=shown.cct_k,
-        codes=shown.colour,
-        white=(red, green, blue),
-        name=shown.name,
-        uncertainty_deg=None if expanded is None else float(f"{expanded[light]:.4g}"),
-    )
-
-
-def photograph(
-    lut: Lut,
-    picture: Picture,
-    lighting: Lighting,
-    options: DatasetOptions,
-    seed: int,
-    number: int,
-    white_level: int,
-    black_taken: float | None = None,
-) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None, Details]:
-    """Return the raw image of a picture's print.
-
-    `picture`: (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
-    `black_taken`: share of the print's black that is taken out, 0 … 1; None for what the options say. Returns (H, W, 3)
-    uint16, linear camera RGB; of several lights the weights (H, W, K) float32 of each in each pixel, else None; and
-    what is recorded of the rendering.
-    """
-    from generator.kernels.mixing import mix_samples
-    from generator.kernels.printing import nearest_nodes
-    from generator.kernels.rendering import draw_samples
-
-    # The hash of the table stands for its samples in the dataset's description.
-    for mixture in lighting.mixtures:
-        for light in mixture.lights:
-            lut.require_unchanged(light)
-    details: Details = {}
-    share = 0.0
-    if black_taken is not None or options.black_point.kind != "keep":
-        share = options.black_point.share(seed, number) if black_taken is None else black_taken
-        details["black_taken"] = share
-    weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
-    if options.rendering == "colorimetric":
-        rendering = rendering_of(lut, options)
-        outside, distance = rendering.map.missed(nearest_nodes(picture))
-        seen: Details = {
-            "cells": rendering.map.sha256[:16],
-            "outside": round(outside, 6),
-            "distance": round(distance, 6),
-        }
-        image = rendering.draw(
-            picture,
-            lighting.mixtures,
-            share,
-            weights,
-            most=lut.provenance.white_level if weights is None else white_level,
-            seed=seed,
-            image=number,
-            out=_reused(picture.shape),
-        )
-        return image, weights, seen | details
-    tables = [_samples(lut, mixture, picture, share, seed) for mixture in lighting.mixtures]
-    if weights is None:
-        out = _reused(picture.shape)
-        return draw_samples(tables[0], picture, seed=seed, image=number, out=out), None, details
-    image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
-    return image, weights, details
-
-
-def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int) -> npt.NDArray[np.uint16]:
-    """Return the samples of a light without a share of the print's black, at least those of a picture's colours."""
-    from generator.kernels.choice import colours_in
-    from generator.kernels.rendering import WHOLE_LIGHT_PIXELS
-    from generator.rendering.black_points import veil_of, without_veil
-
-    samples = mixture.samples(lut, seed, picture)
-    if not share:
-        return samples
-    colours = colours_in(picture, lut.provenance.bits) if picture.size < 3 * WHOLE_LIGHT_PIXELS else None
-    veil = veil_of(lut, mixture, share)
-    return without_veil(samples, veil, lut.provenance.white_level, colours)
-
-
-def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
-    """Return the rendering by colour that the options ask for; it keeps what it has found out of a table."""
-    from generator.rendering.colorimetric import rendering_with
-    from generator.rendering.matrices import matrix_for
-
-    return rendering_with(lut, options.matrix or matrix_for(lut))
-
-
-def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
-    """Return an array uint16 of any content in memory of the calling thread, which its next call overwrites.
-
-    Fresh pages take as long to map as the drawing into them.
-    """
-    size = math.prod(shape)
-    memory: npt.NDArray[np.uint16] | None = getattr(_threads, "memory", None)
-    if memory is None or memory.size < size:
-        _threads.memory = memory = np.empty(size, np.uint16)
-    return memory[:size].reshape(shape)
-
-
-@dataclass(frozen=True, eq=False)
-class _ImageLight:
-    """The light of one image.
-
-    - `truth`: chromaticity, sum 1, of the light averaged over the pixels.
-    - `maps`: kind, what follows the image's number in the file's name, and the bytes of each map beside the image.
-    """
-
-    truth: Triple
-    rows: list[LightRow]
-    maps: list[tuple[str, str, bytes]]
-
-
-def _image_light(
-    lut: Lut, lighting: Lighting, weights: npt.NDArray[np.float32] | None, varied: Varied, tints: bool
-) -> _ImageLight:
-    """Return the light of an image.
-
-    `weights`: (H, W, K) float32, of each of K lights in each pixel; None of one light.
-    """
-    from generator.masks.maps import encode_maps, mean_weights
-
-    labels = [mixture.label for mixture in lighting.mixtures]
-    whites = lighting.whites(lut)
-    intensity = None
-    if tints:
-        weights, labels = varied.weights, labels * 2
-        whites = np.concatenate([whites, whites * np.array(varied.end)])
-    elif weights is not None:
-        intensity = varied.intensity()
-    rows = [
-        LightRow(illumination=label, truth=chromaticity(white)) for label, white in zip(labels, whites, strict=True)
-    ]
-    if weights is None:
-        return _ImageLight(rows[0].truth, rows, [])
-    reaching = weights if intensity is None else weights * intensity[..., None]
-    truth = chromaticity(np.asarray(mean_weights(reaching) @ whites))
-    return _ImageLight(truth, rows, encode_maps(weights, whites))
-
-
-def chromaticity(white: npt.NDArray[np.float64]) -> Triple:
-    """Return (r, g, b) of sum 1 of linear RGB (3,) float64."""
-    red, green, blue = (float(part) for part in white / white.sum())
-    return red, green, blue
-
-
-LARGEST_COUNT: Final = 65535
-"""Largest value of 16 bits."""
-
-
-def _ignore(*arguments: object) -> None:
-    del arguments
-
-
-@dataclass(frozen=True)
-class Callbacks:
-    """What is called while images are made, always from the calling thread.
-
-    Attributes
-    ----------
-    on_done
-        Takes how many more of the planned images are found finished: of the shards that are done before the first image
-        is made, and of a shard that was begun when it is taken up; less than 0 for images whose source proves to have
-        changed since, which are made again.
-    on_image
-        Called after each image.
-    on_skip
-        Takes the name of a source that cannot be read, the reason, and the number of images that are left out.
-    on_wait
-        Takes a sentence for the user where the work waits for somebody to do something.
-
-    Examples
-    --------
-    >>> left_out = []
-    >>> callbacks = Callbacks(on_skip=lambda name, reason, images: left_out.append(name))
-    >>> callbacks.on_skip("bad.png", "bad.png is no picture", 2)
-    >>> left_out
-    ['bad.png']
-    """
-
-    on_done: Callable[[int], None] = _ignore
-    on_image: Callable[[], None] = _ignore
-    on_skip: Callable[[str, str, int], None] = _ignore
-    on_wait: Callable[[str], None] = _ignore
-
-
-SILENT: Final = Callbacks()
-"""Callbacks that do nothing."""
-
-
-@dataclass(frozen=True)
-class _ReadSource:
-    """The crops of a source, or all of it, and what is recorded of it; no crops where all its images are finished.
-
-    Where sRGB codes are those of the print, they are codes that the table has samples of.
-    """
-
-    cuts: tuple[Cut, ...]
-    record: SourceRecord
-    black_taken: float | None
-
-
-class _ShardCancelled(Exception):
-    """A shard was given up because something else failed; whoever caused it handles it."""
-
-
-def make_shard(
-    job: ShardJob,
-    lut: Lut,
-    place: Workplace,
-    pool: ThreadPoolExecutor,
-    workers: int,
-    callbacks: Callbacks = SILENT,
-    cancelled: threading.Event | None = None,
-) -> ShardRecord:
-    """Make a shard and commit its record."""
-    sources: list[SourceRecord] = []
-    skipped: list[Skipped] = []
-    images: list[ImageRecord] = []
-    used: set[int] = set()
-    pending: deque[Future[Sample]] = deque()
-    reading: deque[Future[_ReadSource]] = deque()
-    finished = _finished_images(job, place, pool)
-    if finished:
-        callbacks.on_done(len(finished))
-
-    def finish_one(writer: ShardWriter) -> None:
-        sample = pending.popleft().result()
-        writer.append(sample)
-        images.append(sample.record)
-        if sample.record.number not in finished:
-            callbacks.on_image()
-
-    def forget_changed(wanted: list[tuple[int, int, Lighting]], source: SourceRecord | None) -> None:
-        changed = [number for number, _, _ in wanted if number in finished and finished[number].source != source]
-        for number in changed:
-            del finished[number]
-        if changed:
-            callbacks.on_done(-len(changed))
-
-    with _writer_of(job, place) as writer, _cancelling(pending, reading):
-        for row, source in enumerate(job.sources):
-            while len(reading) <= workers and row + len(reading) < len(job.sources):
-                reading.append(pool.submit(_read, job, lut, row + len(reading), finished))
-            wanted = _wanted(job, job.position + row)
-            try:
-                read = reading.popleft().result()
-            except FormatError as error:
-                forget_changed(wanted, None)
-                skipped.append(Skipped(position=job.position + row, name=source.name))
-                callbacks.on_skip(source.name, str(error), len(wanted))
-                continue
-            forget_changed(wanted, read.record)
-            sources.append(read.record)
-            for number, crop, lighting in wanted:
-                while len(pending) >= 2 * workers:
-                    finish_one(writer)
-                if cancelled is not None and cancelled.is_set():
-                    raise _ShardCancelled
-                used.update(light for mixture in lighting.mixtures for light in mixture.lights)
-                if number in finished:
-                    pending.append(pool.submit(_taken_up, finished[number]))
-                else:
-                    pending.append(pool.submit(_photographed, job, lut, place, writer, number, read, crop, lighting))
-        while pending:
-            finish_one(writer)
-        files = writer.close()
-    record = ShardRecord(
-        shard=job.shard,
-        sources=sources,
-        skipped=skipped,
-        images=images,
-        files=files,
-        lights=[light_of(lut, light) for light in sorted(used)],
-    )
-    place.commit(record)
-    return record
-
-
-def _finished_images(job: ShardJob, place: Workplace, pool: ThreadPoolExecutor) -> dict[int, FinishedImage]:
-    """Return by number the images of a shard that whoever was at it before has finished."""
-    noted = place.noted(job.shard)
-    whole = pool.map(place.is_whole, noted)
-    return {image.image.number: image for image, is_whole in zip(noted, whole, strict=True) if is_whole}
-
-
-def _taken_up(image: FinishedImage) -> Sample:
-    """Return a finished image for `ShardWriter.append`."""
-    source = image.source
-    return Sample(image.image, source.name, source.split, source.width, source.height, (), tuple(image.files))
-
-
-def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
-    options = job.options
-    lightings = job.choice.lightings_of(job.position * options.crops)
-    maps = options.tints or any(lighting.masks is not None for lighting in lightings)
-    return open_writer(options.layout, place.files, job.shard, Beside(options.previews, maps, options.has_details))
-
-
-@contextmanager
-def _cancelling(*queues: deque[Future[Any]]) -> Generator[None]:
-    """Cancel what still waits for a thread if the block fails."""
-    try:
-        yield
-    except BaseException:
-        for queue in queues:
-            for future in queue:
-                future.cancel()
-        raise
-
-
-@dataclass(frozen=True)
-class _ShardDone:
-    """Result of a task: how many images its shard has, and of each source that cannot be read name, reason, images.
-
-    `found`: how many of the images whoever was at the shard before had finished.
-    """
-
-    images: int
-    skipped: tuple[tuple[str, str, int], ...]
-    found: int = 0
-
-
-def make_elsewhere(job: ShardJob, place: Workplace) -> _ShardDone:
-    """Make a shard in a program of its own, which opens the table itself: the task of an engine's worker.
-
-    A shard that is done already is not made again.
-    """
-    if place.has(job.shard):
-        return _ShardDone(len(place.load(job.shard).images), ())
-    found = versions(job.options.form, job.options.layout)
-    if found != job.versions:
-        differing = [name for name in job.versions if found.get(name) != job.versions[name]]
-        raise InputError(
-            "a worker has other libraries than the plan was made with: "
-            + ", ".join(f"{name} {found.get(name)} for {job.versions[name]}" for name in differing)
-            + "; install the same on every machine"
-        )
-    skipped: list[tuple[str, str, int]] = []
-    taken_up: list[int] = []
-
-    def skip(name: str, reason: str, images: int) -> None:
-        skipped.append((name, reason, images))
-
-    lut = _table_of(job.table, job.table_sha256)
-    with ThreadPoolExecutor(1) as pool:
-        record = make_shard(job, lut, place, pool, 1, Callbacks(on_done=taken_up.append, on_skip=skip))
-    return _ShardDone(len(record.images), tuple(skipped), sum(taken_up))
-
-
-@lru_cache(maxsize=2)
-def _table_of(folder: Path, sha256: str) -> Lut:
-    from calibration.table.lut import open_lut
-
-    lut = open_lut(folder)
-    if lut.sha256 != sha256:
-        raise InputError(
-            f"the table {folder} of a worker is not that of the plan; give every machine the same table at that path"
-        )
-    return lut
-
-
-def _wanted(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
-    """Return number, crop and lighting of each image of the source at `position` that is in the shard."""
-    crops, each = job.options.crops, job.choice.lights_each
-    numbered = (
-        ((position * crops + crop) * each + place, crop, lighting)
-        for crop in range(crops)
-        for place, lighting in enumerate(job.choice.lightings_of(position * crops + crop))
-    )
-    return [wanted for wanted in numbered if job.first <= wanted[0] < job.stop]
-
-
-def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedImage]) -> _ReadSource:
-    from generator.files import smallest_side
-    from generator.kernels.choice import replace_unfit_colours
-
-    known = _known_source(job, job.position + place, finished) if finished else None
-    if known is not None:
-        return _ReadSource((), known, None)
-    source: Source = job.sources[place]
-    scene = source.read()
-    whole = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
-    if len(whole) != job.options.crops:
-        raise InputError(
-            f"{source.name} has {max(1, len(whole))} crops, expected {job.options.crops}; give the preparation of "
-            "pictures and the options of the dataset the same number, and leave random scenes out"
-        )
-    whole = tuple(replace(cut, picture=keep_bits(cut.picture, job.options.bits)) for cut in whole)
-    if job.options.rendering == "codes":
-        fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in whole]
-    else:
-        # Mixtures of cells hold fit ones alone.
-        fit = [(cut.picture, 0) for cut in whole]
-    height, width = scene.picture.shape[:2]
-    least = smallest_side(job.options.form)
-    if min(height, width) < least:
-        raise FormatError(
-            f"{source.name} is {width}x{height} px, too small for {job.options.form}, which takes {least}x{least} and "
-            "more; choose another format, or leave it out"
-        )
-    notes = [*scene.notes]
-    if min(height, width) < TINY_PX:
-        notes.append(f"tiny, {width}x{height} px")
-    if not all(cut.picture.any() for cut in whole):
-        notes.append("all black")
-    record = SourceRecord(
-        position=job.position + place,
-        name=source.name,
-        sha256=scene.sha256,
-        profile=scene.profile,
-        width=width,
-        height=height,
-        replaced_pixels=sum(replaced for _, replaced in fit),
-        split=job.parts[place] if job.parts else split_of(job.options.split, job.seed, scene.sha256, source.name),
-        note="; ".join(notes) or None,
-        weight=scene.weight,
-    )
-    cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
-    return _ReadSource(cuts, record, scene.black_taken)
-
-
-def _known_source(job: ShardJob, position: int, finished: Mapping[int, FinishedImage]) -> SourceRecord | None:
-    """Return the record of a source that is as it was when every image of it was finished; else None."""
-    known = [finished[number].source if number in finished else None for number, _, _ in _wanted(job, position)]
-    first = known[0] if known else None
-    if first is None or any(source != first for source in known):
-        return None
-    # Of a file on a store no hash is known before it is read.
-    return first if hash_since(job.sources[position - job.position], -math.inf) == first.sha256 else None
-
-
-def _photographed(
-    job: ShardJob,
-    lut: Lut,
-    place: Workplace,
-    writer: ShardWriter,
-    number: int,
-    source: _ReadSource,
-    crop: int,
-    lighting: Lighting,
-) -> Sample:
-    from generator.files import (
-        FULL,
-        ImageMetadata,
-        encode_pieces,
-        encode_preview,
-        preview_of,
-        suffix_of,
-        to_full_scale,
-    )
-
-    options, cut = job.options, source.cuts[crop]
-    height, width = cut.picture.shape[:2]
-    white_level = lut.provenance.white_level
-    # What exceeds saturation may be below it once it is exposed anew, and is cut then.
-    most = white_level if options.variation is None else LARGEST_COUNT
-    taken = source.black_taken
-    image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
-    varied = Varied()
-    if options.variation is not None:
-        varied = options.variation.apply(image, white_level, job.seed, number)
-    light = _image_light(lut, lighting, weights, varied, options.tints)
-    stored, level = (image, white_level) if options.scale == "table" else (to_full_scale(image, white_level), FULL)
-    metadata = ImageMetadata(level, light.truth, lut.provenance.camera)
-    files: list[tuple[str, str, Pieces]] = [
-        ("images", suffix_of(options.form), encode_pieces(stored, options.form, metadata)),
-        *((kind, ending, (data,)) for kind, ending, data in light.maps),
-    ]
-    if options.previews:
-        files.append(("previews", ".jpg", (encode_preview(preview_of(image, white_level)),)))
-    details: Details = {"crop": crop, "left": cut.left, "top": cut.top} if options.crops > 1 else {}
-    if source.record.weight is not None:
-        details["weight"] = source.record.weight
-    record = ImageRecord(
-        number=number,
-        position=source.record.position,
-        truth=light.truth,
-        lights=light.rows,
-        details=details | rendered | varied.details,
-    )
-    sample = writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
-    if sample.stored:
-        place.note(job.shard, FinishedImage(image=record, source=source.record, files=list(sample.stored)))
-    return sample
 
 
 @dataclass(frozen=True)
@@ -776,7 +181,7 @@ def _by_threads(plan: Plan, shards: Sequence[int], place: Workplace, workers: in
                         return
                     job = plan.job(shard)
                 make_shard(job, plan.lut, place, pool, depth, queued, cancelled)
-        except _ShardCancelled:
+        except ShardCancelled:
             pass
         except BaseException as error:
             events.put(partial(fail, error))
@@ -805,7 +210,7 @@ def _by_dask(
     waiting: Iterator[int] = iter(shards)
     with _client(address, workers) as client:
 
-        def submit(shard: int) -> distributed.Future[_ShardDone]:
+        def submit(shard: int) -> distributed.Future[ShardDone]:
             attempts[shard] += 1
             key = f"crop-shard-{shard}-{attempts[shard]}-{plan.seed}-{id(plan)}"
             return client.submit(make_elsewhere, plan.job(shard), place, key=key, pure=False)
@@ -965,8 +370,8 @@ def make_dataset(plan: Plan, out: Path | str, workers: Workers | None = None, ca
         with workplace(out, identity) as place:
             _make(plan, place, range(plan.shards), workers or Workers(), callbacks)
             try:
-                _assemble(place, identity)
-            except _NothingMadeError:
+                assemble(place, identity)
+            except NothingMadeError:
                 place.discard()
                 raise
     return open_dataset(out)
@@ -1058,7 +463,7 @@ def finish_dataset(out: Path | str) -> Dataset:
                     f"{len(missing)} of {identity['shards']} shards of {out} are not made yet: {first_of(missing)}; "
                     "run their shares, or the command without a share, which makes all that is missing"
                 )
-            _assemble(place, identity)
+            assemble(place, identity)
     return open_dataset(out)
 
 
@@ -1069,313 +474,6 @@ def _make(plan: Plan, place: Workplace, wanted: range, workers: Workers, callbac
     _make_shards(plan, missing, place, workers, callbacks)
 
 
-class _NothingMadeError(FormatError):
-    """None of the sources can be read, so there is no dataset."""
-
-
-class _RenderingSums:
-    """Adds up how images were rendered."""
-
-    def __init__(self) -> None:
-        self._sums = dict.fromkeys(("images", "pixels", "black_taken", "outside", "distance"), 0.0)
-
-    def add(self, details: Details, pixels: int) -> None:
-        """Add what is recorded of an image of so many pixels."""
-        self._sums["images"] += 1
-        self._sums["black_taken"] += float(details.get("black_taken", 0))
-        if "cells" in details:
-            self._sums["pixels"] += pixels
-            for name in ("outside", "distance"):
-                self._sums[name] += pixels * float(details[name])
-
-    def summary(self) -> RenderingSummary:
-        """Return means over pixels and images."""
-        by_colour = {
-            name: round(self._sums[name] / self._sums["pixels"], 6)
-            for name in ("outside", "distance")
-            if self._sums["pixels"]
-        }
-        black_taken = round(self._sums["black_taken"] / max(self._sums["images"], 1), 6)
-        return RenderingSummary(**by_colour, black_taken=black_taken)
-
-
-class _ListedFile:
-    """A text file of the dataset that is written in order and hashed while it is written."""
-
-    def __init__(self, stack: ExitStack, store: Store, name: str) -> None:
-        self.name = name
-        self._writer = HashingWriter(stack.enter_context(store.create(name)))
-
-    def write(self, text: str) -> None:
-        """Append a text, as UTF-8."""
-        self._writer.write(text.encode())
-
-    @property
-    def sha256(self) -> str:
-        """Of what was written so far."""
-        return self._writer.sha256
-
-    @property
-    def sum(self) -> str:
-        """The file's line in SHA256SUMS."""
-        return f"{self.sha256}  {self.name}\n"
-
-
-def _assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
-    """Write what a dataset has beside its images, and give the dataset its name."""
-    options = identity["options"]
-    suffix = suffix_of(options["format"])
-    counts: Counter[str] = Counter()
-    splits: Counter[str] = Counter()
-    skipped: list[Skipped] = []
-    used: dict[int, Light] = {}
-    details: _ListedFile | None = None
-    rendered = _RenderingSums()
-    with ExitStack() as stack:
-        truths = _ListedFile(stack, place.files, TRUTHS)
-        table = _ListedFile(stack, place.files, GROUND_TRUTH)
-        listed = _ListedFile(stack, place.files, SOURCES)
-        parts = {
-            part: _ListedFile(stack, place.files, f"splits/{part}.txt")
-            for part in SPLITS
-            if options["split"] is not None
-        }
-        sums = stack.enter_context(place.files.create(SUMS))
-        stated = bool(options.get("uncertainty"))
-        table.write(_row((*GROUND_TRUTH_COLUMNS, *([UNCERTAINTY_COLUMN] if stated else []))))
-        listed.write(_row(SOURCE_COLUMNS))
-        for record, fresh, left_out in _records(place, int(identity["shards"])):
-            names = {source.position: source for source in record.sources}
-            for source in fresh:
-                listed.write(_source_row(source))
-                counts["sources"] += 1
-                counts["pixels"] += source.width * source.height * int(options.get("crops", 1))
-                counts["replaced"] += source.replaced_pixels
-            skipped += left_out
-            used.update((light.illumination, light) for light in record.lights)
-            for image in record.images:
-                source = names[image.position]
-                name = f"{image_key(image.number)}{suffix}"
-                table.write(_image_rows(name, source.name, image, used if stated else None))
-                truths.write("{:.9f} {:.9f} {:.9f}\n".format(*image.truth))
-                if image.details:
-                    rendered.add(image.details, source.width * source.height)
-                    if details is None:
-                        details = _ListedFile(stack, place.files, IMAGES)
-                        details.write(_row(("image", *image.details)))
-                    details.write(_row((name, *map(_plain, image.details.values()))))
-                if source.split is not None:
-                    parts[source.split].write(f"{name}\n")
-                    splits[source.split] += 1
-                counts["images"] += 1
-            for file in record.files:
-                sums.write(f"{file.sha256}  {file.name}\n".encode())
-        if not counts["images"]:
-            raise _NothingMadeError(
-                f"none of the {identity['sources']['count']} pictures can be used: all were "
-                "left out, each with its reason; name others, or ask for a smaller crop if they are too small"
-            )
-        description = Description(
-            version=STRETCHED_VERSION if options.get("scale") == "full" else VERSION,
-            software=software(),
-            libraries=identity["libraries"],
-            table=TableRecord.model_validate(identity["table"]),
-            seed=identity["seed"],
-            options=options,
-            planned=identity["images"],
-            images=counts["images"],
-            sources=counts["sources"],
-            pixels=counts["pixels"],
-            replaced_pixels=counts["replaced"],
-            splits={part: splits[part] for part in parts},
-            lights=[used[light] for light in sorted(used)],
-            skipped=skipped,
-            rendering=rendered.summary() if {"rendering", "black_point"} & options.keys() else None,
-        )
-        text = (description.model_dump_json(indent=2) + "\n").encode()
-        written = [table, truths, listed, *parts.values()]
-        if details is not None:
-            written.append(details)
-        for file in written:
-            sums.write(file.sum.encode())
-        sums.write(f"{hashlib.sha256(text).hexdigest()}  {DESCRIPTION}\n".encode())
-        known = {file.name: file.sha256 for file in written}
-        _write_cards(place, description, known)
-    names = [file.name for file in written]
-    place.files.sync([*names, SUMS, *COMPLETED_BY_HAND])
-    # In an object store this makes it a dataset, so everything else is there.
-    place.files.put(DESCRIPTION, text)
-    place.files.sync([DESCRIPTION])
-    place.publish()
-
-
-def _write_cards(place: Workplace, description: Description, sums: Mapping[str, str]) -> None:
-    """Write what people and catalogues read of the dataset; its makers complete it, so that no hash is recorded."""
-    texts = {CARD: card(description), DATASHEET: datasheet(description), CROISSANT: croissant(description, sums)}
-    for name, text in texts.items():
-        place.files.put(name, text.encode())
-
-
-def _records(place: Workplace, shards: int) -> Iterator[tuple[ShardRecord, list[SourceRecord], list[Skipped]]]:
-    """Yield each shard's record, and those of its sources that no shard before had."""
-    last: SourceRecord | Skipped | None = None
-    for shard in range(shards):
-        record = place.load(shard)
-        ordered = sorted((*record.sources, *record.skipped), key=lambda source: source.position)
-        if last is not None and ordered and ordered[0].position == last.position:
-            if ordered[0] != last:
-                raise FormatError(
-                    f"the picture {last.name} changed, or could be read only once, while the dataset was made; remove "
-                    f"{place.notes.place} with all beside it and begin again"
-                )
-            fresh = ordered[1:]
-        else:
-            fresh = ordered
-        if ordered:
-            last = ordered[-1]
-        yield (
-            record,
-            [source for source in fresh if isinstance(source, SourceRecord)],
-            [source for source in fresh if isinstance(source, Skipped)],
-        )
-
-
-def _row(fields: Iterable[object]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(fields)
-    return text.getvalue()
-
-
-def _plain(value: float | str) -> str:
-    """Return a value of `images.csv`; nine digits give back every float32."""
-    return f"{value:.9g}" if isinstance(value, float) else str(value)
-
-
-def _source_row(source: SourceRecord) -> str:
-    known = (source.position, source.name, source.sha256 or "", source.width, source.height, source.replaced_pixels)
-    return _row((*known, source.split or "", source.profile or "", source.note or ""))
-
-
-def _image_rows(name: str, source: str, image: ImageRecord, stated: Mapping[int, Light] | None) -> str:
-    """Return the rows of an image's lights, with what each may be off by where the table's lights are given."""
-    return "".join(
-        _row(
-            (
-                name,
-                source,
-                light.illumination,
-                *(f"{part:.9f}" for part in light.truth),
-                *([] if stated is None else [_uncertainty(light.illumination, stated)]),
-            )
-        )
-        for light in image.lights
-    )
-
-
-def _uncertainty(label: str, lights: Mapping[int, Light]) -> str:
-    """Return the expanded uncertainty of a light by its label, degrees: of a mixture the largest of its parts'.
-
-    Errors of a table's lights have causes in common, so that they do not cancel in a mixture, and a mixture lies
-    between its parts. Nothing where the table does not state one.
-    """
-    parts = [lights[int(part.partition(":")[0])].uncertainty_deg for part in label.split("+")]
-    known = [part for part in parts if part is not None]
-    return f"{max(known):.4g}" if len(known) == len(parts) else ""
-
-
-@dataclass(frozen=True)
-class Workplace:
-    """Where a dataset is being made.
-
-    - `files`: what will be the dataset.
-    - `notes`: the plan and the shards' records, which are removed at the end.
-    - `out`: the dataset's place.
-    - `plan_id`: identifier of the plan; see `_plan_id`.
-    """
-
-    files: Store
-    notes: Store
-    out: str
-    plan_id: str
-
-    def done(self) -> set[int]:
-        """Return the shards that are done."""
-        ending = f".{self.plan_id}{_DONE}"
-        found = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
-        return {int(name.removesuffix(ending)) for name in found if name.endswith(ending)}
-
-    def has(self, shard: int) -> bool:
-        """Return whether a shard is done."""
-        return self.notes.has(self._record_name(shard))
-
-    def load(self, shard: int) -> ShardRecord:
-        """Return the record of a shard that is done."""
-        name = self._record_name(shard)
-        remedy = "remove it and run the same command again, which makes it anew"
-        return from_json(ShardRecord, self.notes.get(name), f"{self.notes.place}/{name}", remedy)
-
-    def commit(self, record: ShardRecord) -> None:
-        """Bring the record of a shard to the disk whose files are there: from here on it is done."""
-        name = self._record_name(record.shard)
-        self.notes.put(name, record.model_dump_json().encode())
-        self.notes.sync([name])
-        if isinstance(self.notes, LocalStore):
-            # Whoever makes the shard at the same time may have it open, and no later reader asks for it.
-            with contextlib.suppress(OSError):
-                (self.notes.root / self._images_name(record.shard)).unlink(missing_ok=True)
-
-    def note(self, shard: int, image: FinishedImage) -> None:
-        """Note that all files of an image of a shard are written; any thread may do so."""
-        if isinstance(self.notes, LocalStore):
-            line = image.model_dump_json().encode()
-            # It begins anew behind a line that was cut.
-            self.notes.append(self._images_name(shard), b"\n%s %s\n" % (sha256_of(line).encode(), line))
-
-    def noted(self, shard: int) -> list[FinishedImage]:
-        """Return what was noted of the images of a shard, but for what cannot be read; see `is_whole`."""
-        name = self._images_name(shard)
-        if not isinstance(self.notes, LocalStore) or not self.notes.has(name):
-            return []
-        found: list[FinishedImage] = []
-        # Whoever makes the shard at the same time may be done, and have removed them.
-        with contextlib.suppress(FormatError):
-            for noted in self.notes.get(name).splitlines():
-                sha256, _, line = noted.partition(b" ")
-                if sha256 == sha256_of(line).encode():
-                    found.append(from_json(FinishedImage, line, f"{self.notes.place}/{name}", "remove it"))
-        return found
-
-    def is_whole(self, image: FinishedImage) -> bool:
-        """Return whether all files of an image are there as they were written."""
-        try:
-            for file in image.files:
-                with self.files.open(file.name) as stream:
-                    if stream_sha256(stream) != file.sha256:
-                        return False
-        except (CropError, OSError):
-            return False
-        return True
-
-    def discard(self) -> None:
-        """Remove the records of the shards that are done, since to continue would end the same."""
-        self.notes.remove(RECORDS)
-
-    def publish(self) -> None:
-        """Make a dataset of the files; all of them, the description last, are there."""
-        if isinstance(self.files, LocalStore):
-            out = Path(self.out)
-            require_free(out, "the dataset")
-            self.files.sweep()
-            publish_folder(self.files.root, out, "the dataset")
-        _remove_notes(self.notes)
-
-    def _record_name(self, shard: int) -> str:
-        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}{_DONE}"
-
-    def _images_name(self, shard: int) -> str:
-        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}{_IMAGES}"
-
-
 def finished(out: str | Path, identity: PlanIdentity) -> bool:
     """Return whether the dataset of this plan is complete; notes that a killed program left are removed then."""
     notes = _notes(out)
@@ -1384,17 +482,8 @@ def finished(out: str | Path, identity: PlanIdentity) -> bool:
     planned = notes.has(PLAN)
     if planned and list(_differences(_load(notes), _read_back(identity))):
         return False
-    _remove_notes(notes)
+    remove_notes(notes)
     return planned
-
-
-def _remove_notes(notes: Store) -> None:
-    """Remove the notes, the plan last: until then a program that is run again finds that the dataset is its own."""
-    notes.remove(RECORDS)
-    if isinstance(notes, LocalStore):
-        shutil.rmtree(notes.root.parent, ignore_errors=True)
-    else:
-        notes.remove("")
 
 
 def require_free_place(out: str | Path) -> None:
@@ -1451,7 +540,7 @@ def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Ge
             yield place
         except BaseException as error:
             # An InputError asks for another command, which could not go on with images of this one.
-            useful = _DONE if isinstance(error, InputError) else (_DONE, _IMAGES)
+            useful = DONE if isinstance(error, InputError) else (DONE, IMAGE_NOTES)
             if alone and folder.is_dir() and not any(name.endswith(useful) for name in notes.names(RECORDS)):
                 shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -1467,12 +556,12 @@ def stored_identity(out: str | Path) -> PlanIdentity:
 
 def _notes(out: str | Path) -> Store:
     if isinstance(out, str) and is_remote(out):
-        return RemoteStore(f"{out.rstrip('/')}/{_NOTES}")
+        return RemoteStore(f"{out.rstrip('/')}/{NOTES}")
     return LocalStore(partial_path(local_path(out)) / "plan")
 
 
 def _remote(out: str, identity: PlanIdentity) -> Generator[Workplace]:
-    files, notes = RemoteStore(out), RemoteStore(f"{out.rstrip('/')}/{_NOTES}")
+    files, notes = RemoteStore(out), RemoteStore(f"{out.rstrip('/')}/{NOTES}")
     place = Workplace(files, notes, out, _plan_id(identity))
     if files.has(DESCRIPTION):
         raise InputError(f"{out} already holds a dataset; name another place, or remove what is there")

@@ -27,7 +27,8 @@ from foundation.errors import InputError
 from foundation.files import file_sha256
 from foundation.secret_texts import masked_values
 from foundation.version import software
-from generator.dataset.layouts import SPLITS, Layout, Scale, Split, TableRecord, library_of, require_library
+from generator.dataset.joined import library_of, require_library
+from generator.dataset.layouts import SPLITS, Layout, Scale, Split, TableRecord
 from generator.files import FORMATS, Format, libraries_of
 from generator.pictures.sources import PictureFile
 from generator.rendering import DEFAULT, Rendering

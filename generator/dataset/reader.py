@@ -38,13 +38,13 @@ from pydantic import ValidationError
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError, counted
 from foundation.files import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object, stream_sha256
+from generator.dataset.joined import JOINED, read_member
 from generator.dataset.layouts import (
     COMPLETED_BY_HAND,
     FORMAT,
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,
     IMAGES,
-    JOINED,
     SOURCES,
     SPLITS,
     STRETCHED_VERSION,
@@ -58,7 +58,6 @@ from generator.dataset.layouts import (
     Split,
     Triple,
     member_name,
-    read_member,
     shard_key,
 )
 from generator.files import decode_image, from_full_scale
@@ -315,7 +314,7 @@ class Dataset:
 
     @property
     def layout(self) -> str:
-        """Its layout: ``folder``, or a name of `generator.dataset.layouts.JOINED`."""
+        """Its layout: ``folder``, or a name of `generator.dataset.joined.JOINED`."""
         return self._options.layout
 
     @cached_property

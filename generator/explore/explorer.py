@@ -1,6 +1,6 @@
 """`generate explore`: the server of a page on a table, what the page may ask, and pictures for those who name none.
 
-Images are made as `generate` makes them (`generator.dataset.making.photograph`): the first image of a dataset of this
+Images are made as `generate` makes them (`generator.dataset.shards.photograph`): the first image of a dataset of this
 picture alone, under this light alone, with seed 0. So the command that is shown makes the bytes that are shown. The
 server (see `foundation.local_server`) writes no file that stays.
 
@@ -27,17 +27,19 @@ import numpy.typing as npt
 
 from foundation.colorimetry import srgb_codes
 from foundation.errors import CropError, FormatError, InputError
-from foundation.files import cache_folder, sha256_of, write_whole
+from foundation.files import sha256_of, write_whole
+from foundation.folders import cache_folder
 from foundation.local_server import LocalServer, Refusal, Request, Response
 from foundation.pages import render
 from foundation.secret_texts import masked
-from generator.dataset.making import chromaticity, light_of, photograph
 from generator.dataset.plan import DatasetOptions
-from generator.kernels.choice import replace_unfit_colours
+from generator.dataset.shards import chromaticity, light_of, photograph
+from generator.kernels.unfit import replace_unfit_colours
 from generator.lights.choices import parse_light
 from generator.lights.gamut import Gamut, black_body, rb_of
 from generator.lights.lighting import Lighting, Mixture
-from generator.pictures.sources import SUFFIXES, Picture, PictureFile, Preparation, RandomScene, open_picture
+from generator.pictures.random_scenes import RandomScene
+from generator.pictures.sources import SUFFIXES, Picture, PictureFile, Preparation, open_picture
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.colorimetric import reference_light
 from generator.rendering.matrices import ColourMatrix, matrix_for
@@ -365,7 +367,7 @@ _PATCHES: Final = 6
 def sample_folder(cache: Path | None = None) -> Path:
     """Return the folder of the sample pictures, made if it is not there.
 
-    `cache`: where it is kept; None for `foundation.files.cache_folder`.
+    `cache`: where it is kept; None for `foundation.folders.cache_folder`.
     """
     import cv2
 

@@ -19,31 +19,47 @@ digits in base S and differ from independent ones by less than S²/2³² of thei
 
 The multipliers are odd numbers found by others to spread changes well: C. Wellons, "Prospecting for hash functions",
 2018, and its collection of improved constants.
-
-A table lists the cells whose samples must not be used. A pixel of such a colour takes the nearest fit colour, and the
-number of those pixels is printed and recorded with the dataset; nothing is replaced in silence.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from llvmlite import ir
 from numpy import uint32, uint64
 
-from foundation.compiled import compiled, inlined
-from foundation.errors import InputError, QualityError, kind_of
-from generator.kernels.vector import GROUP, LANES, LINE, choose, copy1, offset_at, prefetch_once, write_colours
-from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
+from foundation.compiled import inlined, intrinsic
+from foundation.errors import InputError, kind_of
+from generator.kernels.vector import (
+    ADDRESS,
+    EIGHT,
+    GROUP,
+    I8,
+    I32,
+    I64,
+    LANES,
+    LINE,
+    SAMPLE_BYTES,
+    WORDS,
+    Builder,
+    Value,
+    broadcast,
+    constant,
+    copy1,
+    load,
+    pixel_codes,
+    pointer_at,
+    store,
+    void,
+)
+from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES, key_of
 
 if TYPE_CHECKING:
-    from calibration.table.lut import Provenance
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-
-from generator.philox import key_of
+    pass
 
 LEAD: Final = 2
 """Groups of pixels by which choosing offsets leads fetching samples, so that the processor computes while it waits."""
@@ -62,6 +78,155 @@ _W0: Final = np.uint32(KEY_STEPS[0])
 _W1: Final = np.uint32(KEY_STEPS[1])
 _HALF: Final = np.uint64(32)
 _PURPOSE: Final = np.uint32(SAMPLES)
+_PAIRS = ir.VectorType(I64, LANES // 2)
+_MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
+"""Of the three rounds of the rule."""
+
+
+def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
+    """Return the colour indices of the 16 pixels (48 bytes) at `picture`."""
+    codes = pixel_codes(builder, picture)
+
+    def field(place: int) -> Value:
+        shift = builder.sub(ir.Constant(I32, 8 * (place + 1)), builder.mul(bits, ir.Constant(I32, place + 1)))
+        ones = builder.sub(builder.shl(ir.Constant(I32, 1), bits), ir.Constant(I32, 1))
+        mask = builder.shl(ones, builder.mul(bits, ir.Constant(I32, place)))
+        return builder.and_(builder.lshr(codes, broadcast(builder, shift, WORDS)), broadcast(builder, mask, WORDS))
+
+    return builder.or_(builder.or_(field(0), field(1)), field(2))
+
+
+def hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
+    """Return the words h of a group."""
+    numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
+    h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
+    h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
+    for key, shift, multiplier in zip(keys[1:], (16, 15), _MULTIPLIERS[1:], strict=True):
+        h = builder.xor(h, broadcast(builder, key, WORDS))
+        h = builder.xor(h, builder.lshr(h, constant(WORDS, shift)))
+        h = builder.mul(h, constant(WORDS, multiplier))
+    return h
+
+
+def digits(builder: Builder, h: Value, count: Value) -> tuple[Value, ...]:
+    """Return the choices of the first and the second 16 pixels of a group, from its words."""
+    counts = broadcast(builder, count, WORDS)
+
+    def upper(numbers: Value) -> Value:
+        """Return the upper halves of the products with `count`, even and odd lanes by one 64-bit product each."""
+        low, half = constant(_PAIRS, 0xFFFFFFFF), constant(_PAIRS, 32)
+        pairs, factor = builder.bitcast(numbers, _PAIRS), builder.and_(builder.bitcast(counts, _PAIRS), low)
+        even = builder.lshr(builder.mul(builder.and_(pairs, low), factor), half)
+        odd = builder.mul(builder.lshr(pairs, half), factor)
+        odd = builder.and_(odd, constant(_PAIRS, 0xFFFFFFFF << 32))
+        return builder.bitcast(builder.or_(even, odd), WORDS)
+
+    first, second = upper(h), upper(builder.mul(h, counts))
+    # Eight words serve eight pixels by their first digits and the next eight by their second.
+    return tuple(
+        builder.shuffle_vector(
+            first, second, constant(WORDS, [*range(half, half + EIGHT), *range(LANES + half, LANES + half + EIGHT)])
+        )
+        for half in (0, EIGHT)
+    )
+
+
+@intrinsic
+def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, bits: Any, target: Any) -> Any:
+    """Write to `target` the offsets, uint32 bytes, of the samples chosen for the 32 pixels at `picture`.
+
+    `word` is the number of the group's first word; 96 bytes are read, 128 written.
+    """
+    del typing, picture, word, k0, k1, k2, count, bits, target
+    number = "uint32"
+
+    def emit(
+        builder: Builder,
+        picture: Value,
+        word: Value,
+        k0: Value,
+        k1: Value,
+        k2: Value,
+        count: Value,
+        bits: Value,
+        target: Value,
+    ) -> None:
+        stride = broadcast(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
+        for half, choices in enumerate(digits(builder, hashed(builder, word, (k0, k1, k2)), count)):
+            begin = builder.add(picture, ir.Constant(I64, 3 * LANES * half))
+            colours = builder.mul(_colours(builder, begin, bits), stride)
+            offsets = builder.add(colours, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
+            store(builder, offsets, target, 4 * LANES * half)
+
+    return void(emit, ADDRESS, number, number, number, number, number, number, ADDRESS)
+
+
+@intrinsic
+def write_colours(
+    typing: Any, picture: Any, bits: Any, stride: Any, target: Any, other_stride: Any, other_target: Any
+) -> Any:
+    """Write the colours of the 32 pixels at `picture` as uint32: their indices times each stride, at each target."""
+    del typing, picture, bits, stride, target, other_stride, other_target
+
+    def emit(
+        builder: Builder,
+        picture: Value,
+        bits: Value,
+        stride: Value,
+        target: Value,
+        other_stride: Value,
+        other_target: Value,
+    ) -> None:
+        for half in range(2):
+            colours = _colours(builder, builder.add(picture, ir.Constant(I64, 3 * LANES * half)), bits)
+            for factor, place in ((stride, target), (other_stride, other_target)):
+                store(builder, builder.mul(colours, broadcast(builder, factor, WORDS)), place, 4 * LANES * half)
+
+    return void(emit, ADDRESS, "uint32", "uint32", ADDRESS, "uint32", ADDRESS)
+
+
+@intrinsic
+def choose_for_colours(typing: Any, colours: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, target: Any) -> Any:
+    """Write what `choose` writes for the 32 pixels whose colours stand at `colours`, times the bytes of a colour."""
+    del typing, colours, word, k0, k1, k2, count, target
+    number = "uint32"
+
+    def emit(
+        builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
+    ) -> None:
+        for half, choices in enumerate(digits(builder, hashed(builder, word, (k0, k1, k2)), count)):
+            named = load(builder, colours, 4 * LANES * half, WORDS)
+            offsets = builder.add(named, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
+            store(builder, offsets, target, 4 * LANES * half)
+
+    return void(emit, ADDRESS, number, number, number, number, number, ADDRESS)
+
+
+def prefetching(locality: int) -> Callable[..., None]:
+    """Return an emitter of LLVM's prefetch with that locality: 3 keeps the line in every cache, 0 in none."""
+
+    def emit(builder: Builder, address: Value) -> None:
+        pointer = I8.as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [pointer, I32, I32, I32])
+        function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
+        numbers = [ir.Constant(I32, number) for number in (0, locality, 1)]  # to read, how near, data
+        builder.call(function, [pointer_at(builder, address, 0, I8), *numbers])
+
+    return emit
+
+
+@intrinsic
+def prefetch(typing: Any, address: Any) -> Any:
+    """Prefetch the line of `address` into all caches; an address without memory is ignored."""
+    del typing, address
+    return void(prefetching(3), ADDRESS)
+
+
+@intrinsic
+def prefetch_once(typing: Any, address: Any) -> Any:
+    """Prefetch a line that is read once, so that it takes no place in the larger caches."""
+    del typing, address
+    return void(prefetching(0), ADDRESS)
 
 
 @inlined
@@ -149,112 +314,6 @@ def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
     colours = np.asarray(colours, dtype=np.int64)
     mask = (1 << bits) - 1
     return np.stack([colours >> 2 * bits & mask, colours >> bits & mask, colours & mask], axis=-1)
-
-
-def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
-    """Return for each unfit colour the nearest fit one.
-
-    Nearest by Euclidean distance of the codes; of several equally near the lowest index.
-
-    `unfit`: (N,) int, distinct colour indices 0 … 8**bits − 1. Returns (N,) int64 colour indices, none of them unfit.
-
-    Examples
-    --------
-    >>> nearest_fit_colours([0, 1], bits=2)
-    array([4, 2])
-    """
-    unfit = np.asarray(unfit, dtype=np.int64)
-    is_fit = np.ones(8**bits, dtype=bool)
-    is_fit[unfit] = False
-    fit = np.flatnonzero(is_fit)
-    if not fit.size:
-        raise QualityError(f"all {8**bits} colours of the table are unfit for use; build the table again")
-    codes = channels_of(fit, bits)
-    nearest = [
-        fit[np.argmin(((codes - channel) ** 2).sum(axis=1))] for channel in channels_of(unfit, bits).reshape(-1, 3)
-    ]
-    return np.array(nearest, dtype=np.int64).reshape(unfit.shape)
-
-
-def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple[npt.NDArray[np.uint8], int]:
-    """Return `picture` with unfit colours replaced, and the number of pixels replaced.
-
-    `picture`: (H, W, 3) uint8 sRGB codes. Returns (H, W, 3) uint8, the same array if nothing had to be replaced; and
-    the count.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> stained = SimpleNamespace(bits=2, unfit=(SimpleNamespace(colour=0),))
-    >>> picture = np.array([[[0, 10, 20], [255, 255, 255]]], np.uint8)
-    >>> replaced, pixels = replace_unfit_colours(picture, stained)
-    >>> replaced, pixels
-    (array([[[  0,   0,  64],
-            [255, 255, 255]]], dtype=uint8), 1)
-    """
-    bits = provenance.bits
-    unfit = tuple(sorted({cell.colour for cell in provenance.unfit}))
-    if not unfit or not colours_in(picture, bits)[list(unfit)].any():
-        return picture, 0
-    is_unfit, instead = _replacements(unfit, bits)
-    replaced = np.array(picture, order="C")
-    return replaced, int(_replace(replaced, np.uint32(bits), is_unfit, instead))
-
-
-@lru_cache(maxsize=4)
-def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8]]:
-    """Return which colours of a table are unfit, (8**bits,) bool, and their replacements, (8**bits, 3) uint8."""
-    is_unfit, instead = np.zeros(8**bits, np.bool_), np.zeros((8**bits, 3), np.uint8)
-    is_unfit[list(unfit)] = True
-    instead[list(unfit)] = channels_of(nearest_fit_colours(unfit, bits), bits) << (8 - bits)
-    return is_unfit, instead
-
-
-def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool_]:
-    """Return which colours of a table, (8**bits,) bool, are in a picture (H, W, 3) uint8.
-
-    Examples
-    --------
-    >>> np.flatnonzero(colours_in(np.array([[[0, 0, 0], [255, 255, 0]]], np.uint8), bits=5))
-    array([    0, 32736])
-    """
-    found = np.zeros(8**bits, np.bool_)
-    pixels = np.ascontiguousarray(picture)
-    scratch = np.ones(EDGE_BYTES + 2 * OFFSETS_BYTES + 1, np.uint8)
-    _find(pixels.ctypes.data, pixels.size // 3, np.uint32(bits), found.ctypes.data, scratch.ctypes.data)
-    return found
-
-
-@compiled
-def _find(pixels: int, count: int, bits: Any, found: int, scratch: int) -> None:
-    """Set the byte at `found` of each colour that is among the pixels to 1, the last byte of scratch memory."""
-    places, others = scratch + EDGE_BYTES, scratch + EDGE_BYTES + OFFSETS_BYTES
-    one = others + OFFSETS_BYTES
-    for group in range((count + GROUP - 1) // GROUP):
-        source = group_address(pixels, count, group, scratch)
-        write_colours(source, bits, uint32(1), places, uint32(0), others)
-        for i in range(min(GROUP, count - GROUP * group)):
-            copy1(one, found + offset_at(places + 4 * i))
-
-
-@inlined
-def _colour_at(picture: Any, y: int, x: int, bits: Any) -> Any:
-    low = np.uint32(8) - bits
-    red, green, blue = picture[y, x, 0] >> low, picture[y, x, 1] >> low, picture[y, x, 2] >> low
-    return red << np.uint32(2) * bits | green << bits | blue
-
-
-@compiled
-def _replace(picture: Any, bits: Any, is_unfit: Any, instead: Any) -> int:
-    count = 0
-    for y in range(picture.shape[0]):
-        for x in range(picture.shape[1]):
-            colour = _colour_at(picture, y, x, bits)
-            if is_unfit[colour]:
-                for channel in range(3):
-                    picture[y, x, channel] = instead[colour, channel]
-                count += 1
-    return count
 
 
 Samples = npt.NDArray[np.uint16]

@@ -42,17 +42,20 @@ from generator.kernels.choice import (
     check_tables,
     check_weights,
     check_white_level,
-    colours_in,
+    choose_for_colours,
     group_address,
     packed_rows,
     philox4x32,
+    prefetch,
     prefetch_group,
     readable,
     row_keys,
     run_in_threads,
     writable,
+    write_colours,
 )
 from generator.kernels.rendering import choose_first_groups, draw_groups
+from generator.kernels.unfit import colours_in
 from generator.kernels.vector import (
     BLOCK,
     FAULT_BYTES,
@@ -63,17 +66,14 @@ from generator.kernels.vector import (
     PLAN_ENTRIES,
     SAMPLE_BYTES,
     arrange_weights,
-    choose_for_colours,
     first_line,
     interleave_weights,
     line_buffer_bytes,
     mean4,
     mix,
-    prefetch,
     store_fence,
     stream_lines,
     weight_flags,
-    write_colours,
 )
 
 _MIXTURES: Final = np.uint32(philox.MIXTURES)

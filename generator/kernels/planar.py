@@ -33,11 +33,12 @@ from generator.kernels.choice import (
     check_white_level,
     choose_group,
     packed_rows,
+    prefetch,
     readable,
     row_keys,
     run_in_threads,
 )
-from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored, prefetch
+from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored
 
 Window = tuple[int, int, int, int]
 """x and y of a window's first pixel in the picture, and its width and height, px."""

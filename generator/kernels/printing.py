@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -39,8 +38,11 @@ from generator.kernels.choice import (
     check_out,
     check_picture,
     check_seed,
+    choose_for_colours,
     copied_back,
     packed_rows,
+    prefetch,
+    prefetching,
     readable,
     row_keys,
     run_in_threads,
@@ -62,14 +64,11 @@ from generator.kernels.vector import (
     Builder,
     Value,
     broadcast,
-    choose_for_colours,
     concatenated,
     constant,
     load,
     minimum,
     pixel_codes,
-    prefetch,
-    prefetching,
     store,
     void,
 )
@@ -170,21 +169,21 @@ def means_at(
 
 
 _FOUR: Final = ir.VectorType(F32, 4)
-_BLOCK: Final = LANES
+BLOCK: Final = LANES
 """Pixels that are planned and interpolated at a time."""
 _PLAN_ROWS: Final = 8
 """Rows of 16 numbers that the plan of a block has: offsets of three nodes in bytes, weights of four, the offset of the
 nearest. The fourth node is one step farther in each channel than the first."""
-_ROW: Final = 4 * _BLOCK
+_ROW: Final = 4 * BLOCK
 """Bytes of a row: one number of 32 bits a pixel."""
 _PLAN_BYTES: Final = _ROW * _PLAN_ROWS
-_LINE_BYTES: Final = 16 * _BLOCK
+_LINE_BYTES: Final = 16 * BLOCK
 """Bytes of a block's pixels: red, green, blue and noise, float32 each."""
 _SEGMENT: Final = 8
 """Blocks of a row that are planned, and their samples prefetched, while those before are interpolated."""
 _ROWS_AHEAD: Final = 2
 """Rows by which prefetching the picture leads planning it."""
-_SEGMENT_GROUPS: Final = _SEGMENT * _BLOCK // GROUP + 2
+_SEGMENT_GROUPS: Final = _SEGMENT * BLOCK // GROUP + 2
 """Groups of 32 pixels, whose choices are made together, that a segment may touch."""
 
 
@@ -202,7 +201,7 @@ def plan_block(typing: Any, picture: Any, part: Any, target: Any) -> Any:
         parts: list[Value] = []
         for channel in range(3):
             vector: Value = ir.Constant(FLOATS, ir.Undefined)
-            for pixel in range(_BLOCK):
+            for pixel in range(BLOCK):
                 code = builder.zext(load(builder, picture, 3 * pixel + channel, I8), I64)
                 its = load(builder, builder.add(part, builder.shl(code, ir.Constant(I64, 2))), 0, F32)
                 vector = builder.insert_element(vector, its, ir.Constant(I32, pixel))
@@ -258,7 +257,7 @@ def place_samples(typing: Any, plan: Any, cells: Any, choices: Any, samples: Any
     del typing, plan, cells, choices, samples, target
 
     def emit(builder: Builder, plan: Value, cells: Value, choices: Value, samples: Value, target: Value) -> None:
-        for pixel in range(_BLOCK):
+        for pixel in range(BLOCK):
             near = load(builder, plan, _ROW * 7 + 4 * pixel, I32)
             cell = builder.zext(builder.lshr(near, ir.Constant(I32, 3)), I64)
             place = builder.add(load(builder, builder.add(cells, cell), 0, I32), load(builder, choices, 4 * pixel, I32))
@@ -323,7 +322,7 @@ def draw_block(
 
     def emit(builder: Builder, *addresses: Value) -> None:
         *those, means, line = addresses
-        for first in range(0, _BLOCK, 4):
+        for first in range(0, BLOCK, 4):
             seen = _interpolated(builder, those[0], means, first)
             store(builder, _deviating(builder, seen, first, those), line, 16 * first)
 
@@ -337,7 +336,7 @@ def add_deviations(typing: Any, plan: Any, bases: Any, samples: Any, places: Any
 
     def emit(builder: Builder, *addresses: Value) -> None:
         *those, line = addresses
-        for first in range(0, _BLOCK, 4):
+        for first in range(0, BLOCK, 4):
             seen = load(builder, line, 16 * first, FLOATS)
             store(builder, _deviating(builder, seen, first, those), line, 16 * first)
 
@@ -402,7 +401,7 @@ def write_pixels(typing: Any, line: Any, most: Any, target: Any) -> Any:
 @inlined
 def _block_at(block: int, width: int) -> int:
     """Return where a block of a row begins; the last may overlap the one before."""
-    return min(_BLOCK * block, width - _BLOCK)
+    return min(BLOCK * block, width - BLOCK)
 
 
 @inlined
@@ -425,11 +424,11 @@ def _plan_segment(
 ) -> None:
     """Plan blocks `first` … `stop` - 1 of a row of which the first pixel is at address `row` and has x = x0."""
     _, _, cells, part, zeros = tables
-    for line in range(3 * _BLOCK * first, 3 * _BLOCK * stop + LINE, LINE):
+    for line in range(3 * BLOCK * first, 3 * BLOCK * stop + LINE, LINE):
         prefetch(row + _ROWS_AHEAD * pitch + line)
     for block in range(first, stop):
         plan_block(row + 3 * _block_at(block, width), part, plans + (block - first) * _PLAN_BYTES)
-    low, high = (x0 + _block_at(first, width)) // GROUP, (x0 + _block_at(stop - 1, width) + _BLOCK - 1) // GROUP
+    low, high = (x0 + _block_at(first, width)) // GROUP, (x0 + _block_at(stop - 1, width) + BLOCK - 1) // GROUP
     for number in range(len(samples)):
         k0, k1, k2 = row_keys(y, number, image, seed)
         for group in range(low, high + 1):
@@ -452,7 +451,7 @@ def _mix_block(plan: int, place: int, tables: Any, members: Any, shares: Any, fa
         owner = owners[number]
         first, last = number == 0 or owner != owners[number - 1], number + 1 == len(owners)
         lit = False
-        for pixel in range(_BLOCK):
+        for pixel in range(BLOCK):
             share[pixel] = shares[pixel, owner]
             lit |= share[pixel] != 0
             factors[0, pixel] = roots[number] / np.sqrt(share[pixel]) if share[pixel] else np.float32(0)
@@ -464,13 +463,13 @@ def _mix_block(plan: int, place: int, tables: Any, members: Any, shares: Any, fa
         else:
             add_deviations(plan, bases, samples[number], to, at, own)
         if last or owners[number + 1] != owner:
-            for pixel in range(_BLOCK):
+            for pixel in range(BLOCK):
                 for channel in range(3):
                     lines[0, pixel, channel] += share[pixel] * lines[1, pixel, channel]
 
 
 @compiled
-def _print(
+def print_segments(
     source: int,
     pitch: int,
     frame: Any,
@@ -497,7 +496,7 @@ def _print(
     samples, roots, _ = members
     for number in range(len(samples)):
         factors[number] = roots[number]
-    blocks = (width + _BLOCK - 1) // _BLOCK
+    blocks = (width + BLOCK - 1) // BLOCK
     segments = (blocks + _SEGMENT - 1) // _SEGMENT
     for segment in range(height * segments + 1):
         if segment < height * segments:
@@ -529,7 +528,7 @@ def _print(
             plan = plans + (slot * _SEGMENT + block - first) * _PLAN_BYTES
             place = places + (slot * _SEGMENT * len(samples) + block - first) * _ROW
             if masked:
-                _mix_block(plan, place, tables, members, shares[y, x : x + _BLOCK], factors, lines)
+                _mix_block(plan, place, tables, members, shares[y, x : x + BLOCK], factors, lines)
             else:
                 draw_block(plan, tables[1], samples[0], place, factors.ctypes.data, tables[0], line)
                 for number in range(1, len(samples)):
@@ -538,7 +537,7 @@ def _print(
             if scales == 0:
                 write_pixels(line, most, target + y * pitches[0] + SAMPLE_BYTES * x)
                 continue
-            red = target + y * pitches[1] + 4 * (width - _BLOCK - x if flip else x)
+            red = target + y * pitches[1] + 4 * (width - BLOCK - x if flip else x)
             green, blue = red + pitches[0], red + 2 * pitches[0]
             if flip:
                 write_mirrored(line, scales, red, green, blue)
@@ -546,47 +545,7 @@ def _print(
                 write_planes(line, scales, red, green, blue)
 
 
-@compiled
-def _print_crops(
-    plan: Any,
-    first: int,
-    end: int,
-    size: Any,
-    rest: Any,
-    members: Any,
-    shares: Any,
-    count: Any,
-    seeds: Any,
-    memory: Any,
-    target: int,
-    pitches: Any,
-    scales: int,
-) -> None:
-    """Fill crops `first` to `end` - 1; `plan` (N, 9): source, pitch, x, y, flip, means, bases, members from and to."""
-    samples, roots, owners = members
-    for item in range(first, end):
-        source, pitch, x, y, flip, means, bases, begin, stop = plan[item]
-        _print(
-            source,
-            pitch,
-            (x, y, size[0], size[1]),
-            flip != 0,
-            (means, bases, rest[0], rest[1], rest[2]),
-            (samples[begin:stop], roots[begin:stop], owners[begin:stop]),
-            shares,
-            False,
-            count,
-            seeds[item],
-            0,
-            memory,
-            target + item * pitches[0],
-            (pitches[1], pitches[2]),
-            scales + 28 * item,
-            np.float32(0),
-        )
-
-
-class _Memory:
+class Memory:
     """What compiled code works in: plans of two segments, their samples' places and choices, and lines of pixels."""
 
     def __init__(self, components: int) -> None:
@@ -605,8 +564,8 @@ class _Memory:
         addresses = (part.ctypes.data for name, part in parts.items() if name != "factors")
         self.arrays = (
             *addresses,
-            parts["factors"].view(np.float32).reshape(-1, _BLOCK),
-            parts["lines"].view(np.float32).reshape(2, _BLOCK, 4),
+            parts["factors"].view(np.float32).reshape(-1, BLOCK),
+            parts["lines"].view(np.float32).reshape(2, BLOCK, 4),
         )
 
 
@@ -614,7 +573,7 @@ _NOTHING: Final = np.zeros(GROUP, np.uint32)
 """What is added to choices, none."""
 
 
-class _Members:
+class Members:
     """The table's lights in those of an image or a batch, as compiled code takes them.
 
     What they point to lives as long as this. `starts`: (M + 1,) int64, the first member of each light, and the end.
@@ -633,7 +592,7 @@ class _Members:
         self.most = max(sizes)
 
 
-class _Rest:
+class Rest:
     """What all lights share as compiled code takes it: where nodes' samples begin, parts of codes, and zeros."""
 
     def __init__(self, samples: npt.NDArray[np.uint16], cells: npt.NDArray[np.uint32]) -> None:
@@ -641,9 +600,9 @@ class _Rest:
         self.addresses = tuple(array.ctypes.data for array in self._kept)
 
 
-def _at_least_a_block(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+def at_least_a_block(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """Return a picture (H, W, 3) whose rows compiled code can read, with black pixels behind it up to a block."""
-    missing = _BLOCK - picture.shape[1]
+    missing = BLOCK - picture.shape[1]
     return packed_rows(picture) if missing <= 0 else np.pad(picture, ((0, 0), (0, missing), (0, 0)))
 
 
@@ -672,20 +631,20 @@ def draw_printed(
     target = check_out(out, picture.shape, np.uint16)
     key = check_seed(seed, image)
     count, masked, width = np.uint32(samples.shape[2]), shares is not None, picture.shape[1]
-    members, rest = _Members(samples, lights), _Rest(samples, cells)
+    members, rest = Members(samples, lights), Rest(samples, cells)
     means, bases = (
         np.concatenate([getattr(one, name) for one in lights]) if masked else getattr(lights[0], name)
         for name in ("means", "bases")
     )
     given = np.zeros((1, 1, 1), np.float32) if shares is None else shares
-    source = _at_least_a_block(picture)
-    if masked and width < _BLOCK:
-        given = np.pad(given, ((0, 0), (0, _BLOCK - width), (0, 0)))
-    work = writable(target) if width >= _BLOCK else np.empty(source.shape, np.uint16)
+    source = at_least_a_block(picture)
+    if masked and width < BLOCK:
+        given = np.pad(given, ((0, 0), (0, BLOCK - width), (0, 0)))
+    work = writable(target) if width >= BLOCK else np.empty(source.shape, np.uint16)
 
     def fill(top: int, bottom: int) -> None:
-        memory = _Memory(len(members.arrays[0]))
-        _print(
+        memory = Memory(len(members.arrays[0]))
+        print_segments(
             source.ctypes.data + top * source.strides[0],
             source.strides[0],
             (0, first_row + top, source.shape[1], bottom - top),
@@ -705,77 +664,7 @@ def draw_printed(
         )
 
     run_in_threads(fill, len(picture), threads)
-    if width < _BLOCK:
+    if width < BLOCK:
         target[...] = work[:, :width]
         return target
     return copied_back(work, target)
-
-
-def draw_printed_crops(
-    samples: npt.NDArray[np.uint16],
-    lights: Sequence[PrintedLight],
-    pictures: Sequence[npt.NDArray[np.uint8]],
-    windows: npt.NDArray[np.int64],
-    cells: npt.NDArray[np.uint32],
-    *,
-    scales: npt.NDArray[np.float32],
-    flips: npt.NDArray[np.bool_],
-    seeds: npt.NDArray[np.uint64],
-    threads: int = 1,
-    out: npt.NDArray[np.float32],
-) -> npt.NDArray[np.float32]:
-    """Return N crops by colour in `out` (N, 3, height, width) float32, 1 = saturation.
-
-    `lights`, `pictures` and `windows` (N, 4: x, y, width, height, inside the picture) are one for each; `scales`
-    (N, 7) float32 as of `planar.scales_of`.
-
-    Raises
-    ------
-    InputError
-        `out` is of another shape or type.
-    """
-    width, height = windows[0, 2:].tolist()
-    check_out(out, (len(pictures), 3, height, width), np.float32)
-    count = len(pictures)
-    # Most batches show a light more than once.
-    known = {id(light): light for light in lights}
-    members, rest = _Members(samples, list(known.values())), _Rest(samples, cells)
-    of_lights = {
-        name: (light.means.ctypes.data, light.bases.ctypes.data, *ends)
-        for (name, light), ends in zip(known.items(), pairwise(members.starts.tolist()), strict=True)
-    }
-    sources = [
-        _at_least_a_block(picture[y : y + height, x : x + width])
-        for picture, (x, y) in zip(pictures, windows[:, :2].tolist(), strict=True)
-    ]
-    plan = np.empty((count, 9), np.int64)
-    plan[:, :2] = [(source.ctypes.data, source.strides[0]) for source in sources]
-    plan[:, 2:4], plan[:, 4] = windows[:, :2], flips
-    plan[:, 5:] = [of_lights[id(light)] for light in lights]
-    whole = width >= _BLOCK and out.strides[3] == 4
-    work = out if whole else np.empty((count, 3, height, max(width, _BLOCK)), np.float32)
-    unmasked = np.zeros((1, 1, 1), np.float32)
-
-    def fill(first: int, end: int) -> None:
-        memory = _Memory(members.most)
-        _print_crops(
-            plan,
-            first,
-            end,
-            (work.shape[3], height),
-            rest.addresses,
-            members.arrays,
-            unmasked,
-            np.uint32(samples.shape[2]),
-            seeds,
-            memory.arrays,
-            work.ctypes.data,
-            work.strides[:3],
-            scales.ctypes.data,
-        )
-
-    run_in_threads(fill, count, threads)
-    if not whole:
-        for item, flip in enumerate(flips.tolist()):
-            out[item] = work[item, :, :, -width:] if flip else work[item, :, :, :width]
-    return out

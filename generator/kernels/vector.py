@@ -35,12 +35,9 @@ I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 F32 = ir.FloatType()
 FLOATS = ir.VectorType(F32, LANES)
 WORDS = ir.VectorType(I32, LANES)
-_PAIRS = ir.VectorType(I64, LANES // 2)
 _EIGHT_FLOATS, _EIGHT_WORDS = ir.VectorType(F32, EIGHT), ir.VectorType(I32, EIGHT)
 _LINE = ir.VectorType(I32, LINE // 4)
 ADDRESS: Final = "int64"
-_MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
-"""Of the three rounds of the choice rule; `choice.py` names their source."""
 
 Builder = Any
 Value = Any
@@ -98,54 +95,6 @@ def pixel_codes(builder: Builder, picture: Value) -> Value:
     return builder.bitcast(builder.shuffle_vector(loaded, nothing, mask), WORDS)
 
 
-def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
-    """Return the colour indices of the 16 pixels (48 bytes) at `picture`."""
-    codes = pixel_codes(builder, picture)
-
-    def field(place: int) -> Value:
-        shift = builder.sub(ir.Constant(I32, 8 * (place + 1)), builder.mul(bits, ir.Constant(I32, place + 1)))
-        ones = builder.sub(builder.shl(ir.Constant(I32, 1), bits), ir.Constant(I32, 1))
-        mask = builder.shl(ones, builder.mul(bits, ir.Constant(I32, place)))
-        return builder.and_(builder.lshr(codes, broadcast(builder, shift, WORDS)), broadcast(builder, mask, WORDS))
-
-    return builder.or_(builder.or_(field(0), field(1)), field(2))
-
-
-def hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
-    """Return the words h of a group; the rule is that of `choice.py`."""
-    numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
-    h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
-    h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
-    for key, shift, multiplier in zip(keys[1:], (16, 15), _MULTIPLIERS[1:], strict=True):
-        h = builder.xor(h, broadcast(builder, key, WORDS))
-        h = builder.xor(h, builder.lshr(h, constant(WORDS, shift)))
-        h = builder.mul(h, constant(WORDS, multiplier))
-    return h
-
-
-def digits(builder: Builder, h: Value, count: Value) -> tuple[Value, ...]:
-    """Return the choices of the first and the second 16 pixels of a group, from its words."""
-    counts = broadcast(builder, count, WORDS)
-
-    def upper(numbers: Value) -> Value:
-        """Return the upper halves of the products with `count`, even and odd lanes by one 64-bit product each."""
-        low, half = constant(_PAIRS, 0xFFFFFFFF), constant(_PAIRS, 32)
-        pairs, factor = builder.bitcast(numbers, _PAIRS), builder.and_(builder.bitcast(counts, _PAIRS), low)
-        even = builder.lshr(builder.mul(builder.and_(pairs, low), factor), half)
-        odd = builder.mul(builder.lshr(pairs, half), factor)
-        odd = builder.and_(odd, constant(_PAIRS, 0xFFFFFFFF << 32))
-        return builder.bitcast(builder.or_(even, odd), WORDS)
-
-    first, second = upper(h), upper(builder.mul(h, counts))
-    # Eight words serve eight pixels by their first digits and the next eight by their second.
-    return tuple(
-        builder.shuffle_vector(
-            first, second, constant(WORDS, [*range(half, half + EIGHT), *range(LANES + half, LANES + half + EIGHT)])
-        )
-        for half in (0, EIGHT)
-    )
-
-
 def signature(returned: str, *kinds: str) -> Any:
     """Return numba's type of a function that returns one kind and takes others, by their names."""
     from numba import types
@@ -163,77 +112,6 @@ def void(emit: Callable[..., None], *kinds: str) -> Any:
         return context.get_dummy_value()
 
     return signature("void", *kinds), generate
-
-
-@intrinsic
-def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, bits: Any, target: Any) -> Any:
-    """Write to `target` the offsets, uint32 bytes, of the samples chosen for the 32 pixels at `picture`.
-
-    `word` is the number of the group's first word; 96 bytes are read, 128 written.
-    """
-    del typing, picture, word, k0, k1, k2, count, bits, target
-    number = "uint32"
-
-    def emit(
-        builder: Builder,
-        picture: Value,
-        word: Value,
-        k0: Value,
-        k1: Value,
-        k2: Value,
-        count: Value,
-        bits: Value,
-        target: Value,
-    ) -> None:
-        stride = broadcast(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
-        for half, choices in enumerate(digits(builder, hashed(builder, word, (k0, k1, k2)), count)):
-            begin = builder.add(picture, ir.Constant(I64, 3 * LANES * half))
-            colours = builder.mul(_colours(builder, begin, bits), stride)
-            offsets = builder.add(colours, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
-            store(builder, offsets, target, 4 * LANES * half)
-
-    return void(emit, ADDRESS, number, number, number, number, number, number, ADDRESS)
-
-
-@intrinsic
-def write_colours(
-    typing: Any, picture: Any, bits: Any, stride: Any, target: Any, other_stride: Any, other_target: Any
-) -> Any:
-    """Write the colours of the 32 pixels at `picture` as uint32: their indices times each stride, at each target."""
-    del typing, picture, bits, stride, target, other_stride, other_target
-
-    def emit(
-        builder: Builder,
-        picture: Value,
-        bits: Value,
-        stride: Value,
-        target: Value,
-        other_stride: Value,
-        other_target: Value,
-    ) -> None:
-        for half in range(2):
-            colours = _colours(builder, builder.add(picture, ir.Constant(I64, 3 * LANES * half)), bits)
-            for factor, place in ((stride, target), (other_stride, other_target)):
-                store(builder, builder.mul(colours, broadcast(builder, factor, WORDS)), place, 4 * LANES * half)
-
-    return void(emit, ADDRESS, "uint32", "uint32", ADDRESS, "uint32", ADDRESS)
-
-
-@intrinsic
-def choose_for_colours(typing: Any, colours: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, target: Any) -> Any:
-    """Write what `choose` writes for the 32 pixels whose colours stand at `colours`, times the bytes of a colour."""
-    del typing, colours, word, k0, k1, k2, count, target
-    number = "uint32"
-
-    def emit(
-        builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
-    ) -> None:
-        for half, choices in enumerate(digits(builder, hashed(builder, word, (k0, k1, k2)), count)):
-            named = load(builder, colours, 4 * LANES * half, WORDS)
-            offsets = builder.add(named, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
-            store(builder, offsets, target, 4 * LANES * half)
-
-    return void(emit, ADDRESS, number, number, number, number, number, ADDRESS)
 
 
 @intrinsic
@@ -390,33 +268,6 @@ def plane1(typing: Any, source: Any, factor: Any, summand: Any, limit: Any, targ
         store(builder, minimum(builder, builder.fadd(value, summand), limit), target, 0)
 
     return void(emit, ADDRESS, "float32", "float32", "float32", ADDRESS)
-
-
-def prefetching(locality: int) -> Callable[..., None]:
-    """Return an emitter of LLVM's prefetch with that locality: 3 keeps the line in every cache, 0 in none."""
-
-    def emit(builder: Builder, address: Value) -> None:
-        pointer = I8.as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [pointer, I32, I32, I32])
-        function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
-        numbers = [ir.Constant(I32, number) for number in (0, locality, 1)]  # to read, how near, data
-        builder.call(function, [pointer_at(builder, address, 0, I8), *numbers])
-
-    return emit
-
-
-@intrinsic
-def prefetch(typing: Any, address: Any) -> Any:
-    """Prefetch the line of `address` into all caches; an address without memory is ignored."""
-    del typing, address
-    return void(prefetching(3), ADDRESS)
-
-
-@intrinsic
-def prefetch_once(typing: Any, address: Any) -> Any:
-    """Prefetch a line that is read once, so that it takes no place in the larger caches."""
-    del typing, address
-    return void(prefetching(0), ADDRESS)
 
 
 BLOCK: Final = 8

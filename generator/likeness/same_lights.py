@@ -25,7 +25,8 @@ from generator.dataset.layouts import GROUND_TRUTH, Light
 from generator.dataset.reader import Dataset, open_dataset
 from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture
 from generator.masks.making import GivenMaskPlan, find_masks
-from generator.pictures.sources import RandomScene, Source, SourcePicture
+from generator.pictures.random_scenes import RandomScene
+from generator.pictures.sources import Source, SourcePicture
 from generator.stores import is_remote, local_path
 
 if TYPE_CHECKING:

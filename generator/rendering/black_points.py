@@ -39,7 +39,7 @@ import numpy.typing as npt
 from foundation.compiled import compiled
 from foundation.errors import InputError, QualityError
 from generator import philox
-from generator.kernels.choice import nearest_fit_colours
+from generator.kernels.unfit import nearest_fit_colours
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

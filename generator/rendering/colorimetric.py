@@ -39,7 +39,8 @@ import numpy.typing as npt
 
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import CropError, InputError, QualityError
-from foundation.files import cache_folder, sha256_of, whole_file
+from foundation.files import sha256_of, whole_file
+from foundation.folders import cache_folder
 from generator.kernels import printing
 from generator.kernels.choice import channels_of
 from generator.kernels.printing import NODE_CODES, NODES, SIDE, PrintedLight, means_at

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
-from generator.kernels.choice import check_picture, replace_unfit_colours
+from generator.kernels.choice import check_picture
 from generator.kernels.rendering import draw_samples
+from generator.kernels.unfit import replace_unfit_colours
 from generator.lights.choices import light_of
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.matrices import matrix_for

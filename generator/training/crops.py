@@ -32,9 +32,10 @@ import numpy.typing as npt
 
 from foundation.errors import InputError, kind_of
 from generator import philox
-from generator.kernels.choice import replace_unfit_colours
 from generator.kernels.planar import draw_batch, scales_of
-from generator.kernels.printing import PrintedLight, draw_printed_crops
+from generator.kernels.printed_crops import draw_printed_crops
+from generator.kernels.printing import PrintedLight
+from generator.kernels.unfit import replace_unfit_colours
 from generator.lights.choices import light_of
 from generator.lights.lighting import Mixture
 from generator.rendering import DEFAULT, Rendering

@@ -17,7 +17,8 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from foundation.errors import FormatError, InputError, kind_of
-from foundation.files import storage_error, whole_folder, write_whole
+from foundation.files import storage_error, write_whole
+from foundation.folders import whole_folder
 from foundation.records import Record
 from generator.kernels.choice import check_picture
 from generator.pictures.sources import Picture, Source

@@ -262,7 +262,7 @@ def test_two_programs_do_not_take_the_same_session(lab: Path) -> None:
 def test_a_journal_that_another_program_holds_is_waited_for_as_long_as_the_settings_say(
     lab: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("experiment.session.journal.TRY_S", 0.01)
+    monkeypatch.setattr("experiment.session.opening.TRY_S", 0.01)
     lab.write_text(lab.read_text().replace("[sequence]", "[sequence]\npatience_s = 0"))
     folder = lab.parent / "session"
     others: list[sqlite3.Connection] = []

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.table.lut import LutWriter, Provenance, open_lut
+from calibration.table.lut import Provenance, open_lut
+from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
-from generator.pictures.sources import random_scenes
+from generator.pictures.random_scenes import random_scenes
 
 LIGHTS = np.array([[2000.0, 3000, 1000], [1500, 3000, 2500]])
 

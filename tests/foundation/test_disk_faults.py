@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from foundation.errors import StorageError
-from foundation.files import held_folder, require_free, whole_folder, write_whole
+from foundation.files import write_whole
+from foundation.folders import held_folder, require_free, whole_folder
 from tests.failing_calls import DISK_FAULTS, FailingCalls, Ran, failing_calls, why_not
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(why_not() != "", reason=why_not())]

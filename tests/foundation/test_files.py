@@ -23,12 +23,10 @@ from foundation.files import (
     partial_path,
     read_csv,
     read_whole,
-    require_free,
-    require_free_file,
     whole_file,
-    whole_folder,
     write_whole,
 )
+from foundation.folders import require_free, require_free_file, whole_folder
 
 
 def names(folder: Path) -> list[str]:

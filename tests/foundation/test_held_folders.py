@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from foundation import files
+from foundation import folders
 from foundation.errors import InputError, StorageError
-from foundation.files import LOCK_FILE, held_folder
+from foundation.folders import LOCK_FILE, held_folder
 
 BUSY = "another program is at it; wait for it"
 Flock = Callable[[int, int], None]
@@ -36,7 +36,7 @@ def refuse_folders(handle: int, operation: int) -> None:
 def locks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Return what the file system locks."""
     if request.param == "files":
-        monkeypatch.setattr(files.fcntl, "flock", refuse_folders)
+        monkeypatch.setattr(folders.fcntl, "flock", refuse_folders)
     return request.param
 
 
@@ -140,14 +140,14 @@ def test_a_folder_that_was_finished_between_opening_and_locking_is_made_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, final = tmp_path / "making", tmp_path / "made"
-    now: Flock = files.fcntl.flock
+    now: Flock = folders.fcntl.flock
 
     def finished_first(handle: int, operation: int) -> None:
         if not final.exists():
             folder.rename(final)
         now(handle, operation)
 
-    monkeypatch.setattr(files.fcntl, "flock", finished_first)
+    monkeypatch.setattr(folders.fcntl, "flock", finished_first)
     with held_folder(folder, BUSY):
         assert folder.is_dir()
     assert list(final.iterdir()) == []
@@ -163,7 +163,7 @@ def test_a_lock_file_that_its_holder_removed_is_no_lock(tmp_path: Path, monkeypa
             removed.append(True)
             (tmp_path / LOCK_FILE).unlink()
 
-    monkeypatch.setattr(files.fcntl, "flock", removed_first)
+    monkeypatch.setattr(folders.fcntl, "flock", removed_first)
     with held_folder(tmp_path, BUSY):
         assert (tmp_path / LOCK_FILE).exists()
         with pytest.raises(InputError, match=BUSY), held_folder(tmp_path, BUSY):
@@ -177,7 +177,7 @@ def test_without_locks_the_work_goes_on_with_a_warning(
     def none(handle: int, operation: int) -> None:
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(files.fcntl, "flock", none)
+    monkeypatch.setattr(folders.fcntl, "flock", none)
     with caplog.at_level(logging.WARNING), held_folder(tmp_path, BUSY) as lock:
         lock.share()
         assert list(tmp_path.iterdir()) == []
@@ -197,8 +197,8 @@ def test_a_lock_file_that_cannot_be_made_is_the_disk_s_fault(
             raise OSError(number, os.strerror(number), path)
         return system(path, flags, mode, dir_fd=dir_fd)
 
-    monkeypatch.setattr(files.fcntl, "flock", refuse_folders)
-    monkeypatch.setattr(files.os, "open", opened)
+    monkeypatch.setattr(folders.fcntl, "flock", refuse_folders)
+    monkeypatch.setattr(folders.os, "open", opened)
     with pytest.raises(StorageError, match=f"cannot write {tmp_path}"), held_folder(tmp_path, BUSY):
         pytest.fail("held without a lock")
 
@@ -207,7 +207,7 @@ def test_another_fault_of_locking_is_the_disk_s_fault(tmp_path: Path, monkeypatc
     def fails(handle: int, operation: int) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    monkeypatch.setattr(files.fcntl, "flock", fails)
+    monkeypatch.setattr(folders.fcntl, "flock", fails)
     with pytest.raises(StorageError, match=f"cannot write {tmp_path}"), held_folder(tmp_path, BUSY):
         pytest.fail("held without a lock")
 
@@ -234,7 +234,7 @@ def test_a_folder_that_is_made_and_never_there_is_not_waited_for(
     def make_nothing(folder: Path, of: Path | None = None) -> None:
         del folder, of
 
-    monkeypatch.setattr("foundation.files.make_folder", make_nothing)
+    monkeypatch.setattr("foundation.folders.make_folder", make_nothing)
     with (
         pytest.raises(StorageError, match="ordinary disk"),
         held_folder(tmp_path / "x", "busy"),

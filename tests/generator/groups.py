@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from generator.dataset.making import Callbacks, Workers
+from generator.dataset.making import Workers
 from generator.dataset.plan import DatasetOptions
+from generator.dataset.shards import Callbacks
 
 
 def grouped(**wishes: Any) -> dict[str, Any]:

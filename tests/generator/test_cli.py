@@ -186,7 +186,7 @@ def test_who_asks_for_the_end_is_told_and_goes_on_later(
 
     wish = ("--sources", "pictures", "--illuminations", "all")
     with monkeypatch.context() as patched:
-        patched.setattr("generator.cli._Images.advance", ended)
+        patched.setattr("generator.progress._Images.advance", ended)
         assert generate("lut", "out", *wish) == 130
     assert "interrupted" in capsys.readouterr().err
     assert generate("lut", "out", *wish) == 0

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from generator import cli as progress
-from generator.cli import main, matrix_sentence, shown_progress
-from generator.dataset.making import SILENT
+from generator import progress
+from generator.cli import main, matrix_sentence
+from generator.dataset.shards import SILENT
+from generator.progress import shown_progress
 from generator.rendering.matrices import SOURCE, camera_matrix
 from tests.generator.conftest import MakeLut
 

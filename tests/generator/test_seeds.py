@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from generator import philox
-from generator.dataset.making import split_of
 from generator.dataset.plan import exact_parts
+from generator.dataset.shards import split_of
 from generator.lights.choices import DrawnLights
 from generator.lights.distributions import Gaussian, Uniform
 from generator.lights.gamut import Gamut, rb_of, rgb_of
 from generator.lights.lighting import RandomLights
 from generator.masks.making import RandomStreams, parse_masks
-from generator.pictures.sources import random_places, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import random_places
 from generator.rendering.black_points import parse_black_point
 from generator.training.crops import Crops
 from generator.training.gallery import gallery_of

@@ -39,7 +39,8 @@ from evaluation.results.tables import PAPER_COLUMNS, Table
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
-from foundation.files import is_inside_name, read_inside, reading_error, whole_folder, write_whole
+from foundation.files import is_inside_name, read_inside, reading_error, write_whole
+from foundation.folders import whole_folder
 from generator.files import Flash, fit_flash
 from generator.pictures.sources import clear_bits
 

@@ -33,7 +33,7 @@ from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex, tables_to_latex
 from evaluation.results.tables import Table, table_to_csv
 from foundation import pages, plots
-from foundation.files import whole_folder
+from foundation.folders import whole_folder
 from foundation.plots import FAINT, INK, legend_label, series_style, svg_of
 from generator.lights.choices import nearest_lights
 

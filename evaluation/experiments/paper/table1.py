@@ -45,9 +45,10 @@ from evaluation.results.tables import PAPER_COLUMNS, STATISTICS_COLUMNS, Table
 from evaluation.scene import Scene
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted
-from generator.kernels.choice import replace_unfit_colours
 from generator.kernels.rendering import draw_samples
-from generator.pictures.sources import Source, random_scenes
+from generator.kernels.unfit import replace_unfit_colours
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import Source
 
 if TYPE_CHECKING:
     from generator import Lut

@@ -32,7 +32,8 @@ from evaluation.results.tables import Table, table_to_csv
 from evaluation.scene import SceneSet
 from foundation import pages
 from foundation.errors import InputError
-from foundation.files import whole_folder, write_whole
+from foundation.files import write_whole
+from foundation.folders import whole_folder
 from foundation.plots import FAINT, INK, legend_label, series_style, standalone, svg_of
 from foundation.version import software
 

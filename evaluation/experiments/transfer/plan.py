@@ -33,7 +33,8 @@ from foundation.errors import FormatError, InputError, first_of
 from foundation.files import file_sha256, sha256_of
 from generator.dataset.reader import Dataset
 from generator.lights.lighting import parse_mixture
-from generator.pictures.sources import PictureFile, Preparation, RandomScene, find_pictures, open_picture
+from generator.pictures.random_scenes import RandomScene
+from generator.pictures.sources import PictureFile, Preparation, find_pictures, open_picture
 from generator.rendering.matrices import ColourMatrix, camera_matrix, choose_matrix
 from generator.variation.variation import Falloff, described_gradient
 

@@ -20,16 +20,8 @@ from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session.folder import Session, rebuild_journal, session_exists
-from experiment.session.journal import (
-    Journal,
-    LostJournalError,
-    Rows,
-    beat_beside,
-    ledger_path,
-    open_to_read,
-    read_ledger,
-    rows_of,
-)
+from experiment.session.journal import Journal, LostJournalError, Rows, beat_beside, ledger_path, read_ledger, rows_of
+from experiment.session.opening import open_to_read
 from experiment.session.records import ACCEPTED
 from foundation.clock import SimulatedClock
 from foundation.errors import FormatError, StorageError

@@ -28,7 +28,7 @@ from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.journal import HeldJournalError
+from experiment.session.opening import HeldJournalError
 from experiment.session.records import plan_steps
 from foundation.clock import SimulatedClock
 from foundation.errors import (

@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.checks import light_codes
-from calibration.checks.light_codes import EXCHANGED, ExchangedLights, ProjectorFit, fit_projector
+from calibration.checks import light_codes, projector_model
+from calibration.checks.light_codes import EXCHANGED, ExchangedLights
+from calibration.checks.projector_model import ProjectorFit, fit_projector
 from sim.spectral import projector_primaries, sensitivities
 from tests.calibration.checks.test_light_codes import CAMERAS
 
@@ -33,18 +34,18 @@ def test_primaries_are_those_of_measured_cameras_and_lamps() -> None:
     )
     white = seen.sum(axis=2)
     shares = np.median(seen / white[:, :, None], axis=0)
-    np.testing.assert_allclose(light_codes._SEEN, shares, rtol=0.15)
+    np.testing.assert_allclose(projector_model._SEEN, shares, rtol=0.15)
     # A logarithm's deviation is what they differ by, up to three times.
-    off = np.log(seen / white[:, :, None] / light_codes._SEEN) / light_codes._SEEN_SD
+    off = np.log(seen / white[:, :, None] / projector_model._SEEN) / projector_model._SEEN_SD
     differ = np.sqrt((off**2).mean(axis=0))
     assert 1 / 3 < differ.min() < differ.max() < 0.9
-    np.testing.assert_allclose(light_codes._CHANNELS, np.median(white / white[:, 1:2], axis=0), rtol=0.1)
+    np.testing.assert_allclose(projector_model._CHANNELS, np.median(white / white[:, 1:2], axis=0), rtol=0.1)
 
 
 def test_logarithms_of_primaries_share_what_scale_channels_and_primaries_have() -> None:
-    root = light_codes._primary_root()
+    root = projector_model._primary_root()
     covariance = root @ root.T
-    own = light_codes._SEEN_SD.ravel() ** 2
+    own = projector_model._SEEN_SD.ravel() ** 2
     # Row by row the channels: of any two, of one primary in two channels, of two primaries in one channel.
     assert covariance[0, [4, 3, 1]] == pytest.approx([2.0**2, 2.0**2 + 0.3**2, 2.0**2 + 0.35**2])
     assert np.diag(covariance) == pytest.approx(own + 2.0**2 + 0.3**2 + 0.35**2)
@@ -52,14 +53,14 @@ def test_logarithms_of_primaries_share_what_scale_channels_and_primaries_have() 
 
 def test_tone_curves_bend_smoothly_about_a_power_and_are_one_at_full_code() -> None:
     codes = np.array([6, 20, 50, 100, 130, 180, 240, 255])
-    basis = light_codes._curve_basis()[codes]
+    basis = projector_model._curve_basis()[codes]
     x = np.log(codes / 255)
     apart = np.exp(-0.5 * (np.subtract.outer(x, x) / 0.4) ** 2)
     # Bends on condition that there is none at 255.
     known = np.exp(-0.5 * np.add.outer(x**2, x**2) / 0.4**2)
     assert basis @ basis.T == pytest.approx(0.4**2 * np.outer(x, x) + 0.2**2 * (apart - known), abs=0.01)
     nodes = np.array([0, 64, 128, 192, 255])
-    overlap = light_codes._overlap_basis()
+    overlap = projector_model._overlap_basis()
     expected = 0.2**2 + 0.15**2 * np.exp(-0.5 * (np.subtract.outer(nodes, nodes) / 120) ** 2)
     assert overlap[nodes] @ overlap[nodes].T == pytest.approx(expected, abs=1e-6)
     assert overlap[32] == pytest.approx((overlap[0] + overlap[64]) / 2), "linear between"
@@ -70,9 +71,9 @@ CODES = np.array([(255, 0, 0), (0, 255, 40), (255, 255, 255), (12, 200, 90), (0,
 
 def whites_of(state: _Array) -> _Array:
     """Return whites (L, 3) of a state by the docstring's formula, light by light."""
-    bases, overlap_basis = light_codes._curve_basis(), light_codes._overlap_basis()
-    root = light_codes._primary_root()
-    middle = light_codes._SEEN * light_codes._CHANNELS[:, None] * SCALE
+    bases, overlap_basis = projector_model._curve_basis(), projector_model._overlap_basis()
+    root = projector_model._primary_root()
+    middle = projector_model._SEEN * projector_model._CHANNELS[:, None] * SCALE
     primaries = middle * np.exp((root @ state[:9]).reshape(3, 3))
     shared, *alone = state[9:57].reshape(4, 12)
     overlaps = iter(state[57:102].reshape(9, 5))
@@ -98,7 +99,7 @@ def whites_of(state: _Array) -> _Array:
 
 def test_a_white_is_its_primaries_times_their_curves_with_overlaps_and_a_rest() -> None:
     state = np.random.default_rng(1).normal(0, 0.5, NUMBERS)
-    white, slopes = light_codes._model(state, light_codes._Codes.of(CODES), SCALE, REST)
+    white, slopes = projector_model._model(state, projector_model._Codes.of(CODES), SCALE, REST)
     np.testing.assert_allclose(white, whites_of(state))
     for direction in np.random.default_rng(2).normal(0, 1, (4, NUMBERS)):
         tangent = (whites_of(state + 1e-6 * direction) - whites_of(state - 1e-6 * direction)) / 2e-6

@@ -20,7 +20,8 @@ from calibration.comparison.comparing import (
     light_pairs,
 )
 from calibration.comparison.report import cells_csv, comparison_json, lights_csv, lines, write_comparison
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut, references_csv
+from calibration.table.lut import Lut, Provenance, open_lut
+from calibration.table.writing import LutWriter, references_csv
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from foundation.errors import FormatError

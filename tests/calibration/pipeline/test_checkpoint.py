@@ -18,10 +18,12 @@ import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
-import calibration.table.lut as lut_files
+from calibration.pipeline import checkpoint
 from calibration.pipeline.baseline import frame_faults
-from calibration.pipeline.build import CHECKPOINT, Checkpoint, TableProgress, append, build, unfinished_table
+from calibration.pipeline.build import TableProgress, append, build
+from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, unfinished_table
 from calibration.pipeline.frames import stored_names
+from calibration.table import writing
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
 from calibration.verdict import BuildResult
@@ -38,9 +40,9 @@ FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload([__name__])
 
 PLACES = {
-    "putting": (lut_files.LutWriter, "put"),
-    "saving": (building.UnfinishedTable, "save"),
-    "finishing": (lut_files, "write_whole"),
+    "putting": (writing.LutWriter, "put"),
+    "saving": (checkpoint.UnfinishedTable, "save"),
+    "finishing": (writing, "write_whole"),
     "publishing": (Path, "replace"),
 }
 

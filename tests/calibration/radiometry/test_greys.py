@@ -10,7 +10,7 @@ import pytest
 
 from calibration.measurements import GreyMeasurements
 from calibration.pipeline.frames import GreyLevels
-from calibration.table.lut import references_csv
+from calibration.table.writing import references_csv
 from experiment.chart.model import Reference
 
 GREYS = [

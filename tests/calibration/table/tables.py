@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.table.lut import Lut, LutWriter, Provenance, SourceFrame, frames_sha256, open_lut
+from calibration.table.lut import Lut, Provenance, SourceFrame, frames_sha256, open_lut
+from calibration.table.writing import LutWriter
 from experiment.lights import plan_illuminations
 
 LIGHTS = plan_illuminations(1, (2500, 6500))

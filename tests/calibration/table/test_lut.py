@@ -10,8 +10,9 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from calibration.table.lut import MOST_WHITE, LutWriter, Provenance, map_samples, open_lut
+from calibration.table.lut import MOST_WHITE, Provenance, map_samples, open_lut
 from calibration.table.verification import find_faults
+from calibration.table.writing import LutWriter
 from foundation.errors import FormatError, InputError, StorageError
 from tests.calibration.table.tables import FRAMES, LIGHTS, flip, write
 

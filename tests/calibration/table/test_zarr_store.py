@@ -17,7 +17,8 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from calibration.cli import main
-from calibration.table.lut import Lut, LutWriter, Provenance, SourceFrame, open_lut
+from calibration.table.lut import Lut, Provenance, SourceFrame, open_lut
+from calibration.table.writing import LutWriter
 from calibration.table.zarr_store import SHARD_LIGHTS, fetch, publish
 from drivers.presenter import Colour
 from experiment.lights import Illumination

@@ -16,7 +16,7 @@ from PIL import Image
 from evaluation.cli import main
 from generator import DatasetOptions, find_pictures, generate_dataset
 from generator.lights.lighting import RandomLights
-from generator.pictures.sources import random_scenes
+from generator.pictures.random_scenes import random_scenes
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker, make_table
 from tests.json_of import json_of
 

@@ -23,7 +23,7 @@ from generator.dataset.plan import DatasetOptions
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks
-from generator.pictures.sources import random_scenes
+from generator.pictures.random_scenes import random_scenes
 from tests.evaluation.datasets import contract
 
 pytestmark = pytest.mark.slow

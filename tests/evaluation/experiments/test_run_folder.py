@@ -28,7 +28,8 @@ from evaluation.results.result import SceneAnswer
 from evaluation.scene import Scene, SceneSet
 from foundation.clock import SystemClock
 from foundation.errors import InputError
-from foundation.files import held_folder, partial_path
+from foundation.files import partial_path
+from foundation.folders import held_folder
 from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
 
 IDENTITY = {"methods": [{"name": "A", "settings": {"p": 1 / 3}}], "software": "x 1", "several lights": (False, True)}

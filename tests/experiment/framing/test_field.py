@@ -23,7 +23,7 @@ from experiment.chart.model import Chart
 from experiment.framing import field
 from experiment.framing.field import FoundField, corners_text, field_mm, find_field, parse_corners, refine_edges
 from experiment.framing.finding import find_chart
-from experiment.framing.pictures import blur_px
+from experiment.framing.sharpness import blur_px
 from foundation.errors import CropError, InputError, RegistrationError
 from sim.world.world import Room
 from tests.calibration.lab import Lab, hang_chart

@@ -15,7 +15,8 @@ from experiment.chart.model import Chart
 from experiment.framing import finding
 from experiment.framing.finding import FoundTag, find_chart, find_tags
 from experiment.framing.homography import project, rms, robust_homography
-from experiment.framing.pictures import blur_px, shift_between
+from experiment.framing.pictures import shift_between
+from experiment.framing.sharpness import blur_px
 from foundation.errors import RegistrationError
 from sim.world.world import Room
 from tests.calibration.lab import Lab, hang

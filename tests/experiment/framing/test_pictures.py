@@ -17,7 +17,7 @@ from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, Plane, plane_of, read_raw, strongest_plane
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
-from experiment.framing import pictures
+from experiment.framing import pictures, sharpness
 from experiment.framing.field import FoundField, field_mm
 from experiment.framing.finding import Framing, annotated_png, apparent_sizes, find_chart, small_parts_warning
 from experiment.framing.pictures import gauge_boxes, preview_jpeg, shift_between
@@ -232,7 +232,7 @@ def test_a_preview_is_brightened_to_a_hundredth_of_white_and_marks_what_deviates
 def test_the_blur_of_steps_is_found_without_their_heights(sigma: float, steps: tuple[float, ...]) -> None:
     aside = np.random.default_rng(0).uniform(-9, 9, 800)
     seen = 100 + sum((300 - 170 * number) * ndtr((aside - at) / sigma) for number, at in enumerate(steps))
-    assert pictures._sigma(np.asarray(seen), aside, steps) == pytest.approx(sigma, rel=0.01)  # pyright: ignore[reportPrivateUsage]
+    assert sharpness._sigma(np.asarray(seen), aside, steps) == pytest.approx(sigma, rel=0.01)  # pyright: ignore[reportPrivateUsage]
 
 
 def test_a_movement_across_sides_is_a_shift_a_turn_and_a_growth() -> None:

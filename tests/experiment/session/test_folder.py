@@ -19,7 +19,7 @@ from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session, journal_path, session_exists
 from experiment.session.records import Judgement, plan_steps
 from foundation.errors import FormatError, InputError, StorageError
-from foundation.files import unmounted_at
+from foundation.folders import unmounted_at
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)

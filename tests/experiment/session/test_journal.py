@@ -16,15 +16,9 @@ import pytest
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.lights import Illumination
-from experiment.session import journal as journals
-from experiment.session.journal import (
-    JOURNAL_VERSION,
-    Journal,
-    ReceivedFile,
-    create_file,
-    require_sound_rows,
-    time_text,
-)
+from experiment.session import opening
+from experiment.session.journal import Journal, ReceivedFile, time_text
+from experiment.session.opening import JOURNAL_VERSION, create_file, require_sound_rows
 from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, Judgement, SessionEvent, plan_steps
 from foundation.errors import FormatError, StorageError
 
@@ -162,7 +156,7 @@ def test_a_journal_that_may_not_be_read_is_not_damaged(path: Path, monkeypatch: 
 
 
 def test_a_journal_that_another_holds_is_not_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journals, "READING_LIMIT_S", 0)
+    monkeypatch.setattr(opening, "READING_LIMIT_S", 0)
     with closing(sqlite3.connect(path)) as other:
         other.execute("BEGIN EXCLUSIVE")
         with pytest.raises(FormatError, match="is locked"):

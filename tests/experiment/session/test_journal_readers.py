@@ -19,7 +19,7 @@ import pytest
 
 from drivers.presenter import Colour
 from experiment.lights import Illumination
-from experiment.session import journal as journals
+from experiment.session import opening
 from experiment.session.journal import Journal
 from experiment.session.records import plan_steps
 from foundation.errors import FormatError, StorageError
@@ -117,7 +117,7 @@ def test_a_reader_who_was_there_before_the_run_does_not_stop_it(path: Path) -> N
 
 
 def test_another_writer_is_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journals, "TRY_S", 0.01)
+    monkeypatch.setattr(opening, "TRY_S", 0.01)
     said: list[str] = []
     with closing(Journal.open_for_run(path)) as journal, another_program(path, *WRITER) as other:
 
@@ -132,7 +132,7 @@ def test_another_writer_is_waited_for(path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_another_writer_is_waited_for_at_the_start(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journals, "TRY_S", 0.01)
+    monkeypatch.setattr(opening, "TRY_S", 0.01)
     said: list[str] = []
     with another_program(path, *WRITER) as other:
 
@@ -147,7 +147,7 @@ def test_another_writer_is_waited_for_at_the_start(path: Path, monkeypatch: pyte
 
 
 def test_patience_ends_with_a_sentence_and_nothing_is_lost(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journals, "TRY_S", 0.01)
+    monkeypatch.setattr(opening, "TRY_S", 0.01)
     with closing(Journal.open_for_run(path, 0.05)) as journal:
         with (
             another_program(path, *WRITER),
@@ -159,12 +159,12 @@ def test_patience_ends_with_a_sentence_and_nothing_is_lost(path: Path, monkeypat
 
 
 def test_where_machines_share_no_memory_a_reader_is_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journals, "TRY_S", 0.01)
+    monkeypatch.setattr(opening, "TRY_S", 0.01)
 
     def shared(_: Path) -> bool:
         return True
 
-    monkeypatch.setattr(journals, "_on_network", shared)
+    monkeypatch.setattr(opening, "_on_network", shared)
     said: list[str] = []
     with closing(Journal.open_for_run(path, 60)) as journal:
         assert set(files(path)) == {"journal.sqlite"}
@@ -188,8 +188,8 @@ def test_the_file_systems_of_networks_are_known(tmp_path: Path, monkeypatch: pyt
         return mounts
 
     monkeypatch.setattr(Path, "read_text", read)
-    assert journals._on_network(tmp_path / "s" / "journal.sqlite")  # pyright: ignore[reportPrivateUsage]
-    assert not journals._on_network(Path("/journal.sqlite"))  # pyright: ignore[reportPrivateUsage]
+    assert opening._on_network(tmp_path / "s" / "journal.sqlite")  # pyright: ignore[reportPrivateUsage]
+    assert not opening._on_network(Path("/journal.sqlite"))  # pyright: ignore[reportPrivateUsage]
 
 
 def kill_a_run(path: Path) -> None:
@@ -299,14 +299,14 @@ def test_where_there_are_no_locks_it_goes_on_with_a_warning(
     path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """SQLite answers `database is locked` to ENOLCK and `disk I/O error` to EINVAL; both at the first look."""
-    real = journals._connect_with  # pyright: ignore[reportPrivateUsage]
+    real = opening._connect_with  # pyright: ignore[reportPrivateUsage]
 
     def connect(path: Path, parameters: str) -> sqlite3.Connection:
         if "nolock" not in parameters:
             raise sqlite3.OperationalError("database is locked")
         return real(path, parameters)
 
-    monkeypatch.setattr(journals, "_connect_with", connect)
+    monkeypatch.setattr(opening, "_connect_with", connect)
 
     def no_locks(*_: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.table.lut import Lut, LutWriter, Provenance, SourceFrame, Unfit, frames_sha256, open_lut
+from calibration.table.lut import Lut, Provenance, SourceFrame, Unfit, frames_sha256, open_lut
+from calibration.table.writing import LutWriter
 from calibration.table.zarr_store import publish
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -23,7 +24,7 @@ from generator.dataset.plan import DatasetOptions
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks
-from generator.pictures.sources import random_scenes
+from generator.pictures.random_scenes import random_scenes
 
 if TYPE_CHECKING:
     from typing import BinaryIO

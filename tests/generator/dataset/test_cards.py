@@ -11,21 +11,12 @@ from typing import TYPE_CHECKING, get_args
 import pytest
 
 from calibration.citation import NOT_RECORDED, OriginRecord
-from generator.dataset.layouts import (
-    CONFORMS_TO,
-    JOINED,
-    OPEN,
-    Description,
-    Layout,
-    Split,
-    card,
-    datasheet,
-    kind_of,
-    size_category,
-)
+from generator.dataset.cards import CONFORMS_TO, OPEN, card, datasheet, kind_of, size_category
+from generator.dataset.joined import JOINED
+from generator.dataset.layouts import Description, Layout, Split
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
-from generator.pictures.sources import random_scenes
+from generator.pictures.random_scenes import random_scenes
 from tests.generator.conftest import lut_in
 
 if TYPE_CHECKING:

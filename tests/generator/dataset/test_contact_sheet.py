@@ -16,7 +16,7 @@ from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
 from generator.lights.lighting import LightChoice, ListedLights, RandomLights, mixture_of
-from generator.pictures.sources import random_scenes
+from generator.pictures.random_scenes import random_scenes
 
 pytestmark = pytest.mark.slow
 

@@ -12,10 +12,12 @@ import psutil
 import pytest
 
 from foundation.errors import InputError
-from generator.dataset.making import SILENT, Callbacks, Workers, generate_dataset, parse_engine
+from generator.dataset.making import Workers, generate_dataset, parse_engine
 from generator.dataset.plan import DatasetOptions
+from generator.dataset.shards import SILENT, Callbacks
 from generator.lights.lighting import RandomLights
-from generator.pictures.sources import find_pictures, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import find_pictures
 from tests.generator.dataset.contents import contents
 
 pytestmark = pytest.mark.slow

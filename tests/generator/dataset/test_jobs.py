@@ -21,7 +21,8 @@ from generator.dataset.making import generate_dataset
 from generator.dataset.plan import STRETCHED, DatasetOptions, Scale, exact_parts, sizes_of
 from generator.dataset.reader import Dataset, open_dataset
 from generator.files import FULL, from_full_scale, to_full_scale
-from generator.pictures.sources import find_pictures, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import find_pictures
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -21,7 +21,8 @@ import numpy.typing as npt
 import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.layouts import COMPLETED_BY_HAND, JOINED, Layout
+from generator.dataset.joined import JOINED
+from generator.dataset.layouts import COMPLETED_BY_HAND, Layout
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset, file_faults, open_dataset
@@ -29,7 +30,8 @@ from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks
 from generator.options import ImageOptions
-from generator.pictures.sources import SourcePicture, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import SourcePicture
 from tests.generator.groups import grouped
 
 pytestmark = pytest.mark.slow
@@ -331,7 +333,7 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
     def find_spec(name: str) -> None:
         del name
 
-    monkeypatch.setattr("generator.dataset.layouts.find_spec", find_spec)
+    monkeypatch.setattr("generator.dataset.joined.find_spec", find_spec)
     with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install pyarrow"):
         make("parquet")
 

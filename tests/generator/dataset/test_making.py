@@ -15,11 +15,13 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
-from generator.dataset.making import Callbacks, generate_dataset
+from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import open_dataset
+from generator.dataset.shards import Callbacks
 from generator.lights.lighting import ListedLights, RandomLights, mixture_of
-from generator.pictures.sources import find_pictures, random_scenes, read_picture
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import find_pictures, read_picture
 from generator.rendering.render import render
 from tests.generator.dataset.contents import contents
 

@@ -15,10 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.errors import InputError
-from generator.dataset.making import generate_dataset, parse_share, split_of
+from generator.dataset.making import generate_dataset, parse_share
 from generator.dataset.plan import DatasetOptions, Plan, exact_parts, parse_split
+from generator.dataset.shards import split_of
 from generator.lights.lighting import ListedLights
-from generator.pictures.sources import find_pictures, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import find_pictures
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

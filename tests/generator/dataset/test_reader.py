@@ -14,7 +14,7 @@ from generator.dataset.reader import open_dataset
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks
-from generator.pictures.sources import random_scenes
+from generator.pictures.random_scenes import random_scenes
 
 pytestmark = pytest.mark.slow
 

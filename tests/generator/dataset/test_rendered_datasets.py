@@ -16,9 +16,10 @@ import pytest
 
 from foundation.errors import InputError
 from generator.cli import main
-from generator.dataset.making import finish_dataset, generate_dataset, make_shard, make_share, workplace
+from generator.dataset.making import finish_dataset, generate_dataset, make_share, workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import open_dataset
+from generator.dataset.shards import make_shard
 from generator.kernels.printing import draw_printed
 from generator.kernels.rendering import draw_samples
 from generator.lights.lighting import ListedLights, Mixture, plain

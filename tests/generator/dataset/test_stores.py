@@ -22,18 +22,13 @@ from fsspec.registry import register_implementation
 
 from foundation.errors import FormatError, InputError, StorageError
 from generator.dataset.layouts import Layout
-from generator.dataset.making import (
-    finish_dataset,
-    generate_dataset,
-    make_dataset,
-    make_elsewhere,
-    make_share,
-    workplace,
-)
+from generator.dataset.making import finish_dataset, generate_dataset, make_dataset, make_share, workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import file_faults, open_dataset
+from generator.dataset.shards import make_elsewhere
 from generator.lights.lighting import ListedLights
-from generator.pictures.sources import find_pictures, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import find_pictures
 from generator.stores import LocalStore, RemoteStore, open_store
 from tests.generator.groups import grouped
 

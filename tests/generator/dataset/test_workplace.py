@@ -17,27 +17,19 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
-from foundation.files import FolderLock, held_folder
+from foundation.folders import FolderLock, held_folder
 from generator.dataset import layouts as plain_files
-from generator.dataset import making
+from generator.dataset import shards
 from generator.dataset.layouts import FinishedImage, Layout, ShardRecord
-from generator.dataset.making import (
-    SILENT,
-    Callbacks,
-    Workers,
-    Workplace,
-    finish_dataset,
-    generate_dataset,
-    make_dataset,
-    make_share,
-    workplace,
-)
+from generator.dataset.making import Workers, finish_dataset, generate_dataset, make_dataset, make_share, workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.shards import SILENT, Callbacks, Workplace
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights, RandomLights
 from generator.masks.making import parse_masks
-from generator.pictures.sources import Source, find_pictures, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import Source, find_pictures
 from generator.rendering.black_points import BlackPoint
 from tests.generator.dataset.contents import contents
 from tests.generator.groups import grouped
@@ -94,14 +86,14 @@ def made_after(monkeypatch: pytest.MonkeyPatch, call: Callable[[Callbacks], obje
     found: list[int] = []
     reported: list[None] = []
     rendered: list[int] = []
-    photograph = making.photograph
+    photograph = shards.photograph
 
     def noted(*arguments: Any) -> Any:
         rendered.append(arguments[5])
         return photograph(*arguments)
 
     with monkeypatch.context() as patched:
-        patched.setattr(making, "photograph", noted)
+        patched.setattr(shards, "photograph", noted)
         call(Callbacks(on_done=found.append, on_image=lambda: reported.append(None)))
     return sum(found), len(reported), sorted(rendered)
 

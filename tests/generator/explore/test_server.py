@@ -14,7 +14,7 @@ import pytest
 
 from generator.cli import main
 from generator.explore.explorer import Explorer, ExploreServer
-from generator.pictures.sources import RandomScene
+from generator.pictures.random_scenes import RandomScene
 from tests.generator.conftest import MakeLut
 from tests.serving import serving
 

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.table.lut import Provenance, Unfit
-from generator.kernels.choice import channels_of, colours_in, nearest_fit_colours, replace_unfit_colours
+from generator.kernels.choice import channels_of
+from generator.kernels.unfit import colours_in, nearest_fit_colours, replace_unfit_colours
 
 if TYPE_CHECKING:
     pass

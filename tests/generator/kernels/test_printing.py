@@ -11,15 +11,8 @@ from hypothesis import strategies as st
 from foundation.colorimetry import decode_srgb
 from foundation.errors import InputError
 from generator.kernels.planar import scales_of
-from generator.kernels.printing import (
-    NODE_CODES,
-    NODES,
-    SIDE,
-    PrintedLight,
-    draw_printed,
-    draw_printed_crops,
-    nearest_nodes,
-)
+from generator.kernels.printed_crops import draw_printed_crops
+from generator.kernels.printing import NODE_CODES, NODES, SIDE, PrintedLight, draw_printed, nearest_nodes
 from generator.kernels.rendering import draw_samples
 
 Array = npt.NDArray[np.float64]

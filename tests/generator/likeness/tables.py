@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, Provenance, open_lut
+from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 

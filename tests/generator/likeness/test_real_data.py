@@ -32,7 +32,8 @@ from generator.likeness.real_data import (
     drawn_sources,
     remedies,
 )
-from generator.pictures.sources import Source, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import Source
 from generator.rendering.black_points import BlackPoint
 from generator.statistics import RealStatistics, cell_means, numbers_of_cells
 from tests.generator.likeness.tables import make_table, seen

@@ -16,7 +16,8 @@ import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
 from generator.pictures import sources as scene
-from generator.pictures.sources import PictureFile, Preparation, RandomScene, find_pictures, random_scenes
+from generator.pictures.random_scenes import RandomScene, random_scenes
+from generator.pictures.sources import PictureFile, Preparation, find_pictures
 from generator.stores import filesystem
 from tests.generator.pictures.oiio_files import write
 

@@ -11,8 +11,8 @@ import pytest
 
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, QualityError
-from generator.dataset.making import photograph
 from generator.dataset.plan import DatasetOptions
+from generator.dataset.shards import photograph
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Lighting, Mixture, plain

@@ -14,8 +14,8 @@ from scipy.interpolate import RegularGridInterpolator
 
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, QualityError
-from generator.dataset.making import photograph
 from generator.dataset.plan import DatasetOptions
+from generator.dataset.shards import photograph
 from generator.kernels.printing import NODES, SIDE
 from generator.lights.lighting import Lighting, Mixture, plain
 from generator.rendering import print_inverse

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 
 from foundation.errors import FormatError, InputError
 from generator.lights.lighting import Mixture
-from generator.pictures.sources import Picture, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import Picture
 from generator.rendering import Rendering
 from generator.rendering.black_points import BlackPoint, veil_of
 from generator.rendering.colorimetric import ColorimetricRendering
@@ -205,7 +206,7 @@ def test_unfit_colours_take_their_stand_ins(make_lut: MakeLut) -> None:
     white = np.full((8, 8, 3), 255, np.uint8)
     crops = Crops(lut, gallery_of([white]), (4, 4), lights=[1], flip=False, length=9, rendering="codes")
     images = crops.batch(np.arange(9)).images
-    from generator.kernels.choice import nearest_fit_colours
+    from generator.kernels.unfit import nearest_fit_colours
 
     wanted = lut.samples[1, int(nearest_fit_colours([63], BITS)[0])].astype(np.float32) / lut.provenance.white_level
     values = images.transpose(0, 2, 3, 1).reshape(-1, 1, 3)

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, Provenance, open_lut
+from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 

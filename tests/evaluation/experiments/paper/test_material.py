@@ -30,7 +30,7 @@ from foundation.errors import FormatError, InputError
 from generator import DatasetOptions, generate_dataset
 from generator.lights.choices import nearest_lights
 from generator.lights.lighting import RandomLights
-from generator.pictures.sources import random_scenes
+from generator.pictures.random_scenes import random_scenes
 from generator.rendering.matrices import camera_matrix
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
 

@@ -32,7 +32,8 @@ from evaluation.experiments.paper.table1 import (
 from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
 from foundation.errors import InputError
-from generator.pictures.sources import SourcePicture, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import SourcePicture
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
 
 HOT_PICTURES = random_scenes(4, 24, 16, seed=8)

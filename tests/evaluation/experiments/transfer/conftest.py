@@ -11,7 +11,8 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, Provenance, open_lut
+from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
 from evaluation.datasets.generated import open_generated
 from evaluation.scene import SceneSet

@@ -35,7 +35,8 @@ from generator.dataset.reader import Dataset
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights, mixture_of
 from generator.masks.making import parse_masks
-from generator.pictures.sources import Preparation, random_scenes
+from generator.pictures.random_scenes import random_scenes
+from generator.pictures.sources import Preparation
 from generator.rendering.matrices import ColourMatrix
 from tests.evaluation.experiments.transfer.conftest import BOTH, LIGHTS, Maker, save_pictures, write_table
 

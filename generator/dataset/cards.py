@@ -1,0 +1,489 @@
+"""What a dataset says of itself to people and to programs: its card, its datasheet and its Croissant description.
+
+`README.md` is a dataset card as the Hugging Face Hub reads it, `DATASHEET.md` answers the questions of Gebru et al.,
+"Datasheets for Datasets", Communications of the ACM 64 (2021), and `croissant.json` keeps to Croissant 1.0
+(mlcommons.org/croissant/1.0). What only the makers of a dataset know is left open, and said to be so.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from statistics import median
+from string import Template
+from typing import Any, Final
+
+from calibration.citation import bibtex, origin_lines, table_title
+from generator.dataset.joined import JOINED, JoinedLayout
+from generator.dataset.layouts import (
+    CROISSANT,
+    DATASHEET,
+    GROUND_TRUTH,
+    SOURCES,
+    Description,
+    one_line,
+    table_cell,
+)
+from generator.files import FULL, suffix_of
+
+OPEN: Final = "**TO BE ANSWERED BY THE LAB.**"
+"""What stands where only the makers of a dataset know the answer."""
+
+
+def uncertainty_of(description: Description) -> str:
+    """Return in a sentence how well the lights are known."""
+    known = [light.uncertainty_deg for light in description.lights if light.uncertainty_deg is not None]
+    if not known:
+        return "The table does not state what its lights may be off by."
+    return (
+        f"By the table's uncertainty budget the directions of its lights are known to {median(known):.2g}° in the "
+        f"median and {max(known):.2g}° at worst (expanded uncertainty, k = 2, about 95 % of lights; `uncertainty_deg` "
+        "in `dataset.json`). Differences between methods below that are none."
+    )
+
+
+def name_of(description: Description) -> str:
+    """Return what the dataset is called until its makers name it."""
+    return f"CroP images of the {one_line(description.table.camera)}, {counted_images(description)}"
+
+
+def counted_images(description: Description) -> str:
+    """Return the number of images in words."""
+    return f"{description.images} image" + "s" * (description.images != 1)
+
+
+def kind_of(description: Description) -> str:
+    """Return in words whether colours were photographed, simulated or computed: no reader may take one for another."""
+    table = description.table
+    if table.computed is not None:
+        return "The table behind them was computed from spectra and a model of the sensor; nothing was photographed."
+    rig = None if table.origin is None else table.origin.rig
+    if rig == "simulated":
+        return "The table behind them was taken in a simulated laboratory; nothing was photographed."
+    if rig is None:
+        return "The table behind them does not record whether its frames were photographed or simulated."
+    return "The table behind them was made from raw frames of a printed chart under a projector's lights."
+
+
+def summary_of(description: Description) -> str:
+    """Return what the images are, in two sentences."""
+    table = description.table
+    return (
+        f"{counted_images(description)} of linear camera RGB as the raw sensor of the {one_line(table.camera)} would "
+        "give them, each with the exact colour of its light. Black is 0, saturation "
+        f"{stored_white(description)}; nothing is white balanced. {kind_of(description)}"
+    )
+
+
+def stored_white(description: Description) -> int:
+    """Return the number that saturation has in the files."""
+    return FULL if option(description, "scale") == "full" else description.table.white_level
+
+
+def brightness_note(description: Description) -> str:
+    """Return why a reader that knows nothing of raw images shows them as it does, and what to do about it."""
+    white = stored_white(description)
+    if option(description, "format") == "dng":
+        return "Images are raw files: open them with a raw developer."
+    if option(description, "scale") == "full":
+        counts = description.table.white_level
+        return (
+            f"Counts of 0 to {counts} are stretched over 16 bits: the camera's count is round(v * {counts} / {FULL}). "
+            "Images are linear, so that they still look darker than photographs: for display divide by the ground "
+            "truth and apply the sRGB curve."
+        )
+    return (
+        f"A reader that takes {FULL} for white, as WebDataset's decoders, imageio and image viewers do, shows them "
+        f"nearly black: {white} is white here. Divide by {white} after decoding all 16 bits, or make the dataset with "
+        "generate --scale full. Previews show what they look like."
+    )
+
+
+def origin_table(description: Description) -> list[tuple[str, str]]:
+    """Return what the table says of its origin, names and values; what it does not say is "not recorded"."""
+    return [(name, one_line(value)) for name, value in origin_lines(description.table.origin)]
+
+
+def citation_of(description: Description) -> str:
+    """Return a BibTeX entry of the table."""
+    table = description.table
+    computed = table.computed is not None
+    return bibtex(table.camera, table.lights, table.software, table.sha256, table.origin, computed)
+
+
+def table_name(description: Description) -> str:
+    """Return what the table is called."""
+    table = description.table
+    return one_line(table_title(table.camera, table.lights, table.origin, table.computed is not None))
+
+
+def truth_of(description: Description) -> str:
+    """Return in words where the ground truth comes from."""
+    if description.table.computed is not None:
+        return "it is what the model of the sensor answers to bare paper under the light's spectrum."
+    return "it is the mean of the white references that lie among the colours, under the same light."
+
+
+def pixels_of(description: Description) -> str:
+    """Return in words how a pixel comes from the table's samples, by the rendering of the dataset."""
+    samples = description.table.samples
+    if option(description, "rendering") is None:
+        return (
+            f"Each pixel is one of the {samples} samples that the table has of its colour, drawn by the seed; where "
+            "lights mix, one of each."
+        )
+    return (
+        "Each pixel is the mean of its colour, interpolated between cells of the table, plus the deviation of one of "
+        f"the {samples} samples of the nearest cell from their mean, drawn by the seed and scaled to the noise at that "
+        "level; where lights mix, of each."
+    )
+
+
+def noise_of(description: Description) -> str:
+    """Return in words how many electrons a count is and what noise a sample has, as far as the table says it."""
+    green = "Green is the mean of two photosites, so that its noise has half the variance of one."
+    table = description.table
+    if table.computed is None:
+        return f"Gain and read noise are in `report.html` of the table, as measured. {green}"
+    try:
+        body, iso = table.computed["body"], float(table.computed["exposure"]["iso"])
+        gain, read, early = (float(body[name]) for name in ("electrons_per_dn", "read_noise_dn", "sensor_noise_e"))
+    except (KeyError, TypeError, ValueError):
+        return f"The table does not state gain and read noise. {green}"
+    stretched = f"; a count is {FULL / table.white_level:.4g} of the files' units" * (
+        option(description, "scale") == "full"
+    )
+    return (
+        f"In the model of the sensor a count is {gain * 100 / iso:.4g} electrons at its ISO {iso:g}{stretched}; "
+        f"at ISO 100 it is {gain:.4g}, and the read noise of a photosite {read:.4g} counts, of which {early:.4g} "
+        f"electrons arise before the amplifier. {green}"
+    )
+
+
+def _repeats(description: Description) -> str:
+    """Return in words whether pictures come more than once."""
+    if description.images <= description.sources:
+        return "Each picture is in one image."
+    return "Images of one picture repeat it, or parts of it, under another light or with other noise."
+
+
+def _procedure(description: Description) -> str:
+    """Return in words how the table's colours were obtained and what vouches for them."""
+    name = table_name(description)
+    if description.table.computed is not None:
+        return (
+            f"{name}: samples of all colours of a chart were computed under known lights. No frame was taken, and "
+            "there is no report; `computed` under `table` in `dataset.json` has the model and its settings."
+        )
+    return (
+        f"A chart of all colours under known lights: {name}. The table's report has the verdict on it and every figure "
+        "with its limit."
+    )
+
+
+def option(description: Description, name: str) -> Any:
+    """Return an option as `dataset.json` has it; None where it was off."""
+    return description.options.get(name)
+
+
+def datasheet(description: Description) -> str:
+    """Return the text of DATASHEET.md."""
+    template = Template((Path(__file__).parent / "datasheet.md").read_text("utf-8"))
+    table, origin = description.table, dict(origin_table(description))
+    authors = "" if table.origin is None else "; ".join(table.origin.authors)
+    splits = "; ".join(f"{part}: {images} images" for part, images in description.splits.items())
+    by_colour = option(description, "rendering") is not None
+    rendering = "by codes: a picture's 8-bit sRGB value is the code of a printed cell"
+    answers: dict[str, object] = {
+        "authors": f"The table: {authors}. The dataset: {OPEN}" if authors else OPEN,
+        "camera": table.camera,
+        "citation": citation_of(description),
+        "dates": "No frame was taken for the table."
+        if table.computed is not None
+        else f"The table's frames: {origin['Dates']}.",
+        "format": option(description, "format"),
+        "images": counted_images(description),
+        "kind": kind_of(description),
+        "layout": option(description, "layout"),
+        "licence": origin["Licence"],
+        "lights": len(description.lights),
+        "name": name_of(description),
+        "noise": noise_of(description),
+        "open": OPEN,
+        "origin": "\n".join(f"| {name} | {table_cell(value)} |" for name, value in origin.items()),
+        "pixels": description.pixels,
+        "pixels_are": pixels_of(description),
+        "procedure": _procedure(description),
+        "rendering": "colorimetrically, interpolated between the cells of the chart" if by_colour else rendering,
+        "replaced": description.replaced_pixels,
+        "repeats": _repeats(description),
+        "seed": description.seed,
+        "skipped": len(description.skipped),
+        "software": description.software,
+        "sources": description.sources,
+        "splits": f"{splits}. All images of a picture are in one part."
+        if splits
+        else "None; keep all images of a picture in one part.",
+        "summary": summary_of(description),
+        "table": table.sha256,
+        "table_software": table.software,
+        "truth": truth_of(description),
+        "uncertainty": uncertainty_of(description),
+        "white_level": stored_white(description),
+    }
+    # The makers of the dataset are asked for whether or not those of the table are known.
+    return template.substitute(answers, count=template.template.count("${open}") + 1)
+
+
+_SIZES = (
+    (1_000, "n<1K"),
+    (10_000, "1K<n<10K"),
+    (100_000, "10K<n<100K"),
+    (1_000_000, "100K<n<1M"),
+    (10_000_000, "1M<n<10M"),
+    (100_000_000, "10M<n<100M"),
+    (1_000_000_000, "100M<n<1B"),
+)
+"""Numbers of images below which a data set is of a size category of the Hub."""
+
+_TAGS = ("color-constancy", "white-balance", "illumination-estimation", "raw-images", "image")
+
+
+def size_category(images: int) -> str:
+    """Return the Hub's size category of a number of images."""
+    return next((name for limit, name in _SIZES if images < limit), "1B<n<10B")
+
+
+def card(description: Description) -> str:
+    """Return the text of README.md; the licence is left open, for pictures have one of their own."""
+    lights = "".join(f"| {light.illumination} | {light.cell} |\n" for light in description.lights[:20])
+    more = f"\nand {len(description.lights) - 20} more in `dataset.json`.\n" if len(description.lights) > 20 else ""
+    origin = "".join(f"| {name} | {table_cell(value)} |\n" for name, value in origin_table(description))
+    splits = ", ".join(f"{part} {images}" for part, images in description.splits.items()) or "not divided"
+    return (
+        f"---\n{_front_matter(description)}---\n\n# {name_of(description)}\n\n{summary_of(description)}\n\n"
+        f"- **Images**: {description.images}, of {description.sources} pictures; parts: {splits}\n"
+        f"- **Ground truth**: `ground_truth.csv`, r + g + b = 1, a row a light; `gt.txt`, a line an image\n"
+        f"- **Made by** {description.software}, seed {description.seed}; `dataset.json` has enough to make every byte "
+        f"again, `SHA256SUMS` the hash of every file but this one, `{DATASHEET}` and `{CROISSANT}`\n"
+        f"- **More**: [{DATASHEET}]({DATASHEET}) (Datasheets for Datasets), [{CROISSANT}]({CROISSANT}) (MLCommons)\n\n"
+        f"## Reading\n\n{_reading(description)}\n\n{brightness_note(description)}\n\n"
+        f"## Noise\n\n{pixels_of(description)} {noise_of(description)}\n\n"
+        f"## Licence\n\n**To be stated by whoever publishes**: images are made of pictures, which have licences of "
+        f"their own (`sources.csv` names them), and of the table, whose licence is in the list below. Put the result "
+        f"into the front matter, in place of `unknown`.\n\n"
+        f"## The table\n\n{kind_of(description)} Its hash is `{description.table.sha256}`.\n\n"
+        f"| | |\n|---|---|\n{origin}\n"
+        f"## Lights\n\n| number | light |\n|---|---|\n{lights}{more}\n"
+        f"## Citation\n\n```bibtex\n{citation_of(description)}```\n"
+    )
+
+
+def _front_matter(description: Description) -> str:
+    """Return the YAML between the lines of three hyphens."""
+    keys: dict[str, object] = {
+        "pretty_name": name_of(description),
+        "license": "unknown",
+        "tags": list(_TAGS),
+        "size_categories": [size_category(description.images)],
+        "annotations_creators": ["machine-generated"],
+    }
+    lines = [f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in keys.items()]
+    return "".join(lines) + _configs(description)
+
+
+def _configs(description: Description) -> str:
+    """Return where the files of each part lie; of plain files the table of ground truths is what rows are read from."""
+    joined = _joined(description)
+    if joined is None or not joined.is_of_the_hub:
+        files = "  - split: train\n    path: ground_truth.csv\n"
+    else:
+        files = "".join(
+            f"  - split: {'train' if part == 'data' else part}\n    path: {part}/*.{joined.ending}\n"
+            for part in _parts(description)
+        )
+    return f"configs:\n- config_name: default\n  data_files:\n{files}"
+
+
+def _reading(description: Description) -> str:
+    """Return how the images are read without losing bits."""
+    form, joined = option(description, "format"), _joined(description)
+    if joined is not None:
+        return joined.reading
+    return (
+        f"`images/NNNNNN.{form}` are linear, 16 bits where the format has them; `load_dataset` gives the rows of "
+        "`ground_truth.csv`, whose column `image` names the file. Pillow, and imageio by it, keep 8 of 16 bits of a "
+        "PNG: use `cv2.imread(path, cv2.IMREAD_UNCHANGED)` (then BGR) or `generator.open_dataset`."
+    )
+
+
+CONFORMS_TO: Final = "http://mlcommons.org/croissant/1.0"
+
+_CONTEXT: Final = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "citeAs": "cr:citeAs",
+    "column": "cr:column",
+    "conformsTo": "dct:conformsTo",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract",
+    "field": "cr:field",
+    "fileProperty": "cr:fileProperty",
+    "fileObject": "cr:fileObject",
+    "fileSet": "cr:fileSet",
+    "format": "cr:format",
+    "includes": "cr:includes",
+    "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath",
+    "key": "cr:key",
+    "md5": "cr:md5",
+    "parentField": "cr:parentField",
+    "path": "cr:path",
+    "recordSet": "cr:recordSet",
+    "references": "cr:references",
+    "regex": "cr:regex",
+    "repeated": "cr:repeated",
+    "replace": "cr:replace",
+    "sc": "https://schema.org/",
+    "separator": "cr:separator",
+    "source": "cr:source",
+    "subField": "cr:subField",
+    "transform": "cr:transform",
+}
+"""The context that the specification recommends, "Appendix 1: JSON-LD context"."""
+
+_MEDIA: Final = {
+    "png": "image/png",
+    "tiff": "image/tiff",
+    "exr": "image/x-exr",
+    "jxl": "image/jxl",
+    "dng": "image/x-adobe-dng",
+}
+"""Media types of the formats of images; those of OpenEXR and DNG are not registered with IANA."""
+
+_TRUTH_COLUMNS: Final = (
+    ("image", "sc:Text", "Name of the image, as in the images' files or shards."),
+    ("source", "sc:Text", "Name of the picture that it shows."),
+    ("illumination", "sc:Text", "Number of its light in the table, or the mixture of lights."),
+    ("r", "sc:Float", "Red of the light on bare paper, linear camera RGB, r + g + b = 1."),
+    ("g", "sc:Float", "Green of the light."),
+    ("b", "sc:Float", "Blue of the light."),
+)
+
+
+def croissant(description: Description, sums: Mapping[str, str]) -> str:
+    """Return the text of croissant.json."""
+    document: dict[str, Any] = {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "name": name_of(description),
+        "description": summary_of(description),
+        "conformsTo": CONFORMS_TO,
+        "version": "1.0.0",
+        "keywords": ["colour constancy", "white balance", "illumination estimation", "raw images"],
+        "citeAs": citation_of(description),
+        "isLiveDataset": False,
+        "distribution": [
+            *(_table_file(name, sums[name]) for name in (GROUND_TRUTH, SOURCES)),
+            *_files_of_images(description),
+        ],
+        "recordSet": [_ground_truth(), *_images(description)],
+    }
+    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+
+
+def _table_file(name: str, sha256: str) -> dict[str, Any]:
+    return {
+        "@type": "cr:FileObject",
+        "@id": name,
+        "name": name,
+        "contentUrl": name,
+        "encodingFormat": "text/csv",
+        "sha256": sha256,
+    }
+
+
+def _files_of_images(description: Description) -> list[dict[str, Any]]:
+    """Return the set of files that holds the images: themselves, or the shards that they lie in."""
+    joined = _joined(description)
+    if joined is None:
+        suffix = suffix_of(option(description, "format"))
+        media = _MEDIA.get(str(option(description, "format")), "application/octet-stream")
+        return [_file_set("image-files", [f"images/*{suffix}"], media)]
+    return [_file_set("shards", [f"{part}/*.{joined.ending}" for part in _parts(description)], joined.media)]
+
+
+def _joined(description: Description) -> JoinedLayout | None:
+    """Return the layout of a dataset; None where each image is a file of its own."""
+    return JOINED.get(option(description, "layout"))
+
+
+def _parts(description: Description) -> list[str]:
+    """Return the folders in which a dataset's shards lie."""
+    return [part for part, images in description.splits.items() if images] or ["data"]
+
+
+def _file_set(name: str, includes: list[str], media: str) -> dict[str, Any]:
+    return {"@type": "cr:FileSet", "@id": name, "name": name, "encodingFormat": media, "includes": includes}
+
+
+def _ground_truth() -> dict[str, Any]:
+    return {
+        "@type": "cr:RecordSet",
+        "@id": "ground_truth",
+        "name": "ground_truth",
+        "description": "The lights of the images: a row a light, in the order of the images.",
+        "field": [
+            _field("ground_truth", name, kind, text, {"fileObject": {"@id": GROUND_TRUTH}, "extract": {"column": name}})
+            for name, kind, text in _TRUTH_COLUMNS
+        ],
+    }
+
+
+def _images(description: Description) -> list[dict[str, Any]]:
+    """Return the records of images: their files, or the columns of their shards."""
+    joined = _joined(description)
+    if joined is not None:
+        fields = [
+            _field("images", name, kind, text, {"fileSet": {"@id": "shards"}, "extract": {"column": name}})
+            for name, kind, text in joined.columns
+        ]
+        if not fields:
+            return []
+    else:
+        fields = [
+            _field(
+                "images", "name", "sc:Text", "Name of the file.",
+                {"fileSet": {"@id": "image-files"}, "extract": {"fileProperty": "filename"}},
+            ),
+            _field(
+                "images", "content", "sc:ImageObject", "The image, linear camera RGB; keep all 16 bits.",
+                {"fileSet": {"@id": "image-files"}, "extract": {"fileProperty": "content"}},
+            ),
+        ]  # fmt: skip
+    return [
+        {
+            "@type": "cr:RecordSet",
+            "@id": "images",
+            "name": "images",
+            "description": "The images, as they lie in the dataset.",
+            "field": fields,
+        }
+    ]
+
+
+def _field(record: str, name: str, kind: str, text: str, source: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "@type": "cr:Field",
+        "@id": f"{record}/{name}",
+        "name": name,
+        "description": text,
+        "dataType": kind,
+        "source": source,
+    }

@@ -1,0 +1,132 @@
+"""Colours whose samples must not be used are replaced by the nearest fit one, and counted.
+
+A table lists the cells whose samples must not be used. A pixel of such a colour takes the nearest fit colour, and the
+number of those pixels is printed and recorded with the dataset; nothing is replaced in silence.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from numpy import uint32
+
+from foundation.compiled import compiled, inlined
+from foundation.errors import QualityError
+from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, channels_of, group_address, write_colours
+from generator.kernels.vector import (
+    GROUP,
+    copy1,
+    offset_at,
+)
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Provenance
+
+
+def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
+    """Return for each unfit colour the nearest fit one.
+
+    Nearest by Euclidean distance of the codes; of several equally near the lowest index.
+
+    `unfit`: (N,) int, distinct colour indices 0 … 8**bits − 1. Returns (N,) int64 colour indices, none of them unfit.
+
+    Examples
+    --------
+    >>> nearest_fit_colours([0, 1], bits=2)
+    array([4, 2])
+    """
+    unfit = np.asarray(unfit, dtype=np.int64)
+    is_fit = np.ones(8**bits, dtype=bool)
+    is_fit[unfit] = False
+    fit = np.flatnonzero(is_fit)
+    if not fit.size:
+        raise QualityError(f"all {8**bits} colours of the table are unfit for use; build the table again")
+    codes = channels_of(fit, bits)
+    nearest = [
+        fit[np.argmin(((codes - channel) ** 2).sum(axis=1))] for channel in channels_of(unfit, bits).reshape(-1, 3)
+    ]
+    return np.array(nearest, dtype=np.int64).reshape(unfit.shape)
+
+
+def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple[npt.NDArray[np.uint8], int]:
+    """Return `picture` with unfit colours replaced, and the number of pixels replaced.
+
+    `picture`: (H, W, 3) uint8 sRGB codes. Returns (H, W, 3) uint8, the same array if nothing had to be replaced; and
+    the count.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> stained = SimpleNamespace(bits=2, unfit=(SimpleNamespace(colour=0),))
+    >>> picture = np.array([[[0, 10, 20], [255, 255, 255]]], np.uint8)
+    >>> replaced, pixels = replace_unfit_colours(picture, stained)
+    >>> replaced, pixels
+    (array([[[  0,   0,  64],
+            [255, 255, 255]]], dtype=uint8), 1)
+    """
+    bits = provenance.bits
+    unfit = tuple(sorted({cell.colour for cell in provenance.unfit}))
+    if not unfit or not colours_in(picture, bits)[list(unfit)].any():
+        return picture, 0
+    is_unfit, instead = _replacements(unfit, bits)
+    replaced = np.array(picture, order="C")
+    return replaced, int(_replace(replaced, np.uint32(bits), is_unfit, instead))
+
+
+@lru_cache(maxsize=4)
+def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8]]:
+    """Return which colours of a table are unfit, (8**bits,) bool, and their replacements, (8**bits, 3) uint8."""
+    is_unfit, instead = np.zeros(8**bits, np.bool_), np.zeros((8**bits, 3), np.uint8)
+    is_unfit[list(unfit)] = True
+    instead[list(unfit)] = channels_of(nearest_fit_colours(unfit, bits), bits) << (8 - bits)
+    return is_unfit, instead
+
+
+def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool_]:
+    """Return which colours of a table, (8**bits,) bool, are in a picture (H, W, 3) uint8.
+
+    Examples
+    --------
+    >>> np.flatnonzero(colours_in(np.array([[[0, 0, 0], [255, 255, 0]]], np.uint8), bits=5))
+    array([    0, 32736])
+    """
+    found = np.zeros(8**bits, np.bool_)
+    pixels = np.ascontiguousarray(picture)
+    scratch = np.ones(EDGE_BYTES + 2 * OFFSETS_BYTES + 1, np.uint8)
+    _find(pixels.ctypes.data, pixels.size // 3, np.uint32(bits), found.ctypes.data, scratch.ctypes.data)
+    return found
+
+
+@compiled
+def _find(pixels: int, count: int, bits: Any, found: int, scratch: int) -> None:
+    """Set the byte at `found` of each colour that is among the pixels to 1, the last byte of scratch memory."""
+    places, others = scratch + EDGE_BYTES, scratch + EDGE_BYTES + OFFSETS_BYTES
+    one = others + OFFSETS_BYTES
+    for group in range((count + GROUP - 1) // GROUP):
+        source = group_address(pixels, count, group, scratch)
+        write_colours(source, bits, uint32(1), places, uint32(0), others)
+        for i in range(min(GROUP, count - GROUP * group)):
+            copy1(one, found + offset_at(places + 4 * i))
+
+
+@inlined
+def _colour_at(picture: Any, y: int, x: int, bits: Any) -> Any:
+    low = np.uint32(8) - bits
+    red, green, blue = picture[y, x, 0] >> low, picture[y, x, 1] >> low, picture[y, x, 2] >> low
+    return red << np.uint32(2) * bits | green << bits | blue
+
+
+@compiled
+def _replace(picture: Any, bits: Any, is_unfit: Any, instead: Any) -> int:
+    count = 0
+    for y in range(picture.shape[0]):
+        for x in range(picture.shape[1]):
+            colour = _colour_at(picture, y, x, bits)
+            if is_unfit[colour]:
+                for channel in range(3):
+                    picture[y, x, channel] = instead[colour, channel]
+                count += 1
+    return count
