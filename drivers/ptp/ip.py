@@ -21,6 +21,7 @@ Source: CIPA DC-005-2005, PTP-IP, clauses 2.2 (connections) and 2.3 (packets).
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -50,8 +51,11 @@ PORT = 15740
 """TCP port of PTP-IP (CIPA DC-005-2005)."""
 VERSION = 0x00010000
 """PTP/IP 1.0."""
-HEADER_LENGTH = 8
+_HEADER: Final = struct.Struct("<II")
 """Bytes of length and type."""
+HEADER_LENGTH = _HEADER.size
+_DATA_HEADER: Final = struct.Struct("<III")
+"""The same, and the transaction that data belong to."""
 MAX_PACKET = 4096
 """Bytes of the longest packet that is no data; the longest real one carries a name of 40 characters."""
 MAX_NAME_UNITS = 255
@@ -267,9 +271,9 @@ def encode(packet: Packet) -> bytes:
 
 def encode_data(transaction: int, data: bytes | memoryview, *, last: bool) -> bytes:
     """Return the packet `Data`, or `EndData` for the last one, around a part of something large: it is copied once."""
-    length = HEADER_LENGTH + 4 + len(data)
+    length = _DATA_HEADER.size + len(data)
     kind = PacketType.END_DATA if last else PacketType.DATA
-    return b"".join((encode_integer(length, 4), encode_integer(kind, 4), encode_integer(transaction, 4), data))
+    return b"".join((_DATA_HEADER.pack(length, kind, transaction), data))
 
 
 def decode(data: bytes) -> Packet:
@@ -326,16 +330,14 @@ class PacketCutter:
                 "an HTTP server answers, no camera; give the camera's address, and as port "
                 f"{PORT} unless its menu says another"
             )
-        cursor = Cursor(self._waiting[self._at : self._at + HEADER_LENGTH + 4], "a PTP/IP packet")
-        length, kind = cursor.u32("length"), cursor.u32("type")
+        length, kind = _HEADER.unpack_from(self._waiting, self._at)
         _checked(kind, length)
         if kind in _DATA_TYPES:
-            if cursor.left < 4:
+            if self._left < _DATA_HEADER.size:
                 return False
-            self._transaction = cursor.u32("transaction")
-            self._data_kind = kind
-            self._data_left = length - cursor.at
-            self._at += cursor.at
+            _, self._data_kind, self._transaction = _DATA_HEADER.unpack_from(self._waiting, self._at)
+            self._data_left = length - _DATA_HEADER.size
+            self._at += _DATA_HEADER.size
             return True
         if self._left < length:
             return False
@@ -365,7 +367,7 @@ def _checked(kind: int, length: int) -> None:
     """Raise ProtocolError unless a packet of this type can be of this length."""
     if kind not in _PACKETS:
         raise _unusable(f"a packet of type {kind} and {length} bytes; a type of 1 to 14 was expected")
-    least, most = (HEADER_LENGTH + 4, 0xFFFFFFFF) if kind in _DATA_TYPES else (HEADER_LENGTH, MAX_PACKET)
+    least, most = (_DATA_HEADER.size, 0xFFFFFFFF) if kind in _DATA_TYPES else (HEADER_LENGTH, MAX_PACKET)
     if not least <= length <= most:
         raise _unusable(f"a {PacketType(kind).name} packet of {length} bytes; {least} to {most} were expected")
 
@@ -374,8 +376,8 @@ def _unusable(what: str) -> ProtocolError:
     return ProtocolError(f"the PTP/IP connection gives {what}; check that a camera answers at this port, and reconnect")
 
 
-READ: Final = 256 * 1024
-"""Bytes asked of a link at once: as large as a piece of data, which makes few calls of a long transfer."""
+READ: Final = 128 * 1024
+"""Bytes asked of a link at once: few calls for a long transfer, and no buffer that has to be mapped anew for each."""
 
 
 class Channel:

@@ -68,13 +68,13 @@ class Cursor:
 
     def take(self, count: int, field: str) -> bytes:
         """Return the next `count` bytes."""
-        if count > self.left:
+        begin, end = self.at, self.at + count
+        if end > len(self._data):
             raise ProtocolError(
-                f"{self.what}: {field} at byte {self.at} needs {count} bytes, but only {self.left} follow"
+                f"{self.what}: {field} at byte {begin} needs {count} bytes, but only {self.left} follow"
             )
-        self._before = self.at
-        self.at += count
-        return self._data[self._before : self.at]
+        self._before, self.at = begin, end
+        return self._data[begin:end]
 
     def rest(self) -> bytes:
         """Return all bytes that are left."""

@@ -22,6 +22,7 @@ ISO 15740:2013, annex D.
 from __future__ import annotations
 
 import contextlib
+import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -41,8 +42,9 @@ from drivers.ptp.protocol import (
 from foundation.clock import Clock
 from foundation.errors import LinkError, LinkTimeout, ProtocolError
 
-HEADER_LENGTH = 12
-"""Bytes of length, type, code and transaction (clause 7)."""
+_HEADER = struct.Struct("<IHHI")
+"""Length, type, code and transaction (clause 7)."""
+HEADER_LENGTH = _HEADER.size
 _LENGTH_AND_TYPE = 6
 """Bytes before the code: what follows them is a message as ISO 15740 has it."""
 UNKNOWN_LENGTH = 0xFFFFFFFF
@@ -123,9 +125,7 @@ class ContainerReader:
             return self._next_payload(messages)
         if len(self._rest) < HEADER_LENGTH:
             return False
-        cursor = Cursor(bytes(self._rest[:HEADER_LENGTH]), "a USB container")
-        length, kind = cursor.u32("length"), cursor.u16("type")
-        code, transaction = cursor.u16("code"), cursor.u32("transaction")
+        length, kind, code, transaction = _HEADER.unpack_from(self._rest)
         if kind == ContainerType.DATA:
             if length < HEADER_LENGTH:
                 raise _unusable(f"a data container of {length} bytes; its header alone has {HEADER_LENGTH}")
