@@ -75,7 +75,6 @@ _NAMELESS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT,
 """Faults of a write to an open file, of which the system does not say which one: these cannot be a socket's, nor a
 file's that somebody reads meanwhile."""
 
-
 ATTEMPTS = 1000
 """How often a folder is made anew that another program takes away meanwhile: programs do so once or twice, special file
 systems (/proc) for ever."""
@@ -320,7 +319,6 @@ MOST_JSON_BYTES: Final = 256 << 20
 
 MOST_LINE_BYTES: Final = 1 << 20
 """Longest line of a file that is read by lines: the longest of ours are some hundred bytes, names of files 4096."""
-
 
 _MOST_NAME: Final = 4096
 """Longest name, as PATH_MAX of Linux has it."""

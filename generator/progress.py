@@ -9,9 +9,7 @@ from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from typing import TYPE_CHECKING, Final
 
-from foundation.console import (
-    shows_progress,
-)
+from foundation.console import shows_progress
 from foundation.secret_texts import printable
 
 if TYPE_CHECKING:

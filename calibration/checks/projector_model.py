@@ -41,7 +41,6 @@ _SEEN_SD = np.array([[0.25, 0.45, 0.9], [0.6, 0.2, 0.6], [1.0, 0.7, 0.25]])
 _CHANNELS = np.array([0.45, 1.0, 0.70])
 """White's counts in the channels over green's, of those cameras and lamps."""
 
-
 _CHANNEL_SD, _PRIMARY_SD, _SCALE_SD = 0.35, 0.3, 2.0
 """Prior standard deviations (logarithm) of a channel's level, a primary's, and that of all: projectors of 5000 to
 11 000 K, and any exposure."""
@@ -52,7 +51,6 @@ _NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 18
 _POWER = 2.2
 """Exponent about which tone curves are described: displays have 1.8 to 2.6."""
 
-
 _SLOPE, _BEND, _LENGTH = 0.4, 0.2, 0.4
 """Prior standard deviations of a tone curve's exponent and bends (logarithm), and the bends' length in the logarithm of
 the code: sRGB, S-shaped curves and any exponent from 1.5 to 2.9 lie within two."""
@@ -62,7 +60,6 @@ _OWN = 0.2
 
 _OVERLAP_NODES = np.array([0.0, 64.0, 128.0, 192.0, 255.0])
 """Codes between which the light added where primaries overlap is interpolated."""
-
 
 _OVERLAP, _OVERLAP_BEND, _OVERLAP_LENGTH = 0.2, 0.15, 120.0
 """Prior standard deviations of the light added where primaries overlap, over the primary's own: of the whole, and of
@@ -95,7 +92,6 @@ _DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)
 
 _N = 12
 """Principal components of a tone curve that are kept: the next ones have standard deviations below .003."""
-
 
 _CURVES, _OVERLAPS = 4 * _N, len(_TERMS) * len(_OVERLAP_NODES)
 

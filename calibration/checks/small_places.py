@@ -19,9 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 _Array = npt.NDArray[np.float64]
-
 _Index = npt.NDArray[np.int64]
-
 _Mask = npt.NDArray[np.bool_]
 
 FAR = 5.0

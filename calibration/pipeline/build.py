@@ -90,7 +90,6 @@ CHECKPOINT_EVERY = 16
 METHOD = 17
 """Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods."""
 
-
 MOST_THREADS = 8
 """Each thread holds a raw file and its counts, 110 MB for a 6D Mark II: more would not stay below 2 GB."""
 

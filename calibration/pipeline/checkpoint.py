@@ -16,9 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration.table.lut import (
-    SAMPLES,
-)
+from calibration.table.lut import SAMPLES
 from foundation.files import partial_path, storage_error, sync_folder, write_whole
 from foundation.folders import clear_folder, held_folder, publish_folder, require_free
 

@@ -34,14 +34,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from calibration.citation import OriginRecord
 from experiment.lights import Illumination, load_illuminations
 from foundation.errors import FormatError, InputError, kind_of
-from foundation.files import (
-    file_sha256,
-    partial_path,
-    read_text,
-    reading_error,
-    require_plain_folder,
-    sha256_of,
-)
+from foundation.files import file_sha256, partial_path, read_text, reading_error, require_plain_folder, sha256_of
 from foundation.records import Record, from_json
 
 FORMAT: Final = "crop.lut"

@@ -29,11 +29,7 @@ from calibration.table.lut import (
 )
 from experiment.lights import COLUMNS, NAME, Illumination
 from foundation.errors import StorageError
-from foundation.files import (
-    sha256_of,
-    storage_error,
-    write_whole,
-)
+from foundation.files import sha256_of, storage_error, write_whole
 
 _Array = npt.NDArray[np.float64]
 

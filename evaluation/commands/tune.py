@@ -7,13 +7,7 @@ from typing import Annotated
 
 import typer
 
-from evaluation.commands.options import (
-    AngularError,
-    Data,
-    DataReading,
-    image_steps,
-    thread_option,
-)
+from evaluation.commands.options import AngularError, Data, DataReading, image_steps, thread_option
 from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
 
 FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"

@@ -39,7 +39,6 @@ FLOOR_DEG: Final = 0.01
 _DECADE: Final = 10.0
 """Points on the two axes stay apart by at least this factor, so that close errors do not fill the figure."""
 
-
 _AXES_PT: Final = 330.0
 """Height of the scatter's axes, about, in typographic points; it is 5.4 inches with its labels."""
 _LABEL_PT, _LABEL_RISE_PT = 8.5, 3.0

@@ -20,14 +20,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from drivers.raw.rawfile import (
-    CHANNELS,
-    Channel,
-    Mosaic,
-    Plane,
-    channel_offset_px,
-    phases,
-)
+from drivers.raw.rawfile import CHANNELS, Channel, Mosaic, Plane, channel_offset_px, phases
 from experiment.framing.field import FoundField
 from experiment.framing.finding import AMBER, FONT, GREEN, RED, FoundTag, Framing
 from foundation.robust import huber_weights, sigma_of
@@ -296,7 +289,6 @@ WIDTH_PX = 640
 
 _QUALITY = 80
 """JPEG quality: some 40 kB, 30 MB a session."""
-
 
 _LETTER_PX = 7.4
 """Width of a letter of the cause at `_SCALE`, px."""

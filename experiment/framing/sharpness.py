@@ -8,9 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from drivers.raw.rawfile import (
-    Plane,
-)
+from drivers.raw.rawfile import Plane
 from experiment.chart.model import TAG_MODULES
 from experiment.framing.field import FoundField
 from experiment.framing.finding import FoundTag, Framing
@@ -26,7 +24,6 @@ _BLURS = np.geomspace(0.15, 4, 48)
 
 _OUTLINE_PLACES = 80
 """Places of the field's outline at which blur is measured: enough for a median that marks in the margin do not move."""
-
 
 _INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0
 """How much around a place of the field's outline is looked at: one cell, and not the marks in the margin."""

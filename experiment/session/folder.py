@@ -57,7 +57,6 @@ from foundation.folders import held_folder, require_free, unmounted_at, whole_fo
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""
 
-
 _DECODED: Final = "decoded"
 """Record of a session whose frames were all looked at by software that sees damage inside of lossless JPEG."""
 

@@ -16,15 +16,7 @@ from typing import Any, Final
 
 from calibration.citation import bibtex, origin_lines, table_title
 from generator.dataset.joined import JOINED, JoinedLayout
-from generator.dataset.layouts import (
-    CROISSANT,
-    DATASHEET,
-    GROUND_TRUTH,
-    SOURCES,
-    Description,
-    one_line,
-    table_cell,
-)
+from generator.dataset.layouts import CROISSANT, DATASHEET, GROUND_TRUTH, SOURCES, Description, one_line, table_cell
 from generator.files import FULL, suffix_of
 
 OPEN: Final = "**TO BE ANSWERED BY THE LAB.**"

@@ -587,15 +587,7 @@ def _photographed(
     crop: int,
     lighting: Lighting,
 ) -> Sample:
-    from generator.files import (
-        FULL,
-        ImageMetadata,
-        encode_pieces,
-        encode_preview,
-        preview_of,
-        suffix_of,
-        to_full_scale,
-    )
+    from generator.files import FULL, ImageMetadata, encode_pieces, encode_preview, preview_of, suffix_of, to_full_scale
 
     options, cut = job.options, source.cuts[crop]
     height, width = cut.picture.shape[:2]

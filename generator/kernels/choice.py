@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -57,9 +57,6 @@ from generator.kernels.vector import (
     void,
 )
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES, key_of
-
-if TYPE_CHECKING:
-    pass
 
 LEAD: Final = 2
 """Groups of pixels by which choosing offsets leads fetching samples, so that the processor computes while it waits."""

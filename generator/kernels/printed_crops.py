@@ -10,10 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.compiled import compiled
-from generator.kernels.choice import (
-    check_out,
-    run_in_threads,
-)
+from generator.kernels.choice import check_out, run_in_threads
 from generator.kernels.printing import BLOCK, Members, Memory, PrintedLight, Rest, at_least_a_block, print_segments
 
 

@@ -16,11 +16,7 @@ from numpy import uint32
 from foundation.compiled import compiled, inlined
 from foundation.errors import QualityError
 from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, channels_of, group_address, write_colours
-from generator.kernels.vector import (
-    GROUP,
-    copy1,
-    offset_at,
-)
+from generator.kernels.vector import GROUP, copy1, offset_at
 
 if TYPE_CHECKING:
     from calibration.table.lut import Provenance

@@ -59,7 +59,6 @@ if TYPE_CHECKING:
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG file."""
 
-
 _CANDIDATES: Final = 8
 """Places of which a further crop takes the best; chosen, not measured: with one, crops may be nearly the same."""
 

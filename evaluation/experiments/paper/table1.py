@@ -120,7 +120,6 @@ SENSORS: Final[Mapping[str, str]] = {"Canon EOS 550D": "550D", "Canon EOS 6D Mar
 OWN: Final = ("Given", "Given")
 """Names of pictures and of ground truths of which nothing is said: the paper has no numbers of them."""
 
-
 _HEAD: Final = ("scenes", "sensor", "illuminations", "images", "method", "error")
 """What a row of numbers is about, in CSV."""
 

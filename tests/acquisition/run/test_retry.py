@@ -12,13 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.run.devices import (
-    PAUSE_S,
-    RETRY_S,
-    TOLD_LATER,
-    RetryPolicy,
-    pause_cause,
-)
+from acquisition.run.devices import PAUSE_S, RETRY_S, TOLD_LATER, RetryPolicy, pause_cause
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE

@@ -12,13 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.comparison.comparing import (
-    NoiseAnswer,
-    TableComparison,
-    compare,
-    geometry_difference,
-    light_pairs,
-)
+from calibration.comparison.comparing import NoiseAnswer, TableComparison, compare, geometry_difference, light_pairs
 from calibration.comparison.report import cells_csv, comparison_json, lights_csv, lines, write_comparison
 from calibration.table.lut import Lut, Provenance, open_lut
 from calibration.table.writing import LutWriter, references_csv

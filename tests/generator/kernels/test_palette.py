@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,9 +9,6 @@ from hypothesis import strategies as st
 from calibration.table.lut import Provenance, Unfit
 from generator.kernels.choice import channels_of
 from generator.kernels.unfit import colours_in, nearest_fit_colours, replace_unfit_colours
-
-if TYPE_CHECKING:
-    pass
 
 
 @settings(max_examples=40)
