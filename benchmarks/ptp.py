@@ -16,7 +16,7 @@ from statistics import median
 from drivers.links.network import LOOPBACK
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import Operation, ResponseCode
-from drivers.ptp.ip import IpTransport
+from drivers.ptp.ip import READ, IpTransport
 from drivers.ptp.protocol import Answer, PtpEvent, PtpRequest, PtpResponse, Transport
 from drivers.ptp.usb import UsbTransport
 from foundation.clock import SystemClock
@@ -58,7 +58,7 @@ class Plain:
         self._thread.start()
         self._socket = socket.create_connection(self._listener.getsockname())
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._buffer = bytearray(256 * 1024)
+        self._buffer = bytearray(READ)
 
     def download(self) -> None:
         self._socket.sendall(b"0")

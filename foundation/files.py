@@ -1,8 +1,8 @@
-"""Files: how they appear whole, and the gate to those that somebody else made.
+"""Files: how they appear whole; and the gate to files and folders that somebody else made.
 
-Everything that CroP writes under a final name goes through here: written beside its place under a hidden name, flushed
-to the disk, then renamed. A crash leaves a hidden leftover, never a half file; nothing is ever overwritten that the
-caller did not mean to replace. What is hashed is hashed by SHA-256 (FIPS 180-4).
+Every file that CroP writes under a final name goes through here, folders through `foundation.folders`: written beside
+its place under a hidden name, flushed to the disk, then renamed. A crash leaves a hidden leftover, never a half file;
+nothing is ever overwritten that the caller did not mean to replace. What is hashed is hashed by SHA-256 (FIPS 180-4).
 
 A folder of others is copied from a stranger's disk or an archive, and any file of it may hold anything. Rules that
 every reader keeps by going through here:
@@ -75,7 +75,7 @@ _NAMELESS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT,
 """Faults of a write to an open file, of which the system does not say which one: these cannot be a socket's, nor a
 file's that somebody reads meanwhile."""
 
-ATTEMPTS = 1000
+FOLDER_ATTEMPTS = 1000
 """How often a folder is made anew that another program takes away meanwhile: programs do so once or twice, special file
 systems (/proc) for ever."""
 
@@ -182,7 +182,7 @@ def make_folder(folder: Path, of: Path | None = None) -> None:
     `of`: what the folder is made for, named in the messages; the folder itself if None.
     """
     path = folder if of is None else of
-    for _ in range(ATTEMPTS):
+    for _ in range(FOLDER_ATTEMPTS):
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:

@@ -1,8 +1,8 @@
-"""Folders: made, emptied, published whole, and held by who works in one at a time.
+"""Folders: whether a place is free, how they are published whole and emptied, who holds one, which disk is missing.
 
 A folder appears whole as a file does (`foundation.files`): filled beside its place under a hidden name, flushed to the
 disk, then renamed. One that is held is locked by the system, so that a program which ends leaves no lock behind; where
-a disk locks no folders, a file in it is locked.
+a disk locks no folders, a file in it is locked. Also where the user's cache is.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Final
 
 from foundation.errors import InputError, StorageError
 from foundation.files import (
-    ATTEMPTS,
+    FOLDER_ATTEMPTS,
     disk_remedy_of,
     is_about_writing,
     make_folder,
@@ -121,8 +121,8 @@ def whole_folder(path: Path, what: str) -> Generator[Path]:
 
 
 FSTAB: Final = Path("/etc/fstab")
-
 MOUNTS: Final = Path("/proc/self/mounts")
+"""Tables of disks, and of mounted ones, of Linux."""
 
 
 def unmounted_at(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
@@ -193,7 +193,7 @@ def held_folder(
     this returns true then; if not, the attempt begins anew. `of`: what is made in the folder, named in the messages of
     errors; the folder itself if None.
     """
-    for _ in range(ATTEMPTS):
+    for _ in range(FOLDER_ATTEMPTS):
         make_folder(folder, of)
         with ExitStack() as opened:
             try:

@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Callbacks": "generator.dataset.making",
+    "Callbacks": "generator.dataset.shards",
     "DatasetOptions": "generator.dataset.plan",
     "Workers": "generator.dataset.making",
     "draw_batch": "generator.kernels.planar",

@@ -45,7 +45,6 @@ from experiment.session.records import FrameRecord
 from foundation.robust import huber_weights, sigma_of
 
 _Array = npt.NDArray[np.float64]
-_Index = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
 DEGREE = 4
@@ -201,6 +200,8 @@ class ConsistencyCheck:
         places_mm = cells_mm[self._some]
         block, self._middles, self._block_mm2 = _blocks(places_mm)
         self._members = _members(block, len(self._middles))
+        # Eight, those of a square grid: what covers the print, however small, covers two cells or harms one alone.
+        # A bound by the block's own spread would leave what covers less than half of each block it lies in.
         around = cKDTree(places_mm).query(places_mm, k=min(AROUND + 1, len(places_mm)))[1]
         self._around = np.ascontiguousarray(np.atleast_2d(around), dtype=np.int64)
 

@@ -22,23 +22,23 @@ _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
-FAR = 5.0
+_FAR = 5.0
 """Standard deviations from which on a cell is far off: noise alone has one in a million comparisons there."""
 
-ALONE = 8.0
+_ALONE = 8.0
 """Standard deviations from which on a cell that stands alone is not what the print shows elsewhere (chosen: 707 frames
 of a full chart are 70 million comparisons, and no polynomial is exact at the cube's corners)."""
 
-LEAST_ALONE = 0.05
+_LEAST_ALONE = 0.05
 """Deviation of such a cell, at least, as a share (chosen)."""
 
-ALSO = 3.0
+_ALSO = 3.0
 """Standard deviations from which on a cell is part of a place that it touches."""
 
 LEAST_MODEL_ERROR = 0.004
 """Standard deviation of what a cell's code predicts, at least, as a share: photosites answer to some 0.4 % alike."""
 
-BY_CHANCE = 0.1
+_BY_CHANCE = 0.1
 """Number of places of a size that a frame has by chance, from which on one of that size says nothing (chosen; in frames
 of healthy rooms hardly a cell is far off, and two next to each other need two)."""
 
@@ -80,7 +80,7 @@ class SmallPlaces:
         no_cells = np.zeros(0, dtype=np.int64)
         far = np.abs(deviation)
         far /= sigma
-        candidates = np.flatnonzero((far > FAR).any(axis=0))
+        candidates = np.flatnonzero((far > _FAR).any(axis=0))
         if not len(candidates):
             return no_cells, np.zeros(0), no_cells, no_cells
         own = deviation[:, candidates]
@@ -91,16 +91,16 @@ class SmallPlaces:
         apart = np.abs(own - usual) / sigma[:, candidates]
         # As far off from its code as from those next to it.
         certain = np.nan_to_num(np.minimum(apart, far[:, candidates]))
-        large = np.nan_to_num(np.minimum(np.abs(own), np.abs(own - usual))) > LEAST_ALONE
+        large = np.nan_to_num(np.minimum(np.abs(own), np.abs(own - usual))) > _LEAST_ALONE
         usable = self._usable[candidates]
-        seeds = candidates[usable & (certain > FAR).any(axis=0)]
-        alone = candidates[usable & ((certain > ALONE) & large).any(axis=0)]
+        seeds = candidates[usable & (certain > _FAR).any(axis=0)]
+        alone = candidates[usable & ((certain > _ALONE) & large).any(axis=0)]
         places = self._places(seeds)
         if not places.any():
             return no_cells, np.zeros(0), no_cells, alone
         compared = np.isfinite(far)
         far[~compared] = 0.0
-        found = self._grown(places, self._usable & (far.max(axis=0) > ALSO))
+        found = self._grown(places, self._usable & (far.max(axis=0) > _ALSO))
         # Nothing is known of those that are too dark, so that a place does not grow through them.
         found |= self._touched(found) & self._usable & ~compared.any(axis=0)
         cells = np.flatnonzero(found)
@@ -123,7 +123,7 @@ class SmallPlaces:
         # Of n cells strewn at random, n/2 (8 n / C)^(k - 1) places of k or more are to be expected.
         by_chance = 0.5 * cells * (AROUND * cells / count) ** (size - 1.0)
         # Where most of a print is far off, places are as large as it is.
-        kept[seeds[(size > 1) & ((by_chance < BY_CHANCE) | (size > cells // 2))]] = True
+        kept[seeds[(size > 1) & ((by_chance < _BY_CHANCE) | (size > cells // 2))]] = True
         return kept
 
     def _grown(self, places: _Mask, joins: _Mask) -> _Mask:

@@ -2,7 +2,7 @@
 
 What the dark frames show is known, and may be subtracted. What was there in other frames alone makes deep colours pale,
 and hardly moves a white; its amount is not found by what codes predict of a light, which is known to some per cent at
-best (`calibration.checks.light_codes`). Two sums are known far better, whatever the projector's response to codes:
+best (`calibration.checks.projector_model`). Two sums are known far better, whatever the projector's response to codes:
 
 - *Codes of 0.* A light is a sum of the three primaries, each of which has a frame of its own. Of a primary whose code
   is 0 it has nothing beyond the dark light. What it seems to have is room light in its own frame; what it seems to lack

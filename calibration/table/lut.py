@@ -1,8 +1,9 @@
 """The look-up table on disk: what lies in it, and how it is opened for reading.
 
-A LUT folder holds `samples.npy` (uint16 little-endian, C order, [light, colour, sample, RGB]), `illuminations.csv`
-(the lights and their ground truth), `lut.json` (provenance), `frames.csv` (the frames it was made from), and
-`SHA256SUMS`. The generator reads tables through this file, and nothing behind it (docs/formats.md).
+A LUT folder holds `samples.npy` (uint16 little-endian, C order, [light, colour, sample, RGB]), `illuminations.csv` (the
+lights and their ground truth), `lut.json` (provenance), `frames.csv` (the frames it was made from), and `SHA256SUMS`.
+The generator reads tables through this file, and nothing behind it (docs/formats.md). It is written by
+`calibration.table.writing`.
 
 Rules that hold inside:
 
@@ -50,9 +51,6 @@ FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$")]
 
 FRAME_FIELDS: Final = ("kind", "illumination", "file", "sha256")
 """Columns of a table's `frames.csv` (docs/formats.md)."""
-
-REFERENCE_COLUMNS: Final = ("light", "name", "r", "g", "b", "r_error", "g_error", "b_error")
-"""Columns of a table's `references.csv` (docs/formats.md)."""
 
 MOST_SAMPLES: Final = 1024
 """Samples of a cell at most: the largest window has 9×9."""
@@ -108,7 +106,6 @@ MOST_BYTES: Final = {
 OPTIONAL: Final = frozenset({REPORT_PAGE})
 """Files that a table may do without: no number is read from them, and a table that was fetched has none."""
 
-_Array = npt.NDArray[np.float64]
 _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")
 _TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, REPORT_PAGE)
 RESTORE: Final = "restore it from a copy, fetch the table again, or build it anew"

@@ -8,6 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,6 @@ from calibration.table.lut import (
     FRAMES,
     ILLUMINATIONS,
     PROVENANCE,
-    REFERENCE_COLUMNS,
     SAMPLES,
     SUMS,
     WHITE_COLUMNS,
@@ -32,6 +32,9 @@ from foundation.errors import StorageError
 from foundation.files import sha256_of, storage_error, write_whole
 
 _Array = npt.NDArray[np.float64]
+
+REFERENCE_COLUMNS: Final = ("light", "name", "r", "g", "b", "r_error", "g_error", "b_error")
+"""Columns of a table's `references.csv` (docs/formats.md)."""
 
 
 def frames_csv(frames: Sequence[SourceFrame]) -> str:

@@ -52,8 +52,9 @@ PORT = 15740
 VERSION = 0x00010000
 """PTP/IP 1.0."""
 _HEADER: Final = struct.Struct("<II")
-"""Bytes of length and type."""
-HEADER_LENGTH = _HEADER.size
+"""Length and type of a packet (clause 2.3)."""
+HEADER_LENGTH: Final = _HEADER.size
+"""Bytes of these."""
 _DATA_HEADER: Final = struct.Struct("<III")
 """The same, and the transaction that data belong to."""
 MAX_PACKET = 4096

@@ -25,6 +25,7 @@ import contextlib
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Final
 
 from drivers.links.usb import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.codes import ResponseCode
@@ -42,9 +43,10 @@ from drivers.ptp.protocol import (
 from foundation.clock import Clock
 from foundation.errors import LinkError, LinkTimeout, ProtocolError
 
-_HEADER = struct.Struct("<IHHI")
+_HEADER: Final = struct.Struct("<IHHI")
 """Length, type, code and transaction (clause 7)."""
-HEADER_LENGTH = _HEADER.size
+HEADER_LENGTH: Final = _HEADER.size
+"""Bytes of these."""
 _LENGTH_AND_TYPE = 6
 """Bytes before the code: what follows them is a message as ISO 15740 has it."""
 UNKNOWN_LENGTH = 0xFFFFFFFF

@@ -1,4 +1,4 @@
-"""How sharp a chart's picture is: the blur of its tags' and its field's edges."""
+"""How sharp a chart's picture is: the blur of its tags' and its field's edges, in half-size pixels."""
 
 from __future__ import annotations
 

@@ -25,16 +25,16 @@ Rules that hold inside:
   facts and are not kept. What a crash cut off is the last line alone, and is no fact.
 - A raw file may be downloaded in one thread and made whole in another (`IncomingFile`), before its row is committed.
 
-Which raw files are really there, `experiment.session.folder` knows.
+How the file is opened, and what is refused then, is `experiment.session.opening`; which raw files are really there,
+`experiment.session.folder` knows.
 
-Sources: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvantages"; sqlite.org/lockingv3.html.
+Source: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvantages".
 """
 
 from __future__ import annotations
 
 import base64
 import json
-import logging
 import os
 import shlex
 import sqlite3
@@ -688,7 +688,6 @@ class _JournalGuard:
 
 
 _T = TypeVar("_T")
-_log = logging.getLogger(__name__)
 
 
 class LostJournalError(StorageError):

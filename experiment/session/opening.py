@@ -38,6 +38,8 @@ _T = TypeVar("_T")
 
 _log = logging.getLogger(__name__)
 
+_DAMAGED: Final = "it is damaged, or not to be trusted"
+
 JOURNAL_VERSION = 2
 """`PRAGMA user_version` of the journals that this software writes (docs/formats.md); version 1 is read."""
 
@@ -458,8 +460,7 @@ def _primary_code(error: sqlite3.DatabaseError) -> int:
     return getattr(error, "sqlite_errorcode", 0) & 0xFF
 
 
-_DAMAGED: Final = "it is damaged, or not to be trusted"
-
+# What a row may hold, in SQL; {0} is the column.
 _WHOLE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 1000000000"
 
 _MAYBE_WHOLE = "({0} IS NULL OR " + _WHOLE + ")"

@@ -1,4 +1,4 @@
-"""Layouts in which the images of a shard lie in one file: tar and Parquet.
+"""Layouts in which the images of a shard lie in one file, tar and Parquet; and what writes and reads each layout.
 
 WebDataset shards: plain tar files in which the files of an image follow each other under one number.
 

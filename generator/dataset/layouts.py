@@ -1,10 +1,10 @@
-"""What a dataset is on disk: its records, and how images and records are written as files of their own.
+"""What a dataset is on disk: its records, the names of its files, and images that are files of their own.
 
 The records are its description, lights and sources, and the record of each shard. A shard is a range of planned image
 numbers that is made by one task. Its record is written when everything else of it is on the disk: a shard with a record
 is done, one without is not.
 
-Images lie in files of their own, or those of a shard in one (`generator.dataset.joined`).
+Images are files of their own here; those of a shard that lie in one file are `generator.dataset.joined`.
 """
 
 from __future__ import annotations

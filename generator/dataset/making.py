@@ -1,9 +1,9 @@
-"""Making a dataset: whole, in shares beside other programs, and out of the shards of all shares; and the place of it.
+"""Making a dataset: whole, in shares beside other programs, out of the shards of all shares; and who may work at it.
 
 Shards (`generator.dataset.shards`) are made by threads of this program, or by the workers of a Dask cluster. Either
 takes the shards that are not done and returns when they are, whatever died meanwhile.
 
-Rules that hold inside, of the place where a dataset is made:
+Rules that hold inside, of the place where a dataset is made (`shards.Workplace`):
 
 - A place belongs to one plan. Another plan is refused with a message that says how the two differ. A worker of a plan
   that was removed may still be alive: its records bear the identifier of its plan, so they are never taken for ours.

@@ -98,18 +98,19 @@ if TYPE_CHECKING:
 
 
 PLAN: Final = "plan.json"
-
 RECORDS: Final = "shards"
-
 NOTES: Final = ".plan"
-
+"""Names among a place's notes: of the plan, of the folder of shards' records, and in a store of the notes' folder."""
 DONE: Final = ".json"
-
 IMAGE_NOTES: Final = ".images"
+"""Ends of the names of a shard's record, and of the lines of its finished images."""
 
 PlanIdentity = Mapping[str, Any]
 
 _threads: Final = threading.local()
+
+_LARGEST_COUNT: Final = 65535
+"""Largest value of 16 bits."""
 
 TINY_PX: Final = 16
 """A shorter side below which a picture is noted: icons and failed downloads are so small, photographs never are."""
@@ -289,10 +290,6 @@ def chromaticity(white: npt.NDArray[np.float64]) -> Triple:
     """Return (r, g, b) of sum 1 of linear RGB (3,) float64."""
     red, green, blue = (float(part) for part in white / white.sum())
     return red, green, blue
-
-
-LARGEST_COUNT: Final = 65535
-"""Largest value of 16 bits."""
 
 
 def _ignore(*arguments: object) -> None:
@@ -593,7 +590,7 @@ def _photographed(
     height, width = cut.picture.shape[:2]
     white_level = lut.provenance.white_level
     # What exceeds saturation may be below it once it is exposed anew, and is cut then.
-    most = white_level if options.variation is None else LARGEST_COUNT
+    most = white_level if options.variation is None else _LARGEST_COUNT
     taken = source.black_taken
     image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
     varied = Varied()
@@ -845,7 +842,7 @@ class Workplace:
     - `files`: what will be the dataset.
     - `notes`: the plan and the shards' records, which are removed at the end.
     - `out`: the dataset's place.
-    - `plan_id`: identifier of the plan; see `_plan_id`.
+    - `plan_id`: identifier of the plan; see `generator.dataset.making`.
     """
 
     files: Store

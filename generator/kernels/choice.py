@@ -1,7 +1,8 @@
 """Which of a colour's samples a pixel gets: a pure function of (seed, image number, light's place, x, y).
 
-Beside that what all kernels share: the colours of a table, and their arguments, which are checked before compiled code
-reads their memory.
+Its steps are LLVM's vectors (`kernels/vector.py`) and can be called from compiled functions only, as can those that
+prefetch. Beside that what all kernels share: the colours of a table, and their arguments, which are checked before
+compiled code reads their memory.
 
 Tiles, threads and workers cannot change a choice. The rule is part of the dataset format
 (`docs/decisions/0010-compiled-kernel.md` says why it is this one); all arithmetic is modulo 2³² but for p and q::
@@ -75,7 +76,7 @@ _W0: Final = np.uint32(KEY_STEPS[0])
 _W1: Final = np.uint32(KEY_STEPS[1])
 _HALF: Final = np.uint64(32)
 _PURPOSE: Final = np.uint32(SAMPLES)
-_PAIRS = ir.VectorType(I64, LANES // 2)
+_PAIRS: Final = ir.VectorType(I64, LANES // 2)
 _MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
 """Of the three rounds of the rule."""
 
@@ -93,7 +94,7 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
     return builder.or_(builder.or_(field(0), field(1)), field(2))
 
 
-def hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
+def _hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
     """Return the words h of a group."""
     numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
     h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
@@ -105,7 +106,7 @@ def hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
     return h
 
 
-def digits(builder: Builder, h: Value, count: Value) -> tuple[Value, ...]:
+def _digits(builder: Builder, h: Value, count: Value) -> tuple[Value, ...]:
     """Return the choices of the first and the second 16 pixels of a group, from its words."""
     counts = broadcast(builder, count, WORDS)
 
@@ -149,7 +150,7 @@ def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, coun
         target: Value,
     ) -> None:
         stride = broadcast(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
-        for half, choices in enumerate(digits(builder, hashed(builder, word, (k0, k1, k2)), count)):
+        for half, choices in enumerate(_digits(builder, _hashed(builder, word, (k0, k1, k2)), count)):
             begin = builder.add(picture, ir.Constant(I64, 3 * LANES * half))
             colours = builder.mul(_colours(builder, begin, bits), stride)
             offsets = builder.add(colours, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
@@ -191,7 +192,7 @@ def choose_for_colours(typing: Any, colours: Any, word: Any, k0: Any, k1: Any, k
     def emit(
         builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
     ) -> None:
-        for half, choices in enumerate(digits(builder, hashed(builder, word, (k0, k1, k2)), count)):
+        for half, choices in enumerate(_digits(builder, _hashed(builder, word, (k0, k1, k2)), count)):
             named = load(builder, colours, 4 * LANES * half, WORDS)
             offsets = builder.add(named, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
             store(builder, offsets, target, 4 * LANES * half)

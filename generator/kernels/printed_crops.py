@@ -1,4 +1,4 @@
-"""Crops of pictures printed by colour, for training batches: each at its own place, scale of light and mirroring."""
+"""Crops by colour for training batches, each at its own place, scale and mirroring; the rule is `printing.py`'s."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ import numpy.typing as npt
 
 from foundation.compiled import compiled
 from generator.kernels.choice import check_out, run_in_threads
-from generator.kernels.printing import BLOCK, Members, Memory, PrintedLight, Rest, at_least_a_block, print_segments
+from generator.kernels.printing import (
+    PRINTED_BLOCK,
+    PrintedLight,
+    PrintedMembers,
+    PrintMemory,
+    SharedTables,
+    at_least_a_block,
+    print_segments,
+)
 
 
 @compiled
@@ -82,7 +90,7 @@ def draw_printed_crops(
     count = len(pictures)
     # Most batches show a light more than once.
     known = {id(light): light for light in lights}
-    members, rest = Members(samples, list(known.values())), Rest(samples, cells)
+    members, rest = PrintedMembers(samples, list(known.values())), SharedTables(samples, cells)
     of_lights = {
         name: (light.means.ctypes.data, light.bases.ctypes.data, *ends)
         for (name, light), ends in zip(known.items(), pairwise(members.starts.tolist()), strict=True)
@@ -95,12 +103,12 @@ def draw_printed_crops(
     plan[:, :2] = [(source.ctypes.data, source.strides[0]) for source in sources]
     plan[:, 2:4], plan[:, 4] = windows[:, :2], flips
     plan[:, 5:] = [of_lights[id(light)] for light in lights]
-    whole = width >= BLOCK and out.strides[3] == 4
-    work = out if whole else np.empty((count, 3, height, max(width, BLOCK)), np.float32)
+    whole = width >= PRINTED_BLOCK and out.strides[3] == 4
+    work = out if whole else np.empty((count, 3, height, max(width, PRINTED_BLOCK)), np.float32)
     unmasked = np.zeros((1, 1, 1), np.float32)
 
     def fill(first: int, end: int) -> None:
-        memory = Memory(members.most)
+        memory = PrintMemory(members.most)
         _print_crops(
             plan,
             first,

@@ -83,7 +83,7 @@ NODE_CODES: Final = (*range(0, 256, 16), 255)
 """sRGB codes of a channel's nodes."""
 
 _RED, _GREEN, _BLUE = np.int32(SIDE * SIDE), np.int32(SIDE), np.int32(1)
-_ALL, _LAST, _HALF = np.int32(SIDE * SIDE + SIDE + 1), np.int32(SIDE - 2), np.int32(8)
+_ALL, _HALF = np.int32(SIDE * SIDE + SIDE + 1), np.int32(8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,21 +169,21 @@ def means_at(
 
 
 _FOUR: Final = ir.VectorType(F32, 4)
-BLOCK: Final = LANES
+PRINTED_BLOCK: Final = LANES
 """Pixels that are planned and interpolated at a time."""
 _PLAN_ROWS: Final = 8
 """Rows of 16 numbers that the plan of a block has: offsets of three nodes in bytes, weights of four, the offset of the
 nearest. The fourth node is one step farther in each channel than the first."""
-_ROW: Final = 4 * BLOCK
+_ROW: Final = 4 * PRINTED_BLOCK
 """Bytes of a row: one number of 32 bits a pixel."""
 _PLAN_BYTES: Final = _ROW * _PLAN_ROWS
-_LINE_BYTES: Final = 16 * BLOCK
+_LINE_BYTES: Final = 16 * PRINTED_BLOCK
 """Bytes of a block's pixels: red, green, blue and noise, float32 each."""
 _SEGMENT: Final = 8
 """Blocks of a row that are planned, and their samples prefetched, while those before are interpolated."""
 _ROWS_AHEAD: Final = 2
 """Rows by which prefetching the picture leads planning it."""
-_SEGMENT_GROUPS: Final = _SEGMENT * BLOCK // GROUP + 2
+_SEGMENT_GROUPS: Final = _SEGMENT * PRINTED_BLOCK // GROUP + 2
 """Groups of 32 pixels, whose choices are made together, that a segment may touch."""
 
 
@@ -201,7 +201,7 @@ def plan_block(typing: Any, picture: Any, part: Any, target: Any) -> Any:
         parts: list[Value] = []
         for channel in range(3):
             vector: Value = ir.Constant(FLOATS, ir.Undefined)
-            for pixel in range(BLOCK):
+            for pixel in range(PRINTED_BLOCK):
                 code = builder.zext(load(builder, picture, 3 * pixel + channel, I8), I64)
                 its = load(builder, builder.add(part, builder.shl(code, ir.Constant(I64, 2))), 0, F32)
                 vector = builder.insert_element(vector, its, ir.Constant(I32, pixel))
@@ -257,7 +257,7 @@ def place_samples(typing: Any, plan: Any, cells: Any, choices: Any, samples: Any
     del typing, plan, cells, choices, samples, target
 
     def emit(builder: Builder, plan: Value, cells: Value, choices: Value, samples: Value, target: Value) -> None:
-        for pixel in range(BLOCK):
+        for pixel in range(PRINTED_BLOCK):
             near = load(builder, plan, _ROW * 7 + 4 * pixel, I32)
             cell = builder.zext(builder.lshr(near, ir.Constant(I32, 3)), I64)
             place = builder.add(load(builder, builder.add(cells, cell), 0, I32), load(builder, choices, 4 * pixel, I32))
@@ -322,7 +322,7 @@ def draw_block(
 
     def emit(builder: Builder, *addresses: Value) -> None:
         *those, means, line = addresses
-        for first in range(0, BLOCK, 4):
+        for first in range(0, PRINTED_BLOCK, 4):
             seen = _interpolated(builder, those[0], means, first)
             store(builder, _deviating(builder, seen, first, those), line, 16 * first)
 
@@ -336,7 +336,7 @@ def add_deviations(typing: Any, plan: Any, bases: Any, samples: Any, places: Any
 
     def emit(builder: Builder, *addresses: Value) -> None:
         *those, line = addresses
-        for first in range(0, BLOCK, 4):
+        for first in range(0, PRINTED_BLOCK, 4):
             seen = load(builder, line, 16 * first, FLOATS)
             store(builder, _deviating(builder, seen, first, those), line, 16 * first)
 
@@ -401,7 +401,7 @@ def write_pixels(typing: Any, line: Any, most: Any, target: Any) -> Any:
 @inlined
 def _block_at(block: int, width: int) -> int:
     """Return where a block of a row begins; the last may overlap the one before."""
-    return min(BLOCK * block, width - BLOCK)
+    return min(PRINTED_BLOCK * block, width - PRINTED_BLOCK)
 
 
 @inlined
@@ -424,11 +424,11 @@ def _plan_segment(
 ) -> None:
     """Plan blocks `first` … `stop` - 1 of a row of which the first pixel is at address `row` and has x = x0."""
     _, _, cells, part, zeros = tables
-    for line in range(3 * BLOCK * first, 3 * BLOCK * stop + LINE, LINE):
+    for line in range(3 * PRINTED_BLOCK * first, 3 * PRINTED_BLOCK * stop + LINE, LINE):
         prefetch(row + _ROWS_AHEAD * pitch + line)
     for block in range(first, stop):
         plan_block(row + 3 * _block_at(block, width), part, plans + (block - first) * _PLAN_BYTES)
-    low, high = (x0 + _block_at(first, width)) // GROUP, (x0 + _block_at(stop - 1, width) + BLOCK - 1) // GROUP
+    low, high = (x0 + _block_at(first, width)) // GROUP, (x0 + _block_at(stop - 1, width) + PRINTED_BLOCK - 1) // GROUP
     for number in range(len(samples)):
         k0, k1, k2 = row_keys(y, number, image, seed)
         for group in range(low, high + 1):
@@ -451,7 +451,7 @@ def _mix_block(plan: int, place: int, tables: Any, members: Any, shares: Any, fa
         owner = owners[number]
         first, last = number == 0 or owner != owners[number - 1], number + 1 == len(owners)
         lit = False
-        for pixel in range(BLOCK):
+        for pixel in range(PRINTED_BLOCK):
             share[pixel] = shares[pixel, owner]
             lit |= share[pixel] != 0
             factors[0, pixel] = roots[number] / np.sqrt(share[pixel]) if share[pixel] else np.float32(0)
@@ -463,7 +463,7 @@ def _mix_block(plan: int, place: int, tables: Any, members: Any, shares: Any, fa
         else:
             add_deviations(plan, bases, samples[number], to, at, own)
         if last or owners[number + 1] != owner:
-            for pixel in range(BLOCK):
+            for pixel in range(PRINTED_BLOCK):
                 for channel in range(3):
                     lines[0, pixel, channel] += share[pixel] * lines[1, pixel, channel]
 
@@ -496,7 +496,7 @@ def print_segments(
     samples, roots, _ = members
     for number in range(len(samples)):
         factors[number] = roots[number]
-    blocks = (width + BLOCK - 1) // BLOCK
+    blocks = (width + PRINTED_BLOCK - 1) // PRINTED_BLOCK
     segments = (blocks + _SEGMENT - 1) // _SEGMENT
     for segment in range(height * segments + 1):
         if segment < height * segments:
@@ -528,7 +528,7 @@ def print_segments(
             plan = plans + (slot * _SEGMENT + block - first) * _PLAN_BYTES
             place = places + (slot * _SEGMENT * len(samples) + block - first) * _ROW
             if masked:
-                _mix_block(plan, place, tables, members, shares[y, x : x + BLOCK], factors, lines)
+                _mix_block(plan, place, tables, members, shares[y, x : x + PRINTED_BLOCK], factors, lines)
             else:
                 draw_block(plan, tables[1], samples[0], place, factors.ctypes.data, tables[0], line)
                 for number in range(1, len(samples)):
@@ -537,7 +537,7 @@ def print_segments(
             if scales == 0:
                 write_pixels(line, most, target + y * pitches[0] + SAMPLE_BYTES * x)
                 continue
-            red = target + y * pitches[1] + 4 * (width - BLOCK - x if flip else x)
+            red = target + y * pitches[1] + 4 * (width - PRINTED_BLOCK - x if flip else x)
             green, blue = red + pitches[0], red + 2 * pitches[0]
             if flip:
                 write_mirrored(line, scales, red, green, blue)
@@ -545,7 +545,7 @@ def print_segments(
                 write_planes(line, scales, red, green, blue)
 
 
-class Memory:
+class PrintMemory:
     """What compiled code works in: plans of two segments, their samples' places and choices, and lines of pixels."""
 
     def __init__(self, components: int) -> None:
@@ -564,16 +564,12 @@ class Memory:
         addresses = (part.ctypes.data for name, part in parts.items() if name != "factors")
         self.arrays = (
             *addresses,
-            parts["factors"].view(np.float32).reshape(-1, BLOCK),
-            parts["lines"].view(np.float32).reshape(2, BLOCK, 4),
+            parts["factors"].view(np.float32).reshape(-1, PRINTED_BLOCK),
+            parts["lines"].view(np.float32).reshape(2, PRINTED_BLOCK, 4),
         )
 
 
-_NOTHING: Final = np.zeros(GROUP, np.uint32)
-"""What is added to choices, none."""
-
-
-class Members:
+class PrintedMembers:
     """The table's lights in those of an image or a batch, as compiled code takes them.
 
     What they point to lives as long as this. `starts`: (M + 1,) int64, the first member of each light, and the end.
@@ -592,7 +588,11 @@ class Members:
         self.most = max(sizes)
 
 
-class Rest:
+_NOTHING: Final = np.zeros(GROUP, np.uint32)
+"""What is added to choices, none."""
+
+
+class SharedTables:
     """What all lights share as compiled code takes it: where nodes' samples begin, parts of codes, and zeros."""
 
     def __init__(self, samples: npt.NDArray[np.uint16], cells: npt.NDArray[np.uint32]) -> None:
@@ -602,7 +602,7 @@ class Rest:
 
 def at_least_a_block(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """Return a picture (H, W, 3) whose rows compiled code can read, with black pixels behind it up to a block."""
-    missing = BLOCK - picture.shape[1]
+    missing = PRINTED_BLOCK - picture.shape[1]
     return packed_rows(picture) if missing <= 0 else np.pad(picture, ((0, 0), (0, missing), (0, 0)))
 
 
@@ -631,19 +631,19 @@ def draw_printed(
     target = check_out(out, picture.shape, np.uint16)
     key = check_seed(seed, image)
     count, masked, width = np.uint32(samples.shape[2]), shares is not None, picture.shape[1]
-    members, rest = Members(samples, lights), Rest(samples, cells)
+    members, rest = PrintedMembers(samples, lights), SharedTables(samples, cells)
     means, bases = (
         np.concatenate([getattr(one, name) for one in lights]) if masked else getattr(lights[0], name)
         for name in ("means", "bases")
     )
     given = np.zeros((1, 1, 1), np.float32) if shares is None else shares
     source = at_least_a_block(picture)
-    if masked and width < BLOCK:
-        given = np.pad(given, ((0, 0), (0, BLOCK - width), (0, 0)))
-    work = writable(target) if width >= BLOCK else np.empty(source.shape, np.uint16)
+    if masked and width < PRINTED_BLOCK:
+        given = np.pad(given, ((0, 0), (0, PRINTED_BLOCK - width), (0, 0)))
+    work = writable(target) if width >= PRINTED_BLOCK else np.empty(source.shape, np.uint16)
 
     def fill(top: int, bottom: int) -> None:
-        memory = Memory(len(members.arrays[0]))
+        memory = PrintMemory(len(members.arrays[0]))
         print_segments(
             source.ctypes.data + top * source.strides[0],
             source.strides[0],
@@ -664,7 +664,7 @@ def draw_printed(
         )
 
     run_in_threads(fill, len(picture), threads)
-    if width < BLOCK:
+    if width < PRINTED_BLOCK:
         target[...] = work[:, :width]
         return target
     return copied_back(work, target)

@@ -8,6 +8,7 @@ can do.
 Addresses are plain integers; whoever calls must keep them inside arrays. What may be read or written beyond is said
 with each function. First come steps that all kernels share, then those that write past the caches an image that they
 could not keep, so that they keep the table, then those of `mixing.py`.
+What chooses samples, and prefetches, is in `choice.py`.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ _HEAD: Final = 1 << 20
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _AvifPicture:
+class AvifPicture:
     """What a file holds.
 
     - `codes`: (H, W, 3) uint8.
@@ -62,7 +62,7 @@ class _AvifPicture:
     icc: bytes | None
 
 
-def read_avif(path: Path, most_pixels: int) -> _AvifPicture:
+def read_avif(path: Path, most_pixels: int) -> AvifPicture:
     """Return the picture in an AVIF file."""
     from PIL import Image
 
@@ -85,7 +85,7 @@ def read_avif(path: Path, most_pixels: int) -> _AvifPicture:
     if not icc:
         _require_srgb(path)
     alpha = pixels[..., 3].astype(np.float64) / 255 if has_alpha and pixels[..., 3].min() < 255 else None
-    return _AvifPicture(np.ascontiguousarray(pixels[..., :3]), alpha, orientation, icc or None)
+    return AvifPicture(np.ascontiguousarray(pixels[..., :3]), alpha, orientation, icc or None)
 
 
 def _require_srgb(path: Path) -> None:
@@ -105,16 +105,6 @@ def _require_srgb(path: Path) -> None:
 
 ASSUMED: Final = "none, taken as sRGB"
 """Remark on a picture without a profile."""
-
-ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"
-"""Remark on a picture that a camera made in that space."""
-
-LINEAR: Final = "floating-point values, taken as linear light"
-
-TRANSPARENT: Final = "transparent, composited on white"
-
-PROFILE_UNUSED: Final = "colour profile not applied"
-"""Notes on a picture, for its row of the dataset's list of sources."""
 
 _PROBE_STEPS: Final = 9
 """Codes of each channel, every 32nd, of the grid of 729 colours that shows whether a profile is sRGB."""

@@ -8,12 +8,12 @@ this order, so that one picture always gives the same codes::
                   light, 1 = white, clipped and encoded with the sRGB curve (IEC 61966-2-1) unless the file calls itself
                   sRGB
     transparency  white shows through, as paper does in a print; mixed in the values that the file holds
-    profile       codes of another colour space become those of sRGB; see below
+    profile       codes of another colour space become those of sRGB (`generator.pictures.conversion`)
     orientation   turned as the file's EXIF or TIFF orientation asks
     size          only ever made smaller, on request, by averaging areas of codes
     crop          cut, on request, from the centre or at places that the picture's name and a seed choose
 
-Conversion between colour spaces, and AVIF, are `generator.pictures.conversion`.
+Other colour spaces, and AVIF, are in `generator.pictures.conversion`, random colours in `.random_scenes`.
 """
 
 from __future__ import annotations
@@ -41,11 +41,7 @@ from foundation.files import file_sha256, sha256_of, stream_sha256
 from foundation.secret_texts import masked
 from generator import philox
 from generator.pictures.conversion import (
-    ADOBE_RGB,
     ASSUMED,
-    LINEAR,
-    PROFILE_UNUSED,
-    TRANSPARENT,
     from_adobe_rgb,
     read_avif,
     to_srgb,
@@ -55,6 +51,14 @@ from generator.stores import DESCRIPTION, filesystem, is_remote, local_path
 if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
 
+
+ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"
+"""Remark on a picture that a camera made in that space."""
+
+LINEAR: Final = "floating-point values, taken as linear light"
+TRANSPARENT: Final = "transparent, composited on white"
+PROFILE_UNUSED: Final = "colour profile not applied"
+"""Notes on a picture, as those above, for its row of the dataset's list of sources."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG file."""

@@ -24,8 +24,8 @@ from PIL import Image, ImageCms, features
 
 from foundation.errors import FormatError, InputError
 from generator.pictures import sources
-from generator.pictures.conversion import PROFILE_UNUSED, to_srgb
-from generator.pictures.sources import Preparation, find_pictures, open_picture, read_picture
+from generator.pictures.conversion import to_srgb
+from generator.pictures.sources import PROFILE_UNUSED, Preparation, find_pictures, open_picture, read_picture
 from tests.generator.pictures.icc import ADOBE_RGB, PROPHOTO_RGB, gamma_profile
 from tests.generator.pictures.oiio_files import write
 
