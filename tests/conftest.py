@@ -1,16 +1,18 @@
-"""Which tests are slow: what is left out of `make quick`, so that it takes less than a minute on two cores."""
+"""Which tests are slow, what all have in common, and that comparisons of arrays compare something."""
 
 from __future__ import annotations
 
 import atexit
+import functools
 import gc
 import os
 import re
 import shutil
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -20,6 +22,8 @@ from hypothesis import settings
 # NumPy is imported; what tests start inherits it. Threads of our own are as many as ever.
 for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(_threads, "1")
+
+import numpy as np  # noqa: E402 - after the threads
 
 # Sessions and tables are written to the disk for good, step by step: a run of twenty lights waits for it half a second.
 # What is lost with the power is of no interest here, and in memory nobody waits.
@@ -41,6 +45,21 @@ sys.modules.setdefault("triton", None)  # pyright: ignore[reportArgumentType]
 gc.disable()
 # At the end bindings of C++ look whether anything of theirs is left.
 atexit.register(gc.unfreeze)
+
+
+def _of_something(compare: Callable[..., None]) -> Callable[..., None]:
+    """Return a comparison of NumPy's that fails where an array without numbers is held against a number."""
+
+    @functools.wraps(compare)
+    def compared(actual: Any, desired: Any, *given: Any, **named: Any) -> None:
+        assert np.size(actual) or np.ndim(desired), "an array without numbers equals any number: nothing was tested"
+        compare(actual, desired, *given, **named)
+
+    return compared
+
+
+np.testing.assert_allclose = _of_something(np.testing.assert_allclose)
+np.testing.assert_array_equal = _of_something(np.testing.assert_array_equal)
 
 
 def pytest_collection_finish() -> None:

@@ -71,6 +71,19 @@ def test_a_part_with_the_colours_of_its_neighbours_is_found(slipped: bool) -> No
     assert 1 <= parts <= 6
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_part_that_is_off_by_a_third_of_a_cell_has_not_slipped(axis: int) -> None:
+    colours = smooth_colours()
+    seen = colours.copy()
+    seen[16:, 16:32] = ((2 * colours + np.roll(colours, -1, axis=axis)) / 3)[16:, 16:32]
+    row, column = (places.ravel() for places in np.mgrid[:ROWS, :COLUMNS])
+    cells = ROWS * COLUMNS
+    places, _ = slipped_parts(
+        seen.reshape(-1, 3), colours.reshape(-1, 3), PAPER, np.zeros(cells, np.bool_), (row, column), (ROWS, COLUMNS)
+    )
+    assert not places.size
+
+
 def test_light_on_the_page_is_a_polynomial_of_second_order() -> None:
     light = np.arange(18.0).reshape(6, 3)
     points = np.array([[25.0, 150.0], [80.0, 60.0]])

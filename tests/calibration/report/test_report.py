@@ -74,6 +74,18 @@ def test_every_picture_of_a_report_is_drawn(session: Session, built: BuildResult
         assert pixels.std() > 5, "something is on it"
 
 
+def test_a_group_says_how_many_of_its_figures_are_beyond_their_limits(
+    session: Session, built: BuildResult, tmp_path: Path
+) -> None:
+    write_report(built, session, tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    said = re.findall(r"(\d+) figures?, (all within|\d+ beyond) their limits", page)
+    beyond = sum(one.outcome != "accept" for one in built.verdict.rows)
+    assert said
+    assert sum(int(how.removesuffix(" beyond")) for _, how in said if how != "all within") == beyond
+    assert sum(int(count) for count, _ in said) == len(built.verdict.rows)
+
+
 def test_what_the_field_leaves_is_that_of_the_frame_s_own_figure(session: Session, built: BuildResult) -> None:
     first = built.figures.registered_frame
     picture = half_size(read_raw(session.folder / first.record.file))

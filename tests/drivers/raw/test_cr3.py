@@ -111,6 +111,7 @@ def test_masked_columns_of_a_cr3() -> None:
     assert masked("Canon EOS M50", 264, Cr3(black=(Area(0, 0, 4056, 256), Area(0, 264, 28, 6024)))) == (
         Area(36, 0, 4020, 256),
     )
+    assert masked("Canon EOS M50", 264, Cr3(black=(Area(40, 40, 4000, 100),))) == (Area(40, 40, 4000, 100),)
     assert masked("Canon EOS M50", 264, Cr3(black=(Area(0, 40, 4000, 400),))) == (Area(36, 0, 4020, 260),), (
         "it is not black there"
     )

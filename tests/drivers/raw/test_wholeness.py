@@ -122,6 +122,14 @@ def test_what_real_rw2_state_is_believed(size: tuple[int, int], start: int, leng
     assert (found.columns, found.rows) == size
 
 
+@pytest.mark.parametrize(("bits", "colours", "least"), [(16, 1, 8 / 7), (12, 1, 12), (16, 32803, 16), (14, 1, 16)])
+def test_grey_photosites_of_16_bits_may_be_compressed(bits: int, colours: int, least: float) -> None:
+    """Olympus writes compressed pixels so; all others that are called uncompressed have the bits that they state."""
+    pixels = Directory({**one_strip((64, 48), 1, bits, 1000, 90_000).values, T.PHOTOMETRIC_INTERPRETATION: (colours,)})
+    (found,) = stored_frames(b"IIRO".ljust(100_000, b"\0"), [described({T.MAKE: "OLYMPUS"}), pixels])
+    assert found.least_bits == pytest.approx(least)
+
+
 # What makers' own headers say (LibRaw 0.22, src/decoders and src/metadata)
 
 

@@ -59,11 +59,15 @@ def test_the_grayness_index_is_that_of_equations_9_and_10() -> None:
     assert grayness(image)[1][:, 30:].all()
 
 
-@pytest.mark.parametrize(("rates", "cosine"), [((1, 1, 1), 1), ((1, 0, 0), 3**-0.5), ((1, 1, 0), (2 / 3) ** 0.5)])
+@pytest.mark.parametrize(
+    ("rates", "cosine"),
+    [((1, 1, 1), 1), ((1, 0, 0), 3**-0.5), ((1, 1, 0), (2 / 3) ** 0.5), ((4, 2, 1), 7 / (3 * 21) ** 0.5)],
+)
 def test_the_angle_to_grey_by_hand(rates: tuple[float, ...], cosine: float) -> None:
     x = np.linspace(-1, 0, 30)[None, :, None]
-    image = np.exp(x * rates).repeat(20, axis=0).astype(np.float32)
+    image = np.exp(x * rates).repeat(30, axis=0).astype(np.float32)
     found, missing = angle_to_grey(image)
+    assert found[INNER].size
     np.testing.assert_allclose(found[INNER], np.arccos(cosine), atol=2e-3)
     assert not missing.any()
     assert angle_to_grey(np.full((9, 9, 3), 0.5, np.float32))[1].all()
