@@ -6,6 +6,7 @@ Tables of results: one light and several are never mixed silently, and images wi
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -119,6 +120,9 @@ def test_the_tables_of_methods_and_of_images_as_text() -> None:
     assert [image["image"] for image in images] == [scene.name for scene in scenes]
     errors = [float(image["reproduction"]) for image in images]
     np.testing.assert_allclose(errors, results[0].errors["reproduction"], atol=1e-6)
+    uneven = replace(results[0], estimates=np.array([[2.0, 3.0, 6.0]]) / 7 * np.ones((len(scenes), 1)))
+    (row, *_) = csv.DictReader(images_csv(scenes, [uneven]).splitlines())
+    assert [float(row[channel]) for channel in "rgb"] == pytest.approx([2 / 11, 3 / 11, 6 / 11], abs=1e-6)
 
 
 def test_causes_are_named_few_at_a_time() -> None:
