@@ -82,6 +82,7 @@ def test_a_group_says_how_many_of_its_figures_are_beyond_their_limits(
     said = re.findall(r"(\d+) figures?, (all within|\d+ beyond) their limits", page)
     beyond = sum(one.outcome != "accept" for one in built.verdict.rows)
     assert said
+    assert all(how == "all within" or int(how.removesuffix(" beyond")) for _, how in said)
     assert sum(int(how.removesuffix(" beyond")) for _, how in said if how != "all within") == beyond
     assert sum(int(count) for count, _ in said) == len(built.verdict.rows)
 
