@@ -274,7 +274,7 @@ def encode_data(transaction: int, data: bytes | memoryview, *, last: bool) -> by
     """Return the packet `Data`, or `EndData` for the last one, around a part of something large: it is copied once."""
     length = _DATA_HEADER.size + len(data)
     kind = PacketType.END_DATA if last else PacketType.DATA
-    return b"".join((_DATA_HEADER.pack(length, kind, transaction), data))
+    return b"".join((encode_integer(length, 4), encode_integer(kind, 4), encode_integer(transaction, 4), data))
 
 
 def decode(data: bytes) -> Packet:

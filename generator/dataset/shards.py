@@ -109,9 +109,6 @@ PlanIdentity = Mapping[str, Any]
 
 _threads: Final = threading.local()
 
-_LARGEST_COUNT: Final = 65535
-"""Largest value of 16 bits."""
-
 TINY_PX: Final = 16
 """A shorter side below which a picture is noted: icons and failed downloads are so small, photographs never are."""
 
@@ -590,7 +587,7 @@ def _photographed(
     height, width = cut.picture.shape[:2]
     white_level = lut.provenance.white_level
     # What exceeds saturation may be below it once it is exposed anew, and is cut then.
-    most = white_level if options.variation is None else _LARGEST_COUNT
+    most = white_level if options.variation is None else FULL
     taken = source.black_taken
     image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
     varied = Varied()
