@@ -40,7 +40,7 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *__getattr__("__all__")]  # pyright: ignore[reportGeneralTypeIssues, reportUnknownVariableType]
+    return [*globals(), *__getattr__("__all__")]
 
 
 def _require_own_packages() -> None:

@@ -69,7 +69,7 @@ class Lab:
             situation = replace(situation, picture=light[None, None])
         if self.flicker:
             own = float(np.random.default_rng([7, key]).normal(1, self.flicker))
-            situation = replace(situation, ambient=tuple(0.01 * own * share for share in (1.2, 1.0, 0.7)))
+            situation = replace(situation, ambient=(0.012 * own, 0.01 * own, 0.007 * own))
         counts = self.world.expose(
             gone_wrong.shown(moment), self.settings.camera.exposure, key=(key,), situation=situation
         )

@@ -350,7 +350,7 @@ def counted_writes() -> Generator[list[float]]:
     spent: list[float] = []
     real = {name: getattr(Journal, name) for name in ("begin", "commit", "beat", "note")}
 
-    def timed(name: str):  # pyright: ignore
+    def timed(name: str):
         def call(*given: object, **named: object) -> object:
             begun = time.perf_counter()
             try:

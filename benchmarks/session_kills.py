@@ -274,7 +274,7 @@ class TroubledLab(SmallLab):
             raise DeviceError("the camera does not answer; look at its cable")
         self._fails = 0
         if taken % 9 == 8:
-            self.projector._enter(Power.STANDBY, self.clock.monotonic())  # pyright: ignore[reportPrivateUsage]
+            self.projector._enter(Power.STANDBY, self.clock.monotonic())
         return super().expose()
 
 

@@ -187,7 +187,7 @@ class TroubledLab:
         self.at(self.clock.lab_s() + 20, lambda: self.pull_camera(False))
 
     def _strike(self, power: Power) -> SimulatedProjector:
-        self.projector._enter(power, self.clock.monotonic())  # pyright: ignore[reportPrivateUsage]
+        self.projector._enter(power, self.clock.monotonic())
         return self.projector
 
     @contextmanager
@@ -566,7 +566,7 @@ def _happen(lab: TroubledLab, night_s: float, least_s: float) -> None:
     def battery(charge: float) -> Callable[[], None]:
         def change() -> None:
             assert lab.eos is not None
-            lab.eos._battery = charge  # pyright: ignore[reportPrivateUsage]
+            lab.eos._battery = charge
 
         return change
 

@@ -365,7 +365,7 @@ class LabSettings(Settings):
     def read_from(self, file: str) -> LabSettings:
         """Return the same settings as read from a file."""
         named = self.model_copy()
-        named._file = file
+        named._file = file  # noqa: SLF001 - its own class
         return named
 
     def to_toml(self) -> str:
@@ -531,16 +531,17 @@ def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None
     for key in _SECRETS:
         *tables, last = key.split(".")
         holder: Any = document
-        for table in tables:
-            holder = cast("dict[str, Any]", holder).get(table) if isinstance(holder, dict) else None
-        found = cast("dict[str, Any]", holder).get(last) if isinstance(holder, dict) else None
+        for name in tables:
+            holder = cast("dict[str, Any]", holder).get(name) if isinstance(holder, dict) else None
+        table = cast("dict[str, Any]", holder) if isinstance(holder, dict) else {}
+        found = table.get(last)
         if isinstance(found, dict):
             place = cast("dict[str, Any]", found)
             if tables[0] == "lab" and document.get("rig") != "lab":
-                del holder[last]
+                del table[last]
                 continue
             try:
-                holder[last] = _found_secret(key, place, folder)
+                table[last] = _found_secret(key, place, folder)
             except ConfigurationError as error:
                 missing.append(error)
     if missing:

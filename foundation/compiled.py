@@ -90,7 +90,7 @@ def _dispatcher(function: FunctionType) -> Any:
     made = _numba().njit(nogil=True, error_model="numpy")(_translated(function))
     cache_of_code = _checked_cache()
     try:
-        made._cache = cache_of_code(made.py_func)
+        made._cache = cache_of_code(made.py_func)  # noqa: SLF001 - as numba itself sets it
     except RuntimeError:
         # No folder of numba's is writable; compiling anew costs seconds a start.
         logging.getLogger(__name__).debug("no folder to keep the code of %s in", function.__qualname__)

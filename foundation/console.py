@@ -639,7 +639,7 @@ def plain(value: Any) -> Any:
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in cast("Mapping[Any, Any]", value).items()}
-    if isinstance(value, list | tuple | set | frozenset):
+    if isinstance(value, (list, tuple, set, frozenset)):
         return [plain(item) for item in cast("list[Any]", value)]
     listed: Callable[[], Any] | None = getattr(value, "tolist", None)
     return str(value) if listed is None else plain(listed())

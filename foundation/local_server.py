@@ -284,14 +284,14 @@ class LocalServer(ABC, ThreadingHTTPServer):
 
     def finish_request(self, request: Any, client_address: Any) -> None:
         """Answer what a connection asks, which has a deadline."""
-        super().finish_request(_PatientLink(request, self._head_s, self._idle_s), client_address)  # pyright: ignore[reportArgumentType]
+        super().finish_request(_PatientLink(request, self._head_s, self._idle_s), client_address)  # pyrefly: ignore[bad-argument-type]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of viewers that went away: the terminal is the user's."""
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: LocalServer  # pyright: ignore[reportIncompatibleVariableOverride]  # the handler's own server, by construction
+    server: LocalServer  # pyrefly: ignore[bad-override-mutable-attribute]  # the handler's own server, by construction
     protocol_version = "HTTP/1.1"
     # Head and body are written one after the other: the second would wait for the first to be acknowledged, 40 ms.
     disable_nagle_algorithm = True

@@ -55,7 +55,7 @@ def masked_values(value: Any) -> Any:
         return masked(value)
     if isinstance(value, dict):
         return {key: masked_values(inner) for key, inner in cast("dict[Any, Any]", value).items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [masked_values(inner) for inner in cast("list[Any]", value)]
     return value
 

@@ -97,7 +97,8 @@ class _Generate(StyledCommand):
         """The commands below it by their names."""
         return {"explore": get_command(_explore_app)}
 
-    def main(  # pyright: ignore[reportIncompatibleMethodOverride]  # the others are passed on by name
+    # The others are passed on by name.
+    def main(  # pyrefly: ignore[bad-override]
         self, args: Sequence[str] | None = None, prog_name: str | None = None, **more: Any
     ) -> Any:
         """Run the command that the arguments name."""

@@ -153,7 +153,7 @@ def png_pieces(image: Image, metadata: ImageMetadata) -> Iterator[bytes | memory
     for top in range(0, height, rows):
         last = top + rows >= height
         data, plain = _packer().pack(np.ascontiguousarray(image[top : top + rows]), last=last)
-        checksum = int(isal_zlib.adler32(plain.data, checksum))  # pyright: ignore  # its stub leaves the function out
+        checksum = int(isal_zlib.adler32(plain.data, checksum))  # pyrefly: ignore[missing-attribute]  # its stub leaves the function out
         yield from _chunk(b"IDAT", b"" if top else _ZLIB, data.data, struct.pack(">I", checksum) if last else b"")
     yield from _chunk(b"IEND")
 

@@ -36,9 +36,7 @@ def main(argv: Sequence[str] | None = None, read_chart: Callable[[Path], Print] 
 
 
 @app.callback()
-def _devices(  # pyright: ignore[reportUnusedFunction]  # typer calls it
-    verbose: Verbose = 0, quiet: Quiet = False, version: Version = False
-) -> None:
+def _devices(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
     """Serve simulated devices on loopback connections, until interrupted."""
 
 

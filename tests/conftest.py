@@ -40,7 +40,7 @@ if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).
 # PyTorch loads Triton's LLVM where that is installed, which crashes a process in which Mesa has loaded its own for
 # OpenGL. No program shows a full screen and trains; a test process may do both. None keeps a module from
 # being imported.
-sys.modules.setdefault("triton", None)  # pyright: ignore[reportArgumentType]
+sys.modules.setdefault("triton", None)  # pyrefly: ignore[no-matching-overload]
 
 # Ten thousand tests stay to the end, and are looked through by the garbage collector again and again as they become
 # more: a sixth of the time that reading them takes.

@@ -96,11 +96,11 @@ def mutated(node: ast.expr) -> Iterator[ast.expr]:
     """Yield an expression's mutations."""
     match node:
         case ast.Compare(ops=[op]) if type(op) in OTHER:
-            yield ast.Compare(node.left, [OTHER[type(op)]()], node.comparators)  # pyright: ignore[reportArgumentType]
+            yield ast.Compare(node.left, [OTHER[type(op)]()], node.comparators)  # pyrefly: ignore[bad-argument-type]
         case ast.BoolOp(op=op):
-            yield ast.BoolOp(OTHER[type(op)](), node.values)  # pyright: ignore[reportArgumentType]
+            yield ast.BoolOp(OTHER[type(op)](), node.values)  # pyrefly: ignore[bad-argument-type]
         case ast.BinOp(op=op) if type(op) in OTHER and not _is_text(node):
-            yield ast.BinOp(node.left, OTHER[type(op)](), node.right)  # pyright: ignore[reportArgumentType]
+            yield ast.BinOp(node.left, OTHER[type(op)](), node.right)  # pyrefly: ignore[bad-argument-type]
         case ast.UnaryOp(op=ast.Not(), operand=operand):
             yield operand
         case ast.IfExp(test=test):
@@ -125,7 +125,7 @@ def places(path: Path) -> Iterator[Mutation]:
         skipped: list[ast.AST] = []
         match node:
             case ast.arg(annotation=ast.expr() as note) | ast.AnnAssign(annotation=note):
-                skipped = [note]
+                skipped = [note]  # pyrefly: ignore[bad-assignment]
             case ast.FunctionDef(returns=ast.expr() as note):
                 skipped = [note]
             case ast.JoinedStr() | ast.Raise() | ast.MatchValue():

@@ -154,7 +154,7 @@ def _exposure_findings(seen: CheckFrames, settings: LabSettings, recorded: bool)
             seen.first.shutter_s,
             seen.saturation.counts,
             settings.limits.clipped_percent,
-            seen.chart and seen.chart.place,
+            seen.chart.place if seen.chart else None,
         ),
     ]
     differs = None if recorded else disagreement(seen.first.mosaic, settings.camera.exposure)

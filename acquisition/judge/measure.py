@@ -507,7 +507,7 @@ class Frame:
             facts["anchor"] = [self.anchor.of_chart, self.anchor.framing.plane.channel]
         arrays["facts"] = np.frombuffer(json.dumps(facts).encode(), dtype=np.uint8)
         stream = io.BytesIO()
-        np.savez(stream, **arrays)  # pyright: ignore[reportArgumentType]
+        np.savez(stream, **arrays)  # pyrefly: ignore[bad-argument-type]  # no array has the name of an option
         return stream.getvalue()
 
     @classmethod

@@ -725,8 +725,8 @@ class JudgeState:
         if not np.isnan(frame.moved_px).any() and (self.rested or steady):
             state = replace(state, moved_px=frame.moved_px)
         if frame.anchor is not None:
-            state = state._anchored(frame.anchor)
-        state = state._referenced(step, frame)
+            state = state._anchored(frame.anchor)  # noqa: SLF001 - its own class
+        state = state._referenced(step, frame)  # noqa: SLF001 - its own class
         # A frame that makes the basis has been learnt from with it.
         if found.light is not None and self.modelled and state.modelled and step.kind != "dark":
             model = state.model.stepped(found.lamp.brightness) if found.lamp.stepped else state.model
@@ -777,7 +777,7 @@ class JudgeState:
             of: list[Measured | None] = list(state.primaries)
             of[primary] = measured
             state = replace(state, primaries=(of[0], of[1], of[2]))
-        return state._based(step)
+        return state._based(step)  # noqa: SLF001 - its own class
 
     def _based(self, step: SessionStep) -> JudgeState:
         """Return what is known with the best basis that the frames so far give."""

@@ -866,7 +866,7 @@ class Accumulator:
     def with_dark_frame(self, measured: MeasuredDarkFrame) -> Accumulator:
         """Return what there is after a dark frame."""
         after = replace(self, figures=(*self.figures, measured.figures), hot=self.hot.with_frame(measured.excess))
-        return after._learned(measured) if self.baseline.options.subtract_dark else after
+        return after._learned(measured) if self.baseline.options.subtract_dark else after  # noqa: SLF001 - its own class
 
     def _registered_again(self, record: FrameRecord) -> tuple[Accumulator, MeasuredFrame]:
         """Return what there is once the chart is registered in this frame, and what the frame shows."""

@@ -14,6 +14,7 @@ Rules that hold inside:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -427,7 +428,7 @@ class Matcher:
         for channel, plane in enumerate(self._planes):
             own = places
             if plane.channel != "G" and self.lateral.terms_px.any():
-                own = raster.element_places(lambda points, colour=plane.channel: self.to_pixels(points, colour))
+                own = raster.element_places(partial(self.to_pixels, channel=plane.channel))
             image[..., channel] = cv2.remap(
                 plane.values,
                 own[..., 0] - np.float32(plane.offset_px[0]),

@@ -327,7 +327,7 @@ class _LocalMean:
         self._weight, self._window = weight, window
         self.share = np.maximum(box_mean(weight, window), np.float32(1e-3))
         rows, columns = (np.flatnonzero(weight.any(axis=axis)) for axis in (1, 0))
-        self._inner = None
+        self._inner: tuple[slice, slice] | None = None
         if keep_gradient and min(len(rows), len(columns)) > window:
             self._inner = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 

@@ -93,7 +93,7 @@ def train(
             fitted = fit_extracted(learner, features, truths, seed)
         else:
             fitted = adapting.adapt(known, adapting.learn_alone(learner, features, truths, seed))
-        record = provenance_of(found, seed, SystemClock(), adapted_from=known and known.provenance)
+        record = provenance_of(found, seed, SystemClock(), adapted_from=known.provenance if known else None)
         save_model(out, fitted, record)
     unused = sum(given is None for given in features)
     notes = [f"{unused} of {count} images have no usable pixel and were left out of the training"] if unused else []

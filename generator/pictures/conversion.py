@@ -182,7 +182,7 @@ def _transform(icc: bytes) -> tuple[ImageCmsTransform | None, str, str]:
         mode = {"RGB": "RGB", "GRAY": "L"}.get(space)
         if mode is None:
             return None, "RGB", f"{name} of {space} colours, not applied, taken as sRGB"
-        srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
+        srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
         transform = ImageCms.buildTransform(profile, srgb, mode, "RGB", ImageCms.Intent.RELATIVE_COLORIMETRIC)
     except (ImageCms.PyCMSError, OSError, ValueError) as error:
         return None, "RGB", f"damaged ({' '.join(str(error).split())}), not applied, taken as sRGB"

@@ -75,7 +75,7 @@ class Recycled:
         memory = self._memory(size)
         # Views refer to `values`, since what is below it is no array; so it lives as long as the last of them.
         values = np.frombuffer(memory, dtype=np.float32)
-        weakref.finalize(values, self._free.append, memory).atexit = False
+        weakref.finalize(values, self._free.append, memory).atexit = False  # pyrefly: ignore[missing-attribute]
         return values.reshape(shape)
 
     def _memory(self, size: int) -> mmap.mmap:
@@ -406,7 +406,7 @@ def _require_kinds(gallery: object, size: object, lights: object, black_point: o
         raise InputError(
             f"the gallery is {kind_of(gallery)}, expected one of gallery_of([picture, …]) or open_gallery(FOLDER)"
         )
-    if np.shape(size) != (2,) or isinstance(size, str):  # pyright: ignore[reportCallIssue, reportArgumentType]
+    if np.shape(size) != (2,) or isinstance(size, str):  # pyrefly: ignore[no-matching-overload]
         raise InputError(f"the size of crops is {kind_of(size)}, expected height and width, such as (128, 128)")
     if isinstance(lights, int | str | Mixture):
         raise InputError(f"the lights are {kind_of(lights)}, expected a list, such as [0, 3] or ['D65']")

@@ -46,7 +46,7 @@ class CropDataset(Dataset[Item]):
         """Return the items of an epoch."""
         return len(self.crops)
 
-    def __getitem__(self, item: int) -> Item:
+    def __getitem__(self, item: int) -> Item:  # pyrefly: ignore[bad-override-param-name]
         """Return one item."""
         if not 0 <= item < len(self):
             raise IndexError(f"item {item} of {len(self)}")

@@ -199,7 +199,7 @@ def rendered_once() -> Generator[None]:
 
     The same charts hang in the same rooms in hundreds of tests.
     """
-    render = World._lit  # pyright: ignore[reportPrivateUsage]
+    render = World._lit
 
     def kept(self: World, situation: Situation) -> Rendering:
         sheet = self.sheet

@@ -43,7 +43,7 @@ DEVICES = {"camera": "Canon Canon EOS 550D, serial number 77", "projector": "Acm
 
 def stated(citation: CitationSettings | None = None, rig: str | None = "lab") -> StatedOrigin:
     known = citation or CitationSettings()
-    return StatedOrigin(known, rig, CameraSettings(iso=200), DEVICES)  # pyright: ignore[reportArgumentType]
+    return StatedOrigin(known, rig, CameraSettings(iso=200), DEVICES)  # pyrefly: ignore[bad-argument-type]
 
 
 def test_the_raw_files_come_before_settings_and_journal() -> None:

@@ -45,7 +45,7 @@ def test_a_figure_that_lacks_a_part_does_not_import() -> None:
 def test_figures_that_contradict_themselves_do_not_import(
     wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(light, "WRONG", replace(DARKEST_COUNTS, **{"name": "wrong", **wrong}), raising=False)
+    monkeypatch.setattr(light, "WRONG", replace(DARKEST_COUNTS, **{"name": "wrong", **wrong}), raising=False)  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(ValueError, match=r"wrong|names"):
         all_figures.collected()
 

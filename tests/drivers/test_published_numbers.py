@@ -18,8 +18,6 @@ from drivers.raw import rawfile
 from drivers.serial_projectors import benq, epson, nec, optoma
 from sim.buses import usbip
 
-# pyright: reportPrivateUsage=false
-
 
 @pytest.mark.parametrize(
     ("ours", "published"),

@@ -116,7 +116,7 @@ def world() -> World:
     rgb = np.array([[0, 0, 0], [248, 0, 0], [0, 248, 0], [0, 0, 248], [120, 120, 120]], dtype=np.uint8)
     left = 10 + 32.0 * np.arange(5)
     boxes = np.stack([left, np.full(5, 40.0), left + 25, np.full(5, 80.0)], axis=-1)
-    return World(Print((180, 125), boxes, rgb), BODIES["Test"], Room(lamp_drift_per_hour=0))
+    return World(Print((180, 125), boxes, rgb), BODIES["Test"], Room(lamp_drift_per_hour=0))  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.fixture

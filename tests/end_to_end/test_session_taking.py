@@ -156,7 +156,7 @@ def test_a_run_that_is_told_to_end_closes_its_devices(
     closed: list[str] = []
 
     def spy(owner: type, name: str) -> None:
-        close = owner.close  # pyright: ignore[reportAttributeAccessIssue, reportUnknownMemberType, reportUnknownVariableType]
+        close = owner.close
 
         def closing(self: object) -> None:
             closed.append(name)

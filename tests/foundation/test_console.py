@@ -448,7 +448,7 @@ def test_errors_alone_means_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
     seen: list[bool] = []
 
     def quiet() -> None:
-        command_line._tell_errors(True)  # pyright: ignore[reportPrivateUsage]
+        command_line._tell_errors(True)
         seen.append(shows_progress())
         with progress("frames") as tell:
             tell(1, 2)

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-import atheris  # pyright: ignore[reportMissingModuleSource]  # installed by hand only
+import atheris
 
 with atheris.instrument_imports():
     from drivers import canon

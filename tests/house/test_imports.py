@@ -35,6 +35,19 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     assert not circle, f"imports go round: {' <- '.join(circle)}; move what both need to a module below them"
 
 
+def test_no_module_imports_a_private_name_of_another() -> None:
+    taken = [
+        f"{source.path}: {name.name} of {node.module}"
+        for package in PACKAGES
+        for source in sources(package)
+        for node in ast.walk(source.tree)
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in PACKAGES
+        for name in node.names
+        if name.name.startswith("_")
+    ]
+    assert not taken
+
+
 @pytest.mark.slow
 def test_a_public_class_name_has_one_home() -> None:
     homes: defaultdict[str, list[str]] = defaultdict(list)

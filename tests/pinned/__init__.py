@@ -22,7 +22,6 @@ import numpy as np
 from pydantic import BaseModel
 
 # What is pinned is of any kind.
-# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 
 FOLDER = Path(__file__).parent
 

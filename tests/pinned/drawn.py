@@ -18,7 +18,6 @@ from matplotlib.text import Text
 from tests.pinned import plain
 
 # What is pinned is of any kind.
-# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 
 
 def drawn(figure: Figure) -> list[Any]:

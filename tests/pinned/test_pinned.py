@@ -15,8 +15,6 @@ from tests import pinned as kit
 from tests.pinned import Pinned, plain
 from tests.pinned.drawn import drawn
 
-# pyright: reportUnknownMemberType=false
-
 
 @dataclass(frozen=True)
 class Run:

@@ -32,7 +32,7 @@ ROOM = Room(waviness_mm=0.5, vignetting=0.08, projector_falloff=0.05)
 
 def task_of(bits: int = 3, page: str = "A5", window: int = 5, **room: float) -> TableTask:
     chart = designed(bits, page, 1)[0]
-    return TableTask(chart, BODIES["Test"], replace(ROOM, **room), SETTINGS, LIGHTS, None, window, {"by": "test"})
+    return TableTask(chart, BODIES["Test"], replace(ROOM, **room), SETTINGS, LIGHTS, None, window, {"by": "test"})  # pyrefly: ignore[bad-argument-type]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ def test_the_ground_truths_differ_by_no_more_than_their_errors(computed: Lut, ph
     "changes", [{"electrons_per_dn": 1.5}, {"read_noise_dn": 9.0}, {"sensitivities": "Canon_EOS_200D"}]
 )
 def test_the_comparison_sees_another_sensor(photographed: Lut, tmp_path: Path, changes: dict[str, float | str]) -> None:
-    body = replace(BODIES["Test"], **changes)  # pyright: ignore[reportArgumentType]
+    body = replace(BODIES["Test"], **changes)  # pyrefly: ignore[bad-argument-type]
     compute_table(replace(task_of(), body=body), tmp_path / "lut", threads=2)
     found = compared(open_lut(tmp_path / "lut"), photographed)
     assert abs(float(found.spread.mean()) - 1) > 0.01 or float(np.abs(found.normal.mean(axis=1)).max()) > 1

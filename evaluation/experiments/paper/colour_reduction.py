@@ -213,7 +213,7 @@ def write_codes(
         raise InputError(f"images of {data.name} have names that differ in their endings only; name a part of it")
     clear_bits(np.zeros(1, np.uint8), cleared)
     with whole_folder(out, "the codes") as folder:
-        rows = [",".join(COLUMNS)]
+        rows: list[str] = [",".join(COLUMNS)]
 
         def write(numbered: tuple[Scene, str]) -> str:
             scene, name = numbered

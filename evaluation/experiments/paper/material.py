@@ -200,7 +200,7 @@ def develop(
     if saturation is not None:
         linear = np.minimum(linear, saturation * float((light[1] / light).min()))
     if matrix is not None:
-        linear = linear @ np.linalg.inv(matrix.rows).T
+        linear = np.asarray(linear @ np.linalg.inv(matrix.rows).T, dtype=np.float64)
     seen = linear.reshape(-1, 3) if mask is None else linear[~mask]
     white = float(np.percentile(seen, WHITE_PERCENTILE, axis=0).max()) if len(seen) else 0.0
     return srgb_codes(linear / max(white, _DARKEST))

@@ -145,7 +145,7 @@ def test_the_noise_of_a_pair_is_that_of_single_photosites() -> None:
 
 
 def test_the_run_s_own_limit_makes_the_room_s_light_a_fault() -> None:
-    refuses = check._as_the_run_refuses  # pyright: ignore[reportPrivateUsage]
+    refuses = check._as_the_run_refuses
     seen = Finding("room light", "remark", "seen", 0.03)
     assert [refuses(seen, percent).grade for percent in (2.9, 3.1)] == ["fault", "remark"]
     assert refuses(seen, 2.9).tolerable == (None, pytest.approx(0.029))

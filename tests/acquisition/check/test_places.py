@@ -56,7 +56,7 @@ def test_cells_lie_where_the_room_shows_them(
 
 def test_a_peak_is_that_of_the_parabola_and_stays_at_the_rim() -> None:
     rows, columns = np.mgrid[:5, :6].astype(np.float64)
-    peak = places._peak  # pyright: ignore[reportPrivateUsage]
+    peak = places._peak
     np.testing.assert_allclose(peak(-((columns - 2.3) ** 2) - 2 * (rows - 1.6) ** 2, 2, 2), [2.3, 1.6])
     np.testing.assert_array_equal(peak(-columns - rows, 0, 0), [0, 0])
     np.testing.assert_array_equal(peak(columns + rows, 5, 4), [5, 4])
@@ -65,7 +65,7 @@ def test_a_peak_is_that_of_the_parabola_and_stays_at_the_rim() -> None:
 
 
 def test_a_shift_that_its_neighbours_do_not_share_is_theirs() -> None:
-    settled = places._settled  # pyright: ignore[reportPrivateUsage]
+    settled = places._settled
     found = np.tile([0.5, -1.0], (4, 5, 1))
     good = np.ones((4, 5), dtype=np.bool_)
     found[1, 2] = [0.5 + 1.1 * places.SHIFT_SPREAD_PX, -1.0]

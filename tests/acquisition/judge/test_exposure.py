@@ -61,7 +61,7 @@ def test_the_measure_is_that_of_the_counts(tmp_path: Path) -> None:
     ],
 )
 def test_a_refusal_says_value_and_limit(clipped: float, brightest: float, kind: str, expected: str | None) -> None:
-    reason = refusal(Exposure(clipped, brightest, RANGE), kind, LIMITS)  # pyright: ignore[reportArgumentType]
+    reason = refusal(Exposure(clipped, brightest, RANGE), kind, LIMITS)  # pyrefly: ignore[bad-argument-type]
     if expected is None:
         assert reason is None
     else:
@@ -95,8 +95,8 @@ def test_a_file_that_states_what_was_asked_agrees(tmp_path: Path) -> None:
 def test_a_nominal_value_agrees_with_the_exact_one_behind_it(
     tmp_path: Path, asked: dict[str, float | None], stated: dict[str, float | None]
 ) -> None:
-    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyright: ignore[reportArgumentType] - names from the table
-    assert disagreement(mosaic, replace(ASKED, **asked)) is None  # pyright: ignore[reportArgumentType] - likewise
+    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyrefly: ignore[bad-argument-type]
+    assert disagreement(mosaic, replace(ASKED, **asked)) is None  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_a_nominal_value_agrees_with_the_exact_one_behind_it(
     ],
 )
 def test_a_dial_turned_by_one_third_of_a_stop_is_seen(tmp_path: Path, stated: dict[str, float], expected: str) -> None:
-    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyright: ignore[reportArgumentType] - names from the table
+    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyrefly: ignore[bad-argument-type]
     assert expected in (disagreement(mosaic, ASKED) or "")
 
 

@@ -55,7 +55,7 @@ def test_noise_is_read_from_the_greens_of_one_block(floor: float, slope: float, 
     greens = level[:, None] + random.standard_normal((len(level), 2)) * np.sqrt(floor + slope * level)[:, None]
     # Some blocks lie across an edge between two cells.
     greens[::50, 0] += 200
-    found = measure._noise(greens)  # pyright: ignore[reportPrivateUsage]
+    found = measure._noise(greens)
     at = top * np.array([0.25, 0.5, 1.0])
     np.testing.assert_allclose(found.variance(at), floor + slope * at, rtol=0.12)
     assert found.variance(-100.0) == found.variance(0.0) == found.floor
@@ -71,7 +71,7 @@ def test_the_brightest_place_of_each_part_is_paper() -> None:
         # A third are darker than paper may be where light falls off.
         values[y - 1 : y + 2, x - 1 : x + 2] = 600 if number % 3 == 0 else 1000
     values[:, -16:] = 1000  # beyond the last whole part but the margin
-    found = measure._brightest(values)  # pyright: ignore[reportPrivateUsage]
+    found = measure._brightest(values)
     assert found.tolist() == [list(place) for number, place in enumerate(places) if number % 3]
 
 
@@ -80,7 +80,7 @@ def test_texture_is_many_edges_and_no_single_bright_photosite() -> None:
     x, y = 90, 100
     values[y - 12 : y + 12 : 2, x - 12 : x + 12] = 20
     values[180, 140] = 150
-    framing = measure._textures(Plane("G", values, (0.5, 0.0)))  # pyright: ignore[reportPrivateUsage]
+    framing = measure._textures(Plane("G", values, (0.5, 0.0)))
     middles = np.array([tag.corners_px.mean(axis=0) for tag in framing.tags])
     assert len(middles) == 8
     assert np.abs(middles - (x + 0.5, y)).max(axis=1).min() <= 6

@@ -12,7 +12,7 @@ from acquisition.judge import state
 from acquisition.judge.state import LAMP_STEP, ProjectorModel, combined
 from experiment.session.records import TOP
 
-NODES = len(state._NODES)  # pyright: ignore[reportPrivateUsage]
+NODES = len(state._NODES)
 LEVELS = 3 * NODES
 """First of the three entries of the state that are levels; behind the curves of the nodes."""
 CHROMA, BRIGHTNESS, ABSOLUTE = 0.004, 0.002, 3e-4
@@ -23,7 +23,7 @@ UNKNOWN = ProjectorModel.unknown()
 def known(**overlaps: float) -> ProjectorModel:
     """Return a projector known exactly, gamma 2.2, whose primary gains light where it overlaps: ``p0_of_01=0.3``."""
     model = replace(UNKNOWN, covariance=np.zeros_like(UNKNOWN.covariance), state=UNKNOWN.state.copy())
-    terms = [f"p{primary}_of_{''.join(map(str, subset))}" for primary, subset in state._TERMS]  # pyright: ignore[reportPrivateUsage]
+    terms = [f"p{primary}_of_{''.join(map(str, subset))}" for primary, subset in state._TERMS]
     for name, gain in overlaps.items():
         model.state[LEVELS + 3 + terms.index(name)] = gain
     return model
@@ -46,7 +46,7 @@ def test_before_anything_is_seen_a_projector_has_any_usual_tone_curve() -> None:
     np.testing.assert_allclose(own, covariance[NODES : 2 * NODES, NODES : 2 * NODES])
     np.testing.assert_allclose(shared, own * (1 - 0.15**2))
     # An exponent off by 0.4, and bends of 0.12 that are alike within a factor of e^0.7 of the code; none at full code.
-    x = np.log(state._NODES / TOP)  # pyright: ignore[reportPrivateUsage]
+    x = np.log(state._NODES / TOP)
     full = np.exp(-0.5 * (x / 0.7) ** 2)
     bends = np.exp(-0.5 * ((x[:, None] - x) / 0.7) ** 2) - np.outer(full, full)
     np.testing.assert_allclose(own, 0.4**2 * np.outer(x, x) + 0.12**2 * bends, atol=1.1e-8)

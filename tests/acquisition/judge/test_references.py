@@ -38,7 +38,7 @@ def measured(level: npt.ArrayLike, black_measured: bool = True, noise: Noise = N
 def known(**more: object) -> JudgeState:
     """Return what is known after a white and a dark frame."""
     dark = measured(DARK)
-    return replace(JudgeState(white=measured(WHITE), dark=dark, first_dark=dark), **more)  # pyright: ignore[reportArgumentType]
+    return replace(JudgeState(white=measured(WHITE), dark=dark, first_dark=dark), **more)  # pyrefly: ignore[bad-argument-type]
 
 
 def of_dark(state: JudgeState, frame: Measured) -> dict[str, Check]:
@@ -297,7 +297,7 @@ def test_more_light_is_no_room_s_light_where_the_lamp_scatters_as_much() -> None
 
     def added(brightness_sd: float) -> tuple[float, float] | None:
         steady = replace(model, brightness=(100 * brightness_sd**2, 100.0))
-        return judge_module._SeenLight(steady, light, codes, None, ())._added_of(None)  # pyright: ignore[reportPrivateUsage]
+        return judge_module._SeenLight(steady, light, codes, None, ())._added_of(None)
 
     assert added(scatter) is None
     found = added(0.0006)

@@ -20,8 +20,6 @@ from experiment.session.records import TOP, Check, SessionStep
 from tests.acquisition.judge.test_projector_model import at
 from tests.acquisition.judge.test_references import DARK, PRIMARIES, WHITE, begun, known, measured
 
-# pyright: reportPrivateUsage=false
-
 Amounts = tuple[float, float, float]
 FULL = (TOP, TOP, TOP)
 SCATTER, TOGETHER, NO_LIGHT = 0.004, 0.002, 3e-4

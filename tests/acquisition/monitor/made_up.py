@@ -68,7 +68,7 @@ class MadeUpRun:
 
     def beat(self, state: str, sentence: str, within_s: float = 60.0) -> None:
         """Give a sign of life, by the wall clock."""
-        self.journal.beat(state, sentence, datetime.now(UTC) + timedelta(seconds=within_s))  # pyright: ignore[reportArgumentType]
+        self.journal.beat(state, sentence, datetime.now(UTC) + timedelta(seconds=within_s))  # pyrefly: ignore[bad-argument-type]
 
     def expose(self, step: SessionStep, try_: int = 1) -> int:
         """Begin an attempt; return its number."""

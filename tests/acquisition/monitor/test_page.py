@@ -52,7 +52,7 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
 
 
 @pytest.fixture(autouse=True)
-def _no_errors(tab: Tab) -> Iterator[None]:  # pyright: ignore[reportUnusedFunction]
+def _no_errors(tab: Tab) -> Iterator[None]:
     tab.errors.clear()
     yield
     tab.value("1")

@@ -82,7 +82,7 @@ def test_pictures_are_bounded_and_those_of_refused_frames_go_first(
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
 def test_any_number_of_pictures_is_spread_over_the_night(count: int) -> None:
-    places = view._spread(count)  # pyright: ignore[reportPrivateUsage]
+    places = view._spread(count)
     assert sorted(places) == list(range(count))
     if count == 100:
         first = sorted(places[:10])

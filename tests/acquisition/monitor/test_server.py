@@ -149,9 +149,7 @@ def test_a_picture_is_shown_only_as_such(opened: MonitorServer, run: MadeUpRun, 
 def test_no_row_of_a_journal_leads_out_of_the_previews(opened: MonitorServer, run: MadeUpRun) -> None:
     (run.folder / "secret.jpg").write_bytes(b"\xff\xd8\xffsecret")
     attempt = run.take(run.steps[2])
-    run.journal._connection.execute(  # pyright: ignore[reportPrivateUsage]
-        "UPDATE attempts SET file = 'previews/../../secret.cr2' WHERE id = ?", (attempt,)
-    )
+    run.journal._connection.execute("UPDATE attempts SET file = 'previews/../../secret.cr2' WHERE id = ?", (attempt,))
     assert ask(opened, f"/frame/{attempt}.jpg")[0] == 404
 
 

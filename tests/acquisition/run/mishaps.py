@@ -153,8 +153,8 @@ class TroubledLab:
 
     def open(self) -> Transport:
         number, self.openings = self.openings, self.openings + 1
-        pipes = self.pipes.get(number, lambda good: good)(open_usb(backend=SimulatedBus(PtpUsbDevice(self.device))))
-        return self.cables.get(number, lambda good: good)(UsbTransport(pipes, self.clock))
+        pipes = self.pipes.get(number, lambda good: good)(open_usb(backend=SimulatedBus(PtpUsbDevice(self.device))))  # pyrefly: ignore[implicit-any-lambda]
+        return self.cables.get(number, lambda good: good)(UsbTransport(pipes, self.clock))  # pyrefly: ignore[implicit-any-lambda]
 
     def connect_beamer(self) -> Link:
         if self.pulled:

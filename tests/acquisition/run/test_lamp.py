@@ -331,7 +331,7 @@ def test_a_projector_without_power_is_lit_again_if_asked_to() -> None:
     def power_back() -> None:
         room.device = SimulatedProjector(room.clock)
         lit = room.device.switch_on
-        room.device.switch_on = lambda: (switched.append(room.clock.monotonic()), lit())  # pyright: ignore
+        room.device.switch_on = lambda: (switched.append(room.clock.monotonic()), lit())  # pyrefly: ignore[bad-assignment, method-assign]
         room.pull(False)
 
     room.at(0, room.pull)
@@ -348,7 +348,7 @@ def test_a_lamp_that_does_not_light_is_not_switched_on_again_and_again() -> None
     room = Room()
     tries: list[float] = []
     room.device.switch_off()
-    room.device.switch_on = lambda: tries.append(room.clock.monotonic())  # pyright: ignore
+    room.device.switch_on = lambda: tries.append(room.clock.monotonic())  # pyrefly: ignore[method-assign]
     with pytest.raises(DeviceFault, match="standby"):
         await_health(room.projector, SEQUENCE.model_copy(update={"relight": True}), room.retry)
     assert len(tries) == 1

@@ -94,7 +94,7 @@ def test_a_change_is_told_that_the_run_follows(step: str, checks: dict[str, floa
     first, light = SessionStep(3, "response", None, grey), SessionStep(5, "light", 0, grey)
     link = replace(first, number=9)
     limits = {"movement": 0.2, "lamp": 9.0, "lamp beyond": 3.0}
-    found = pipeline._followed_changes(  # pyright: ignore[reportPrivateUsage]
+    found = pipeline._followed_changes(
         {"light": light, "response": first, "link": link}[step],
         Judgement(tuple(Check(name.split()[0], value, -limits[name], limits[name]) for name, value in checks.items())),
         (first, light, link),

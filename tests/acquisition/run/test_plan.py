@@ -356,7 +356,7 @@ class TestAsking:
                 self.configure, self.expose, self.download = Silent().configure, Silent().expose, Silent().download
                 self.close = Silent().close
 
-        answers = ask(Devices(Mute(), Silent(), None, SimulatedClock()))
+        answers = ask(Devices(Mute(), Silent(), None, SimulatedClock()))  # pyrefly: ignore[bad-argument-type]
         assert [sentence.split(":")[0] for sentence in answers.unasked] == [
             "shutter times", "battery", "ISO speed and aperture", "lamp",
         ]  # fmt: skip

@@ -253,15 +253,15 @@ def test_references_tell_of_what_lies_near_them_in_other_white_frames() -> None:
     frames = [Frame("white", left=off), Frame("white", left=FieldResidual((97.0, 25.0), (-0.03, 0, 0)), number=1),
               Frame("white", left=FieldResidual((98.0, 25.0), (-0.05, 0, 0), rim=-0.1), number=2),
               Frame("white", left=FieldResidual((45.0, 25.0), (-0.029, 0, 0)), number=3)]  # fmt: skip
-    two, _ = gathering._of_residuals(session(frames[:2]), frames[0])  # pyright: ignore[reportPrivateUsage, reportArgumentType]
+    two, _ = gathering._of_residuals(session(frames[:2]), frames[0])  # pyrefly: ignore[bad-argument-type]
     assert two["white_residual"] == 1
-    known, places = gathering._of_residuals(session(frames), frames[0])  # pyright: ignore[reportPrivateUsage, reportArgumentType]
+    known, places = gathering._of_residuals(session(frames), frames[0])  # pyrefly: ignore[bad-argument-type]
     assert known == pytest.approx(
         {"white_residual": 0.5, "deviation": -0.06, "tint": 0.5, "share": 0.2, "rim_frames": 0.25}
     )
     assert places == (PrintPlace("0.dng", 45.0, 25.0, 0.0),)
     for alone in (frames[:1], [Frame("white", left=FieldResidual(deviation=(-0.019, 0, 0))), *frames[1:]]):
-        assert gathering._of_residuals(session(alone), alone[0]) == ({}, ())  # pyright: ignore[reportPrivateUsage, reportArgumentType]
+        assert gathering._of_residuals(session(alone), alone[0]) == ({}, ())  # pyrefly: ignore[bad-argument-type]
     found = chart_evidence(session(frames), 0.0)
     assert (found.evidence.deviation, found.evidence.agreement, found.evidence.showing) == (-0.06, 0.97, 0.25)
 
@@ -321,14 +321,14 @@ def test_exposures_are_held_against_that_of_most_light_frames(
 
 def test_whites_colour_scatters_where_it_goes_no_further_than_it_comes_back() -> None:
     def scatter(*red: float) -> float:
-        return gathering._colour_scatter(session([Frame("white", white=(value, 1.0, 1.0)) for value in np.exp(red)]))  # pyright: ignore[reportPrivateUsage]
+        return gathering._colour_scatter(session([Frame("white", white=(value, 1.0, 1.0)) for value in np.exp(red)]))
 
     # Differences from the mean of both neighbours have 1.5 times the variance; red and blue count, and blue is still.
     assert scatter(0, 0.02, 0) == pytest.approx(0.02 / np.sqrt(3))
     assert scatter(0, 0.02) == 0
     assert scatter(0, 0.01, 0.04) == 0, "a drift"
     flicker = [Frame("white", white=(value, value, value)) for value in (1.0, 1.1, 1.0)]
-    assert gathering._colour_scatter(session(flicker)) == pytest.approx(0, abs=1e-12)  # pyright: ignore[reportPrivateUsage]
+    assert gathering._colour_scatter(session(flicker)) == pytest.approx(0, abs=1e-12)
 
 
 def test_a_drift_is_told_by_what_lies_on_the_print_in_a_white_frame() -> None:
@@ -394,7 +394,7 @@ def test_what_files_and_dark_frames_say_is_counted() -> None:
     origins = SimpleNamespace(other_camera=foreign, other_lens=(), other_iso=foreign[:2])
     codes = SimpleNamespace(off_brightness=np.array([0.05, 0.0, 0.06, 0.04]))
     stray = SimpleNamespace(
-        lights_beyond=lambda limit: [2, 9] if limit == 0.01 else [],  # pyright: ignore[reportUnknownLambdaType]
+        lights_beyond=lambda limit: [2, 9] if limit == 0.01 else [],  # pyrefly: ignore[implicit-any-lambda]
         certain=np.array([0.0, 0.02, 0.03]),
         of_primaries=0.004,
     )

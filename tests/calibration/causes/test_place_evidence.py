@@ -36,7 +36,7 @@ def test_cells_about_a_place_that_hold_a_hot_photosite() -> None:
 
     def share(hottest: list[float], size_mm: float) -> float:
         table: Any = SimpleNamespace(dark_frames=SimpleNamespace(hottest=np.array(hottest)), cells=cells)
-        return gathering._hot_share(table, places[0], size_mm)  # pyright: ignore[reportPrivateUsage]
+        return gathering._hot_share(table, places[0], size_mm)
 
     assert share([5, 0, 0, 7], 3.0) == 0.5
     assert share([5, 0, 0, 7], 5.0) == pytest.approx(1 / 3)
@@ -55,7 +55,7 @@ class Frame:
 
 def test_the_distance_of_a_spot_is_that_of_its_nearest_cell() -> None:
     stains: Any = SimpleNamespace(places_mm=np.array([[0.0, 0], [30, 40], [60, 80]]))
-    away = gathering._distance(stains, np.array([1, 2]), np.array([30.0, 0]))  # pyright: ignore[reportPrivateUsage]
+    away = gathering._distance(stains, np.array([1, 2]), np.array([30.0, 0]))
     assert away == 40
 
 

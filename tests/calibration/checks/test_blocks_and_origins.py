@@ -12,8 +12,6 @@ from calibration.checks import frame_consistency
 from calibration.checks.frame_consistency import ForeignFrame, OriginFigures, origin_figures
 from drivers.raw.rawfile import FrameOrigin
 
-# pyright: reportPrivateUsage=false
-
 
 @pytest.mark.parametrize(
     ("across", "down", "columns", "rows"),

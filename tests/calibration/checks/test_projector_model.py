@@ -15,8 +15,6 @@ from calibration.checks.projector_model import ProjectorFit, fit_projector
 from sim.spectral import projector_primaries, sensitivities
 from tests.calibration.checks.test_light_codes import CAMERAS
 
-# pyright: reportPrivateUsage=false
-
 _Array = npt.NDArray[np.float64]
 
 SUBSETS = ((0, 1), (0, 2), (1, 2), (0, 1, 2))
@@ -28,7 +26,7 @@ NUMBERS = 9 + 4 * 12 + 9 * 5 + 3
 def test_primaries_are_those_of_measured_cameras_and_lamps() -> None:
     seen = np.array(
         [
-            np.einsum("pl,lc->cp", projector_primaries(lamp), sensitivities(camera))
+            np.einsum("pl,lc->cp", projector_primaries(lamp), sensitivities(camera))  # pyrefly: ignore[bad-argument-type]
             for lamp, camera in product(("uhp", "led"), CAMERAS)
         ]
     )

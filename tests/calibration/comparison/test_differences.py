@@ -52,7 +52,7 @@ def table(folder: Path, white: _Array, errors: _Array, samples: int, drift: _Arr
         white=white,
         samples=np.rint(counts).astype(np.uint16),
         provenance=provenance,
-        require_unchanged=lambda light: None,  # pyright: ignore[reportUnknownLambdaType]
+        require_unchanged=lambda light: None,  # pyrefly: ignore[implicit-any-lambda]
     )
 
 
@@ -61,7 +61,7 @@ def found(tmp_path: Path) -> tuple[Any, Any, LightDifferences, CellDifferences]:
     drift = np.array([[1.0, 1, 1], [1.01, 1.02, 1.01], [1.1, 1.1, 1.1], [0.98, 0.97, 0.99]])
     one = table(tmp_path / "one", WHITE, ERRORS, 4, drift, 6)
     other = table(tmp_path / "other", OTHER, 2 * ERRORS, 9, None, 7)
-    return one, other, *comparing._differences(one, other, PAIRS, None)  # pyright: ignore[reportPrivateUsage]
+    return one, other, *comparing._differences(one, other, PAIRS, None)
 
 
 def test_lights_differ_by_angle_and_length_in_units_of_their_errors(

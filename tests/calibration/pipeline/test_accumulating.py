@@ -29,7 +29,7 @@ def empty() -> Any:
     )
     unknown: Any = None
     return Accumulator(
-        session=unknown, selected=unknown, baseline=baseline, figures=(), saturation=SATURATION, registered=unknown,  # pyright: ignore[reportArgumentType]
+        session=unknown, selected=unknown, baseline=baseline, figures=(), saturation=SATURATION, registered=unknown,  # pyrefly: ignore[bad-argument-type]
         dark=None, estimate=unknown, hot=HotPixels.none(CELLS, 25), highest=np.full(CELLS, 500, np.uint16),
         highest_at=np.zeros(CELLS, np.int64), outside=np.zeros(CELLS, np.bool_), covered=np.zeros(CELLS, np.bool_),
         place_error=np.zeros(CELLS), even_sum=np.full((CELLS, 25, 3), 1000, np.float32),

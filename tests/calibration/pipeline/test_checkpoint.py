@@ -55,7 +55,7 @@ def lab() -> Lab:
 
 def build_until_killed(place: str, count: int, folder: Path, out: Path) -> None:
     """Build a table; the process is killed before the `count`-th call at a place."""
-    building.CHECKPOINT_EVERY = 3
+    building.CHECKPOINT_EVERY = 3  # pyrefly: ignore[bad-assignment]
     owner, name = PLACES[place]
     real, left = getattr(owner, name), itertools.count(count, -1)
 

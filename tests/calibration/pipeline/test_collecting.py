@@ -156,7 +156,7 @@ def frame(white: tuple[float, float, float] = (100.0, 200, 50), at_s: float = 0,
 def test_frames_are_brought_to_the_usual_exposure_that_files_state() -> None:
     def factors(*exposures: float) -> list[float]:
         frames = [frame(exposure=one) for one in exposures]
-        return collecting._to_one_exposure(frames).ravel().tolist()  # pyright: ignore[reportPrivateUsage]
+        return collecting._to_one_exposure(frames).ravel().tolist()
 
     assert factors(0.5, 0.25, 1.0, 0.0) == [1, 2, 0.5, 1]
     assert factors(0.0, 0.0) == [1, 1]
@@ -180,15 +180,15 @@ def test_white_frames_drift_by_less_than_15_per_cent_and_two_degrees(
 ) -> None:
     # The median of three is what two of them have.
     frames = [frame(), frame(white), frame()]
-    assert collecting._drift_is_one(frames) is is_drift  # pyright: ignore[reportPrivateUsage]
-    assert collecting._drift_is_one([frame(white)])  # pyright: ignore[reportPrivateUsage]
+    assert collecting._drift_is_one(frames) is is_drift
+    assert collecting._drift_is_one([frame(white)])
 
 
 def test_the_lamp_s_gain_at_a_light_is_over_the_first_white_frame() -> None:
     whites = [frame(at_s=10), frame((110.0, 220, 45), at_s=110)]
     lights = [frame(at_s=10), frame(at_s=60)]
-    gains = collecting._gains(lights, whites)  # pyright: ignore[reportPrivateUsage]
+    gains = collecting._gains(lights, whites)
     np.testing.assert_allclose(gains, [[1, 1, 1], [1.05, 1.05, 0.95]], rtol=1e-3)
-    assert (collecting._gains(lights, []) == 1).all()  # pyright: ignore[reportPrivateUsage]
-    at, white_at = collecting._times_s(lights, whites)  # pyright: ignore[reportPrivateUsage]
+    assert (collecting._gains(lights, []) == 1).all()
+    at, white_at = collecting._times_s(lights, whites)
     assert (at.tolist(), white_at.tolist()) == ([0, 50], [0, 100])

@@ -90,10 +90,10 @@ def showing(lab: Lab, colours: Mapping[int, Colour]) -> Frame:
 
 def as_stated(lab: Lab, step: SessionStep, exposed: object, stated: object, world: World | None = None) -> bytes:
     """Return a frame exposed in one way whose file states another."""
-    counts = (world or lab.world).expose(step.colour, exposed, key=(step.number,))  # pyright: ignore[reportArgumentType]
+    counts = (world or lab.world).expose(step.colour, exposed, key=(step.number,))  # pyrefly: ignore[bad-argument-type]
     stream = BytesIO()
     body = (world or lab.world).body
-    write_dng(stream, counts, body, settings=stated, taken_at=TAKEN_AT)  # pyright: ignore[reportArgumentType]
+    write_dng(stream, counts, body, settings=stated, taken_at=TAKEN_AT)  # pyrefly: ignore[bad-argument-type]
     return stream.getvalue()
 
 
@@ -175,7 +175,7 @@ def test_white_frames_at_half_exposure_are_no_brilliant_colour(lab: Lab, tmp_pat
         lambda step: as_stated(lab, step, *((HALF, HALF) if step.kind == "white" else (SETTINGS, SETTINGS))),
     )
     assert "Exposure of a frame" in said
-    assert "additivity" not in report["figures"]  # pyright: ignore[reportOperatorIssue]
+    assert "additivity" not in report["figures"]  # pyrefly: ignore[not-iterable]
 
 
 def test_a_white_frame_at_half_exposure_that_does_not_say_so(lab: Lab, tmp_path: Path) -> None:
@@ -183,7 +183,7 @@ def test_a_white_frame_at_half_exposure_that_does_not_say_so(lab: Lab, tmp_path:
         lab, tmp_path, lambda step: as_stated(lab, step, HALF if step.kind == "white" else SETTINGS, SETTINGS)
     )
     assert "white" in said
-    rows = {limit["name"] for limit in report["limits"] if limit["outcome"] != "accept"}  # pyright: ignore
+    rows = {limit["name"] for limit in report["limits"] if limit["outcome"] != "accept"}  # pyrefly: ignore[not-iterable]
     assert "additivity" not in rows
     assert rows & {"white_frame_brightness", "white_short"}
 

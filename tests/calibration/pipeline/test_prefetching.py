@@ -23,7 +23,7 @@ AT = datetime(2024, 3, 1, tzinfo=UTC)
 def records(kinds: str) -> list[FrameRecord]:
     kind = {"w": "white", "d": "dark", "l": "light"}
     return [
-        FrameRecord(kind[letter], None, f"{number}.dng", "", AT, 0.5, "accepted")  # pyright: ignore[reportArgumentType]
+        FrameRecord(kind[letter], None, f"{number}.dng", "", AT, 0.5, "accepted")  # pyrefly: ignore[bad-argument-type]
         for number, letter in enumerate(kinds)
     ]
 

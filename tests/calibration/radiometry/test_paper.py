@@ -192,7 +192,7 @@ def test_a_hand_in_a_corner_is_no_fall_off() -> None:
 
 
 def test_what_a_field_leaves_is_told_by_share_rim_and_rings() -> None:
-    residual = papers._residual  # pyright: ignore[reportPrivateUsage]
+    residual = papers._residual
     noise = np.random.default_rng(2).normal(0, 0.001, (len(PLACES), 3))
     noise[:4] = 0.008  # between five and ten usual deviations
     left = residual(noise, PLACES, PAGE, 1)

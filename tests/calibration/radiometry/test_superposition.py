@@ -12,7 +12,7 @@ from scipy import stats
 from calibration.radiometry.superposition import (
     NODES,
     Superposition,
-    _posterior,  # pyright: ignore[reportPrivateUsage]
+    _posterior,
     printed_predictors,
     superposition,
 )

@@ -20,8 +20,6 @@ from experiment.chart.layout import design_chart, paper_chart
 from experiment.framing.field import SIDE_POINTS, FoundField, field_mm
 from foundation.errors import RegistrationError
 
-# pyright: reportPrivateUsage=false
-
 CHART = design_chart(2, "A7", 1)
 
 
@@ -36,9 +34,9 @@ def registration(
     )
     errors = PlaceErrors(Raster(np.zeros(2), np.ones(2), (7, 9)), np.full((7, 9), error))
     return Registration(
-        framing=SimpleNamespace(field=None if has_tags else "outline"), lens=None, displacement=None, lateral=None,  # pyright: ignore[reportArgumentType]
+        framing=SimpleNamespace(field=None if has_tags else "outline"), lens=None, displacement=None, lateral=None,  # pyrefly: ignore[bad-argument-type]
         marks_residual_px=np.array([[3.0, 4.0], [0.0, 0.0]]), lens_residual_px=1.0, blocks=blocks, place_errors=errors,
-        colours=None, mismatched_cells=np.zeros(64, np.bool_), agreement=agreement, blur_px=0.6, cell_px=cell_px,  # pyright: ignore[reportArgumentType]
+        colours=None, mismatched_cells=np.zeros(64, np.bool_), agreement=agreement, blur_px=0.6, cell_px=cell_px,  # pyrefly: ignore[bad-argument-type]
     )  # fmt: skip
 
 
@@ -85,7 +83,7 @@ def test_a_blur_is_refused_that_cells_are_too_small_for(cell_px: float, blur: fl
 def test_a_field_is_refused_of_which_two_parts_and_one_and_a_half_per_cent_have_slipped(
     slipped: int, parts: int, fails: bool
 ) -> None:
-    matcher: Any = SimpleNamespace(slipped=lambda cells: (np.full((slipped, 2), 7.0), parts))  # pyright: ignore[reportUnknownLambdaType]
+    matcher: Any = SimpleNamespace(slipped=lambda cells: (np.full((slipped, 2), 7.0), parts))  # pyrefly: ignore[implicit-any-lambda]
     with refused("colours of the cells beside them" if fails else ""):
         registering._require_own_cells(matcher, np.zeros(9, np.bool_), "it")
 

@@ -118,19 +118,19 @@ def test_the_error_of_a_place_is_the_fit_s_the_systematic_one_and_what_cells_sti
     none = np.zeros((rows, columns, 2))
     anchors = np.array([[1.0, 2.0]]), np.eye(2)[None]
     followed = Followed(0.03)
-    still = place_errors(compared(none, 100.0), RASTER, 1, followed, anchors)  # pyright: ignore[reportArgumentType]
+    still = place_errors(compared(none, 100.0), RASTER, 1, followed, anchors)  # pyrefly: ignore[bad-argument-type]
     np.testing.assert_allclose(still.error_px, np.hypot(0.03, SYSTEMATIC_PX))
     assert [len(given) for given in followed.asked] == [rows * columns + 1] * 2
     np.testing.assert_array_equal(followed.asked[0][-1], [1, 2])
     # A part that moved by a third of a pixel and is not followed shows, there and beside it, and nowhere else.
     moved = none.copy()
     moved[5:15, 20:30] = [0.3, -0.4]
-    asks = place_errors(compared(moved, 1e4), RASTER, 1, followed, anchors)  # pyright: ignore[reportArgumentType]
+    asks = place_errors(compared(moved, 1e4), RASTER, 1, followed, anchors)  # pyrefly: ignore[bad-argument-type]
     assert asks.error_px[10, 25] == pytest.approx(0.5, abs=0.02)
     assert asks.error_px[10, 25 + 12] == pytest.approx(still.error_px[0, 0], abs=0.01)
     # Measurements that scatter more than they say weigh less.
     noisy = compared(np.random.default_rng(3).normal(0, 0.5, (rows, columns, 2)), 100.0)
-    place_errors(noisy, RASTER, 1, followed, anchors)  # pyright: ignore[reportArgumentType]
+    place_errors(noisy, RASTER, 1, followed, anchors)  # pyrefly: ignore[bad-argument-type]
     weight = followed.asked[1][:-1] / noisy.information
     assert float(np.median(weight)) < 0.1
     assert float(np.ptp(weight)) < 1e-9

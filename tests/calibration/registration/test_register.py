@@ -92,7 +92,7 @@ def test_what_agrees_too_little_is_refused(lab: Lab, white: Mosaic, monkeypatch:
 
 
 def test_corners_of_tags_are_known_in_the_channel_in_which_they_are_found(lab: Lab, registered: Registration) -> None:
-    known = registering._tag_corners(registered.framing, lab.chart)  # pyright: ignore[reportPrivateUsage]
+    known = registering._tag_corners(registered.framing, lab.chart)
     assert len(known.points_mm) == 4 * len(registered.framing.tags)
     # Between the .085 px of white light and the .2 of weak ones.
     own = known.information.any(axis=(1, 2, 3))

@@ -11,7 +11,7 @@ from calibration.registration.tiles import (
     MIN_SCORE,
     FoundBlocks,
     Raster,
-    _peak,  # pyright: ignore[reportPrivateUsage]
+    _peak,
     compare_tiles,
     find_blocks,
     jacobians,

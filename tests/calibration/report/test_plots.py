@@ -174,7 +174,7 @@ def test_a_cell_is_outlined_at_its_corners_and_its_samples_about_its_middle() ->
     chart: Any = SimpleNamespace(cell_mm=(4, 2), centres_mm=np.array([[6.0, 5.0], [40.0, 5.0]]))
     registration: Any = SimpleNamespace(cell_px=20, to_pixels=seen)
     picture, places = np.zeros((100, 500, 3), np.float32), np.array([[60.0, 50.0], [400.0, 50.0]])
-    magnified = plots._magnified  # pyright: ignore[reportPrivateUsage]
+    magnified = plots._magnified
     magnified(axes, picture, places[0], 30.0, chart, registration, places, 5)
     cell, samples = lines
     assert cell == [(40, 40), (80, 40), (80, 60), (40, 60), (40, 40)]
@@ -434,7 +434,7 @@ def test_a_name_at_the_edge_of_a_plot_is_turned_inwards() -> None:
         axes: Any = empty_axes()
         axes.set(xlim=(10, 30), ylim=(-5, 5))
         place = (10 + 20 * x, -5 + 10 * y)
-        plots._ring(axes, *place, "here")  # pyright: ignore[reportPrivateUsage]
+        plots._ring(axes, *place, "here")
         (note,) = axes.texts
         assert (note.xy, note.get_ha(), note.xyann) == (place, ha, text)
 

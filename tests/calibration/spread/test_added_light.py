@@ -78,15 +78,15 @@ def test_bumps_stand_on_a_grid_of_nine_places_along_the_longer_side() -> None:
     x, y = np.linspace(left, right, 9), np.linspace(top, bottom, rows)
     middles = np.stack([np.tile(x, rows), np.repeat(y, 9)], axis=1)
     expected = np.exp(-((cells[:, None] - middles) ** 2).sum(axis=-1) / (2 * apart**2))
-    np.testing.assert_allclose(module._bumps(cells), expected)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(module._bumps(cells), expected)
 
 
 def test_added_light_has_the_likeliest_of_its_sizes() -> None:
     random = np.random.default_rng(5)
     design, noise = random.standard_normal((300, 7)), random.standard_normal(300)
     value = design @ np.array([0.012, -0.014, 0.013, 0.01, -0.012, 0.002, -0.001]) * 40 + noise
-    heights, spread = module._likeliest(value, 40 * design, 5)  # pyright: ignore[reportPrivateUsage]
-    priors = [np.diag([size**2] * 5 + [0.003**2] * 2) for size in module._SIZES]  # pyright: ignore[reportPrivateUsage]
+    heights, spread = module._likeliest(value, 40 * design, 5)
+    priors = [np.diag([size**2] * 5 + [0.003**2] * 2) for size in module._SIZES]
     covariances = [np.eye(300) + 1600 * design @ prior @ design.T for prior in priors]
     # The likelihood of the values themselves, heights integrated out.
     likelihood = [-value @ np.linalg.solve(one, value) - np.linalg.slogdet(one)[1] for one in covariances]

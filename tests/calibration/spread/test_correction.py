@@ -54,12 +54,12 @@ def test_what_is_left_is_the_residual_and_without_correction_what_it_would_chang
 @pytest.mark.parametrize(("references", "order"), [(0, 0), (8, 0), (9, 1), (17, 1), (18, 2), (29, 2), (30, 3)])
 def test_white_references_show_a_change_of_a_third_as_many_terms(references: int, order: int) -> None:
     # A polynomial of order n over the page has (n + 1) (n + 2) / 2 terms.
-    assert correction._white_order(references) == order  # pyright: ignore[reportPrivateUsage]
+    assert correction._white_order(references) == order
 
 
 def test_a_kernel_brings_the_tails_beyond_a_cell_half_a_pixel_off_its_middle() -> None:
     around: Any = SimpleNamespace(pitch_px=np.array([[10.0, 11], [9.0, 12]]), window=5)
-    worst, mean = correction._beyond_cell(around)  # pyright: ignore[reportPrivateUsage]
+    worst, mean = correction._beyond_cell(around)
     for kernel, sigma in enumerate((1.5, 3.0, 6.0)):
         at = np.array([-2.0, -1, 0, 1, 2]) + 0.5
         inside = np.asarray(stats.norm(at, sigma).cdf(4.5) - stats.norm(at, sigma).cdf(-4.5), dtype=np.float64)
@@ -73,5 +73,5 @@ def test_white_errs_by_its_change_for_each_share_and_their_covariance() -> None:
     change = [random.normal(size=len(terms_of(channel))) for channel in range(3)]
     draws = root @ random.normal(size=(TERMS, 5))
     of_white = np.array([change[channel] @ draws[terms_of(channel)] for channel in range(3)])
-    found = correction._of_white(draws @ draws.T, change)  # pyright: ignore[reportPrivateUsage]
+    found = correction._of_white(draws @ draws.T, change)
     np.testing.assert_allclose(found, of_white @ of_white.T)

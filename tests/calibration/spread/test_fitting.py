@@ -82,7 +82,7 @@ def test_shares_stand_by_term_channel_and_kernel_and_what_is_left_out_is_an_erro
 def test_far_light_is_never_negative_and_the_rest_is_least_squares(seed: int) -> None:
     design, value, matrix, vector = equations(2 * TERMS, TERMS, seed)
     kept = np.sort(np.random.default_rng(seed).permutation(TERMS)[: TERMS // 2])
-    shares, gain = fitting._positive(matrix, vector, kept)  # pyright: ignore[reportPrivateUsage]
+    shares, gain = fitting._positive(matrix, vector, kept)
     low = np.where(free_terms()[kept], -np.inf, 0.0)
     expected = np.zeros(TERMS)
     expected[kept] = lsq_linear(design[:, kept], value, (low, np.inf), tol=1e-12).x
@@ -96,11 +96,11 @@ def test_what_is_eliminated_is_solved_for_as_well() -> None:
     size = TERMS + 4
     _, _, matrix, vector = equations(2 * size, size, 5)
     prior = np.diag(np.linspace(1, 2, size))
-    inner, right = fitting._without_factors(matrix, vector, prior)  # pyright: ignore[reportPrivateUsage]
+    inner, right = fitting._without_factors(matrix, vector, prior)
     whole = np.linalg.solve(matrix + prior, vector)
     np.testing.assert_allclose(np.linalg.solve(inner, right), whole[:TERMS])
     free = np.flatnonzero(free_terms())
-    solution = fitting._solved(matrix, vector, prior, free)  # pyright: ignore[reportPrivateUsage]
+    solution = fitting._solved(matrix, vector, prior, free)
     used = np.concatenate([free, np.arange(TERMS, size)])
     expected = np.zeros(size)
     expected[used] = np.linalg.solve((matrix + prior)[np.ix_(used, used)], vector[used])
@@ -117,7 +117,7 @@ def test_kernels_that_gain_less_than_chance_and_four_standard_errors_are_left_ou
     for group, gain in zip(groups, worth, strict=True):
         vector[group] = np.sqrt(gain / len(group))
     for misfit, kept in ((1.0, [0, len(groups) - 1]), (1.1, [])):
-        found = fitting._selected(matrix, vector, misfit, groups)  # pyright: ignore[reportPrivateUsage]
+        found = fitting._selected(matrix, vector, misfit, groups)
         assert found.tolist() == sorted(np.concatenate([np.zeros(0, int), *(groups[k] for k in kept)]).tolist())
 
 
@@ -126,7 +126,7 @@ def test_rows_weigh_by_their_level_s_scatter_and_outliers_little() -> None:
     level = np.repeat([100.0, 1000.0], 4000)
     left = random.standard_normal(8000) * np.repeat([1.0, 5.0], 4000)
     left[0] = 50.0
-    weights = fitting._weights(left, level)  # pyright: ignore[reportPrivateUsage]
+    weights = fitting._weights(left, level)
     usual = np.median(weights[:4000]), np.median(weights[4000:])
     assert usual == pytest.approx((1, 1 / 25), rel=0.1)
     # Huber's weight falls as the distance grows.
@@ -144,17 +144,17 @@ def test_a_kernel_s_share_of_a_power_law_is_that_of_the_sizes_about_its_own(powe
     amount: npt.NDArray[np.float64] = middle ** (1 - power) * np.diff(sizes)
     nearest = np.abs(np.log(middle[:, None] / scale)).argmin(axis=1)
     expected = np.bincount(nearest, amount) / amount.sum()
-    np.testing.assert_allclose(fitting._law(power), expected, rtol=1e-3)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(fitting._law(power), expected, rtol=1e-3)
 
 
 @pytest.mark.parametrize("few", [False, True])
 def test_what_is_supposed_of_lenses_has_odds_that_sum_to_one_and_a_covariance(few: bool) -> None:
-    lenses = fitting._supposed_lenses(few)  # pyright: ignore[reportPrivateUsage]
+    lenses = fitting._supposed_lenses(few)
     assert sum(lens.odds for lens in lenses) == pytest.approx(1)
     assert min(lens.odds for lens in lenses) > 0
     veil = far_groups()[-1]
     for lens in lenses[:: max(1, len(lenses) // 6)]:
-        usual = fitting._usual_shares(3 if few else 5, lens)  # pyright: ignore[reportPrivateUsage]
+        usual = fitting._usual_shares(3 if few else 5, lens)
         np.testing.assert_allclose(usual, usual.T)
         assert np.linalg.eigvalsh(usual).min() > 0
         np.testing.assert_allclose(np.diag(usual)[veil], (lens.veil * fitting.USUAL_VEIL) ** 2)
@@ -171,11 +171,11 @@ def test_a_sensor_that_falls_short_bends_neither_black_nor_white() -> None:
 def test_folds_are_patches_of_the_page_and_none_is_lost() -> None:
     random = np.random.default_rng(1)
     places, points = random.uniform(0, 1, (900, 2)) * (300, 200), random.permutation(900)[:600]
-    ordered, folds = fitting._by_fold(points, places, (300.0, 200.0))  # pyright: ignore[reportPrivateUsage]
+    ordered, folds = fitting._by_fold(points, places, (300.0, 200.0))
     assert sorted(ordered.tolist()) == sorted(points.tolist())
     assert [fold.start for fold in folds] == [0, *(fold.stop for fold in folds[:-1])]
     assert folds[-1].stop == len(ordered)
-    side = 300 / fitting._PATCHWORK  # pyright: ignore[reportPrivateUsage]
+    side = 300 / fitting._PATCHWORK
     fold_of = np.empty(900, dtype=np.int64)
     for number, fold in enumerate(folds):
         fold_of[ordered[fold]] = number
@@ -187,7 +187,7 @@ def test_folds_are_patches_of_the_page_and_none_is_lost() -> None:
 
 @pytest.mark.parametrize(("few", "clean", "clear"), [(False, 0.3, 0.0), (True, 0.7, 0.3)])
 def test_lenses_that_scatter_and_have_a_veil_are_as_likely_as_is_said(few: bool, clean: float, clear: float) -> None:
-    lenses = fitting._supposed_lenses(few)  # pyright: ignore[reportPrivateUsage]
+    lenses = fitting._supposed_lenses(few)
 
     def odds(of: Callable[[Any], bool]) -> float:
         return sum(lens.odds for lens in lenses if of(lens))
@@ -217,8 +217,8 @@ def test_lenses_that_scatter_and_have_a_veil_are_as_likely_as_is_said(few: bool,
 
 
 def test_far_shares_hand_on_half_and_channels_share_them() -> None:
-    lens = fitting._Lens(far=2.0, far_apart=0.6)  # pyright: ignore[reportPrivateUsage]
-    few, many = (fitting._usual_shares(bits, lens) for bits in (3, 5))  # pyright: ignore[reportPrivateUsage]
+    lens = fitting._Lens(far=2.0, far_apart=0.6)
+    few, many = (fitting._usual_shares(bits, lens) for bits in (3, 5))
     # Steps of .01, .01, .004 and .003, twice as large; the last two follow the kernel before by a half.
     steps = np.array([0.02, 0.02, 0.008, 0.006])
     handed = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0.5, 1, 0], [0, 0.25, 0.5, 1]]) * steps
@@ -233,11 +233,11 @@ def test_far_shares_hand_on_half_and_channels_share_them() -> None:
     for usual, of_changes in ((few, 0.002), (many, 0.1)):
         assert np.diag(usual)[means] == pytest.approx(0.1**2)
         assert np.diag(usual)[changes] == pytest.approx(of_changes**2)
-    clean = fitting._usual_shares(3, fitting._Lens(near=0.001, veil=0.001))  # pyright: ignore[reportPrivateUsage]
+    clean = fitting._usual_shares(3, fitting._Lens(near=0.001, veil=0.001))
     assert np.diag(clean)[[*means, *veil]] == pytest.approx([1e-8] * 3 + [1e-10] * 3)
     # A law's kernels follow it all, near ones as well, and deviate by a third of their own.
-    law = fitting._law(3.0)  # pyright: ignore[reportPrivateUsage]
-    usual = fitting._usual_shares(3, fitting._Lens(power=3.0, far=0.5, far_apart=0.6))  # pyright: ignore[reportPrivateUsage]
+    law = fitting._law(3.0)
+    usual = fitting._usual_shares(3, fitting._Lens(power=3.0, far=0.5, far_apart=0.6))
     law[len(NEAR_PX) :] *= 0.5
     groups = [group for group in groups_of_terms() if len(group) == 3][:-1]
     for one, other in product(range(len(groups)), repeat=2):
@@ -253,17 +253,17 @@ def test_equations_are_weighted_sums_of_their_rows_fold_by_fold() -> None:
     unknowns = np.array([1, 3, 4])
     design, value = random.normal(size=(400, 3)), random.normal(size=400)
     folds = tuple(slice(100 * n, 100 * n + 100) for n in range(4))
-    rows = fitting._Rows(value, design, np.linspace(0, 1, 400), folds, unknowns, freedom=0.7)  # pyright: ignore[reportPrivateUsage]
+    rows = fitting._Rows(value, design, np.linspace(0, 1, 400), folds, unknowns, freedom=0.7)
     solution = random.normal(size=6)
-    normal, right = fitting._normal_equations([rows], solution)  # pyright: ignore[reportPrivateUsage]
-    weights = 0.7 * fitting._weights(value - design @ solution[unknowns], rows.level)  # pyright: ignore[reportPrivateUsage]
+    normal, right = fitting._normal_equations([rows], solution)
+    weights = 0.7 * fitting._weights(value - design @ solution[unknowns], rows.level)
     for number, fold in enumerate(folds):
         own = design[fold] * weights[fold, None]
         np.testing.assert_allclose(normal[number][np.ix_(unknowns, unknowns)], own.T @ design[fold])
         np.testing.assert_allclose(right[number][unknowns], own.T @ value[fold])
     assert not normal[:, [0, 2, 5]].any()
     # Twice the same rows are twice the equations.
-    twice, _ = fitting._normal_equations([rows, rows], solution)  # pyright: ignore[reportPrivateUsage]
+    twice, _ = fitting._normal_equations([rows, rows], solution)
     np.testing.assert_allclose(twice, 2 * normal)
 
 
@@ -296,9 +296,9 @@ def test_shares_are_the_mean_of_what_is_supposed_and_err_by_how_that_differs() -
     matrices, vector = roots @ roots.swapaxes(1, 2), random.normal(size=TERMS) + 1
     covariances = np.asarray(np.linalg.inv(matrices), dtype=np.float64)
     weights, kept = np.array([0.3, 0.7]), np.arange(0, TERMS, 2)
-    lenses = fitting._Lenses(matrices, vector, covariances, weights, matrices[0])  # pyright: ignore[reportPrivateUsage]
+    lenses = fitting._Lenses(matrices, vector, covariances, weights, matrices[0])
     mean, covariance = lenses.shares(kept)
-    one, other = (fitting._positive(matrix, vector, kept)[0] for matrix in matrices)  # pyright: ignore[reportPrivateUsage]
+    one, other = (fitting._positive(matrix, vector, kept)[0] for matrix in matrices)
     np.testing.assert_allclose(mean, 0.3 * one + 0.7 * other, atol=1e-7)
     # Of two values that differ by d, with these weights, the variance is .21 d².
     expected = 0.3 * covariances[0] + 0.7 * covariances[1] + 0.21 * np.outer(one - other, one - other)
@@ -307,12 +307,12 @@ def test_shares_are_the_mean_of_what_is_supposed_and_err_by_how_that_differs() -
 
 @pytest.mark.parametrize("scatters", [False, True])
 def test_wide_light_is_as_usual_as_lenses_have_it_on_average(scatters: bool) -> None:
-    supposed = fitting._supposed_lenses(True)  # pyright: ignore[reportPrivateUsage]
+    supposed = fitting._supposed_lenses(True)
     chosen = [lens for lens in supposed if lens.near == 1.0] if scatters else supposed
     odds = np.array([lens.odds for lens in chosen])
-    usual = np.average([fitting._usual_shares(3, lens) for lens in chosen], axis=0, weights=odds)  # pyright: ignore[reportPrivateUsage]
+    usual = np.average([fitting._usual_shares(3, lens) for lens in chosen], axis=0, weights=odds)
     # Of the veil and the two widest kernels.
     wide = np.zeros(TERMS, np.bool_)
     wide[np.concatenate(far_groups()[-3:])] = True
-    found = fitting._usual_wide_light(3, scatters)  # pyright: ignore[reportPrivateUsage]
+    found = fitting._usual_wide_light(3, scatters)
     np.testing.assert_allclose(found, np.where(wide[:, None] & wide, usual, 0.0), atol=1e-15)

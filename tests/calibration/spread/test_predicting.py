@@ -104,7 +104,7 @@ def test_a_small_chart_s_cell_is_held_against_its_neighbours_less_the_curvature_
 
 
 def test_roots_of_levels_are_alike_as_matern_s_function_of_codes_and_their_largest_has_it() -> None:
-    found = predicting._covariance(3)  # pyright: ignore[reportPrivateUsage]
+    found = predicting._covariance(3)
     # A step of one code in one ink, in the largest, from black to white, and none.
     for one, other in (((4, 2, 1), (4, 2, 2)), ((4, 2, 1), (5, 2, 1)), ((0, 0, 0), (7, 7, 7)), ((3, 3, 3), (3, 3, 3))):
         a, b = (np.array([*codes, max(codes)]) for codes in (one, other))

@@ -241,7 +241,7 @@ def test_a_sharp_lens_is_left_alone(sharp: Photograph) -> None:
     ],
 )
 def test_what_a_lens_spreads_is_found_and_taken_out(lens: dict[str, float], least: float, most: float) -> None:
-    shot = photograph(**lens)  # pyright: ignore[reportArgumentType]
+    shot = photograph(**lens)  # pyrefly: ignore[bad-argument-type]
     spread, figures = shot.measured()
     assert figures.corrected
     assert spread.held_out > 0
@@ -390,7 +390,7 @@ def test_what_a_lens_leaves_in_white_is_as_much_as_is_said() -> None:
     """On a chart of 512 colours, which shows little of it: said is neither less nor several times as much."""
     ratios: list[float] = []
     for seed, lens in enumerate(_COLOURED):
-        shot = photograph(**lens, chart=SMALL, rough=0.03, seed=seed)  # pyright: ignore[reportArgumentType]
+        shot = photograph(**lens, chart=SMALL, rough=0.03, seed=seed)  # pyrefly: ignore[bad-argument-type]
         spread, figures = shot.measured()
         tint, stated = white_angles(shot.white_error(spread), figures.white_covariance)
         ratios.append(tint / stated)

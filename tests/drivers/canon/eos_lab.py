@@ -55,18 +55,18 @@ class Lab:
 
     def press(self) -> None:
         """Press the release on the camera itself, and let the frame come."""
-        self.eos._full_press(automatic=False)  # pyright: ignore[reportPrivateUsage] - a finger
+        self.eos._full_press(automatic=False)
         self.clock.sleep(5)
         assert not self.eos.busy
 
     def waiting(self) -> int:
         """Return how many objects wait in the body's memory now."""
         assert not self.eos.busy
-        return len(self.eos._memory)  # pyright: ignore[reportPrivateUsage] - the body tells it nobody
+        return len(self.eos._memory)
 
     def pull(self) -> None:
         """Pull the cable out, and put it back."""
-        self.camera._drop(None)  # pyright: ignore[reportPrivateUsage]
+        self.camera._drop(None)
 
     def download(self) -> bytes:
         """Return what the camera writes of the frame exposed last."""

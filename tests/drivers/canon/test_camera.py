@@ -244,7 +244,7 @@ def test_the_body_is_given_back_as_it_was(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.take()
     lab.camera.close()
-    assert lab.eos._number_of(Property.EOS_CAPTURE_DESTINATION) == CaptureDestination.CARD  # pyright: ignore[reportPrivateUsage]
+    assert lab.eos._number_of(Property.EOS_CAPTURE_DESTINATION) == CaptureDestination.CARD
     assert lab.waiting() == 0
 
 
@@ -876,10 +876,10 @@ def test_what_a_body_has_left(lab: Lab) -> None:
     supplies = lab.camera.supplies()
     assert isinstance(lab.camera, ReportsSupplies)
     assert (supplies.battery, supplies.mains, supplies.saves_to_host) == (1.0, None, True)
-    card = lab.eos._card  # pyright: ignore[reportPrivateUsage]
+    card = lab.eos._card
     assert card is not None
     assert supplies.card_free_bytes == card.free
-    lab.eos._card = None  # pyright: ignore[reportPrivateUsage] - it is taken out
+    lab.eos._card = None
     assert lab.camera.supplies().card_free_bytes is None
 
 

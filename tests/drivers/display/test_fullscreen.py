@@ -305,10 +305,10 @@ def test_a_window_moved_away_is_noticed_and_put_back(screen: FullScreen, virtual
 def test_a_display_that_power_saving_keeps_dark_is_noticed(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
     # No server without a monitor has power saving: only that its absence is no darkness is seen on a real one.
     asked: list[bool] = []
-    monkeypatch.setattr(fullscreen, "is_dark", lambda display: asked.append(is_dark(display)))  # pyright: ignore[reportUnknownArgumentType, reportUnknownLambdaType]
+    monkeypatch.setattr(fullscreen, "is_dark", lambda display: asked.append(is_dark(display)))  # pyrefly: ignore[implicit-any-lambda]
     screen.show(WHITE)
     assert asked == [False]
-    monkeypatch.setattr(fullscreen, "is_dark", lambda display: True)  # pyright: ignore[reportUnknownArgumentType, reportUnknownLambdaType]
+    monkeypatch.setattr(fullscreen, "is_dark", lambda display: True)  # pyrefly: ignore[implicit-any-lambda]
     for use in (screen.show, screen.verify):
         with pytest.raises(DeviceError, match=r"power saving keeps display 1: screen 640×360 .* dark"):
             use(WHITE)
@@ -508,15 +508,15 @@ def test_a_gamma_ramp_that_was_never_written_is_none(screen: FullScreen, monkeyp
 
     # Some X servers give out whatever their memory held before.
     noise = np.random.default_rng(1).random((3, 256))
-    monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor: noise)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor: noise)  # pyrefly: ignore[implicit-any-lambda]
     assert ramps(screen) == []
     straight = np.linspace(0, 1, 256)
     bend = np.sin(np.pi * straight) / 255
     # Drivers end a ramp at 255/256 or at 1; a bend of two codes is one.
     for ramp, told in ((straight * 255 / 256, 0), (straight - bend, 0), (straight - 2 * bend, 1)):
-        monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor, ramp=ramp: [ramp] * 3)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+        monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor, ramp=ramp: [ramp] * 3)  # pyrefly: ignore[implicit-any-lambda]
         assert len(ramps(screen)) == told
-    monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor: [np.linspace(1, 0, 256)] * 3)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor: [np.linspace(1, 0, 256)] * 3)  # pyrefly: ignore[implicit-any-lambda]
     assert len(ramps(screen)) == 1, "inverted colours are somebody's wish"
 
 

@@ -186,7 +186,7 @@ def test_what_another_program_changes_is_noticed(command: LightCrafterCommand, v
     def meddle(command: int, data: bytes) -> bool:
         return write(command, data) and write(changed, to)
 
-    table.controller.write = meddle
+    table.controller.write = meddle  # pyrefly: ignore[method-assign]
     with pytest.raises(DeviceError, match=rf"confirms {reason}.*close other control programs"):
         presenter.show(WHITE)
 
@@ -228,7 +228,7 @@ def test_silence_and_foreign_answers_are_timeouts(table: Table, swallow: bool) -
                 foreign = wire.encode_request(LightCrafterRequest(99, 0x1A00, reads=True))
                 LightCrafterUsb.write(table.device, endpoint, foreign)
 
-    table.device.write = write
+    table.device.write = write  # pyrefly: ignore[method-assign]
     with pytest.raises(LinkTimeout):
         presenter.show(WHITE)
 

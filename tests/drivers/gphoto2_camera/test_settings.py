@@ -47,7 +47,7 @@ class Fake:
     def __init__(self, patch: pytest.MonkeyPatch, name: str, **given: object) -> None:
         self.clock = SimulatedClock()
         self.film = NoisyFilm()
-        self.body = FakeBody(dict(BODIES[name]), self.film, self.clock, **given)  # pyright: ignore[reportArgumentType]
+        self.body = FakeBody(dict(BODIES[name]), self.film, self.clock, **given)  # pyrefly: ignore[bad-argument-type]
         module = fake_module(self.body)
         patch.setattr(gphoto2_camera, "library", lambda: module)
         self.camera = Gphoto2Camera(clock=self.clock)

@@ -335,7 +335,7 @@ def test_every_other_answer_is_told_by_its_name_at_once() -> None:
 
 def test_numbers_begin_anew_after_the_last() -> None:
     session, cable, _ = opened()
-    session._transaction = LAST_TRANSACTION - 1  # pyright: ignore[reportPrivateUsage] - four thousand million calls later
+    session._transaction = LAST_TRANSACTION - 1
     for _ in range(3):
         session.call(Operation.EOS_KEEP_DEVICE_ON)
     assert [request.transaction for request in cable.asked[1:]] == [0xFFFFFFFE, 1, 2]

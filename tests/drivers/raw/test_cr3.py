@@ -102,7 +102,7 @@ def test_whatever_the_bytes_it_is_read_or_damaged(noise: bytes, place: int) -> N
 def masked(model: str, left: int, stated: Cr3 | None, rows: int = 4056) -> tuple[Area, ...]:
     """Return what is taken for black of a sensor whose picture begins at column `left`."""
     visible = Area(36, left, rows - 36, 6288 - left)
-    return rawfile._masked_areas(None, model, visible, (rows, 6288), stated)  # pyright: ignore[reportPrivateUsage]
+    return rawfile._masked_areas(None, model, visible, (rows, 6288), stated)
 
 
 def test_masked_columns_of_a_cr3() -> None:
@@ -151,7 +151,7 @@ def test_a_file_that_libraw_cannot_decode_is_an_error(tmp_path: Path, capfd: pyt
 
 
 def test_what_dcraw_shows_a_row_more_of_ends_at_the_sensor_s_lower_edge() -> None:
-    for (rows, columns), visible in rawfile._ONE_ROW_MORE:  # pyright: ignore[reportPrivateUsage]
+    for (rows, columns), visible in rawfile._ONE_ROW_MORE:
         assert visible.top + visible.height == rows
         assert 4 * visible.height // 3 <= visible.width < columns
         assert visible.left + visible.width <= columns
@@ -160,5 +160,5 @@ def test_what_dcraw_shows_a_row_more_of_ends_at_the_sensor_s_lower_edge() -> Non
 @given(st.lists(st.tuples(st.floats(-9, 9), st.integers(1, 4)), min_size=1))
 def test_a_median_of_counted_values_is_numpy_s(counted: list[tuple[float, int]]) -> None:
     values, numbers = np.array([one for one, _ in counted]), np.array([number for _, number in counted])
-    found = rawfile._median(values, numbers)  # pyright: ignore[reportPrivateUsage]
+    found = rawfile._median(values, numbers)
     assert found == pytest.approx(np.median(np.repeat(values, numbers)), abs=1e-12)

@@ -176,7 +176,7 @@ def test_labels_are_piled_up_from_the_edge_to_the_middle_of_their_quarter() -> N
     # label stands 3 above, or 8.5 above that before it: at 52.67, 61.17, 69.67. Above the middle likewise, downwards.
     low = np.array([2, 2.5, 2.02])
     x, y = np.concatenate([low, 100 / low, [50, 2]]), np.concatenate([low, 100 / low, [2, 50]])
-    rises = comparing._rises(x, y, 1.0, 100.0)  # pyright: ignore[reportPrivateUsage]
+    rises = comparing._rises(x, y, 1.0, 100.0)
     expected = [3, 69.67 - 65.66, 61.17 - 50.38, 3, 266.33 - 264.34, 274.83 - 279.62, 3, 3]
     np.testing.assert_allclose(rises, expected, atol=0.011)
 

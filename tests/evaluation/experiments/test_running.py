@@ -88,7 +88,7 @@ def test_the_line_of_the_user_s_file_is_named(tmp_path: Path) -> None:
     )
     method = find_method(f"{file}:Own")
     with pytest.raises(InputError, match=r"Own fails on wall 0\.png: LinAlgError: Singular matrix \(own\.py, line 7\)"):
-        evaluate(walls(1), [method])  # pyright: ignore[reportArgumentType]
+        evaluate(walls(1), [method])  # pyrefly: ignore[bad-argument-type]
 
 
 def test_a_mistake_in_this_suite_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,7 @@ def light_by_numpy(weights: dict[str, npt.NDArray[Any]], image: npt.NDArray[np.f
 
 def random_weights(size: float) -> dict[str, npt.NDArray[np.float32]]:
     random = np.random.default_rng(3)
-    shapes = convnet._shapes(3)  # pyright: ignore[reportPrivateUsage]
+    shapes = convnet._shapes(3)
     return {name: random.normal(0, size, shape).astype(np.float32) for name, shape in shapes.items()}
 
 
@@ -80,7 +80,7 @@ def test_images_are_lit_anew_by_a_tenth_and_flipped_half_the_time() -> None:
     lights = torch.ones((400, 3))
     flipped: list[bool] = []
     for _ in range(40):
-        seen, wanted = convnet._lit_anew(torch, plain, lights, generator)  # pyright: ignore[reportPrivateUsage]
+        seen, wanted = convnet._lit_anew(torch, plain, lights, generator)
         gains = wanted.numpy()
         assert 0.9 <= gains.min() < 0.901
         assert 1.099 < gains.max() <= 1.1
@@ -94,7 +94,7 @@ def test_images_are_lit_anew_by_a_tenth_and_flipped_half_the_time() -> None:
 
 
 def test_the_network_begins_as_he_draws_it() -> None:
-    weights = convnet._initial(torch, 16, torch.Generator().manual_seed(0))  # pyright: ignore[reportPrivateUsage]
+    weights = convnet._initial(torch, 16, torch.Generator().manual_seed(0))
     for name, inputs, part in (
         ("weight1", 4 * 25, 1),
         ("weight2", 16 * 9, 1),
@@ -116,7 +116,7 @@ def test_the_network_begins_as_he_draws_it() -> None:
 def test_the_loss_is_the_angle() -> None:
     found = torch.tensor([[1.0, 0, 0], [2**-0.5, 2**-0.5, 0], [0, 0, 1]])
     wanted = torch.tensor([[0, 3.0, 0], [5, 0, 0], [0, 0, 2]])
-    angles = convnet._angle(torch, found, wanted).numpy()  # pyright: ignore[reportPrivateUsage]
+    angles = convnet._angle(torch, found, wanted).numpy()
     np.testing.assert_allclose(angles, [np.pi / 2, np.pi / 4, 0], atol=1e-5)
 
 

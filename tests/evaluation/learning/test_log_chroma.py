@@ -61,7 +61,7 @@ def test_chromas_are_counted_in_bins_of_a_32nd_on_a_torus_of_four() -> None:
     steps = np.array([[-3, 0, 2], [-65, 0, 64], [0, 0, 0], [0, 0, 0]], dtype=np.float64) / 32
     pixels = (np.exp(steps) * [[0.5], [0.5], [2**-8], [0.9]]).astype(np.float32)
     pixels[3, 1] = 2**-8.001
-    counts = log_chroma._histogram(pixels, 2.0**-8)  # pyright: ignore[reportPrivateUsage]
+    counts = log_chroma._histogram(pixels, 2.0**-8)
     assert counts.sum() == 3
     assert (counts[3, 126], counts[65, 64], counts[0, 0]) == (1, 1, 1)
     assert counts.dtype == np.uint16
@@ -71,7 +71,7 @@ def test_deviations_are_from_the_usable_of_eight_neighbours() -> None:
     random = np.random.default_rng(0)
     image, used = random.random((5, 6, 3)).astype(np.float32), random.random((5, 6)) < 0.6
     used[:2, :3] = False
-    found = log_chroma._deviations(image, used)  # pyright: ignore[reportPrivateUsage]
+    found = log_chroma._deviations(image, used)
     for row, column in np.ndindex(5, 6):
         near = [
             np.abs(image[y, x] - image[row, column])
@@ -84,7 +84,7 @@ def test_deviations_are_from_the_usable_of_eight_neighbours() -> None:
 
 def test_the_penalty_of_what_is_scaled_is_its_squared_length() -> None:
     scaled = np.random.default_rng(1).normal(0, 1, (BINS, BINS))
-    spectrum = np.fft.rfft2(scaled) * log_chroma._scale(0.3, 0.002)  # pyright: ignore[reportPrivateUsage]
+    spectrum = np.fft.rfft2(scaled) * log_chroma._scale(0.3, 0.002)
     # The authors' penalty of a filter: its squares, and an eighth of its squared differences, of all coefficients.
     full = np.fft.fft2(np.fft.irfft2(spectrum, s=(BINS, BINS)))
     turn = np.abs(1 - np.exp(2j * np.pi * np.arange(BINS) / BINS)) ** 2

@@ -51,7 +51,7 @@ def test_the_mean_of_maxima_is_that_of_samples_with_repetition() -> None:
 def test_the_light_of_each_point_is_the_smoothed_pixel_over_the_smoothed_ratio() -> None:
     step, count = 4, 6
     radius = math.hypot(33, 47)
-    offsets = (retinex._sprays(2, count) * radius).astype(int)  # pyright: ignore[reportPrivateUsage]
+    offsets = (retinex._sprays(2, count) * radius).astype(int)
     chosen = np.random.default_rng((2, 1)).integers(0, retinex.SPRAYS, (9, 12))
     points, ratios = np.zeros((2, 9 + 2, 12 + 2, 3))
     used = np.zeros((9, 12), bool)
@@ -74,6 +74,6 @@ def test_the_light_of_each_point_is_the_smoothed_pixel_over_the_smoothed_ratio()
 
 
 def test_sprays_are_dense_in_the_middle() -> None:
-    distances = np.linalg.norm(retinex._sprays(0, 50), axis=2)  # pyright: ignore[reportPrivateUsage]
+    distances = np.linalg.norm(retinex._sprays(0, 50), axis=2)
     # Uniform along the radius: half of the pixels lie in a quarter of the area.
     np.testing.assert_allclose(np.percentile(distances, [25, 50, 75, 100]), [0.25, 0.5, 0.75, 1], atol=0.01)

@@ -275,7 +275,7 @@ def test_a_blurred_step_is_found_to_a_hundredth_beside_cells_that_slope() -> Non
     expected = np.array([[-1.2, 0.5], [0.0, 0.2], [0.37, 0.9], [1.1, 0.4]])
     at, height = expected[:, :1], expected[:, 1:]
     profiles = np.asarray(0.3 + height * ndtr((across - at) / 0.8) + 0.02 * np.minimum(across, 0), dtype=np.float64)
-    off, rise = field._fitted_step(profiles, 0.8)  # pyright: ignore[reportPrivateUsage]
+    off, rise = field._fitted_step(profiles, 0.8)
     np.testing.assert_allclose(np.stack([off, rise], axis=1), expected, atol=0.01)
 
 
@@ -296,19 +296,19 @@ def test_sides_bend_outwards_and_meet_in_corners() -> None:
     middle = corners.mean(axis=0)
     share = np.linspace(0, 1, 41)
     for start, end in zip(corners, ends, strict=True):
-        normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+        normal = field._outwards(start, end)
         assert np.linalg.norm(normal) == pytest.approx(1)
         assert normal @ (end - start) == pytest.approx(0)
         assert normal @ (start - middle) > 0
-        bent = field._bent(share, curve, start, end)  # pyright: ignore[reportPrivateUsage]
+        bent = field._bent(share, curve, start, end)
         # At its ends a Legendre series is the sum of its terms with alternating and with equal signs.
         np.testing.assert_allclose(bent[[0, -1]], [start - 0.5 * normal, end - 1.5 * normal])
         np.testing.assert_allclose(bent[20], (start + end) / 2 + 2 * normal)
-        found = field._curve_between(start, end, bent, 2)  # pyright: ignore[reportPrivateUsage]
+        found = field._curve_between(start, end, bent, 2)
         np.testing.assert_allclose(found, curve, atol=1e-9)
     sides = [start + share[3:-5, None] * (end - start) for start, end in zip(corners, ends, strict=True)]
-    np.testing.assert_allclose(field._corners_of(sides), corners)  # pyright: ignore[reportPrivateUsage]
-    np.testing.assert_allclose(field._sum(np.array([1.0, 2]), np.array([3.0])), [4, 2])  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(field._corners_of(sides), corners)
+    np.testing.assert_allclose(field._sum(np.array([1.0, 2]), np.array([3.0])), [4, 2])
 
 
 def test_outlines_are_the_same_whichever_corner_they_begin_with() -> None:
@@ -326,7 +326,7 @@ def test_a_step_on_a_profile_is_where_it_rises_to_paper() -> None:
     rows = np.repeat(0.3 + 0.7 * ndtr((across - at[:, None]) / 0.7), 3, axis=0).astype(np.float32)
     # Beyond the margin it is dark again, and a mark stands in the margin.
     rows[:, across > 16] = 0.1
-    off, strength = field._edges(rows, across, 1e3)  # pyright: ignore[reportPrivateUsage]
+    off, strength = field._edges(rows, across, 1e3)
     np.testing.assert_allclose(off[1::3], at, atol=0.05)
     # A step of 0.7 between two sigma to either side, its own blur and that of the profile taken together.
     wide = float(np.hypot(0.7, 1.0))
@@ -352,7 +352,7 @@ def painted(level: float = 1000, offset: tuple[float, float] = (0, 0), moved: fl
     y, x = np.mgrid[:300, :400].astype(np.float64)
     away = np.full(x.shape, -np.inf)
     for start, end in zip(QUAD, np.roll(QUAD, -1, axis=0), strict=True):
-        normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+        normal = field._outwards(start, end)
         away = np.maximum(away, (x + offset[0] - start[0]) * normal[0] + (y + offset[1] - start[1]) * normal[1])
     return Plane("G", (level * (0.4 + 0.6 * ndtr(away - moved))).astype(np.float32), offset)
 
@@ -376,13 +376,13 @@ def test_the_outline_of_a_field_is_traced_from_a_guess(
                           ((wide - 9, 1, wide - 1, 9), True), ((1, high - 9, 9, high - 1), True)):  # fmt: skip
         left, top, right, bottom = box
         outline = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])[:, None]
-        assert picture._touches_border(outline) is is_outer  # pyright: ignore[reportPrivateUsage]
+        assert picture._touches_border(outline) is is_outer
     assert any(field.same_corners(quad, QUAD, 6) for quad in picture.quads())
     found = field.trace_outline(picture, QUAD + np.array([[9, -7], [-8, 10], [6, 6], [10, 9]]))
     assert found is not None
     np.testing.assert_allclose(found.corners_px, QUAD, atol=0.2)
     for side, (start, end) in enumerate(zip(QUAD, np.roll(QUAD, -1, axis=0), strict=True)):
-        normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+        normal = field._outwards(start, end)
         assert len(found.sides_px[side]) == len(found.normals[side]) > 120
         np.testing.assert_allclose(found.normals[side], np.tile(normal, (len(found.normals[side]), 1)), atol=0.01)
         # At its ends a side is blurred with its neighbours.
@@ -400,7 +400,7 @@ def test_the_outline_of_a_field_is_traced_from_a_guess(
 
 def test_each_plane_s_edge_is_found_where_it_lies_in_it() -> None:
     start, end = QUAD[:2]
-    normal = field._outwards(start, end)  # pyright: ignore[reportPrivateUsage]
+    normal = field._outwards(start, end)
     places = start + np.linspace(0.1, 0.9, 30)[:, None] * (end - start)
     planes = [painted(), painted(500, (0.25, -0.25), 0.4), painted(5), painted(800, (0, 0), 2.5)]
     found, heights = refine_edges(planes, places, np.tile(normal, (30, 1)), 1.0)

@@ -217,7 +217,7 @@ def test_a_pose_is_read_off_the_homography(
 ) -> None:
     plane = Plane("G", np.zeros((100, 200), np.float32), (0.0, 0.0))
     homography = np.array([*rows, (0, 0, 1)], dtype=np.float64)
-    found = finding._pose(homography, replace(chart, page_mm=page), plane)  # pyright: ignore[reportPrivateUsage]
+    found = finding._pose(homography, replace(chart, page_mm=page), plane)
     assert found == (pytest.approx(fill), inside, pytest.approx(rotation))
 
 

@@ -232,7 +232,7 @@ def test_a_preview_is_brightened_to_a_hundredth_of_white_and_marks_what_deviates
 def test_the_blur_of_steps_is_found_without_their_heights(sigma: float, steps: tuple[float, ...]) -> None:
     aside = np.random.default_rng(0).uniform(-9, 9, 800)
     seen = 100 + sum((300 - 170 * number) * ndtr((aside - at) / sigma) for number, at in enumerate(steps))
-    assert sharpness._sigma(np.asarray(seen), aside, steps) == pytest.approx(sigma, rel=0.01)  # pyright: ignore[reportPrivateUsage]
+    assert sharpness._sigma(np.asarray(seen), aside, steps) == pytest.approx(sigma, rel=0.01)
 
 
 def test_a_movement_across_sides_is_a_shift_a_turn_and_a_growth() -> None:
@@ -247,7 +247,7 @@ def test_a_movement_across_sides_is_a_shift_a_turn_and_a_growth() -> None:
     away = np.stack([dx - turn * y + growth * x, dy + turn * x + growth * y], axis=1)
     moved = (away * normals).sum(axis=1)
     moved[5] = 3
-    found = pictures._similarity(middles, normals, moved, np.full(32, 100.0), made, 0.25)  # pyright: ignore[reportPrivateUsage]
+    found = pictures._similarity(middles, normals, moved, np.full(32, 100.0), made, 0.25)
     assert (found.dx, found.dy, found.gauges, found.blur_growth_px2) == pytest.approx((dx, dy, 32, 0.25), abs=0.02)
     u, v = ((corners - centre) / reach).T
     at_corners = np.hypot(dx - turn * v + growth * u, dy + turn * u + growth * v)

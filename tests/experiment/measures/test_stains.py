@@ -137,7 +137,7 @@ def test_a_neighbourhood_is_the_mean_of_five_cells_or_more_of_which_none_is_far_
     logs = np.full((13, 3), np.nan)
     logs[:5] = np.array([-0.02, -0.01, 0, 0.01, 0.5])[:, None]
     near = np.array([[*range(13)], [0, 1, 2, 3, *range(5, 13), 5]])
-    mean, error = module._of_neighbourhoods(logs, near)  # pyright: ignore[reportPrivateUsage]
+    mean, error = module._of_neighbourhoods(logs, near)
     usual = 0.01 / 0.674490
     bounded = np.array([-0.02, -0.01, 0, 0.01, 4 * usual])
     assert mean[0] == pytest.approx([np.expm1(bounded.mean())] * 3, rel=1e-5)
@@ -151,7 +151,7 @@ def test_a_curvature_is_the_median_of_nine_codes_beside_or_more(axis: int) -> No
     random = np.random.default_rng(axis)
     cube = random.normal(0, 1, (7, 7, 7, 3))
     cube[random.random(cube.shape) < 0.55] = np.nan
-    found = np.moveaxis(module._beside(cube, axis), axis, 0)  # pyright: ignore[reportPrivateUsage]
+    found = np.moveaxis(module._beside(cube, axis), axis, 0)
     given = np.moveaxis(cube, axis, 0)
     expected = np.full_like(given, np.nan)
     counts = np.zeros(given.shape, int)

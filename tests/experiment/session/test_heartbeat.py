@@ -193,7 +193,7 @@ class TestPlace:
         self, run: Path, kind: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         told, here = self.of(run)
-        monkeypatch.setattr(heartbeat, "file_system_of", lambda path: kind)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+        monkeypatch.setattr(heartbeat, "file_system_of", lambda path: kind)  # pyrefly: ignore[implicit-any-lambda]
         mounted = SessionPlace.of(run / "journal.sqlite")
         assert mounted is not None
         assert mounted.folder == here.folder

@@ -188,8 +188,8 @@ def test_the_file_systems_of_networks_are_known(tmp_path: Path, monkeypatch: pyt
         return mounts
 
     monkeypatch.setattr(Path, "read_text", read)
-    assert opening._on_network(tmp_path / "s" / "journal.sqlite")  # pyright: ignore[reportPrivateUsage]
-    assert not opening._on_network(Path("/journal.sqlite"))  # pyright: ignore[reportPrivateUsage]
+    assert opening._on_network(tmp_path / "s" / "journal.sqlite")
+    assert not opening._on_network(Path("/journal.sqlite"))
 
 
 def kill_a_run(path: Path) -> None:
@@ -299,7 +299,7 @@ def test_where_there_are_no_locks_it_goes_on_with_a_warning(
     path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """SQLite answers `database is locked` to ENOLCK and `disk I/O error` to EINVAL; both at the first look."""
-    real = opening._connect_with  # pyright: ignore[reportPrivateUsage]
+    real = opening._connect_with
 
     def connect(path: Path, parameters: str) -> sqlite3.Connection:
         if "nolock" not in parameters:

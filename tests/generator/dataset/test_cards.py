@@ -87,7 +87,7 @@ def test_the_card_is_what_the_hub_reads(made: Dataset) -> None:
     assert "color-constancy" in read.data.tags
     files = [entry for config in read.data.to_dict()["configs"] for entry in config["data_files"]]
     splits = made.description.splits
-    named: set[Split] = {part for part, images in splits.items() if images}  # pyright: ignore[reportAssignmentType]
+    named: set[Split] = {part for part, images in splits.items() if images}  # pyrefly: ignore[bad-assignment]
     layout = JOINED.get(made.layout)
     assert {entry["split"] for entry in files} == (named if layout and layout.is_of_the_hub else {"train"})
     for entry in files:

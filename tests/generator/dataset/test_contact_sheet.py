@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from generator.dataset.contact_sheet import MAX_COLUMNS, MAX_ROWS, contact_sheet
-from generator.dataset.contact_sheet import _draw as draw  # pyright: ignore[reportPrivateUsage] - before it is painted
+from generator.dataset.contact_sheet import _draw as draw
 from generator.dataset.layouts import Entry
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions

@@ -33,7 +33,7 @@ def test_shares_hold_on_average() -> None:
     parts = Counter(split_of(SHARES, 5, None, f"picture-{number}") for number in range(count))
     for part, share in zip(("train", "validation", "test"), SHARES, strict=True):
         # Six standard deviations of a binomial count: chance alone fails one of the three in 2·10⁸ runs.
-        assert abs(parts[part] - share * count) < 6 * math.sqrt(count * share * (1 - share))
+        assert abs(parts[part] - share * count) < 6 * math.sqrt(count * share * (1 - share))  # pyrefly: ignore[bad-index]
 
 
 @pytest.mark.slow

@@ -146,7 +146,7 @@ def test_by_colour_is_what_is_made_unasked_and_rendered_in_one_call(
     image = render(lut, first.read().picture, 3, seed=5, image=1)
     np.testing.assert_array_equal(image, dataset.read_image(dataset.entries[1]))
     with pytest.raises(InputError, match="'inks'"):
-        render(lut, first.read().picture, 3, rendering="inks")  # pyright: ignore[reportArgumentType] - the fault
+        render(lut, first.read().picture, 3, rendering="inks")  # pyrefly: ignore[bad-argument-type]
 
 
 def test_what_was_begun_or_made_by_codes_goes_on_so(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
@@ -291,4 +291,4 @@ def test_faults_are_named() -> None:
     with pytest.raises(InputError, match="a colour matrix is for colorimetric rendering"):
         DatasetOptions(rendering="codes", matrix=MATRIX)
     with pytest.raises(InputError, match="'inks'"):
-        DatasetOptions(rendering="inks")  # pyright: ignore[reportArgumentType] - the fault under test
+        DatasetOptions(rendering="inks")  # pyrefly: ignore[bad-argument-type]

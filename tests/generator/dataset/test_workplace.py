@@ -110,7 +110,7 @@ def killed_after(images: int, action: Callable[[], object]) -> None:
             if next(counted, None) is None:
                 os.kill(os.getpid(), signal.SIGKILL)
 
-        Workplace.note = noted
+        Workplace.note = noted  # pyrefly: ignore[method-assign]
         try:
             action()
         finally:

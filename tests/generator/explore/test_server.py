@@ -51,7 +51,7 @@ def test_a_picture_is_sent_and_shown(server: ExploreServer) -> None:
     status, headers, body = ask(server, "/counts?picture=0&light=1&rendering=codes")
     assert (status, headers["Content-Type"]) == (200, "application/octet-stream")
     assert np.frombuffer(body[:8], "<u4").tolist() == [30, 40]
-    explorer = server._explorer  # pyright: ignore[reportPrivateUsage]
+    explorer = server._explorer
     image = explorer.counts(0, "1", "codes")
     assert body[8:] == image.astype("<u2").tobytes()
     told = json.loads(ask(server, "/shown.json?picture=0&light=0:.5%2B2:.5")[2])

@@ -146,4 +146,4 @@ def test_sizes_that_raw_programs_do_not_open_are_refused() -> None:
 def test_the_matrix_of_srgb_is_the_inverse_of_the_standards() -> None:
     # Of IEC 61966-2-1, which gives it to four decimals beside its inverse.
     inverse = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-    np.testing.assert_allclose(np.array(files._SRGB) @ inverse, np.eye(3), atol=3e-4)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(np.array(files._SRGB) @ inverse, np.eye(3), atol=3e-4)

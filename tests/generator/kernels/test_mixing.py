@@ -104,7 +104,7 @@ def test_faults_are_named(make_lut: Callable[..., Lut]) -> None:
     with pytest.raises(InputError, match="the white level is 0"):
         mixed_table(samples[:1], [1], white_level=0)
     with pytest.raises(InputError, match="the samples are int64"):
-        mixed_table([samples[0].astype(np.int64)], [1])  # pyright: ignore[reportArgumentType] - the fault under test
+        mixed_table([samples[0].astype(np.int64)], [1])
 
 
 def weight_maps(height: int, width: int, lights: int) -> npt.NDArray[np.float32]:

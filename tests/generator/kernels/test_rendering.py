@@ -198,7 +198,7 @@ def test_render_replaces_unfit_colours_by_the_nearest(make_lut: Callable[..., Lu
 
 def test_a_picture_of_another_type_is_refused_before_anything_is_drawn(make_lut: Callable[..., Lut]) -> None:
     with pytest.raises(InputError, match="float64"):
-        render(make_lut(unfit=(0,)), np.zeros((4, 4, 3)), 0)  # pyright: ignore[reportArgumentType] - the fault under test
+        render(make_lut(unfit=(0,)), np.zeros((4, 4, 3)), 0)  # pyrefly: ignore[bad-argument-type]
 
 
 def test_a_light_that_is_not_there_is_named(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
@@ -216,7 +216,7 @@ def test_a_light_that_is_not_there_is_named(make_lut: Callable[..., Lut], pictur
 def test_wrong_shapes_and_numbers_are_named(picture: npt.NDArray[np.uint8]) -> None:
     samples = np.zeros((8, 25, 3), np.uint16)
     with pytest.raises(InputError, match="uint16"):
-        draw_samples(samples, picture.astype(np.uint16))  # pyright: ignore[reportArgumentType] - the fault under test
+        draw_samples(samples, picture.astype(np.uint16))  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(InputError, match=r"\(37, 1053\)"):
         draw_samples(samples, picture[..., 0])
     with pytest.raises(InputError, match="the samples are"):

@@ -156,7 +156,7 @@ def likelihood_of_uniform(values: npt.NDArray[np.float64]) -> float:
     """Return how likely uniform numbers (N,) of 0 … 1 are as uneven, by Kolmogorov's test."""
     steps = np.arange(len(values) + 1) / len(values)
     off = np.maximum(steps[1:] - np.sort(values), np.sort(values) - steps[:-1]).max()
-    return float(np.asarray(kolmogorov(np.sqrt(len(values)) * off), dtype=np.float64))  # pyright: ignore[reportUnknownArgumentType]
+    return float(np.asarray(kolmogorov(np.sqrt(len(values)) * off), dtype=np.float64))
 
 
 def test_uniform_fills_the_triangle_evenly() -> None:

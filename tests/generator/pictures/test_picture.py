@@ -80,8 +80,8 @@ def test_profiles_are_ignored_when_asked(tmp_path: Path, dull: Codes) -> None:
 
 
 def test_srgb_under_any_name_is_left_alone(tmp_path: Path, dull: Codes) -> None:
-    made = ImageCms.createProfile("sRGB")  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-    icc = ImageCms.ImageCmsProfile(made).tobytes()  # pyright: ignore[reportUnknownArgumentType]
+    made = ImageCms.createProfile("sRGB")
+    icc = ImageCms.ImageCmsProfile(made).tobytes()
     reading = open_picture(save(tmp_path / "picture.png", dull, icc))
     np.testing.assert_array_equal(reading.picture, dull)
     assert reading.profile.endswith("is sRGB")
@@ -237,7 +237,7 @@ def test_a_picture_smaller_than_the_crop_is_refused(tmp_path: Path) -> None:
 )
 def test_impossible_preparations_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(InputError):
-        Preparation(**wrong)  # pyright: ignore[reportArgumentType]
+        Preparation(**wrong)  # pyrefly: ignore[bad-argument-type]
 
 
 needs_avif = pytest.mark.skipif(not features.check("avif"), reason="this Pillow is without libavif")

@@ -87,7 +87,7 @@ def test_white_stays_to_the_last_bit_and_saturation_stays_saturated() -> None:
     samples = np.concatenate([np.repeat(BLACK[None, None], 25, axis=1), np.full((7, 25, 3), 3500)]).astype(np.uint16)
     provenance = SimpleNamespace(bits=1, white_level=3500, unfit=())
     lut = SimpleNamespace(samples=samples[None], white=WHITE[None] * 1.5, provenance=provenance, folder="lut")
-    got = without_veil(samples, veil_of(lut, plain(0), 0.97), 3500)  # pyright: ignore[reportArgumentType]
+    got = without_veil(samples, veil_of(lut, plain(0), 0.97), 3500)  # pyrefly: ignore[bad-argument-type]
     assert (got[1:] == 3500).all()
     assert got[0].max() < 9
 

@@ -310,14 +310,14 @@ def test_what_is_missed_and_its_slopes_are_those_of_the_print_between_its_cells(
     print_at = RegularGridInterpolator([np.arange(side)] * 3, cells, bounds_error=False, fill_value=None)
     # Brightness counts half of what chromaticity does; each is seen along axes of length 1.
     scale = np.array([[0.5**0.5 / 3**0.5] * 3, [0.5**0.5, 0, -(0.5**0.5)], [6**-0.5, -2 * 6**-0.5, 6**-0.5]])
-    np.testing.assert_allclose(print_inverse._SCALE, scale)  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(print_inverse._SCALE, scale)
 
     def missed(place: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         return scale @ (np.log(print_at(place)[0]) - target)
 
     for place in [*rng.uniform(0.1, 2.9, (9, 3)), np.zeros(3), np.full(3, 3.0)]:
         miss, slopes = np.empty(3), np.empty((3, 3))
-        square = print_inverse._look(colours, place, target, side, scale, miss, slopes)  # pyright: ignore[reportPrivateUsage]
+        square = print_inverse._look(colours, place, target, side, scale, miss, slopes)
         np.testing.assert_allclose(miss, missed(place))
         assert square == pytest.approx((miss**2).sum())
         steps = 1e-5 * np.eye(3)

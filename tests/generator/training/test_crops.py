@@ -231,7 +231,7 @@ def test_unfit_colours_take_their_stand_ins(make_lut: MakeLut) -> None:
 def test_what_cannot_be_is_refused(make_lut: MakeLut, gallery: Gallery, wrong: dict[str, object], word: str) -> None:
     arguments: dict[str, object] = {"size": (4, 4)} | wrong
     with pytest.raises(InputError, match=word):
-        Crops(make_lut(bits=BITS), gallery, **arguments)  # pyright: ignore[reportArgumentType]
+        Crops(make_lut(bits=BITS), gallery, **arguments)  # pyrefly: ignore[bad-argument-type]
 
 
 def test_items_that_are_not_there(make_lut: MakeLut, gallery: Gallery) -> None:
@@ -310,7 +310,7 @@ def test_crops_by_colour_are_windows_of_the_image_that_is_rendered_so(make_lut: 
 def test_renderings_that_cannot_be_are_named(make_lut: MakeLut, gallery: Gallery) -> None:
     lut = make_lut(bits=BITS)
     with pytest.raises(InputError, match="'inks'"):
-        Crops(lut, gallery, (5, 6), rendering="inks")  # pyright: ignore[reportArgumentType] - the fault under test
+        Crops(lut, gallery, (5, 6), rendering="inks")  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(InputError, match="a colour matrix is for colorimetric rendering"):
         Crops(lut, gallery, (5, 6), rendering="codes", matrix=MATRIX)
 

@@ -124,13 +124,13 @@ def test_the_tags_of_a_550d_file_are_those_of_the_standard() -> None:
 
 
 def test_colours_of_bodies_are_those_that_libraw_has_and_of_unknown_ones_srgb_s() -> None:
-    for sensitivities, numbers in film._COLOUR_MATRICES.items():  # pyright: ignore[reportPrivateUsage]
+    for sensitivities, numbers in film._COLOUR_MATRICES.items():
         theirs = camera_matrix(sensitivities.replace("_", " "))
         assert theirs is not None
         np.testing.assert_allclose(np.array(numbers).reshape(3, 3) / 1e4, theirs, atol=1e-6)
     # IEC 61966-2-1: linear sRGB to XYZ.
     to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    unknown = np.array(film._LINEAR_SRGB).reshape(3, 3) / 1e4  # pyright: ignore[reportPrivateUsage]
+    unknown = np.array(film._LINEAR_SRGB).reshape(3, 3) / 1e4
     np.testing.assert_allclose(unknown @ to_xyz, np.eye(3), atol=2e-4)
 
 
@@ -261,13 +261,13 @@ def test_a_stream_that_cannot_seek_will_do() -> None:
             return True
 
         def write(self, data: object) -> int:
-            piece = bytes(memoryview(data))  # pyright: ignore[reportArgumentType] - io's own type has no public name
+            piece = bytes(memoryview(data))  # pyrefly: ignore[bad-argument-type]
             self.received += piece
             return len(piece)
 
     body = BODIES["Test"]
     pipe = Pipe()
-    write_dng(pipe, mosaic(body), body, settings=SETTINGS, taken_at=TAKEN_AT, serial="062031400123")  # pyright: ignore[reportArgumentType] - a raw stream suffices
+    write_dng(pipe, mosaic(body), body, settings=SETTINGS, taken_at=TAKEN_AT, serial="062031400123")  # pyrefly: ignore[bad-argument-type]
     assert bytes(pipe.received) == dng(body)
 
 

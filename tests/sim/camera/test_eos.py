@@ -633,7 +633,7 @@ def test_film_that_cannot_be_exposed_so_is_a_release_that_fails(host: Host) -> N
     def refuse(settings: ExposureSettings) -> None:
         raise DeviceRefused(f"not at ISO {settings.iso}")
 
-    host.film.accept = refuse
+    host.film.accept = refuse  # pyrefly: ignore[method-assign]
     assert host.press() == ResponseCode.GENERAL_ERROR
     assert len(host.film.frames) == 1
 

@@ -100,7 +100,7 @@ def test_shoulders_spread_a_share_of_a_squares_light_as_the_profile_says() -> No
     world = World(
         white_squares(np.array([[90.0, 62.5]]), side),
         BODIES["Test"],
-        replace(Room(shoulder_share=share, shoulder_px=scale, tilt_deg=0, pan_deg=0, roll_deg=0), **FLAT),
+        replace(Room(shoulder_share=share, shoulder_px=scale, tilt_deg=0, pan_deg=0, roll_deg=0), **FLAT),  # pyrefly: ignore[bad-argument-type]
     )
     seen = planes(world.signal(WHITE, REFERENCE_EXPOSURE))["G"]
     white, black = (world.reflected([code], WHITE, REFERENCE_EXPOSURE)[0, 1] for code in ((255,) * 3, (0,) * 3))
@@ -165,7 +165,7 @@ def test_each_channel_lies_where_project_says() -> None:
     x, y = np.meshgrid([12.0, 50.0, 90.0, 131.0, 168.0], [12.0, 62.0, 113.0])
     centres = np.column_stack([x.ravel(), y.ravel()])
     room = Room(lateral_red_px=1.5, lateral_blue_px=-0.8, blur_px=0.8, seed=4, tilt_deg=3, pan_deg=4)
-    room = replace(room, **EVEN)
+    room = replace(room, **EVEN)  # pyrefly: ignore[bad-argument-type]
     world = World(white_squares(centres, 3.0), BODIES["Test"], room)
     for channel, plane in planes(world.signal(WHITE, REFERENCE_EXPOSURE)).items():
         truth = world.project(centres, channel)
@@ -216,4 +216,4 @@ def test_a_curl_lifts_both_edges_and_shrinks_with_the_sheet() -> None:
 )
 def test_settings_out_of_range_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
-        replace(Room(), **wrong)
+        replace(Room(), **wrong)  # pyrefly: ignore[bad-argument-type]

@@ -128,14 +128,14 @@ def test_ink_codes_between_nodes_lie_between_those_of_nodes() -> None:
 def test_an_unmanaged_print_sends_codes_as_they_are_and_unknown_names_are_refused() -> None:
     assert np.array_equal(printed_reflectance(CODES), print_reflectance(CODES))
     with pytest.raises(ValueError, match="profile 'icc': known are unmanaged, managed"):
-        printed_reflectance(CODES, "icc")  # pyright: ignore[reportArgumentType]
+        printed_reflectance(CODES, "icc")  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(ValueError, match="paper 'silk': known are poster, matt, glossy"):
-        printed_reflectance(CODES, "managed", "silk")  # pyright: ignore[reportArgumentType]
+        printed_reflectance(CODES, "managed", "silk")  # pyrefly: ignore[bad-argument-type]
 
 
 def test_srgb_under_d50_is_the_adapted_matrix_of_its_primaries() -> None:
     space = colour.RGB_COLOURSPACES["sRGB"]
     whites: Any = [colour.xy_to_XYZ(xy) for xy in (space.whitepoint, (0.3457, 0.3585))]
     adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(*whites, transform="Bradford")
-    found = spectral._SRGB_TO_D50  # pyright: ignore[reportPrivateUsage]
+    found = spectral._SRGB_TO_D50
     np.testing.assert_allclose(found, adapt @ space.matrix_RGB_to_XYZ, atol=2e-4)

@@ -483,6 +483,6 @@ def squares_sheet() -> Print:
     ],
 )
 def test_numbers_that_no_sensor_has_are_refused(changed: dict[str, Any], allowed: bool) -> None:
-    require = sensors._require_sensor  # pyright: ignore[reportPrivateUsage]
+    require = sensors._require_sensor
     with nullcontext() if allowed else pytest.raises(ConfigurationError, match=f"body.{next(iter(changed))} is"):
         require(replace(BODIES["Test"], **changed), "lab.toml", "body")

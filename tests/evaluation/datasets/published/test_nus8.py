@@ -52,7 +52,7 @@ def test_levels_mask_and_truth_of_each_camera(copy: Path) -> None:
 
 def test_the_published_numbers_are_those_of_the_whole_set() -> None:
     # The authors' page: eight cameras, 1736 images; with the ninth 1853, as in the list of their ground truths.
-    counts = dict(published._PUBLISHED)  # pyright: ignore[reportPrivateUsage]
+    counts = dict(published._PUBLISHED)
     assert (len(counts), counts.pop("NikonD40"), sum(counts.values())) == (9, 117, 1736)
     assert counts["Canon1DsMkIII"] == 259
 

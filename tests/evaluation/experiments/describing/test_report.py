@@ -147,7 +147,7 @@ QUANTITY = {quantity.name: quantity for quantity in QUANTITIES}
 def test_a_figure_is_alike_within_a_quarter(
     name: str, scale: float, change: tuple[float, float, float], verdict: Verdict | None
 ) -> None:
-    assert report._verdict(QUANTITY[name], change, scale) == verdict  # pyright: ignore[reportPrivateUsage]
+    assert report._verdict(QUANTITY[name], change, scale) == verdict
     made = FigureCompared(QUANTITY[name], 3.0, 4.0, change, scale, 0.1, 0.5, verdict)
     told = sentence(made, ("a", "b"))
     ends = {
@@ -193,13 +193,13 @@ def test_figures_show_what_the_descriptions_hold(monkeypatch: pytest.MonkeyPatch
     lights = np.random.default_rng(0).dirichlet((9, 9, 9), 3001)
     one = replace(one, lights=lights)
     other = replace(other, lights=lights[:3000])
-    (axes,) = drawn_by(lambda: report._luminance((one, other)), monkeypatch)  # pyright: ignore[reportPrivateUsage]
+    (axes,) = drawn_by(lambda: report._luminance((one, other)), monkeypatch)
     for patch, made in zip(axes.patches, (one, other), strict=True):
         values, edges, _ = patch.get_data()
         np.testing.assert_allclose(values, 100 * made.luminance)
         np.testing.assert_allclose(np.log10(edges), LUMINANCE_EDGES)
     assert (axes.get_xscale(), axes.get_ylim()[0]) == ("log", 0)
-    both = drawn_by(lambda: report._chroma((one, other)), monkeypatch)  # pyright: ignore[reportPrivateUsage]
+    both = drawn_by(lambda: report._chroma((one, other)), monkeypatch)
     top = max(one.chroma.max(), other.chroma.max())
     for axes, made in zip(both, (one, other), strict=True):
         (image,) = axes.images
@@ -210,7 +210,7 @@ def test_figures_show_what_the_descriptions_hold(monkeypatch: pytest.MonkeyPatch
         assert image.get_clim() == pytest.approx((0, top**0.4))
         assert [line.get_xydata()[0].tolist() for line in axes.lines] == [[0, 0], [0, 0]]
         assert axes.get_subplotspec().get_gridspec().get_geometry() == (1, 2)
-    (axes,) = drawn_by(lambda: report._lights((one, other)), monkeypatch)  # pyright: ignore[reportPrivateUsage]
+    (axes,) = drawn_by(lambda: report._lights((one, other)), monkeypatch)
     few, all_ = (np.asarray(points.get_offsets()) for points in axes.collections)
     np.testing.assert_allclose(few, lights[::2, [0, 2]])
     np.testing.assert_allclose(all_, lights[:3000, [0, 2]])
@@ -221,7 +221,7 @@ def test_the_figure_of_noise_shows_the_fitted_curve(monkeypatch: pytest.MonkeyPa
     plain = describe(random_set("a", 3))
     fitted = replace(plain, noise=(NoiseCurve(()), NoiseCurve(levels, 0.03, 0.16, 0.1), NoiseCurve(())))
     bare = replace(plain, noise=(NoiseCurve(()), NoiseCurve(levels[:2]), NoiseCurve(())))
-    (axes,) = drawn_by(lambda: report._noise((fitted, bare)), monkeypatch)  # pyright: ignore[reportPrivateUsage]
+    (axes,) = drawn_by(lambda: report._noise((fitted, bare)), monkeypatch)
     points, curve, others = axes.lines
     np.testing.assert_allclose(points.get_xydata(), [[0.01, 0.001], [0.1, 0.01], [1, 0.1]])
     np.testing.assert_allclose(others.get_xydata(), [[0.01, 0.001], [0.1, 0.01]])
@@ -229,10 +229,10 @@ def test_the_figure_of_noise_shows_the_fitted_curve(monkeypatch: pytest.MonkeyPa
     np.testing.assert_allclose(signal[[0, -1]], [0.01, 1])
     np.testing.assert_allclose(sigma**2, 0.03**2 + 0.16 * signal)
     other_unit = replace(fitted, noise_unit="another")
-    (axes,) = drawn_by(lambda: report._noise((bare, other_unit)), monkeypatch)  # pyright: ignore[reportPrivateUsage]
+    (axes,) = drawn_by(lambda: report._noise((bare, other_unit)), monkeypatch)
     assert len(axes.lines) == 1
     nothing = replace(plain, noise=(NoiseCurve(()),) * 3)
-    assert report._noise((nothing,)) == []  # pyright: ignore[reportPrivateUsage]
+    assert report._noise((nothing,)) == []
 
 
 def test_six_sizes_are_listed_and_the_others_counted() -> None:

@@ -28,7 +28,7 @@ def drawn(draw: Any, *arguments: Any) -> list[Any]:
 @pytest.mark.slow
 def test_each_method_has_its_medians_and_that_of_the_images_as_they_are() -> None:
     found = bits_removed([Photo(photo(seed)) for seed in range(3)], bits_methods(sigma=2), (0, 5))
-    (axes,) = drawn(reporting._draw_bits, found, "recovery")  # pyright: ignore[reportPrivateUsage]
+    (axes,) = drawn(reporting._draw_bits, found, "recovery")
     lines = axes.lines
     assert len(lines) == 2 * len(found.raw)
     for place, raw in enumerate(found.raw):
@@ -48,7 +48,7 @@ def test_each_method_has_its_medians_and_that_of_the_images_as_they_are() -> Non
 def test_each_data_set_has_its_medians_by_the_side_of_its_images() -> None:
     cells = ("C1", "6D", "Random"), ("C1", "550D", "Random")
     rows = [SizeRow(cell, side, {"M": number + side / 100}) for number, cell in enumerate(cells) for side in (12, 48)]
-    (axes,) = drawn(reporting._draw_sizes, rows, "M")  # pyright: ignore[reportPrivateUsage]
+    (axes,) = drawn(reporting._draw_sizes, rows, "M")
     shown = {line.get_label(): (list(line.get_xdata()), list(line.get_ydata())) for line in axes.lines}
     assert shown == {
         "C1 scenes, 6D sensor, random illuminations": ([12, 48], [0.12, 0.48]),
@@ -62,7 +62,7 @@ def test_lights_and_ground_truths_lie_at_their_chromaticities(make_table: TableM
     luts = [make_table("Canon EOS 550D"), make_table("Test")]
     # Two of three that no eye tells apart are one dot.
     truths = np.concatenate([LIGHTS[:2], LIGHTS[:1] * 1.0001])
-    left, right = drawn(reporting._draw_chromaticities, luts, {"Mine": truths})  # pyright: ignore[reportPrivateUsage]
+    left, right = drawn(reporting._draw_chromaticities, luts, {"Mine": truths})
     assert (left.get_title(), right.get_title()) == ("Canon EOS 550D", "Test")
     assert left.get_position().x1 < right.get_position().x0
     for axes in (left, right):
