@@ -3,11 +3,12 @@
 `python -m tests.mutations [--count 60] [--seed 1] [--results FILE]` changes one place at a time in a copy of the
 repository (a comparison, an operator, a number), runs the tests that can reach it, and prints one JSON object
 a mutation and one for the whole. Every place is as likely, so that packages have their share by size. A mutation is
-killed where a test fails or does not end, and passes without it. Which tests run a place is found first, by one run
-of them all that notes the lines of each (a quarter of an hour), which is kept in `build/mutations` until the product or
-the tests change. They are tried from the quickest on until one fails or `--limit` seconds are over: what survives these
-is said to survive. `--results` keeps what was tried, so that a run that was stopped goes on; `--again` tries what
-survived there once more, wherever its line is now.
+killed where `make test` would fail: a test fails or does not end, and passes without it, or types do not fit. Which
+tests run a place is found first, by one run of them all that notes the lines of each (a quarter of an hour), which is
+kept in `build/mutations` until the product or the tests change. They are tried from the quickest on until one fails or
+`--limit` seconds are over: what survives these, and the checker of types, is said to survive. `--results` keeps what
+was tried, so that a run that was stopped goes on; `--again` tries what survived there once more, wherever its line is
+now.
 
 Not drawn are annotations, messages, numbers that are an index, and what only type checkers read.
 """
@@ -45,6 +46,17 @@ ROOT = Path(__file__).parents[1]
 PACKAGES: list[str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["root_packages"]
 TRACED_INTO = "CROP_TRACED_INTO"
 """Names the folder to a run of pytest that has this file as a plugin, in which it keeps the lines of each test."""
+
+STARTED = """
+[run]
+parallel = true
+sigterm = true
+context = ${PYTEST_CURRENT_TEST}
+data_file = ${CROP_TRACED_INTO}/lines
+source_pkgs = %s
+disable_warnings = module-not-imported, no-data-collected, module-not-measured
+"""
+"""How coverage.py notes the lines of programs that tests start."""
 
 ENDLESS_S = 90
 """Time after which a test is said not to end: half as long again as the slowest takes beside others."""
@@ -180,8 +192,9 @@ def _rows(results: Path | None) -> list[dict[str, Any]]:
 class Covered:
     """Which lines of the product each test runs, and how long it takes; made once for a state of the product.
 
-    `folder`: where it is kept. Coverage.py sees the lines that the interpreter runs, in the tests' own process: those
-    of compiled functions, and what is run once, on import, are looked for by their names.
+    `folder`: where it is kept. Coverage.py sees the lines that the interpreter runs, in the tests' own process and in
+    programs that they start: those of compiled functions, and what is run once, on import, are looked for by their
+    names.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -213,7 +226,8 @@ class Covered:
 
     def _running(self, file: str, lines: Iterable[int]) -> set[str]:
         known = self._lines(file)
-        return {test for line in lines for test in known.get(line, ()) if test}
+        # Programs that a test started name its stage as well: "tests/a.py::test (call)".
+        return {test.partition(" (")[0] for line in lines for test in known.get(line, ()) if test} & self.seconds.keys()
 
     @cache  # noqa: B019 - there is one as long as the program runs
     def _lines(self, file: str) -> dict[int, list[str]]:
@@ -224,12 +238,19 @@ def _trace(folder: Path) -> None:
     """Run all tests in a copy of the checkout, and keep in a folder which lines each of them ran."""
     shutil.rmtree(folder, ignore_errors=True)
     copy = copied(folder / "copy")
+    # Python runs this file as it starts, where it is on its path.
+    (copy / "sitecustomize.py").write_text(
+        "import os\n\nif 'PYTEST_CURRENT_TEST' in os.environ:\n    import coverage\n\n    coverage.process_startup()\n",
+        encoding="utf-8",
+    )
+    (copy / "started.ini").write_text(STARTED % ", ".join(PACKAGES), encoding="utf-8")
+    started = {"COVERAGE_PROCESS_START": str(copy / "started.ini"), TRACED_INTO: str(folder.absolute())}
     plugged = ["-p", "tests.mutations", "-n", "auto", "--dist", "worksteal", "-q"]
     subprocess.run(
         [sys.executable, "-m", "pytest", *plugged, "--tb=no"],
         cwd=copy,
         # Without what it forbids, each worker of pytest would compile every test anew.
-        env=_environment(copy) | {TRACED_INTO: str(folder.absolute()), "PYTHONDONTWRITEBYTECODE": ""},
+        env=_environment(copy) | started | {"PYTHONDONTWRITEBYTECODE": ""},
         stdout=sys.stderr,
         check=False,
     )
@@ -353,6 +374,18 @@ def killed_by(
     return killed_by(mutation, covered, folder, end_s - time.monotonic(), (*left_out, failed))
 
 
+def misfits(mutation: Mutation, folder: Path) -> bool:
+    """Return whether the checker of types refuses a mutation in a copy of the checkout."""
+    known_text = mutation.apply(folder)
+    checker = [Path(sys.executable).with_name("pyrefly"), "check", "--threads", "1", "--summary=none"]
+    try:
+        return subprocess.run(
+            [*checker, "--python-interpreter-path", sys.executable], cwd=folder, capture_output=True, check=False
+        ).returncode != 0  # fmt: skip
+    finally:
+        (folder / mutation.file).write_text(known_text, encoding="utf-8")
+
+
 def tested(folder: Path, words: list[str], limit_s: float) -> tuple[int | str, str]:
     """Run tests in a copy of the checkout; return pytest's exit status or "no time", and the test that failed."""
     endless = ("-o", f"faulthandler_timeout={ENDLESS_S}", "-o", "faulthandler_exit_on_timeout=true")
@@ -427,7 +460,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return bool(known[mutation])
             folder = free.get()
             try:
-                by = killed_by(mutation, covered, folder, given.limit)
+                by = killed_by(mutation, covered, folder, given.limit) or "types" * misfits(mutation, folder)
             finally:
                 free.put(folder)
             row = json.dumps({"mutation": asdict(mutation), "killed by": by or None})
