@@ -34,6 +34,9 @@ NOTHING = 1e-9
 WHOLE = 64
 """Values up to which an array is written out."""
 
+SHORT = 400
+"""Characters up to which a value is written on one line."""
+
 SHOWN = 20
 """Differences that are told."""
 
@@ -53,11 +56,31 @@ class Pinned:
         path = FOLDER / f"{name}.json"
         now = plain(found)
         if self._renew:
-            path.write_text(json.dumps(now, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+            path.write_text(written(now) + "\n", encoding="utf-8")
         kept = json.loads(path.read_text(encoding="utf-8"))
         moved = list(differences(kept, now, same, nothing))
         more = f"\nand {len(moved) - SHOWN} more" if len(moved) > SHOWN else ""
         assert not moved, f"{path.name}, was and is:\n" + "\n".join(moved[:SHOWN]) + more
+
+
+def written(value: Any, indent: str = "") -> str:
+    """Return a plain value as JSON: on one line where it is short, or a list or record of numbers and words alone."""
+    inner: list[Any] = list(value.values()) if isinstance(value, dict) else value
+    line = json.dumps(value, ensure_ascii=False)
+    if (
+        len(line) <= SHORT
+        or not isinstance(value, (dict, list))
+        or not any(isinstance(one, (dict, list)) for one in inner)
+    ):
+        return line
+    names = (
+        [f"{json.dumps(name, ensure_ascii=False)}: " for name in value]
+        if isinstance(value, dict)
+        else [""] * len(inner)
+    )
+    parts = [f"{indent} {name}{written(one, f'{indent} ')}" for name, one in zip(names, inner, strict=True)]
+    first, last = "{}" if isinstance(value, dict) else "[]"
+    return "\n".join([first, ",\n".join(parts), f"{indent}{last}"])
 
 
 def differences(kept: Any, now: Any, same: float, nothing: float, place: str = "") -> Iterator[str]:
@@ -79,12 +102,12 @@ def differences(kept: Any, now: Any, same: float, nothing: float, place: str = "
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON holds it: numbers to nine digits, long arrays by what any change of them would change."""
+    """Return a value as JSON holds it: numbers to eight digits, long arrays by what any change of them would change."""
     match value:
         case bool() | int() | str() | None:
             return value
         case float():
-            return float(f"{value:.9g}") if math.isfinite(value) else str(value)
+            return float(f"{value:.8g}") if math.isfinite(value) else str(value)
         case bytes() | bytearray() | memoryview():
             return {"bytes": len(value), "sha256": hashlib.sha256(value).hexdigest()}
         case np.generic():

@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests import pinned as kit
-from tests.pinned import Pinned, plain
+from tests.pinned import Pinned, plain, written
 from tests.pinned.drawn import drawn
 
 
@@ -78,3 +78,11 @@ def test_a_line_that_is_drawn_elsewhere_is_told(kept: Pinned) -> None:
 def test_every_value_is_one_of_json() -> None:
     found = plain({1: (b"ab", np.float32(0.5), Path("/a/b"), {"b", "a"}, float("inf"), None, np.arange(3))})
     assert json.loads(json.dumps(found))["1"][1:] == [0.5, "b", ["a", "b"], "inf", None, [0, 1, 2]]
+
+
+@pytest.mark.parametrize(
+    "value", [1, [], {}, [1, [2, "a"], {"b": [], "c": {"d": [[1.5]]}}], {"a": None, "b": {"c": True}}]
+)
+def test_what_is_written_is_json_of_the_same_value(value: Any) -> None:
+    assert json.loads(written(value)) == value
+    assert "\n" not in written([1, "a", None])
