@@ -198,8 +198,8 @@ def _describe(bus_id: str, device: PtpUsbDevice) -> bytes:
     )
 
 
-_READ = 256 * 1024
-"""Bytes read at once; large beside a request, so that a long transfer out takes few calls."""
+_READ = 128 * 1024
+"""Bytes read at once: few calls for a long transfer out, and no buffer that has to be mapped anew for each request."""
 _TICK_S = 0.02
 """Between two looks at transfers that wait for data: short beside the times a host waits."""
 _TIMEOUT_S = 10.0
