@@ -144,16 +144,16 @@ def test_what_methods_share_of_an_image(case: str, pinned: Pinned) -> None:
     one = PreparedImage(*CASES[case])
     found = {
         "peak, scale, white": (one.peak, one.scale / 2.0**60, one.white),
-        "usable": {border: np.packbits(one.usable(border)) for border in (0, 1, 3, 20)},
+        "usable": {border: np.packbits(one.usable(border)) for border in (0, 3)},
         "moments": {border: one.moments(border) / 2.0 ** (border % 2) for border in (0, 1, 2, 5)},
         "norms": {f"{p} {border}": one.norm(0, 0, p, border) for p in (1, 1.5, 3, 20, np.inf) for border in (0, 2)},
         "derivatives": {
             f"{order} {sigma}": one.derivative(order, sigma)
             for order in (0, 1, 2)
-            for sigma in (0.3, 1.0, 2.6, 9.0)
+            for sigma in (0.3, 1.0, 4.6)
             if order or sigma
         },
-        "smaller": [[small.image, small.usable(0)] for small in map(one.at_most, (4, 9, 20, 64))],
+        "smaller": [[small.image, small.usable(0)] for small in map(one.at_most, (4, 20, 64))],
         "shrunk": [prepared.shrink(one.image, one.usable(1), 5, least) for least in (0.0, 0.3, 0.75)],
     }
     pinned(f"shared parts of an image, {case}", found, same=1e-5, nothing=0 if case == "tiny values" else 1e-6)

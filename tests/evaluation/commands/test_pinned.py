@@ -1,0 +1,131 @@
+"""What every command prints and writes of small data sets, to the last digits: no change may move it unseen."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evaluation.cli import main
+from tests.evaluation.datasets.made_up import COPIES
+from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
+from tests.evaluation.learning.made_up_world import world
+from tests.evaluation.shown import compact, contents, printed, recorded_figures
+from tests.pinned import Pinned
+
+pytestmark = pytest.mark.slow
+
+
+def save_world(path: Path, count: int, seed: int, first: int = 0) -> None:
+    scenes = world(count, seed, size=24)
+    np.savez(
+        path,
+        images=np.stack([scene.image for scene in scenes]),
+        gt=np.stack([scene.truth for scene in scenes]),
+        names=np.array([f"{path.stem} {number + first}" for number in range(count)]),
+    )
+
+
+@pytest.fixture(scope="module")
+def made_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a generated set, its pictures and table, two sets of thumbnails, and copies of layouts."""
+    folder = tmp_path_factory.mktemp("place")
+    save_pictures(folder / "pictures", [f"{number}.png" for number in range(6)])
+    Maker(folder, write_table(folder / "lut")).make()
+    save_world(folder / "world.npz", 14, 0)
+    save_world(folder / "other.npz", 9, 5)
+    for layout in ("lsmi", "folder", "nus8"):
+        COPIES[layout].make(folder / layout)
+    return folder
+
+
+@pytest.fixture
+def place(made_place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a working folder that is a copy of it."""
+    shutil.copytree(made_place, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+SEQUENCES: dict[str, tuple[str, ...]] = {
+    "run": (
+        "run world.npz --methods standard --out out --workers 1 --json",
+        "run lsmi --methods gray-world,gray-world-by-patches,grayness-index-local --saturation 20000 --out mixed --workers 1",
+        "run folder --methods all --statistics all --error recovery --saturation 20000 --csv t.csv --images i.csv "
+        "--workers 1",
+        "run made --method gray-edge-2@12 --method shades-of-gray:p=3 --workers 1 --json",
+        "run nus8 --camera SonyA57 --black 100 --saturation 5000 --methods white-patch --workers 1 --json",
+    ),
+    "cv": (
+        "cv kernel-ridge,smart-color-cat world.npz --out out --save-folds folds.csv --workers 1 --json",
+        "cv constant-light made --folds 2 --seed 3 --statistics all --error recovery --workers 1",
+        "cv kernel-ridge world.npz --folds folds.csv --workers 1",
+    ),
+    "train": (
+        "train kernel-ridge world.npz --out a.npz --workers 1",
+        "train kernel-ridge other.npz --adapt a.npz --seed 2 --out b.npz --workers 1",
+        "run other.npz --method a.npz --method b.npz --workers 1 --json",
+        "run world.npz --method a.npz --workers 1",
+    ),
+    "tune": (
+        "tune shades-of-gray world.npz --workers 1 --json",
+        "tune gray-edge-1@24 made --errors recovery --out s.csv --workers 1",
+    ),
+    "compare": (
+        "run world.npz --methods standard --out one --workers 1",
+        "run world.npz --method gray-world --method pca --saturation 0.3 --out two --workers 1",
+        "compare one --method pca --method gray-world --out cmp --json",
+        "compare one two --error recovery --level 0.9 --seed 3",
+        "compare one two --method gray-world=pca --images",
+        "compare one",
+    ),
+    "describe": (
+        "describe world.npz --against made --out s.json --report page.html --workers 1 --json",
+        "describe s.json --against nus8 --cells 4 --workers 1",
+        "describe lsmi --saturation 20000 --workers 1",
+    ),
+    "transfer": (
+        "transfer --train made --test world.npz --methods kernel-ridge --statistics gray-world --naive pictures "
+        "--real 3,all --images 8 --seeds 2 --out one --error recovery --workers 1 --json",
+        "transfer --train made --test other.npz --methods kernel-ridge --statistics gray-world --naive pictures "
+        "--real 3,all --images 8 --seeds 2 --out two --side 8 --error recovery --workers 1",
+        "pool one two --base made:\\ generated --out pooled --json",
+    ),
+    "paper": (
+        "paper table1 lut --pictures pictures --lights-like world.npz --side 16 --sizes 8,24 --hot 500 --out t1 "
+        "--workers 1 --json",
+        "paper table1 lut --pictures other.npz --matrix Canon\\ EOS\\ 550D --lights-like other.npz --side 8 --seed 2 "
+        "--error recovery --workers 1",
+        "paper table2 world.npz --generated made --methods smart-color-cat --folds 2 --out t2 --workers 1 --json",
+        "paper bits other.npz --sigma 1.5 --out bits --workers 1 --json",
+        "paper flash other.npz --out codes --clear 3 --workers 1 --json",
+        "paper flash-inverse codes --out linear --workers 1 --json",
+        "run linear --methods gray-world --workers 1 --json",
+        "paper reduction pictures/0.png --out reduction --json",
+        "paper chromaticities lut --truths world.npz --out lights --json",
+    ),
+}
+"""Commands that are run one after another."""
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_commands(
+    name: str, place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = recorded_figures(monkeypatch)
+    before = set(place.rglob("*"))
+    told: dict[str, Any] = {}
+    for command in SEQUENCES[name]:
+        assert main(shlex.split(command)) == 0, command
+        out = capsys.readouterr().out
+        told[command] = compact(json.loads(out)) if command.endswith("--json") else printed(out)
+    new = [path for path in sorted(place.rglob("*")) if path not in before and path.is_file()]
+    if name == "transfer":  # Its tables are printed as well, and are many.
+        new = [path for path in new if path.suffix != ".tex"]
+    files = {path.relative_to(place).as_posix(): contents(path) for path in new}
+    pinned(f"commands, {name}", {"told": told, "files": files, "figures": figures}, nothing=1e-7)
