@@ -11,10 +11,13 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from matplotlib.figure import Figure
 
+from evaluation.results.tables import Table
 from foundation.version import software
+from tests.pinned import WHOLE
 from tests.pinned.drawn import drawn
 
 # What is shown is of any kind.
@@ -33,19 +36,25 @@ def printed(text: str) -> list[str]:
 
 
 MANY = 12
-"""Texts from which a column is told by its kinds and their places."""
+"""Texts from which a column is told by its kinds and their places; numbers above twice as many by their sums."""
+
+
+def numbers(values: Any) -> npt.NDArray[np.float64]:
+    """Return numbers as an array (N,), nothing as NaN; many followed by zeros, so that they are kept by their sums."""
+    found = np.array(values, dtype=np.float64).ravel()
+    return np.pad(found, (0, WHOLE)) if len(found) > 2 * MANY else found
 
 
 def column(values: Sequence[Any]) -> Any:
     """Return numbers and nothing (NaN) as an array, many texts by their kinds, others as they are."""
     if all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values):
-        return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+        return numbers(values)
     parts = [compact(value) for value in values]
     if all(isinstance(part, np.ndarray) for part in parts) and len({part.shape for part in parts}) == 1:
         return np.stack(parts)
     if len(parts) > MANY and all(isinstance(part, str) for part in parts):
         kinds = list(dict.fromkeys(parts))
-        return {"texts": kinds, "places": np.array([kinds.index(part) for part in parts])}
+        return {"texts": kinds, "places": numbers([kinds.index(part) for part in parts])}
     return parts
 
 
@@ -70,6 +79,12 @@ def _field(text: str) -> str | float | None:
         return float(text) if text else None
     except ValueError:
         return unversioned(text)
+
+
+def lines(shown: Table) -> list[str]:
+    """Return a table as people read it, a line a row."""
+    rows = [" | ".join(row) for row in (shown.columns, *shown.texts())]
+    return [shown.title, *rows, *shown.notes]
 
 
 def table(text: str) -> Any:
@@ -104,14 +119,14 @@ def figure_seen(figure: Figure) -> dict[str, Any]:
     """Return the words of a figure, and its numbers in one array for each kind of artist."""
     size, *artists = drawn(figure)
     texts: dict[str, None] = {}
-    numbers: dict[str, list[float]] = {"size": size}
+    known: dict[str, list[float]] = {"size": size}
     for kind, *shown in artists:
         for one in _leaves(shown):
             if isinstance(one, str):
                 texts[one] = None
             elif one is not None:
-                numbers.setdefault(kind, []).append(float(one))
-    return {"texts": [*texts], **{kind: np.array(values) for kind, values in numbers.items()}}
+                known.setdefault(kind, []).append(float(one))
+    return {"texts": [*texts], **{kind: numbers(values) for kind, values in known.items()}}
 
 
 def _leaves(value: Any) -> Iterator[Any]:

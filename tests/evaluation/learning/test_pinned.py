@@ -23,6 +23,7 @@ from evaluation.learning.smart_color_cat import SmartColorCat
 from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
 from foundation.errors import InputError
 from tests.evaluation.learning.made_up_world import MadeUp, world
+from tests.evaluation.shown import numbers
 from tests.pinned import Pinned
 
 # Parts of a method are pinned as well, since its estimate may not show them.
@@ -128,7 +129,7 @@ def test_parts_of_learning(pinned: Pinned) -> None:
         "bounded": color_beaver.bounded(points, corners, np.array([[0.01, 0.2], [0.1, 0.0]])),
         "consensus": [consensus(estimates, agreement) for agreement in (0.0, 0.025, 0.1, 0.3)],
         "reduced": [
-            reduce(kind, saturation, given, longest)
+            list(map(numbers, reduce(kind, saturation, given, longest)))
             for kind, saturation in (
                 (image, 1000.0),
                 (image.astype(np.uint16), 900.0),

@@ -21,6 +21,7 @@ from evaluation.methods.standard import local_methods, standard_methods
 from evaluation.methods.wrapped import PatchwiseMethod, ResizedMethod, fill_unknown
 from foundation.errors import InputError
 from tests.evaluation.made_up import Wall
+from tests.evaluation.shown import numbers
 from tests.pinned import Pinned
 
 # Parts of a method are pinned as well, since its estimate may not show them.
@@ -129,7 +130,8 @@ def test_maps_of_lights(pinned: Pinned) -> None:
         "5 lights": LocalGraynessIndex(share=0.02, lights=5),
     }
     found = {
-        case: {name: method.estimate_map(*given) for name, method in methods.items()} for case, given in CASES.items()
+        case: {name: numbers(method.estimate_map(*given)) for name, method in methods.items()}
+        for case, given in CASES.items()
     }
     pinned("maps of lights by every local method", found, same=1e-5, nothing=1e-6)
     unknown = tiles(5, 4, 9)
@@ -144,17 +146,20 @@ def test_what_methods_share_of_an_image(case: str, pinned: Pinned) -> None:
     one = PreparedImage(*CASES[case])
     found = {
         "peak, scale, white": (one.peak, one.scale / 2.0**60, one.white),
-        "usable": {border: np.packbits(one.usable(border)) for border in (0, 3)},
+        "usable": {border: numbers(one.usable(border)) for border in (0, 3)},
         "moments": {border: one.moments(border) / 2.0 ** (border % 2) for border in (0, 1, 2, 5)},
         "norms": {f"{p} {border}": one.norm(0, 0, p, border) for p in (1, 1.5, 3, 20, np.inf) for border in (0, 2)},
         "derivatives": {
-            f"{order} {sigma}": one.derivative(order, sigma)
+            f"{order} {sigma}": numbers(one.derivative(order, sigma))
             for order in (0, 1, 2)
             for sigma in (0.3, 1.0, 4.6)
             if order or sigma
         },
-        "smaller": [[small.image, small.usable(0)] for small in map(one.at_most, (4, 20, 64))],
-        "shrunk": [prepared.shrink(one.image, one.usable(1), 5, least) for least in (0.0, 0.3, 0.75)],
+        "smaller": [
+            [small.image.shape, numbers(small.image), numbers(small.usable(0))]
+            for small in map(one.at_most, (4, 20, 64))
+        ],
+        "shrunk": [numbers(prepared.shrink(one.image, one.usable(1), 5, least)[0]) for least in (0.0, 0.3, 0.75)],
     }
     pinned(f"shared parts of an image, {case}", found, same=1e-5, nothing=0 if case == "tiny values" else 1e-6)
 
