@@ -35,14 +35,14 @@ def printed(text: str) -> list[str]:
     return [line for line in lines if line and line[0] not in "┏┡├└"]
 
 
-MANY = 12
-"""Texts from which a column is told by its kinds and their places; numbers above twice as many by their sums."""
+MANY = 15
+"""Texts from which a column is told by its kinds and their places; numbers above so many by their sums."""
 
 
 def numbers(values: Any) -> npt.NDArray[np.float64]:
     """Return numbers as an array (N,), nothing as NaN; many followed by zeros, so that they are kept by their sums."""
     found = np.array(values, dtype=np.float64).ravel()
-    return np.pad(found, (0, WHOLE)) if len(found) > 2 * MANY else found
+    return np.pad(found, (0, WHOLE)) if len(found) > MANY else found
 
 
 def column(values: Sequence[Any]) -> Any:

@@ -130,10 +130,12 @@ def test_commands(
         if "--out one" not in command:
             told[command] = compact(json.loads(out)) if command.endswith("--json") else printed(out)
     new = [path for path in sorted(place.rglob("*")) if path not in before and path.is_file()]
-    if name != "paper":  # Tables are printed as well.
-        new = [path for path in new if path.suffix != ".tex"]
-    if name in ("cv", "transfer"):  # Pages are those of runs; what is pooled shows in the pool.
+    # Tables are printed as well, pages are those of runs, and what is compared or pooled shows in what is made of it.
+    new = [path for path in new if path.suffix != ".tex"]
+    if name in ("cv", "transfer"):
         new = [path for path in new if path.suffix != ".html" and path.parent.name != "two"]
+    if name in ("compare", "transfer"):
+        new = [path for path in new if path.parent.name not in ("one", "two") or path.suffix == ".json"]
     files = {path.relative_to(place).as_posix(): contents(path) for path in new}
     pinned(f"commands, {name}", {"told": told, "files": files, "figures": figures}, nothing=1e-7)
 

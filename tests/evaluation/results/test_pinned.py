@@ -78,7 +78,7 @@ def test_damaged_tables(tmp_path: Path, pinned: Pinned) -> None:
             "with negative numbers": whole.replace(",0.", ",-0."),
             "with heads twice": rows[0].replace("r,", "image,") + "".join(rows[1:]),
         }
-        for how, text in [*others.items(), *damages(whole)]:
+        for how, text in [*others.items(), *damages(whole)][: 3 if " with" in name else None]:
             path.write_text(text)
             found[f"{name} {how}"] = attempt(partial(read, path), tmp_path)
     pinned("damaged tables of results", found)
