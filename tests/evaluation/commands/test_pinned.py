@@ -141,6 +141,7 @@ def test_commands(
 
 
 REFUSED = (
+    *("compare one four", "compare one two --method other"),
     *("compare nowhere", "compare a b c", "compare one one/errors.csv", "compare one --method pca", "run nowhere"),
     *("compare one three", "compare one --method gray-world --method x", "compare one --level 0.4", "pool"),
     *("pool one", "run world.npz --estimates nowhere.csv", "run world.npz --camera a", "run world.npz --layout x"),
@@ -172,13 +173,16 @@ REFUSED = (
 
 def test_refusals(place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
     every = [f"world {at}" for at in range(14)]
-    for name, rows in (("one", every), ("two", every[2:]), ("three", ["else"])):
+    for name, rows in (("one", every), ("two", every[2:]), ("three", ["else"]), ("four", every)):
         (place / name).mkdir()
-        text = "".join(f"{row},Gray-world,{1 + at % 3}.5,{2 + at}.25,0\n" for at, row in enumerate(rows))
+        method = "Other" if name == "four" else "Gray-world"
+        text = "".join(f"{row},{method},{1 + at % 3}.5,{2 + at}.25,0\n" for at, row in enumerate(rows))
         (place / name / "errors.csv").write_text(f"image,method,recovery,reproduction,guessed\n{text}")
     found: dict[str, Any] = {}
     for command in REFUSED:
         code = main(shlex.split(command))
+        if not code:
+            found[f"{command} told"] = printed(capsys.readouterr().out)
         told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
         found[command] = [code, *(line.replace(str(place), "PLACE") for line in told)]
     pinned("commands that are refused", found)

@@ -13,7 +13,7 @@ import pytest
 from evaluation import metrics
 from evaluation.experiments import bootstrap, comparing, cross_validation, folds, suspicions
 from evaluation.experiments.describing import description, report
-from evaluation.experiments.paper import colour_reduction, material, reporting, table1
+from evaluation.experiments.paper import colour_reduction, material, published, reporting, table1
 from evaluation.experiments.run_folder import describe_run
 from evaluation.experiments.running import evaluate
 from evaluation.experiments.transfer import outcome
@@ -478,6 +478,7 @@ def test_parts_of_the_paper(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> 
         ],
         "thinned": [list(table1.thinned(range(count), most)) for count, most in ((7, 3), (3, 7), (64, 64), (65, 64))],
         "sizes": table1.size_table(rows),
+        "published": [published.TABLE1, published.TABLE2],
         "figures": figures,
     }
     pinned("parts of the paper's experiments", found, same=1e-5)

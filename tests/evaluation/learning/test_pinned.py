@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.learning import color_beaver, log_chroma
+from evaluation.learning import color_beaver, convnet, log_chroma, regression_trees
 from evaluation.learning.adapting import adapt, learn_alone, stacked_share
 from evaluation.learning.color_beaver import ColorBeaver
 from evaluation.learning.constant_light import ConstantLight
@@ -108,6 +108,25 @@ def test_what_is_learned(key: str, pinned: Pinned) -> None:
     )
 
 
+FREQUENT = [
+    [1, 0.5, 0.5],
+    [0.99, 0.5, 0.5],
+    [0.2, 0.2, 0.2],
+    [0.25, 0.25, 0.75],
+    [0.26, 0.3, 0.8],
+    [1, 1, 1],
+    [0, 0, 0],
+]
+"""Colours at and beside borders of bins."""
+
+
+def test_angles_of_the_net(pinned: Pinned) -> None:
+    torch: Any = pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
+    wanted = torch.tensor([[1.0, 0, 0], [1.0, 0, 0], [1.0, 2, 3]])
+    found = torch.tensor([[1.0, 0, 0], [0.6, 0.8, 0], [0.0, 0, 1]])
+    pinned("angles of the net", convnet._angle(torch, found, wanted).numpy(), same=1e-4, nothing=1e-8)
+
+
 def test_parts_of_learning(pinned: Pinned) -> None:
     random = np.random.default_rng(2)
     one, truths = (random.dirichlet([5.0, 9, 4], 12) for _ in range(2))
@@ -127,6 +146,11 @@ def test_parts_of_learning(pinned: Pinned) -> None:
             for expected in (0.0, 0.5, 1)
         ],
         "bounded": color_beaver.bounded(points, corners, np.array([[0.01, 0.2], [0.1, 0.0]])),
+        "frequent": [
+            regression_trees._frequent_colours(np.array(FREQUENT, np.float32), bins, most)
+            for bins in (1, 4, 5)
+            for most in (1, 3)
+        ],
         "consensus": [consensus(estimates, agreement) for agreement in (0.0, 0.025, 0.1, 0.3)],
         "reduced": [
             list(map(numbers, reduce(kind, saturation, given, longest)))
@@ -153,6 +177,8 @@ def test_losses_of_log_chroma(pinned: Pinned) -> None:
     likely /= likely.sum(axis=(1, 2), keepdims=True)
     places = np.array([[0.0, 0], [-1.4, 31.5], [32.5, 95.49], [5, 60], [33.5, 1], [10, 11.2]])
     flat = np.full((1, 64, 64), 1 / 4096)
+    opposite = np.zeros((1, 64, 64))
+    opposite[0, 0, 0], opposite[0, 32, 32] = 0.5 + 3.5e-7, 0.5 - 3.5e-7
     moments = log_chroma.moments(likely)
     scales = [log_chroma._scale(*weights) for weights in ((1e-8, 2e-10), (0.0, 1e-9), (1e-6, 1e-7))]
     fine = random.poisson(0.02, (2, 2, 128, 128)).astype(np.uint16)
@@ -165,6 +191,7 @@ def test_losses_of_log_chroma(pinned: Pinned) -> None:
     found = {
         "moments": moments,
         "moments of a flat one": log_chroma.moments(flat).covariance,
+        "slopes of a nearly flat one": log_chroma.moments(opposite).slopes,
         "likelihood": [log_chroma.likelihood(likely, moments, places, spread) for spread in (1.0, 0.3)],
         "cross-entropy": log_chroma.crossentropy(response, likely, places),
         "scales": scales,
