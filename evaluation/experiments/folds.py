@@ -113,7 +113,8 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     """
     columns, table = read_csv(path, "expected CSV, image,fold a line", "folds from")
     if not {"image", "fold"} <= set(columns):
-        raise FormatError(f"{path} has the columns {','.join(columns)}; expected image,fold; correct its first line")
+        have = ",".join(columns) or "of an empty file"
+        raise FormatError(f"{path} has the columns {have}; expected image,fold; correct its first line")
     given = {row["image"]: row["fold"].strip() for row in table}
     twice = [image for image, count in Counter(row["image"] for row in table).items() if count > 1]
     missing = [name for name in names if not given.get(name)]
@@ -131,7 +132,8 @@ def read_names(path: Path, names: Sequence[str]) -> frozenset[str]:
     """Return the images of a data set that a CSV file names in its column `image`."""
     columns, table = read_csv(path, "expected CSV with a column image", "images from")
     if "image" not in columns:
-        raise FormatError(f"{path} has the columns {','.join(columns)}; expected image among them")
+        have = ",".join(columns) or "of an empty file"
+        raise FormatError(f"{path} has the columns {have}; expected image among them")
     given = frozenset(row["image"] for row in table)
     strange = sorted(given - set(names))
     if strange or not given:

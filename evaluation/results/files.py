@@ -78,10 +78,14 @@ def read_errors(place: Path | str) -> dict[str, MethodErrors]:
             f"{path} has the columns {', '.join(columns) or 'of an empty file'}; expected {', '.join(missing)} too, as "
             "evaluate run writes them"
         )
+    if len(set(columns)) < len(columns):
+        raise FormatError(f"{path} has columns of the same name: {', '.join(columns)}; expected each once")
     known = all(name in columns for name in _TRUTH)
     found: dict[str, dict[str, _Line]] = {}
     for row in rows:
         where = f"{path}, line {rows.line_num}"
+        if rows.restkey in row:
+            raise FormatError(f"{where} has more fields than the {len(columns)} of its head; correct it")
         wanted = (*_KINDS, *(_TRUTH if known else ()))
         numbers = [_number(row[name], name, where) for name in wanted]
         if min(numbers) < 0 or (known and not any(numbers[2:])):

@@ -63,6 +63,7 @@ def test_estimates_are_there_where_all_are(tmp_path: Path, second: str, whole: b
         ("a,Mine,1,1,1,1,1,1,x,2,0", "line 2: recovery is 'x'"),
         ("a,Mine,1,1,1,1,1,1,nan,2,0", "line 2: recovery is 'nan'"),
         ("a,Mine,1,1,1,1,1", "line 2: recovery is None"),
+        ("a,Mine,1,1,1,1,1,1,1,2,0,1", "line 2 has more fields than the 11 of its head"),
         ("a,Mine,1,1,1,1,1,1,-1,2,0", "line 2: a has .*none is below 0"),
         ("a,Mine,1,1,1,0,0,0,1,2,0", "line 2: a has"),
         ("a,Mine,1,1,1,1,1,1,1,2,maybe", "guessed is 'maybe'"),
@@ -76,6 +77,8 @@ def test_faults_are_named(tmp_path: Path, line: str, says: str) -> None:
 
 
 def test_other_files(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="columns of the same name: image, method, recovery, reproduction, recovery"):
+        read_errors(written(tmp_path, "a,M,1,2,3", head="image,method,recovery,reproduction,recovery"))
     with pytest.raises(FormatError, match="has the columns image, method; expected recovery, reproduction too"):
         read_errors(written(tmp_path, head="image,method").rename(tmp_path / "x.csv"))
     with pytest.raises(InputError, match=r"cannot read .*errors.csv.*name a results folder"):

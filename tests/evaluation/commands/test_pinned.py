@@ -1,0 +1,188 @@
+"""What every command prints and writes of small data sets, to the last digits: no change may move it unseen."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evaluation.cli import main
+from tests.evaluation.datasets.made_up import COPIES
+from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
+from tests.evaluation.learning.made_up_world import world
+from tests.evaluation.shown import compact, contents, printed, recorded_figures
+from tests.pinned import Pinned
+
+pytestmark = pytest.mark.slow
+
+
+def save_world(path: Path, count: int, seed: int, first: int = 0) -> None:
+    scenes = world(count, seed, size=24)
+    np.savez(
+        path,
+        images=np.stack([scene.image for scene in scenes]),
+        gt=np.stack([scene.truth for scene in scenes]),
+        names=np.array([f"{path.stem} {number + first}" for number in range(count)]),
+    )
+
+
+@pytest.fixture(scope="module")
+def made_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a generated set, its pictures and table, two sets of thumbnails, and copies of layouts."""
+    folder = tmp_path_factory.mktemp("place")
+    save_pictures(folder / "pictures", [f"{number}.png" for number in range(6)])
+    Maker(folder, write_table(folder / "lut")).make()
+    save_world(folder / "world.npz", 14, 0)
+    save_world(folder / "other.npz", 9, 5)
+    for layout in ("lsmi", "folder", "nus8"):
+        COPIES[layout].make(folder / layout)
+    return folder
+
+
+@pytest.fixture
+def place(made_place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a working folder that is a copy of it."""
+    shutil.copytree(made_place, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+SEQUENCES: dict[str, tuple[str, ...]] = {
+    "run": (
+        "run world.npz --methods standard --out out --workers 1 --json",
+        "run lsmi --methods gray-world,gray-world-by-patches,grayness-index-local --saturation 20000 --out mixed "
+        "--workers 1",
+        "run folder --methods all --statistics all --error recovery --saturation 20000 --csv t.csv --images i.csv "
+        "--workers 1",
+        "run made --method gray-edge-2@12 --method shades-of-gray:p=3 --workers 1 --json",
+        "run nus8 --camera SonyA57 --black 100 --saturation 5000 --methods white-patch --workers 1 --json",
+    ),
+    "cv": (
+        "cv kernel-ridge,smart-color-cat world.npz --out out --save-folds folds.csv --workers 1 --json",
+        "cv constant-light made --folds 2 --seed 3 --statistics all --error recovery --workers 1",
+        "cv kernel-ridge world.npz --folds folds.csv --workers 1",
+    ),
+    "train": (
+        "train kernel-ridge world.npz --out a.npz --workers 1",
+        "train kernel-ridge other.npz --adapt a.npz --seed 2 --out b.npz --workers 1",
+        "run other.npz --method a.npz --method b.npz --workers 1 --json",
+        "run world.npz --method a.npz --workers 1",
+    ),
+    "tune": (
+        "tune shades-of-gray world.npz --workers 1 --json",
+        "tune gray-edge-1@24 made --errors recovery --out s.csv --workers 1",
+    ),
+    "compare": (
+        "run world.npz --methods standard --out one --workers 1",
+        "run world.npz --method gray-world --method pca --saturation 0.3 --out two --workers 1",
+        "compare one --method pca --method gray-world --out cmp --json",
+        "compare one two --error recovery --level 0.9 --seed 3",
+        "compare one two --method gray-world=pca --images",
+        "compare one --method white-patch --method pca --method gray-world --method gray-edge-1",
+    ),
+    "describe": (
+        "describe world.npz --against made --out s.json --report page.html --workers 1",
+        "describe s.json --against nus8 --cells 4 --workers 1",
+        "describe lsmi --saturation 20000 --workers 1",
+    ),
+    "transfer": (
+        "transfer --train made --test world.npz --methods kernel-ridge --statistics gray-world --naive pictures "
+        "--real 3,all --images 8 --seeds 2 --out one --error recovery --workers 1",
+        "transfer --train made --test other.npz --methods kernel-ridge --statistics gray-world --naive pictures "
+        "--real 3,all --images 8 --seeds 2 --out two --side 8 --error recovery --workers 1",
+        "pool one two --base made:\\ generated --out pooled",
+    ),
+    "paper": (
+        "paper table1 lut --pictures pictures --lights-like world.npz --side 16 --sizes 8,24 --hot 500 --out t1 "
+        "--workers 1",
+        "paper table1 lut --pictures other.npz --matrix Canon\\ EOS\\ 550D --lights-like other.npz --side 8 --seed 2 "
+        "--error recovery --workers 1",
+        "paper table2 world.npz --generated made --methods smart-color-cat --folds 2 --out t2 --workers 1 --json",
+        "paper bits other.npz --sigma 1.5 --out bits --workers 1 --json",
+        "paper flash other.npz --out codes --clear 3 --workers 1 --json",
+        "paper flash-inverse codes --out linear --workers 1 --json",
+        "run linear --methods gray-world --workers 1 --json",
+        "paper reduction pictures/0.png --out reduction --json",
+        "paper chromaticities lut --truths world.npz --out lights --json",
+    ),
+}
+"""Commands that are run one after another."""
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_commands(
+    name: str, place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = recorded_figures(monkeypatch)
+    before = set(place.rglob("*"))
+    told: dict[str, Any] = {}
+    for command in SEQUENCES[name]:
+        drawn = len(figures)
+        assert main(shlex.split(command)) == 0, command
+        out = capsys.readouterr().out
+        if "--out two" in command:
+            del figures[drawn:]
+        if "--out one" not in command:
+            told[command] = compact(json.loads(out)) if command.endswith("--json") else printed(out)
+    new = [path for path in sorted(place.rglob("*")) if path not in before and path.is_file()]
+    # Tables are printed as well, pages are those of runs, and what is compared or pooled shows in what is made of it.
+    new = [path for path in new if path.suffix != ".tex"]
+    if name in ("cv", "transfer"):
+        new = [path for path in new if path.suffix != ".html" and path.parent.name != "two"]
+    if name in ("compare", "transfer"):
+        new = [path for path in new if path.parent.name not in ("one", "two") or path.suffix == ".json"]
+    files = {path.relative_to(place).as_posix(): contents(path) for path in new}
+    pinned(f"commands, {name}", {"told": told, "files": files, "figures": figures}, nothing=1e-7)
+
+
+REFUSED = (
+    *("compare one four", "compare one two --method other"),
+    *("compare nowhere", "compare a b c", "compare one one/errors.csv", "compare one --method pca", "run nowhere"),
+    *("compare one three", "compare one --method gray-world --method x", "compare one --level 0.4", "pool"),
+    *("pool one", "run world.npz --estimates nowhere.csv", "run world.npz --camera a", "run world.npz --layout x"),
+    *("run world.npz --methods pca,pca", "run world.npz --method kernel-ridge", "run world.npz --black -1"),
+    *("run world.npz --csv a.csv --images ./a.csv", "run world.npz --out o --csv o/t.csv"),
+    *("run folder --saturation 0", "cv world.npz kernel-ridge", "cv pca world.npz", "cv magic world.npz"),
+    *("cv kernel-ridge,kernel-ridge world.npz", "cv kernel-ridge world.npz --folds 1"),
+    *("cv kernel-ridge world.npz --folds 15", "cv kernel-ridge world.npz --folds x"),
+    *("cv kernel-ridge made --folds 7", "cv kernel-ridge world.npz --folds 2.5", "train all world.npz --out a.npz"),
+    *("train kernel-ridge world.npz --out a.txt", "train world.npz kernel-ridge --out a.npz", "tune pca world.npz"),
+    *("train kernel-ridge world.npz --out world.npz", "train kernel-ridge world.npz --adapt world.npz --out a.npz"),
+    *("describe nowhere", "describe world.npz --against world.npz --out world.npz"),
+    *("transfer --train made --test world.npz --real x", "transfer --train made --test world.npz --beside x"),
+    *("transfer --train made --test made --methods kernel-ridge",),
+    *("transfer --train made --test other.npz --methods kernel-ridge --images 99",),
+    *("transfer --train made --test other.npz --methods kernel-ridge --naive nowhere",),
+    *("paper table1 lut --pictures made --lights-like world.npz",),
+    *("paper table1 lut --pictures x --lights-like x.csv",),
+    *("paper table1 lut --pictures pictures --lights-like world.npz --sizes 0", "paper reduction nowhere.png"),
+    *("paper table1 lut --pictures pictures --lights-like world.npz --sizes 65536",),
+    *("paper flash-inverse made --out x",),
+    *("paper table1 lut --pictures pictures --lights-like world.npz --hot 1000001", "paper bits nowhere"),
+    *("paper table1 lut --pictures pictures --lights-like world.npz --hot 1.5", "paper chromaticities made"),
+    *("paper table2 world.npz --generated world.npz", "paper flash world.npz --out made"),
+    *("paper bits world.npz --sigma 0", "compare one --level 1", "run world.npz --workers 0"),
+)
+"""Commands that are told to do what cannot be done, most at a limit."""
+
+
+def test_refusals(place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
+    every = [f"world {at}" for at in range(14)]
+    for name, rows in (("one", every), ("two", every[2:]), ("three", ["else"]), ("four", every)):
+        (place / name).mkdir()
+        method = "Other" if name == "four" else "Gray-world"
+        text = "".join(f"{row},{method},{1 + at % 3}.5,{2 + at}.25,0\n" for at, row in enumerate(rows))
+        (place / name / "errors.csv").write_text(f"image,method,recovery,reproduction,guessed\n{text}")
+    found: dict[str, Any] = {}
+    for command in REFUSED:
+        code = main(shlex.split(command))
+        if not code:
+            found[f"{command} told"] = printed(capsys.readouterr().out)
+        told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+        found[command] = [code, *(line.replace(str(place), "PLACE") for line in told)]
+    pinned("commands that are refused", found)
