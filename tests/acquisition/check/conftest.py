@@ -69,7 +69,11 @@ def check(checking: Check, pinned: Pinned, request: pytest.FixtureRequest) -> Ch
         # What is free on a disk changes by itself.
         known = [found for found in report.findings if found.name not in ("disk", "card")]
         # Numbers in sentences are rounded, and stand among the details as they are.
-        found = {one.name: [one.grade, re.sub("[0-9.]+", "#", one.sentence()), one.value, one.details] for one in known}
+        said = [re.sub("[0-9.]+", "#", one.sentence()) if one.grade != "good" else "" for one in known]
+        found = {
+            f"{one.name}: {one.grade} {sentence}": [one.value, one.details]
+            for one, sentence in zip(known, said, strict=True)
+        }
         pinned(f"check, {name}", [found, report.forecast, report.figures, " ".join(report.not_known)], same=1e-4)
         return report
 

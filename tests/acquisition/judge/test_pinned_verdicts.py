@@ -200,6 +200,8 @@ def test_frames_are_held_against_pictures_as_they_were(pinned: Pinned) -> None:
     before = state.Seen((255, 0, 0), red, np.array([1.0, 0, 0]))
     for name, frame in frames.items():
         for title, basis in bases.items():
+            if title == "white" and name not in ("white", "a hand"):
+                continue
             light = basis.light(frame)
             strips = [basis.strips(frame, light.amounts, *moved) for moved in ((0, 0), (0.021, 0), (1.5, 0), (0, 0.7))]
             checks, off = judge._judge_evenness(basis, light, frame, np.array([0.3, -0.4]), before)
@@ -234,7 +236,7 @@ def test_frames_are_held_against_pictures_as_they_were(pinned: Pinned) -> None:
 
 def test_lights_that_are_off_are_named_as_they_were(pinned: Pinned) -> None:
     _, model = learnt(3, 40)
-    random, found = np.random.default_rng(8), list[Any]()
+    random, found, numbers = np.random.default_rng(8), list[str](), list[float]()
     nothing = state.Residuals(np.zeros(0), np.zeros(0), np.zeros(0))
     plan = ((255, 255, 255), (0, 0, 0), (255, 0, 0), (200, 100, 50), (30, 60, 90), (0, 255, 0), (255, 128, 0))
     for number in range(80):
@@ -259,11 +261,12 @@ def test_lights_that_are_off_are_named_as_they_were(pinned: Pinned) -> None:
         seen = judge._SeenLight(
             model, light, codes, state.Seen(other, measured(LIT), model.predict(other).amounts), plan
         )
-        fit = seen.fit
+        fit, added = seen.fit, [seen._added_of(one) or (-1.0, -1.0) for one in (None, seen.before)]
         ways = [seen.cause(wrong, 0.01, again=again) for wrong in (True, False) for again in (True, False)]
-        found.append([fit.distance, fit.angle_deg, fit.brightness, fit.brightness_sd, *dict.fromkeys(ways)])
-        found.append([seen.neutral_light(), seen._coloured(), seen._added_of(None), seen._added_of(seen.before)])
-    pinned("lights that are off", found)
+        numbers += [fit.distance, fit.angle_deg, fit.brightness, fit.brightness_sd, seen._coloured()]
+        numbers += [*seen.neutral_light(), *added[0], *added[1], *(light for _, light in ways)]
+        found += [reason for reason, _ in dict.fromkeys(ways) if reason]
+    pinned("lights that are off", [found, np.array(numbers)])
 
 
 @pytest.mark.slow

@@ -70,11 +70,12 @@ def contents(data: bytes) -> str:
 def seen(mosaic: Mosaic) -> dict[str, Any]:
     """Return all that is asked of a frame."""
     black = frame_black(mosaic)
+    planes = [plane_of(mosaic, channel) for channel in CHANNELS]
 
     def lean(found: Any) -> Any:
         """Return an array, of a large one every so many a value."""
-        large = isinstance(found, np.ndarray) and found.size > 100_000
-        return found[::13, ::11] if large else found
+        shape: tuple[int, ...] = getattr(found, "shape", ())
+        return found[::13, ::11] if np.prod(shape) > 100_000 else found
 
     return {
         **{one.name: lean(getattr(mosaic, one.name)) for one in fields(mosaic) if one.name != "sensor"},
@@ -83,7 +84,8 @@ def seen(mosaic: Mosaic) -> dict[str, Any]:
         "saturation": mosaic.saturation(),
         "exposure": [mosaic.origin.exposure, mosaic.origin.exposure_text],
         "strongest": [rawfile.strongest_channel(mosaic, black, every) for every in (1, 8, 16)],
-        "planes": [(lean(plane.values), plane.offset_px) for plane in (plane_of(mosaic, one) for one in CHANNELS)],
+        "planes": np.stack([lean(plane.values) for plane in planes]),
+        "offsets": str([plane.offset_px for plane in planes]),
         "fault": filled_fault(mosaic.counts, mosaic.black, mosaic.white_level),
     }
 

@@ -51,7 +51,7 @@ def short(data: bytes | None) -> str:
     if data is None:
         return "-"
     text = data.hex()
-    return text if len(text) <= 80 else f"{text[:48]}…{len(data)} {hashlib.sha256(data).hexdigest()[:10]}"
+    return text if len(text) <= 48 else f"{text[:32]}…{len(data)} {hashlib.sha256(data).hexdigest()[:8]}"
 
 
 def told(host: Host, code: int, *parameters: int, data: bytes | None = None) -> str:
@@ -87,7 +87,7 @@ def opening(host: Host) -> list[str]:
 def test_a_body_says_of_itself_what_it_said(name: str, pinned: Pinned) -> None:
     host = host_of(name)
     found: list[Any] = [told(host, Operation.GET_DEVICE_INFO), told(host, Operation.GET_STORAGE_IDS), opening(host)]
-    found.append([f"{record!s:.300}" for record in host.events()])
+    found.append([f"{record!s:.150}" for record in host.events()])
     codes = [spec.code for spec in BODIES[name][0].properties] + [0x5001, 0xD303, 0xD402, 0xD406, 0xD407, 0x5010]
     for ask in (Operation.GET_DEVICE_PROP_DESC, Operation.GET_DEVICE_PROP_VALUE):
         found += [told(host, ask, code) for code in codes[::3] + codes[-6:]]
@@ -172,7 +172,7 @@ def step(host: Host, chance: random.Random, handles: list[int]) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("name", list(BODIES)[1::2] + list(BODIES)[4:])
 def test_a_body_answers_what_it_answered(name: str, pinned: Pinned) -> None:
     host, chance = host_of(name), random.Random(name)
     destination = PropertySetting(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.HOST)).encode()
@@ -193,7 +193,7 @@ def test_a_body_answers_what_it_answered(name: str, pinned: Pinned) -> None:
     pinned(f"a conversation with a body, {name}", [found, exposed])
 
 
-@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("name", list(BODIES)[:3])
 def test_the_driver_plans_what_it_planned(name: str, pinned: Pinned) -> None:
     """Every exposure of a body, set or refused, in two states of its dials."""
     found: dict[str, Any] = {}

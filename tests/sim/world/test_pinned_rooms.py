@@ -17,7 +17,7 @@ from sim.world import rendering
 from sim.world.disturbances import KINDS, AnyDisturbance, Disturbances, Moment, drawn
 from sim.world.rendering import Fold, Print, Waviness, label_map
 from sim.world.sensors import BODIES, FACTS, Body, Rectangle, find_body
-from sim.world.world import REFERENCE_EXPOSURE, Blob, Glare, Patch, Room, Situation, World, moved
+from sim.world.world import REFERENCE_EXPOSURE, UNDISTURBED, Blob, Glare, Patch, Room, Situation, World, moved
 from tests.pinned import Pinned
 from tests.sim.conftest import PAGE_MM, patches
 
@@ -75,11 +75,10 @@ def test_a_room_shows_what_it_showed(name: str, pinned: Pinned) -> None:
     spots = PLACES[:2, :2].reshape(-1, 2)
     found = {
         "signal": [world.signal(WHITE, REFERENCE_EXPOSURE), world.signal(ORANGE, BRIGHT, 0.7)],
-        "seen at": [world.project(PLACES, channel) for channel in "RGB"],
+        "seen at": np.stack([world.project(PLACES, channel) for channel in "RGGB"]),
         "found at": world.view.locate(np.array([[-4.0, -2], [20, 30], [82, 58], [50.3, 11.1]])),
-        "unshifted": [world.lens.unshifted(PLACES, channel) for channel in "RGB"],
-        "field": world.field(PLACES),
-        "worn": world.worn(PLACES),
+        "unshifted": np.stack([world.lens.unshifted(PLACES, channel) for channel in "RGGB"]),
+        "light at": np.stack([world.field(PLACES), world.worn(PLACES), world.field(PLACES[::-1])]),
         "white": world.white(ORANGE, BRIGHT, 1.5),
         "reflected": world.reflected(rgb, ORANGE, BRIGHT),
         "seen": world.seen(rgb, spots, ORANGE, BRIGHT, 0.9),
@@ -124,7 +123,9 @@ def test_every_disturbance_shows_what_it_showed(pinned: Pinned) -> None:
             found[title] = {
                 "there": [str([len(every.at(one)) for one in moments]) for every in (events, Disturbances((timed,)))],
                 "shown": " ".join(str(events.shown(moment)) for moment in moments),
-                "situation": situation,
+                "situation": {
+                    name: one for name, one in vars(situation).items() if one is not getattr(UNDISTURBED, name)
+                },
                 "later": events.situation(moments[4]).lamp,
                 "counted": events.counted(counts, there),
                 "signal": world.signal(events.shown(there), BRIGHT, situation=situation),
