@@ -41,7 +41,7 @@ def told(head: Head) -> dict[str, Any]:
 
 def test_a_session_stands_as_it_stood(pinned: Pinned) -> None:
     chance, found = random.Random(3), list[Any]()
-    for number in range(60):
+    for number in range(40):
         count = chance.choice((0, 1, 2, 3, 5, 8, 8))
         verdict = chance.choice(("accepted", "accepted", "refused", "failed", None))
         taken = attempts(count, verdict, chance.choice((5, 40)))
