@@ -199,7 +199,16 @@ def test_lossless_jpegs_are_told_as_before(pinned: Pinned) -> None:
     damaged = [stream[:at] + stream[at + 1 :] for at in range(begin, len(stream), 9)]
     behind = [
         stream[:-2] + more
-        for more in (b"", bytes(4), bytes(5), b"\1\1\1\1\1\1", b"\1\1\1\1\2", bytes(17) + b"\xff\xd9")
+        for more in (
+            b"",
+            bytes(4),
+            bytes(5),
+            b"\1\1\1\1\1\1",
+            b"\1\1\1\1\2",
+            bytes(17) + b"\xff\xd9",
+            b"\1\1\1\1\1\1\1\1\2",
+            b"\1\2\3",
+        )
     ]
     every = [stream, *flipped, *damaged, *behind]
     found: dict[str, str] = {}

@@ -150,6 +150,8 @@ def test_several_things_at_once_show_what_they_showed(pinned: Pinned) -> None:
                          bump_px=(2, -1), bump_mm=(0.5, 3), turn_deg=-2, defocus_px=1.5),
     }  # fmt: skip
     found = {name: world.signal(ORANGE, BRIGHT, 1.1, one) for name, one in situations.items()}
+    for name, room in (("stain", Room(stain_mm=40)), ("fold", Room(fold_mm=4)), ("curl", Room(curl_mm=9, wave_mm=90))):
+        found[name] = World(patches(), TINY, room).signal(WHITE, REFERENCE_EXPOSURE)
     pinned("a room's situations", [found, world.project(PLACES, "R", situations["all"])], same=SINGLE)
 
 
@@ -186,6 +188,7 @@ def test_lights_and_cameras_are_what_they_were(pinned: Pinned) -> None:
             if name in FACTS
         },
         "bodies": [BODIES, FACTS],
+        "defaults": [Room(), Glare((0, 0, 1, 1)), Blob((0, 0, 1, 1)), Moment(1)],
         "a body with changes": find_body("Canon_EOS_5DS", {"pixels": [64, 17], "black": 100, "read_noise_dn": 9.5}),
         "observer": spectral._observer(),
     }
