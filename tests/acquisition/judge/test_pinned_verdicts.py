@@ -234,6 +234,7 @@ def test_frames_are_held_against_pictures_as_they_were(pinned: Pinned) -> None:
     pinned("frames held against pictures", found, nothing=1e-7)
 
 
+@pytest.mark.slow
 def test_lights_that_are_off_are_named_as_they_were(pinned: Pinned) -> None:
     _, model = learnt(3, 40)
     random, found, numbers = np.random.default_rng(8), list[str](), list[float]()

@@ -241,6 +241,7 @@ def test_directories_of_all_types_are_read_as_before(pinned: Pinned) -> None:
     pinned("directories of all types", [found, {tag.name: int(tag) for tag in TiffTag}])
 
 
+@pytest.mark.slow
 def test_bytes_of_raw_files_are_what_they_were(pinned: Pinned) -> None:
     tiny = {
         "sensor": (30, 44),
@@ -304,6 +305,10 @@ def test_what_is_known_of_sensors_is_as_before(pinned: Pinned) -> None:
             counts = whole.copy()
             counts[place] = value
             holes.append(filled_fault(counts, np.full((2, 2), black), white))
+    for rows, columns, part in product((32, 64, 65), (256, 512, 513), (1, 33)):
+        counts = np.full((rows, columns), 4000, np.uint16)
+        counts[-part:, -256:] = 3
+        holes.append(filled_fault(counts, np.full((2, 2), 2048.0), 15000))
     common = [
         rawfile._common(Area(2, 3, 10, 20), other)
         for other in (Area(0, 0, 5, 5), Area(4, 5, 3, 30), Area(50, 50, 2, 2))
