@@ -20,6 +20,7 @@ from acquisition.check.frames import (
 from acquisition.run.devices import ENGRAVED_S
 from drivers.raw.rawfile import Mosaic
 from drivers.raw.storage import Area
+from tests.pinned import Pinned
 
 PERIOD_S = 1 / 60
 TIMES = fitting_times(ENGRAVED_S, PERIOD_S)
@@ -140,3 +141,20 @@ def test_times_that_hold_whole_turns_up_to_half_a_minute_are_offered() -> None:
     offered = [31.0, 30.0, 0.5, 1 / 50, 1 / 60, 1 / 120]
     assert fitting_times(offered, PERIOD_S) == [1 / 60, 0.5, 30.0]
     assert fitting_times(offered, None) == [1 / 120, 1 / 60, 1 / 50, 0.5, 30.0]
+
+
+def test_exposures_are_proposed_as_before(pinned: Pinned) -> None:
+    found: list[list[object]] = []
+    for number, rate in enumerate(np.geomspace(2e-3, 400, 14).tolist()):
+        start_s = (1 / 60, 0.5, 30.0)[number % 3]
+        trials = tried(rate, start_s, TIMES)
+        white = judge_exposure(trials, Saturation(13584, number % 4 != 0, 15831), TIMES, PERIOD_S, number % 5 == 0)
+        found.append([" ".join(f"{one.shutter_s:.6g}" for one in trials), white.grade, white.sentence(), white.value])
+    full = [
+        measure_saturation(
+            photographed(rate, 0.5, 13584, 20.0), lambda s, rate=rate: photographed(rate, s, 13584, 20.0), TIMES
+        )
+        for rate in (50.0, 9000.0, 30000.0, 1e6)
+    ]
+    fitting = [fitting_times(ENGRAVED_S, period) for period in (None, 1 / 50, 1 / 180)]
+    pinned("exposures that a check proposes", [found, full, fitting])

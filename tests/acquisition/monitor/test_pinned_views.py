@@ -1,0 +1,94 @@
+"""What is shown of a night, and said of how it stands, number by number."""
+
+from __future__ import annotations
+
+import random
+import re
+from dataclasses import asdict, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from acquisition.monitor import view
+from acquisition.monitor.view import Head, SessionView, head_of, read_session, with_seconds
+from acquisition.status import check_text, status_json, status_lines
+from experiment.session.heartbeat import Heartbeat, RunState
+from experiment.session.records import Check
+from tests.acquisition.monitor.made_up import closed, whole_night
+from tests.acquisition.monitor.test_view import ELSEWHERE, HERE, NOW, STEPS, attempts
+from tests.pinned import Pinned
+
+# pyright: reportPrivateUsage=false
+
+HEAD = ("total", "done", "lights_total", "lights_done", "refused", "failed", "seconds_per_frame")
+CHECKS = (
+    *(
+        Check("lamp", 1.234, -0.2, 1.5, "%"),
+        Check("lamp", 1.5, None, None, "%"),
+        Check("light", 1.2346, None, 1.2, "°"),
+    ),
+    *(Check("blur", 12345.6, 0.5, None, "px"), Check("movement", 1.51, -0.2, 1.5, "px")),
+)
+
+
+def told(head: Head) -> dict[str, Any]:
+    """Return how a session stands, but for times of day in words, which are those of the place."""
+    values = asdict(head)
+    return values | {"sentence": re.sub(r"\d[\d:-]*", "#", head.sentence)}
+
+
+def test_a_session_stands_as_it_stood(pinned: Pinned) -> None:
+    chance, found = random.Random(3), list[Any]()
+    for number in range(40):
+        count = chance.choice((0, 1, 2, 3, 5, 8, 8))
+        verdict = chance.choice(("accepted", "accepted", "refused", "failed", None))
+        taken = attempts(count, verdict, chance.choice((5, 40)))
+        if count > 3:
+            odd = replace(taken[2], verdict=chance.choice(("voided", "refused")), reason="off")
+            taken = (*taken[:2], odd, *taken[3:])
+        state = chance.choice(get_args(RunState))
+        at = NOW - timedelta(seconds=chance.choice((0, 44, 45, 46, 49, 51, 170, 331, 4000)))
+        words = chance.choice(("as it should", "the camera: no answer (the run waits)", "the disk: full; free space"))
+        within = timedelta(seconds=chance.choice((10, 300)))
+        beat = Heartbeat(at, chance.choice((HERE, ELSEWHERE)), state, words, at + within) if number % 8 else None
+        session = SessionView("night", "night", STEPS, (), {}, taken, (), beat, None, 25_000_000)
+        if number % 11 == 0:
+            session = replace(session, lost={0: "frames/0.cr2"}, unreadable="chart.json: gone")
+        alive, stopped = chance.choice((True, True, False, None)), chance.random() < 0.1
+        stands = head_of(session, NOW, alive, is_stopped=stopped, free_bytes=chance.choice((None, 10**7, 10**12)))
+        # Of the defaults nothing is said.
+        nothing = asdict(Head("", ""))
+        found.append({name: value for name, value in told(stands).items() if value != nothing[name]})
+    pinned("how sessions stand", found)
+
+
+@pytest.mark.slow
+def test_a_night_is_shown_as_it_was(tmp_path: Path, pinned: Pinned) -> None:
+    run = whole_night(tmp_path / "night", 0.3, grid=3, previews=False)
+    with closed(run):
+        night = read_session(tmp_path / "night")
+        now = run.clock
+    whites = night.whites()
+    frames = [view._attempt_json(one, whites[one.id], None) for one in night.attempts]
+    shown = view._session_json(night)
+    changed = [str(one) for one in frames]
+    lines = [line for line in status_lines(night, now) if not line.startswith("state")]
+    status = status_json(night, now)
+    pinned(
+        "a night as it is shown",
+        {
+            "session": {name: [str(one) for one in shown[name][::5]] for name in ("steps", "lights", "records")},
+            "frames": [*changed[:3], *changed[::6]],
+            "events": [str(view._event_json(one)) for one in night.events],
+            "status": lines,
+            "json": {name: status[name] for name in ("white_drift", "checks", "without_accepted_frame", "doubts")},
+            "head": {name: status[name] for name in HEAD},
+            "spread": [view._spread(count) for count in (0, 1, 5, 17)],
+            "places": [view.place_of(*one) for one in ((0, 0, 0), (1, 2, 3), (-1, 0, 0.5), (float("nan"), 1, 1))],
+            "checks": [check_text(one) for one in CHECKS],
+            "seconds": [one.seconds for one in with_seconds(night.attempts[:9], [night.attempts[4].started_at])],
+            "rounded": [view._rounded(one) for one in (1.23456789, 1e-9, float("inf"), 123456789.0)],
+        },
+    )

@@ -1,0 +1,216 @@
+"""How runs are planned, what they wait for, take again and tell, number by number and word by word."""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.run import pipeline, plan
+from acquisition.run.devices import ENGRAVED_S, holds_whole_turns, pause_cause, period_s, require_whole_turns, wheel_of
+from acquisition.run.plan import Answers, bytes_text, frame_bytes, make_plan, needed_bytes, plan_lines
+from acquisition.run.run import take_session
+from drivers.camera import Supplies
+from drivers.presenter import BLACK, Colour
+from experiment.config import CameraSettings, JudgeSettings, ProjectorCable
+from experiment.session.folder import Session
+from experiment.session.records import Check, Judgement, SessionStep
+from foundation.errors import CropError, DeviceError, DeviceFault, LinkClosed
+from tests.acquisition.run.mishaps import TroubledLab, new_session
+from tests.acquisition.run.scripted import GLARE, NIGHT, TURNED, Lab
+from tests.acquisition.run.test_pipeline import FOUR, PATIENT, ScriptedJudge, refused
+from tests.acquisition.run.test_plan import EOS, GB, SPEEDS, settings_with, work_of
+from tests.acquisition.run.test_queue import queue_of, take
+from tests.acquisition.run.test_retry import Room
+from tests.pinned import Pinned
+
+# pyright: reportPrivateUsage=false
+
+pytestmark = pytest.mark.slow
+
+
+def untimed(text: str) -> str:
+    """Return a text without the time of day, which is that of the place, and without a folder's path."""
+    return re.sub(r"\d\d:\d\d:\d\d|/\S*(?=/session)", "#", text)
+
+
+def test_runs_are_planned_as_they_were(pinned: Pinned) -> None:
+    chance, found = random.Random(5), list[Any]()
+    supplies = [
+        None,
+        Supplies(0.25, None, None, saves_to_host=True),
+        Supplies(0.26, mains=False, card_free_bytes=10**9, saves_to_host=False),
+        Supplies(0.2, mains=True, card_free_bytes=10**12, saves_to_host=False),
+        Supplies(None, None, 3 * 10**9, saves_to_host=False),
+    ]
+    bodies = [None, EOS, *(replace(EOS, model=model) for model in ("ILCE-7M4", "NIKON D850", "Canon EOS R5", "X"))]
+    rigs: list[dict[str, Any]] = [
+        {},
+        {"camera": {"shutter_s": 0.7}, "sequence": {"settle_s": 10.1, "warm_up_s": 299}},
+        {"camera": {"shutter_s": 2.0}, "sequence": {"settle_s": 10.0, "warm_up_s": 300, "order": "listed"}},
+        {"lab": {"projector": {"control": "none", "colour_wheel_hz": 60}}, "sequence": {"seed": 7}},
+        {"sequence": {"notify": "nobody-here", "warm_up_s": 0}, "notify": {"alive": "https://example.org/x"}},
+    ]
+    for number in range(18):
+        settings = settings_with(**chance.choice(rigs))
+        done = chance.choice((0, 0, 50, 59, 60, 61, 110))
+        largest, frame_s = chance.choice((None, 25_000_000)), chance.choice((None, 3.25))
+        work = work_of(settings, done, frame_bytes=largest, frame_s=frame_s)
+        if number % 9 == 0:
+            steps = tuple(replace(step, colour=BLACK) if step.illumination == 3 else step for step in work.steps)
+            work = replace(work, steps=steps)
+        answers = Answers(
+            camera=chance.choice(bodies),
+            offered_s=chance.choice(((), SPEEDS, (2.02, 0.505), (0.71, 1.99))),
+            supplies=chance.choice(supplies),
+            projector=chance.choice(("", "Epson")),
+            lit=chance.choice((None, True, False)),
+            unasked=chance.choice(((), ("this",))),
+        )
+        free, given = chance.choice((GB, 3 * GB, 5 * GB, 10**12)), chance.choice((None, 10**6))
+        one = make_plan(settings, work, answers, free, given)
+        numbers = [one.frame_bytes, one.frame_s, one.warm_up_s, one.time_s, one.needed_bytes]
+        found.append([str(numbers), "\n".join(plan_lines(one)), "; ".join(map(str, one.faults))])
+    models = [frame_bytes(None, model).value for model in ("", "ILCE-7M4", "CroP Test", *plan.MEGAPIXELS)]
+    amounts = (0, 1, 999_949_999, 10**9 - 1, 10**9, 12.34e9)
+    sizes = [bytes_text(number, up) for number in amounts for up in (True, False)]
+    needs = [needed_bytes(frames, size) for frames in (0, 1, 766) for size in (1, 25e6)]
+    others = [settings_with(**rig) for rig in rigs]
+    orders = [plan.order_of(work_of(one).steps, other) for one, other in product(others, others)]
+    offered = [plan.is_offered(time, SPEEDS) for time in (0.5, 0.505, 0.506, 0.495, 0.494, 1.01, 1.02)]
+    pinned("plans of runs", [found, str(models), sizes, needs, sorted(set(orders)), offered])
+
+
+def test_shutter_times_hold_the_turns_that_they_held(pinned: Pinned) -> None:
+    wheels = (24.0, 50.0, 59.94, 60.0, 120.0, 180.0)
+    turns = {str(hz): [time for time in ENGRAVED_S if holds_whole_turns(time, 1 / hz)] for hz in wheels}
+    odd = [[n, holds_whole_turns(n / 60, 1 / 60)] for n in (0.4, 0.5, 0.994, 0.995, 1.005, 1.0051, 30.14, 30.16, 300.9)]
+    said: list[str] = []
+    for time, cable in product(
+        (0.5, 0.3, 0.01, 1 / 60, 31.0, 0.5026),
+        (ProjectorCable(), ProjectorCable(colour_wheel_hz=180), ProjectorCable(refresh_hz=50)),
+    ):
+        try:
+            require_whole_turns(CameraSettings(shutter_s=time), cable)
+            said.append("")
+        except CropError as error:
+            said.append(str(error))
+    plain, wheel = settings_with(), settings_with(lab={"projector": {"colour_wheel_hz": 90}})
+    rigs = [plain, wheel, plain.model_copy(update={"rig": "simulated"})]
+    pinned("whole turns", [turns, odd, said, [[wheel_of(one), period_s(one)] for one in rigs], list(ENGRAVED_S)])
+
+
+def test_what_fails_is_waited_for_as_it_was(pinned: Pinned) -> None:
+    faults = [DeviceError("covered by 3 windows"), LinkClosed("nothing at 10.0.0.1"), DeviceFault("off; switch it on")]
+    found: dict[str, Any] = {}
+    for limit, takes, pattern in product(
+        (0.0, 60.0, 600.0, math.inf), (0.0, 2.5), ((0.9,), (1.0, 30.0), (0.5, 4.0, 9.0), (45.0, 80.0), (1e9,))
+    ):
+        if math.inf in (limit,) and max(pattern) > 1e8:
+            continue
+        room = Room(limit)
+        retry, ended = room.retry, ""
+
+        def fault(now: float, pattern: tuple[float, ...] = pattern) -> CropError | None:
+            return next((faults[n] for n, end in enumerate(pattern) if now < end), None)
+
+        try:
+            for again in range(2):
+                retry.attempt(room.broken(lambda now, again=again: fault(now - 100 * again), takes), "the camera")
+                retry.accepted()
+                room.clock.sleep(max(100 * (again + 1) - room.clock.monotonic(), 0))
+            pause = retry.pause("frames")
+            for _ in range(4):
+                pause.back_off(DeviceError("late"))
+            pause.over()
+        except CropError as error:
+            ended = str(error)
+        beats = [room.beats[n] for n in range(0, len(room.beats), 1 + len(room.beats) // 2)]
+        times = [len(room.beats), len(room.idled), len(room.tries), room.tries[-1], room.clock.monotonic()]
+        said = [f"{what}: {untimed(sentence)}" for what, sentence in room.said]
+        found[f"{limit:g} s, {takes:g} s, {pattern}"] = [said[:3], ended, str(times), [str(beat) for beat in beats]]
+    causes = ["frames: x (y)", "the camera: 3 px off (the run waits)", "the disk: full"]
+    pinned("waits for what fails", [found, [pause_cause(one) for one in causes]])
+
+
+def test_steps_come_in_the_order_that_they_had(pinned: Pinned) -> None:
+    chance, found = random.Random(2), list[Any]()
+    for number in range(60):
+        done = set(chance.sample(range(10), chance.randrange(9)))
+        bad = {n: chance.randrange(1, 5) for n in chance.sample(range(12), chance.randrange(4))}
+        queue = queue_of(done, chance.choice((1, 2, 3)))
+        if number % 3 == 0:
+            queue.void(chance.sample(sorted(done), len(done) // 2), "doubtful")
+        order = take(queue, bad)
+        found.append(f"{sorted(done)} {bad}: {order} {len(queue)} {queue.given_up} {queue.is_stuck}")
+    taken = ((), ("white",), ("white", "light"), ("dark", "light", "white"))
+    kinds = [sorted(pipeline.unclosed_kinds(one)) for one in taken]
+    pinned("steps in their order", [found, kinds])
+
+
+def test_changes_that_a_run_follows_are_told_as_they_were(pinned: Pinned) -> None:
+    grey, found = Colour(250, 250, 250), list[Any]()
+    first, light = SessionStep(3, "response", None, grey), SessionStep(5, "light", 0, grey)
+    dark = SessionStep(1, "dark", None, BLACK)
+    steps = (first, light, dark, replace(first, number=9))
+    for step, value in product(steps, (-2.0, -1.0, -0.2, 0.0, 0.2, 0.5, 0.51, 1.0, 1.01)):
+        for name in ("movement", "lamp", "dark"):
+            judged = Judgement((Check(name, value, -1.5, 1.5),))
+            told = pipeline._followed_changes(step, judged, steps, JudgeSettings())
+            found += [f"{step.number} {name} {value} {one}" for one in told]
+    pinned("changes that a run follows", found)
+
+
+LASTS = refused("moved", lasting=True)
+SEEDS = (29, 30, 34, 37, 41)
+"""Runs in which five things and more go wrong, none of them with the disk, which is written to beside."""
+
+SCRIPTS: dict[str, tuple[dict[int, bytes | Exception], dict[int, Judgement]]] = {
+    "calm": ({}, {}),
+    "dark, glaring and turned": ({2: NIGHT, 4: GLARE, 7: TURNED}, {}),
+    "of faults": ({1: DeviceFault("no lens"), 3: LinkClosed("the cable is out"), 5: DeviceError("busy")}, {}),
+    "of refusals": ({}, {2: refused("off"), 5: refused("off", voids=True), 9: refused("off")}),
+    "of what lasts": ({}, {3: LASTS, 4: LASTS, 8: refused("x", voids=True)}),
+    "given up": ({}, {n: refused("never") for n in range(2, 30)}),
+}
+
+
+def journal_of(session: Session) -> dict[str, Any]:
+    """Return what a journal holds, but for what is of a machine."""
+    attempts, events = session.journal.attempts(), session.journal.events()
+    begun = [(one.started_at - attempts[0].started_at).total_seconds() for one in attempts]
+    told = [f"{one.step} {one.kind} {one.verdict} {untimed(one.reason)}" for one in attempts]
+    return {
+        "attempts": [f"{at:.3f} {one}" for at, one in zip(begun, told, strict=True)],
+        "events": [f"{one.what}: {untimed(one.detail)}" for one in events],
+    }
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_run_takes_what_it_took(name: str, tmp_path: Path, pinned: Pinned) -> None:
+    script, judged = SCRIPTS[name]
+    lab = Lab(tmp_path / "session", dict(script), FOUR, 2)
+    judge = ScriptedJudge(dict(judged)) if judged else None
+    try:
+        outcome = take_session(lab.session, lab.devices, PATIENT, judge)
+        ended: Any = [outcome.complete, outcome.refused, outcome.doubts]
+    except CropError as error:
+        ended = untimed(str(error))
+    lab.session.close()
+    with Session.open(tmp_path / "session") as session:
+        pinned(f"a run, {name}", [ended, journal_of(session)])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_run_with_mishaps_goes_as_it_went(seed: int, tmp_path: Path, pinned: Pinned) -> None:
+    lab = TroubledLab(seed)
+    with new_session(tmp_path / "session") as session:
+        ended = lab.take(session)
+        outcome = untimed(str(ended)) if isinstance(ended, CropError) else str(ended.refused)
+        pinned(f"a run with mishaps, {seed}", [lab.mishaps, outcome, journal_of(session)])

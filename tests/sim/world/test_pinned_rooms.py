@@ -1,0 +1,237 @@
+"""What small rooms of every kind show, photosite by photosite, and every light, ink and shape that they are made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+
+from drivers.camera import ExposureSettings
+from drivers.presenter import BLACK, WHITE, Colour
+from sim import spectral
+from sim.optics import PhotographicLens
+from sim.spectral import WAVELENGTHS_NM, daylight, paper, projector_primaries, published_spectra
+from sim.world import rendering
+from sim.world.disturbances import KINDS, AnyDisturbance, Disturbances, Moment, drawn
+from sim.world.rendering import Fold, Print, Waviness, label_map
+from sim.world.sensors import BODIES, FACTS, Body, Rectangle, find_body
+from sim.world.world import REFERENCE_EXPOSURE, UNDISTURBED, Blob, Glare, Patch, Room, Situation, World, moved
+from tests.pinned import Pinned
+from tests.sim.conftest import PAGE_MM, patches
+
+# pyright: reportPrivateUsage=false
+
+TINY = replace(
+    BODIES["Test"], sensor=(131, 187), visible=Rectangle(11, 16, 117, 166), masked=(Rectangle(0, 0, 131, 14),)
+)
+ORANGE = Colour(255, 140, 11)
+BRIGHT = ExposureSettings(800, 5.6, 0.25)
+PLACES = np.stack(np.meshgrid([-3.0, 75.5, 181], [0.0, 40.2, 125]), axis=-1)
+SINGLE = 1e-5
+"""Single precision, in which photosites are rendered, to a few of its last digits."""
+COUNT = 2e-4
+"""Single precision may move a photosite over the edge between two counts."""
+
+ROOMS: dict[str, tuple[Room, Body]] = {
+    "usual": (Room(seed=4), TINY),
+    "bent": (
+        Room(seed=1, fill=0.7, focal_diagonals=0.9, tilt_deg=7, pan_deg=5, roll_deg=-4, k1=-0.12, k2=0.05, p1=2e-3,
+             p2=-1e-3, waviness_mm=30, wave_mm=260, curl_mm=25, blur_px=1.1, vignetting=0.5, projector_falloff=0.4,
+             primary_difference=0.4, response_spread=0),
+        replace(TINY, pattern="GBRG"),
+    ),
+    "of a poor lens": (
+        Room(seed=2, shoulder_share=0.05, shoulder_px=2.5, veil=0.03, lateral_red_px=0.8, lateral_blue_px=-0.6),
+        replace(TINY, pattern="BGGR"),
+    ),
+    "lit by diodes": (
+        Room(seed=3, lamp_spectrum="led", transfer=2.4, black_leak=0.01, ambient=0.02, white_level_share=1.1,
+             paper="matt", wheel_hz=37, shutter_jitter_s=0.002),
+        replace(TINY, pattern="GRBG", sensitivities="Canon_EOS_200D", black=511, saturation=15000, bits=14),
+    ),
+    "worn": (
+        Room(seed=5, stain_mm=40, stain_depth=0.6, fold_mm=4, hot_per_million=1500, hot_dn_per_s=9000, paper="glossy"),
+        TINY,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROOMS)
+def test_a_room_shows_what_it_showed(name: str, pinned: Pinned) -> None:
+    room, body = ROOMS[name]
+    world = World(patches(), body, room)
+    rgb = np.array([[0, 0, 0], [255, 255, 255], [200, 30, 90], [3, 128, 254]])
+    found: dict[str, Any] = {
+        "exposed": [
+            world.expose(WHITE, REFERENCE_EXPOSURE, key=(1,)),
+            world.expose(ORANGE, BRIGHT, key=(2, 3), lamp=0.8, situation=Situation(black_dn=7.5)),
+            world.expose(BLACK, ExposureSettings(100, None, 2.0), key=(0,)),
+        ],
+    }
+    pinned(f"frames of a room, {name}", found, same=COUNT)
+    spots = PLACES[:2, :2].reshape(-1, 2)
+    found = {
+        "signal": [world.signal(WHITE, REFERENCE_EXPOSURE), world.signal(ORANGE, BRIGHT, 0.7)],
+        "seen at": np.stack([world.project(PLACES, channel) for channel in "RGGB"]),
+        "found at": world.view.locate(np.array([[-4.0, -2], [20, 30], [82, 58], [50.3, 11.1]])),
+        "unshifted": np.stack([world.lens.unshifted(PLACES, channel) for channel in "RGGB"]),
+        "light at": np.stack([world.field(PLACES), world.worn(PLACES), world.field(PLACES[::-1])]),
+        "white": world.white(ORANGE, BRIGHT, 1.5),
+        "reflected": world.reflected(rgb, ORANGE, BRIGHT),
+        "seen": world.seen(rgb, spots, ORANGE, BRIGHT, 0.9),
+        "of primaries": world.of_primaries(rgb, spots),
+        "drive": world.drive(ORANGE, BRIGHT, np.array([1, 0.5, 2]), np.array([0, 0.1, 0.01])),
+        "light of codes": room.light_of(np.arange(0, 256, 15)),
+        "light of a wheel": [room.wheel_light(t, np.random.default_rng(8)) for t in (0.5, 0.01, 1 / 60)],
+        "hot": world.hot,
+        "stain and fold": [world.stain, world.fold],
+        "shoulder": world.lens.kernel(),
+        "noise": [[body.gain_e(iso), body.noise_dn(iso)] for iso in (100, 400, 6400)],
+    }
+    pinned(f"light of a room, {name}", found, same=SINGLE)
+
+
+@pytest.mark.slow
+def test_every_disturbance_shows_what_it_showed(pinned: Pinned) -> None:
+    world = World(patches(), TINY, Room(seed=6, veil=0.02, black_leak=0.002))
+    # What was on the screen before, and moments at the ends of what is there for a while.
+    moments = [
+        Moment(n, 10.0 * n, ORANGE, ((10.0 * n - 10, WHITE), (10.0 * n - 0.5, Colour(0, 9, 200)))) for n in range(6)
+    ]
+    others: dict[str, dict[str, Any]] = {
+        "bump": {"px": 3.0, "mm": 1.5, "direction_deg": 200.0, "turn_deg": 1.2},
+        "dead primary": {"primary": "blue"},
+        "half-changed": {"share": 0.4},
+        "lamp step": {"rgb": (1.0, -2.0, 5.0)},
+        "lamp drift": {"rgb": (1.0, -2.0, 5.0)},
+        "screen saver": {"share": 0.3, "seed": 7},
+        "scrambled rows": {"seed": 5, "top": 0.11},
+    }
+    found: dict[str, Any] = {}
+    for kind in get_args(AnyDisturbance):
+        name = str(kind.what)
+        for title, more in ((name, {}), *([(f"{name}, other", others[name])] if name in others else [])):
+            one = kind(from_frame=1, to_frame=4, from_s=None, to_s=None, **more)
+            timed = kind(from_s=15.0, to_s=40.0)
+            events = Disturbances((one,))
+            there = moments[2]
+            situation = events.situation(there)
+            counts = np.arange(131 * 187, dtype=np.uint16).reshape(131, 187)
+            found[title] = {
+                "there": [str([len(every.at(one)) for one in moments]) for every in (events, Disturbances((timed,)))],
+                "shown": " ".join(str(events.shown(moment)) for moment in moments),
+                "situation": {
+                    name: one for name, one in vars(situation).items() if one is not getattr(UNDISTURBED, name)
+                },
+                "later": events.situation(moments[4]).lamp,
+                "counted": events.counted(counts, there),
+                "signal": world.signal(events.shown(there), BRIGHT, situation=situation),
+                "stale": events.stale(there) is not None,
+            }
+    found["drawn"] = drawn(3, 50, 40)
+    found["drawn of some"] = drawn(9, 7, 5, KINDS[3:8])
+    pinned("a room's disturbances", found, same=SINGLE)
+
+
+@pytest.mark.slow
+def test_several_things_at_once_show_what_they_showed(pinned: Pinned) -> None:
+    world = World(patches(), TINY, ROOMS["of a poor lens"][0])
+    picture = np.random.default_rng(2).uniform(size=(5, 9, 3)).astype(np.float32)
+    situations = {
+        "picture": Situation(picture=picture),
+        "plain picture": Situation(picture=picture[:1, :1]),
+        "patches": Situation(patches=(Patch((0.1, 0.2, 0.6, 0.7), WHITE, 0.6), Patch((0.5, 0.5, 2, 2), ORANGE))),
+        "blobs": Situation(blobs=(Blob((0.1, 0.1, 0.5, 0.9)), Blob((0.4, 0, 1.2, 0.5), 0.5)), lamp=(1, 0.5, 1.2)),
+        "glares": Situation(glares=(Glare((0, 0, 0.7, 0.6)), Glare((0.5, 0.5, 1, 1), 0.2)), ambient=(0.1, 0, 0.05)),
+        "all": Situation(picture=picture, patches=(Patch((0.1, 0.2, 0.6, 0.7), WHITE),), glares=(Glare((0, 0, 1, 1)),),
+                         bump_px=(2, -1), bump_mm=(0.5, 3), turn_deg=-2, defocus_px=1.5),
+    }  # fmt: skip
+    found = {name: world.signal(ORANGE, BRIGHT, 1.1, one) for name, one in situations.items()}
+    for name, room in (("stain", Room(stain_mm=40)), ("fold", Room(fold_mm=4)), ("curl", Room(curl_mm=9, wave_mm=90))):
+        found[name] = World(patches(), TINY, room).signal(WHITE, REFERENCE_EXPOSURE)
+    pinned("a room's situations", [found, world.project(PLACES, "R", situations["all"])], same=SINGLE)
+
+
+@pytest.mark.parametrize("name", get_args(spectral.PaperName))
+def test_inks_are_what_they_were(name: spectral.PaperName, pinned: Pinned) -> None:
+    rgb = np.random.default_rng(3).uniform(0, 255, (40, 3)).round(1)
+    rgb[:3] = [[0, 0, 0], [255, 255, 255], [255, 0, 0]]
+    inks = spectral._Inks(name)
+    # Colours that inks reach, and some that they do not; a neutral one has no hue.
+    lab = np.array([[50.0, 0, 0], [60, 30, 20], [90, 80, -70], [20, -60, 40], [75, 5, 60], [100, 0, 0], [5, 5, -5]])
+    matching = inks.matching(lab)
+    found = {
+        "coverage": spectral.ink_coverage(rgb, name),
+        "reflectance": spectral.print_reflectance(rgb, name),
+        "lab": spectral.relative_lab(spectral.print_reflectance(rgb, name), name),
+        "paper": paper(name),
+        "overprints": paper(name).overprints(),
+        "intended": spectral._lab(spectral._wanted(rgb / 255, 0.02)),
+        "xyz": inks.xyz(rgb / 255),
+    }
+    pinned(f"inks on {name} paper", found)
+    # An inversion ends where its steps are small, not where they are nothing.
+    pinned(f"inks that look like colours, on {name} paper", [matching, inks.xyz(matching)], same=1e-3, nothing=1e-4)
+
+
+def test_lights_and_cameras_are_what_they_were(pinned: Pinned) -> None:
+    found = {
+        "lamps": {lamp: projector_primaries(lamp) for lamp in get_args(spectral.LampSpectrum)},
+        "daylight": {str(k): daylight(k).power for k in (4000, 5003, 7000, 7001, 12000, 25000)},
+        "lights": {name: [one.wavelengths_nm, one.power] for name, one in sorted(published_spectra().items())[::9]},
+        "cameras": {
+            name: [spectral.sensitivities(name), spectral.describe_sensitivities(spectral.read_sensitivities(name))]
+            for name in spectral.known_sensitivities()
+            if name in FACTS
+        },
+        "bodies": [BODIES, FACTS],
+        "defaults": [Room(), Glare((0, 0, 1, 1)), Blob((0, 0, 1, 1)), Moment(1)],
+        "a body with changes": find_body("Canon_EOS_5DS", {"pixels": [64, 17], "black": 100, "read_noise_dn": 9.5}),
+        "observer": spectral._observer(),
+    }
+    pinned("lights and cameras", found)
+
+
+def test_grids_are_what_they_were(pinned: Pinned) -> None:
+    random = np.random.default_rng(6)
+    grids = {
+        "same": WAVELENGTHS_NM,
+        "coarse": np.arange(395.0, 740.0, 7.3),
+        "as fine": np.arange(380.0, 781.0, 4.996),
+        "finer": np.arange(380.0, 781.0, 4.99),
+        "fine": np.arange(390.0, 720.0, 1.0),
+        "uneven": np.sort(random.uniform(380, 780, 90)),
+    }
+    pinned(
+        "spectra on another grid",
+        {
+            name: spectral.regridded(grid, random.uniform(size=(len(grid), 2)), WAVELENGTHS_NM)
+            for name, grid in grids.items()
+        },
+    )
+
+
+def test_shapes_of_paper_and_of_a_drawing_are_what_they_were(pinned: Pinned) -> None:
+    fold = Fold((90.0, 60.0), (0.0998334, 0.9950042), 3.0, 0.8)
+    random = np.random.default_rng(4)
+    ends = np.sort(random.uniform(0, 0.5, (9000, 2)).round(5), axis=1)
+    lines, begins, stops = rendering._lines(ends)
+    over = Print(
+        PAGE_MM,
+        np.array([[-5.0, 10, 50, 60], [20, 20.0004, 200, 20.0004], [40, 30, 90, 99]]),
+        np.array([[9, 9, 9], [0, 0, 0], [9, 9, 9]], np.uint8),
+    )
+    found = {
+        "waves": [Waviness.random(seed, 4.0, PAGE_MM, modes, wave) for seed, modes, wave in ((0, 7, 0), (5, 3, 40.0))],
+        "heights": Waviness.random(1, 5.0, PAGE_MM).height(PLACES),
+        "fold": [fold.height(PLACES), fold.shade(PLACES)],
+        "label map": label_map(over),
+        "labels of patches": label_map(patches()),
+        "many lines": [len(lines), lines, begins, stops],
+        "moved": moved(PLACES, np.array([90.0, 60]), np.array([2.0, -1]), 13.0),
+        "lens": PhotographicLens((58, 83), 0.1, 0.4, 0.0, 1.0, 0.0).kernel(),
+    }
+    pinned("shapes of a sheet", found)
