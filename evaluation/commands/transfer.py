@@ -137,10 +137,13 @@ def transfer(
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
     from foundation.compiled import processor_count
+    from foundation.errors import InputError
     from foundation.folders import require_free
 
     if out is not None:
         require_free(out, "the results")
+    if matrix is not None and naive is None:
+        raise InputError(f"--matrix {matrix} is for the naive baseline; expected --naive PICTURES with it, or no --matrix")
     threads = workers or processor_count()
     learners, left_out = _learners(methods)
     references = _references(statistics)

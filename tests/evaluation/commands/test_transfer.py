@@ -215,6 +215,7 @@ def test_only_some_images_are_tested(place: Path, capsys: pytest.CaptureFixture[
         (("--folds", "none.csv"), "cannot read folds from none.csv"),
         (("--naive", "lut"), "holds no picture"),
         (("--naive", "pictures", "--matrix", "Pinhole"), "'Pinhole' is neither a file nor a camera"),
+        (("--matrix", "Canon EOS 550D"), "--naive PICTURES"),
         (("--train", "made/../made"), "two training sets are called made"),
         (("--out", "lut"), "lut already exists; name another place for the results"),
         (("--train", "lut"), "is no dataset"),
