@@ -21,7 +21,6 @@ from tests.pinned import WHOLE
 from tests.pinned.drawn import drawn
 
 # What is shown is of any kind.
-# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false
 
 
 def unversioned(text: str) -> str:

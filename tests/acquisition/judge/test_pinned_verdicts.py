@@ -41,8 +41,6 @@ from tests.acquisition.judge.test_references import DARK, PRIMARIES, measured
 from tests.acquisition.judge.test_references import WHITE as LIT
 from tests.pinned import Pinned
 
-# pyright: reportPrivateUsage=false
-
 ORANGE, SKY, BLUE = (255, 197, 126), (113, 188, 255), (0, 0, 255)
 WHITE_STEP = SessionStep(901, "white", None, WHITE)
 DARK_STEP = SessionStep(902, "dark", None, BLACK)

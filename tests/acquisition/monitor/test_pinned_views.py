@@ -20,8 +20,6 @@ from tests.acquisition.monitor.made_up import closed, whole_night
 from tests.acquisition.monitor.test_view import ELSEWHERE, HERE, NOW, STEPS, attempts
 from tests.pinned import Pinned
 
-# pyright: reportPrivateUsage=false
-
 HEAD = ("total", "done", "lights_total", "lights_done", "refused", "failed", "seconds_per_frame")
 CHECKS = (
     *(

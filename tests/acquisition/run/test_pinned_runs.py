@@ -30,8 +30,6 @@ from tests.acquisition.run.test_queue import queue_of, take
 from tests.acquisition.run.test_retry import Room
 from tests.pinned import Pinned
 
-# pyright: reportPrivateUsage=false
-
 pytestmark = pytest.mark.slow
 
 

@@ -33,8 +33,6 @@ from tests.drivers.raw.raw_files import Tags, cr2_bytes, dng_bytes, longs, lossl
 from tests.fuzz.raw import changed, entries
 from tests.pinned import Pinned
 
-# pyright: reportPrivateUsage=false
-
 REAL = {
     name: shipped(f"raw/{name}").read_bytes() for name in ("canon_eos_550d_colorchart.dng", "canon_powershot_g2.crw")
 }

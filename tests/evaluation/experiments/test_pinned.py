@@ -30,7 +30,6 @@ from tests.evaluation.shown import lines, numbers, printed, recorded_figures, ta
 from tests.pinned import Pinned
 
 # Parts are pinned as well, since what is made of them may not show them.
-# pyright: reportPrivateUsage=false
 
 pytestmark = pytest.mark.slow
 

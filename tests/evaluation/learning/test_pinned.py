@@ -27,7 +27,6 @@ from tests.evaluation.shown import numbers
 from tests.pinned import Pinned
 
 # Parts of a method are pinned as well, since its estimate may not show them.
-# pyright: reportPrivateUsage=false
 
 pytestmark = pytest.mark.slow
 

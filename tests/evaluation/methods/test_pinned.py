@@ -25,7 +25,6 @@ from tests.evaluation.shown import numbers
 from tests.pinned import Pinned
 
 # Parts of a method are pinned as well, since its estimate may not show them.
-# pyright: reportPrivateUsage=false
 
 pytestmark = pytest.mark.slow
 
@@ -276,7 +275,7 @@ def test_limits_of_parameters(pinned: Pinned) -> None:
         {"border": 0},
     ):
         try:
-            found.append(repr(replace(one, **change).left_out))
+            found.append(repr(replace(one, **change).left_out))  # pyrefly: ignore[bad-argument-type]
         except ValueError as error:
             found.append(str(error))
     scales = (0.0, 0.5, 0.999, 1.0, 1.999, 6.0)

@@ -261,7 +261,7 @@ def test_the_driver_takes_what_it_took(name: str, pinned: Pinned) -> None:
         asked.append(f"{lab.clock.monotonic():.3f} {words} {code:x} {size}")
         return found
 
-    lab.eos.answer = noted  # pyright: ignore[reportAttributeAccessIssue] - to listen
+    lab.eos.answer = noted  # pyright: ignore[reportAttributeAccessIssue] - to listen  # pyrefly: ignore[method-assign]
     outcomes: list[Any] = []
     for settings in (ExposureSettings(200, 8.0, 0.5), ExposureSettings(400, 5.6, 4.0)):
         try:

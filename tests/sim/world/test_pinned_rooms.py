@@ -21,8 +21,6 @@ from sim.world.world import REFERENCE_EXPOSURE, UNDISTURBED, Blob, Glare, Patch,
 from tests.pinned import Pinned
 from tests.sim.conftest import PAGE_MM, patches
 
-# pyright: reportPrivateUsage=false
-
 TINY = replace(
     BODIES["Test"], sensor=(131, 187), visible=Rectangle(11, 16, 117, 166), masked=(Rectangle(0, 0, 131, 14),)
 )
