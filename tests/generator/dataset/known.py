@@ -28,22 +28,29 @@ CAMERA = np.array([[1.0, 0.2, 0.0], [0.1, 1.0, 0.2], [0.0, 0.1, 0.8]])
 """Sensitivities of the camera in those bands."""
 
 
-def table_in(folder: Path, bits: int = 2, samples: int = 25) -> Lut:
-    """Make a table with noise of every kind, unfit cells, a uncertainty of each light, names and an origin."""
+def table_in(folder: Path, bits: int = 2, samples: int = 25, order: tuple[int, ...] = (0, 1, 2, 3, 4)) -> Lut:
+    """Make a table with noise of every kind, unfit cells, an uncertainty of each light, names and an origin.
+
+    `order`: in which the lights stand.
+    """
     folder.mkdir()
     rng = np.random.default_rng(11)
     index, most = np.arange(8**bits), 2**bits - 1
     codes = np.stack([index >> 2 * bits & most, index >> bits & most, index & most], axis=1) / most
-    writer = LutWriter(folder, len(SPECTRA), 8**bits, samples)
-    white = [400 * np.asarray(light) @ CAMERA.T for light in SPECTRA]
-    for number, light in enumerate(SPECTRA):
+    writer = LutWriter(folder, len(order), 8**bits, samples)
+    spectra = [SPECTRA[light] for light in order]
+    white = [400 * np.asarray(light) @ CAMERA.T for light in spectra]
+    for number, light in enumerate(spectra):
         means = 400 * ((0.04 + 0.96 * codes**2.2) * light) @ CAMERA.T
         drawn = rng.poisson(means[:, None].repeat(samples, axis=1) / 3) * 3 + rng.normal(0, 6, (8**bits, samples, 3))
         writer.put(number, np.clip(np.rint(drawn), 0, 4600).astype(np.uint16))
+    kelvins = (2500.0, 3800.0, 5500.0, 9000.0, None)
     plan = [
-        Illumination(number, "blackbody" if kelvin else "spectrum", kelvin, Colour(9, 8, number), name)
-        for number, (kelvin, name) in enumerate(zip((2500.0, 3800.0, 5500.0, 9000.0, None), "ABCDE", strict=True))
+        Illumination(number, "blackbody" if kelvins[light] else "uniform", kelvins[light], Colour(9, 8, light))
+        for number, light in enumerate(order)
     ]
+    if order == (0, 1, 2, 3, 4):
+        plan[4] = Illumination(4, "spectrum", None, Colour(9, 8, 4), "E")
     known = Provenance(
         camera="Known camera",
         bits=bits,
@@ -54,7 +61,9 @@ def table_in(folder: Path, bits: int = 2, samples: int = 25) -> Lut:
         unfit=[Unfit(colour=colour, cause="a test") for colour in (0, 37, 8**bits - 3)],
         origin=OriginRecord(rig="lab", iso=100, aperture=8, shutter_s=0.5, lens="a lens", authors=["One", "Other"]),
     )
-    uncertainty = "illumination,expanded_deg\n" + "".join(f"{n},{0.1 * (n + 1) ** 1.5:.4f}\n" for n in range(5))
+    uncertainty = "illumination,expanded_deg\n" + "".join(
+        f"{n},{0.1 * (n + 1) ** 1.5:.4f}\n" for n in range(len(order))
+    )
     writer.finish(plan, np.array(white), known, files={UNCERTAINTY: uncertainty})
     return open_lut(folder)
 
@@ -72,11 +81,14 @@ def rows_of(text: str) -> list[list[Any]]:
     return [[plain_text(cell) for cell in row] for row in csv.reader(io.StringIO(text))]
 
 
-def held_by(out: Path, *, pixels: bool = True) -> dict[str, Any]:
-    """Return what a dataset holds: every list, and every image and map as its shape and the hash of its values."""
+def held_by(out: Path, without: tuple[str, ...] = ("table", "lights")) -> dict[str, Any]:
+    """Return what a dataset holds: every list, and every image and map as its shape and the hash of its values.
+
+    `without`: parts of its description that other datasets of the same table have as well.
+    """
     dataset = open_dataset(out)
     described = json.loads((out / "dataset.json").read_text(encoding="utf-8"))
-    for name in MADE_ELSEWHERE:
+    for name in (*MADE_ELSEWHERE, *without):
         described.pop(name, None)
     lists = {path.name: rows_of(path.read_text(encoding="utf-8")) for path in sorted(out.glob("*.csv"))}
     parts = {path.stem: path.read_text().split() for path in sorted(out.glob("splits/*"))}
@@ -88,7 +100,7 @@ def held_by(out: Path, *, pixels: bool = True) -> dict[str, Any]:
         "parts": parts,
         "files": " ".join(sums),
         "faults": list(file_faults(out)),
-        "images": [shown_of(dataset, number) for number in range(len(dataset.entries))] if pixels else [],
+        "images": [shown_of(dataset, number) for number in range(len(dataset.entries))],
     }
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
+import json
 from collections.abc import Iterator
 from contextlib import chdir
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from generator.cli import main
 from tests.generator.dataset.known import held_by, table_in
+from tests.generator.stats_files import write_stats
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -21,7 +23,8 @@ RUNS = {
     "all lights of the table": "--illuminations all --rendering codes --no-preview --split 2,1",
     "listed lights and an exact split": "--illuminations 0,2-3 --rendering codes --split .5,.25,.25 --exact-split",
     "random lights": "--random 3 --rendering codes --format tiff --scale full --shard-images 4",
-    "mixed lights": "--light 1 --light 0:0.25+3:0.75 --light 5600K --light E --light r=.32,b=.3 --rendering codes --uncertainty",
+    "mixed lights": "--light 1 --light 0:0.25+3:0.75 --light 5600K --light E --light r=.32,b=.3 --rendering "
+    "codes --uncertainty",
     "lights drawn evenly": "--distribution uniform --random 3 --rendering codes --format exr --bits 1",
     "lights drawn from a bell": "--distribution gaussian:r=.32,b=.28,sd_r=.03,sd_b=.02,corr=-.6 --random 2 --outside "
     "nearest --rendering codes",
@@ -77,7 +80,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         picture("small/a.png", 21, 34, 8)
         picture("small/b.png", 40, 19, 9)
         picture("small/c.png", 9, 8, 10)
-        os.mkdir("masks")
+        Path("masks").mkdir()
         Path("masks/one.png").write_bytes(
             cv2.imencode(".png", np.arange(48, dtype=np.uint8).reshape(6, 8))[1].tobytes()
         )
@@ -95,3 +98,81 @@ def test_a_dataset(name: str, place: Path, pinned: Pinned, capsys: pytest.Captur
     out = place / name.replace(" ", "-")
     assert main(["lut", out.name, *words, "--seed", "5", "--workers", "1"]) in (0, 1)
     pinned(f"dataset, {name}", {"said": capsys.readouterr().out, **held_by(out)})
+
+
+LIKE = {
+    "like real data": "--draw 14",
+    "like real data in lights and size": "--like-in lights,size --illuminations 1",
+    "like real data with crops": "--like-in pictures,exposure --crop 12x10 --crops 2 --draw 5 --rendering codes",
+    "like real data in black": "--black-point like --like-in pictures --illuminations 2 --draw 9",
+}
+
+
+@pytest.mark.parametrize("name", LIKE)
+def test_a_dataset_like_real_ones(name: str, place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
+    """Weights are found by a descent that ends within a thousandth."""
+    rng = np.random.default_rng(15)
+    values = {name: rng.uniform(low, high, 40) for name, (low, high) in REAL.items()}
+    write_stats(place / "stats.json", rng.normal([0.36, 0.39, 0.25], 0.01, (20, 3)), values)
+    for number in range(8):
+        picture(f"many/{number}.png", 30 + number, 60 - 3 * number, 20 + number)
+    out = place / name.replace(" ", "-")
+    words = f"lut {out.name} --sources many --like stats.json --seed 4 --workers 1 {LIKE[name]}".split()
+    code = main(words)
+    said = capsys.readouterr()
+    pinned(f"dataset, {name}", [code, said.out, said.err if code else held_by(out)], same=1e-3)
+
+
+REAL = {
+    "luminance_1": (0.005, 0.05),
+    "luminance_50": (0.1, 0.45),
+    "luminance_95": (0.5, 0.9),
+    "chroma_spread": (0.02, 0.12),
+    "grey_red": (-0.2, 0.2),
+    "grey_blue": (-0.1, 0.3),
+    "exposure": (0.2, 1.0),
+}
+
+
+def test_scenes_under_the_lights_of_another_table(
+    place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table_in(place / "other", order=(3, 1, 0, 2))
+    first = "--sources small --random-scenes 2 --size 9x7 --seed 6 --max-side 30 --rendering codes"
+    found: list[Any] = []
+    for name, lights in (("single", "--random 2"), ("mixed", "--light 0:.3+2:.7"), ("masks", "--lights-per-image 2")):
+        lights += " --gradient smooth:stops=1" if name == "single" else ""
+        assert main(f"lut first-{name} {first} {lights}".split()) == 0
+        for table in ("lut", "other"):
+            again = f"{table} again-{name}-{table} --lights-of first-{name} --sources small --rendering codes"
+            code = main(again.split())
+            said = capsys.readouterr()
+            found.append([code, said.out, said.err if code else held_by(place / f"again-{name}-{table}")])
+    pinned("datasets under the lights of others", found)
+
+
+def test_a_dataset_in_shares(place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = "lut shares --random-scenes 7 --size 12x9 --random 2 --rendering codes --seed 1 --shard-images 3"
+    found: list[Any] = []
+
+    def run(words: str) -> None:
+        found.append([main([*words.split(), "--json"]), *told(capsys)])
+
+    for words in (f"{plan} --shard 0/2", f"{plan} --shard 2/2", f"{plan} --shard 1/2", "--finish shares", plan):
+        run(words)
+    run("--verify shares")
+    found.append(held_by(place / "shares", ()))
+    (place / "shares/images/000003.png").write_bytes(b"1")
+    (place / "shares/images/000004.png").unlink()
+    (place / "shares/new.txt").touch()
+    run("--verify shares")
+    pinned("a dataset in shares", found)
+
+
+def told(capsys: pytest.CaptureFixture[str]) -> list[Any]:
+    """Return what was printed, without what says when, by which software and how fast."""
+    said = capsys.readouterr()
+    printed = json.loads(said.out or "{}")
+    for name in ("software", "crop"):
+        printed.pop(name, None)
+    return [printed, [line for line in said.err.splitlines() if "/s" not in line and " left " not in line]]

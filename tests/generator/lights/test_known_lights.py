@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import chdir
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from foundation.errors import CropError
 from generator import philox
 from generator.lights.choices import parse_light, parse_lights
 from generator.lights.distributions import load_ground_truths, parse_distribution
-from generator.lights.gamut import Gamut, Match, OutsideGamut, black_body, rgb_of
+from generator.lights.gamut import Gamut, OutsideGamut, black_body, rgb_of
 from generator.lights.lighting import LightChoice, mixture_of, parse_mixture
 from generator.lights.request import LightRequest, load_named_truths
 from tests.generator.dataset.known import table_in
@@ -85,13 +86,12 @@ def test_mixtures_for_wanted_lights(name: str, pinned: Pinned) -> None:
     gamut = GAMUTS[name]
     found: list[Any] = [gamut.rb, gamut.edges, gamut.triangles, gamut.contains(np.array(WANTED, float))]
     ways: tuple[OutsideGamut, ...] = ("refuse", "nearest")
-    for rb in WANTED:
 
-        def match(way: OutsideGamut, light: Any = rgb_of(rb)) -> list[Any]:
-            made: Match = gamut.match(light, way)
-            return [made.mixture.label, made.angle]
+    def matched(rb: Any, way: OutsideGamut) -> list[Any]:
+        made = gamut.match(rgb_of(rb), way)
+        return [made.mixture.label, made.angle]
 
-        found.append([said(lambda way=way: match(way)) for way in ways])
+    found += [[said(partial(matched, rb, way)) for way in ways] for rb in WANTED]
     pinned(f"mixtures of {name}", found, nothing=1e-5)
 
 
