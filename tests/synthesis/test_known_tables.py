@@ -39,11 +39,6 @@ CASES: dict[str, tuple[str, dict[str, Any], str | None]] = {
         {**SETTINGS, "room": {"profile": "managed", "white_level_share": 0.5}},
         "E,cie-hp",
     ),
-    "overexposed cells": (
-        "Test",
-        {**SETTINGS, "room": {"white_level_share": 1.05, "vignetting": 0.4, "projector_falloff": 0.5}},
-        "D65,A",
-    ),
 }
 
 
