@@ -46,11 +46,23 @@ def made(lut: Lut, out: Path, scenes: Any, lights: LightChoice | list[int], **op
 
 
 ORIGIN = OriginRecord(
-    rig="simulated", camera_serial="00ff", camera_serial_is="hash", lens="EF50mm", iso=400, aperture=5.6,
-    shutter_s=0.05, exposure_by="settings", first_frame="2026-03-01T21:30:00+00:00", last_frame="2026-03-02T04:00:00+00:00",
-    frames=12, projector="EPSON", screen="screen", taken_by="croplab 1", title="A title", authors=["Family, Given", "Other"],
-    licence="CC-BY-4.0", note="one\ntwo", url="https://example.org/table",
-)  # fmt: skip
+    rig="simulated",
+    camera_serial="00ff",
+    camera_serial_is="hash",
+    lens="EF50mm",
+    iso=400,
+    aperture=5.6,
+    shutter_s=0.05,
+    exposure_by="settings",
+    first_frame="2026-03-01T21:30:00+00:00",
+    last_frame="2026-03-02T04:00:00+00:00",
+    projector="EPSON",
+    title="A title",
+    authors=["Family, Given", "Other"],
+    licence="CC-BY-4.0",
+    note="one\ntwo",
+    url="https://example.org/table",
+)
 
 
 def test_texts_beside_datasets(lut: Lut, tmp_path: Path, pinned: Pinned) -> None:

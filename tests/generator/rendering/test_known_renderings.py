@@ -138,5 +138,6 @@ def test_black_points(make_table: MakeTable, tmp_path: Path, pinned: Pinned) -> 
                     continue
                 some = np.arange(len(samples)) % 3 == 0
                 out = [without_veil(samples, veil, white, some) for white in (700, lut.provenance.white_level)]
-                found[label] = [black_of(lut, light), veil, *out, without_veil(samples, veil, 65535)]
+                out.append(without_veil(samples, veil, 65535))
+                found[label] = [black_of(lut, light), veil, b"".join(one.tobytes() for one in out)]
     pinned("black points", found)

@@ -101,7 +101,7 @@ def test_images_exposed_anew(pinned: Pinned) -> None:
                     image, factor, NOISE, wanted=NOISE.at(ratio), ratio=ratio, weights=far, end=end if far is not None
                     else (1.0, 1.0, 1.0), white_level=4600, seed=5, number=3, first_row=2, out=out,
                 )  # fmt: skip
-                found[f"{factor} {ratio} {far is not None}"] = [share, out]
+                found[f"{factor} {ratio} {far is not None}"] = [share, out.max(), out.tobytes()]
     shares = (0.0, 0.004, 0.0043, 0.01, 0.5, 1.0)
     found["reached"] = [[brightness_reached(image, share, far, end) for share in shares] for far in (None, weights)]
     for wanted, ratio, below in ((None, 1.0, False), (NOISE.at(4.0), 4.0, True), (NOISE.at(2.0), 2.0, False)):
@@ -122,7 +122,7 @@ def test_images_exposed_anew(pinned: Pinned) -> None:
                     made = image.copy()
                     varied = Variation(exposure, gradient, iso, noise=NOISE).apply(made, 4600, 7, 2)
                     name = f"{exposure} {gradient is not None} {iso is not None}"
-                    found[name] = [varied.details, varied.end, varied.intensity(), made]
+                    found[name] = [varied.details, varied.end, varied.intensity(), made.tobytes()]
     pinned("images exposed anew", found)
 
 
