@@ -12,7 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
+from foundation.errors import CropError
 from generator.cli import main
+from generator.dataset.reader import file_faults, open_dataset
 from tests.generator.dataset.known import held_by, table_in
 from tests.generator.stats_files import write_stats
 from tests.pinned import Pinned
@@ -176,3 +178,109 @@ def told(capsys: pytest.CaptureFixture[str]) -> list[Any]:
     for name in ("software", "crop"):
         printed.pop(name, None)
     return [printed, [line for line in said.err.splitlines() if "/s" not in line and " left " not in line]]
+
+
+REFUSED = """lut new --sources small --crop 5
+lut new --sources small --crop 99x99
+lut new --sources small --cover
+lut new --sources small --crops 2
+lut new --random-scenes 2 --crop 4x4
+lut new --random-scenes 2 --max-side 4
+lut new --sources small --random-scenes 1 --crop 4x4 --crops 2
+lut new --random-scenes 1 --bits 3 --rendering codes
+lut new --random-scenes 1 --scale full --format exr
+lut new --random-scenes 1 --format dng --size 21x30
+lut new --random-scenes 1 --exact-split
+lut new --random-scenes 1 --rendering codes --matrix none
+lut new --random-scenes 1 --matrix nothing
+lut new --random-scenes 1 --black-point like
+lut new --random-scenes 1 --iso 50
+lut new --random-scenes 1 --iso 800/200
+lut new --random-scenes 1 --gradient smooth:colour=.2 --masks smooth --rendering codes
+lut new --random-scenes 1 --like-in lights
+lut new --random-scenes 1 --draw 2
+lut new --random-scenes 1 --like stats.json --like-in lights,other
+lut new --random-scenes 1 --like stats.json --like-in lights --random 2 --light 1
+lut new --random-scenes 1 --like stats.json --like-in size --draw 3
+lut new --random-scenes 1 --like truths.csv
+lut new --random-scenes 1 --like stats.json --lights-of old
+lut new --random-scenes 1 --lights-of old
+lut new --sources small --lights-of old --light 1
+lut new --sources small --lights-of old --max-side 9
+lut new --sources small --lights-of lut
+lut new --random-scenes 1 --light none
+lut new --random-scenes 1 --light 1 --random 2
+lut new --random-scenes 1 --light r=.1,b=.1
+lut new --random-scenes 1 --masks smooth --lights-per-image 1
+lut new --random-scenes 1 --masks smooth --illuminations 0-2
+lut new --random-scenes 1 --masks smooth --random 3
+lut new --random-scenes 1 --nearest cat.png
+lut new --random-scenes 1 --match truths.csv
+lut new --sources cat.png --lights-by-name named.csv
+lut new --random-scenes 1 --size 0x4
+lut old --random-scenes 2 --size 9x8
+lut old --random-scenes 1 --size 9x8 --seed 7"""
+
+
+def test_what_is_refused(place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
+    write_stats(place / "stats.json", [[0.3, 0.4, 0.3]] * 3, {name: [0.1, 0.2, 0.3] for name in REAL})
+    assert main(["lut", "old", "--random-scenes", "1", "--size", "9x8", "--rendering", "codes"]) == 0
+    capsys.readouterr()
+    found: dict[str, Any] = {}
+    for words in REFUSED.splitlines():
+        code = main(words.split())
+        said = [line for line in capsys.readouterr().err.splitlines() if not line.endswith("/s")]
+        found[words] = [code, *(line.replace(str(place), "PLACE") for line in said)]
+        assert not (place / "new").exists(), words
+    pinned("datasets that are refused", found)
+
+
+DAMAGES: dict[str, list[tuple[str, str]]] = {
+    "gt.txt": [
+        ("0.", "1."),
+        ("\n", "\n\n"),
+        (" ", ","),
+        ("0.5", "0.500003"),
+        ("0.543478261", "0.543480"),
+        ("0.543478261", "0.5434797"),
+        ("1\n", "1 1\n"),
+    ],
+    "ground_truth.csv": [
+        (",0,", ",9,"),
+        ("000001", "000009"),
+        ("000000", "x"),
+        ("illumination", "light"),
+        ("0.5", "nan"),
+    ],
+    "dataset.json": [
+        ('"version": 2', '"version": 9'),
+        ('"images": 2', '"images": 3'),
+        ('"seed"', '"sead"'),
+        ("{", "["),
+    ],
+    "sources.csv": [("width", "wide"), (",9,8,", ",9,eight,"), (",9,8,", ",9,-8,")],
+    "SHA256SUMS": [("  ", " "), ("gt.txt", "../gt.txt"), ("gt.txt", "sources.csv"), ("gt.txt", "none.txt")],
+    "images/000001.png": [("IHDR", "IHDS"), ("IDAT", "IDAX"), ("IEND", "")],
+}
+
+
+def test_damaged_datasets(place: Path, pinned: Pinned) -> None:
+    plan = "lut damaged --random-scenes 2 --size 9x8 --rendering codes --light 0 --no-preview"
+    assert main(plan.split()) == 0
+    found: dict[str, Any] = {}
+    for name, changes in DAMAGES.items():
+        path = place / "damaged" / name
+        whole = path.read_bytes()
+        for old, new in changes:
+            path.write_bytes(whole.replace(old.encode(), new.encode(), 1))
+            told: list[Any] = []
+            try:
+                told += file_faults(place / "damaged")
+                dataset = open_dataset(place / "damaged")
+                told += [[entry.image, entry.truth, dataset.read_image(entry).tobytes()] for entry in dataset.entries]
+                told.append(len(dataset.sources))
+            except CropError as error:
+                told.append(f"{type(error).__name__}: {error}".replace(str(place), "PLACE").partition(" (")[0])
+            found[f"{name} {old!r} {new!r}"] = told
+        path.write_bytes(whole)
+    pinned("damaged datasets", found)
