@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+from bisect import bisect_left
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,12 +11,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from foundation.errors import FormatError
 from generator import files
 from generator.deflate import code_lengths, codes_of
 from generator.files import (
     ImageMetadata,
+    decode_image,
     encode_dng,
     encode_exr,
+    encode_image,
     encode_map,
     encode_png,
     encode_tiff,
@@ -24,6 +29,7 @@ from generator.files import (
     half_size,
     mosaic_of,
     preview_of,
+    require_plausible,
     to_full_scale,
 )
 from tests.pinned import Pinned
@@ -115,3 +121,39 @@ def test_previews_and_scales(pinned: Pinned) -> None:
     found["mosaic"] = [mosaic, half_size(mosaic), half_size(mosaic[:6, 1:])]
     # A code may be off by one where another processor rounds a power otherwise.
     pinned("previews and scales", found, same=1e-4)
+
+
+def test_what_a_head_may_claim(pinned: Pinned) -> None:
+    """The most rows that a file of 200 bytes may claim, by bits and kind of colour; and how long a part may be."""
+
+    def is_plausible(data: bytes) -> bool:
+        try:
+            require_plausible(data, "it")
+        except FormatError:
+            return False
+        return True
+
+    def head(rows: int, depth: int, colour: int, size: int = 13) -> bytes:
+        return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBB", size, b"IHDR", 61, rows, depth, colour) + bytes(7)
+
+    found: dict[str, Any] = {}
+    for depth in (1, 8, 16):
+        for colour in range(8):
+            rows = range(1 << 20)
+            found[f"{depth} {colour}"] = bisect_left(
+                rows, True, key=lambda many, d=depth, c=colour: not is_plausible(head(many, d, c) + bytes(167))
+            )
+    parts = [head(1, 8, 2)[:length] + struct.pack(">I", size) + bytes(8) for length in (32, 33) for size in range(4)]
+    parts += [head(1, 8, 2, size) for size in (12, 13, 14)] + [head(1, 8, 2)[:length] for length in (7, 25, 26, 32)]
+    found["parts"] = [is_plausible(part) for part in parts]
+    pinned("what a head may claim", found)
+
+
+@pytest.mark.slow
+def test_images_come_back(pinned: Pinned) -> None:
+    image = np.random.default_rng(12).integers(0, 65536, (23, 25, 3)).astype(np.uint16)
+    forms: tuple[files.Format, ...] = ("png", "tiff", "exr", "dng")
+    pinned(
+        "images that come back",
+        [decode_image(encode_image(image, form, OF_A_BODY), form, "it").tobytes() for form in forms],
+    )
