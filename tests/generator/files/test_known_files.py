@@ -1,4 +1,7 @@
-"""Bytes of files, previews and scales of images that are easily packed wrong, as they were before."""
+"""Bytes of files, previews and scales of images that are easily packed wrong, as they were before.
+
+Who changes the bytes of an image's file changes every dataset: one that is made again is to be the same.
+"""
 
 from __future__ import annotations
 
@@ -60,6 +63,9 @@ def images() -> Iterator[tuple[str, Image16]]:
     yield "rare bytes", np.where(rng.random((90, 90, 1)) < 0.001, rng.integers(0, 65536, (90, 90, 3)), few[:1])
     ramp = np.arange(90 * 70).reshape(90, 70, 1) * np.array([1, 3, 7])
     yield "a ramp", ramp % 65536
+    index = np.arange(640 * 480).reshape(640, 480, 1)
+    # Of so many symbols one row of eight is counted.
+    yield "samples of cells", (index * index // 97 % 40) * [31, 97, 55] + (index * 2654435761 >> 7) % 25 * [3, 10, 6]
     yield "a noisy ramp", ramp // 8 + rng.poisson(20, (90, 70, 3))
 
 

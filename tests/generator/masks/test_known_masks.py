@@ -1,4 +1,7 @@
-"""Masks of every kind, number of lights and shape of image, and maps of them, as they were before."""
+"""Masks of every kind, number of lights and shape of image, and maps of them, as they were before.
+
+Who changes what a seed decides changes datasets: who makes one again, with a later version, is to get the same.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,8 @@ import numpy as np
 import pytest
 
 from foundation.errors import CropError
-from generator.masks.making import find_masks, parse_masks, quantise_shares
+from generator import philox
+from generator.masks.making import RandomStreams, find_masks, parse_masks, quantise_shares
 from generator.masks.maps import (
     decode_ground_truth,
     decode_weights,
@@ -117,3 +121,8 @@ def test_maps_of_weights(pinned: Pinned) -> None:
             decode_ground_truth(maps[-1][2], "map") if maps else None,
         ]  # fmt: skip
     pinned("maps of weights", found)
+
+
+def test_streams_are_of_the_words() -> None:
+    words = philox.words(2**40 + 9, np.arange(5), 2, 7, philox.MASKS)[0]
+    np.testing.assert_allclose(RandomStreams(2**40 + 9, 7).uniform(2, 5), (words + 0.5) / 2**32, rtol=1e-15)

@@ -124,7 +124,7 @@ def test_black_points(make_table: MakeTable, tmp_path: Path, pinned: Pinned) -> 
     found: dict[str, Any] = {}
     for text, point in points.items():
         found[text] = point if isinstance(point, str) else [
-            point.label, said(point.shares, words), [said(point.share, 3, image) for image in range(3)]
+            point.label, said(point.shares, words), [said(point.share, 2**40 + 9, image) for image in (0, 1, 70000)]
         ]  # fmt: skip
     assert BlackPoint() == points["keep"]
     for name, lut in (("print", make_table()), ("known", table_in(tmp_path / "known"))):
