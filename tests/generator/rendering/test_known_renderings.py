@@ -57,14 +57,13 @@ def test_matrices(make_table: MakeTable, tmp_path: Path, pinned: Pinned, monkeyp
     pinned("colour matrices", {**found, "fitted": [fitted_matrix(lut), fitted_matrix(other)]})
 
 
-@pytest.mark.parametrize("case", ["plain", "tinted", "odd", "small"])
+@pytest.mark.parametrize("case", ["tinted", "odd", "small"])
 def test_maps_of_prints(case: str, make_table: MakeTable, tmp_path: Path, pinned: Pinned) -> None:
     def spoil(samples: Any) -> None:
         samples[37, 3], samples[100] = 11000, 0
         samples[5, :, 1] = 11536
 
     lut = {
-        "plain": lambda: make_table(),
         "tinted": lambda: make_table(tint=0.1, blue_of_green=0.4),
         "odd": lambda: make_table(change=spoil, lights=2),
         "small": lambda: table_in(tmp_path / "known"),
@@ -82,7 +81,7 @@ def test_maps_of_prints(case: str, make_table: MakeTable, tmp_path: Path, pinned
     found.append([black_point(one, one.colours, one.bits) for one in profiles])
     found.append(nearest_to(colours, 0.2 + 0.5 * source_colours(MINE)[::400], np.full((13, 3), 0.5), profiles[-1].bits))
     for light in (*map(plain, lights), mixture):
-        for share in (0.0, 0.7, 1.0):
+        for share in (0.0, 0.7):
             made = said(rendering.printed, light, share)
             found.append(made if isinstance(made, str) else [rendering.black(light), vars(made)])
     picture = np.random.default_rng(17).integers(0, 256, (21, 37, 3)).astype(np.uint8)
