@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from calibration.table.lut import open_lut
-from foundation.errors import CropError
 from synthesis.lamps import illuminations_of, parse_spectra, read_lights
 from synthesis.settings import parse_settings, room_of, stated_by_hand, table_task
 from synthesis.table import compute_table
 from tests.generator.dataset.known import rows_of
+from tests.generator.said import said
 from tests.pinned import Pinned
 from tests.synthesis.test_table import task_of
 
@@ -40,14 +40,6 @@ CASES: dict[str, tuple[str, dict[str, Any], str | None]] = {
         "E,cie-hp",
     ),
 }
-
-
-def said(call: Any, *given: Any) -> Any:
-    """Return what a call gives, or the sentence that refuses it."""
-    try:
-        return call(*given)
-    except CropError as error:
-        return str(error)
 
 
 def held_by(folder: Path) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from calibration.table.writing import LutWriter
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from generator.dataset.reader import Dataset, file_faults, open_dataset
+from generator.kernels.choice import channels_of
 
 MADE_ELSEWHERE = ("software", "libraries")
 """What `dataset.json` says of the machine that made it."""
@@ -35,14 +36,14 @@ def table_in(folder: Path, bits: int = 2, samples: int = 25, order: tuple[int, .
     """
     folder.mkdir()
     rng = np.random.default_rng(11)
-    index, most = np.arange(8**bits), 2**bits - 1
-    codes = np.stack([index >> 2 * bits & most, index >> bits & most, index & most], axis=1) / most
+    codes = channels_of(np.arange(8**bits), bits) / (2**bits - 1)
     writer = LutWriter(folder, len(order), 8**bits, samples)
     spectra = [SPECTRA[light] for light in order]
     white = [400 * np.asarray(light) @ CAMERA.T for light in spectra]
     for number, light in enumerate(spectra):
         means = 400 * ((0.04 + 0.96 * codes**2.2) * light) @ CAMERA.T
-        drawn = rng.poisson(means[:, None].repeat(samples, axis=1) / 3) * 3 + rng.normal(0, 6, (8**bits, samples, 3))
+        photons = np.asarray(rng.poisson(means[:, None].repeat(samples, axis=1) / 3), np.float64)
+        drawn = photons * 3 + rng.normal(0, 6, (8**bits, samples, 3))
         writer.put(number, np.clip(np.rint(drawn), 0, 4600).astype(np.uint16))
     kelvins = (2500.0, 3800.0, 5500.0, 9000.0, None)
     plan = [

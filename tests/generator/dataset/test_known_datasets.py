@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from foundation.errors import CropError
@@ -114,7 +115,7 @@ LIKE = {
 def test_a_dataset_like_real_ones(name: str, place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
     """Weights are found by a descent that ends within a thousandth."""
     rng = np.random.default_rng(15)
-    values = {name: rng.uniform(low, high, 40) for name, (low, high) in REAL.items()}
+    values: dict[str, npt.ArrayLike] = {name: rng.uniform(low, high, 40) for name, (low, high) in REAL.items()}
     write_stats(place / "stats.json", rng.normal([0.36, 0.39, 0.25], 0.01, (20, 3)), values)
     for number in range(8):
         picture(f"many/{number}.png", 30 + number, 60 - 3 * number, 20 + number)

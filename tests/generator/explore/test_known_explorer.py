@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from foundation.errors import CropError
 from foundation.local_server import Refusal, Request
 from generator.explore.explorer import Explorer, ExploreServer
 from generator.pictures.sources import Preparation, find_pictures
 from tests.generator.dataset.known import table_in
+from tests.generator.said import said
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -24,13 +24,6 @@ LIGHTS = ("0", "1:.3+2:.7", "r=.3,b=.3", "r=.9,b=.05", "5600K", "E", "9", "")
 def png(seed: int, height: int, width: int) -> bytes:
     codes = np.random.default_rng(seed).integers(0, 256, (height, width, 3)).astype(np.uint8)
     return cv2.imencode(".png", codes)[1].tobytes()
-
-
-def said(call: Any, *given: Any) -> Any:
-    try:
-        return call(*given)
-    except CropError as error:
-        return str(error)
 
 
 def test_what_the_page_is_told(tmp_path: Path, pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,10 +40,8 @@ from tests.pinned import Pinned
 METADATA = ImageMetadata(white_level=4600, white=(4000.0, 2520.0, 840.5), camera="Known camera")
 OF_A_BODY = ImageMetadata(white_level=11536, white=(2046.0, 1579.5, 4520.0), camera="Canon EOS 550D")
 
-Image16 = npt.NDArray[np.uint16]
 
-
-def images() -> Iterator[tuple[str, Image16]]:
+def images() -> Iterator[tuple[str, npt.NDArray[Any]]]:
     """Yield images with runs of every length, repeats at the ends of the window, few and many values, odd sizes."""
     rng = np.random.default_rng(8)
     few = rng.integers(0, 4000, (9, 3))

@@ -5,9 +5,8 @@ Who changes what a seed decides changes datasets: who makes one again, with a la
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import chdir
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ import numpy as np
 import pytest
 
 from calibration.table.lut import Lut
-from foundation.errors import CropError
 from generator import philox
 from generator.lights.choices import parse_light, parse_lights
 from generator.lights.distributions import load_ground_truths, parse_distribution
@@ -23,6 +21,7 @@ from generator.lights.gamut import Gamut, OutsideGamut, black_body, rgb_of
 from generator.lights.lighting import LightChoice, mixture_of, parse_mixture
 from generator.lights.request import LightRequest, load_named_truths
 from tests.generator.dataset.known import table_in
+from tests.generator.said import said
 from tests.generator.stats_files import write_stats
 from tests.pinned import Pinned
 
@@ -48,14 +47,6 @@ WANTED = [
     [0, 0],
 ]
 """At lights, anywhere, half way between two, beside that by less and by more than the tolerance, and far outside."""
-
-
-def said(call: Callable[[], Any]) -> Any:
-    """Return what a call gives, or the sentence that refuses it."""
-    try:
-        return call()
-    except CropError as error:
-        return f"{type(error).__name__}: {error}"
 
 
 def shown(choice: LightChoice, scenes: tuple[int, ...] = (0, 1, 2, 70000)) -> list[Any]:
@@ -95,7 +86,7 @@ def test_mixtures_for_wanted_lights(name: str, pinned: Pinned) -> None:
         made = gamut.match(rgb_of(rb), way)
         return [made.mixture.label, made.angle]
 
-    found += [[said(partial(matched, rb, way)) for way in ways] for rb in WANTED]
+    found += [[said(matched, rb, way) for way in ways] for rb in WANTED]
     pinned(f"mixtures of {name}", found, nothing=1e-5)
 
 
@@ -105,7 +96,7 @@ def test_draws_of_distributions(pinned: Pinned) -> None:
     texts += ("gt.csv", "gt.txt", "stats.json", "far.json", "gaussian:r=.3,sd=.1", "gaussian:r=.3,b=.2,sd_r=.1", "none")
     found: dict[str, Any] = {}
     for text in texts:
-        distribution = said(lambda text=text: parse_distribution(text))
+        distribution = said(parse_distribution, text)
         found[text] = distribution if isinstance(distribution, str) else [
             distribution.describe(),
             distribution.draw(words),
@@ -127,12 +118,10 @@ def test_lights_that_texts_name(lut: Lut, pinned: Pinned) -> None:
         "0:0+4:3",
     )
     texts += ("4:.3+0:.7", "0:.3+0:.7", "", "r=.3,b=.25,cct=5000", "1:.2+9:.8")
-    found = {text: said(lambda text=text: parse_light(text, lut).label) for text in texts}
-    found |= {
-        f"{text} nearest": said(lambda text=text: parse_light(text, lut, None, "nearest").label) for text in texts
-    }
+    found = {text: said(parse_light, text, lut) for text in texts}
+    found |= {f"{text} nearest": said(parse_light, text, lut, None, "nearest") for text in texts}
     lists = ("all", " ALL ", "0,2-4", "4-4,1,4", "3-1", "0-5", "1,,2", "0 - 2 , 4", "-1")
-    found |= {f"list {text}": said(lambda text=text: parse_lights(text, 5).lights) for text in lists}
+    found |= {f"list {text}": said(parse_lights, text, 5) for text in lists}
     parts = ({4: 3, 1: 1, 2: 0.0}, {0: 1, 1: 4e-10}, {0: 1, 1: 6e-10}, {0: 1, 1: 1, 2: 1})
     found |= {f"parts {number}": mixture_of(one) for number, one in enumerate(parts)}
     found["parsed"] = [parse_mixture(text) for text in ("7", "3:.2+1:.8", "1:.3333333+2:.3333333+5:.3333334")]
@@ -146,10 +135,7 @@ def test_files_of_lights(pinned: Pinned) -> None:
     Path("none.csv").write_text("r,g,b\n", "utf-8")
     Path("other.csv").write_text("x,y\n1,2\n", "utf-8")
     names = ("gt.csv", "gt.txt", "many.csv", "stats.json", "wrong.csv", "few.txt", "none.csv", "other.csv")
-    found = {
-        name: [said(lambda n=name, r=read: r(Path(n))) for read in (load_ground_truths, load_named_truths)]
-        for name in names
-    }
+    found = {name: [said(read, Path(name)) for read in (load_ground_truths, load_named_truths)] for name in names}
     pinned("files of lights", found)
 
 
@@ -179,15 +165,12 @@ REQUESTS: dict[str, dict[str, Any]] = {
 @pytest.mark.slow
 def test_requests(lut: Lut, pinned: Pinned) -> None:
     names = ["one.png", "raw/two.png", "one.png", "raw/two.png"]
-    found = {
-        name: said(
-            lambda wishes=wishes, name=name: shown(
-                LightRequest(**wishes).choose(lut, SEED, names[:2]), (0, 1) if "by name" in name else (0, 1, 70000)
-            )
-        )
-        for name, wishes in REQUESTS.items()
-    }
-    crops = LightRequest(lights_by_name=Path("many.csv"), outside="nearest").choose(lut, SEED, names[:2], 2)
-    pinned("requests of lights", {**found, "crops by name": shown(crops, (0, 1, 2, 3)), "ambiguous": said(
-        lambda: LightRequest(lights_by_name=Path("many.csv")).choose(lut, SEED, names)
-    )})  # fmt: skip
+    found: dict[str, Any] = {}
+    for name, wishes in REQUESTS.items():
+        choice = said(LightRequest(**wishes).choose, lut, SEED, names[:2])
+        scenes = (0, 1) if "by name" in name else (0, 1, 70000)
+        found[name] = choice if isinstance(choice, str) else said(shown, choice, scenes)
+    by_name = LightRequest(lights_by_name=Path("many.csv"), outside="nearest")
+    found["crops by name"] = shown(by_name.choose(lut, SEED, names[:2], 2), (0, 1, 2, 3))
+    found["ambiguous"] = said(by_name.choose, lut, SEED, names)
+    pinned("requests of lights", found)

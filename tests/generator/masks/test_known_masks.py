@@ -33,16 +33,17 @@ TEXTS = (
     "half-plane:angle=-30,width=.3",
     "soft-edge",
     "soft-edge:angle=200,width=0",
-)
-TEXTS += (
     "spots",
     "spots:count=1,radius=1,softness=2",
     "spots:count=20,radius=.05,softness=0",
     "smooth",
     "smooth:scale=2",
+    "smooth:scale=.02,contrast=100",
+    "smooth:contrast=0",
+    "window",
+    "window:columns=1,rows=1,softness=0",
+    "window:columns=5,rows=2,softness=.3",
 )
-TEXTS += ("smooth:scale=.02,contrast=100", "smooth:contrast=0", "window", "window:columns=1,rows=1,softness=0")
-TEXTS += ("window:columns=5,rows=2,softness=.3",)
 REFUSED = ("window:columns=1.5", "spots:count=0", "spots:count=21", "smooth:scale=.01", "half", "smooth:radius=1", "")
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from foundation.errors import CropError
 from generator.lights.lighting import Mixture, plain
 from generator.rendering.black_points import BlackPoint, black_of, parse_black_point, veil_of, without_veil
 from generator.rendering.colorimetric import (
@@ -24,19 +23,12 @@ from generator.rendering.print_profiles import neutral_ends, odd_cells, profile_
 from tests.generator.dataset.known import table_in
 from tests.generator.rendering.conftest import MakeTable
 from tests.generator.rendering.prints import MATRIX, printed
+from tests.generator.said import said
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
 
 MINE = ColourMatrix("mine", MATRIX, "a test")
-
-
-def said(call: Any, *given: Any) -> Any:
-    """Return what a call gives, or the sentence that refuses it."""
-    try:
-        return call(*given)
-    except CropError as error:
-        return str(error)
 
 
 def test_matrices(make_table: MakeTable, tmp_path: Path, pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,7 +45,7 @@ def test_matrices(make_table: MakeTable, tmp_path: Path, pinned: Pinned, monkeyp
         Path(name).write_text(text, "utf-8")
     lut, other = make_table(name="lut"), table_in(Path("other"))
     names = (*texts, None, " Table", "none", "NONE ", "1000d", "absent")
-    found |= {f"asked for {name}": said(lambda name=name: matrix_for(lut, name)) for name in names}
+    found |= {f"asked for {name}": said(matrix_for, lut, name) for name in names}
     pinned("colour matrices", {**found, "fitted": [fitted_matrix(lut), fitted_matrix(other)]})
 
 
@@ -63,11 +55,11 @@ def test_maps_of_prints(case: str, make_table: MakeTable, tmp_path: Path, pinned
         samples[37, 3], samples[100] = 11000, 0
         samples[5, :, 1] = 11536
 
-    lut = {
-        "tinted": lambda: make_table(tint=0.1, blue_of_green=0.4),
-        "odd": lambda: make_table(change=spoil, lights=2),
-        "small": lambda: table_in(tmp_path / "known"),
-    }[case]()
+    changes: dict[str, dict[str, Any]] = {
+        "tinted": {"tint": 0.1, "blue_of_green": 0.4},
+        "odd": {"change": spoil, "lights": 2},
+    }
+    lut = make_table(**changes[case]) if case in changes else table_in(tmp_path / "known")
     lights = range(len(lut.white))
     profiles = [profile_of(lut, light) for light in lights]
     samples = np.asarray(lut.samples[0])

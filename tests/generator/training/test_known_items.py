@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from foundation.errors import CropError
 from generator.lights.lighting import Mixture
 from generator.pictures.random_scenes import random_scenes
 from generator.rendering.matrices import ColourMatrix
@@ -19,6 +18,7 @@ from generator.variation.iso_speed import parse_iso
 from generator.variation.sensor_noise import SensorNoise
 from tests.generator.dataset.known import table_in
 from tests.generator.rendering.prints import MATRIX
+from tests.generator.said import said
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -70,20 +70,17 @@ def test_galleries_and_what_is_refused(tmp_path: Path, pinned: Pinned) -> None:
     wrong += [{"epoch": 2**32}, {"black_point": "like"}, {"black_point": "grey"}, {"black_point": 3}]
     found: list[Any] = [saved.names, saved.sizes, saved.offsets, saved.codes, again.names, again.picture(2), len(again)]
 
-    def said(call: Any) -> str:
-        with pytest.raises(CropError) as refused:
-            call()
-        return str(refused.value).replace(str(tmp_path), "PLACE")
-
     for given in wrong:
         named: dict[str, Any] = {"size": (5, 8), "rendering": "codes", **given}
-        found.append([str(given), said(lambda named=named: Crops(lut, again, **named))])
+        found += [str(given), said(Crops, lut, again, **named)]
     crops = Crops(lut, again, (5, 8), length=4, rendering="codes")
     items: list[Any] = [[], [4], [-1], [[0]]]
-    found += [said(lambda items=items: crops.batch(items)) for items in items]
-    found += [said(lambda: gallery_of([])), said(lambda: gallery_of(pictures(), ["a"]))]
+    found += [said(crops.batch, one) for one in items]
     found += [
-        said(lambda: gallery_of([np.zeros((0, 3, 3), np.uint8)])),
-        said(lambda: save_gallery([], tmp_path / "new")),
+        said(gallery_of, []),
+        said(gallery_of, pictures(), ["a"]),
+        said(gallery_of, [np.zeros((0, 3, 3), np.uint8)]),
     ]
-    pinned("galleries", found)
+    found.append(said(save_gallery, [], tmp_path / "new"))
+    places = [one.replace(str(tmp_path), "PLACE") if isinstance(one, str) else one for one in found]
+    pinned("galleries", places)

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from foundation.errors import CropError
 from generator.variation.exposing import add_noise, brightness_reached, expose
 from generator.variation.iso_speed import parse_iso
 from generator.variation.sensor_noise import SensorNoise, normal_deviates
@@ -19,20 +18,45 @@ from generator.variation.variation import (
     parse_exposure,
     parse_gradient,
 )
+from tests.generator.said import said
 from tests.pinned import Pinned
 
 NOISE = SensorNoise(read=(6.0, 0.0, 3.5), shot=(0.5, 0.25, 0.75))
-EXPOSURES = ("2", ".25", "64", "0.000244140625", "65", ".0002", "nan", "stops:low=-2,high=1", "stops:low=1,high=1")
-EXPOSURES += ("stops:low=1,high=0", "stops:low=-2", "normal:mean=-1,sd=.5", "normal:mean=0,sd=0", "normal:mean=1")
-EXPOSURES += ("clip:share=.01", "clip:share=0", "clip:share=.9,most=64", "clip", "level:share=.01,low=.3,high=.9")
-EXPOSURES += ("level:share=.01,low=.5", "level:share=0,low=1,high=1,most=2", "level:share=.1,high=1", "bright")
+EXPOSURES = (
+    "2",
+    ".25",
+    "64",
+    "0.000244140625",
+    "65",
+    ".0002",
+    "nan",
+    "stops:low=-2,high=1",
+    "stops:low=1,high=1",
+    "stops:low=1,high=0",
+    "stops:low=-2",
+    "normal:mean=-1,sd=.5",
+    "normal:mean=0,sd=0",
+    "normal:mean=1",
+    "clip:share=.01",
+    "clip:share=0",
+    "clip:share=.9,most=64",
+    "clip",
+    "level:share=.01,low=.3,high=.9",
+    "level:share=.01,low=.5",
+    "level:share=0,low=1,high=1,most=2",
+    "level:share=.1,high=1",
+    "bright",
+)
 GRADIENTS = (
     "smooth",
     "soft-edge:width=.8,stops=2",
     "half-plane:angle=30,least=2",
     "spots:stops=1.5,least=.5,colour=.3",
+    "window:columns=2,softness=.1,colour=0",
+    "smooth:stops=1,least=2",
+    "none",
+    "smooth:stops=0,colour=.2",
 )
-GRADIENTS += ("window:columns=2,softness=.1,colour=0", "smooth:stops=1,least=2", "none", "smooth:stops=0,colour=.2")
 SPEEDS = (
     "1600/100",
     "1600",
@@ -45,14 +69,6 @@ SPEEDS = (
     "400:read=0",
     "400/200",
 )
-
-
-def said(parse: Any, *given: Any) -> Any:
-    """Return what is read of a text, or the sentence that refuses it."""
-    try:
-        return parse(*given)
-    except CropError as error:
-        return str(error)
 
 
 def test_texts_of_variations(pinned: Pinned) -> None:
@@ -131,21 +147,21 @@ def test_what_cannot_be_varied(pinned: Pinned) -> None:
     items = np.zeros((2, 3, 2, 2), np.float32)
     seeds = np.zeros(2, np.uint64)
     found = [
-        said(lambda: expose(image[..., :2], 1.0, NOISE)),
-        said(lambda: expose(image, 0.0, NOISE)),
-        said(lambda: expose(image, 1.0, NOISE, ratio=0.5)),
-        said(lambda: expose(image, 1.0, NOISE, end=(0.0, 1.0, 1.0))),
-        said(lambda: expose(image, 1.0, NOISE, weights=np.zeros((4, 4, 2), np.float32))),
-        said(lambda: expose(image, 1.0, NOISE, out=image[:2].copy())),
-        said(lambda: expose(image, 1.0, NOISE, white_level=0)),
-        said(lambda: add_noise(items, ones * 0, NOISE, seeds, white_level=9)),
-        said(lambda: add_noise(items, ones, NOISE, seeds[:1], white_level=9)),
-        said(lambda: add_noise(items[0], ones, NOISE, seeds, white_level=9)),
-        said(lambda: DrawnExposure((1.0, 0.0))),
-        said(lambda: DrawnExposure(())),
-        said(lambda: AutomaticExposure(1.0)),
-        said(lambda: AutomaticExposure(0.5, (0.0, 1.0))),
-        said(lambda: Variation(noise=NOISE)),
+        said(expose, image[..., :2], 1.0, NOISE),
+        said(expose, image, 0.0, NOISE),
+        said(expose, image, 1.0, NOISE, ratio=0.5),
+        said(expose, image, 1.0, NOISE, end=(0.0, 1.0, 1.0)),
+        said(expose, image, 1.0, NOISE, weights=np.zeros((4, 4, 2), np.float32)),
+        said(expose, image, 1.0, NOISE, out=image[:2].copy()),
+        said(expose, image, 1.0, NOISE, white_level=0),
+        said(add_noise, items, ones * 0, NOISE, seeds, white_level=9),
+        said(add_noise, items, ones, NOISE, seeds[:1], white_level=9),
+        said(add_noise, items[0], ones, NOISE, seeds, white_level=9),
+        said(DrawnExposure, (1.0, 0.0)),
+        said(DrawnExposure, ()),
+        said(AutomaticExposure, 1.0),
+        said(AutomaticExposure, 0.5, (0.0, 1.0)),
+        said(Variation, noise=NOISE),
     ]
     assert all(isinstance(sentence, str) for sentence in found)
     pinned("what cannot be varied", found)
