@@ -72,7 +72,12 @@ def test_texts_for_readers(pinned: Pinned) -> None:
     output.append("list", "é")
     output.add(other=np.float64("nan"), values=values)
     output.write(stream)
-    words = (["run", "-vv", "x", "-q"], ["-v", "--", "-q"], ["a", "--verbose", "-vq", "--quiet"], [])
+    words: tuple[list[str], ...] = (
+        ["run", "-vv", "x", "-q"],
+        ["-v", "--", "-q"],
+        ["a", "--verbose", "-vq", "--quiet"],
+        [],
+    )
     names = ["one", "two", "three", "four"]
     hosts = ("localhost", "127.9.0.1", "::1", "0.0.0.0", "a.b", "LOCALHOST", "1.2.3.4")
     addresses = ("s3://key:secret@host/a?token=abc&x=1", "https://a.b/c?sig=1", "plain", "u:p@h")
@@ -108,7 +113,7 @@ def test_pieces_of_pages_and_figures(pinned: Pinned) -> None:
     for side, inches in ((8.0, 4.0), (0.01, 4.0), (2.0, 9.0)):
         draw_squares(axes, (105.0, 74.0), places, side, np.array([0.1, 0.5, 2.0]), inches, cmap="gray", vmin=0, vmax=2)
     squares = [[one.get_sizes(), one.get_offsets().data] for one in axes.collections]  # pyright: ignore
-    found = {
+    found: dict[str, Any] = {
         "pieces": [str(piece) for piece in pieces],
         "styles": [series_style(number) for number in (0, 6, 7, 13, 27, 28)],
         "labels": [legend_label(name) for name in ("_a", "a_", "")],

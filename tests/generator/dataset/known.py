@@ -36,7 +36,7 @@ def table_in(folder: Path, bits: int = 2, samples: int = 25, order: tuple[int, .
     """
     folder.mkdir()
     rng = np.random.default_rng(11)
-    codes = channels_of(np.arange(8**bits), bits) / (2**bits - 1)
+    codes = channels_of(np.arange(1 << 3 * bits), bits) / (2**bits - 1)
     writer = LutWriter(folder, len(order), 8**bits, samples)
     spectra = [SPECTRA[light] for light in order]
     white = [400 * np.asarray(light) @ CAMERA.T for light in spectra]
