@@ -38,6 +38,8 @@ from generator.files import (
 from tests.generator.said import said
 from tests.pinned import Pinned
 
+pytestmark = pytest.mark.slow
+
 METADATA = ImageMetadata(white_level=4600, white=(4000.0, 2520.0, 840.5), camera="Known camera")
 OF_A_BODY = ImageMetadata(white_level=11536, white=(2046.0, 1579.5, 4520.0), camera="Canon EOS 550D")
 
@@ -68,7 +70,6 @@ def images() -> Iterator[tuple[str, npt.NDArray[Any]]]:
     yield "a noisy ramp", ramp // 8 + rng.poisson(20, (90, 70, 3))
 
 
-@pytest.mark.slow
 def test_files_of_images(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
     found: dict[str, Any] = {}
     for name, numbers in images():
@@ -98,7 +99,6 @@ def test_codes(pinned: Pinned) -> None:
     pinned("codes of frequencies", found)
 
 
-@pytest.mark.slow
 def test_previews_and_scales(pinned: Pinned) -> None:
     rng = np.random.default_rng(10)
     found: dict[str, Any] = {}
@@ -154,7 +154,6 @@ def test_what_a_head_may_claim(pinned: Pinned) -> None:
     pinned("what a head may claim", found)
 
 
-@pytest.mark.slow
 def test_images_come_back(pinned: Pinned) -> None:
     image = np.random.default_rng(12).integers(0, 65536, (23, 25, 3)).astype(np.uint16)
     forms: tuple[files.Format, ...] = ("png", "tiff", "exr", "dng")
@@ -164,7 +163,6 @@ def test_images_come_back(pinned: Pinned) -> None:
     )
 
 
-@pytest.mark.slow
 def test_what_cannot_be_encoded(pinned: Pinned) -> None:
     image = np.full((22, 22, 3), 7, np.uint16)
     found: list[Any] = []

@@ -25,6 +25,8 @@ from tests.generator.said import said
 from tests.generator.stats_files import write_stats
 from tests.pinned import Pinned
 
+pytestmark = pytest.mark.slow
+
 CORNERS = [[0.5, 0.1], [0.3, 0.2], [0.2, 0.45], [0.35, 0.35], [0.4, 0.25]]
 SEED = 2**40 + 9
 
@@ -162,7 +164,6 @@ REQUESTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.slow
 def test_requests(lut: Lut, pinned: Pinned) -> None:
     names = ["one.png", "raw/two.png", "one.png", "raw/two.png"]
     found: dict[str, Any] = {}

@@ -21,6 +21,8 @@ from generator.variation.variation import (
 from tests.generator.said import said
 from tests.pinned import Pinned
 
+pytestmark = pytest.mark.slow
+
 NOISE = SensorNoise(read=(6.0, 0.0, 3.5), shot=(0.5, 0.25, 0.75))
 EXPOSURES = (
     "2",
@@ -165,6 +167,3 @@ def test_what_cannot_be_varied(pinned: Pinned) -> None:
     ]
     assert all(isinstance(sentence, str) for sentence in found)
     pinned("what cannot be varied", found)
-
-
-pytestmark = pytest.mark.slow
