@@ -39,9 +39,10 @@ GAMUTS: dict[str, Gamut] = {
 }
 """Gamuts with an area, without one, and with lights in one place."""
 
+INSIDE_OR_NOT = np.random.default_rng(5).uniform(0.15, 0.45, (9, 2)).tolist()
 WANTED = [
     *CORNERS,
-    *np.random.default_rng(5).uniform(0.15, 0.45, (9, 2)).tolist(),
+    *INSIDE_OR_NOT,
     [0.4, 0.15],
     [0.40002, 0.15],
     [0.4004, 0.1501],
@@ -81,7 +82,7 @@ def lut(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lut]:
 @pytest.mark.parametrize("name", GAMUTS)
 def test_mixtures_for_wanted_lights(name: str, pinned: Pinned) -> None:
     gamut = GAMUTS[name]
-    found: list[Any] = [gamut.rb, gamut.edges, gamut.triangles, gamut.contains(np.array(WANTED, float))]
+    found: list[Any] = [gamut.rb, gamut.edges, gamut.triangles, gamut.contains(np.array(INSIDE_OR_NOT))]
     ways: tuple[OutsideGamut, ...] = ("refuse", "nearest")
 
     def matched(rb: Any, way: OutsideGamut) -> list[Any]:

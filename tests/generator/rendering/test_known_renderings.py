@@ -49,14 +49,14 @@ def test_matrices(make_table: MakeTable, tmp_path: Path, pinned: Pinned, monkeyp
     pinned("colour matrices", {**found, "fitted": [fitted_matrix(lut), fitted_matrix(other)]})
 
 
-@pytest.mark.parametrize("case", ["tinted", "odd", "small"])
+@pytest.mark.parametrize("case", ["plain", "odd", "small"])
 def test_maps_of_prints(case: str, make_table: MakeTable, tmp_path: Path, pinned: Pinned) -> None:
     def spoil(samples: Any) -> None:
         samples[37, 3], samples[100] = 11000, 0
         samples[5, :, 1] = 11536
 
     changes: dict[str, dict[str, Any]] = {
-        "tinted": {"tint": 0.1, "blue_of_green": 0.4},
+        "plain": {},
         "odd": {"change": spoil, "lights": 2},
     }
     lut = make_table(**changes[case]) if case in changes else table_in(tmp_path / "known")
