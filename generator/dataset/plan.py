@@ -211,8 +211,8 @@ def parse_split(text: str) -> tuple[float, float, float]:
     whole = total >= 1 and all(part == int(part) for part in parts)
     if not (whole or abs(total - 1) < _ROUNDED or abs(total - 100) < 100 * _ROUNDED):
         raise InputError(
-            f"the split {text} sums to {total:g}, and every picture is put into a part; expected shares that sum to 1, "
-            "such as 0.8,0.1,0.1, or whole numbers such as 8,1,1"
+            f"the split {text} sums to {total:.10g}, and every picture is put into a part; expected shares that sum to "
+            "1, such as 0.8,0.1,0.1, or whole numbers such as 8,1,1"
         )
     return parts[0] / total, parts[1] / total, parts[2] / total
 

@@ -803,6 +803,8 @@ def _refuse_names(found: Sequence[PictureFile]) -> None:
     seen: dict[str, PictureFile] = {}
     for picture in found:
         if (other := seen.setdefault(picture.name, picture)) is not picture:
+            if other.location == picture.location:
+                raise InputError(f"{picture.location} is named twice; name it, or the folder that it is in, once")
             raise InputError(
                 f"two pictures would be called {picture.name}: {other.location} and {picture.location}; name a folder "
                 "that holds both, or rename one"

@@ -119,7 +119,7 @@ def test_two_pictures_of_one_name_are_refused(tmp_path: Path, colours: npt.NDArr
         write(tmp_path / folder / "a.png", colours, "uint8")
     with pytest.raises(InputError, match=r"two pictures would be called a\.png: .*one/a\.png and .*two/a\.png; name"):
         find_pictures([tmp_path / "one", tmp_path / "two"])
-    with pytest.raises(InputError, match=r"two pictures would be called a\.png"):
+    with pytest.raises(InputError, match=r"one/a\.png is named twice; name it, or the folder that it is in, once"):
         find_pictures([tmp_path / "one", tmp_path / "one"])
     assert [found.name for found in find_pictures(tmp_path)] == ["one/a.png", "two/a.png"]
 

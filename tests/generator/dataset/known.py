@@ -1,0 +1,115 @@
+"""What a dataset of known options holds, to be pinned."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.citation import OriginRecord
+from calibration.table.lut import UNCERTAINTY, Lut, Provenance, Unfit, open_lut
+from calibration.table.writing import LutWriter
+from drivers.presenter import Colour
+from experiment.lights import Illumination
+from generator.dataset.reader import Dataset, file_faults, open_dataset
+from generator.kernels.choice import channels_of
+
+MADE_ELSEWHERE = ("software", "libraries")
+"""What `dataset.json` says of the machine that made it."""
+
+
+SPECTRA = ((9, 5, 2), (7, 6, 4), (5, 6, 6), (3, 5, 9), (4, 9, 3))
+"""Lights in three bands."""
+
+CAMERA = np.array([[1.0, 0.2, 0.0], [0.1, 1.0, 0.2], [0.0, 0.1, 0.8]])
+"""Sensitivities of the camera in those bands."""
+
+
+def table_in(folder: Path, bits: int = 2, samples: int = 25, order: tuple[int, ...] = (0, 1, 2, 3, 4)) -> Lut:
+    """Make a table with noise of every kind, unfit cells, an uncertainty of each light, names and an origin.
+
+    `order`: in which the lights stand.
+    """
+    folder.mkdir()
+    rng = np.random.default_rng(11)
+    codes = channels_of(np.arange(1 << 3 * bits), bits) / (2**bits - 1)
+    writer = LutWriter(folder, len(order), 8**bits, samples)
+    spectra = [SPECTRA[light] for light in order]
+    white = [400 * np.asarray(light) @ CAMERA.T for light in spectra]
+    for number, light in enumerate(spectra):
+        means = 400 * ((0.04 + 0.96 * codes**2.2) * light) @ CAMERA.T
+        photons = np.asarray(rng.poisson(means[:, None].repeat(samples, axis=1) / 3), np.float64)
+        drawn = photons * 3 + rng.normal(0, 6, (8**bits, samples, 3))
+        writer.put(number, np.clip(np.rint(drawn), 0, 4600).astype(np.uint16))
+    kelvins = (2500.0, 3800.0, 5500.0, 9000.0, None)
+    plan = [
+        Illumination(number, "blackbody" if kelvins[light] else "uniform", kelvins[light], Colour(9, 8, light))
+        for number, light in enumerate(order)
+    ]
+    if order == (0, 1, 2, 3, 4):
+        plan[4] = Illumination(4, "spectrum", None, Colour(9, 8, 4), "E")
+    known = Provenance(
+        camera="Known camera",
+        bits=bits,
+        white_level=4600,
+        session_sha256="1" * 64,
+        chart_sha256="2" * 64,
+        software="test 1",
+        unfit=[Unfit(colour=colour, cause="a test") for colour in (0, 37, 8**bits - 3)],
+        origin=OriginRecord(rig="lab", iso=100, aperture=8, shutter_s=0.5, lens="a lens", authors=["One", "Other"]),
+    )
+    uncertainty = "illumination,expanded_deg\n" + "".join(
+        f"{n},{0.1 * (n + 1) ** 1.5:.4f}\n" for n in range(len(order))
+    )
+    writer.finish(plan, np.array(white), known, files={UNCERTAINTY: uncertainty})
+    return open_lut(folder)
+
+
+def plain_text(text: str) -> Any:
+    """Return a number where a text is one."""
+    try:
+        return float(text) if "." in text or "e" in text else int(text)
+    except ValueError:
+        return text
+
+
+def rows_of(text: str) -> list[list[Any]]:
+    """Return the cells of a CSV file, numbers as numbers."""
+    return [[plain_text(cell) for cell in row] for row in csv.reader(io.StringIO(text))]
+
+
+def held_by(out: Path, without: tuple[str, ...] = ("table", "lights")) -> dict[str, Any]:
+    """Return what a dataset holds: every list, and every image and map as its shape and the hash of its values.
+
+    `without`: parts of its description that other datasets of the same table have as well.
+    """
+    dataset = open_dataset(out)
+    described = json.loads((out / "dataset.json").read_text(encoding="utf-8"))
+    for name in (*MADE_ELSEWHERE, *without):
+        described.pop(name, None)
+    lists = {path.name: rows_of(path.read_text(encoding="utf-8")) for path in sorted(out.glob("*.csv"))}
+    parts = {path.stem: path.read_text().split() for path in sorted(out.glob("splits/*"))}
+    sums = [line.split("  ")[1] for line in (out / "SHA256SUMS").read_text().splitlines()]
+    return {
+        "described": described,
+        "lists": lists,
+        "truths": [[float(part) for part in line.split()] for line in (out / "gt.txt").read_text().splitlines()],
+        "parts": parts,
+        "files": " ".join(sums),
+        "faults": list(file_faults(out)),
+        "images": [shown_of(dataset, number) for number in range(len(dataset.entries))],
+    }
+
+
+def shown_of(dataset: Dataset, number: int) -> list[Any]:
+    """Return shape and hash of an image, and of its maps where lights differ over it."""
+    entry = dataset.entries[number]
+    image = dataset.read_image(entry)
+    shown: list[Any] = [image.shape, image.tobytes()]
+    if len(entry.lights) > 1:
+        shown += [dataset.read_weights(entry).tobytes(), dataset.read_ground_truth_map(entry).tobytes()]
+    return shown

@@ -1,0 +1,178 @@
+"""Lights of known gamuts, distributions, lists and requests, as they were chosen before.
+
+Who changes what a seed decides changes datasets: who makes one again, with a later version, is to get the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import chdir
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibration.table.lut import Lut
+from generator import philox
+from generator.lights.choices import parse_light, parse_lights
+from generator.lights.distributions import load_ground_truths, parse_distribution
+from generator.lights.gamut import Gamut, OutsideGamut, black_body, rgb_of
+from generator.lights.lighting import LightChoice, mixture_of, parse_mixture
+from generator.lights.request import LightRequest, load_named_truths
+from tests.generator.dataset.known import table_in
+from tests.generator.said import said
+from tests.generator.stats_files import write_stats
+from tests.pinned import Pinned
+
+pytestmark = pytest.mark.slow
+
+CORNERS = [[0.5, 0.1], [0.3, 0.2], [0.2, 0.45], [0.35, 0.35], [0.4, 0.25]]
+SEED = 2**40 + 9
+
+GAMUTS: dict[str, Gamut] = {
+    "five lights": Gamut(1000 * rgb_of(CORNERS) * [[1], [2], [0.7], [1.5], [1]]),
+    "a line": Gamut(rgb_of([[0.5, 0.1], [0.3, 0.3], [0.4, 0.2], [0.4, 0.2], [0.2, 0.4]])),
+    "two lights": Gamut(rgb_of(CORNERS[:2])),
+    "one light": Gamut(rgb_of(CORNERS[:1])),
+    "many lights": Gamut(np.random.default_rng(4).uniform(0.5, 2, (40, 3))),
+}
+"""Gamuts with an area, without one, and with lights in one place."""
+
+INSIDE_OR_NOT = np.random.default_rng(5).uniform(0.15, 0.45, (9, 2)).tolist()
+WANTED = [
+    *CORNERS,
+    *INSIDE_OR_NOT,
+    [0.4, 0.15],
+    [0.40002, 0.15],
+    [0.4004, 0.1501],
+    [1, 0],
+    [0, 0],
+]
+"""At lights, anywhere, half way between two, beside that by less and by more than the tolerance, and far outside."""
+
+
+def shown(choice: LightChoice, scenes: tuple[int, ...] = (0, 1, 2, 70000)) -> list[Any]:
+    """Return what a choice says of itself, and the lights of some scenes."""
+    lights = [
+        [mixture.label for lighting in choice.lightings_of(scene) for mixture in lighting.mixtures] for scene in scenes
+    ]
+    return [choice.describe(), choice.lights_each, lights]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def lut(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lut]:
+    """Go to a folder with a table and files of lights."""
+    folder = tmp_path_factory.mktemp("lights")
+    rng = np.random.default_rng(6)
+    with chdir(folder):
+        truths = rgb_of(rng.normal([0.35, 0.25], 0.02, (12, 2)))
+        Path("gt.csv").write_text(
+            "name,R,G,B\n" + "".join(f"{n}.png,{r},{g},{b}\n" for n, (r, g, b) in enumerate(truths))
+        )
+        Path("gt.txt").write_text("\n".join(f" {r:.6f} {g:.6f};{b:.6f}" for r, g, b in truths[:4]) + "\n\n")
+        Path("many.csv").write_text(
+            "b,image,r,g\n.2,one.cr2,.4,.4\n.25,two.png,.35,.4\n.3,one.cr2,.3,.4\n.2,two.png,.45,.35\n"
+        )
+        write_stats(Path("stats.json"), truths, {})
+        write_stats(Path("far.json"), truths[:2], {})
+        yield table_in(Path("lut"))
+
+
+@pytest.mark.parametrize("name", GAMUTS)
+def test_mixtures_for_wanted_lights(name: str, pinned: Pinned) -> None:
+    gamut = GAMUTS[name]
+    found: list[Any] = [gamut.rb, gamut.edges, gamut.triangles, gamut.contains(np.array(INSIDE_OR_NOT))]
+    ways: tuple[OutsideGamut, ...] = ("refuse", "nearest")
+
+    def matched(rb: Any, way: OutsideGamut) -> list[Any]:
+        made = gamut.match(rgb_of(rb), way)
+        return [made.mixture.label, made.angle]
+
+    found += [[said(matched, rb, way) for way in ways] for rb in WANTED]
+    pinned(f"mixtures of {name}", found, nothing=1e-5)
+
+
+def test_draws_of_distributions(pinned: Pinned) -> None:
+    words = philox.words(3, np.arange(100), 1, 2, philox.CHROMATICITIES)
+    texts = ("uniform", "gaussian:r=.3,b=.25,sd=.02", "gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8", "fit:gt.csv")
+    texts += ("gt.csv", "gt.txt", "stats.json", "far.json", "gaussian:r=.3,sd=.1", "gaussian:r=.3,b=.2,sd_r=.1", "none")
+    found: dict[str, Any] = {}
+    for text in texts:
+        distribution = said(parse_distribution, text)
+        found[text] = distribution if isinstance(distribution, str) else [
+            distribution.describe(),
+            distribution.draw(words),
+        ]  # fmt: skip
+    pinned("draws of distributions", found)
+
+
+def test_lights_that_texts_name(lut: Lut, pinned: Pinned) -> None:
+    texts = ("0", "4", "5", "999", "1000", "5500", "C", " C ", "c", "tungsten", "2500K", "9000k", "2499K", "4000 K")
+    texts += (
+        "cct=7000",
+        "cct=.5",
+        "r=.3,b=.25",
+        "r=.3",
+        "r=.6,b=.5",
+        "r=.5,b=.5",
+        "r=.33333,b=.9",
+        "0:1+4:3",
+        "0:0+4:3",
+    )
+    texts += ("4:.3+0:.7", "0:.3+0:.7", "", "r=.3,b=.25,cct=5000", "1:.2+9:.8")
+    found = {text: said(parse_light, text, lut) for text in texts}
+    found |= {f"{text} nearest": said(parse_light, text, lut, None, "nearest") for text in texts}
+    lists = ("all", " ALL ", "0,2-4", "4-4,1,4", "3-1", "0-5", "1,,2", "0 - 2 , 4", "-1")
+    found |= {f"list {text}": said(parse_lights, text, 5) for text in lists}
+    parts = ({4: 3, 1: 1, 2: 0.0}, {0: 1, 1: 4e-10}, {0: 1, 1: 6e-10}, {0: 1, 1: 1, 2: 1})
+    found |= {f"parts {number}": mixture_of(one) for number, one in enumerate(parts)}
+    found["parsed"] = [parse_mixture(text) for text in ("7", "3:.2+1:.8", "1:.3333333+2:.3333333+5:.3333334")]
+    found["bodies"] = [black_body(lut, kelvin) for kelvin in (2500, 2501, 3000, 3800, 5000, 5500, 8000, 9000)]
+    pinned("lights that texts name", found)
+
+
+def test_files_of_lights(pinned: Pinned) -> None:
+    Path("wrong.csv").write_text("r,g,b\n.3,.4,.3\n0,0,0\n", "utf-8")
+    Path("few.txt").write_text("1 2\n", "utf-8")
+    Path("none.csv").write_text("r,g,b\n", "utf-8")
+    Path("other.csv").write_text("x,y\n1,2\n", "utf-8")
+    names = ("gt.csv", "gt.txt", "many.csv", "stats.json", "wrong.csv", "few.txt", "none.csv", "other.csv")
+    found = {name: [said(read, Path(name)) for read in (load_ground_truths, load_named_truths)] for name in names}
+    pinned("files of lights", found)
+
+
+REQUESTS: dict[str, dict[str, Any]] = {
+    "random": {},
+    "three random": {"random": 3},
+    "drawn": {"distribution": "gaussian:r=.32,b=.28,sd=.03", "random": 2},
+    "drawn evenly together": {"distribution": "uniform", "random": 2, "lights_per_image": 2},
+    "like statistics": {"distribution": "stats.json", "lights_per_image": 3, "masks": "spots"},
+    "nearest": {"nearest": Path("gt.csv")},
+    "nearest together": {"nearest": Path("gt.txt"), "lights_per_image": 2},
+    "matched": {"match": Path("gt.csv"), "outside": "nearest", "masks": "window"},
+    "matched inside": {"match": Path("gt.csv")},
+    "by name": {"lights_by_name": Path("many.csv"), "outside": "nearest"},
+    "by name together": {"lights_by_name": Path("many.csv"), "outside": "nearest", "lights_per_image": 2},
+    "listed together": {"illuminations": "0-3", "lights_per_image": 2, "masks": "half-plane"},
+    "listed unevenly": {"illuminations": "0-2", "lights_per_image": 2},
+    "texts": {"light": ("A", "r=.33,b=.27", "4000K"), "lights_per_image": 3},
+    "one of several": {"masks": "smooth", "lights_per_image": 1},
+    "none": {"lights_per_image": 0},
+    "both": {"illuminations": "0", "random": 2},
+    "too many": {"random": 6},
+    "far": {"distribution": "gaussian:r=.9,b=.02,sd=.001"},
+}
+
+
+def test_requests(lut: Lut, pinned: Pinned) -> None:
+    names = ["one.png", "raw/two.png", "one.png", "raw/two.png"]
+    found: dict[str, Any] = {}
+    for name, wishes in REQUESTS.items():
+        choice = said(LightRequest(**wishes).choose, lut, SEED, names[:2])
+        scenes = (0, 1) if "by name" in name else (0, 1, 70000)
+        found[name] = choice if isinstance(choice, str) else said(shown, choice, scenes)
+    by_name = LightRequest(lights_by_name=Path("many.csv"), outside="nearest")
+    found["crops by name"] = shown(by_name.choose(lut, SEED, names[:2], 2), (0, 1, 2, 3))
+    found["ambiguous"] = said(by_name.choose, lut, SEED, names)
+    pinned("requests of lights", found)
