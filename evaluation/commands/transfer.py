@@ -143,7 +143,7 @@ def transfer(
     if out is not None:
         require_free(out, "the results")
     if matrix is not None and naive is None:
-        raise InputError(f"--matrix {matrix} is for the naive baseline; expected --naive PICTURES with it, or no --matrix")
+        raise InputError(f"--matrix {matrix} is for the naive baseline; expected --naive PICTURES beside it")
     threads = workers or processor_count()
     learners, left_out = _learners(methods)
     references = _references(statistics)

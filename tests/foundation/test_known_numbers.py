@@ -112,7 +112,7 @@ def test_pieces_of_pages_and_figures(pinned: Pinned) -> None:
     places = np.array([[10.0, 20.0], [50.0, 60.0], [90.0, 5.0]])
     for side, inches in ((8.0, 4.0), (0.01, 4.0), (2.0, 9.0)):
         draw_squares(axes, (105.0, 74.0), places, side, np.array([0.1, 0.5, 2.0]), inches, cmap="gray", vmin=0, vmax=2)
-    squares = [[one.get_sizes(), one.get_offsets().data] for one in axes.collections]  # pyright: ignore
+    squares = [[one.get_sizes(), one.get_offsets().data] for one in axes.collections]  # pyrefly: ignore[missing-attribute]
     found: dict[str, Any] = {
         "pieces": [str(piece) for piece in pieces],
         "styles": [series_style(number) for number in (0, 6, 7, 13, 27, 28)],

@@ -253,7 +253,7 @@ def test_bytes_of_raw_files_are_what_they_were(pinned: Pinned) -> None:
         settings = ExposureSettings(400, None if name == "Test" else 5.6, 1 / 60)
         write_dng(
             stream, counts, replace(body, **tiny), settings=settings, taken_at=datetime(2026, 5, 6, 7, 8, 9, tzinfo=UTC)
-        )  # pyright: ignore[reportArgumentType] - names from above
+        )  # names from above
         data = stream.getvalue()
         found[name] = [data, seen(decode_raw(data, Path("case")))["masked black"], rawfile.camera_matrix(body.camera)]
     tags: tiff.Tags = {

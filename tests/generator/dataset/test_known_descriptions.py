@@ -14,7 +14,7 @@ import pytest
 from calibration.citation import OriginRecord
 from calibration.table.lut import Lut
 from generator.dataset.cards import card, croissant, datasheet, size_category
-from generator.dataset.contact_sheet import _draw as draw  # pyright: ignore[reportPrivateUsage] - before it is painted
+from generator.dataset.contact_sheet import _draw as draw  # before it is painted
 from generator.dataset.layouts import Description, Layout
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
@@ -32,7 +32,6 @@ from tests.pinned import Pinned
 from tests.pinned.drawn import drawn
 
 # What is pinned is of any kind.
-# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 
 pytestmark = pytest.mark.slow
 

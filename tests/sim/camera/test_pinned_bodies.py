@@ -185,7 +185,7 @@ def test_a_body_answers_what_it_answered(name: str, pinned: Pinned) -> None:
             found += [*opening(host), told(host, Operation.EOS_PC_HDD_CAPACITY, 0x0FFFFFFF, 0x1000, 1)]
             found.append(told(host, Operation.EOS_SET_DEVICE_PROP_VALUE_EX, data=destination))
             host.eos.turn_dial(AeMode.MANUAL)
-        handles = [*host.eos._memory, *host.eos._on_card()]  # pyright: ignore[reportPrivateUsage] - what it may be asked
+        handles = [*host.eos._memory, *host.eos._on_card()]  # what it may be asked
         found.append(step(host, chance, handles))
         if number % 5 == 4:
             found.append(told(host, Operation.EOS_GET_EVENT))
@@ -261,7 +261,7 @@ def test_the_driver_takes_what_it_took(name: str, pinned: Pinned) -> None:
         asked.append(f"{lab.clock.monotonic():.3f} {words} {code:x} {size}")
         return found
 
-    lab.eos.answer = noted  # pyright: ignore[reportAttributeAccessIssue] - to listen  # pyrefly: ignore[method-assign]
+    lab.eos.answer = noted  # to listen  # pyrefly: ignore[method-assign]
     outcomes: list[Any] = []
     for settings in (ExposureSettings(200, 8.0, 0.5), ExposureSettings(400, 5.6, 4.0)):
         try:
