@@ -21,7 +21,7 @@ from experiment.session.records import SessionStep
 from sim.world.sensors import BODIES
 from sim.world.world import Room, Situation
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds")]
 
 LIGHTS = {
     "red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255), "white": Colour(255, 255, 255),
