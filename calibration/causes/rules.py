@@ -293,8 +293,14 @@ READINGS: Final = {
 """What a report calls each value of `Evidence`, and its unit: per cent of a share, with its sign where it has one."""
 
 
+_ROUNDING = 1e-9
+"""Of a share, pixels or degrees: far below what any of them is measured to."""
+
+
 def _reading(words: str, unit: str, value: float) -> str:
-    """Return a value in words, the number first where the words go on from it."""
+    """Return a value in words, the number first where the words go on from it; what rounding alone leaves is 0."""
+    if abs(value) < _ROUNDING:
+        value = 0.0
     match unit:
         case "yes":
             return f"{words}: {'yes' if value else 'no'}"

@@ -34,6 +34,7 @@ from calibration.figures.figure import (
     Line,
     SummaryRow,
     Worst,
+    format_value,
 )
 from calibration.radiometry.superposition import NODES
 from foundation.colorimetry import angles_deg
@@ -531,7 +532,7 @@ def _checked_row(table: TableMeasurements) -> SummaryRow | None:
     codes = table.lights.codes
     if codes is None:
         return None
-    value = f"{_checked_text(table, 0.0)}; exchanged names excluded down to {codes.exchange_deg:.2g}°"
+    value = f"{_checked_text(table, 0.0)}; exchanged names excluded down to {format_value(codes.exchange_deg, '°')}"
     note = "the others are too few, or too dim, for a wrong name to be noticed"
     return SummaryRow("Lights held against their codes", value, note)
 

@@ -262,10 +262,11 @@ def place_errors(
         noise = 2 * scatter * (around(weight / np.sqrt(np.maximum(strength, 1e-6))) / total) ** 2
     else:
         noise = 2 * scatter * around(weight**2 / np.maximum(strength, 1e-6)) / (_AROUND_CELLS * total) ** 2
-    # In the margin and beside tags it would be one cell's noise.
+    asked = np.maximum(asked - _NOISE * noise, 0.0)
+    # In the margin and beside tags it would be one cell's noise, or the rounding of the means, over almost nothing.
     asked[total < 0.5 * most] = 0.0
     # What a displacement cannot follow swings about it: next to where it shows it may be hidden.
-    asked = ndimage.maximum_filter(np.maximum(asked - _NOISE * noise, 0.0), _AROUND_CELLS)
+    asked = ndimage.maximum_filter(asked, _AROUND_CELLS)
     cells = Raster(raster.low_mm, raster.step_mm * per_cell, shape)
     return PlaceErrors(cells, np.sqrt((fitted**2 + np.square(systematic_px)).reshape(shape) + asked))
 

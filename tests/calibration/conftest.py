@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+import re
+from collections.abc import Callable, Generator, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,7 +13,13 @@ from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from calibration.verdict import BuildResult
 from experiment.session.folder import Session
+from foundation.errors import CropError
 from tests.calibration.lab import LIGHTS, Lab, blank_pictures, hang, lens_unmeasured, rendered_once, take
+from tests.calibration.whole import LIMITS, sketched, told
+from tests.pinned import Pinned
+
+# What is pinned is of any kind.
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 
 __all__ = ["built", "lab", "lens_unmeasured", "rendered_once", "session"]
 
@@ -31,3 +40,51 @@ def built(session: Session, tmp_path_factory: pytest.TempPathFactory) -> BuildRe
     """Return the table of the session with its report, whose pictures are blank; to be read, not changed."""
     with blank_pictures():
         return build(session, tmp_path_factory.mktemp("table") / "lut", report=write_report)
+
+
+@pytest.fixture
+def pinned_builds(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, pinned: Pinned) -> Iterator[None]:
+    """Pin what is told of every table that a test builds by `build` of its module, and why there is none."""
+    module: Any = request.module
+    known: Callable[..., BuildResult] = module.build
+    found: list[Any] = []
+
+    def kept(session: Session, out: Path, *given: Any, report: Any = None, **named: Any) -> BuildResult:
+        def seen(result: BuildResult, session: Session, folder: Path) -> None:
+            found.append(told(result))
+            if report is not None:
+                report(result, session, folder)
+
+        try:
+            return known(session, out, *given, report=seen, **named)
+        except CropError as error:
+            found.append(str(error).replace(str(out.parent), ""))
+            raise
+
+    monkeypatch.setattr(module, "build", kept)
+    yield
+    if found:
+        pinned(f"build, {words_of_test(request)}", found, **LIMITS)
+
+
+@pytest.fixture
+def pinned_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, pinned: Pinned) -> Iterator[None]:
+    """Pin each figure that a test has drawn by `drawn` of its module."""
+    module: Any = request.module
+    known: Callable[..., Any] = module.drawn
+    found: list[Any] = []
+
+    def kept(*given: Any) -> Any:
+        figure = known(*given)
+        found.append(sketched(figure))
+        return figure
+
+    monkeypatch.setattr(module, "drawn", kept)
+    yield
+    if found:
+        pinned(f"picture, {words_of_test(request)}", found)
+
+
+def words_of_test(request: pytest.FixtureRequest) -> str:
+    """Return a test's name in words that a file may have as its name."""
+    return re.sub(r"[^a-z0-9.-]+", " ", request.node.name.removeprefix("test_").lower()).strip()

@@ -37,6 +37,8 @@ from sim.world.sensors import BODIES, Body, Rectangle
 from sim.world.world import Room, World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
+SOFTWARE = "croplab 0.1.0"
+"""What designed the charts: it stands in the margin, so that another version would be another picture."""
 Paint = Callable[[npt.NDArray[np.uint16]], None]
 TAKEN_AT = datetime(2024, 3, 1, 9, 0, tzinfo=UTC)
 
@@ -91,7 +93,7 @@ class Lab:
 @cache
 def designed(bits: int, page: str, seed: int) -> tuple[Chart, Print]:
     """Return a chart and its sheet, drawn once."""
-    chart = design_chart(bits, A_SERIES_MM[page], seed)
+    chart = replace(design_chart(bits, A_SERIES_MM[page], seed), software=SOFTWARE)
     picture = drawing(chart)
     return chart, Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
 
@@ -104,6 +106,7 @@ def hang(bits: int = 3, page: str = "A5", body: str = "Test", seed: int = 1, roo
 
 def hang_chart(chart: Chart, body: str | Body, room: Room) -> Lab:
     """Return a lab with a chart of one's own."""
+    chart = replace(chart, software=SOFTWARE)
     picture = drawing(chart)
     seen_by = BODIES[body] if isinstance(body, str) else body
     return Lab(chart, World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), seen_by, room))

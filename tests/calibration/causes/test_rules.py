@@ -218,3 +218,5 @@ def test_evidence_is_told_in_words_with_units() -> None:
         "frames compared: 4, 25 % of them show it, chart moved by: 1.5 px, the light is its codes': no, "
         "light under black, of white: 2.98 %"
     )
+    # What a sum rounds by is nothing.
+    assert Evidence(softer=-2.9e-16).in_words() == "light of neighbouring cells by the frame's blur: 0 %"

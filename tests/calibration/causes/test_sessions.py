@@ -32,7 +32,7 @@ from sim.world.world import Blob, Room, Situation
 from tests.calibration.causes.rooms import BRIGHT, HAND, Counts, glare, half, nth_white, taken
 from tests.calibration.lab import Lab, hang
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("lens_unmeasured")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")]
 
 REMARKING = tuple(replace(limit, refuse=None) for limit in FIGURES)
 """The limits, none of which refuses: a table is made, and all that is wrong is a remark."""

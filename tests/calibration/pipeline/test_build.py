@@ -30,9 +30,11 @@ from foundation.errors import FormatError, InputError, QualityError
 from sim.camera.film import write_dng
 from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
+from tests.calibration.whole import LIMITS, reported, told, whole, words_of, written
 from tests.json_of import json_of
+from tests.pinned import Pinned
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds", "undrawn")]
 
 
 def angle_deg(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> float:
@@ -292,6 +294,18 @@ def test_the_worst_of_each_figure_is_somewhere(built: BuildResult, session: Sess
     assert found["bleed"].place is not None
     smallest = cell_sides_px(built.figures.registration.to_pixels, chart).min()
     assert smallest == pytest.approx(built.figures.registration.cell_px, rel=0.1)
+
+
+def test_the_whole_table_is_what_it_was(built: BuildResult, session: Session, pinned: Pinned) -> None:
+    assert built.lut is not None
+    pinned("table of 13 lights, measured", whole(built), **LIMITS)
+    pinned("table of 13 lights, files", written(built.lut), **LIMITS)
+    worst = {name: [one.where, one.light] for name, one in worst_of_figures(built.figures, session.chart).items()}
+    pinned("table of 13 lights, report", [reported(built), worst, words_of(built.lut)], **LIMITS)
+
+
+def test_a_check_measures_what_it_did(session: Session, pinned: Pinned) -> None:
+    pinned("check of 13 lights", told(check(session)), **LIMITS)
 
 
 def test_check_writes_nothing(session: Session) -> None:

@@ -23,7 +23,7 @@ from foundation.errors import FormatError, QualityError
 from sim.camera.film import write_dng
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, figures_alone, hang, take
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds")]
 
 CORRECTED = BuildOptions(correct_drift=True)
 

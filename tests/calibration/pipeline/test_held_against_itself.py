@@ -25,7 +25,7 @@ from sim.world.sensors import BODIES
 from sim.world.world import Room, World
 from tests.calibration.lab import SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds")]
 
 CODES = (
     Colour(255, 255, 255),

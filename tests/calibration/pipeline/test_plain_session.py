@@ -23,7 +23,7 @@ from experiment.session.records import ACCEPTED, SessionStep
 from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, blank_pictures, figures_alone, hang_chart, renumbered, take
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds")]
 
 SMALL = paper_chart("A6", 3)
 ROOM = Room(waviness_mm=0.5)

@@ -18,7 +18,7 @@ from sim.world.world import Room
 from tests.calibration.causes.rooms import BRIGHT, Counts, taken
 from tests.calibration.lab import LIGHTS, SETTINGS, hang, renumbered, take
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("lens_unmeasured")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")]
 
 LIGHT = renumbered(LIGHTS[5:6])
 

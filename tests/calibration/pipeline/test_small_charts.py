@@ -17,7 +17,7 @@ from experiment.lights import plan_illuminations
 from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, QUARTER, SETTINGS, blank_pictures, hang_chart, renumbered, take
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds")]
 
 LIGHT = renumbered(LIGHTS[5:6])
 

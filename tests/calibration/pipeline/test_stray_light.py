@@ -20,8 +20,9 @@ from drivers.presenter import Colour
 from experiment.session.records import SessionStep
 from sim.world.sensors import BODIES
 from sim.world.world import Room, Situation
+from tests.calibration.lab import SOFTWARE
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds")]
 
 LIGHTS = {
     "red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255), "white": Colour(255, 255, 255),
@@ -33,7 +34,7 @@ DAYLIGHT = Situation(ambient=(0.008, 0.01, 0.012))
 
 
 def built(folder: Path, room: Room, leaking: frozenset[str] = frozenset(), subtract_dark: bool = False) -> BuildResult:
-    chart, lights = chart_of(small=True), short_plan(LIGHTS)
+    chart, lights = replace(chart_of(small=True), software=SOFTWARE), short_plan(LIGHTS)
     leak = FrameChange(situation=DAYLIGHT)
 
     def changes(step: SessionStep) -> FrameChange:

@@ -136,6 +136,25 @@ def test_the_error_of_a_place_is_the_fit_s_the_systematic_one_and_what_cells_sti
     assert float(np.ptp(weight)) < 1e-9
 
 
+@pytest.mark.parametrize("strength", [1e3, 3e4])
+def test_where_nothing_was_compared_nothing_is_asked_for(strength: float) -> None:
+    """What sums over a grid round by is no displacement, though it is divided by no information."""
+    rows, columns = RASTER.shape
+    moved = np.random.default_rng(6).normal(0, 0.1, (rows, columns, 2))
+    moved[10:30, 10:30] = 0
+    tiles = compared(moved, strength)
+    seen = np.ones((rows, columns))
+    seen[8:32, 8:32] = 0
+    bare = TileComparison.of(
+        tiles.points_mm,
+        tiles.information * seen.ravel()[:, None, None] / 3 * np.ones((3, 1, 1, 1)),
+        tiles.pull * seen.ravel()[:, None] / 3 * np.ones((3, 1, 1)),
+        tiles.score,
+    )
+    found = place_errors(bare, RASTER, 1, Followed(0.03), (np.zeros((0, 2)), np.zeros((0, 2, 2))))  # pyright: ignore[reportArgumentType]
+    np.testing.assert_allclose(found.error_px[11:29, 11:29], np.hypot(0.03, SYSTEMATIC_PX))
+
+
 def test_anchors_pull_by_their_information_and_colours_that_were_not_measured_do_not() -> None:
     random = np.random.default_rng(4)
     root = random.standard_normal((3, 5, 2, 2))

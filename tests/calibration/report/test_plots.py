@@ -42,6 +42,8 @@ from experiment.chart.layout import design_chart
 from experiment.framing.pictures import STILL_PX
 from experiment.measures.stains import Stains
 
+pytestmark = pytest.mark.usefixtures("pinned_pictures")
+
 
 def drawn(draw: Callable[..., None], *arguments: Any) -> Any:
     """Return the figure that is drawn, which nobody renders; Matplotlib is imported where one is."""
