@@ -19,7 +19,6 @@ from tests.calibration.whole import LIMITS, sketched, told
 from tests.pinned import Pinned
 
 # What is pinned is of any kind.
-# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 
 __all__ = ["built", "lab", "lens_unmeasured", "rendered_once", "session"]
 

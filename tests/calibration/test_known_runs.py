@@ -42,8 +42,6 @@ from tests.calibration.whole import brief, of_fields, sketched, together
 from tests.pinned import Pinned
 
 # What is pinned is of any kind.
-# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
-# pyright: reportPrivateUsage=false
 
 _Array = npt.NDArray[np.float64]
 LOOSE = {"same": 1e-4, "nothing": 1e-8}
@@ -232,8 +230,8 @@ def test_places_of_cells(pinned: Pinned) -> None:
             matching.fit_blocks(comparison, RASTER, 1, CHART, size, known) for size in (6, 9) for known in (False, True)
         ]
         errors = [
-            matching.place_errors(comparison, RASTER, 1, Followed(), anchors, 0.01, alike)  # pyright: ignore[reportArgumentType]
-            for alike in (False, True)
+            matching.place_errors(comparison, RASTER, 1, Followed(), anchors, 0.01, alike)
+            for alike in (False, True)  # pyrefly: ignore[bad-argument-type]
         ]
         found.append([*map(brief, blocks), *(brief(one.error_px) for one in errors)])
     marks = random.uniform(0, 100, (300, 2))

@@ -33,7 +33,6 @@ from tests.experiment.test_config import MINIMAL
 from tests.pinned import Pinned
 
 # What is pinned is of any kind.
-# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 
 _Array = npt.NDArray[np.float64]
 LOOSE = {"same": 1e-4, "nothing": 1e-6}

@@ -151,7 +151,7 @@ def test_where_nothing_was_compared_nothing_is_asked_for(strength: float) -> Non
         tiles.pull * seen.ravel()[:, None] / 3 * np.ones((3, 1, 1)),
         tiles.score,
     )
-    found = place_errors(bare, RASTER, 1, Followed(0.03), (np.zeros((0, 2)), np.zeros((0, 2, 2))))  # pyright: ignore[reportArgumentType]
+    found = place_errors(bare, RASTER, 1, Followed(0.03), (np.zeros((0, 2)), np.zeros((0, 2, 2))))  # pyrefly: ignore[bad-argument-type]
     np.testing.assert_allclose(found.error_px[11:29, 11:29], np.hypot(0.03, SYSTEMATIC_PX))
 
 
