@@ -70,6 +70,12 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Print arrays as NumPy does by itself: the package colour sets its own way for all of a process."""
+    np.set_printoptions(legacy=False)
+
+
 SLOW_FILE = re.compile(r"^pytestmark = (\[\s*)?pytest\.mark\.slow\b", re.MULTILINE)
 """What marks all tests of a file."""
 

@@ -229,9 +229,9 @@ def test_places_of_cells(pinned: Pinned) -> None:
         blocks = [
             matching.fit_blocks(comparison, RASTER, 1, CHART, size, known) for size in (6, 9) for known in (False, True)
         ]
+        followed: Any = Followed()
         errors = [
-            matching.place_errors(comparison, RASTER, 1, Followed(), anchors, 0.01, alike)
-            for alike in (False, True)  # pyrefly: ignore[bad-argument-type]
+            matching.place_errors(comparison, RASTER, 1, followed, anchors, 0.01, alike) for alike in (False, True)
         ]
         found.append([*map(brief, blocks), *(brief(one.error_px) for one in errors)])
     marks = random.uniform(0, 100, (300, 2))

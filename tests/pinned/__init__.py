@@ -102,12 +102,12 @@ def differences(kept: Any, now: Any, same: float, nothing: float, place: str = "
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON holds it: numbers to eight digits, long arrays by what any change of them would change."""
+    """Return a value as JSON holds it: numbers to ten digits, long arrays by what any change of them would change."""
     match value:
         case bool() | int() | str() | None:
             return value
         case float():
-            return float(f"{value:.8g}") if math.isfinite(value) else str(value)
+            return float(f"{value:.10g}") if math.isfinite(value) else str(value)
         case bytes() | bytearray() | memoryview():
             return {"bytes": len(value), "sha256": hashlib.sha256(value).hexdigest()}
         case np.generic():

@@ -33,9 +33,9 @@ def _artist(artist: Artist) -> Iterator[Any]:
             shown = [artist.get_xlim(), artist.get_ylim(), artist.get_xscale(), artist.get_yscale()]
         case Line2D():
             style = (artist.get_color(), artist.get_linewidth(), artist.get_linestyle(), artist.get_marker())
-            shown = [np.asarray(artist.get_xydata(), float), [str(one) for one in style]]
+            shown = [np.asarray(artist.get_xydata(), float), style]
         case Text():
-            shown = [artist.get_text(), artist.get_position(), artist.get_fontsize(), str(artist.get_color())]
+            shown = [artist.get_text(), artist.get_position(), artist.get_fontsize(), artist.get_color()]
         case Collection():
             offsets = np.ma.filled(np.ma.asarray(artist.get_offsets(), float), np.nan)
             shown = [offsets, artist.get_facecolor(), artist.get_linewidth()]
