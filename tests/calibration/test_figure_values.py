@@ -124,6 +124,7 @@ TWICE = unlike(table().frames)
 FOREIGN = SimpleNamespace(other_camera=("one",), other_exposure=(), other_lens=(), other_iso=())
 TINTED = (table().frames[0], frame(4, paper=SimpleNamespace(white=np.array([4000.0, 9000, 2200]))))
 SUBTRACTED = np.ones((3, 3))
+DARK: dict[str, Any] = {"off_codes_deg": None, "subtracted": SUBTRACTED}
 AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.array([0.2, 0.1]))
 
 
@@ -161,28 +162,12 @@ AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.arra
         (light.WHITE_DEFICIT, {"additivity": off(-0.03, -0.01, 0.0), "off_codes_deg": np.zeros(3)}, 0),
         # Half of what white has beyond the primaries, less two of its scatter, as far as there was so much dark light.
         (light.TOO_DARK, {"additivity": off(-0.02, -0.016, -0.01), "off_codes_deg": None}, None),
-        (
-            light.TOO_DARK,
-            {"additivity": off(-0.02, -0.016, -0.01), "off_codes_deg": None, "subtracted": SUBTRACTED},
-            0.008,
-        ),
-        (light.TOO_DARK, {"additivity": off(-0.02, 0.001, -0.01), "off_codes_deg": None, "subtracted": SUBTRACTED}, 0),
-        (
-            light.TOO_DARK,
-            {"additivity": off(-0.028, -0.016, -0.01), "off_codes_deg": None, "subtracted": SUBTRACTED},
-            0,
-        ),
-        (
-            light.TOO_DARK,
-            {"additivity": off(-0.026, -0.016, -0.01), "off_codes_deg": None, "subtracted": SUBTRACTED},
-            0.011,
-        ),
+        (light.TOO_DARK, {"additivity": off(-0.02, -0.016, -0.01)} | DARK, 0.008),
+        (light.TOO_DARK, {"additivity": off(-0.02, 0.001, -0.01)} | DARK, 0),
+        (light.TOO_DARK, {"additivity": off(-0.028, -0.016, -0.01)} | DARK, 0),
+        (light.TOO_DARK, {"additivity": off(-0.026, -0.016, -0.01)} | DARK, 0.011),
         # What was subtracted too much is no light of the projector's.
-        (
-            light.ADDITIVITY,
-            {"additivity": off(-0.02, -0.016, -0.01), "off_codes_deg": None, "subtracted": SUBTRACTED},
-            None,
-        ),
+        (light.ADDITIVITY, {"additivity": off(-0.02, -0.016, -0.01)} | DARK, None),
         (light.OFF_CODES_DEG, {}, 3),
         (light.OFF_CODES_DEG, {"off_codes_deg": None}, None),
         (light.OFF_BRIGHTNESS, {}, 0.4),

@@ -19,7 +19,6 @@ from experiment.lights import (
     load_illuminations,
     parse_ccts,
     plot_illuminations,
-    save_illuminations,
     uniform_lights,
 )
 from foundation.colorimetry import decode_srgb
@@ -113,13 +112,6 @@ def test_lights_do_not_overwrite_their_plot(tmp_path: Path, capsys: pytest.Captu
     assert main(["illuminations", str(tmp_path / "a.png"), "--grid", "1"]) == 2
     assert "a.png" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_the_plan_is_read_again(plan: tuple[Illumination, ...], tmp_path: Path) -> None:
-    path = tmp_path / "illuminations.csv"
-    save_illuminations(plan, path)
-    assert load_illuminations(path) == plan
-    assert path.read_text().splitlines()[666 + 1].startswith("666,blackbody,2000,255,")
 
 
 ccts_k = st.none() | st.floats(1, 1e6)

@@ -51,15 +51,7 @@ def test_a_file_written_by_hand(tmp_path: Path) -> None:
 def test_what_is_saved_is_read_again(chart: Chart, tmp_path: Path) -> None:
     chart.save(tmp_path / "chart.json")
     again = load_chart(tmp_path / "chart.json")
-    assert (again.page_mm, again.bits, again.cell_mm) == (chart.page_mm, chart.bits, chart.cell_mm)
-    np.testing.assert_array_equal(again.colours, chart.colours)
     np.testing.assert_allclose(again.centres_mm, chart.centres_mm, rtol=0, atol=1e-6)
-    for one, other in zip(again.tags, chart.tags, strict=True):
-        assert (one.family, one.id) == (other.family, other.id)
-        np.testing.assert_allclose(one.corners_mm, other.corners_mm, rtol=0, atol=1e-6)
-    for one, other in zip(again.references, chart.references, strict=True):
-        assert (one.name, one.rgb, one.size_mm) == (other.name, other.rgb, other.size_mm)
-        assert one.centre_mm == pytest.approx(other.centre_mm, abs=1e-6)
     assert again.to_json() == chart.to_json()
     assert again.sha256 == chart.sha256
 
