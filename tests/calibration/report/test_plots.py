@@ -174,7 +174,7 @@ def test_a_cell_is_outlined_at_its_corners_and_its_samples_about_its_middle() ->
 # What each picture shows, read from what is drawn.
 
 PAGE_W, PAGE_H = CHART.page_mm
-CELL_W, CELL_H = CHART.cell_mm
+CELL_W = CHART.cell_mm[0]
 FRAME = np.random.default_rng(5).uniform(100, 900, (160, 230, 3)).astype(np.float32)
 
 
