@@ -1,4 +1,4 @@
-"""Figures: each has its parts and stands once; limits at their borders; the blur that belongs to a bleed."""
+"""Figures: each has its parts and stands once; limits at their borders."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from acquisition.judge import limits as judge
 from calibration.figures import all_figures, geometry, light, radiometry, truth
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import QUESTIONS, CheckMeasurements, Figure
 from calibration.figures.truth import DARKEST_COUNTS
-from calibration.sampling import largest_blur_px
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("foundation", "drivers", "sim", "experiment", "calibration", "acquisition", "benchmarks")
@@ -107,17 +105,6 @@ def test_what_a_lens_leaves_is_a_figure_where_cells_are_enough_to_tell_it(
         lens=SimpleNamespace(measured=measured, is_left_in=left_in, left=0.003, left_worst=0.02),
     )
     assert geometry.CORRECTION_RESIDUAL.measure(table) == (0.003 if told else None)
-
-
-def test_larger_cells_may_be_softer() -> None:
-    assert largest_blur_px(10.0) == 1.0
-    assert largest_blur_px(100.0) > 20
-
-
-def test_the_live_judge_follows_a_lasting_change_as_far_as_a_table_is_made() -> None:
-    assert judge.LAMP_TOTAL == 15.0
-    assert judge.LIGHT_FOLLOWED_DEG == 2.0
-    assert judge.ADDED_LEAST == 0.004
 
 
 @pytest.mark.parametrize(("frames", "expected"), [(1, None), (2, 1.0), (5, 1.0)])

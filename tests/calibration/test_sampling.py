@@ -23,7 +23,6 @@ from calibration.sampling import (
     median_of_variance,
     noise_levels,
     patch_means,
-    rim_difference,
     sample_noise,
     sites_at,
     table_values,
@@ -95,11 +94,6 @@ def test_one_pass_and_two_give_the_same_values(lab: Lab, tmp_path: Path, window:
 
 def patches(level: float, sigma: float, count: int = 3000) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     return np.random.default_rng(2).normal(level, sigma, (count, 25, 3))
-
-
-def test_noise_alone_is_even() -> None:
-    samples = patches(800, 30)
-    assert not unevenness(samples, np.full((len(samples), 3), 30.0)).any()
 
 
 def test_a_rim_of_another_colour_is_found() -> None:
@@ -184,15 +178,6 @@ def test_what_comes_from_beyond_a_cell_is_the_gaussian_s_tails(window: int) -> N
     inside = stats.norm(x, blur_px).cdf(cell_px / 2) - stats.norm(x, blur_px).cdf(-cell_px / 2)
     expected = 1 - float(np.outer(inside, inside).mean())
     assert mean_bleed(cell_px, np.array([1e-9, blur_px]), window) == pytest.approx([0, expected], abs=1e-12)
-
-
-def test_rim_and_middle_are_means_over_their_pixels_with_the_noise_of_means() -> None:
-    window = np.arange(25.0).reshape(5, 5) ** 2
-    inner = window[1:4, 1:4]
-    rim = (window.sum() - inner.sum()) / 16
-    difference, sigma = rim_difference(np.repeat(window.reshape(1, 25, 1), 3, axis=2), np.array([[1.0, 2, 4]]))
-    assert difference == pytest.approx(np.full((1, 3), abs(rim - inner.mean())))
-    assert sigma == pytest.approx(np.array([[1, 2, 4]]) * np.sqrt(1 / 9 + 1 / 16))
 
 
 def test_a_dead_photosite_has_less_than_half_and_halves_what_two_greens_have() -> None:

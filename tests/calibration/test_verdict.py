@@ -11,7 +11,7 @@ import pytest
 
 from calibration import verdict as module
 from calibration.causes.rules import DEFOCUS, HOT_PHOTOSITES, RULES, Cause, Decision, Evidence
-from calibration.figures.figure import Figure, Sense, format_value
+from calibration.figures.figure import Figure, Sense
 from calibration.figures.radiometry import FRAME_SCATTER, OTHER_EXPOSURE
 from calibration.verdict import JudgedValue, ProbableCause, Verdict, is_mended_by_retaking, judge, retaken_frames
 
@@ -47,21 +47,6 @@ def test_the_worst_row_is_the_verdict() -> None:
     assert judge({"a": 0, "b": 3, "c": 1.5}, rows).outcome == "refuse"
     assert judge({"a": 0, "c": 1.5}, rows).outcome == "accept with remarks"
     assert judge({}, rows).outcome == "accept"
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [
-        (0.0123, "share", "1.23 %"),
-        (12.04, "°", "12°"),
-        (0.0034, "px RMS", "0.0034 px RMS"),
-        (12345.6, "counts", "12346 counts"),
-        (2.0, "", "2"),
-        (3.86e-29, "share", "0 %"),
-    ],
-)
-def test_a_value_is_shown_with_its_unit(value: float, unit: str, text: str) -> None:
-    assert format_value(value, unit) == text
 
 
 def test_a_row_gives_value_expectation_and_consequence() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -19,10 +18,7 @@ from experiment.lights import (
     illuminations_to_csv,
     load_illuminations,
     parse_ccts,
-    plan_illuminations,
     plot_illuminations,
-    save_illuminations,
-    shown_colour,
     uniform_lights,
 )
 from foundation.colorimetry import decode_srgb
@@ -99,11 +95,8 @@ def test_temperatures_are_read() -> None:
     [
         ("10000:2000:200", "200 K .*10000 to 2000 K"),
         ("2000:10000:0", "steps of 0 K"),
-        ("2000:10000:nan", "steps of nan K"),
         ("2000:10000:1e-6", "in at most 10000 temperatures"),
         ("1:1e12:1", "1 K is not within 1000"),
-        ("2000:inf:200", "inf K is not within"),
-        ("2000:3000", "expected FIRST:LAST:STEP"),
         ("warm", "expected FIRST:LAST:STEP"),
         ("999", "999 K is not within"),
         ("100001", "100001 K is not within"),
@@ -119,28 +112,6 @@ def test_lights_do_not_overwrite_their_plot(tmp_path: Path, capsys: pytest.Captu
     assert main(["illuminations", str(tmp_path / "a.png"), "--grid", "1"]) == 2
     assert "a.png" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_a_smaller_plan() -> None:
-    few = plan_illuminations(2, (3000, 6500))
-    assert [light.kind for light in few] == ["uniform"] * 6 + ["blackbody"] * 2
-    # 6500 K of the table (0.3135, 0.3237) is all but sRGB's white (0.3127, 0.3290), a little more magenta.
-    assert codes(few[-1:])[0] == pytest.approx((255, 248, 254), abs=1.5)
-    assert [light.kind for light in plan_illuminations(0, (5000,))] == ["blackbody"]
-    assert codes(plan_illuminations(1, ())) == [(0, 255, 0), (0, 0, 255), (255, 0, 0)]
-
-
-def test_a_light_is_shown_at_its_brightest() -> None:
-    assert shown_colour([0.2, 0.1, 0.0]) == Colour(255, 188, 0)
-    assert shown_colour([7, 7, 7]) == Colour(255, 255, 255)
-    assert shown_colour([1, -0.1, 0]) == Colour(255, 0, 0)
-
-
-def test_the_plan_is_read_again(plan: tuple[Illumination, ...], tmp_path: Path) -> None:
-    path = tmp_path / "illuminations.csv"
-    save_illuminations(plan, path)
-    assert load_illuminations(path) == plan
-    assert path.read_text().splitlines()[666 + 1].startswith("666,blackbody,2000,255,")
 
 
 ccts_k = st.none() | st.floats(1, 1e6)
@@ -176,16 +147,13 @@ def test_a_file_of_other_hands(tmp_path: Path) -> None:
     [
         ("", "lights under the columns"),
         (HEADER, "lights under the columns"),
-        (HEADER.replace(",", ";") + "0;uniform;;1;2;3\n", "lights under the columns"),
         ("index,kind,red,green,blue\n0,uniform,1,2,3\n", "lights under the columns"),
         (HEADER + "0,uniform,,1,2\n", "light 0: blue is missing"),
         (HEADER + "0,uniform,,1.5,2,3\n", "light 0: red is 1.5"),
-        (HEADER + "0,uniform,,-1,2,3\n", "light 0: red is -1"),
         (HEADER + "0,uniform,,1,256,3\n", "light 0: green is 256; a code is 0 … 255"),
         (HEADER + "0,sun,,1,2,3\n", "light 0: kind is 'sun'"),
         (HEADER + "0,uniform,,1,2,3\n2,uniform,,1,2,3\n", "light 1: index is 2, expected 1"),
         (HEADER + "0,blackbody,,1,2,3\n", "light 0: cct_k is missing"),
-        (HEADER + "0,blackbody,warm,1,2,3\n", "light 0: cct_k is warm"),
         (HEADER + "0,blackbody,-5,1,2,3\n", "light 0: cct_k is -5"),
         (HEADER + "0,blackbody,inf,1,2,3\n", "light 0: cct_k is inf"),
         (HEADER + "0," + "u" * 200_000 + ",,1,2,3\n", "field larger than field limit"),
@@ -210,24 +178,6 @@ def test_what_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_figure_shows_each_light_at_its_chromaticity(plan: tuple[Illumination, ...], tmp_path: Path) -> None:
-    path = tmp_path / "lights.png"
-    plot_illuminations(plan, path)
-    picture = cv2.imread(str(path))
-    assert picture is not None
-    assert min(picture.shape[:2]) > 600
-    # The corners of the triangle are pure green, blue and red: each stands in the picture, left or right, up or down.
-    height, width = picture.shape[:2]
-    for code, left, top in (((0, 255, 0), True, False), ((255, 0, 0), True, True), ((0, 0, 255), False, False)):
-        ys, xs = np.nonzero((picture == code).all(axis=2))
-        near = (xs < 0.2 * width if left else xs > 0.8 * width) & (ys < 0.2 * height if top else ys > 0.8 * height)
-        assert near.any(), f"the light of BGR {code} is not in its corner"
-    first = path.read_bytes()
-    plot_illuminations(plan, path)
-    assert path.read_bytes() == first
-
-
-@pytest.mark.slow
 def test_the_figure_is_a_triangle_in_which_five_black_bodies_are_named(
     plan: tuple[Illumination, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,6 +198,9 @@ def test_the_figure_is_a_triangle_in_which_five_black_bodies_are_named(
     uniform, bodies = (np.asarray(points.get_offsets()) for points in axes.collections)
     np.testing.assert_allclose(uniform, chromaticities[:666])
     np.testing.assert_allclose(bodies, chromaticities[666:])
+    # Each in its colour.
+    shown = np.concatenate([np.asarray(points.get_facecolors())[:, :3] for points in axes.collections])
+    np.testing.assert_allclose(shown, np.array(codes(plan)) / 255, atol=1e-9)
     # Black bodies lie on top, and their names beyond the triangle's long side, straight away from it.
     assert axes.collections[0].get_zorder() < axes.collections[1].get_zorder()
     names = {text.get_text(): text for text in axes.texts}
@@ -266,5 +219,7 @@ def test_figures_of_other_kinds(tmp_path: Path) -> None:
         plot_illuminations(few, tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(head)
     plot_illuminations((), tmp_path / "none.png")
+    plot_illuminations((), tmp_path / "again.png")
+    assert (tmp_path / "none.png").read_bytes() == (tmp_path / "again.png").read_bytes()
     with pytest.raises(InputError, match=r"\.png, \.pdf, \.svg"):
         plot_illuminations(few, tmp_path / "lights.txt")

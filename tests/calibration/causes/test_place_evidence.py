@@ -53,12 +53,6 @@ class Frame:
     record: SimpleNamespace
 
 
-def test_the_distance_of_a_spot_is_that_of_its_nearest_cell() -> None:
-    stains: Any = SimpleNamespace(places_mm=np.array([[0.0, 0], [30, 40], [60, 80]]))
-    away = gathering._distance(stains, np.array([1, 2]), np.array([30.0, 0]))
-    assert away == 40
-
-
 def test_references_that_are_off_where_no_stain_lies_have_a_place_of_no_size(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -58,34 +58,22 @@ CASES: list[tuple[Subject, Evidence, Cause]] = [
     ("few cells", replace(LIGHT, deviation=-0.3), OBJECT_IN_FRAME),
     # Few cells, all brighter: a glint, or a pale hand.
     ("few cells", replace(LIGHT, deviation=0.3), UNKNOWN),
-    # Two dark cells that are brighter: a glint, or a finger.
-    ("few cells", replace(LIGHT, deviation=math.nan), UNKNOWN),
     # Cells that are brighter and darker alike, in a white frame too: a hand does not do that.
     ("few cells", replace(LIGHT, even_showing=0.33, deviation=math.nan), UNKNOWN),
-    ("unfit cells", replace(LIGHT, even_showing=0.33, deviation=math.nan), UNKNOWN),
-    ("few cells", replace(LIGHT, even_showing=0.33, deviation=0.3), UNKNOWN),
-    ("few cells", replace(LIGHT, even_showing=0.33, deviation=-0.3), OBJECT_IN_FRAME),
-    ("block", replace(LIGHT, even_showing=0.33, deviation=0.3), OBJECT_IN_FRAME),
     # Half of the frames: something came and stayed, and nobody knows what.
     ("block", replace(LIGHT, showing=0.5, deviation=-0.2), UNKNOWN),
     ("block", replace(LIGHT, showing=1, in_first=1, deviation=0.2), OBJECT_IN_FRAME),
     # Of three frames the one that differs from the others may be any.
     ("block", replace(LIGHT, frames=2, showing=1, in_first=1, deviation=0.2), UNKNOWN),
-    # A reflection shows a little under a light of another colour than white.
-    ("block", replace(LIGHT, spot=0.9, deviation=0.02), UNKNOWN),
     # Where many photosites are hot a block of cells is brighter in dim lights; a hand is darker there, too.
     ("block", replace(LIGHT, deviation=0.08, tint=0.8, added=0.0, kept=1.0, hot=0.47), HOT_PHOTOSITES),
-    ("block", replace(LIGHT, deviation=-0.9, tint=0, added=0, kept=0.1, hot=0.3), OBJECT_IN_FRAME),
     ("block", replace(LIGHT, softer=0.03, scatter=0.05), DEFOCUS),
     ("block", replace(LIGHT, scatter=0.5), ANOTHER_PRINT),
     # Most of the sheet: a cloud before the window, a lamp, or nothing that is known.
     ("block", replace(LIGHT, share=0.8, deviation=-0.05), UNKNOWN),
     ("spot", replace(PRINT, deviation=-0.1, tint=0.7, added=0, kept=0.9), STAIN),
     ("spot", replace(PRINT, deviation=-0.03, tint=0.1, added=0, kept=0.97), SHADOW),
-    # Cells at its rim are half under it, and most under it do not look like the chart's.
-    ("spot", replace(PRINT, deviation=-0.2, tint=0.63, added=0.025, kept=0.64), STAIN),
     ("unfit cells", Evidence(white_residual=1, deviation=-0.2, tint=0.7, share=0.03, rim_frames=0, hot=0), STAIN),
-    ("unfit cells", Evidence(white_residual=1, deviation=-0.2, tint=0.1, share=0.03, rim_frames=0, hot=0), UNKNOWN),
     # Between a stain and a shadow: both are possible.
     ("spot", replace(PRINT, deviation=-0.05, tint=0.3, added=0, kept=0.95), UNKNOWN),
     ("spot", replace(PRINT, deviation=0.1, tint=0.2, added=0.03, kept=0.97), REFLECTION),
@@ -107,12 +95,10 @@ CASES: list[tuple[Subject, Evidence, Cause]] = [
     ),
     # From one frame nothing can be said of all.
     ("spot", Evidence(frames=0, deviation=-0.1, tint=0.7, added=0, kept=0.9, share=0.03), UNKNOWN),
-    ("unfit cells", replace(LIGHT, deviation=-0.3), OBJECT_IN_FRAME),
     ("unfit cells", Evidence(misplaced=0.8, waves_px=0.8, hot=0, uneven=0, beyond_cell=0), CURL),
     # A flat print: few cells, or dark corners, and no curl.
     ("unfit cells", Evidence(misplaced=1, waves_px=0.05, hot=0, uneven=0, beyond_cell=0), UNKNOWN),
     ("unfit cells", Evidence(misplaced=0, waves_px=0.05, hot=0, uneven=0.9, beyond_cell=0.08), SPREAD),
-    ("noisy cells", Evidence(hot=0, uneven=0.9, beyond_cell=0.08), SPREAD),
     # Uneven cells before a sharp lens are dirt, or a print of dots.
     ("unfit cells", Evidence(misplaced=0, waves_px=0.05, hot=0, uneven=0.9, beyond_cell=0.001), UNKNOWN),
     ("unfit cells", Evidence(hot=0.9), HOT_PHOTOSITES),
@@ -122,45 +108,28 @@ CASES: list[tuple[Subject, Evidence, Cause]] = [
     # One primary more and another as much less: the one's frame holds the other's light.
     ("sum", Evidence(frames=11, exposure=1, mixed=0.05), MIXED),
     ("stray", Evidence(frames=11, stray=0.05, mixed=0.05), MIXED),
-    ("sum", Evidence(frames=11, exposure=1, mixed=0.005), UNKNOWN),
-    ("drift", Evidence(frames=11, exposure=1, colour_scatter=0.01), COLOUR_WHEEL),
     ("sum", Evidence(frames=11, exposure=1, colour_scatter=0.01), COLOUR_WHEEL),
-    ("drift", Evidence(frames=11, exposure=1, colour_scatter=0.0), UNKNOWN),
     # A frame of another light among the white ones.
     ("drift", Evidence(frames=11, exposure=1, colour_scatter=0.5), UNKNOWN),
-    ("unfit cells", Evidence(hot=0.2), UNKNOWN),
     ("unfit cells", Evidence(hot=0, lit=0.8), REFLECTION),
-    ("unfit cells", Evidence(hot=0, lit=0.2), UNKNOWN),
     ("references", Evidence(frames=4, radial=0.8, rim=-0.02, rim_frames=1, white_residual=1), FALL_OFF),
-    ("references", Evidence(frames=4, radial=0.8, rim=0.02, rim_frames=0, white_residual=1), UNKNOWN),
     (
         "references",
         Evidence(frames=4, white_residual=0.25, deviation=-0.8, share=0.09, rim_frames=0),
         OBJECT_IN_FRAME,
     ),
-    (
-        "chart",
-        Evidence(agreement=0.93, white_residual=0.25, deviation=-0.8, share=0.09, rim_frames=0, scatter=0),
-        OBJECT_IN_FRAME,
-    ),
     ("chart", Evidence(agreement=0.1), ANOTHER_PRINT),
-    ("chart", Evidence(agreement=0.9), UNKNOWN),
     ("frame", Evidence(softer=0.02, scatter=0.01), DEFOCUS),
-    ("frame", Evidence(softer=0.02, scatter=0.04), DEFOCUS),
     ("frame", Evidence(softer=0, scatter=0.5), ANOTHER_PRINT),
-    ("frame", Evidence(softer=0, scatter=0.03), UNKNOWN),
     ("movement", Evidence(anew=0.1, moved_px=2, softer=0), BUMP),
     ("iso", Evidence(frames=8, other_iso=2), OTHER_EXPOSURE),
     ("sum", Evidence(exposure=0.5), OTHER_EXPOSURE),
-    ("drift", Evidence(exposure=2.0), OTHER_EXPOSURE),
     ("sum", Evidence(exposure=1.0, named_right=0), WRONG_NAME),
     # A projector with a white segment: exposures and names are right.
     ("sum", Evidence(exposure=1.0, named_right=1), UNKNOWN),
-    ("sum", Evidence(), UNKNOWN),
     ("names", Evidence(exposure=1.0, cameras=2, named_right=0), OTHER_CAMERA),
     ("dark", Evidence(frames=3, room=0.01, room_change=0.0001), UNKNOWN),
     ("dark", Evidence(frames=3, room=0.05, room_change=0.0001), ROOM_LIGHT),
-    ("dark", Evidence(frames=3, room=0.01, room_change=0.004), ROOM_LIGHT),
 ]
 
 

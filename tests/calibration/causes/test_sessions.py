@@ -17,7 +17,6 @@ from calibration.causes.rules import (
     OTHER_EXPOSURE,
     REFLECTION,
     REFLECTION_IN_FRAME,
-    ROOM_LIGHT,
     STAIN,
     UNKNOWN,
     Cause,
@@ -155,25 +154,13 @@ def test_a_white_frame_of_half_the_exposure_is_told_by_its_file(lab: Lab, tmp_pa
     assert "white" in frame.file
 
 
-@pytest.mark.parametrize(
-    ("situation", "room", "figure", "cause"),
-    [
-        (Situation(defocus_px=0.9), None, "softer_bleed", DEFOCUS),
-        (Situation(), Room(waviness_mm=0.5, ambient=0.03), "leak_share", ROOM_LIGHT),
-    ],
-    ids=["defocus", "room light"],
-)
-def test_what_is_known_is_named(
-    situation: Situation, room: Room | None, figure: str, cause: Cause, lab: Lab, tmp_path: Path
-) -> None:
-    hung = lab if room is None else hang(room=room)
-
+def test_a_frame_out_of_focus_is_called_that(lab: Lab, tmp_path: Path) -> None:
     def one(step: SessionStep) -> bool:
         return step.kind == "light" and step.illumination == 2
 
-    _, found = measured(taken(hung, tmp_path / "session", one, situation=situation), tmp_path)
-    assert causes(found) == {cause}
-    assert found[figure].decision.cause is cause
+    _, found = measured(taken(lab, tmp_path / "session", one, situation=Situation(defocus_px=0.9)), tmp_path)
+    assert causes(found) == {DEFOCUS}
+    assert found["softer_bleed"].decision.cause is DEFOCUS
 
 
 def test_dark_corners_are_no_dirt(tmp_path: Path) -> None:

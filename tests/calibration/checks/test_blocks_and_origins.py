@@ -1,4 +1,4 @@
-"""How cells are put into blocks and what is told of their light; which frames' files state otherwise than most."""
+"""What is told of the light of blocks; which frames' files state otherwise than most."""
 
 from __future__ import annotations
 
@@ -11,32 +11,6 @@ import pytest
 from calibration.checks import frame_consistency
 from calibration.checks.frame_consistency import ForeignFrame, OriginFigures, origin_figures
 from drivers.raw.rawfile import FrameOrigin
-
-
-@pytest.mark.parametrize(
-    ("across", "down", "columns", "rows"),
-    # Of 32 cells each, fewer of fewer than 512 cells, and twenty at least.
-    [(32, 24, 6, 4), (64, 64, 11, 11), (24, 16, 5, 3), (16, 10, 4, 2)],
-)
-def test_blocks_are_squares_of_as_many_cells_as_noise_asks_for(across: int, down: int, columns: int, rows: int) -> None:
-    x, y = np.meshgrid(np.arange(across) * 10.0 + 5, np.arange(down) * 10.0 + 7)
-    cells = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
-    block, middles, area = frame_consistency._blocks(cells)
-    width, height = (across - 1) * 10 / columns, (down - 1) * 10 / rows
-    assert area == pytest.approx(width * height)
-    x, y = np.meshgrid(5 + (np.arange(columns) + 0.5) * width, 7 + (np.arange(rows) + 0.5) * height)
-    np.testing.assert_allclose(middles, np.column_stack([x.ravel(), y.ravel()]))
-    # Each cell lies in the block whose middle is no further than half a block along either axis.
-    assert (np.abs(cells - middles[block]) <= np.array([width, height]) / 2 + 1e-6).all()
-    members = frame_consistency._members(block, len(middles))
-    for number, row in enumerate(members):
-        assert row[row >= 0].tolist() == np.flatnonzero(block == number).tolist()
-    assert members.shape[1] == np.bincount(block).max()
-    values = np.where(np.arange(len(cells)) % 3 == 0, np.nan, np.arange(len(cells), dtype=np.float64))
-    means, counts = frame_consistency._known_means(np.append(values, np.nan)[members])
-    for number in range(len(middles)):
-        own = values[block == number]
-        assert (means[number], counts[number]) == pytest.approx((np.nanmean(own), np.isfinite(own).sum()))
 
 
 def test_light_of_blocks_is_a_line_through_the_cells_that_are_seen() -> None:

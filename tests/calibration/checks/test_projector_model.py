@@ -40,30 +40,6 @@ def test_primaries_are_those_of_measured_cameras_and_lamps() -> None:
     np.testing.assert_allclose(projector_model._CHANNELS, np.median(white / white[:, 1:2], axis=0), rtol=0.1)
 
 
-def test_logarithms_of_primaries_share_what_scale_channels_and_primaries_have() -> None:
-    root = projector_model._primary_root()
-    covariance = root @ root.T
-    own = projector_model._SEEN_SD.ravel() ** 2
-    # Row by row the channels: of any two, of one primary in two channels, of two primaries in one channel.
-    assert covariance[0, [4, 3, 1]] == pytest.approx([2.0**2, 2.0**2 + 0.3**2, 2.0**2 + 0.35**2])
-    assert np.diag(covariance) == pytest.approx(own + 2.0**2 + 0.3**2 + 0.35**2)
-
-
-def test_tone_curves_bend_smoothly_about_a_power_and_are_one_at_full_code() -> None:
-    codes = np.array([6, 20, 50, 100, 130, 180, 240, 255])
-    basis = projector_model._curve_basis()[codes]
-    x = np.log(codes / 255)
-    apart = np.exp(-0.5 * (np.subtract.outer(x, x) / 0.4) ** 2)
-    # Bends on condition that there is none at 255.
-    known = np.exp(-0.5 * np.add.outer(x**2, x**2) / 0.4**2)
-    assert basis @ basis.T == pytest.approx(0.4**2 * np.outer(x, x) + 0.2**2 * (apart - known), abs=0.01)
-    nodes = np.array([0, 64, 128, 192, 255])
-    overlap = projector_model._overlap_basis()
-    expected = 0.2**2 + 0.15**2 * np.exp(-0.5 * (np.subtract.outer(nodes, nodes) / 120) ** 2)
-    assert overlap[nodes] @ overlap[nodes].T == pytest.approx(expected, abs=1e-6)
-    assert overlap[32] == pytest.approx((overlap[0] + overlap[64]) / 2), "linear between"
-
-
 CODES = np.array([(255, 0, 0), (0, 255, 40), (255, 255, 255), (12, 200, 90), (0, 0, 0), (64, 3, 128), (130, 131, 7)])
 
 

@@ -40,18 +40,17 @@ def read(room: Room, folder: Path) -> tuple[Lab, Stains]:
     return lab, find_stains(level[: len(cells)] / field, cells, lab.chart.bits)
 
 
-@pytest.mark.parametrize("seed", [0, 5])
-def test_a_clean_print_has_none(seed: int, tmp_path: Path) -> None:
-    _, stains = read(Room(waviness_mm=0.5, seed=seed), tmp_path)
+def test_a_clean_print_has_none(tmp_path: Path) -> None:
+    _, stains = read(Room(waviness_mm=0.5, seed=5), tmp_path)
     assert not stains.stained.any()
     assert not stains.doubtful.any()
     assert (np.isfinite(stains.deviation)).mean() > 0.95
     assert (stains.largest_deviation() == 0).mean() < 0.05
 
 
-@pytest.mark.parametrize(("depth", "seed"), [(0.15, 0), (0.5, 2)])
-def test_a_thumb_s_stain_is_found_cell_by_cell(depth: float, seed: int, tmp_path: Path) -> None:
-    lab, stains = read(Room(waviness_mm=0.5, seed=seed, stain_mm=25, stain_depth=depth), tmp_path)
+def test_a_thumb_s_stain_is_found_cell_by_cell(tmp_path: Path) -> None:
+    depth = 0.15
+    lab, stains = read(Room(waviness_mm=0.5, seed=0, stain_mm=25, stain_depth=depth), tmp_path)
     stain = lab.world.stain
     assert stain is not None
     away = np.linalg.norm(cells_mm(lab) - stain.centre_mm, axis=1)

@@ -15,7 +15,6 @@ import pytest
 from calibration.citation import exposure_text
 from calibration.cli import main
 from calibration.figures.figure import QUESTIONS
-from calibration.figures.geometry import cell_sides_px
 from calibration.pipeline.build import build, check
 from calibration.report.report import summary, worst_of_figures
 from calibration.table.lut import Lut, open_lut
@@ -252,18 +251,8 @@ def test_the_report_stands_alone(built: BuildResult) -> None:
     assert pictures >= set(re.findall(r"href='#(\w+)'", page)) >= {"residuals", "course", "budget"}
 
 
-def test_the_summary_goes_from_the_whole_to_parts(built: BuildResult) -> None:
+def test_the_summary_gives_figures_in_their_units(built: BuildResult) -> None:
     rows = {row.name: row for row in summary(built.figures)}
-    assert list(rows) == [
-        "Lights", "Frame registered", "Tags found", "Shorter side of a cell", "Window", "Blur", "Spread of the lens",
-        "Residual of tags", "Residual of plane and lens", "Residual of cell blocks", "Correlation with the chart",
-        "Movement of the chart", "Drift of white", "Black level", "Saturation", "Darkest light", "Noise of a sample",
-        "Photon transfer", "Linearity", "Uncertainty of the ground truth", "Samples at 0",
-        "Light while the projector shows black", "Lights against their codes", "Lights held against their codes",
-        "Light that no dark frame shows", "Red + green + blue − white", "Tint of the greys", "Cells unfit for use",
-    ]  # fmt: skip
-    marks = rows["Residual of tags"].note
-    assert marks == "corners of the tags against the final map; the detector's own error is 0.09"
     figures, percent = built.figures, "{:.2f} %".format
     assert rows["Lights"].value == str(len(LIGHTS))
     assert rows["Tags found"].value == "4 of 4"
@@ -281,21 +270,6 @@ def test_the_summary_goes_from_the_whole_to_parts(built: BuildResult) -> None:
     assert dark[3:] == pytest.approx(100 * figures.dark_frames.light / white, abs=0.006)
 
 
-def test_the_worst_of_each_figure_is_somewhere(built: BuildResult, session: Session) -> None:
-    chart, found = session.chart, worst_of_figures(built.figures, session.chart)
-    files = {record.file for record in session.frames()}
-    for worst in found.values():
-        assert worst.where
-        assert not worst.file or worst.file in files
-        if worst.place is not None:
-            assert 0 <= worst.place.x_mm <= chart.page_mm[0]
-            assert 0 <= worst.place.y_mm <= chart.page_mm[1]
-    assert found["truth_worst_deg"].light == int(np.argmax(built.figures.budget.expanded_deg))
-    assert found["bleed"].place is not None
-    smallest = cell_sides_px(built.figures.registration.to_pixels, chart).min()
-    assert smallest == pytest.approx(built.figures.registration.cell_px, rel=0.1)
-
-
 def test_the_whole_table_is_what_it_was(built: BuildResult, session: Session, pinned: Pinned) -> None:
     assert built.lut is not None
     pinned("table of 13 lights, measured", whole(built), **LIMITS)
@@ -304,16 +278,12 @@ def test_the_whole_table_is_what_it_was(built: BuildResult, session: Session, pi
     pinned("table of 13 lights, report", [reported(built), worst, words_of(built.lut)], **LIMITS)
 
 
-def test_a_check_measures_what_it_did(session: Session, pinned: Pinned) -> None:
-    pinned("check of 13 lights", told(check(session)), **LIMITS)
-
-
-def test_check_writes_nothing(session: Session) -> None:
+def test_a_check_measures_what_it_did_and_writes_nothing(session: Session, pinned: Pinned) -> None:
     before = sorted(session.folder.rglob("*"))
     result = check(session)
+    pinned("check of 13 lights", told(result), **LIMITS)
     assert result.lut is None
     assert result.figures.session.registered_file == "frames/0000_white.dng"
-    assert result.figures.registration.agreement > 0.99
     assert sorted(session.folder.rglob("*")) == before
 
 

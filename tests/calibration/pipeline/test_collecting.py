@@ -13,7 +13,6 @@ import pytest
 from calibration.pipeline import collecting
 from calibration.pipeline.collecting import budget_of
 from calibration.radiometry.superposition import Superposition
-from calibration.sampling import mean_bleed
 from calibration.spread.added_light import AddedLight
 
 _Array = npt.NDArray[np.float64]
@@ -65,11 +64,6 @@ def in_channels(squares: npt.ArrayLike) -> _Array:
     return np.array([np.diag(row) for row in np.asarray(squares, dtype=np.float64)])
 
 
-def partly_common(size: float) -> _Array:
-    """Return three quarters of the square of a size in all channels alike, and the rest in each."""
-    return np.array([size**2 * (0.75 + 0.25 * np.eye(3))] * 2)
-
-
 CELLS = np.maximum(LEVELS, 1e-3)
 
 
@@ -107,42 +101,6 @@ def test_black_and_dark_light_count_over_white_and_over_each_cell() -> None:
     found = of("darkness", given)
     np.testing.assert_allclose(found.lights, in_channels(squares / WHITE**2))
     assert not found.assumed
-
-
-def test_lens_flicker_and_added_light_count_as_they_are_known_or_judged() -> None:
-    lens = of("lens")
-    np.testing.assert_allclose(lens.lights, [np.diag([1e-6, 2e-6, 3e-6])] * 2)
-    np.testing.assert_allclose(lens.cells, 9e-6)
-    assert not lens.assumed
-    flicker = of("flicker")
-    np.testing.assert_allclose(flicker.lights, partly_common(5e-5))
-    np.testing.assert_allclose(flicker.cells, 25e-10)
-    added = of("added light")
-    np.testing.assert_allclose(added.lights, partly_common(1e-4))
-    np.testing.assert_allclose(added.cells, (1e-8 + 5e-6) / CELLS**2)
-    assert added.assumed
-    given = table()
-    given.lights.stray, given.lens.measured = SimpleNamespace(share=0.002), False
-    shown = of("added light", given)
-    np.testing.assert_allclose(shown.lights, partly_common(1e-4) + 4e-6 * np.eye(3))
-    np.testing.assert_allclose(shown.cells, (1e-8 + 4e-6 + 5e-6) / CELLS**2)
-    assert not shown.assumed
-    assert of("lens", given).assumed
-
-
-def test_cells_are_off_by_counts_that_lack_beside_paper_s_and_by_their_neighbours() -> None:
-    linearity, given = of("linearity"), table()
-    sensor = given.sensor.superposition
-    paper = np.broadcast_to(BRIGHTEST, LEVELS.shape)
-    np.testing.assert_allclose(linearity.cells, sensor.errors(CELLS * BRIGHTEST, paper))
-    np.testing.assert_allclose(linearity.lights, sensor.white_covariance(WHITE))
-    assert linearity.assumed
-    # A place that is known to an error blurs by it; neighbours are the print's other cells.
-    bleed = mean_bleed(9.0, np.hypot(0.7, np.linspace(0.1, 0.4, 4)), 5)
-    for cell, channel in np.ndindex(4, 3):
-        apart = np.mean((CELLS[cell, channel] - CELLS[:, channel]) ** 2) / CELLS[cell, channel] ** 2
-        assert of("geometry").cells[cell, channel] == pytest.approx(bleed[cell] ** 2 * apart)
-    assert not of("geometry").lights.any()
 
 
 def frame(white: tuple[float, float, float] = (100.0, 200, 50), at_s: float = 0, exposure: float = 0.5) -> Any:

@@ -125,7 +125,6 @@ def test_a_jump_between_white_frames_is_refused_and_names_the_remedy(lab: Lab, t
         with pytest.raises(QualityError, match=r"Drift .*--correct-drift"):
             build(session, tmp_path / "lut", options=CORRECTED)
         assert not (tmp_path / "lut").exists()
-        assert build(session, tmp_path / "lut").verdict.outcome != "refuse"
 
 
 def test_one_white_frame_is_refused_before_anything_is_read(lab: Lab, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from calibration.pipeline import frames as framing
 from calibration.pipeline.baseline import select_frames, stated_origin
-from calibration.pipeline.frames import Baseline, beyond_print, movement_of, usable_means
+from calibration.pipeline.frames import beyond_print, usable_means
 from calibration.sampling import sites_at
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -99,46 +99,6 @@ def test_patches_that_are_cut_off_or_clipped_have_no_mean() -> None:
     means = usable_means(samples, np.array([limit - 1, 50, limit, 50], dtype=np.uint16), sites, 10_000)
     assert np.isnan(means).all(axis=1).tolist() == [False, True, True, False]
     np.testing.assert_allclose(means[[0, 3]], samples[[0, 3]].mean(axis=1))
-
-
-def baseline(**more: object) -> Baseline:
-    """Return of a baseline what its levels and movements are made of: three cells and two white references."""
-
-    def read(whites: object, file: str) -> tuple[Any, npt.NDArray[np.float64]]:
-        def at(places: object) -> npt.NDArray[np.float64]:
-            return np.full((2, 3), 0.5)
-
-        paper = SimpleNamespace(white=np.array([1000.0, 2000, 0]), field=SimpleNamespace(at=at))
-        return paper, np.array([[1.0, 1, 1], [0.8, 0.9, 1], [1.2, 1.1, 1]])
-
-    made = object.__new__(Baseline)
-    cells_mm = np.array([[0.0, 0], [10, 0], [0, 20]])
-    points = SimpleNamespace(cells_mm=cells_mm, references_mm=np.zeros((2, 2)))
-    first = SimpleNamespace(file="0.dng")
-    means = np.array([[500.0, 500, 1], [400, 1800, 1], [240, 220, 1], [500, 1000, 1], [250, 900, 1]])
-    made.__dict__.update({"paper": SimpleNamespace(read=read), "points": points, "first": first, "whites": None,
-                          "means": means} | more)  # fmt: skip
-    return made
-
-
-def test_levels_are_over_the_field_and_paper_s_white() -> None:
-    expected = np.array([[0.5, 0.25], [0.5, 1], [0.2, 0.1]])
-    np.testing.assert_allclose(baseline().levels[:, :2], expected)
-    found = baseline().reflectances()
-    np.testing.assert_allclose(found[:, :2], [*expected, [1, 1], [0.5, 0.9]])
-    # A channel without light has the reflectances of the brightest.
-    np.testing.assert_array_equal(found[:, 2], found[:, 1])
-
-
-def test_a_movement_is_the_cells_median_and_its_largest_that_of_the_cell_that_moves_most() -> None:
-    def seen(by: list[tuple[float, float]]) -> Any:
-        def to_pixels(places: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-            return 2 * places + np.array(by)
-
-        return SimpleNamespace(registration=SimpleNamespace(to_pixels=to_pixels))
-
-    shift = movement_of(baseline(), seen([(0, 0)] * 3), seen([(1, -2), (1.5, -3), (6, 8)]))
-    assert (shift.dx, shift.dy, shift.largest_px, shift.gauges) == (1.5, -2, 10, 3)
 
 
 def test_what_lies_behind_the_print_is_the_mean_of_places_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:

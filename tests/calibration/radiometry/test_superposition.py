@@ -7,12 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy import stats
 
 from calibration.radiometry.superposition import (
     NODES,
     Superposition,
-    _posterior,
     printed_predictors,
     superposition,
 )
@@ -153,16 +151,6 @@ def test_an_error_is_what_counts_lack_beside_those_of_a_reference() -> None:
     assert written["measured"]
 
 
-def test_what_is_usual_bends_by_a_hundredth_and_loses_some_counts_near_black() -> None:
-    """One per cent at saturation, .05 % of it near black, .03 % at every level, and no part that is a straight line."""
-    share = np.array(NODES)
-    usual = Superposition.usual(FULL).covariance / FULL**2
-    shapes = [0.01 * share**2, 0.01 * share**3, *(0.0005 * (1 - np.exp(-share / scale)) for scale in (0.0005, 0.002))]
-    relative = [shape / share - np.mean(shape / share) for shape in shapes]
-    expected = sum((np.outer(one, one) for one in relative), 0.0003**2 * np.eye(len(share)))
-    np.testing.assert_allclose(usual / np.outer(share, share), expected, rtol=1e-9)
-
-
 def test_predictors_are_codes_of_cells_and_one_level_for_references_of_a_colour() -> None:
     rgb = np.random.default_rng(3).integers(0, 256, (80, 3))
     found = printed_predictors(rgb, np.array([1, 0, 1]))
@@ -176,23 +164,3 @@ def test_predictors_are_codes_of_cells_and_one_level_for_references_of_a_colour(
         value = np.prod((rgb / 255) ** power, axis=1)
         fitted = np.asarray(codes @ np.linalg.lstsq(codes, value, rcond=None)[0], dtype=np.float64)
         assert np.allclose(fitted, value, atol=1e-9) == exact
-
-
-def test_priors_are_averaged_by_how_likely_they_make_what_is_seen() -> None:
-    random = np.random.default_rng(2)
-    design, value = random.normal(size=(40, 5)), random.normal(size=40)
-    priors = [(np.diag(1 / np.full(5, size) ** 2), odds) for size, odds in ((0.1, 0.6), (1.0, 0.3), (3.0, 0.1))]
-    mean, covariance = _posterior(design.T @ design, design.T @ value, priors)
-    likely: list[float] = []
-    means: list[_Array] = []
-    covariances: list[_Array] = []
-    for prior, odds in priors:
-        of_values = np.eye(40) + design @ np.linalg.inv(prior) @ design.T
-        inverse = np.asarray(np.linalg.inv(design.T @ design + prior), dtype=np.float64)
-        likely.append(odds * float(stats.multivariate_normal(np.zeros(40), of_values).pdf(value)))
-        means.append(inverse @ design.T @ value)
-        covariances.append(inverse)
-    weights = np.array(likely) / sum(likely)
-    np.testing.assert_allclose(mean, weights @ means)
-    spread = sum(w * (c + np.outer(m - mean, m - mean)) for w, m, c in zip(weights, means, covariances, strict=True))
-    np.testing.assert_allclose(covariance, spread)

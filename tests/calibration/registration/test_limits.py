@@ -106,15 +106,6 @@ def test_places_may_be_off_by_two_errors_or_three_of_a_chart_without_tags() -> N
     assert found.places_known_px == pytest.approx((31, np.percentile(rim, 99)))
 
 
-def test_a_cell_s_side_is_the_shorter_one_of_the_smallest() -> None:
-    width, height = CHART.cell_mm
-    squeezed = Lens(np.diag([3.0, 2.0, 1.0]), np.zeros(2), 1000.0, np.zeros(4))
-    assert registering._cell_px(squeezed, CHART) == pytest.approx(min(3 * width, 2 * height))
-    assert registering._cell_px(Lens(np.diag([2.0, 3.0, 1.0]), np.zeros(2), 1.0, np.zeros(4)), CHART) == pytest.approx(
-        min(2 * width, 3 * height)
-    )
-
-
 def test_a_block_s_score_sinks_with_its_mismatched_cells() -> None:
     centres = np.array([CHART.centres_mm.min(axis=0), CHART.centres_mm.max(axis=0)])
     blocks = Blocks(centres, np.array([0.8, 0.9]), np.zeros((2, 2)))

@@ -14,7 +14,6 @@ from calibration.registration.register import Registration, register
 from drivers.presenter import Colour
 from drivers.raw.rawfile import CHANNELS, Mosaic
 from experiment.chart.layout import paper_chart
-from experiment.framing.field import field_mm
 from foundation.errors import RegistrationError
 from sim.world.world import Room
 from tests.calibration.lab import QUARTER, Lab, hang_chart
@@ -40,9 +39,8 @@ def registered(plain: Lab, white: Mosaic) -> Registration:
     return register(white, plain.chart)
 
 
-@pytest.mark.parametrize("colour", [Colour(110, 70, 20), Colour(0, 0, 255)])
-def test_every_light_that_shows_which_way_up_registers(plain: Lab, tmp_path: Path, colour: Colour) -> None:
-    error = plain.miss_px(plain.mosaic(tmp_path, colour))
+def test_blue_light_shows_which_way_up_and_registers(plain: Lab, tmp_path: Path) -> None:
+    error = plain.miss_px(plain.mosaic(tmp_path, Colour(0, 0, 255)))
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert error.max() < 0.4
 
@@ -98,11 +96,6 @@ def test_a_flat_sheet_has_no_uncertain_cell(plain: Lab, white: Mosaic, registere
     assert (error < 3 * registered.uncertainty_px(SMALL.centres_mm)).all()
 
 
-def test_upside_down_is_the_same_chart(tmp_path: Path) -> None:
-    lab = hang_chart(SMALL, "Test", Room(waviness_mm=0.5, roll_deg=180.0))
-    assert lab.miss_px(lab.mosaic(tmp_path)).max() < 0.4
-
-
 def test_a_large_grid_on_a_sheet_that_waves_by_six_millimetres(tmp_path: Path) -> None:
     """The paper's whole grid is in `benchmarks.plain`."""
     lab = hang_chart(paper_chart("A3", 4), QUARTER, Room(waviness_mm=6.0, seed=3))
@@ -115,21 +108,6 @@ def test_a_large_grid_on_a_sheet_that_waves_by_six_millimetres(tmp_path: Path) -
     assert registration.blocks.good.all()
     assert not registration.mismatched_cells.any()
     assert registration.agreement > 0.999
-
-
-def test_red_light_registers_where_the_session_knows_the_way_up(
-    plain: Lab, registered: Registration, tmp_path: Path
-) -> None:
-    mosaic = plain.mosaic(tmp_path, Colour(255, 0, 0), key=2)
-    places = register(mosaic, plain.chart, near=registered).to_pixels(plain.chart.centres_mm)
-    assert np.abs(places - plain.truth_px(plain.chart.centres_mm, mosaic)).max() < 0.5
-
-
-def test_stated_corners_find_the_same_places(plain: Lab, white: Mosaic, registered: Registration) -> None:
-    stated = plain.truth_px(field_mm(plain.chart), white) + np.array([(6, -5), (-4, 6), (3, 4), (-6, -3)])
-    by_itself = registered.to_pixels(plain.chart.centres_mm)
-    by_corners = register(white, plain.chart, corners=stated).to_pixels(plain.chart.centres_mm)
-    assert np.abs(by_itself - by_corners).max() < 0.1
 
 
 def test_another_order_of_colours_is_refused(plain: Lab, white: Mosaic) -> None:
@@ -148,16 +126,6 @@ def test_a_field_displaced_by_one_cell_is_refused(plain: Lab, white: Mosaic) -> 
     other = replace(plain.chart, colours=np.roll(grid, 1, axis=1).reshape(-1))
     with pytest.raises(RegistrationError, match="cells beside them"):
         register(white, other)
-
-
-def test_a_covered_half_is_refused(plain: Lab, tmp_path: Path) -> None:
-    top, left, height, width = plain.world.body.visible
-
-    def cover(counts: npt.NDArray[np.uint16]) -> None:
-        counts[top + height // 4 : top + 3 * height // 4, left + width // 6 : left + 5 * width // 6] = 3400
-
-    with pytest.raises(RegistrationError, match="uncover"):
-        register(plain.mosaic(tmp_path, paint=cover), plain.chart)
 
 
 def test_a_covered_part_is_named_and_does_not_pull_its_neighbours(plain: Lab, tmp_path: Path) -> None:
@@ -183,10 +151,4 @@ def test_a_covered_part_is_named_and_does_not_pull_its_neighbours(plain: Lab, tm
 def test_out_of_focus_is_refused(tmp_path: Path) -> None:
     lab = hang_chart(SMALL, "Test", Room(waviness_mm=0.5, blur_px=1.6))
     with pytest.raises(RegistrationError, match="out of focus"):
-        register(lab.mosaic(tmp_path), lab.chart)
-
-
-def test_too_far_away_is_refused(tmp_path: Path) -> None:
-    lab = hang_chart(SMALL, "Test", Room(waviness_mm=0.5, fill=0.6))
-    with pytest.raises(RegistrationError, match="nearer"):
         register(lab.mosaic(tmp_path), lab.chart)

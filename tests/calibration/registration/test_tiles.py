@@ -15,8 +15,6 @@ from calibration.registration.tiles import (
     compare_tiles,
     find_blocks,
     jacobians,
-    sums_of,
-    tile_middles,
     tiles,
     to_pixel_units,
 )
@@ -177,12 +175,6 @@ def test_slopes_in_elements_become_information_in_pixels() -> None:
     per_px = slopes @ np.asarray(np.linalg.inv(found[0]), dtype=np.float64)
     np.testing.assert_allclose(information[0], per_px.T @ per_px)
     np.testing.assert_allclose(pull[0], -per_px.T @ error)
-
-
-def test_sums_and_middles_are_those_of_whole_tiles() -> None:
-    image = np.random.default_rng(1).random((11, 13)).astype(np.float32)
-    np.testing.assert_allclose(sums_of(image, 5), image[:10, :10].reshape(2, 5, 2, 5).sum(axis=(1, 3)), rtol=1e-5)
-    assert np.array_equal(tile_middles(image, 5), image[[2, 7]][:, [2, 7]])
 
 
 def test_a_peak_is_a_parabola_s_and_at_the_rim_an_element_s() -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.spread import added_light as module
 from calibration.spread.added_light import AddedLight, added_light
 
 _Array = npt.NDArray[np.float64]
@@ -68,29 +67,3 @@ def test_what_is_certain_is_beyond_four_standard_errors_of_a_level() -> None:
     # A level below a thousandth counts as one.
     assert found.certain_share_of(np.array([[0.1, 0.1, 1e-5]])) == pytest.approx(np.array([[0.16, 0, 12]]))
     assert found.mean_square == pytest.approx(np.array([[0.000401, 0.000017, 0.000404]]))
-
-
-def test_bumps_stand_on_a_grid_of_nine_places_along_the_longer_side() -> None:
-    cells = places()
-    left, top, right, bottom = (float(edge(cells[:, axis])) for edge in (np.min, np.max) for axis in (0, 1))
-    apart = (right - left) / 8
-    rows = round((bottom - top) / apart) + 1
-    x, y = np.linspace(left, right, 9), np.linspace(top, bottom, rows)
-    middles = np.stack([np.tile(x, rows), np.repeat(y, 9)], axis=1)
-    expected = np.exp(-((cells[:, None] - middles) ** 2).sum(axis=-1) / (2 * apart**2))
-    np.testing.assert_allclose(module._bumps(cells), expected)
-
-
-def test_added_light_has_the_likeliest_of_its_sizes() -> None:
-    random = np.random.default_rng(5)
-    design, noise = random.standard_normal((300, 7)), random.standard_normal(300)
-    value = design @ np.array([0.012, -0.014, 0.013, 0.01, -0.012, 0.002, -0.001]) * 40 + noise
-    heights, spread = module._likeliest(value, 40 * design, 5)
-    priors = [np.diag([size**2] * 5 + [0.003**2] * 2) for size in module._SIZES]
-    covariances = [np.eye(300) + 1600 * design @ prior @ design.T for prior in priors]
-    # The likelihood of the values themselves, heights integrated out.
-    likelihood = [-value @ np.linalg.solve(one, value) - np.linalg.slogdet(one)[1] for one in covariances]
-    prior, covariance = priors[int(np.argmax(likelihood))], covariances[int(np.argmax(likelihood))]
-    gain = 40 * prior @ design.T
-    np.testing.assert_allclose(heights, (gain @ np.linalg.solve(covariance, value))[:5], rtol=1e-6)
-    np.testing.assert_allclose(spread, (prior - gain @ np.linalg.solve(covariance, gain.T))[:5, :5], atol=1e-12)

@@ -12,7 +12,6 @@ from scipy import stats
 
 from calibration.spread import correction
 from calibration.spread.correction import LensFigures
-from calibration.spread.fitting import TERMS, terms_of
 
 MEASURED = LensFigures(
     rms=0.004, worst=0.03, residual=0.003, residual_worst=0.04, worst_level=0.1, veil=0.01, veil_error=0.002,
@@ -65,13 +64,3 @@ def test_a_kernel_brings_the_tails_beyond_a_cell_half_a_pixel_off_its_middle() -
         inside = np.asarray(stats.norm(at, sigma).cdf(4.5) - stats.norm(at, sigma).cdf(-4.5), dtype=np.float64)
         assert worst[kernel] == pytest.approx(1 - inside[-1] ** 2)
         assert mean[kernel] == pytest.approx(1 - float(np.outer(inside, inside).mean()))
-
-
-def test_white_errs_by_its_change_for_each_share_and_their_covariance() -> None:
-    random = np.random.default_rng(1)
-    root = random.normal(size=(TERMS, TERMS))
-    change = [random.normal(size=len(terms_of(channel))) for channel in range(3)]
-    draws = root @ random.normal(size=(TERMS, 5))
-    of_white = np.array([change[channel] @ draws[terms_of(channel)] for channel in range(3)])
-    found = correction._of_white(draws @ draws.T, change)
-    np.testing.assert_allclose(found, of_white @ of_white.T)

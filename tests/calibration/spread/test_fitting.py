@@ -23,7 +23,6 @@ from calibration.spread.fitting import (
     far_groups,
     free_terms,
     groups_of_terms,
-    place_terms,
     terms_of,
 )
 from calibration.spread.surroundings import far_taps
@@ -46,18 +45,6 @@ def test_each_unknown_belongs_to_one_channel_and_one_group() -> None:
     assert [len(group) for group in groups] == [3, 3 * (PLACES - 1)] * len(NEAR_PX) + [3] * (len(FAR_PX) + 1)
     assert [group.tolist() for group in far_groups()] == [group.tolist() for group in groups[2 * len(NEAR_PX) :]]
     assert np.flatnonzero(~free_terms()).tolist() == sorted(np.concatenate(far_groups()).tolist())
-
-
-def test_terms_over_the_frame_are_legendre_s() -> None:
-    height, width = 21, 31
-    y, x = np.mgrid[:height, :width]
-    terms = place_terms(np.stack([x.ravel(), y.ravel()], axis=1), (height, width)).reshape(height, width, PLACES)
-    np.testing.assert_allclose(terms[0, 0], np.outer([1, -1, 1], [1, -1, 1]).ravel())
-    np.testing.assert_allclose(terms[-1, -1], 1)
-    np.testing.assert_allclose(terms[10, 15], np.outer([1, 0, -0.5], [1, 0, -0.5]).ravel())
-    np.testing.assert_allclose(terms[10, -1], np.outer([1, 0, -0.5], [1, 1, 1]).ravel())
-    # Beyond the frame as at its rim.
-    np.testing.assert_allclose(place_terms(np.array([[-9.0, 99.0]]), (height, width))[0], terms[-1, 0])
 
 
 def test_shares_stand_by_term_channel_and_kernel_and_what_is_left_out_is_an_error() -> None:
@@ -92,21 +79,6 @@ def test_far_light_is_never_negative_and_the_rest_is_least_squares(seed: int) ->
     assert gain == pytest.approx((value**2).sum() - ((value - design @ shares) ** 2).sum())
 
 
-def test_what_is_eliminated_is_solved_for_as_well() -> None:
-    size = TERMS + 4
-    _, _, matrix, vector = equations(2 * size, size, 5)
-    prior = np.diag(np.linspace(1, 2, size))
-    inner, right = fitting._without_factors(matrix, vector, prior)
-    whole = np.linalg.solve(matrix + prior, vector)
-    np.testing.assert_allclose(np.linalg.solve(inner, right), whole[:TERMS])
-    free = np.flatnonzero(free_terms())
-    solution = fitting._solved(matrix, vector, prior, free)
-    used = np.concatenate([free, np.arange(TERMS, size)])
-    expected = np.zeros(size)
-    expected[used] = np.linalg.solve((matrix + prior)[np.ix_(used, used)], vector[used])
-    np.testing.assert_allclose(solution, expected, atol=1e-12)
-
-
 def test_kernels_that_gain_less_than_chance_and_four_standard_errors_are_left_out() -> None:
     groups = groups_of_terms()
     matrix = np.eye(TERMS)
@@ -119,18 +91,6 @@ def test_kernels_that_gain_less_than_chance_and_four_standard_errors_are_left_ou
     for misfit, kept in ((1.0, [0, len(groups) - 1]), (1.1, [])):
         found = fitting._selected(matrix, vector, misfit, groups)
         assert found.tolist() == sorted(np.concatenate([np.zeros(0, int), *(groups[k] for k in kept)]).tolist())
-
-
-def test_rows_weigh_by_their_level_s_scatter_and_outliers_little() -> None:
-    random = np.random.default_rng(2)
-    level = np.repeat([100.0, 1000.0], 4000)
-    left = random.standard_normal(8000) * np.repeat([1.0, 5.0], 4000)
-    left[0] = 50.0
-    weights = fitting._weights(left, level)
-    usual = np.median(weights[:4000]), np.median(weights[4000:])
-    assert usual == pytest.approx((1, 1 / 25), rel=0.1)
-    # Huber's weight falls as the distance grows.
-    assert 0.01 < weights[0] / usual[0] < 0.06
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 3.0, 4.5])

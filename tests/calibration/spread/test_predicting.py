@@ -6,7 +6,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.spread import predicting
 from calibration.spread.predicting import LevelModel, neighbour_residual
 
 _Array = npt.NDArray[np.float64]
@@ -101,15 +100,3 @@ def test_a_small_chart_s_cell_is_held_against_its_neighbours_less_the_curvature_
             square = bend[row : row + 5, column : column + 5]
             left.append(square[2, 2] - (square.sum() - square[2, 2]) / 24)
         assert found[tuple(place)] == pytest.approx(np.mean(left) if left else 0)
-
-
-def test_roots_of_levels_are_alike_as_matern_s_function_of_codes_and_their_largest_has_it() -> None:
-    found = predicting._covariance(3)
-    # A step of one code in one ink, in the largest, from black to white, and none.
-    for one, other in (((4, 2, 1), (4, 2, 2)), ((4, 2, 1), (5, 2, 1)), ((0, 0, 0), (7, 7, 7)), ((3, 3, 3), (3, 3, 3))):
-        a, b = (np.array([*codes, max(codes)]) for codes in (one, other))
-        r = np.linalg.norm(a - b) / 16
-        matern = (1 + np.sqrt(5) * r + 5 / 3 * r**2) * np.exp(-np.sqrt(5) * r)
-        unknown = 1e4 * (1 + (a - 3.5) @ (b - 3.5))
-        place = tuple(codes[0] * 64 + codes[1] * 8 + codes[2] for codes in (one, other))
-        assert found[place] == pytest.approx(matern + unknown, abs=1e-9)

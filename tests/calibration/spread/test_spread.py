@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -236,7 +236,6 @@ def test_a_sharp_lens_is_left_alone(sharp: Photograph) -> None:
     ("lens", "least", "most"),
     [
         ({"shoulder": 0.03, "veil": 0.015}, 0.015, 0.0055),
-        ({"veil": 0.01}, 0.008, 0.005),
         ({"shoulder": 0.06, "veil": 0.003, "growing": True}, 0.02, 0.01),
     ],
 )
@@ -302,7 +301,7 @@ def test_shoulders_that_grow_are_no_veil_where_cells_are_too_few_to_see_it() -> 
     assert figures.residual > max(after, 0.03)
 
 
-def test_a_veil_in_even_light_is_not_known_and_that_is_said(sharp: Photograph) -> None:
+def test_a_veil_in_even_light_is_not_known_and_that_is_said() -> None:
     even, falling = photograph(veil=0.01, falloff=0.0), photograph(veil=0.01)
     _, unknown = even.measured()
     _, known = falling.measured()
@@ -379,8 +378,6 @@ _COLOURED = [
     {"tails": (3.0, 2.0, (0.02, 0.03, 0.07))},
     {"tails": (3.0, 4.0, (0.06, 0.04, 0.02))},
     {"tails": (2.0, 2.0, (0.02, 0.03, 0.05))},
-    {"tails": (2.0, 1.0, (0.06, 0.07, 0.03))},
-    {"tails": (2.5, 2.0, (0.03, 0.05, 0.02))},
     {"shoulder": 0.03, "veil": (0.003, 0.005, 0.009)},
 ]
 """Lenses whose channels differ, some of forms that are no sums of the kernels."""
@@ -399,9 +396,8 @@ def test_what_a_lens_leaves_in_white_is_as_much_as_is_said() -> None:
     assert 0.2 < float(np.median(ratios)) < 1.5
 
 
-@pytest.mark.parametrize("lens", [_COLOURED[0], _COLOURED[2]], ids=["veil", "r⁻³"])
-def test_a_chart_of_many_colours_shows_the_lens_channel_by_channel(lens: dict[str, Any]) -> None:
-    shot = photograph(**lens)
+def test_a_chart_of_many_colours_shows_the_lens_channel_by_channel() -> None:
+    shot = photograph(veil=(0.003, 0.005, 0.009))
     spread, figures = shot.measured()
     error = shot.white_error(spread)
     before, _ = white_angles(shot.white_error(replace(spread, shares=np.zeros(TERMS))), figures.white_covariance)

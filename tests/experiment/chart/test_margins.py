@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.margins import (
-    GAP_PX,
     Margins,
     Side,
     bar_boxes,
@@ -22,8 +21,6 @@ from experiment.chart.margins import (
     number_every_mm,
     ruler_ticks,
     star_boxes,
-    target_boxes,
-    text_boxes,
     whole_px,
 )
 from experiment.chart.model import Chart
@@ -103,22 +100,6 @@ def test_the_rulers_ticks_are_true(chart: Chart) -> None:
     assert lengths[0] > lengths[round(10 / PX_MM)] > lengths[round(5 / PX_MM)] > lengths[round(1 / PX_MM)]
 
 
-def test_every_hundred_millimetres_of_the_paper_s_chart_are_numbered(a0: Chart) -> None:
-    marks = marks_px(a0)
-    field = field_drawing(a0).rectangles_mm / PX_MM
-    (left, _), (_, bottom) = np.rint(field[:, :2].min(axis=0)), np.rint(field[:, 2:].max(axis=0))
-    numbers = marks[(marks[:, 1] >= bottom + 100) & (marks[:, 3] <= bottom + 140)]
-    for mm in range(0, 1200, 100):
-        expected = text_boxes(str(mm))
-        here = numbers[np.abs((numbers[:, 0] + numbers[:, 2]) / 2 - left - mm / PX_MM) < 80]
-        # Below the middle of its tick, which is 4 px wide.
-        first = left + round(mm / PX_MM) + 2 - expected[:, 2].max() // 2
-        assert here[:, 0].min() == first + expected[:, 0].min()
-        assert sorted((here - here[:, :2].min(axis=0)[[0, 1, 0, 1]]).tolist()) == sorted(
-            (expected - expected[:, :2].min(axis=0)[[0, 1, 0, 1]]).tolist()
-        )
-
-
 def test_bars_are_as_wide_as_their_gaps() -> None:
     bars = bar_boxes().reshape(-1, 3, 4)
     for group in bars:
@@ -164,16 +145,6 @@ FIELD = np.array([500, 600, 2500, 2000])
 """A field on a sheet of 3000 × 2600 px, with as much margin on all sides as anything needs."""
 
 
-def picture_of(boxes: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Return what boxes print on that sheet, (2600, 3000) bool."""
-    seen = np.zeros((2600, 3000), bool)
-    for left, top, right, bottom in boxes.tolist():
-        assert left < right
-        assert top < bottom
-        seen[top:bottom, left:right] = True
-    return seen
-
-
 @pytest.mark.parametrize(
     ("side", "expected"),
     [
@@ -194,62 +165,11 @@ def test_a_margin_runs_along_the_field_and_outwards(side: Side, expected: list[l
     assert near == [False, True]
 
 
-def test_rulers_are_read_from_below_and_from_the_right() -> None:
-    margins = Margins(FIELD, (3000, 2600), NOTHING)
-    assert margins.ruler("bottom")
-    assert margins.ruler("left")
-    seen = picture_of(margins.boxes)
-    number = np.zeros((60, 60), bool)
-    for left, top, right, bottom in text_boxes("20").tolist():
-        number[top:bottom, left:right] = True
-    high, wide = (int(end) for end in text_boxes("20")[:, [3, 2]].max(axis=0))
-    number = number[:high, :wide]
-    # 20 mm are 472 px; the middle of the number is that of the tick, which is 4 px wide.
-    first = 472 + 2 - wide // 2
-    np.testing.assert_array_equal(seen[2100 : 2100 + high, 500 + first : 500 + first + wide], number)
-    down = 600 + first
-    # Turned so that it is read upwards, its foot towards the field.
-    np.testing.assert_array_equal(seen[down : down + wide, 400 - high : 400], np.rot90(number))
-    ticks = {mm: int(seen[2035:2100, 500 + round(mm / PX_MM) + 1].sum()) for mm in (0, 1, 5, 10, 15, 20)}
-    assert ticks == {0: 60, 1: 24, 5: 36, 10: 47, 15: 36, 20: 47}
-
-
 def test_a_long_ruler_has_a_number_at_every_hundred_millimetres() -> None:
     # 300 mm are 7086.6 px.
     assert [number_every_mm(length) for length in (100, 7086, 7087, 30000)] == [10, 10, 100, 100]
     # A tick that does not find room whole is left out: that of 10 mm begins at 236.
     assert [len(ruler_ticks(length)) for length in (3, 4, 239, 240)] == [0, 1, 10, 11]
-
-
-def test_the_sheet_is_cut_along_its_edges() -> None:
-    margins = Margins(FIELD, (3000, 2600), NOTHING)
-    margins.crop_marks()
-    seen = picture_of(margins.boxes)
-    corner = np.zeros((1300, 1500), bool)
-    corner[:5, :120] = corner[:120, :5] = True
-    np.testing.assert_array_equal(seen[:1300, :1500], corner)
-    for turned in (seen[::-1], seen[:, ::-1]):
-        np.testing.assert_array_equal(turned, seen)
-
-
-def test_targets_stand_at_both_ends_and_in_the_middle() -> None:
-    targets, field = target_boxes(), np.array([500, 600, 7500, 6600])
-    long = int(targets[:, 2].max())
-    marks = margin_marks(field, (8000, 7200), NOTHING, ())
-    right = marks[(marks[:, 0] >= 7535) & (marks[:, 1] >= 600) & (marks[:, 3] <= 6600)]
-    pieces = np.split(right, len(right) // len(targets))
-    assert len(pieces) == 3
-    starts = [int(piece[:, 1].min()) - 600 for piece in pieces]
-    # The last where the first free place is from the end less the targets and 35 px of air on.
-    assert starts == [0, (6000 - long - 35) // 2, 6000 - long - 35]
-    for piece, start in zip(pieces, starts, strict=True):
-        turned = np.stack(
-            [7500 + targets[:, 1], 600 + start + targets[:, 0], 7500 + targets[:, 3], 600 + start + targets[:, 2]], 1
-        )
-        np.testing.assert_array_equal(piece, turned)
-    above = marks[(marks[:, 3] <= 565) & (marks[:, 0] >= 500) & (marks[:, 2] <= 7500)]
-    assert len(above) == 3 * len(targets)
-    assert (int(above[:, 0].min()), int(above[:, 2].max())) == (500, 7500 - 35)
 
 
 def test_what_finds_no_room_is_left_out_and_the_rest_stays() -> None:
@@ -270,11 +190,3 @@ def test_a_chart_of_another_maker_without_margins_is_drawn(a7: Chart) -> None:
     high = a7.tags[-1].corners_mm[2] + 50 * PX_MM
     tight = replace(a7, page_mm=(float(high[0]) + 0.5, float(high[1]) + 0.5))
     clear_of_the_field(tight)
-
-
-def test_targets_begin_at_the_corner_that_they_are_put_to() -> None:
-    for boxes in (star_boxes(), edge_boxes(), bar_boxes()):
-        assert boxes[:, :2].min(axis=0).tolist() == [0, 0]
-    (left, top, _, _), (right, _) = (target_boxes().min(axis=0), target_boxes().max(axis=0)[2:])
-    assert (left, top) == (0, GAP_PX)
-    assert right / 600 * 25.4 == pytest.approx(52, abs=1)

@@ -26,7 +26,7 @@ from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.margins import text_boxes
 from experiment.chart.model import Chart, Tag
 from experiment.chart.printing import drawing, field_px, label, preview, save_pdf, save_preview, save_tiff, tag_modules
-from experiment.chart.proof import LOOK_FOR, WEDGE_CODES, instructions, proof_drawing, save_proof
+from experiment.chart.proof import LOOK_FOR, proof_drawing, save_proof
 from foundation.errors import InputError, StorageError
 
 pytestmark = pytest.mark.slow
@@ -131,18 +131,7 @@ def test_the_proof_is_one_a4_page_with_tags_at_true_size(a0: Chart, tmp_path: Pa
         np.testing.assert_allclose(found[number] * 25.4 / 200 - shift, a0.tags[number].corners_mm, atol=0.1)
 
 
-def test_both_halves_of_the_greys_have_the_codes(a7: Chart, tmp_path: Path) -> None:
-    save_proof(a7, tmp_path / "proof.pdf")
-    picture = drawn(tmp_path / "proof.pdf", 254)
-    middles = (360 * PX_MM + 8 * (np.arange(len(WEDGE_CODES)) + 0.5)) * 10
-    for y_mm in (140, 146):
-        row = picture[y_mm * 10, np.rint(middles).astype(int)]
-        np.testing.assert_array_equal(row, np.array(WEDGE_CODES)[:, None].repeat(3, axis=1))
-
-
-@pytest.mark.parametrize(
-    "chart", [design_chart(1), design_chart(3, "A4"), paper_chart("A3", 4)], ids=["1", "3", "paper"]
-)
+@pytest.mark.parametrize("chart", [design_chart(1), paper_chart("A6", 3)], ids=["1", "paper"])
 def test_the_piece_is_the_sheet_s_own(chart: Chart) -> None:
     proof, sheet = proof_drawing(chart), drawing(chart)
     assert (proof.rectangles_mm >= 0).all()
@@ -156,19 +145,6 @@ def test_the_piece_is_the_sheet_s_own(chart: Chart) -> None:
     )
     # The piece does not reach the greys below it.
     assert proof.rectangles_mm[-proof.tiles :, 3].max() < 130
-
-
-def test_the_instructions_tell_the_sheet_s_own_sizes(a0: Chart, a7: Chart) -> None:
-    text = instructions(a0)
-    assert "1189 × 841 mm" in text
-    assert "28087 × 19866 pixels" in text
-    assert "0 and 1100 below the field are 1100 mm apart, 0 and 800 on its left 800 mm" in text
-    assert a0.sha256[:16] in text
-    for word in ("NO COLOUR MANAGEMENT", "100 %", "Matte", "no varnish, no lamination", "Flat"):
-        assert word in text
-    assert "chart.tif" not in instructions(a0, tiff=False)
-    assert "as their numbers say" in instructions(a7)
-    assert max(len(line) for line in text.splitlines()) <= 120
 
 
 def detect(picture: npt.NDArray[np.uint8]) -> dict[int, npt.NDArray[np.float64]]:
@@ -260,8 +236,8 @@ def test_an_independent_library_reads_the_tags_of_the_tiff(a7: Chart, tiff: Path
         np.testing.assert_allclose(found[tag.id], tag.corners_mm * 600 / 25.4, atol=0.5)
 
 
-@pytest.mark.parametrize("dpi", [360, 1200])
-def test_other_resolutions_that_divide_the_cells(dpi: int, a7: Chart, tmp_path: Path) -> None:
+def test_another_resolution_that_divides_the_cells(a7: Chart, tmp_path: Path) -> None:
+    dpi = 360
     save_tiff(a7, tmp_path / "chart.tif", dpi)
     picture = tifffile.imread(tmp_path / "chart.tif")
     rows, columns = field_of(a7, dpi)
@@ -274,7 +250,7 @@ def test_other_resolutions_that_divide_the_cells(dpi: int, a7: Chart, tmp_path: 
     np.testing.assert_array_equal(picture[rows, columns], expected[rows, columns])
 
 
-@pytest.mark.parametrize("dpi", [300, 100, 0, -600])
+@pytest.mark.parametrize("dpi", [300, 0])
 def test_a_resolution_of_broken_modules_is_refused(dpi: int, a7: Chart, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"at {dpi} dpi .*1200 or 600 or 360"):
         save_tiff(a7, tmp_path / "chart.tif", dpi)
@@ -361,7 +337,7 @@ def test_modules_are_the_published_code_words_turned_by_half_a_turn(number: int,
     assert modules.sum() == published.sum(), "the border is black"
 
 
-@pytest.mark.parametrize(("family", "number"), [("25h9", 0), ("36h11", 587), ("36h11", -1)])
+@pytest.mark.parametrize(("family", "number"), [("25h9", 0), ("36h11", 587)])
 def test_a_tag_that_does_not_exist_cannot_be_printed(family: str, number: int) -> None:
     with pytest.raises(InputError, match="36h11"):
         tag_modules(Tag(family, number, np.zeros((4, 2))))

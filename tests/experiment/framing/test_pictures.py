@@ -51,7 +51,7 @@ def moved(plane: Plane, dx: float, dy: float) -> Plane:
     return replace(plane, values=values.astype(np.float32))
 
 
-@pytest.mark.parametrize("colour", [Colour(255, 0, 0), Colour(0, 0, 255), Colour(60, 60, 60)])
+@pytest.mark.parametrize("colour", [Colour(255, 0, 0), Colour(60, 60, 60)])
 def test_a_still_field_does_not_move(white: Mosaic, framing: Framing, tmp_path: Path, colour: Colour) -> None:
     later = strongest_plane(lab_of(FILL).mosaic(tmp_path, colour, key=2))
     shift = shift_between(plane_of(white, later.channel), framing, later)
@@ -59,7 +59,7 @@ def test_a_still_field_does_not_move(white: Mosaic, framing: Framing, tmp_path: 
     assert shift.largest_px < 0.03
 
 
-@pytest.mark.parametrize("by", [(0.3, -0.2), (1.0, 0.6), (-2.2, 1.7), (0.0, 0.04)])
+@pytest.mark.parametrize("by", [(0.3, -0.2), (-2.2, 1.7), (0.0, 0.04)])
 def test_a_movement_is_measured(white: Mosaic, framing: Framing, by: tuple[float, float]) -> None:
     plane = plane_of(white, "G")
     shift = shift_between(plane, framing, moved(plane, *by))
@@ -77,7 +77,7 @@ def test_a_turn_shows_though_the_middle_stays(white: Mosaic, framing: Framing, t
     assert shift.length_px < 0.15
 
 
-@pytest.mark.parametrize("by", [(6.0, 0.0), (0.0, -5.0), (40.0, 0.0)])
+@pytest.mark.parametrize("by", [(0.0, -5.0), (40.0, 0.0)])
 def test_a_leap_is_not_measured_as_a_step(white: Mosaic, framing: Framing, by: tuple[float, float]) -> None:
     plane = plane_of(white, "G")
     shift = shift_between(plane, framing, moved(plane, *by))
@@ -125,13 +125,7 @@ def hung(tags: bool, blur_px: float) -> Lab:
 
 @pytest.mark.parametrize(
     ("tags", "blur_px", "colour"),
-    [
-        (True, 0.4, WHITE),
-        (True, 0.85, Colour(0, 0, 255)),
-        (False, 0.85, WHITE),
-        (False, 0.7, Colour(0, 0, 255)),
-        (False, 0.5, WHITE),
-    ],
+    [(True, 0.4, WHITE), (True, 0.85, Colour(0, 0, 255)), (False, 0.7, Colour(0, 0, 255))],
 )
 def test_a_softer_frame_is_measured(tmp_path: Path, tags: bool, blur_px: float, colour: Colour) -> None:
     """Photosites and lens add by their variances, so the difference is that of the lens alone."""
@@ -153,8 +147,7 @@ def test_the_paper_s_chart_in_both_cameras(a0: Chart) -> None:
     assert small_parts_warning(a0) is None
 
 
-def test_smaller_sheets_are_as_visible_and_long_ones_are_not() -> None:
-    assert small_parts_warning(design_chart(5, "A2")) is None
+def test_long_sheets_are_not_visible_enough() -> None:
     long = design_chart(5, (1200.0, 300.0))
     text = small_parts_warning(long)
     assert text is not None
@@ -178,20 +171,16 @@ def test_the_paper_s_grid_has_no_modules() -> None:
     assert small_parts_warning(paper_chart()) is None
 
 
-PLAIN = paper_chart("A6", 3)
-
-
 def picture(data: bytes) -> npt.NDArray[np.int64]:
     return np.asarray(cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)).astype(np.int64)
 
 
-def test_a_field_found_has_its_outline_drawn(tmp_path: Path) -> None:
-    lab = hang_chart(PLAIN, "Test", Room(waviness_mm=0.5))
-    mosaic = lab.mosaic(tmp_path)
-    seen = picture(annotated_png(mosaic, PLAIN, find_chart(mosaic, PLAIN)))
+def test_a_field_found_has_its_outline_drawn(white: Mosaic, framing: Framing) -> None:
+    lab, mosaic = lab_of(FILL), white
+    seen = picture(annotated_png(mosaic, CHART, framing))
     assert seen.shape[:2] == mosaic.block_planes().shape[2:]
     red = seen[..., 2] - seen[..., 1] > 150
-    corners = lab.truth_px(field_mm(PLAIN), mosaic)
+    corners = lab.truth_px(field_mm(CHART), mosaic)
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         x, y = np.rint((start + end) / 2).astype(int)
         assert red[y - 3 : y + 4, x - 3 : x + 4].any()
@@ -199,7 +188,7 @@ def test_a_field_found_has_its_outline_drawn(tmp_path: Path) -> None:
     assert not red[y - 20 : y + 20, x - 20 : x + 20].any()
 
 
-@pytest.mark.parametrize("chart", [PLAIN, design_chart(3)], ids=["plain", "tagged"])
+@pytest.mark.parametrize("chart", [CHART, design_chart(3)], ids=["plain", "tagged"])
 def test_a_photograph_without_the_chart_says_what_was_looked_for(chart: Chart) -> None:
     mosaic = read_raw(shipped("raw/canon_eos_550d_colorchart.dng"))
     seen = picture(annotated_png(mosaic, chart, None))

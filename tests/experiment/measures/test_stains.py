@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from experiment.measures import stains as module
 from experiment.measures.stains import Stains, added_light, find_stains, joined_cells, light_of_spot, spots_of
 
 _Array = npt.NDArray[np.float64]
@@ -130,37 +129,3 @@ def test_charts_of_four_levels_are_not_judged() -> None:
         places = np.column_stack(np.divmod(np.random.default_rng(0).permutation(len(codes)), 8)) * 5.0
         known.append(find_stains(6000 * (0.1 + 0.9 * codes**2.2), places, bits).known)
     assert known == [False, True]
-
-
-def test_a_neighbourhood_is_the_mean_of_five_cells_or_more_of_which_none_is_far_off() -> None:
-    # Usual is .01 over the 0.6745 of a normal distribution; a cell that is farther off than four of it counts as these.
-    logs = np.full((13, 3), np.nan)
-    logs[:5] = np.array([-0.02, -0.01, 0, 0.01, 0.5])[:, None]
-    near = np.array([[*range(13)], [0, 1, 2, 3, *range(5, 13), 5]])
-    mean, error = module._of_neighbourhoods(logs, near)
-    usual = 0.01 / 0.674490
-    bounded = np.array([-0.02, -0.01, 0, 0.01, 4 * usual])
-    assert mean[0] == pytest.approx([np.expm1(bounded.mean())] * 3, rel=1e-5)
-    assert error[0] == pytest.approx([bounded.std(ddof=1) / 5**0.5] * 3, rel=1e-5)
-    assert np.isnan(mean[1]).all()
-    assert np.isnan(error[1]).all()
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_curvature_is_the_median_of_nine_codes_beside_or_more(axis: int) -> None:
-    random = np.random.default_rng(axis)
-    cube = random.normal(0, 1, (7, 7, 7, 3))
-    cube[random.random(cube.shape) < 0.55] = np.nan
-    found = np.moveaxis(module._beside(cube, axis), axis, 0)
-    given = np.moveaxis(cube, axis, 0)
-    expected = np.full_like(given, np.nan)
-    counts = np.zeros(given.shape, int)
-    for place in np.ndindex(given.shape):
-        value, row, column, channel = place
-        beside = given[value, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3, channel]
-        known = beside[np.isfinite(beside)]
-        counts[place] = len(known)
-        if len(known) >= 9:
-            expected[place] = np.median(known)
-    assert {8, 9, 10, 11} <= {*counts.ravel().tolist()}
-    np.testing.assert_allclose(found, expected)

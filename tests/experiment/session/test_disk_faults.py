@@ -107,12 +107,12 @@ def night() -> Generator[Night]:
 
 
 def test_a_call_that_fails_once(night: Night) -> None:
-    # Every fifth of four hundred, so that each of opening, reading, syncing and closing has its turn.
-    assert night.sweep([errno.EIO], lasting=False, every=5) > 10
+    # Every ninth of four hundred, so that each of opening, reading, syncing and closing has its turn.
+    assert night.sweep([errno.EIO], lasting=False, every=9) > 5
 
 
 def test_a_disk_that_fails_from_some_call_on(night: Night) -> None:
-    assert night.sweep([errno.EIO], lasting=True, every=7) > 20
+    assert night.sweep([errno.EIO], lasting=True, every=13) > 10
 
 
 def test_each_other_fault_of_a_disk(night: Night) -> None:

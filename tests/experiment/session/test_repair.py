@@ -182,11 +182,8 @@ def test_the_same_command_after_an_interruption_takes_nothing_twice(session: Ses
         ("3-7", "no light 7"),
         ("4-2", r"4-2 runs backwards; name it 2-4"),
         ("white", "'white'"),
-        ("1,,2", "'' is no light"),
-        ("-1", "'-1' is no light"),
         ("²", "is no light"),
         ("", "'' is no light"),
-        ("99999999999999", "is no light"),
     ],
 )
 def test_what_is_no_selection(session: Session, text: str, said: str) -> None:
