@@ -24,7 +24,7 @@ from tests.drivers.canon.eos_lab import Lab
 
 pytestmark = pytest.mark.slow
 
-FRAMES = 250
+FRAMES = 150
 ATTEMPTS = 6
 """Tries at a frame; the sequencer's default is three, in a better lab."""
 TROUBLE = 0.05
@@ -121,7 +121,7 @@ def test_a_series_on_a_bad_day_is_whole(tmp_path: Path, forgetful: bool) -> None
     for step, number in enumerate(numbers):
         assert (tmp_path / f"{step:04d}.cr2").read_bytes() == lab.film.frames[number - 1]
     assert len(list(tmp_path.iterdir())) == FRAMES
-    assert min(day.happened.values()) > 10, "every kind of trouble came up"
+    assert min(day.happened.values()) > 5, "every kind of trouble came up"
     assert failed > 0
     assert lab.waiting() == 0
 

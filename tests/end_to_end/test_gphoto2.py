@@ -10,7 +10,6 @@ import importlib.util
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -40,7 +39,6 @@ from sim.world.world import Room, World
 
 pytestmark = pytest.mark.slow
 
-SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
 LIMIT_S = 60
 
 
@@ -199,13 +197,6 @@ def test_a_picture_is_downloaded_as_the_film_wrote_it(served: Served) -> None:
     assert (mosaic.counts.shape, mosaic.iso, mosaic.aperture, mosaic.shutter_s) == ((557, 800), 100, 8.0, 0.25)
 
 
-def test_a_series_of_five(served: Served) -> None:
-    served.gphoto2("-F", "5", "-I", "1", "--capture-image-and-download", "--filename", "frame%02n.%C")
-    files = sorted(served.folder.glob("frame*"))
-    assert [file.read_bytes() for file in files] == served.film.frames
-    assert len(set(served.film.frames)) == 5
-
-
 def test_raw_and_jpeg_by_way_of_the_card(served: Served) -> None:
     served.eos.set_menu(Property.EOS_IMAGE_FORMAT, ImageFormat((*RAW_ONLY.files, ImageFile(1, 0, 3))))
     served.gphoto2("--set-config", "capturetarget=1", "--capture-image-and-download", "--keep", "--filename", "%f.%C")
@@ -248,25 +239,3 @@ camera.exit()
     assert done.returncode == 0, done.stderr
     assert [(served.folder / f"frame{number}").read_bytes() for number in range(2)] == served.film.frames
     assert served.film.exposures == [ExposureSettings(200, 8.0, canon.SHUTTER.value(0x60))] * 2
-
-
-def test_the_command_serves_a_camera(tmp_path: Path) -> None:
-    with subprocess.Popen(
-        [*SIM, "camera", "--port", "0", "--model", "Test"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            assert line.startswith("PTP/IP camera CroP Test at 127.0.0.1:")
-            port = line.rsplit(":", 1)[1].strip()
-            gphoto2(
-                f"ptpip:127.0.0.1:{port}:{port}", tmp_path, "--capture-image-and-download", "--filename", "frame.%C"
-            )
-            process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=LIMIT_S)
-        finally:
-            process.kill()
-    assert (process.returncode, out, err) == (0, "stopped\n", "")
-    mosaic = read_raw(next(tmp_path.glob("frame.*")))
-    # Paper white is the brightest there is, and it is not clipped.
-    assert 0.5 < mosaic.counts.max() / mosaic.white_level < 1.0

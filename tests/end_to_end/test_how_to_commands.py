@@ -1,8 +1,8 @@
 """The commands of the how-to pages are run as they stand there, page by page, each in a folder that has what it names.
 
-A small simulated lab stands in for the lab, a computed table of 64 colours for the table, a dozen generated images for
-each data set. What a command cannot be run on here is in `Page.skipped` with its reason; the commands of rehearsal.md
-have a test of their own, those of the tutorial are run by `make demo`.
+A small simulated lab stands in for the lab, a computed table of 64 colours for the table, two dozen generated images
+for each data set. What a command cannot be run on here is in `Page.skipped` with its reason; the commands of
+rehearsal.md have a test of their own, those of the tutorial are run by `make demo`.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     at = tmp_path_factory.mktemp("made")
     rng = np.random.default_rng(1)
     # Large ones have four places of 512 × 512 that do not touch.
-    for folder, count, side in (("pictures", 8, 48), ("large", 2, 1040)):
+    for folder, count, side in (("pictures", 4, 48), ("large", 2, 1040)):
         (at / folder).mkdir()
         for number in range(count):
             blocks = rng.integers(0, 256, (side // 8, side // 8, 3), dtype=np.uint8)

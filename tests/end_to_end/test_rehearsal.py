@@ -17,7 +17,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -28,7 +28,7 @@ import pytest
 from drivers.links.network import TcpLink
 from drivers.pjlink import PjLinkProjector
 from experiment.session.folder import Session
-from tests.drivers.display.x_servers import notification, two_outputs, virtual_screen
+from tests.drivers.display.x_servers import notification, virtual_screen
 
 pytestmark = [
     pytest.mark.slow,
@@ -134,17 +134,16 @@ class Rehearsal:
         assert code == 0, running.text
         return running.text
 
-    def serve(self, projector: str = "", camera: str = "") -> None:
-        """Start projector and camera as the how-to does, with further options, on ports that are free."""
-        for name, port, options in (("projector", "4353", projector), ("camera", "15741", camera)):
+    def serve(self) -> None:
+        """Start projector and camera as the how-to does, in a brighter room, on ports that are free."""
+        for name, port, options in (("projector", "4353", ""), ("camera", "15741", QUICK_ROOM)):
             command = next(line for line in commands("sim ") if line.startswith(f"sim {name}"))
             running = self.start(command.replace(f" {port} ", " 0 ").removesuffix("&") + options)
             address = running.hears(r" at 127\.0\.0\.1:\d+").split(":")[-1].strip()
             self.replaced[port] = address
             self.programs[name] = running
-        self.settings()
 
-    def settings(self, change: Callable[[str], str] = lambda text: text) -> None:
+    def settings(self, change: Callable[[str], str]) -> None:
         """Write the how-to's LAB.toml with the addresses that there are."""
         (found,) = re.findall(r"^```toml\n(.*?)^```", HOW_TO, re.MULTILINE | re.DOTALL)
         for written, used in self.replaced.items():
@@ -176,38 +175,21 @@ def _end(process: subprocess.Popen[Any]) -> None:
     process.wait(PATIENCE_S)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the how-to's chart and lights, and three lights for sessions that may be short."""
-    folder = tmp_path_factory.mktemp("made")
-    three = "acquire illuminations three.csv --grid 1 --blackbodies ''"
-    for command in [*commands("acquire chart"), *commands("acquire illuminations"), three]:
-        run_here(command, folder)
-    return folder
-
-
 @pytest.fixture
-def rehearsal(made: Path, tmp_path: Path) -> Iterator[Rehearsal]:
-    """Return a rehearsal on a screen with a window manager."""
-    for name in ("chart", "lights.csv", "three.csv"):
-        (tmp_path / name).symlink_to(made / name)
+def rehearsal(tmp_path: Path) -> Iterator[Rehearsal]:
+    """Return a rehearsal of the how-to's chart and lights, on a screen with a window manager."""
+    for command in [*commands("acquire chart"), *commands("acquire illuminations")]:
+        run_here(command, tmp_path)
     screens = tmp_path / "screen"
     screens.mkdir()
     with contextlib.ExitStack() as opened:
         screen = opened.enter_context(virtual_screen(screens, SIZE))
         rehearsal = Rehearsal(tmp_path, {":77": screen.display}, opened)
-        with managed(rehearsal):
-            yield rehearsal
-
-
-@contextlib.contextmanager
-def managed(rehearsal: Rehearsal) -> Generator[None]:
-    """Run a window manager on the screen; skip where there is none."""
-    manager = next((name for name in ("openbox", "twm") if shutil.which(name)), None)
-    if manager is None:
-        pytest.skip("there is no window manager (Debian: openbox, or twm)")
-    rehearsal.start(f"DISPLAY=:77 {manager}")
-    yield
+        manager = next((name for name in ("openbox", "twm") if shutil.which(name)), None)
+        if manager is None:
+            pytest.skip("there is no window manager (Debian: openbox, or twm)")
+        rehearsal.start(f"DISPLAY=:77 {manager}")
+        yield rehearsal
 
 
 def refusals(session: Path) -> list[str]:
@@ -228,7 +210,7 @@ def test_what_the_how_to_says_is_what_happens(rehearsal: Rehearsal, capsys: pyte
     """Its commands, its pop-up and what it says is worth a try: each is told by its cause, and costs no frame."""
     if shutil.which("xmessage") is None:
         pytest.skip("xmessage is not installed (Debian: x11-utils)")
-    rehearsal.serve(camera=QUICK_ROOM)
+    rehearsal.serve()
     # One step may meet it all; in between there are lights alone.
     sequence = "attempts = 10\nreference_every = 8"
     rehearsal.settings(lambda text: text.replace("reference_every = 3", sequence) + QUICK + UNTAUGHT)
@@ -299,35 +281,6 @@ def be_covered_for_half_an_exposure(rehearsal: Rehearsal, after: int) -> None:
     with notification(rehearsal.replaced[":77"], (160, 20, 120, 90), 0xFF8800):
         rehearsal.camera.hears(f"exposure {covered} half over")
     assert "not plain" in rehearsal.camera.hears(f"exposure {covered} ends")
-
-
-def short(text: str) -> str:
-    """Return the settings of three lights: 7 exposures."""
-    return text.replace("lights.csv", "three.csv") + UNTAUGHT
-
-
-def test_an_output_that_is_switched_off_or_over_is_waited_for(made: Path, tmp_path: Path) -> None:
-    """The projector is the second output of a desk: it goes dark, comes back in another mode, then as it was."""
-    if shutil.which("xrandr") is None:
-        pytest.skip("xrandr is not installed (Debian: x11-xserver-utils)")
-    for name in ("chart", "lights.csv", "three.csv"):
-        (tmp_path / name).symlink_to(made / name)
-    with contextlib.ExitStack() as opened:
-        display = opened.enter_context(two_outputs(tmp_path))
-        rehearsal = Rehearsal(tmp_path, {":77": display}, opened)
-        with managed(rehearsal):
-            rehearsal.serve(" --lit", f" --watch-screen :77,480x270+640+0{QUICK_ROOM}")
-            rehearsal.settings(lambda text: short(text) + QUICK + '[lab.light]\ndisplay = "right"\n')
-            session = rehearsal.start("DISPLAY=:77 acquire run LAB.toml session")
-            rehearsal.camera.hears(r"exposure 2 ends: plain picture")
-            rehearsal.run("DISPLAY=:77 xrandr --output DUMMY1 --off")
-            session.hears("(paused|retry): .*no longer fills display")
-            rehearsal.run("DISPLAY=:77 xrandr --output DUMMY1 --mode 640x480 --right-of DUMMY0")
-            session.hears("no longer fills .*640×480 at \\+640")
-            rehearsal.run("DISPLAY=:77 xrandr --output DUMMY1 --mode 480x270 --right-of DUMMY0")
-            assert session.ends() == 0, session.text
-        with Session.open(tmp_path / "session") as taken:
-            assert len(taken.done_steps()) == len(taken.steps)
 
 
 def _last(camera: Running) -> int:

@@ -160,14 +160,3 @@ def test_a_heartbeat_that_cannot_be_written_costs_no_frame(lab: Path, monkeypatc
     assert run("run", lab, folder) == 0
     assert counted_once(folder)
     assert run("status", folder) == 0
-
-
-def test_settings_of_a_session_that_are_damaged_are_named_with_what_helps(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = interrupted(lab, 3)
-    (folder / "session.toml").write_text("x = [")
-    assert run("run", lab, folder) == 2
-    said = capsys.readouterr().err
-    assert f"{folder / 'session.toml'} is not TOML" in said
-    assert "restore it from a copy" in said

@@ -1,4 +1,4 @@
-"""A dozen runs killed at random operations and times; `python -m benchmarks.session_kills` kills ten thousand."""
+"""Half a dozen runs killed at random operations and times; `python -m benchmarks.session_kills` kills ten thousand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.session_kills import KilledSessions
 
-KILLS = 12
+KILLS = 6
 
 pytestmark = [
     pytest.mark.slow,

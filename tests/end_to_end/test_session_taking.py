@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import itertools
 import multiprocessing
 import os
 import re
@@ -24,7 +23,6 @@ from acquisition.run.run import run_session
 from drivers.camera import capture
 from drivers.canon import CanonEos
 from drivers.pjlink import PjLinkProjector
-from drivers.raw.rawfile import read_raw
 from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from experiment.session.folder import Session
@@ -39,25 +37,6 @@ Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 FORKS = multiprocessing.get_context("forkserver")
 """Programs beside this one, without waiting for their imports each time."""
 FORKS.set_forkserver_preload([__name__, "acquisition.run.run", "acquisition.run.run", "sim.camera.eos"])
-
-PLACES = {
-    "renaming": (Path, "replace"),
-    "committing": (Journal, "commit"),
-}
-
-
-def run_until_killed(place: str, count: int, *arguments: str) -> None:
-    """Run `acquire`; the process is killed before the `count`-th call at a place."""
-    owner, name = PLACES[place]
-    real, left = getattr(owner, name), itertools.count(count, -1)
-
-    def deadly(*given: Any, **named: Any) -> Any:
-        if (place != "renaming" or "frames" in str(given[0])) and next(left) == 1:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return real(*given, **named)
-
-    setattr(owner, name, deadly)
-    main(arguments)
 
 
 def run_to_pipe(answer: Connection, *arguments: str) -> None:
@@ -90,21 +69,6 @@ def test_a_session_holds_every_frame_of_the_plan(
     assert run("status", session) == 0
     assert "10 of 10" in capsys.readouterr().out
     assert run("run", lab, session) == 0, "a complete session is complete again"
-
-
-@pytest.mark.parametrize(("place", "count"), [("renaming", 1), ("committing", 4)])
-def test_a_killed_session_ends_in_the_same_frames(
-    lab: Path, undisturbed: Path, frame_hashes: Hashes, place: str, count: int
-) -> None:
-    killed = lab.parent / "killed"
-    program = FORKS.Process(target=run_until_killed, args=(place, count, "run", str(lab), str(killed)))
-    program.start()
-    program.join()
-    assert program.exitcode == -signal.SIGKILL
-    assert run("run", lab, killed) == 0
-    assert frame_hashes(killed) == frame_hashes(undisturbed)
-    assert (killed / "frames.csv").read_text() == (undisturbed / "frames.csv").read_text()
-    assert not list(killed.rglob(".*partial*"))
 
 
 def test_ctrl_c_at_every_frame_ends_in_the_same_frames(lab: Path, undisturbed: Path, frame_hashes: Hashes) -> None:
@@ -149,9 +113,8 @@ def test_a_look_reads_the_lights_too(
 
 
 @pytest.mark.usefixtures("hang_up")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_run_that_is_told_to_end_closes_its_devices(
-    lab: Path, number: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     closed: list[str] = []
 
@@ -171,16 +134,16 @@ def test_a_run_that_is_told_to_end_closes_its_devices(
 
     def told_to_end(self: Journal, *given: Any, **named: Any) -> None:
         commit(self, *given, **named)
-        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGTERM)
 
     session = lab.parent / "session"
-    before = signal.getsignal(number)
+    before = signal.getsignal(signal.SIGTERM)
     with monkeypatch.context() as patched:
         patched.setattr(Journal, "commit", told_to_end)
         assert run("run", lab, session) == 130
     assert "interrupted; run the same command again to go on" in capsys.readouterr().err
     assert set(closed) == {"camera", "projector", "journal"}
-    assert signal.getsignal(number) == before
+    assert signal.getsignal(signal.SIGTERM) == before
     assert run("run", lab, session) == 0
 
 
@@ -190,17 +153,6 @@ def test_an_imported_session_has_the_same_frames(lab: Path, session: Path, frame
     (session / "list.csv").write_text(rows)
     assert run("import", session / "list.csv", lab.parent / "chart.json", imported) == 0
     assert frame_hashes(imported) == frame_hashes(session)
-
-
-def test_an_import_of_a_damaged_file_leaves_nothing(
-    lab: Path, session: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    imported = lab.parent / "imported"
-    victim = next((session / "frames").glob("*light_002*"))
-    victim.write_bytes(victim.read_bytes()[:-10])
-    assert run("import", session / "frames.csv", lab.parent / "chart.json", imported) == 2
-    assert victim.name in capsys.readouterr().err
-    assert not imported.exists()
 
 
 @pytest.mark.parametrize(
@@ -278,33 +230,6 @@ def test_a_journal_that_another_program_holds_is_waited_for_as_long_as_the_setti
     assert run_session(load_lab(lab), folder, lambda done, total: None).complete
 
 
-def test_a_full_disk_costs_nothing_taken(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, frame_hashes: Hashes, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = lab.parent / "session"
-    real: Callable[[int], None] = os.fsync
-    calls = 0
-
-    def fail(handle: int) -> None:
-        nonlocal calls
-        calls += 1
-        if calls > 40:
-            raise OSError(28, "No space left on device")
-        real(handle)
-
-    monkeypatch.setattr(os, "fsync", fail)
-    assert run("run", lab, folder) == 5
-    assert "No space left on device" in capsys.readouterr().err
-    monkeypatch.setattr(os, "fsync", real)
-    # The list of frames is derived, and could not be written on a full disk.
-    Session.open_for_run(folder).close()
-    kept = frame_hashes(folder)
-    assert kept
-    assert run("run", lab, folder) == 0
-    after: dict[Any, list[str]] = frame_hashes(folder)
-    assert all(set(files) <= set(after[key]) for key, files in kept.items())
-
-
 def test_a_replay_with_another_exposure_is_told_the_recordings(
     lab: Path, session: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -324,42 +249,14 @@ def test_a_series_longer_than_a_battery_lasts(lab: Path, monkeypatch: pytest.Mon
     assert len(frames) == 9
 
 
-@pytest.mark.parametrize(("shutter_s", "code"), [(0.02, 0), (1.3, 4)])
 def test_following_what_a_check_recommends_leads_to_a_good_exposure(
-    lab: Path, shutter_s: float, code: int, capsys: pytest.CaptureFixture[str]
+    lab: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = lab.read_text() + "[camera]\nshutter_s = "
-    lab.write_text(f"{text}{shutter_s}\n")
-    # A table is made of dim frames, with remarks; of clipped ones it is not.
-    assert run("check", lab) == code
+    lab.write_text(f"{text}1.3\n")
+    assert run("check", lab) == 4
     (said,) = re.findall(r"set camera\.shutter_s = (\S+) \(tried: \d+ %\)", capsys.readouterr().out)
     assert abs(float(said) * 60 - round(float(said) * 60)) < 0.01, "whole turns of a wheel of 60 Hz"
     lab.write_text(f"{text}{said}\n")
     assert run("check", lab) == 0
     assert "good        exposure" in capsys.readouterr().out
-
-
-def test_what_is_recommended_holds_whole_turns_of_the_simulated_room_s_wheel(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    room = "[simulated.room]\nwheel_hz = 50\nwhite_level_share = 9\nshutter_jitter_s = 0\n"
-    lab.write_text(f"{lab.read_text()}{room}[camera]\nshutter_s = 0.1\n")
-    assert run("check", lab) == 4
-    assert "set camera.shutter_s = 0.04 (tried: 7" in capsys.readouterr().out
-
-
-def test_what_goes_wrong_stands_in_lab_toml_and_may_change(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder, text = lab.parent / "session", lab.read_text()
-    strip = '{ what = "zeroed strip", from_frame = 3, to_frame = 3 }'
-    lab.write_text(text.replace("seed = 7\n", f"seed = 7\nevents = [{strip}]\n"))
-    run("run", lab, folder)
-    torn: set[str] = set()
-    for path in sorted((folder / "frames").glob("*.dng")):
-        rows = read_raw(path).sensor
-        if not rows[len(rows) // 2 + 5].any():
-            torn.add(path.stem)
-    with Session.open(folder) as session:
-        assert torn == {session.steps[3].stem}
-    lab.write_text(text)
-    capsys.readouterr()
-    assert run("run", lab, folder) == 0, "the trouble is over, and the session goes on"

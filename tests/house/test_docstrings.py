@@ -55,6 +55,7 @@ def public() -> dict[tuple[str, str], str]:
         (".".join(source.path.with_suffix("").parts), name): text
         for package in PACKAGES
         for source in sources(package)
+        if _ARRAY.search(source.text)
         for name, text in aliases(source.tree).items()
     }
 
@@ -132,6 +133,8 @@ def without_shape(package: str) -> list[str]:
     missing: list[str] = []
     for source in sources(package):
         path, known = source.path, known_arrays(source.tree)
+        if not known and not _ARRAY.search(source.text):
+            continue
         for name, function in public_functions(source.tree.body):
             head, described = entries(ast.get_docstring(function) or "")
             for array, annotation in arrays_of(function, known).items():
