@@ -49,10 +49,6 @@ def test_light_follows_the_lamp_and_the_mute() -> None:
     assert device.light() == 0.0
 
 
-def test_found_switched_on_it_lights_at_once() -> None:
-    assert SimulatedProjector(SimulatedClock(), Power.ON).light() == 1.0
-
-
 def test_mute_does_not_outlast_standby() -> None:
     clock = SimulatedClock()
     device = SimulatedProjector(clock, Power.ON)

@@ -14,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
@@ -139,7 +140,6 @@ def test_each_photosite_integrates_the_print_over_aperture_and_blur() -> None:
     photosites = np.stack([rng.integers(120, 680, 40), rng.integers(100, 450, 40)], axis=-1)
     blur = 2 * room.blur_px
     steps = np.linspace(-4.95, 4.95, 100)
-    erf = np.vectorize(math.erf)
     errors: list[float] = []
     for column, row in cast("list[list[int]]", photosites.tolist()):
         places = np.stack(np.meshgrid(steps, steps), axis=-1) + rng.uniform(-0.05, 0.05, (100, 100, 2))
@@ -281,7 +281,7 @@ def test_the_lamps_light_scales_the_picture_but_not_the_rooms_own() -> None:
     np.testing.assert_allclose(world.signal(WHITE, REFERENCE_EXPOSURE, lamp=0), full * (0.001 / 1.001), rtol=1e-4)
 
 
-@pytest.mark.parametrize(("shutter_s", "percent"), [(1 / 60, 7), (1 / 8, 8.7), (1.0, 0.11)])
+@pytest.mark.parametrize(("shutter_s", "percent"), [(1 / 60, 7), (1.0, 0.11)])
 def test_a_colour_wheel_shakes_the_colour_of_short_exposures(shutter_s: float, percent: float) -> None:
     """Against an independent simulation of R/G with 0.5 ms of jitter and one turn in 1/60 s."""
     sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
