@@ -23,7 +23,7 @@ from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
 from tests.contracts.camera import SeededFilm
 
-FILM_BYTES = 3_000_000
+FILM_BYTES = 1_200_000
 
 
 class ReportedFilm(SeededFilm):

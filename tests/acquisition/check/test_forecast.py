@@ -88,13 +88,13 @@ ROOMS = {
     "soft, large cells": Case({"blur_px": 1.05}, "accept", bits=2, page="A7"),
     "oblique": Case({"pan_deg": 30.0, "fill": 0.92}, "refuse"),
     "glare spot": Case({}, "not accept", paint=spot(0.2, 0.12)),
-    "a thumb": Case({"stain_mm": 20.0, "stain_depth": 0.3}, "not accept"),
+    "a thumb": Case({"stain_mm": 20.0, "stain_depth": 0.3}, "not accept", bits=2),
     "half covered": Case({}, "refuse", paint=covered(0.5)),
     "dark": Case({"white_level_share": 0.0004}, "refuse"),
     "clipped": Case({"white_level_share": 1.4}, "refuse"),
     "lit room": Case({"ambient": 0.02}, "accept with remarks"),
     "few colours": Case({}, "accept", bits=1, page="A7"),
-    "tagless": Case({"seed": 3}, "any", tagless=True),
+    "tagless": Case({"seed": 3}, "any", bits=2, tagless=True),
 }
 """What a room deserves: an outcome, "not accept", or "any" where it is for both to say, and they must agree."""
 

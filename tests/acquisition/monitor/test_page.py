@@ -205,7 +205,7 @@ def test_keys_go_from_frame_to_frame_and_back_to_the_newest(tab: Tab, run: MadeU
         assert 2 < number() < newest
 
 
-@pytest.mark.parametrize(("width", "dark"), [(320, True), (390, False), (1280, True)])
+@pytest.mark.parametrize(("width", "dark"), [(320, True), (1280, False)])
 def test_nothing_is_wider_than_the_window(tab: Tab, run: MadeUpRun, width: int, dark: bool) -> None:
     with shown(tab, run.folder, width=width, dark=dark):
         assert tab.value("document.documentElement.scrollWidth <= window.innerWidth")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -78,15 +77,6 @@ def test_pictures_are_bounded_and_those_of_refused_frames_go_first(
     assert list(pictures)[:2] == ["4", "6"]
     assert 3 <= len(pictures) < 6
     assert sum(len(picture) for picture in pictures.values()) <= 4 / 3 * bound + 100 * len(pictures)
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
-def test_any_number_of_pictures_is_spread_over_the_night(count: int) -> None:
-    places = view._spread(count)
-    assert sorted(places) == list(range(count))
-    if count == 100:
-        first = sorted(places[:10])
-        assert max(after - before for before, after in pairwise(first)) <= 25
 
 
 def test_a_picture_that_is_gone_or_none_is_left_out(run: MadeUpRun, tmp_path: Path) -> None:

@@ -44,12 +44,6 @@ def head(
     return head_of(SessionView("night", "night", STEPS, (), {}, tuple(views), (), beat, here), now, alive)
 
 
-@pytest.mark.parametrize("state", ["running", "waiting", "paused"])
-def test_a_run_says_what_it_does(state: RunState) -> None:
-    stands = head(attempts(3), heartbeat(state))
-    assert (stands.state, stands.sentence, stands.alive) == (state, f"{state} as it should", True)
-
-
 def test_time_left_is_that_of_the_frames_left() -> None:
     stands = head(attempts(3), heartbeat("running"))
     assert (stands.done, stands.total, stands.lights_done) == (3, 8, 1)
@@ -157,24 +151,6 @@ def test_all_frames_there_and_nobody_at_work_is_complete_and_says_what_comes_nex
         assert stands.state == "complete"
         assert stands.sentence == "complete, 8 frames; next: build-lut night LUT/"
     assert head(attempts(8), heartbeat("running")).state == "running"
-
-
-def test_an_end_with_frames_left_is_incomplete_with_its_cause() -> None:
-    stands = head(attempts(5), heartbeat("ended"))
-    assert (stands.state, stands.sentence) == ("incomplete", "ended as it should")
-    silent = Heartbeat(NOW, HERE, "ended", "", NOW)
-    assert head(attempts(5), silent).sentence == "ended with 3 of 8 frames left; run the same command again"
-
-
-def test_a_journal_without_signs_of_life_says_so() -> None:
-    assert head(attempts(5), None).state == "unknown"
-    assert head((), None).state == "unknown"
-
-
-def test_refused_failed_and_voided_are_told_apart_and_none_of_them_counts() -> None:
-    views = [*attempts(1), *attempts(1, "refused"), *attempts(1, "failed"), *attempts(1, "voided"), *attempts(1, None)]
-    stands = head(views, heartbeat("running"))
-    assert (stands.done, stands.refused, stands.failed, stands.voided) == (1, 1, 1, 1)
 
 
 def test_a_frame_of_a_step_that_the_plan_does_not_have_does_not_count() -> None:

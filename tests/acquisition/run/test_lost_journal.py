@@ -106,7 +106,7 @@ def facts(folder: Path) -> Rows:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("happens", "frame"),
-    [*zip(MISHAPS, itertools.cycle((2, 7, 12)), strict=False), (deleted, 12), (log_deleted, 12), (replaced, 12)],
+    [*zip(MISHAPS, itertools.cycle((2, 7, 12)), strict=False), (deleted, 12), (log_deleted, 12)],
 )
 def test_a_lost_journal_ends_the_run_and_is_made_anew(lab: Lab, happens: Callable[[Path], object], frame: int) -> None:
     folder = lab.session.folder

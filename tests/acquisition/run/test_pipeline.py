@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -11,13 +10,11 @@ from typing import Any
 
 import pytest
 
-from acquisition.run import pipeline
 from acquisition.run.devices import PAUSE_S, HealthWatch
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
-from experiment.config import JudgeSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import IncomingFile, Journal
@@ -73,36 +70,6 @@ def test_light_in_the_room_is_doubted_once_and_lastingly(folder: Path, percent: 
     assert sum(step.kind == "dark" for step in judge.judged) > 1
     assert len(outcome.doubts) == doubted
     assert all(f"{percent} % of white" in doubt for doubt in outcome.doubts)
-
-
-@pytest.mark.parametrize(
-    ("step", "checks", "said"),
-    [
-        ("light", {"movement": 0.21}, "moved: the chart lies 0.21 px from where it was"),
-        ("light", {"movement": 0.19}, ""),
-        ("light", {"lamp": 4.0}, ""),
-        ("light", {"lamp beyond": -4.0}, "level: the light is 4.0 % weaker"),
-        ("light", {"lamp beyond": 4.0}, "level: the light is 4.0 % stronger"),
-        ("link", {"lamp": 1.1}, "level: the light is 1.1 % stronger"),
-        ("link", {"lamp": -1.1}, "level: the light is 1.1 % weaker"),
-        ("link", {"lamp": 0.9}, ""),
-        ("response", {"lamp": 1.1}, ""),  # before any light there is no run that it links
-    ],
-)
-def test_a_change_is_told_that_the_run_follows(step: str, checks: dict[str, float], said: str) -> None:
-    grey = Colour(250, 250, 250)
-    first, light = SessionStep(3, "response", None, grey), SessionStep(5, "light", 0, grey)
-    link = replace(first, number=9)
-    limits = {"movement": 0.2, "lamp": 9.0, "lamp beyond": 3.0}
-    found = pipeline._followed_changes(
-        {"light": light, "response": first, "link": link}[step],
-        Judgement(tuple(Check(name.split()[0], value, -limits[name], limits[name]) for name, value in checks.items())),
-        (first, light, link),
-        JudgeSettings(),
-    )
-    what, _, words = said.partition(": ")
-    assert [one for one, _ in found] == ([what] if said else [])
-    assert all(words in sentence for _, sentence in found)
 
 
 def run(lab: Lab, judge: ScriptedJudge | None = None, **more: Any) -> RunOutcome:
@@ -203,19 +170,6 @@ class TestRefusals:
         assert run(Lab(folder, lights=FOUR, reference_every=2)).complete
         assert len(looked) == 3 + 1
 
-    def test_the_next_frame_is_under_way_when_one_is_refused(self, folder: Path) -> None:
-        lab = Lab(folder)
-        said: list[str] = []
-        assert run(lab, ScriptedJudge({2: refused("another light")}), announce=said.append).complete
-        assert [step for step, _ in lab.taken()] == ["w0", "d1", "l2", "l3", "l2", "w4", "d5"]
-        assert lab.verdicts()[2] == "refused"
-        assert said == ["refused: light 0: another light (it is taken again)", "lamp: it was switched off"]
-
-    def test_a_light_that_is_taken_again_behind_the_last_white_is_closed_by_another(self, folder: Path) -> None:
-        lab = Lab(folder)
-        assert run(lab, ScriptedJudge({3: refused("another light")})).complete
-        assert [step for step, _ in lab.taken()] == ["w0", "d1", "l2", "l3", "w4", "l3", "d5", "w6"]
-
     def test_a_step_without_a_try_left_is_left_for_the_next_run(self, folder: Path) -> None:
         lab = Lab(folder)
         judge = ScriptedJudge({2: refused("a"), 4: refused("b"), 6: refused("c")})
@@ -303,17 +257,6 @@ class TestRefusals:
         accepted = [attempt.step for attempt in lab.session.journal.attempts() if attempt.verdict == "accepted"]
         assert sorted(accepted) == list(range(16)), "each step once, and no light of the earlier run is voided"
         assert lab.verdicts()[:before] == ["accepted"] * before
-
-    def test_what_lasts_pauses_and_goes_on_when_it_is_removed(self, folder: Path) -> None:
-        lab = Lab(folder)
-        moved = refused("the chart has moved by 3.1 px", lasting=True)
-        judge = ScriptedJudge({2: moved, 4: moved})
-        said: list[str] = []
-        assert run(lab, judge, announce=said.append).complete
-        words = [sentence.split(":")[0] for sentence in said]
-        assert words == ["refused", "retry", "refused", "paused", "resumed", "lamp"]
-        assert "the chart has moved by 3.1 px" in said[3]
-        assert lab.verdicts().count("refused") == 2
 
     @pytest.mark.parametrize(("moved_px", "told"), [(5.97, True), (0.15, False), (None, False)])
     def test_a_chart_that_is_followed_is_told_of(self, folder: Path, moved_px: float | None, told: bool) -> None:

@@ -17,7 +17,6 @@ from acquisition.cli import main
 from acquisition.run.devices import Devices
 from acquisition.run.plan import (
     MEGAPIXELS,
-    SPARE_BYTES,
     Answers,
     RunPlan,
     Work,
@@ -25,7 +24,6 @@ from acquisition.run.plan import (
     dry_run,
     free_bytes_at,
     make_plan,
-    needed_bytes,
     order_of,
     outline,
     plan_lines,
@@ -91,17 +89,6 @@ class TestDisk:
         (fault,) = planned(enough - 1).faults
         assert "0.1 MB" in str(fault), "a little too small is never nothing"
 
-    def test_there_is_room_for_what_is_taken_again_and_a_reserve(self) -> None:
-        plan = planned()
-        assert plan.work.left == 110
-        assert plan.needed_bytes - SPARE_BYTES >= 1.1 * 110 * plan.frame_bytes.value
-        assert needed_bytes(0, 1e6) == 0
-
-    def test_frames_of_the_session_tell_their_size(self) -> None:
-        plan = planned(work=work_of(done=50, frame_bytes=25_000_000))
-        assert plan.frame_bytes.value == 25_000_000
-        assert plan.needed_bytes == needed_bytes(60, 25e6)
-
     @pytest.mark.parametrize(("model", "bytes_per_frame"), [("EOS 550D", 25e6), ("EOS 6D Mark II", 36e6)])
     def test_what_a_body_writes_is_not_underestimated(self, model: str, bytes_per_frame: float) -> None:
         answers = Answers(camera=replace(EOS, model=f"Canon {model}"))
@@ -157,11 +144,6 @@ class TestExposure:
         assert str(fault).startswith("camera.shutter_s = 0.45: the body does not offer it; ")
         assert "0.4, 0.5, 0.6 s" in str(fault)
 
-    def test_a_body_that_lists_nothing_is_not_known(self) -> None:
-        plan = planned(answers=Answers(camera=EOS))
-        assert plan.faults == ()
-        assert any("whether the body offers this time is not known" in line for line in plan_lines(plan))
-
     @pytest.mark.parametrize(
         ("shutter_s", "projector", "text"),
         [
@@ -177,12 +159,6 @@ class TestExposure:
 
 
 class TestTime:
-    def test_a_new_session_says_what_is_assumed(self) -> None:
-        plan = planned()
-        assert plan.warm_up_s >= SETTINGS.sequence.warm_up_s
-        assert "assumed" in plan.frame_s.basis
-        assert plan.time_s == pytest.approx(110 * plan.frame_s.value + plan.warm_up_s)
-
     def test_a_lamp_that_could_not_be_asked_about_is_taken_as_cold(self) -> None:
         settings = settings_with(lab={"projector": {"control": "pjlink", "host": "h"}})
         plan = planned(answers=Answers(), settings=settings)
@@ -194,21 +170,6 @@ class TestTime:
         by_hand = planned(answers=Answers())
         assert by_hand.warm_up_s == 0
         assert any("not under control" in line for line in plan_lines(by_hand))
-
-    def test_a_lamp_that_burns_needs_no_warm_up(self) -> None:
-        assert planned(answers=Answers(camera=EOS, lit=True)).warm_up_s == 0
-
-    def test_frames_of_the_session_tell_their_time(self) -> None:
-        plan = planned(work=work_of(done=50, frame_s=3.0), answers=Answers(camera=EOS, lit=True))
-        assert plan.time_s == pytest.approx(60 * 3.0)
-        assert any(
-            "3 min 00 s: 60 frames, 3.00 s each (median of the session so far)" in line for line in plan_lines(plan)
-        )
-
-    def test_nothing_is_left(self) -> None:
-        plan = planned(0, work=work_of(done=110))
-        assert (plan.time_s, plan.needed_bytes, plan.faults) == (0, 0, ())
-        assert any("nothing is left to take" in line for line in plan_lines(plan))
 
 
 class TestSupplies:
@@ -250,11 +211,6 @@ class TestSupplies:
 
 
 class TestOrder:
-    def test_each_order_is_named(self) -> None:
-        listed = plan_steps(LIGHTS, 25)
-        assert order_of(listed, settings_with(sequence={"order": "listed"})) == "as listed"
-        assert order_of(plan_steps(LIGHTS, 25, seed=7), settings_with(sequence={"seed": 7})) == "shuffled by seed 7"
-
     def test_a_session_keeps_the_order_that_it_was_begun_with(self) -> None:
         assert (
             order_of(plan_steps(LIGHTS, 25), SETTINGS) == "as listed, as the session was begun; LAB.toml says shuffled"
@@ -266,10 +222,6 @@ class TestOrder:
         )
         wanted = settings_with(sequence={"order": "listed"})
         assert order_of(shuffled, wanted) == "shuffled by seed 1, as the session was begun; LAB.toml says listed"
-
-    def test_one_light_has_no_order(self) -> None:
-        assert order_of(plan_steps(LIGHTS[:1], 25, seed=1), SETTINGS) == "shuffled by seed 1"
-        assert order_of(plan_steps(LIGHTS[:1], 25), settings_with(sequence={"order": "listed"})) == "as listed"
 
 
 @dataclass

@@ -41,13 +41,6 @@ def take(queue: StepQueue, refused: dict[int, int] | None = None) -> list[int]:
     return taken
 
 
-def test_open_steps_come_in_the_plans_order() -> None:
-    queue = StepQueue(STEPS, {0, 1, 3}, 3)
-    assert len(queue) == 7
-    assert take(queue) == [2, 4, 5, 6, 7, 8, 9]
-    assert len(queue) == 0
-
-
 def test_what_is_under_way_is_not_taken_twice() -> None:
     queue = StepQueue(STEPS, set(), 3)
     first = begun(queue)
@@ -65,23 +58,10 @@ def begun(queue: StepQueue) -> SessionStep:
     return step
 
 
-def test_a_step_without_a_try_left_waits_for_the_next_run() -> None:
-    queue = StepQueue(STEPS, set(), 3)
-    assert take(queue, {2: 9}) == [0, 1, 2, 2, 2, 3, 4, 5, 6, 7, 8, 9]
-    assert queue.given_up == ("light 0: dark",)
-    assert len(queue) == 1
-
-
 def test_a_fault_of_a_device_is_no_try() -> None:
     queue = StepQueue(STEPS, set(), 1)
     queue.withdraw(begun(queue))
     assert take(queue) == list(range(10))
-
-
-def test_lights_that_were_taken_again_last_are_closed_by_another_pair() -> None:
-    queue = queue_of({step.number for step in STEPS} - {6})
-    assert take(queue) == [6, 10, 11]
-    assert len(queue) == 0
 
 
 def test_lights_of_an_earlier_run_are_closed_too() -> None:

@@ -81,14 +81,6 @@ def until(end_s: float, fault: CropError) -> Callable[[float], CropError | None]
     return lambda now: fault if now < end_s else None
 
 
-def test_what_works_says_nothing() -> None:
-    room = Room()
-    assert room.retry.attempt(room.broken(lambda now: None), "the camera") == "done"
-    assert room.said == []
-    assert room.beats == []
-    assert room.clock.monotonic() == 0
-
-
 def test_a_notification_of_less_than_a_second_pauses_nothing() -> None:
     room = Room()
     covered = DeviceError("the screen shows (255, 136, 0)")
@@ -128,31 +120,11 @@ def test_a_cause_with_other_numbers_is_the_same_cause() -> None:
     assert room.words == ["retry", "paused", "resumed"]
 
 
-def test_a_countdown_comes_every_few_seconds() -> None:
-    room = Room()
-    room.retry.attempt(room.broken(until(300, DeviceError("covered"))), "the screen")
-    times = [at for at, *_ in room.beats]
-    assert times[0] <= RETRY_S
-    assert max(after - before for before, after in pairwise(times)) <= PAUSE_S
-    assert {state for _, state, *_ in room.beats} == {"paused"}
-    at, _, sentence, within_s = room.beats[-1]
-    assert within_s >= PAUSE_S
-    left = 600 - at
-    assert f"ends in {left // 60:.0f} min {left % 60:02.0f} s" in sentence
-    assert f"paused for {at // 60:.0f} min {at % 60:02.0f} s" in sentence
-
-
 def test_each_beat_promises_the_next_one() -> None:
     room = Room()
     room.retry.attempt(room.broken(until(100, DeviceError("gone")), takes_s=70), "the camera", idle=False)
     for (before, _, _, within_s), (after, *_) in pairwise(room.beats):
         assert after - before <= within_s
-
-
-def test_what_was_tried_for_long_already_pauses_at_once() -> None:
-    room = Room()
-    room.retry.attempt(room.broken(until(100, DeviceError("no camera on USB")), takes_s=60), "the camera")
-    assert room.words == ["paused", "resumed"]
 
 
 def test_other_devices_are_kept_awake_meanwhile() -> None:
@@ -215,14 +187,6 @@ def test_without_patience_the_first_fault_is_the_end() -> None:
         room.retry.attempt(room.broken(lambda now: fault), "the screen")
     assert caught.value is fault
     assert len(room.tries) == 1
-
-
-def test_patience_without_end() -> None:
-    room = Room(math.inf)
-    week = 7 * 24 * 3600
-    assert room.retry.attempt(room.broken(until(week, DeviceError("gone")), 600), "the camera") == "done"
-    assert "for as long as it takes" in room.said[0][1]
-    assert "waits for as long as it takes" in room.beats[-1][2]
 
 
 def test_what_waiting_does_not_cure_is_raised_at_once() -> None:

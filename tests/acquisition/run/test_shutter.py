@@ -6,13 +6,12 @@ from itertools import pairwise
 
 import pytest
 
-from acquisition.run.devices import ENGRAVED_S, holds_whole_turns, require_whole_turns, wheel_of
+from acquisition.run.devices import ENGRAVED_S, require_whole_turns, wheel_of
 from drivers.canon import SHUTTER
 from experiment.config import CameraSettings, ProjectorCable, parse_lab
 from foundation.errors import ConfigurationError
 
 WHEEL = ProjectorCable()
-PERIOD_S = 1 / 60
 
 
 @pytest.mark.parametrize("shutter_s", [1 / 60, 0.01667, 0.25, 0.5, 0.6, 1.0, 2.0, 4.98])
@@ -47,11 +46,6 @@ def test_the_times_that_are_named_before_a_camera_is_asked_are_engraved() -> Non
     assert set(ENGRAVED_S) <= engraved
     # Thirds of a stop, as engraved: 1/20 after 1/25, 1/13 after 1/15.
     assert all(1.1 < longer / shorter < 1.4 for shorter, longer in pairwise(ENGRAVED_S))
-
-
-@pytest.mark.parametrize(("shutter_s", "whole"), [(1 / 60, True), (1 / 125, False), (0.0, False), (0.508, False)])
-def test_whole_turns(shutter_s: float, whole: bool) -> None:
-    assert holds_whole_turns(shutter_s, PERIOD_S) is whole
 
 
 def test_the_wheel_before_the_camera_is_the_lab_s_or_the_simulated_room_s() -> None:

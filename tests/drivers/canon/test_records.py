@@ -187,12 +187,13 @@ def test_any_records_come_back_without_the_closing_one(records: tuple[Record, ..
     assert canon.decode_events(canon.encode_events(records).removesuffix(canon.encode_events())) == records
 
 
-@pytest.mark.slow
-def test_more_records_than_any_body_queues_are_refused() -> None:
+def test_more_records_than_any_body_queues_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert canon.MAX_RECORDS == 65536
+    monkeypatch.setattr(canon, "MAX_RECORDS", 500)
     notice = bytes.fromhex("0c000000 8bc10000 01000000")
-    assert len(canon.decode_events(canon.MAX_RECORDS * notice)) == canon.MAX_RECORDS
-    with pytest.raises(ProtocolError, match="more than 65536 records"):
-        canon.decode_events((canon.MAX_RECORDS + 1) * notice)
+    assert len(canon.decode_events(500 * notice)) == 500
+    with pytest.raises(ProtocolError, match="more than 500 records"):
+        canon.decode_events(501 * notice)
 
 
 @pytest.mark.parametrize(
@@ -315,13 +316,6 @@ def test_values() -> None:
         canon.text_value("a\0")
     with pytest.raises(ValueError, match="does not fit"):
         canon.number_value(1 << 32)
-
-
-def test_image_formats_have_names() -> None:
-    assert str(canon.RAW_ONLY) == "RAW"
-    assert str(ImageFormat((ImageFile(6, 2, 4), ImageFile(1, 14, 2)))) == "sRAW + JPEG S1 normal"
-    assert str(ImageFile(6, 0, 3)) == "RAW of compression 3"
-    assert [file.is_raw for file in (ImageFile(6, 1, 4), ImageFile(1, 0, 3))] == [True, False]
 
 
 def test_a_device_and_what_it_reports() -> None:
@@ -447,10 +441,6 @@ def test_a_code_in_no_table_has_a_label() -> None:
     assert SHUTTER.label(0xA9) == "code 0xa9"
     with pytest.raises(ProtocolError, match="code 0xa9"):
         SHUTTER.value(0xA9)
-
-
-def test_codes_read_well() -> None:
-    assert [APERTURE.label(code) for code in (0x25, 0x28, 0xF1)] == ["3.5", "4", "code 0xf1"]
 
 
 def test_codes_lie_where_the_standard_and_the_makers_have_them() -> None:

@@ -478,35 +478,6 @@ def test_an_answer_that_comes_too_late_is_a_timeout() -> None:
         projector.power()
 
 
-class TestClass2:
-    """What class 2 adds, on the simulated projector, over memory and over loopback."""
-
-    @pytest.fixture(params=["memory", "loopback", "byte by byte", "dropped"])
-    def lit(self, request: pytest.FixtureRequest) -> Iterator[tuple[PjLinkProjector, SimulatedProjector]]:
-        device = SimulatedProjector(SimulatedClock(), Power.ON)
-        wrapped: dict[str, Callable[[Link], Link]] = {
-            "memory": lambda good: good,
-            "byte by byte": Dribbling,
-            "dropped": lambda good: DroppedAfter(good, 1),
-        }
-        if request.param in wrapped:
-            wrap = wrapped[request.param]
-            yield PjLinkProjector(lambda: wrap(PeerLink(PjLinkPeer(device, PASSWORD))), PASSWORD), device
-            return
-        with serve_pjlink(device, password=PASSWORD) as server:
-            projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), PASSWORD, 10.0)
-            yield projector, device
-            projector.close()
-
-    def test_resolution_and_freeze(self, lit: tuple[PjLinkProjector, SimulatedProjector]) -> None:
-        projector, device = lit
-        assert projector.input_resolution() == device.traits.panel
-        device.signal = NoResolution.NO_SIGNAL
-        assert projector.input_resolution() is NoResolution.NO_SIGNAL
-        device.set_frozen(True)
-        assert projector.frozen()
-
-
 def test_a_garbled_answer_is_told_and_the_next_connection_is_clean() -> None:
     peer = PjLinkPeer(SimulatedProjector(SimulatedClock(), Power.ON))
     garbles: list[Callable[[bytes], bytes]] = [lambda data: data.replace(b"POWR=", b"PO\xffR="), lambda data: data]
@@ -549,26 +520,6 @@ def test_a_served_projector_takes_the_time_that_it_is_given_to_answer() -> None:
         assert projector.power() is Power.STANDBY
         projector.close()
     assert clock.monotonic() == 2.0
-
-
-def test_a_connection_left_idle_over_loopback_is_replaced_silently() -> None:
-    clock = SimulatedClock()
-    with serve_pjlink(SimulatedProjector(clock, Power.ON), password=PASSWORD) as server:
-        made: list[TcpLink] = []
-
-        def connect() -> TcpLink:
-            made.append(TcpLink.connect(*server.address, 10.0))
-            return made[-1]
-
-        projector = PjLinkProjector(connect, PASSWORD, 10.0)
-        assert projector.power() is Power.ON
-        clock.sleep(29)
-        assert projector.power() is Power.ON
-        assert len(made) == 1
-        clock.sleep(30)
-        assert projector.power() is Power.ON
-        assert len(made) == 2
-        projector.close()
 
 
 def test_what_is_logged_has_neither_password_nor_digest(caplog: pytest.LogCaptureFixture) -> None:

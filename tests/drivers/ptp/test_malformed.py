@@ -6,7 +6,7 @@ import tracemalloc
 from collections.abc import Callable
 
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from foundation.errors import ProtocolError
@@ -65,6 +65,7 @@ def test_any_number_inflated(read: Read, octets: bytes) -> None:
 
 @pytest.mark.parametrize("read", [read for _, read, _ in ALL], ids=[name for name, *_ in ALL])
 def test_any_bytes(read: Read) -> None:
+    @settings(max_examples=60)
     @given(st.binary(max_size=200))
     @example(b"")
     @example(b"\xff" * 64)
@@ -79,6 +80,7 @@ def test_pieces_of_others(read: Read, octets: bytes) -> None:
     pieces = [octets, *(row[2] for row in ALL)]
     places = st.integers(0, 100)
 
+    @settings(max_examples=40)
     @given(st.lists(st.tuples(st.sampled_from(pieces), places, places), max_size=4), places)
     def check(cuts: list[tuple[bytes, int, int]], kept: int) -> None:
         outcome(read, octets[:kept] + b"".join(piece[start : start + length] for piece, start, length in cuts))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from enum import IntEnum
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.ptp import codes, protocol
+from drivers.ptp import protocol
 from drivers.ptp.codes import DataType, ObjectFormat, Operation, ResponseCode
 from drivers.ptp.protocol import (
     LAST_TRANSACTION,
@@ -155,32 +154,6 @@ def test_what_the_wire_cannot_hold_is_our_own_mistake(data_type: int, value: Val
 
 # ISO 15740:2013, clauses 10 to 13; Canon's as libgphoto2 2.5 has them in camlibs/ptp2/ptp.h. Hexadecimal, first-last
 # where they follow each other, in the order in which their names stand.
-@pytest.mark.parametrize(
-    ("kind", "numbers"),
-    [
-        (codes.Operation, "1001-100d 1014-1016 101b 9101-9102 9104-9105 9107-9109 910f-9110 9113-911d 9125 9127-9129"
-                          " 9130 9160"),
-        (codes.ResponseCode, "2000-2020 a001 a005-a006 a101-a102 a104 a106"),
-        (codes.EventCode, "4000 4002-4005 4007 4009 c101"),
-        (codes.EosEvent, "0 c181-c18b c18d-c195 c1a3-c1a5 c1a7-c1a9 c1b6-c1b8"),
-        (codes.ObjectFormat, "3000-3002 3006 3008 300a 3801 3808 b101 b103-b105 b108"),
-        (codes.Property, "5001 d303 d402 d406-d407 d101-d10a d10f-d116 d119 d11b-d123 d13a d13d d1a0 d1a8-d1a9"
-                         " d1ab-d1ac d1af-d1b1 d1bd d1bf-d1c1 d1d0-d1d1 d1d3 d1d8-d1d9"),
-        (codes.DataType, "1-a ffff"),
-        (codes.StorageType, "0 4"),
-        (codes.FilesystemType, "0 3"),
-        (codes.AeMode, "0-4 7 9"),
-        (codes.FocusMode, "0-3"),
-        (codes.DriveMode, "0-1 4-5 7 10-11 13-14"),
-        (codes.WhiteBalance, "0-6 8-9 17"),
-        (codes.CaptureDestination, "2 4 6"),
-        (codes.CameraStatus, "0-1"),
-        (codes.ReleaseButton, "1-3"),
-    ],
-)  # fmt: skip
-def test_numbers_are_those_of_the_standard_and_of_canon(kind: type[IntEnum], numbers: str) -> None:
-    spans = [[int(end, 16) for end in span.split("-")] for span in numbers.split()]
-    assert list(map(int, kind)) == [number for span in spans for number in range(span[0], span[-1] + 1)]
 
 
 def test_a_fault_says_what_where_and_how_much() -> None:
@@ -216,7 +189,7 @@ def test_any_value_comes_back(kind: DataType, data: st.DataObject) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=400)
+@settings(max_examples=200)
 @given(DATASETS)
 def test_any_dataset_comes_back(dataset: DeviceInfo | StorageInfo | ObjectInfo) -> None:
     assert type(dataset).decode(dataset.encode()) == dataset

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from drivers.links.usb import Pipe, PipeStalled, UsbPipes, open_usb
 from drivers.ptp import usb as container
 from drivers.ptp.codes import EventCode, Operation, ResponseCode
-from drivers.ptp.protocol import PtpEvent, PtpRequest, PtpResponse, next_transaction
+from drivers.ptp.protocol import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, DeviceStatus, Message, UsbTransport
 from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
@@ -110,14 +110,6 @@ def test_lengths_beyond_32_bits_are_unknown() -> None:
 
 
 @pytest.mark.parametrize(
-    ("total", "packet", "due"),
-    [(12, 512, False), (512, 512, True), (1024, 512, True), (1025, 512, False), (64, 64, True)],
-)
-def test_when_an_empty_packet_is_due(total: int, packet: int, due: bool) -> None:
-    assert container.ends_with_empty_packet(total, packet) is due
-
-
-@pytest.mark.parametrize(
     ("octets", "says"),
     [
         ("0b000000 0100 0210 00000000", "command container of 11 bytes"),
@@ -190,17 +182,6 @@ def test_control_requests_are_the_standards_bytes() -> None:
 def test_a_status_that_is_none(octets: str) -> None:
     with pytest.raises(ProtocolError, match="the device status: length"):
         DeviceStatus.decode(bytes.fromhex(octets))
-
-
-def test_transactions_are_numbered_past_the_reserved_ones() -> None:
-    assert [next_transaction(n) for n in (0, 1, 0xFFFFFFFD, 0xFFFFFFFE)] == [1, 2, 0xFFFFFFFE, 1]
-
-
-def test_messages_read_well() -> None:
-    assert [PtpResponse(code).ok for code in (0x2001, 0x2019)] == [True, False]
-    assert str(PtpRequest(0x1002, 0, (1,))) == "OPEN_SESSION (0x1002)(0x1)"
-    assert str(PtpResponse(0x2019)) == "DEVICE_BUSY (0x2019)"
-    assert str(PtpEvent(0xC999)) == "0xc999"
 
 
 WAYS: dict[str, Callable[[UsbPipes], UsbPipes]] = {

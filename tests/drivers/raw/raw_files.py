@@ -143,8 +143,11 @@ def lossless_jpeg(counts: NDArray[np.uint16]) -> bytes:
     # Sixteen codes of five bits, 0 … 15, so that each category is its own code.
     codes = (size.astype(np.int64) << size) | np.where(one < 0, one + (1 << size) - 1, one)
     bits = _bits(codes, size + 5)
-    stream = np.tile(bits, height) if alike else bits
-    packed = np.packbits(np.concatenate((stream, np.ones(-stream.size % 8, np.uint8)))).tobytes()
+    # Eight of them are whole bytes.
+    many = height // 8 if alike else 0
+    rest = np.tile(bits, height % 8) if alike else bits
+    packed = np.packbits(np.tile(bits, 8)).tobytes() * many if many else b""
+    packed += np.packbits(np.concatenate((rest, np.ones(-rest.size % 8, np.uint8)))).tobytes()
     tables = b"".join(bytes([table]) + bytes([0, 0, 0, 0, 16] + [0] * 11) + bytes(range(16)) for table in (0, 1))
     return (
         b"\xff\xd8"

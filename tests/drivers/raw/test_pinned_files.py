@@ -195,19 +195,8 @@ def test_lossless_jpegs_are_told_as_before(pinned: Pinned) -> None:
     begin = stream.index(b"\xff\xda") + 14
     flipped = [bytes([*stream[:at], stream[at] ^ bit, *stream[at + 1 :]]) for at in range(begin) for bit in (1, 16)]
     damaged = [stream[:at] + stream[at + 1 :] for at in range(begin, len(stream), 9)]
-    behind = [
-        stream[:-2] + more
-        for more in (
-            b"",
-            bytes(4),
-            bytes(5),
-            b"\1\1\1\1\1\1",
-            b"\1\1\1\1\2",
-            bytes(17) + b"\xff\xd9",
-            b"\1\1\1\1\1\1\1\1\2",
-            b"\1\2\3",
-        )
-    ]
+    more = (b"", bytes(4), bytes(5), b"\1\1\1\1\1\1", b"\1\1\1\1\2", bytes(17) + b"\xff\xd9")
+    behind = [stream[:-2] + one for one in (*more, b"\1\1\1\1\1\1\1\1\2", b"\1\2\3")]
     every = [stream, *flipped, *damaged, *behind]
     found: dict[str, str] = {}
     for number, one in enumerate(every):
@@ -224,13 +213,9 @@ def test_directories_of_all_types_are_read_as_before(pinned: Pinned) -> None:
 
     value = bytes([0, 1, 0, 2, 0, 3, 0, 9]) * 3
     tags = (
-        TiffTag.BLACK_LEVEL,
-        TiffTag.IMAGE_WIDTH,
-        TiffTag.MODEL,
-        TiffTag.EXPOSURE_TIME,
-        TiffTag.WHITE_LEVEL,
+        TiffTag.BLACK_LEVEL, TiffTag.IMAGE_WIDTH, TiffTag.MODEL, TiffTag.EXPOSURE_TIME, TiffTag.WHITE_LEVEL,
         TiffTag.SUB_IFDS,
-    )
+    )  # fmt: skip
     found: dict[str, Any] = {}
     for order, tag, kind, count in product("<>", tags, range(14), (1, 2)):
         data = one(order, tag, kind, count, value)
@@ -271,14 +256,9 @@ def test_bytes_of_raw_files_are_what_they_were(pinned: Pinned) -> None:
 def test_what_is_known_of_sensors_is_as_before(pinned: Pinned) -> None:
     frames = [(size, frame) for size, frame in sorted(rawfile._ONE_ROW_MORE, key=str)]
     cameras = (
-        "Canon EOS 550D",
-        "Canon EOS 6D Mark II",
-        "Canon EOS R10",
-        "Canon EOS R5 Mark II",
-        "Canon EOS 5D",
-        "Nikon D3",
+        "Canon EOS 550D", "Canon EOS 6D Mark II", "Canon EOS R10", "Canon EOS R5 Mark II", "Canon EOS 5D", "Nikon D3",
         "",
-    )
+    )  # fmt: skip
     sizes = ((3516, 5344), (4224, 6384), (100, 200))
     masked = {
         f"{camera} {size} {left}": rawfile._masked_areas(None, camera, Area(3, left, 90, 90), size)

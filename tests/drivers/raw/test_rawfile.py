@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import struct
 import subprocess
 import sys
 import threading
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +17,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from drivers.camera import ExposureSettings
 from drivers.raw import rawfile
 from drivers.raw.rawfile import FrameOrigin, Mosaic, body_and_lens, read_raw
 from drivers.raw.storage import Area
 from drivers.tiff import read_directories
 from foundation.errors import FormatError
-from sim.camera.film import write_dng as write_simulated_dng
-from sim.world.sensors import BODIES, Rectangle
 from tests.data_files import available, shipped
 from tests.drivers.raw.raw_files import Tags, longs, lossless_jpeg, ratios, shorts, text, write_cr2, write_dng
 
@@ -113,7 +108,7 @@ def test_a_compressed_file_of_another_maker(tmp_path: Path, real: Path | None) -
 
 def test_a_550d_cr2_is_framed_as_dcraw_does(tmp_path: Path) -> None:
     # dcraw 9.28 shows raw[51:3516, 142:5344] as RGGB; LibRaw's own frame begins one row lower.
-    columns = np.random.default_rng(2).integers(0, 64, 5344)
+    columns = np.random.default_rng(2).integers(0, 2, 5344)
     columns[:2] = 1
     counts = np.add.outer(8192 + np.arange(3516), columns).astype(np.uint16)
     write_cr2(tmp_path / "IMG_0001.CR2", counts, "Canon EOS 550D", iso=200)
@@ -153,33 +148,6 @@ def test_a_dng_is_framed_by_its_active_area(tmp_path: Path, maker: str, top: int
     np.testing.assert_array_equal(mosaic.sensor, counts)
 
 
-@pytest.mark.parametrize(
-    ("code", "pattern"), [(b"\0\1\1\2", "RGGB"), (b"\1\0\2\1", "GRBG"), (b"\1\2\0\1", "GBRG"), (b"\2\1\1\0", "BGGR")]
-)
-def test_patterns(tmp_path: Path, code: bytes, pattern: str) -> None:
-    write_dng(tmp_path / "a.dng", noise((40, 60)), {33422: (1, 4, code)})
-    assert read_raw(tmp_path / "a.dng").pattern == pattern
-
-
-def test_a_simulated_camera_file_reads_back(tmp_path: Path) -> None:
-    body = dataclasses.replace(
-        BODIES["EOS 550D"],
-        sensor=(129, 206),
-        visible=Rectangle(51, 47, 77, 157),
-        masked=(Rectangle(0, 0, 129, 40),),
-    )
-    counts = noise(body.sensor)
-    exposure = ExposureSettings(400, 5.6, 0.25)
-    with (tmp_path / "s.dng").open("wb") as stream:
-        write_simulated_dng(stream, counts, body, settings=exposure, taken_at=datetime(2026, 1, 1, tzinfo=UTC))
-    mosaic = read_raw(tmp_path / "s.dng")
-    np.testing.assert_array_equal(mosaic.counts, counts[51:128, 47:204])
-    assert mosaic.pattern == "RGGB"
-    assert mosaic.masked == (Area(0, 0, 129, 40),)
-    assert mosaic.white_level == 13584
-    assert (mosaic.iso, mosaic.aperture, mosaic.shutter_s) == (400, pytest.approx(5.6), 0.25)
-
-
 def nobody(path: Path, data: bytes, contents: object) -> None:
     """Stand in for the reader of plain files, and leave all to LibRaw."""
 
@@ -205,7 +173,7 @@ def asks_libraw(path: Path) -> bool:
 _CODES = [b"\0\1\1\2", b"\1\0\2\1", b"\1\2\0\1", b"\2\1\1\0"]
 
 
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     size=st.tuples(st.integers(40, 70), st.integers(40, 70)),
     code=st.sampled_from(_CODES),
@@ -402,7 +370,7 @@ def test_flipped_bytes_of_real_files(tmp_path: Path, real: Path, capfd: pytest.C
     data = real.read_bytes()
     rng = np.random.default_rng(5)
     path = tmp_path / real.name
-    for _ in range(12):
+    for _ in range(5):
         flipped = bytearray(data)
         for place in rng.integers(0, len(data), 20):
             flipped[place] = rng.integers(256)

@@ -17,15 +17,12 @@ from hypothesis import strategies as st
 
 from drivers.links.network import TcpServer
 from drivers.links.usb import Pipe, PipeStalled
-from drivers.ptp.protocol import DeviceInfo, PtpRequest, PtpResponse
+from drivers.ptp.protocol import PtpRequest, PtpResponse
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart, UsbTransport, encode
 from foundation.clock import SimulatedClock
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpUsbDevice, UsbIdentity
 from sim.buses.usbip import ImportRequest, RequestReader, Submit, Unlink, UsbIpService, serve_usbip
-from sim.camera.bodies import EOS_550D
-from sim.camera.eos import SimulatedEos
-from tests.contracts.camera import SeededFilm
 from tests.contracts.transport import GIVE, HANG, PATIENCE_S, RAISE, Bench, Echo, TransportContract, payload
 from tests.joined_links import JoinedLink, joined_links
 
@@ -160,17 +157,6 @@ def test_a_client_by_others_imports_a_camera_and_talks_to_it(lender: TcpServer) 
     assert camera.interrupt_in(INTERRUPT_IN, 8) == bytes.fromhex("10000000040001c1")
     assert camera.interrupt_in(INTERRUPT_IN, 8) == bytes.fromhex("ffffffff00000000")
     camera.close()
-
-
-def test_a_client_by_others_asks_a_simulated_eos_what_it_is() -> None:
-    eos = SimulatedEos(EOS_550D, SeededFilm(600), SimulatedClock())
-    with serve_usbip([PtpUsbDevice(eos)], 0) as server:
-        camera = usbip.open(0x04A9, 0x31EA, transport=usbip.USBIP(*server.address))
-        camera.bulk_out(BULK_OUT, encode(PtpRequest(0x1001, 0)))
-        container = camera.bulk_in(BULK_IN, 65536)
-        camera.close()
-    info = DeviceInfo.decode(container[12:])
-    assert (info.manufacturer, info.model) == ("Canon Inc.", "Canon EOS 550D")
 
 
 def test_a_stall_is_told_and_cleared(lender: TcpServer) -> None:

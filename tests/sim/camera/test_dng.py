@@ -50,15 +50,20 @@ def visible(counts: NDArray[np.uint16], body: Body) -> NDArray[np.uint16]:
     return counts[area.top : area.top + area.height, area.left : area.left + area.width]
 
 
-@pytest.fixture(params=BODIES)
+@pytest.fixture(scope="module", params=BODIES)
 def body(request: pytest.FixtureRequest) -> Body:
     return BODIES[request.param]
 
 
-@pytest.fixture
-def file(body: Body, tmp_path: Path) -> Path:
-    path = tmp_path / "IMG_0001.dng"
-    path.write_bytes(dng(body))
+@pytest.fixture(scope="module")
+def counts(body: Body) -> NDArray[np.uint16]:
+    return mosaic(body)
+
+
+@pytest.fixture(scope="module")
+def file(body: Body, counts: NDArray[np.uint16], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("dng") / "IMG_0001.dng"
+    path.write_bytes(dng(body, counts))
     return path
 
 
@@ -179,9 +184,9 @@ def test_the_exif_directory_holds_the_exposure() -> None:
     assert exif["BodySerialNumber"] == "062031400123"
 
 
-def test_directories_are_sorted_and_even_and_the_strip_ends_the_file(body: Body) -> None:
+def test_directories_are_sorted_and_even_and_the_strip_ends_the_file(file: Path) -> None:
     """TIFF 6.0 section 2: entries ascend by code, directories and long values begin on even bytes."""
-    data = dng(body)
+    data = file.read_bytes()
     order, version, first = struct.unpack_from("<2sHI", data)
     assert (order, version) == (b"II", 42)
     strip: dict[int, int] = {}
@@ -205,8 +210,7 @@ def test_directories_are_sorted_and_even_and_the_strip_ends_the_file(body: Body)
     assert strip[273] + strip[279] == len(data)
 
 
-def test_libraw_reads_the_counts_and_the_exposure_back(file: Path, body: Body) -> None:
-    counts = mosaic(body)
+def test_libraw_reads_the_counts_and_the_exposure_back(file: Path, body: Body, counts: NDArray[np.uint16]) -> None:
     area = body.visible
     with rawpy.imread(str(file)) as raw:
         np.testing.assert_array_equal(raw.raw_image, counts)
@@ -224,20 +228,20 @@ def test_libraw_reads_the_counts_and_the_exposure_back(file: Path, body: Body) -
         assert raw.other.aperture == pytest.approx(5.6)
 
 
-def test_our_own_reader_sees_the_whole_visible_frame(file: Path, body: Body) -> None:
+def test_our_own_reader_sees_the_whole_visible_frame(file: Path, body: Body, counts: NDArray[np.uint16]) -> None:
     read = read_raw(file)
-    np.testing.assert_array_equal(read.counts, visible(mosaic(body), body))
+    np.testing.assert_array_equal(read.counts, visible(counts, body))
     assert read.pattern == body.pattern
     assert (read.iso, read.aperture, read.shutter_s) == (400, pytest.approx(5.6), pytest.approx(0.5))
     np.testing.assert_array_equal(read.masked_black(), np.full((2, 2), body.black))
 
 
-def test_dcraw_sees_the_whole_visible_frame(file: Path, body: Body) -> None:
+def test_dcraw_sees_the_whole_visible_frame(file: Path, body: Body, counts: NDArray[np.uint16]) -> None:
     dcraw = shutil.which("dcraw")
     if dcraw is None:
         pytest.skip("dcraw is not installed")
     subprocess.run([dcraw, "-D", "-4", "-T", str(file)], check=True, timeout=60)
-    np.testing.assert_array_equal(tifffile.imread(file.with_suffix(".tiff")), visible(mosaic(body), body))
+    np.testing.assert_array_equal(tifffile.imread(file.with_suffix(".tiff")), visible(counts, body))
     told = subprocess.run([dcraw, "-i", "-v", str(file)], check=True, timeout=60, capture_output=True, text=True).stdout
     assert f"Camera: Canon {body.model.removeprefix('Canon ')}" in told
     assert "ISO speed: 400" in told

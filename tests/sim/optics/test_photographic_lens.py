@@ -55,24 +55,6 @@ def white_squares(centres: NDArray[np.float64], side: float) -> Print:
     return Print(PAGE_MM, boxes, rgb)
 
 
-@pytest.mark.slow
-def test_a_room_without_the_new_settings_gives_the_counts_it_gave_before_it_had_them() -> None:
-    """The counts are of the room of version 0.1, before its lens had shoulders; numpy's deviates are part of them."""
-    sheet = Print((210, 148), np.array([[40.0, 30, 120, 100]]), np.array([[30, 90, 200]], np.uint8))
-    world = World(sheet, BODIES["Test"], Room())
-    frame = world.expose(Colour(200, 180, 90), REFERENCE_EXPOSURE, key=(3,))
-    assert frame[40:600:70, 20:840:110].tolist() == [
-        [2053, 2036, 2054, 2050, 2058, 2046, 2045, 2045],
-        [2055, 4498, 4784, 5112, 5117, 5015, 4847, 4443],
-        [2047, 4612, 2324, 2365, 2368, 5187, 4886, 4516],
-        [2051, 4754, 2350, 2380, 2377, 5258, 4982, 4667],
-        [2043, 4759, 2371, 2368, 2375, 5254, 4991, 4648],
-        [2054, 4667, 2360, 2376, 2362, 5207, 5020, 4642],
-        [2060, 4516, 4868, 5108, 5177, 5135, 4924, 4540],
-        [2051, 4439, 4760, 4992, 5124, 4947, 4761, 4479],
-    ]
-
-
 @pytest.mark.parametrize(("lens", "at_10", "at_30"), [(MILD_SHOULDERS, 0.96, 0.73), (STRONG_SHOULDERS, 0.93, 0.64)])
 def test_the_two_lenses_have_the_contrast_they_are_named_for(
     lens: Mapping[str, float], at_10: float, at_30: float

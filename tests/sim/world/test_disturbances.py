@@ -275,18 +275,6 @@ def _counts(file: bytes, path: Path) -> NDArray[np.uint16]:
     return np.asarray(read_raw(path).sensor)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_event_is_there_when_said_and_leaves_other_frames_as_they_are(bare: World, kind: str) -> None:
-    end = {"to_frame": 9} if kind in ("lamp drift", "sensor warming") else {"to_frame": 4}
-    size = {"px": 2.0} if kind == "bump" else {}
-    (event,) = read_disturbances([{"what": kind, "from_frame": 3, **end, **size}], "LAB.toml").events
-    assert event.what == kind
-    assert [event.is_there(Moment(frame)) for frame in range(2, 5)] == [False, True, True]
-    undisturbed = taken(bare, colour=GREEN, frame=2)
-    np.testing.assert_array_equal(taken(bare, event, colour=GREEN, frame=2), undisturbed)
-
-
 @pytest.mark.parametrize(
     ("limits", "moments"),
     [

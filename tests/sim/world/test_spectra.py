@@ -128,14 +128,6 @@ def test_each_primary_is_seen_most_by_its_own_channel(lamp: LampSpectrum, camera
     assert 0.5 < blue / green < 0.9
 
 
-def test_sensitivities_are_the_measured_ones() -> None:
-    curves = sensitivities("Canon_EOS_600D")
-    assert curves.shape == (81, 3)
-    assert curves[0].tolist() == [0.0002001080709661019, 0.0002540350492889405, 0.0004426951151709159]
-    assert curves[:, 1].max() == 1
-    assert not curves.flags.writeable
-
-
 def documented_paper() -> dict[str, NDArray[np.float64]]:
     """Return the values of measured photo paper that `sim.world.world` documents, in the layout of the whole."""
     # Between 450 and 600 nm the white falls evenly; the inks are given as densities over white.
