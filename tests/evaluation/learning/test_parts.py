@@ -185,18 +185,6 @@ def test_the_penalty_of_kernel_ridge_grows_with_the_images() -> None:
     np.testing.assert_allclose(once.lights(other), twice.lights(other), atol=1e-10)
 
 
-@pytest.mark.parametrize("penalty", [0.0, -1.0, float("nan")])
-def test_kernel_ridge_refuses_a_penalty_that_is_none(penalty: float) -> None:
-    with pytest.raises(ValueError, match="expected a number above 0"):
-        KernelRidge(penalty=penalty)
-
-
-@pytest.mark.parametrize("power", [-0.5, float("inf"), float("nan")])
-def test_kernel_ridge_refuses_a_power_of_brightness_that_is_none(power: float) -> None:
-    with pytest.raises(ValueError, match="0 or more"):
-        KernelRidge(brightness=power)
-
-
 @pytest.mark.parametrize("learner", [KernelRidge, LogChroma])
 def test_counts_of_the_largest_working_size_are_not_cut(learner: type[KernelRidge | LogChroma]) -> None:
     image = np.full((255, 255, 3), RED, np.float32)
