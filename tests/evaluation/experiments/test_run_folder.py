@@ -216,9 +216,7 @@ def _other_treatment() -> SceneSet:
     ("data", "methods", "what"),
     [
         (_other_truth, METHODS, "data set"),
-        (lambda: as_set(walls(COUNT)), METHODS, "data set"),
         (_other_treatment, METHODS, "treatment"),
-        (mixed_set, METHODS[::-1], "methods"),
         (mixed_set, [METHODS[0], GrayEdge("White-Patch", 0, 9, 0, 0)], "methods"),
         (mixed_set, METHODS[:1], "methods"),
     ],
