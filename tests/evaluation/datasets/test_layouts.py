@@ -174,20 +174,6 @@ def test_an_option_without_a_meaning_is_refused(place_of: Place, dataset: Path) 
         open_scenes(dataset, options=DataOptions(black=3))
 
 
-@pytest.mark.parametrize("name", [name for name, copy in COPIES.items() if "black" in LAYOUTS[copy.layout].options])
-def test_levels_that_the_user_gives_replace_the_layouts(name: str, place_of: Place) -> None:
-    given = DataOptions(black=1000, saturation=4500, partial=COPIES[name].partial)
-    data = open_scenes(place_of(name), options=given)
-    if data.layout == "folder":
-        return  # Its table goes first, see test_plain_folder.
-    assert "1000, as the user gave it" in data.treatment["black level"]
-    assert "4500, as the user gave it" in data.treatment["saturation"]
-    for scene in data.scenes:
-        assert scene.saturation == 3500
-        image, _ = scene.read()
-        assert image[-1, 0].tolist() in ([2000, 4000, 3000], [0, 0, 0])  # The latter is an 8-bit thumbnail.
-
-
 @pytest.mark.parametrize("name", COPIES)
 def test_a_truncated_image_is_an_error_with_its_name(name: str, place_of: Place, tmp_path: Path) -> None:
     copy = COPIES[name]
