@@ -153,11 +153,6 @@ def test_a_results_folder_is_told_from_a_data_set(tmp_path: Path) -> None:
             open_scenes(place)
 
 
-def test_a_layout_that_is_none_is_told(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="'magic'"):
-        open_scenes(tmp_path, "magic")
-
-
 def test_what_looks_like_two_must_be_named(place_of: Place, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(place_of("nus8 camera"), copy)

@@ -47,13 +47,6 @@ def test_values(copy: Path) -> None:
     assert data.folds == (1, 0, 1)
 
 
-def test_levels_of_the_user_serve_where_the_table_has_none(copy: Path) -> None:
-    data = open_scenes(copy, options=DataOptions(black=10, saturation=6000))
-    assert [scene.saturation for scene in data.scenes] == [8192 - 512, 6000 - 10, 4000 - 100.5]
-    assert data.scenes[1].read()[0][0, 0].tolist() == [4490, 40, 3490]
-    assert data.treatment["black level"] == "column black of gt.csv, 10 where it is empty"
-
-
 def test_what_is_not_given_is_stated(copy: Path) -> None:
     write_table(copy, "a,0.2,0.5,0.3")
     (copy / "a_mask.png").unlink()

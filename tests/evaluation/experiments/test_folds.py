@@ -92,11 +92,7 @@ def test_a_file_of_folds_is_read_as_it_was_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("image\na.png\n", "columns image; expected image,fold"),
-        ("image,fold\na.png,0\nb.png,1\nc.png,1\n", "without a fold: d, e.png"),
         ('image,fold\na.png,0\nb.png,1\nc.png\n"d, e.png",1\n', "without a fold: c.png"),
-        ('image,fold\na.png,0\na.png,1\nb.png,1\nc.png,0\n"d, e.png",1\n', "more than once: a.png"),
-        ('image,fold\na.png,0\nb.png,1\nc.png,0\n"d, e.png",1\nz.png,1\n', "the data set lacks: z.png"),
         ('image,fold\na.png,7\nb.png,7\nc.png,7\n"d, e.png",7\n', "fold 7 only"),
     ],
 )

@@ -91,12 +91,6 @@ def test_black_stays_black() -> None:
     assert not DevelopedSource(masked).read().picture.any()
 
 
-@pytest.mark.parametrize("light", [[0.0, 1, 1], [np.nan, 1, 1]])
-def test_a_light_has_three_channels(light: list[float]) -> None:
-    with pytest.raises(InputError, match="cannot be balanced"):
-        develop(np.ones((2, 2, 3)), np.array(light))
-
-
 SOURCES = random_scenes(6, 40, 30, seed=3)
 TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0], [1.5, 3.0, 2.4]])
 PLAIN = DatasetOptions(previews=False, rendering="codes")

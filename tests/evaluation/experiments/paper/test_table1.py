@@ -38,8 +38,7 @@ HOT_PICTURES = random_scenes(4, 24, 16, seed=8)
 TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
 
 
-def test_values_are_raised_and_cut(make_table: TableMaker) -> None:
-    del make_table
+def test_values_are_raised_and_cut() -> None:
     samples = np.array([[[10, 20, 30], [40, 50, 60]]], np.uint16)
     hot = HotPhotosites(np.array([0, 5]), np.array([7.4, 1e5]))
     np.testing.assert_array_equal(hot.raise_in(samples, 100), [[[17, 20, 30], [40, 50, 99]]])

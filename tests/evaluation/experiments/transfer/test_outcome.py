@@ -24,7 +24,6 @@ from evaluation.experiments.transfer.outcome import (
     forest_plot,
     harm_notes,
     intervals_table,
-    paper_ratios_table,
 )
 from evaluation.experiments.transfer.rows import Kind, TransferRow, Way
 from evaluation.metrics import summarise
@@ -95,17 +94,6 @@ def test_what_a_number_hides_is_noted() -> None:
         "Means over seeds; the standard deviation of a median over seeds is up to 2.90 degrees.",
     )
     assert table.texts()[1][2] == "–"
-
-
-def test_the_papers_ratios_by_hand() -> None:
-    medians = {row[0]: row[3] for row in paper_ratios_table().rows}
-    assert medians == pytest.approx(
-        {
-            "Regression trees (simple features)": 1.66 / 0.89,
-            "Smart Color Cat": 1.43 / 1.35,
-            "Color Beaver (using Gray-world)": 0.74 / 0.77,
-        }
-    )
 
 
 RANDOM = np.random.default_rng(3)
