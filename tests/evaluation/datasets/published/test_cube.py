@@ -39,14 +39,6 @@ def test_levels_mask_and_truth(copy: Path) -> None:
     assert "the published Cube+ has 1707" in data.treatment["images"]
 
 
-def test_the_left_face(copy: Path) -> None:
-    data = open_scenes(copy, options=DataOptions(truth="left"))
-    assert data.scenes[1].truth.tolist() == [0.25, 0.5, 0.25]
-    assert "cube+_left_gt.txt" in data.treatment["ground truth"]
-    with pytest.raises(InputError, match="'right'"):
-        open_scenes(copy, options=DataOptions(truth="right"))
-
-
 def test_cube_is_told_from_cube_plus(copy: Path) -> None:
     (copy / "cube+_gt.txt").rename(copy / "cube_gt.txt")
     data = open_scenes(copy)
@@ -182,11 +174,7 @@ def test_simple_cube(simple: Path) -> None:
     assert data.treatment["images"] == "train 1, test 1; the published SimpleCube++ has 2234"
 
 
-def test_a_part_of_simple_cube(simple: Path) -> None:
-    data = open_scenes(simple, options=DataOptions(subset="test"))
-    assert [scene.name for scene in data.scenes] == ["01_0004.png"]
-    with pytest.raises(InputError, match="'val'"):
-        open_scenes(simple, options=DataOptions(subset="val"))
+def test_an_image_that_a_part_of_simple_cube_lacks(simple: Path) -> None:
     (simple / "test" / "PNG" / "01_0004.png").unlink()
     with pytest.raises(FormatError, match=r"1.*1.*test/gt\.csv.*01_0004"):
         open_scenes(simple)
