@@ -72,14 +72,6 @@ def test_table1(
     # What is printed is what the file holds.
     first = rows[0]
     assert re.search(rf"White-Patch +│ +{float(first['mean']):.2f} │ +{float(first['median']):.2f} │", printed)
-    assert {path.name for path in out.iterdir()} == {
-        *("report.html", "table1.csv", "table1.tex", "table1_recovery.tex", "noise.csv", "print.csv"),
-        *("sizes.csv", "sizes.svg", "hot.csv", "hot.tex"),
-    }
-    page = (out / "report.html").read_text()
-    assert page.index("Reproduction error") < page.index("Images of other sizes") < page.index("Recovery error")
-    assert "Photos scenes, 6D sensor, A illuminations" in (out / "table1.tex").read_text()
-    assert [row["Per million"] for row in rows_of(out / "hot.csv")] == ["500"] * 8
     assert main(["paper", "table1", *tables, *given, *wish]) == 2
     assert "already exists; name another place for the report" in capsys.readouterr().err
 
@@ -103,7 +95,6 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
     wish = ("--generated", str(made), "--methods", "smart-color-cat", "--out", str(out))
     assert main(["paper", "table2", str(thumbnails), *wish]) == 0
     printed = capsys.readouterr().out
-    assert "Real: photos, 9 images, 3 folds. Generated: made, 12 images. Seed 0." in printed
     assert "The paper's table is of Cube+" in printed
     real, generated = (rows_of(out / f"trained_on_{name}.csv") for name in ("real", "generated"))
     (ratio,) = rows_of(out / "ratios.csv")

@@ -187,13 +187,6 @@ def test_several_lights_are_judged_by_pixel_and_region() -> None:
     assert local.errors["recovery"][1] == whole.errors["recovery"][1] > 1
 
 
-def test_masked_pixels_of_several_lights_do_not_count() -> None:
-    (result,) = evaluate([MixedWall("masked", LIGHTS, masked=True)], [Returns((1, 1, 1))])
-    error = (result.maps or {})[0]
-    assert error.recovery == pytest.approx(0, abs=1e-4)
-    assert [region.light for region in error.regions] == [1]
-
-
 def _two_pixels(found: Any) -> Any:
     found[0, 0] = np.nan
     found[0, 1] = 0
