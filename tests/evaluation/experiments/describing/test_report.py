@@ -18,6 +18,8 @@ from matplotlib.figure import Figure
 from evaluation.experiments.describing import DataDescription, describe, figures, report
 from evaluation.experiments.describing.description import (
     QUANTITIES,
+    NoiseCurve,
+    NoiseLevel,
     read_statistics,
     statistics_to_json,
 )
@@ -198,6 +200,18 @@ def test_of_many_lights_a_part_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None
     few, all_ = (np.asarray(points.get_offsets()) for points in axes.collections)
     np.testing.assert_allclose(few, lights[::2, [0, 2]])
     np.testing.assert_allclose(all_, lights[:3000, [0, 2]])
+
+
+def test_noise_in_another_unit_is_not_drawn_beside(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = tuple(NoiseLevel(signal, 0.1 * signal, 40) for signal in (0.01, 0.1, 1.0))
+    none = NoiseCurve(())
+    one = replace(seen("a", 3), noise=(none, NoiseCurve(levels, 0.03, 0.16, 0.1), none))
+    (axes,) = drawn_by(lambda: report._noise((one, replace(one, noise_unit="another"))), monkeypatch)
+    points, curve = axes.lines
+    np.testing.assert_allclose(points.get_xydata(), [[0.01, 0.001], [0.1, 0.01], [1, 0.1]])
+    signal, sigma = curve.get_xydata().T
+    np.testing.assert_allclose(sigma**2, 0.03**2 + 0.16 * signal)
+    assert report._noise((replace(one, noise=(none,) * 3),)) == []
 
 
 def test_six_sizes_are_listed_and_the_others_counted() -> None:
