@@ -29,19 +29,6 @@ def test_a_dataset_on_a_store(dataset: Path, capsys: pytest.CaptureFixture[str])
     assert "memory://evaluated/nothing is no dataset" in capsys.readouterr().err
 
 
-def test_the_command(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table, images = dataset.parent / "table.csv", dataset.parent / "images.csv"
-    wish = ("--methods", "white-patch,gray-world", "--csv", str(table), "--images", str(images))
-    assert main([str(dataset), *wish]) == 0
-    printed = capsys.readouterr().out
-    assert "reproduction angular error of 16 images" in printed
-    heads = [printed.index(head) for head in ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")]
-    assert heads == sorted(heads)
-    assert printed.index("White-Patch") < printed.index("Gray-world")
-    assert [row.split(",")[0] for row in table.read_text().splitlines()] == ["method", "White-Patch", "Gray-world"]
-    assert len(images.read_text().splitlines()) == 33
-
-
 def test_the_command_counts_images_without_a_usable_pixel(
     make_dataset: Callable[[int, int], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -70,18 +57,12 @@ def test_the_table_names_the_dataset(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("made", "--methods", "magic"), "'magic' is no method; the methods are white-patch"),
         (("lut",), "is no dataset"),
         (("made", "--csv", "made"), "made already exists; name another place for the table"),
         (("made", "--csv", "made/gt.txt"), "made/gt.txt already exists; name another place for the table"),
         (("made", "--images", "empty"), "empty already exists; name another place for the images' errors"),
-        (("made", "--csv", "new.csv", "--images", "lut/../new.csv"), "are both lut/../new.csv; give each a file"),
         (("made", "--out", "lut"), "lut already exists; name another place for the results"),
-        (("made", "--out", "new", "--csv", "new/table.csv"), "new/table.csv lies in new, which --out makes"),
-        (("made", "--method", "regression-trees"), "regression-trees learns from images first: evaluate train"),
-        (("made", "--method", "none.py:Own"), "none.py is not there"),
         (("made", "--method", "none.npz"), "none.npz"),
-        (("made", "--estimates", "none.csv"), "cannot read none.csv"),
         (("made", "--estimates", "lut/illuminations.csv"), "expected the columns image,r,g,b"),
     ],
 )

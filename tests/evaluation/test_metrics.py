@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from evaluation import metrics as maps
 from evaluation.metrics import measure_map, percentiles, recovery_error, reproduction_error, summarise
-from foundation.errors import InputError
 
 lights = st.tuples(*[st.floats(0.01, 100)] * 3)
 
@@ -171,17 +170,3 @@ def test_percentiles_are_matlab_s() -> None:
     # prctile([1 2 3 4 5 6], [25 50 75]): 1.5 places in steps of 100 / 6 from 8.33 percent; the ends stay the ends.
     assert percentiles([6, 5, 4, 3, 2, 1], (25, 50, 75)) == pytest.approx((2, 3.5, 5))
     assert percentiles([6, 5, 4, 3, 2, 1], (0, 5, 100)) == pytest.approx((1, 1, 6))
-
-
-def test_one_error_is_every_statistic() -> None:
-    assert summarise([7.0]).as_tuple() == pytest.approx((7.0,) * 6)
-
-
-def test_perfect_estimates_have_an_average_of_zero() -> None:
-    assert summarise(np.zeros(9)).avg == 0
-
-
-@pytest.mark.parametrize("errors", [[], [1.0, math.nan], [math.inf]])
-def test_nothing_to_sum_up_is_said(errors: list[float]) -> None:
-    with pytest.raises(InputError, match="nothing to sum up"):
-        summarise(errors)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -42,21 +43,12 @@ def test_two_runs(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> 
     assert "corrected for the 2 comparisons" in printed
 
 
-def test_two_methods_of_one_run_and_of_two(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["compare", runs[0]]) == 0
-    assert "A errs less than B <i> on 30 of 30 images" in capsys.readouterr().out
-    assert main(["compare", *runs, "--method", "a=B <i>", "--error", "recovery"]) == 0
-    printed = capsys.readouterr().out
-    assert "A (first) errs less than B <i> (second) on 29 of 29 images" in printed
-    assert "recovery errors of 29 images" in printed
-
-
 def test_results_beside_themselves_are_refused(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", runs[0], f"{runs[0]}/../first/errors.csv"]) == 2
     assert f"are the same results; evaluate compare {runs[0]} compares its methods" in capsys.readouterr().err
 
 
-def test_many_methods_by_their_short_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_methods_by_their_short_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = ("Gray-world", "PCA bright and dark", "Shades-of-Gray (p=4)", "Own")
     lines = [
         f"im {number},{name},1,2,1,1.5,{1 + place + number / 10},0\n"
@@ -64,40 +56,17 @@ def test_many_methods_by_their_short_names(tmp_path: Path, capsys: pytest.Captur
         for place, name in enumerate(names)
     ]
     (tmp_path / "errors.csv").write_text(HEAD + "".join(lines))
-    assert main(["compare", str(tmp_path)]) == 0
-    few = capsys.readouterr().out
-    assert few.count(" errs less than ") == 6
-    assert "largest differences" not in few
-    assert "--images" in few
-    assert main(["compare", str(tmp_path), "--images"]) == 0
-    every = capsys.readouterr().out
-    assert every.count(": the largest differences") == 6
-    assert every.index("Own on 9 of 9") < every.index("largest differences")
     assert main(["compare", str(tmp_path), "--method", "pca", "--method", "shades-of-gray:p=4"]) == 0
     chosen = capsys.readouterr().out
     assert "PCA bright and dark errs less than Shades-of-Gray (p=4) on 9 of 9 images" in chosen
-    assert "Best 25%" in chosen
-    assert "best25" not in chosen
 
 
 def test_files(runs: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["compare", *runs, "--out", str(out)]) == 0
-    assert sorted(path.name for path in out.iterdir()) == [
-        "images.csv",
-        "report.html",
-        "statistics.csv",
-        "tables.tex",
-        "tests.csv",
-    ]
-    images = list(csv.DictReader((out / "images.csv").read_text().splitlines()))
-    assert len(images) == 58
-    assert float(images[0]["second_deg"]) == pytest.approx(0.7 * float(images[0]["first_deg"]), abs=1e-6)
     statistics = list(csv.DictReader((out / "statistics.csv").read_text().splitlines()))
-    assert [row["statistic"] for row in statistics[:6]] == ["mean", "median", "trimean", "best25", "worst25", "avg"]
     assert float(statistics[0]["ratio"]) == pytest.approx(1 / 0.7, abs=1e-5)
     page = (out / "report.html").read_text()
-    assert page.count("<svg") == 2
     assert "B <i>" not in page
     assert "B &lt;i&gt;" in page
     capsys.readouterr()
@@ -105,21 +74,9 @@ def test_files(runs: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixt
     assert str(out) in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("extra", "says"),
-    [
-        (["--method", "Z"], "has no method 'Z'; it has A, B <i>"),
-        (["--method", "A"], "A of .* alone; compare it with a second method"),
-        (["b", "c"], "3 results; compare two"),
-    ],
-)
-def test_what_cannot_be_compared_is_said(
-    runs: tuple[str, str], extra: list[str], says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import re
-
-    assert main(["compare", runs[0], *extra]) == 2
-    assert re.search(says, capsys.readouterr().err.replace("\n", " "))
+def test_a_method_alone_is_not_compared(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", runs[0], "--method", "A"]) == 2
+    assert "alone; compare it with a second method" in " ".join(capsys.readouterr().err.split())
 
 
 def test_runs_without_a_common_method(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -141,11 +98,11 @@ def test_runs_of_one_method_each_are_compared_by_it(runs: tuple[str, str], capsy
 
 
 def test_runs_of_the_command_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("one", "two"):
-        wish = ("--method", "white-patch", "--method", "gray-world", "--out", str(tmp_path / name))
-        assert main(["run", str(dataset), *wish]) == 0
+    out = tmp_path / "one"
+    assert main(["run", str(dataset), "--methods", "white-patch,gray-world", "--out", str(out)]) == 0
+    shutil.copytree(out, tmp_path / "two")
     capsys.readouterr()
-    assert main(["compare", str(tmp_path / "one"), str(tmp_path / "two")]) == 0
+    assert main(["compare", str(out), str(tmp_path / "two")]) == 0
     printed = capsys.readouterr().out
     assert (
         "White-Patch (one) errs less than White-Patch (two) on 0 of 8 groups of 16 images, more on 0, the same on 8"
@@ -153,23 +110,16 @@ def test_runs_of_the_command_run(dataset: Path, tmp_path: Path, capsys: pytest.C
     )
     assert "ground truths" not in printed
     assert "of one picture" not in printed
-    assert main(["compare", str(tmp_path / "one")]) == 0
+    assert main(["compare", str(out)]) == 0
     # Random codes: white is in every image, and grey on average only by chance.
     assert "White-Patch errs less than Gray-world on 8 of 8 groups of 16 images" in capsys.readouterr().out
-
-
-def test_results_of_before_groups_were_kept_say_so(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert main(["run", str(dataset), "--methods", "white-patch,gray-world", "--out", str(out)]) == 0
+    # Results of before groups were kept say so.
     rows = list(csv.reader((out / "errors.csv").read_text().splitlines()))
     assert rows[0][-1] == "group"
     (out / "errors.csv").write_text("".join(",".join(row[:-1]) + "\n" for row in rows))
     about = json.loads((out / "run.json").read_text())
     assert about["data_set"].pop("groups") == 8
     (out / "run.json").write_text(json.dumps(about))
-    capsys.readouterr()
     assert main(["compare", str(out)]) == 0
     printed = capsys.readouterr().out
     assert f"{out} does not say which images are of one picture" in printed

@@ -26,7 +26,6 @@ from evaluation.methods import standard_methods
 from evaluation.methods.standard import STANDARD
 from foundation.console import grouped
 from foundation.errors import FormatError, InputError
-from tests.evaluation.datasets.made_up import nus8
 
 pytestmark = pytest.mark.slow
 
@@ -102,16 +101,6 @@ def test_names_of_estimates(tmp_path: Path) -> None:
         (tmp_path / name).write_text("one,1,1,1\n")
     given = [f"{tmp_path}/a.csv", f"My own={tmp_path}/a.csv", f"{tmp_path}/b=c.csv"]
     assert [found.name for found in choose_estimates(given, ["one"])] == ["a", "My own", "b=c"]
-
-
-@pytest.mark.parametrize("command", [["cv"], ["train", "--out", "model.npz"]])
-def test_data_before_the_method_is_said(dataset: Path, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    for method in ("regression-trees", "nowhere/own.py:Own"):
-        assert main([*command, str(dataset), method]) == 2
-        said = capsys.readouterr().err
-        assert f"the method comes first: evaluate {command[0]} {method} {dataset}" in said
-    assert main([*command, "nowhere", "regression-trees"]) == 2
-    assert "the method comes first" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -212,17 +201,3 @@ def test_two_groups_with_an_option_of_one_name_are_a_mistake() -> None:
 def test_levels_that_are_none_are_refused() -> None:
     with pytest.raises(InputError, match=r"saturation 100 is not above the black level 128"):
         _ = DataReading(black=128, saturation=100).options
-
-
-def test_the_command_reads_one_camera_and_states_what_it_applied(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    nus8(tmp_path)
-    words = ("--camera", "sonya57", "--saturation", "20000", "--method", "white-patch")
-    assert main(["run", str(tmp_path), *words]) == 0
-    printed = capsys.readouterr().out
-    assert "NUS SonyA57: reproduction angular error of 2 images" in printed
-    assert "saturation: 20000, as the user gave it" in printed
-    assert "black level: darkness_level of the camera's .mat, subtracted: SonyA57 128" in printed
-    assert main(["run", str(tmp_path), "--truth", "left"]) == 2
-    assert "--truth has no meaning for" in capsys.readouterr().err

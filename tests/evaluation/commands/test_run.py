@@ -77,30 +77,6 @@ def test_estimates_of_another_program(thumbnails: Path, tmp_path: Path, capsys: 
 
 
 @pytest.mark.slow
-def test_every_statistic_is_printed_on_request(thumbnails: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", str(thumbnails), "--methods", "white-patch", "--statistics", "all"]) == 0
-    out = capsys.readouterr().out
-    assert re.search(r"95% ┃ +Max\. ┃ < 3° \(%\)", out)
-    assert re.search(r"│ +100\.00 │", out)
-
-
-@pytest.mark.slow
-def test_what_a_method_raises_is_one_sentence(
-    thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "wrong.py").write_text(
-        "class Wrong:\n    name = 'Wrong'\n\n    def estimate(self, image, saturation=None, mask=None):\n"
-        "        return image[999, 999]\n"
-    )
-    out = tmp_path / "out"
-    assert main(["run", str(thumbnails), "--method", f"{tmp_path}/wrong.py:Wrong", "--out", str(out)]) == 2
-    message = capsys.readouterr().err
-    assert "error: Wrong fails on image 0.png: IndexError: index 999 is out of bounds" in message
-    assert "(wrong.py, line 5); correct it and run again" in message
-    assert not out.exists()
-
-
-@pytest.mark.slow
 def test_what_a_method_prints_is_no_part_of_the_json(
     thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

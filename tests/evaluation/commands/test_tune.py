@@ -35,17 +35,6 @@ def test_a_family_is_tuned_and_its_setting_evaluated(
     assert str(out) in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_errors_stand_beside(make_dataset: Callable[[int, int], Path], capsys: pytest.CaptureFixture[str]) -> None:
-    dataset = make_dataset(48, 32)
-    out = dataset.parent / "settings.csv"
-    assert main(["tune", "shades-of-gray@24", str(dataset), "--errors", "recovery", "--out", str(out)]) == 0
-    printed = capsys.readouterr().out
-    assert "recovery angular error, degrees" in printed
-    assert "ground truths: not used for the choice, shown beside it only" in printed
-    assert out.read_text().startswith("rank,setting,method,green_spread,images,recovery_mean,recovery_median,")
-
-
 def test_a_family_that_is_none_is_told_before_anything_is_opened(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tune", "pca", "no/such/data"]) == 2
     told = capsys.readouterr().err

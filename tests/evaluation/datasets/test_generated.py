@@ -94,9 +94,3 @@ def test_parts_are_those_of_generate_and_share_no_picture(made_lut: Path, tmp_pa
     assert parts["train"].scenes[0].read()[0].shape == (20, 24, 3)
     with pytest.raises(InputError, match="no subset 'validation'; it has train, test"):
         open_scenes(tmp_path / "made", options=DataOptions(subset="validation"))
-
-
-def test_a_part_of_what_was_not_divided_is_refused(made_lut: Path, tmp_path: Path) -> None:
-    generate_dataset(open_lut(made_lut), tmp_path / "made", random_scenes(2, 24, 20), [0, 1])
-    with pytest.raises(InputError, match="was not divided"):
-        open_scenes(tmp_path / "made", options=DataOptions(subset="test"))

@@ -153,11 +153,6 @@ def test_a_results_folder_is_told_from_a_data_set(tmp_path: Path) -> None:
             open_scenes(place)
 
 
-def test_a_layout_that_is_none_is_told(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="'magic'"):
-        open_scenes(tmp_path, "magic")
-
-
 def test_what_looks_like_two_must_be_named(place_of: Place, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(place_of("nus8 camera"), copy)
@@ -172,20 +167,6 @@ def test_an_option_without_a_meaning_is_refused(place_of: Place, dataset: Path) 
         open_scenes(place_of("cube-plus"), options=DataOptions(camera="SonyA57"))
     with pytest.raises(InputError, match="--black"):
         open_scenes(dataset, options=DataOptions(black=3))
-
-
-@pytest.mark.parametrize("name", [name for name, copy in COPIES.items() if "black" in LAYOUTS[copy.layout].options])
-def test_levels_that_the_user_gives_replace_the_layouts(name: str, place_of: Place) -> None:
-    given = DataOptions(black=1000, saturation=4500, partial=COPIES[name].partial)
-    data = open_scenes(place_of(name), options=given)
-    if data.layout == "folder":
-        return  # Its table goes first, see test_plain_folder.
-    assert "1000, as the user gave it" in data.treatment["black level"]
-    assert "4500, as the user gave it" in data.treatment["saturation"]
-    for scene in data.scenes:
-        assert scene.saturation == 3500
-        image, _ = scene.read()
-        assert image[-1, 0].tolist() in ([2000, 4000, 3000], [0, 0, 0])  # The latter is an 8-bit thumbnail.
 
 
 @pytest.mark.parametrize("name", COPIES)

@@ -148,15 +148,6 @@ def test_refuses_what_has_no_statistic(errors: list[float], says: str) -> None:
         intervals(errors)
 
 
-def test_refuses_what_it_does_not_know() -> None:
-    with pytest.raises(InputError, match="3 errors of one method and 2 of the other"):
-        paired([1, 2, 3], [1, 2])
-    with pytest.raises(InputError, match="0 resamples"):
-        intervals([1, 2], count=0)
-    with pytest.raises(InputError, match="a confidence of 95"):
-        intervals([1, 2], level=95)
-
-
 def test_groups_are_drawn_and_left_out_whole() -> None:
     random = np.random.default_rng(14)
     names = [str(place) for place in random.permutation(np.repeat(np.arange(7), [1, 2, 3, 4, 5, 6, 7]))]

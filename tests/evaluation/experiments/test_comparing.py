@@ -126,12 +126,6 @@ def test_a_comparison_says_who_is_better_and_when_nobody_is() -> None:
     assert all(made.ratio == pytest.approx((0.8, 0.8, 0.8)) for made in first.statistics)
 
 
-def test_largest_differences_come_first_and_equal_errors_never() -> None:
-    made = match(errors("abcd", [1, 5, 2, 3]), errors("abcd", [2, 1, 2, 3.5]), ("", ""), "reproduction")
-    assert [made.images[place] for place in largest_differences(made)] == ["b", "a", "d"]
-    assert largest_differences(made, 1) == [1]
-
-
 def test_what_is_the_same_but_for_rounding_is_the_same() -> None:
     lights, base = np.ones((3, 3)), np.full(3, 5.0)
     for off_deg, is_same in ((0.009, True), (0.011, False)):

@@ -17,8 +17,7 @@ import pytest
 
 from evaluation.datasets import open_scenes
 from evaluation.experiments import run_folder
-from evaluation.experiments.run_folder import append_answers, describe_run, read_journal, run_methods, write_run
-from evaluation.experiments.running import evaluate
+from evaluation.experiments.run_folder import append_answers, read_journal, run_methods
 from evaluation.learning.model_files import StoredMethod, provenance_of
 from evaluation.learning.standard import standard_learners
 from evaluation.methods import GrayEdge
@@ -216,9 +215,7 @@ def _other_treatment() -> SceneSet:
     ("data", "methods", "what"),
     [
         (_other_truth, METHODS, "data set"),
-        (lambda: as_set(walls(COUNT)), METHODS, "data set"),
         (_other_treatment, METHODS, "treatment"),
-        (mixed_set, METHODS[::-1], "methods"),
         (mixed_set, [METHODS[0], GrayEdge("White-Patch", 0, 9, 0, 0)], "methods"),
         (mixed_set, METHODS[:1], "methods"),
     ],
@@ -277,16 +274,6 @@ def test_errors_are_read_back(whole: Path) -> None:
         np.testing.assert_allclose(read.errors["recovery"], result.errors["recovery"], atol=1e-6)
         assert read.truths is not None
         np.testing.assert_allclose(read.truths, made.truths / made.truths.sum(axis=1, keepdims=True), atol=1e-8)
-
-
-def test_folds_are_written_with_results_that_were_made_otherwise(tmp_path: Path) -> None:
-    data = as_set(walls(4))
-    results = evaluate(data.scenes, METHODS)
-    run = describe_run(data, results, [{"name": "A"}, {"name": "B"}], {"seed": 3}, np.array([0, 1, 0, 1]), ("A note.",))
-    write_run(run, data.scenes, tmp_path / "cv")
-    assert "folds.csv" in content(tmp_path / "cv")
-    assert b'"seed": 3' in content(tmp_path / "cv")["run.json"]
-    assert b"A note." in content(tmp_path / "cv")["report.html"]
 
 
 class Flat:

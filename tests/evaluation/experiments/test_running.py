@@ -43,10 +43,8 @@ class Returns:
     ("value", "cause"),
     [
         (None, "returned None"),
-        ((np.nan, 1, 1), "returned nan 1 1"),
         ((np.inf, 1, 1), "returned inf 1 1"),
         ((0, 0, 0), "returned 0 0 0"),
-        ((1, 1, -0.5), "returned 1 1 -0.5"),
         (GREY, "no usable pixel"),
     ],
 )
@@ -62,14 +60,9 @@ def test_what_is_no_light_is_counted_named_and_taken_as_grey(value: object, caus
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ((1, 1), r"shape \(2,\), expected \(3,\)"),
         (np.ones((4, 3)), r"shape \(4, 3\), expected \(3,\)"),
-        ("red", "returned str, expected three real numbers"),
-        ((1j, 1, 1), "returned tuple of complex128, expected three real numbers"),
-        (np.array([True, True, False]), "returned ndarray of bool, expected three real numbers"),
         (SystemExit(0), r"SystemExit: 0 \(test_running\.py, line \d+\)"),
         (KeyError("where"), r"KeyError: 'where' \(test_running\.py, line \d+\)"),
-        (ValueError("no good"), r"ValueError: no good \(test_running\.py, line \d+\)"),
         (np.array([1 + 1j, 1, 1]), "returned ndarray of complex128, expected three real numbers"),
         ([True, True, False], "returned list of bool, expected three real numbers"),
         (np.ma.masked_array([1.0, 1, 1], [False, False, True]), "returned MaskedArray, expected three real numbers"),
@@ -192,13 +185,6 @@ def test_several_lights_are_judged_by_pixel_and_region() -> None:
     assert (error.recovery, error.rgb) == pytest.approx((0, 0), abs=1e-4)
     # Both are held to the mean light by their one estimate.
     assert local.errors["recovery"][1] == whole.errors["recovery"][1] > 1
-
-
-def test_masked_pixels_of_several_lights_do_not_count() -> None:
-    (result,) = evaluate([MixedWall("masked", LIGHTS, masked=True)], [Returns((1, 1, 1))])
-    error = (result.maps or {})[0]
-    assert error.recovery == pytest.approx(0, abs=1e-4)
-    assert [region.light for region in error.regions] == [1]
 
 
 def _two_pixels(found: Any) -> Any:

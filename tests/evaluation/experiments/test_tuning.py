@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.cross_validation import tune_family, tuning_rows, tuning_table
+from evaluation.experiments.cross_validation import tune_family, tuning_table
 from evaluation.experiments.running import evaluate
 from evaluation.methods.green_stability import family
 from evaluation.scene import Image
@@ -95,14 +95,6 @@ def test_images_without_a_light_are_left_out_and_told() -> None:
     assert tuning_table(tuned).notes == ("1 of 9 images give no light with some setting and do not count for any.",)
     with pytest.raises(InputError, match="only 1 of 2 images give a light"):
         tune_family("shades-of-gray", "shops", scenes[-2:])
-
-
-def test_the_tables_have_every_setting_the_chosen_one_first() -> None:
-    tuned = tune_family("shades-of-gray@12", "shops", BLIND)
-    rows = tuning_rows(tuned)
-    assert len(rows.rows) == len(tuning_table(tuned).rows) == 15
-    assert rows.rows[0] == (1, tuned.settings[0].text, tuned.settings[0].name, tuned.settings[0].spread, 8)
-    assert all(str(row[1]).endswith("@12") for row in rows.rows)
 
 
 def test_a_family_that_is_none() -> None:

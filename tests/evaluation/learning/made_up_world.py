@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.learning.color_beaver import ColorBeaver
 from evaluation.learning.convnet import ConvNet
 from evaluation.learning.feature_learner import FeatureLearner
 from evaluation.learning.log_chroma import LogChroma
@@ -24,6 +25,14 @@ LEARNERS: dict[str, FeatureLearner] = {
     "regression-trees": RegressionTrees(windows=3),
 }
 """All methods; three train for less long, and the network's square is no larger than the scenes."""
+
+QUICK: dict[str, FeatureLearner] = {
+    **LEARNERS,
+    "color-beaver": ColorBeaver(population=12, generations=6),
+    "convnet": ConvNet(working_size=SIZE, epochs=6),
+    "log-chroma": LogChroma(pretraining=2, training=6),
+}
+"""All methods, trained for so little that what they answer is the same again, but need not be right."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod, e
 from evaluation.learning.model_files import load_model, save_model
 from evaluation.metrics import recovery_error
 from foundation.errors import FormatError
-from tests.evaluation.learning.made_up_world import LEARNERS, MadeUp, world
+from tests.evaluation.learning.made_up_world import LEARNERS, QUICK, MadeUp, world
 from tests.evaluation.learning.stories import story
 
 ELSEWHERE, HERE, TEST = world(40, cast=0.4), world(8, seed=2), world(8, seed=1)
@@ -23,11 +23,11 @@ def of(scenes: list[MadeUp], method: LearnedMethod) -> npt.NDArray[np.float64]:
     return np.stack([method.estimate(scene.image) for scene in scenes])
 
 
-@pytest.fixture(scope="module", params=LEARNERS)
+@pytest.fixture(scope="module", params=QUICK)
 def learner(request: pytest.FixtureRequest) -> FeatureLearner:
     if request.param == "convnet":
         pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
-    return LEARNERS[request.param]
+    return QUICK[request.param]
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from evaluation.learning.kernel_ridge import KernelRidge
 from evaluation.learning.log_chroma import LogChroma
 from evaluation.learning.regression_trees import RegressionTrees, consensus
 from evaluation.learning.smart_color_cat import CHOICES, FINE, SmartColorCat
-from evaluation.learning.working_size import lights_from_chromaticities, reduce
+from evaluation.learning.working_size import reduce
 from evaluation.metrics import recovery_error
 from foundation.errors import InputError
 from tests.evaluation.learning.made_up_world import MadeUp, lights_on_a_line, world
@@ -185,18 +185,6 @@ def test_the_penalty_of_kernel_ridge_grows_with_the_images() -> None:
     np.testing.assert_allclose(once.lights(other), twice.lights(other), atol=1e-10)
 
 
-@pytest.mark.parametrize("penalty", [0.0, -1.0, float("nan")])
-def test_kernel_ridge_refuses_a_penalty_that_is_none(penalty: float) -> None:
-    with pytest.raises(ValueError, match="expected a number above 0"):
-        KernelRidge(penalty=penalty)
-
-
-@pytest.mark.parametrize("power", [-0.5, float("inf"), float("nan")])
-def test_kernel_ridge_refuses_a_power_of_brightness_that_is_none(power: float) -> None:
-    with pytest.raises(ValueError, match="0 or more"):
-        KernelRidge(brightness=power)
-
-
 @pytest.mark.parametrize("learner", [KernelRidge, LogChroma])
 def test_counts_of_the_largest_working_size_are_not_cut(learner: type[KernelRidge | LogChroma]) -> None:
     image = np.full((255, 255, 3), RED, np.float32)
@@ -253,22 +241,10 @@ def test_blocks_are_means_of_usable_pixels() -> None:
         assert not black.any()
 
 
-def test_a_light_has_something_of_each_channel() -> None:
-    lights = lights_from_chromaticities(np.array([[1.2, -0.1], [0.25, 0.5]]))
-    np.testing.assert_allclose(lights, [[1.2 / 1.200002, 1e-6 / 1.200002, 1e-6 / 1.200002], [0.25, 0.5, 0.25]])
-
-
 def test_a_band_of_a_file_that_cannot_be_is_refused() -> None:
     learner = ColorBeaver(norms="1 2", corners=2)
     arrays: dict[str, Any] = {"corners": np.zeros((2, 2)), "widths": np.zeros(2), "base": np.array(1)}
     assert learner.restore(arrays).base == 1
-    for name, damage in (
-        ("corners", np.zeros((3, 2))),
-        ("widths", np.zeros(3)),
-        ("base", np.array(-1)),
-        ("base", np.array(2)),
-        ("widths", np.array([0, np.inf])),
-    ):
-        with pytest.raises(ValueError, match="shapes" if name != "widths" or len(damage) == 3 else "not finite"):
-            learner.restore({**arrays, name: damage})
+    with pytest.raises(ValueError, match="shapes"):
+        learner.restore({**arrays, "base": np.array(2)})
     assert learner.restore({**arrays, "base": np.array(0)}).base == 0

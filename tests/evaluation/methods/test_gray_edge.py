@@ -49,12 +49,6 @@ def test_kernels_have_the_authors_size_and_norms(sigma: float) -> None:
     assert [kernels[1].sum(), kernels[2].sum()] == pytest.approx([0, 0], abs=1e-12)
 
 
-@pytest.mark.parametrize(("order", "p", "sigma"), [(3, 1, 1), (0, 0.5, 0), (0, 1, -1), (1, 1, 0)])
-def test_constants_that_make_no_method_are_refused(order: int, p: float, sigma: float) -> None:
-    with pytest.raises(ValueError, match="make no method"):
-        GrayEdge("", order, p, sigma)
-
-
 def photograph(height: int, width: int) -> npt.NDArray[np.uint16]:
     """Return smooth colours, edges and noise (height, width, 3) uint16, none saturated below 16000."""
     random = np.random.default_rng(height + width)

@@ -96,9 +96,3 @@ def test_nearest_known_lights_are_averaged() -> None:
     filled = fill_unknown(lights)
     np.testing.assert_allclose(filled[1, 1], (RED + BLUE) / 2)
     np.testing.assert_allclose(filled[0, 1], RED)
-
-
-@pytest.mark.parametrize("patches", [0, -3])
-def test_no_patches_are_refused(patches: int) -> None:
-    with pytest.raises(ValueError, match="expected 1 or more"):
-        patches_of("pca", patches)

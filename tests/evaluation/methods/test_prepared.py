@@ -60,8 +60,3 @@ def test_independent_noise_misleads_second_derivatives_until_it_is_averaged_away
 def test_no_pixel_left_is_grey() -> None:
     image = np.full((64, 64, 3), 100, np.uint16)
     assert ResizedMethod(standard_methods()["gray-world"], 8).estimate(image, 100) is GREY
-
-
-def test_no_size_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected 1 or more"):
-        ResizedMethod(standard_methods()["gray-world"], 0)

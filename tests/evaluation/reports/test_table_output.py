@@ -72,11 +72,6 @@ def test_rows_have_the_columns_of_the_preamble() -> None:
     assert "\\footnotesize n\\_1" in text
 
 
-def test_braces_match() -> None:
-    text = re.sub(r"\\[{}\\]", "", table_to_latex(Table("{", HEADS, (("}", 1.0, 2.0),))))
-    assert text.count("{") == text.count("}")
-
-
 def test_a_stack_has_one_preamble_and_every_title() -> None:
     tables = [Table(f"Set {number}", HEADS, (("Gray-world", 1.0, 2.0),)) for number in range(3)]
     text = tables_to_latex("All of them", tables)

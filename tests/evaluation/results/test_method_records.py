@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.methods import GrayEdge
 from evaluation.methods.naming import find_method
 from evaluation.results.method_records import describe_method
 
@@ -70,13 +69,6 @@ def test_a_changed_file_is_another_method(tmp_path: Path) -> None:
         records.append(describe_method(find_method(f"{tmp_path}/{number}/own.py:Own")))
     assert records[0] == records[1] != records[2]
     assert records[0]["class"] == "own.py:Own"
-
-
-def test_methods_of_the_suite_differ_by_their_settings() -> None:
-    one, other = (describe_method(GrayEdge("M", 0, p, 0)) for p in (1, np.inf))
-    assert one["settings"]["p"] == 1
-    assert other["settings"]["p"] == "inf"
-    assert "file_sha256" not in one
 
 
 def test_what_a_file_imports_from_beside_it_belongs_to_its_method(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ Tables of results: one light and several are never mixed silently, and images wi
 from __future__ import annotations
 
 import csv
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,7 @@ import pytest
 
 from evaluation.experiments.running import evaluate
 from evaluation.metrics import recovery_error, summarise
-from evaluation.reports.table_output import table_to_latex
-from evaluation.results.result import Subject, images_csv, table_csv
+from evaluation.results.result import Subject
 from evaluation.results.tables import Table, lights_tables, statistics_rows, summary_table, table_to_csv
 from evaluation.scene import MixedScene, Scene
 from tests.evaluation.made_up import MixedWall, walls
@@ -74,25 +72,6 @@ def test_several_lights_are_said_and_told_apart() -> None:
     )
 
 
-def test_the_long_table_says_of_which_images_a_row_is() -> None:
-    scenes: tuple[Scene, ...] = (*walls(3), MixedWall("mixed", LIGHTS))
-    table = statistics_rows(subject_of(scenes), evaluate(scenes, [White((1, 1, 1), None)]))
-    counts = {(row[1], row[2]): (row[3], row[-1]) for row in table.rows}
-    assert counts == {
-        ("recovery", "all"): (4, 1),
-        ("reproduction", "all"): (4, 1),
-        ("recovery", "one"): (3, 1),
-        ("reproduction", "one"): (3, 1),
-        ("recovery", "several"): (1, 0),
-        ("reproduction", "several"): (1, 0),
-        ("pixel_recovery", "several"): (1, 0),
-        ("pixel_reproduction", "several"): (1, 0),
-        ("pixel_rgb", "several"): (1, 0),
-        ("region_recovery", "several"): (2, 0),
-        ("region_reproduction", "several"): (2, 0),
-    }
-
-
 def test_an_image_of_which_nothing_is_judged_is_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     scenes = (MixedWall("seen", LIGHTS), MixedWall("unseen", LIGHTS))
     read = MixedWall.read
@@ -110,21 +89,6 @@ def test_an_image_of_which_nothing_is_judged_is_left_out_and_counted(monkeypatch
     assert row[3] == 1
 
 
-def test_the_tables_of_methods_and_of_images_as_text() -> None:
-    scenes = walls(6)
-    results = evaluate(scenes, [White()])
-    (row,) = csv.DictReader(table_csv(results, "recovery").splitlines())
-    assert list(row) == ["method", "mean", "median", "trimean", "best25", "worst25", "avg", "no_estimate"]
-    assert float(row["mean"]) == pytest.approx(results[0].errors["recovery"].mean(), abs=1e-6)
-    images = list(csv.DictReader(images_csv(scenes, results).splitlines()))
-    assert [image["image"] for image in images] == [scene.name for scene in scenes]
-    errors = [float(image["reproduction"]) for image in images]
-    np.testing.assert_allclose(errors, results[0].errors["reproduction"], atol=1e-6)
-    uneven = replace(results[0], estimates=np.array([[2.0, 3.0, 6.0]]) / 7 * np.ones((len(scenes), 1)))
-    (row, *_) = csv.DictReader(images_csv(scenes, [uneven]).splitlines())
-    assert [float(row[channel]) for channel in "rgb"] == pytest.approx([2 / 11, 3 / 11, 6 / 11], abs=1e-6)
-
-
 def test_causes_are_named_few_at_a_time() -> None:
     scenes = walls(6)
     results = evaluate(scenes, [White(None, (0, 0, 0), (1, 1, 1), None, (1, np.nan, 1))])
@@ -133,17 +97,6 @@ def test_causes_are_named_few_at_a_time() -> None:
         "White: no light for 4 of 6 images (wall 0.png returned None, wall 1.png returned 0 0 0, wall 3.png returned "
         "None …); their light was taken to be grey"
     )
-
-
-def test_a_row_says_itself_that_grey_stands_in() -> None:
-    scenes = walls(6)
-    results = evaluate(scenes, [White(None, (0, 0, 0), (1, 1, 1), None, (1, np.nan, 1))])
-    table = summary_table(subject_of(scenes), results, "recovery")
-    assert table.rows[0][0] == "White (no light: 4 of 6)"
-    assert "White (no light: 4 of 6) & " in table_to_latex(table)
-    assert [line.rpartition(",")[2] for line in table_csv(results, "recovery").splitlines()] == ["no_estimate", "4"]
-    # The count stands in a column of its own where programs read it, beside the plain name.
-    assert {(row[0], row[-1]) for row in statistics_rows(subject_of(scenes), results).rows} == {("White", 4)}
 
 
 TABLE = Table(

@@ -61,12 +61,6 @@ def test_the_truth_of_shi_must_be_asked_for(copy: Path) -> None:
         open_scenes(copy, options=SOME)
 
 
-def test_one_camera(copy: Path) -> None:
-    data = open_scenes(copy, options=DataOptions(partial=True, camera="5d"))
-    assert [scene.name for scene in data.scenes] == ["IMG_0281.png", "IMG_0903.png"]
-    assert data.scenes[1].truth[0] == 568
-
-
 def test_missing_and_superfluous_images(copy: Path) -> None:
     with pytest.raises(FormatError, match=r"565.*568.*8D5U5525.*--partial"):
         open_scenes(copy)

@@ -76,27 +76,6 @@ def test_the_mean_is_over_pixels_of_unlike_lights(copy: Path) -> None:
     np.testing.assert_allclose(scene.truth, np.array([1.25, 1, 0.75]) / 3, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("subset", "names"),
-    [
-        ("train", ["Place1_1", "Place1_12"]),
-        ("test", ["Place2_1", "Place2_123"]),
-        ("mixed", ["Place1_12", "Place2_123"]),
-        ("test-single", ["Place2_1"]),
-    ],
-)
-def test_parts(copy: Path, subset: str, names: list[str]) -> None:
-    data = open_scenes(copy, options=DataOptions(subset=subset))
-    assert [scene.name for scene in data.scenes] == [f"sony/{name}.tiff" for name in names]
-
-
-def test_a_part_without_a_place_is_told(copy: Path) -> None:
-    with pytest.raises(FormatError, match=r"has no \.tiff of val"):
-        open_scenes(copy, options=DataOptions(subset="val"))
-    with pytest.raises(InputError, match="'all'"):
-        open_scenes(copy, options=DataOptions(subset="all"))
-
-
 def test_the_prepared_form(prepared: Path) -> None:
     data = open_scenes(prepared)
     assert [scene.name for scene in data.scenes] == ["sony_512/Place1_1.tiff", "sony_512/Place1_12.tiff"]

@@ -11,7 +11,7 @@ from scipy.io import loadmat
 
 from evaluation.datasets import DataOptions, open_scenes
 from evaluation.datasets.published import nus8 as published
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError
 from tests.evaluation.datasets.made_up import image_of, nus8, write_mat, write_png
 
 
@@ -55,14 +55,6 @@ def test_the_published_numbers_are_those_of_the_whole_set() -> None:
     counts = dict(published._PUBLISHED)
     assert (len(counts), counts.pop("NikonD40"), sum(counts.values())) == (9, 117, 1736)
     assert counts["Canon1DsMkIII"] == 259
-
-
-def test_one_camera(copy: Path) -> None:
-    data = open_scenes(copy, options=DataOptions(camera="sonya57"))
-    assert (data.name, len(data.scenes)) == ("NUS SonyA57", 2)
-    with pytest.raises(InputError, match=r"'Canon600D'.*NikonD5200.*SonyA57"):
-        open_scenes(copy, options=DataOptions(camera="Canon600D"))
-    assert open_scenes(copy / "SonyA57").name == "NUS SonyA57"
 
 
 def test_images_and_tables_in_folders_of_their_own(copy: Path, tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -25,7 +24,6 @@ from evaluation.experiments.paper.colour_reduction import (
     PANEL,
     bits_methods,
     bits_removed,
-    bits_table,
     clear_bits,
     read_table,
     reduce_colours,
@@ -37,20 +35,7 @@ from evaluation.methods.standard import standard_methods
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
 from generator.files import Flash, fit_flash
-
-
-@dataclass(frozen=True, eq=False)
-class Photo:
-    """A made-up raw image."""
-
-    image: npt.NDArray[np.float64]
-    mask: npt.NDArray[np.bool_] | None = None
-    saturation: float | None = None
-    name: str = "photo"
-    truth: npt.NDArray[np.float64] = field(default_factory=lambda: np.array([0.4, 1.0, 0.6]))
-
-    def read(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_] | None]:
-        return self.image, self.mask
+from tests.evaluation.experiments.describing.scenes import Made
 
 
 def photo(seed: int, side: int = 40) -> npt.NDArray[np.float64]:
@@ -97,14 +82,6 @@ def test_no_bit_is_unchanged_within_quantisation(seed: int) -> None:
     assert np.abs(again - codes).max() <= 0.51
 
 
-def test_more_bits_are_farther_away() -> None:
-    image = photo(1)
-    image /= image.max()
-    distances = [float(np.abs(reduced - image).mean()) for reduced in reduce_colours(image, range(8))]
-    assert distances == sorted(distances)
-    assert distances[0] < 0.01 < distances[7]
-
-
 def test_a_masked_pixel_has_no_say() -> None:
     image, mask = photo(2), np.zeros((40, 40), np.bool_)
     mask[:5] = True
@@ -125,7 +102,8 @@ def test_a_black_image_stays_black() -> None:
 def test_images_as_they_are_give_what_evaluate_gives() -> None:
     mask = np.zeros((40, 40), np.bool_)
     mask[:, :8] = True
-    scenes = [Photo(photo(seed), mask if seed % 2 else None, 3.0) for seed in range(4)]
+    light = np.array([0.4, 1.0, 0.6])
+    scenes = [Made("photo", light, photo(seed), 3.0, mask if seed % 2 else None) for seed in range(4)]
     assert any((scene.image >= 3.0).any() for scene in scenes)
     methods = bits_methods(sigma=2)
     found = bits_removed(scenes, methods, (0, 3), workers=2)
@@ -138,15 +116,6 @@ def test_images_as_they_are_give_what_evaluate_gives() -> None:
         near = np.abs(exact.errors["recovery"] - raw.errors["recovery"]).max()
         assert near < 0.15
         assert np.abs(coarse.errors["recovery"] - raw.errors["recovery"]).max() > near
-
-
-@pytest.mark.slow
-def test_the_table_has_every_method_and_number() -> None:
-    found = bits_removed([Photo(photo(3)), Photo(photo(4))], bits_methods(sigma=2), (0, 5))
-    table = bits_table(found, "recovery", "made up")
-    assert [row[:2] for row in table.rows[:3]] == [("Gray-world", "as it is"), ("Gray-world", "0"), ("Gray-world", "5")]
-    assert len(table.rows) == 9
-    assert table.rows[2][3] == float(np.median(found.reduced[5][0].errors["recovery"]))
 
 
 def test_the_usual_scale_is_the_standard_method() -> None:

@@ -7,11 +7,9 @@ Ground truths from files and data sets.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from evaluation.experiments.paper.material import (
@@ -32,21 +30,8 @@ from generator.lights.choices import nearest_lights
 from generator.lights.lighting import RandomLights
 from generator.pictures.random_scenes import random_scenes
 from generator.rendering.matrices import camera_matrix
+from tests.evaluation.experiments.describing.scenes import Made
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
-
-
-@dataclass(frozen=True, eq=False)
-class Photo:
-    """A raw image in memory."""
-
-    image: npt.NDArray[np.float64]
-    mask: npt.NDArray[np.bool_] | None
-    truth: npt.NDArray[np.float64]
-    name: str = "photo"
-    saturation: float | None = None
-
-    def read(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_] | None]:
-        return self.image, self.mask
 
 
 @pytest.mark.parametrize("camera", ["Canon EOS 550D", "Canon EOS-1Ds Mark III", "Canon EOS 600D"])
@@ -91,7 +76,7 @@ def test_a_clipped_sky_is_white() -> None:
 def test_a_source_has_no_chart() -> None:
     mask = np.zeros((8, 8), np.bool_)
     mask[:3, :3] = True
-    scene = Photo(np.full((8, 8, 3), 500.0), mask, np.array([1.0, 1.0, 1.0]))
+    scene = Made("photo", np.array([1.0, 1.0, 1.0]), np.full((8, 8, 3), 500.0), None, mask)
     (source,) = developed(SceneSet("made up", "none", "here", (scene,)), camera_matrix("EOS 550D"))
     picture = source.read().picture
     assert not picture[mask].any()
@@ -102,13 +87,8 @@ def test_a_source_has_no_chart() -> None:
 
 def test_black_stays_black() -> None:
     assert not develop(np.zeros((4, 4, 3)), np.ones(3)).any()
-    assert not DevelopedSource(Photo(np.ones((2, 2, 3)), np.ones((2, 2), np.bool_), np.ones(3))).read().picture.any()
-
-
-@pytest.mark.parametrize("light", [[0.0, 1, 1], [np.nan, 1, 1]])
-def test_a_light_has_three_channels(light: list[float]) -> None:
-    with pytest.raises(InputError, match="cannot be balanced"):
-        develop(np.ones((2, 2, 3)), np.array(light))
+    masked = Made("photo", np.ones(3), np.ones((2, 2, 3)), None, np.ones((2, 2), np.bool_))
+    assert not DevelopedSource(masked).read().picture.any()
 
 
 SOURCES = random_scenes(6, 40, 30, seed=3)

@@ -9,11 +9,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from evaluation.experiments.paper import reporting
-from evaluation.experiments.paper.colour_reduction import bits_methods, bits_removed
-from evaluation.experiments.paper.reporting import chromaticity_rows, coverage_table, standalone
-from evaluation.experiments.paper.table1 import SizeRow
+from evaluation.experiments.paper.reporting import coverage_table, standalone
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
-from tests.evaluation.experiments.paper.test_colour_reduction import Photo, photo
 
 RB = LIGHTS[:, [0, 2]] / LIGHTS.sum(axis=1, keepdims=True)
 
@@ -23,39 +20,6 @@ def drawn(draw: Any, *arguments: Any) -> list[Any]:
     figure: Any = Figure()
     draw(figure, *arguments)
     return figure.axes
-
-
-@pytest.mark.slow
-def test_each_method_has_its_medians_and_that_of_the_images_as_they_are() -> None:
-    found = bits_removed([Photo(photo(seed)) for seed in range(3)], bits_methods(sigma=2), (0, 5))
-    (axes,) = drawn(reporting._draw_bits, found, "recovery")
-    lines = axes.lines
-    assert len(lines) == 2 * len(found.raw)
-    for place, raw in enumerate(found.raw):
-        line, level = lines[2 * place : 2 * place + 2]
-        assert list(line.get_xdata()) == [0, 5]
-        assert list(line.get_ydata()) == [
-            results[place].summary("recovery").median for results in found.reduced.values()
-        ]
-        assert list(level.get_ydata()) == [raw.summary("recovery").median] * 2
-        assert line.get_label() == raw.method
-        assert line.get_color() == level.get_color()
-    assert len({line.get_marker() for line in lines[::2]}) == len(found.raw)
-    assert axes.get_ylim()[0] == 0
-    assert "recovery" in axes.get_ylabel()
-
-
-def test_each_data_set_has_its_medians_by_the_side_of_its_images() -> None:
-    cells = ("C1", "6D", "Random"), ("C1", "550D", "Random")
-    rows = [SizeRow(cell, side, {"M": number + side / 100}) for number, cell in enumerate(cells) for side in (12, 48)]
-    (axes,) = drawn(reporting._draw_sizes, rows, "M")
-    shown = {line.get_label(): (list(line.get_xdata()), list(line.get_ydata())) for line in axes.lines}
-    assert shown == {
-        "C1 scenes, 6D sensor, random illuminations": ([12, 48], [0.12, 0.48]),
-        "C1 scenes, 550D sensor, random illuminations": ([12, 48], [1.12, 1.48]),
-    }
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["12", "48"]
-    assert (axes.get_xscale(), axes.get_ylim()[0]) == ("log", 0)
 
 
 def test_lights_and_ground_truths_lie_at_their_chromaticities(make_table: TableMaker) -> None:
@@ -75,15 +39,6 @@ def test_lights_and_ground_truths_lie_at_their_chromaticities(make_table: TableM
         low, high = axes.get_xlim()
         assert (low, high) == axes.get_ylim()
         assert (low, high) == pytest.approx((0, 1.04 * RB.max()))
-
-
-def test_they_are_the_lights_of_the_table(make_table: TableMaker) -> None:
-    lut = make_table("Canon EOS 550D")
-    rows = chromaticity_rows([lut]).rows
-    for row, (red, green, blue) in zip(rows, LIGHTS.tolist(), strict=True):
-        assert row[4:] == pytest.approx((red / (red + green + blue), blue / (red + green + blue)), abs=1e-6)
-    assert [row[2] for row in rows] == ["uniform", "uniform", "blackbody", "blackbody"]
-    assert rows[2][:4] == ("Canon EOS 550D", 2, "blackbody", 3002.0)
 
 
 def test_the_distance_of_ground_truths(make_table: TableMaker) -> None:

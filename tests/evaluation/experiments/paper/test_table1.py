@@ -25,8 +25,6 @@ from evaluation.experiments.paper.table1 import (
     print_table,
     sensor_of,
     settings,
-    size_dependence,
-    size_table,
     table1,
 )
 from evaluation.experiments.running import evaluate
@@ -40,8 +38,7 @@ HOT_PICTURES = random_scenes(4, 24, 16, seed=8)
 TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
 
 
-def test_values_are_raised_and_cut(make_table: TableMaker) -> None:
-    del make_table
+def test_values_are_raised_and_cut() -> None:
     samples = np.array([[[10, 20, 30], [40, 50, 60]]], np.uint16)
     hot = HotPhotosites(np.array([0, 5]), np.array([7.4, 1e5]))
     np.testing.assert_array_equal(hot.raise_in(samples, 100), [[[17, 20, 30], [40, 50, 99]]])
@@ -165,20 +162,6 @@ def test_the_numbers_are_evaluate_s(make_table: TableMaker) -> None:
         np.testing.assert_array_equal(ours.errors["reproduction"], usual.errors["reproduction"])
 
 
-def test_the_paper_s_row_stands_below_ours(make_table: TableMaker) -> None:
-    (block,) = table1(small(make_table, (0.05, 0.05))[5:6])
-    table = block_table(block, "reproduction")
-    assert table.title == "Random scenes, 6D sensor, random illuminations"
-    assert [row[0] for row in table.rows[::2]] == ["White-Patch", "Gray-world", "Shades-of-Gray (p=2)"]
-    assert [row[0] for row in table.rows[1::2]] == ["paper"] * 3
-    assert table.rows[1][1:] == (2.46, 2.15, 2.33, 0.88, 4.34, 2.16)
-    assert table.rows[0][1:] == block.results[0].summary("reproduction").as_tuple()
-    assert block_table(block, "recovery").rows[0] != table.rows[0]
-    joint = joint_table([block])
-    assert len(joint.rows) == 3 * 3
-    assert joint.rows[2][:6] == ("Random", "6D", "Random", 5, "White-Patch", "paper")
-
-
 def test_another_camera_has_no_numbers_of_the_paper(make_table: TableMaker) -> None:
     lut = make_table("Kodak Brownie")
     assert sensor_of(lut) == "Kodak Brownie"
@@ -203,15 +186,6 @@ def test_other_pictures_and_lights_have_no_numbers_of_the_paper(make_table: Tabl
 def test_images_without_a_usable_pixel_are_told(make_table: TableMaker) -> None:
     blocks = table1(settings([make_table("Test")], [*PICTURES[:4], Black()], TRUTHS, side=24))
     assert "White-Patch: no usable pixel in 1 image, whose" in " ".join(block_table(blocks[0], "recovery").notes)
-
-
-def test_the_size_of_images_matters_where_there_is_noise(make_table: TableMaker) -> None:
-    rows = size_dependence([make_table("Test", noise=0.2)], PICTURES, TRUTHS, (24, 96), names=("C1", "L"))
-    assert [(row.cell, row.side) for row in rows[:2]] == [(("C1", "Test", "L"), 24), (("C1", "Test", "Random"), 24)]
-    assert len(rows) == 8
-    table = size_table(rows)
-    assert table.rows[0][1] == 24
-    assert table.rows[0][2] == rows[0].medians["White-Patch"]
 
 
 def test_no_pictures(make_table: TableMaker) -> None:

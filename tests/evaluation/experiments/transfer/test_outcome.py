@@ -7,9 +7,7 @@ Forest plots: every ratio where it belongs, what is not known nowhere, and a wid
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from math import inf, nan
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +15,6 @@ import pytest
 
 from evaluation.experiments.bootstrap import STATISTICS, intervals, paired
 from evaluation.experiments.transfer.outcome import (
-    HEADS,
     BoundedFigure,
     ForestLine,
     beside_plot,
@@ -27,16 +24,10 @@ from evaluation.experiments.transfer.outcome import (
     forest_plot,
     harm_notes,
     intervals_table,
-    long_table,
-    naive_ratios_table,
-    paper_ratios_table,
-    real_ratios_table,
-    round_numbers,
 )
 from evaluation.experiments.transfer.rows import Kind, TransferRow, Way
 from evaluation.metrics import summarise
 from evaluation.results.result import Result
-from evaluation.results.tables import table_to_csv
 from foundation.errors import InputError
 
 ERRORS = np.arange(1.0, 41.0)
@@ -48,28 +39,6 @@ def _plain_row(kind: Kind, *gains: float, guessed: int = 0, images: int = 9) -> 
         Result("Trees", np.ones((40, 3)), {"recovery": gain * ERRORS, "reproduction": ERRORS}, blind) for gain in gains
     )
     return TransferRow("Trees", kind, "" if kind in ("cross-validation", "none") else "made", images, results)
-
-
-def test_all_statistics_stand_in_every_table() -> None:
-    found = figures_of(
-        [_plain_row("cross-validation", 1.0), _plain_row("generated", 2.0), _plain_row("naive", 4.0)], "recovery"
-    )
-    naive = naive_ratios_table(found, "Real")
-    assert naive is not None
-    for table in (
-        errors_table(found, "Real", 40),
-        intervals_table(found, "Real"),
-        real_ratios_table(found, "Real"),
-        naive,
-    ):
-        assert table.columns[-6:] == HEADS
-    assert errors_table(found, "Real", 40).texts()[1][:5] == ("Trees", "made: generated", "9", "41.00", "41.00")
-    # Twice the errors on every image: the interval of the ratio has no width.
-    ratios = real_ratios_table(found, "Real")
-    assert ratios.columns[2:4] == ("Images", "Base")
-    assert ratios.texts()[0][2:] == ("9", "9", *("2.00 (2.00 – 2.00)",) * 6)
-    assert naive.texts()[0][1:5] == ("made: linear sRGB × light", "9", "9", "0.50 (0.50 – 0.50)")
-    assert naive_ratios_table(figures_of([_plain_row("generated", 1.0)], "recovery"), "Real") is None
 
 
 def _beside(kind: Kind, way: Way, gain: float, real: str = "20") -> TransferRow:
@@ -125,32 +94,6 @@ def test_what_a_number_hides_is_noted() -> None:
         "Means over seeds; the standard deviation of a median over seeds is up to 2.90 degrees.",
     )
     assert table.texts()[1][2] == "–"
-
-
-def test_all_numbers_for_other_programs() -> None:
-    found = figures_of([_plain_row("cross-validation", 1.0), _plain_row("generated", 2.0, 4.0)], "recovery")
-    lines = table_to_csv(long_table(found)).splitlines()
-    assert lines[0].split(",") == [
-        *("method", "training", "data", "images", "seeds", "error", "statistic", "degrees", "low", "high"),
-        *("seed_sd", "ratio_to_real", "ratio_low", "ratio_high", "way", "real"),
-    ]
-    assert len(lines) == 13
-    fields = dict(zip(lines[0].split(","), lines[8].split(","), strict=True))
-    assert (fields["statistic"], fields["training"], fields["seeds"]) == ("median", "generated", "2")
-    assert float(fields["degrees"]) == pytest.approx(61.5)
-    assert float(fields["ratio_to_real"]) == pytest.approx(3)
-    assert lines[1].endswith(",,,,")
-
-
-def test_the_papers_ratios_by_hand() -> None:
-    medians = {row[0]: row[3] for row in paper_ratios_table().rows}
-    assert medians == pytest.approx(
-        {
-            "Regression trees (simple features)": 1.66 / 0.89,
-            "Smart Color Cat": 1.43 / 1.35,
-            "Color Beaver (using Gray-world)": 0.74 / 0.77,
-        }
-    )
 
 
 RANDOM = np.random.default_rng(3)
@@ -252,64 +195,11 @@ def test_a_faultless_base_has_no_ratio() -> None:
 PANELS = ("Med.", "Mean")
 
 
-def markers(svg: bytes) -> list[tuple[float, float]]:
-    """Return where markers stand: x, y in points from the top left."""
-    uses = re.findall(r'<use xlink:href="#\w+" x="([\d.]+)" y="([\d.]+)" style="fill: #', svg.decode())
-    return [(float(x), float(y)) for x, y in uses]
-
-
 def line(label: str, *ratios: tuple[float, float, float], whole: bool = True) -> ForestLine:
     return ForestLine(label, tuple(BoundedFigure(*ratio) for ratio in ratios), whole=whole)
-
-
-def test_ratios_stand_on_a_logarithmic_axis_from_top_to_bottom() -> None:
-    lines = [
-        line("half", (0.5, 0.4, 0.6), (1, 0.9, 1.1)),
-        line("one", (1, 0.9, 1.1), (2, 1.9, 2.2), whole=False),
-        line("two", (2, 1.8, 2.5), (0.5, 0.4, 0.6)),
-    ]
-    first, second = markers(forest_plot(lines, PANELS))[:3], markers(forest_plot(lines, PANELS))[3:]
-    assert len(first) == len(second) == 3
-    (half, one, two), ys = zip(*first, strict=True)
-    assert one - half == pytest.approx(two - one, abs=0.01) != 0
-    assert half < one < two
-    assert ys == tuple(sorted(ys))
-    # The panels share their scale.
-    assert second[1][0] - second[0][0] == pytest.approx(two - one, abs=0.01)
-
-
-def test_what_is_not_known_is_not_drawn() -> None:
-    known = line("known", (1.2, 1, 1.4), (0.9, nan, nan))
-    unknown = line("unknown", (nan, nan, nan), (inf, nan, nan))
-    assert len(markers(forest_plot([ForestLine("Method"), known, unknown], PANELS))) == 2
-    assert not markers(forest_plot([ForestLine("Method"), unknown], PANELS))
-
-
-@pytest.mark.slow
-def test_a_wide_interval_does_not_squeeze_the_others() -> None:
-    def distance(end: float) -> float:
-        lines = [line("a", (1.0, 0.9, end), (1, 1, 1)), line("b", (1.2, 1.1, 1.3), (1, 1, 1))]
-        (a, b), _ = zip(*markers(forest_plot(lines, PANELS))[:2], strict=True)
-        return b - a
-
-    assert distance(1000) > 0.1 * distance(1.3)
-    assert distance(1000) == distance(10000)
 
 
 def test_names_stand_as_they_are() -> None:
     svg = forest_plot([ForestLine("Trees <$x_1$>"), line("_mine", (1, 1, 1), (1, 1, 1))], PANELS).decode()
     for text in ("Trees &lt;$x_1$&gt;", "_mine", *PANELS):
         assert f">{text}</text>" in svg
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [
-        (0.79, 1.26, [0.8, 0.9, 1, 1.1, 1.25]),
-        (0.2, 1.3, [0.2, 0.3, 0.5, 0.7, 1]),
-        (0.5, 40, [1, 3, 7, 15]),
-        (0.01, 900, [0.015, 0.125, 1, 7, 50, 500]),
-    ],
-)
-def test_numbers_of_an_axis_are_few_and_within_it(low: float, high: float, expected: list[float]) -> None:
-    assert round_numbers(low, high) == expected
