@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, get_args
 import pytest
 
 from calibration.citation import NOT_RECORDED, OriginRecord
-from generator.dataset.cards import CONFORMS_TO, OPEN, card, datasheet, kind_of, size_category
+from generator.dataset.cards import CONFORMS_TO, OPEN, card, datasheet, kind_of
 from generator.dataset.joined import JOINED
 from generator.dataset.layouts import Description, Layout, Split
 from generator.dataset.making import generate_dataset
@@ -99,11 +99,6 @@ def test_the_data_set_of_a_folder_loads_by_its_card(plain: Dataset, tmp_path: Pa
     load = import_module("datasets").load_dataset
     rows = load(str(place_of(plain)), split="train", cache_dir=str(tmp_path / "cache"))
     assert [row["image"] for row in rows] == [entry.image for entry in plain.entries]
-
-
-@pytest.mark.parametrize(("images", "name"), [(999, "n<1K"), (1000, "1K<n<10K"), (2_000_000, "1M<n<10M")])
-def test_sizes_are_the_hubs(images: int, name: str) -> None:
-    assert size_category(images) == name
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from calibration.table.lut import Lut
 
-BARE = DatasetOptions(previews=False)
+BARE = DatasetOptions(rendering="codes", previews=False)
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def small(make_lut: Callable[..., Lut], tmp_path: Path) -> Path:
         tmp_path / "small",
         random_scenes(2, 24, 16),
         [1],
-        options=DatasetOptions(form="tiff", previews=False),
+        options=DatasetOptions(rendering="codes", form="tiff", previews=False),
     )
     return tmp_path / "small"
 

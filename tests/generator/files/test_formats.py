@@ -88,7 +88,7 @@ def test_opencv_reads_the_same(form: Format) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", WHOLE)
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(image=images)
 def test_any_image_comes_back(form: Format, image: Image16) -> None:
     np.testing.assert_array_equal(decode_image(encode_image(image, form, METADATA), form, "image"), image)
@@ -206,14 +206,6 @@ def test_jpeg_xl_is_one_lossless_codestream() -> None:
     # ISO/IEC 18181-2, 5: the signature box; 16-bit lossless wants level 10, which only a container can tell.
     assert data[:12] == bytes.fromhex("0000000c 4a584c20 0d0a870a")
     np.testing.assert_array_equal(imagecodecs.jpegxl_decode(data), image)
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_other_arrays_are_refused(form: Format) -> None:
-    with pytest.raises(InputError, match=r"the image is uint16 \(4, 4\)"):
-        encode_image(np.zeros((4, 4), np.uint16), form, METADATA)
-    with pytest.raises(InputError, match=r"the image is uint16 \(0, 4, 3\)"):
-        encode_image(np.zeros((0, 4, 3), np.uint16), form, METADATA)
 
 
 @pytest.mark.parametrize(("form", "width", "height"), [("tiff", 30000, 24000), ("dng", 60000, 36000)])
