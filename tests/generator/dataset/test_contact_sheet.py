@@ -137,16 +137,3 @@ def test_lights_are_named_once_above_what_they_light(
         assert pictures[column].x0 < x < pictures[column].x1
         assert y > pictures[column].y1
     assert f"{len(lights)} light{'s' * (len(lights) > 1)}," in " ".join(text.get_text() for text in sheet.texts)
-
-
-def test_names_and_lights_stand_below_their_pictures(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
-    made = made_of(make_lut(), tmp_path / "out", 12, RandomLights(1, 4, 0), size=(16, 24))
-    sheet = draw(made, MAX_ROWS, MAX_COLUMNS)
-    assert images_on(sheet) == 12
-    pictures = [axes.get_position() for axes in sheet.axes if axes.images]
-    words = [(text.get_text(), *text.get_position()) for text in sheet.texts]
-    labels = {str(light.illumination): light.label for light in made.description.lights}
-    for entry, box in zip(made.entries, pictures, strict=True):
-        below = [other.y1 for other in pictures if other.y1 < box.y0]
-        near = [word for word, x, y in words if box.x0 <= x < box.x0 + 0.2 and max(below, default=0) < y < box.y0]
-        assert near[:2] == [labels[entry.lights[0]], entry.source]

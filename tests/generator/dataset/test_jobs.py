@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from evaluation.datasets.generated import open_generated
-from foundation.errors import FormatError, InputError
+from foundation.errors import InputError
 from generator import open_lut, read_picture, render
 from generator.cli import main
 from generator.dataset.making import generate_dataset
@@ -95,16 +95,6 @@ class TestFullScale:
         else:
             assert f"{white} is white here" in Path("plain/README.md").read_text()
             assert f"round(v * {white} / 65535)" in Path("full/README.md").read_text()
-
-    @pytest.mark.slow
-    def test_software_that_knows_nothing_of_it_refuses_it(self, lut: Lut) -> None:
-        """By the version, which readers of version 2 hold against 2; a later one is refused by this software, too."""
-        assert main(("lut", "full", "--sources", "pictures", "--scale", "full")) == 0
-        text = Path("full/dataset.json").read_text()
-        assert '"version": 3' in text
-        Path("full/dataset.json").write_text(text.replace('"version": 3', '"version": 4'))
-        with pytest.raises(FormatError, match="of versions 1 to 3"):
-            open_dataset("full")
 
 
 class TestExactSplit:
