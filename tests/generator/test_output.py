@@ -88,7 +88,6 @@ def place(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         ((), "that of Test camera is not known, so this one was fitted; if the print's colours were", "dcraw"),
         (("--matrix", "table"), "colour matrix: table (least squares", "is not known"),
         (("--matrix", "Canon EOS 600D"), f"colour matrix: Canon EOS 600D ({SOURCE})", "faults"),
-        (("--matrix", "none"), "colour matrix: none (none asked for", "faults"),
     ],
 )
 def test_the_matrix_is_told(

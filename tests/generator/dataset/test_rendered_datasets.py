@@ -114,8 +114,6 @@ def test_by_colour_is_what_is_made_unasked_and_rendered_in_one_call(
     (first, *_) = find_pictures(pictures)
     image = render(lut, first.read().picture, 3, seed=5, image=1)
     np.testing.assert_array_equal(image, dataset.read_image(dataset.entries[1]))
-    with pytest.raises(InputError, match="'inks'"):
-        render(lut, first.read().picture, 3, rendering="inks")  # pyrefly: ignore[bad-argument-type]
 
 
 def test_what_was_begun_or_made_by_codes_goes_on_so(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:

@@ -188,18 +188,6 @@ def test_the_head_of_exr_is_that_of_the_standard() -> None:
         assert struct.unpack_from("<2i", data, start) == (line, stop - start - 8)
 
 
-def test_exr_is_float_under_zip_and_tells_its_shot(tmp_path: Path) -> None:
-    image = noisy(40, 30)
-    path = tmp_path / "image.exr"
-    path.write_bytes(encode_image(image, "exr", METADATA))
-    stream = oiio.ImageInput.open(str(path))
-    assert stream is not None
-    spec = stream.spec()
-    assert spec.getattribute("compression") == "zip"
-    assert spec.getattribute("crop:white") == (2046.0, 1579.5, 4520.0)
-    np.testing.assert_array_equal(by_openimageio(path), image)
-
-
 def test_jpeg_xl_is_one_lossless_codestream() -> None:
     image = noisy(20, 30)
     data = encode_image(image, "jxl", METADATA)

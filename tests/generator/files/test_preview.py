@@ -46,13 +46,6 @@ def test_codes_of_eight_bits_lose_little() -> None:
     assert np.median(np.abs(back / image - 1)) < 0.02
 
 
-def test_black_stays_black() -> None:
-    image = np.zeros((2, 2, 3))
-    assert not flash(image).any()
-    image[0, 0] = 0.5
-    assert flash(image)[1, 1].tolist() == [0, 0, 0]
-
-
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_single_precision_moves_no_code_by_more_than_one(gamma: float) -> None:
     image = np.random.default_rng(4).exponential(0.05, (200, 200, 3))

@@ -14,7 +14,7 @@ import pytest
 from foundation.errors import InputError
 from generator.lights.choices import SimultaneousLights, matched_lights, nearest_lights, parse_light
 from generator.lights.gamut import Gamut
-from generator.lights.lighting import LightChoice, Lighting, ListedLights, Mixture, RandomLights, plain
+from generator.lights.lighting import LightChoice, Lighting, RandomLights, plain
 from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
@@ -45,14 +45,6 @@ def test_random_lights_are_distinct_even_and_their_seeds() -> None:
 def test_more_random_lights_than_the_table_has_are_refused(count: int) -> None:
     with pytest.raises(InputError, match=f"{count} random lights a picture were asked for; the table has 10"):
         RandomLights(count, 10, 0)
-
-
-def test_listed_lights_may_be_mixtures() -> None:
-    mixture = Mixture((1, 3), (0.5, 0.5))
-    choice = ListedLights((2, mixture))
-    assert choice.lights_each == 2
-    assert choice.lightings_of(5) == (Lighting((plain(2),)), Lighting((mixture,)))
-    assert choice.describe() == {"choice": "listed", "lights": [2, "1:0.5+3:0.5"]}
 
 
 def test_nearest_is_by_angle(make_lut: Callable[..., Lut]) -> None:

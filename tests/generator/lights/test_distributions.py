@@ -28,7 +28,6 @@ from generator.lights.lighting import LightChoice
 from generator.philox import CHROMATICITIES, words
 from generator.statistics import log_chroma
 from tests.data_files import available
-from tests.generator.stats_files import write_stats
 
 
 def clusters() -> npt.NDArray[np.float64]:
@@ -61,14 +60,6 @@ def test_channel_gains_move_the_density_and_change_nothing_else() -> None:
     lights, gains = clusters(), np.array([2.0, 1.0, 0.3])
     moved = drawn(LogKernels.of(lights * gains), 100) - drawn(LogKernels.of(lights), 100)
     assert moved == pytest.approx(np.log(gains[[0, 2]])[None].repeat(100, axis=0))
-
-
-def test_a_file_of_statistics_is_a_distribution(tmp_path: Path) -> None:
-    path = write_stats(tmp_path / "s.json", clusters(), {})
-    found = parse_distribution(str(path))
-    assert isinstance(found, LogKernels)
-    assert found.describe()["lights"] == 200
-    assert found.describe()["file"] == "s.json"
 
 
 @pytest.mark.parametrize(
@@ -109,14 +100,9 @@ def test_ground_truths_of_every_layout(tmp_path: Path, text: str) -> None:
     ("text", "message"),
     [
         ("", "is empty"),
-        ("File,R,Green\na,1,2\n", "line 1: no columns GT_R,GT_G,GT_B or r,g,b; found file,r,green"),
-        ("r,g,b\n", "holds no ground truth"),
-        ("1 2 3\n4 5\n", "line 2: '4 5' is no ground truth: expected 3 numbers, found 2"),
-        ("r,g,b\n1,2\n", "line 2: '1,2' is no ground truth"),
         ("1 2 3\n\n1 x 3\n", "line 3: '1 x 3' is no ground truth"),
         ("1 2 -3\n", "expected numbers from 0"),
         ("nan 2 3\n", "expected numbers from 0"),
-        ("0 0 0\n", "sum above 0"),
     ],
 )
 def test_a_bad_ground_truth_is_named_with_its_line(tmp_path: Path, text: str, message: str) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from calibration.table.lut import Lut
 from foundation.errors import CropError, FormatError, InputError
-from generator.lights.choices import DrawnLights, SequentialLights, SimultaneousLights
+from generator.lights.choices import SequentialLights
 from generator.lights.gamut import Gamut
 from generator.lights.lighting import plain
 from generator.lights.request import LightRequest, load_named_truths, named_lights
@@ -102,24 +102,3 @@ def test_ground_truths_of_a_file(make_lut: Callable[..., Lut], truths: Path) -> 
     both = LightRequest(match=truths, lights_per_image=2, masks="window").choose(lut, 3)
     assert both.lights_each == 1
     assert [both.lightings_of(at)[0].mixtures for at in range(2)] == [(plain(2), plain(0)), (plain(1), plain(2))]
-
-
-def test_a_distribution_with_several_lights_an_image(make_lut: Callable[..., Lut]) -> None:
-    lut = make_lut()
-    # The table's lights lie on a line; one more direction gives them a gamut.
-    lut.white[0] = [9000, 1000, 1000]
-    request = LightRequest(distribution="uniform", random=3, lights_per_image=2, masks="spots:count=1")
-    choice = request.choose(lut, 3)
-    assert isinstance(choice, SimultaneousLights)
-    assert choice.lights_each == 3
-    assert isinstance(choice.choice, DrawnLights)
-    lightings = choice.lightings_of(0)
-    assert [len(lighting.mixtures) for lighting in lightings] == [2, 2, 2]
-    weights = lightings[0].weights_of(20, 30)
-    assert weights.shape == (20, 30, 2)
-    assert not np.array_equal(weights, lightings[1].weights_of(20, 30))
-
-
-def test_the_nearest_that_is_possible(make_lut: Callable[..., Lut]) -> None:
-    choice = LightRequest(light=("r=.9,b=.05",), outside="nearest").choose(make_lut(), 0)
-    assert choice.lightings_of(0)[0].mixtures == (plain(3),)

@@ -345,16 +345,6 @@ def test_size_and_exposure(table: Lut, capsys: pytest.CaptureFixture[str]) -> No
     assert np.median(reached) == pytest.approx(0.4, abs=0.08)
 
 
-def test_thumbnails_say_nothing_of_size(table: Lut, capsys: pytest.CaptureFixture[str]) -> None:
-    data = {"name": "small", "layout": "thumbnails", "place": "", "images": 100}
-    write_stats(Path("s.json"), lights_of(table), real_numbers(0.5), data=data)
-    assert main(("lut", "out", *WISH)) == 0
-    printed = capsys.readouterr().out
-    assert "size: small is of thumbnails" in printed
-    assert "exposure: that of small is not known without its saturation" in printed
-    assert (recorded()["like"]["in"], "crop" in recorded()) == (["lights", "pictures", "exposure", "size"], False)
-
-
 def test_what_other_options_say_is_not_followed(table: Lut) -> None:
     write_stats(Path("s.json"), lights_of(table), real_numbers(0.5))
     wish = ("--sources", "pictures", "--no-preview", "--like", "s.json")

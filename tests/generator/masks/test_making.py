@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from hypothesis.extra import numpy as hnp
 from foundation.errors import FormatError
 from generator.masks.making import (
     FULL,
-    MaskMaker,
     RandomStreams,
     Windows,
     find_masks,
@@ -182,13 +180,6 @@ def test_every_light_falls_somewhere(kind: str) -> None:
     shares = np.array([weights(kind, 30, 40, 3, number=number).mean(axis=(0, 1)) for number in range(40)])
     assert shares.mean(axis=0).min() > 0.08
     assert (shares > 0.01).mean() > 0.8
-
-
-def test_masks_travel_to_other_programs() -> None:
-    plan = parse_masks("window:columns=3", 2, 5)
-    again = pickle.loads(pickle.dumps(plan))
-    assert isinstance(plan.maker(3), MaskMaker)
-    np.testing.assert_array_equal(again.maker(3).weights(40, 50, 2), plan.maker(3).weights(40, 50, 2))
 
 
 def test_a_half_plane_has_its_angle() -> None:

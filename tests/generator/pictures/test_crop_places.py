@@ -42,12 +42,6 @@ def test_the_first_of_several_is_in_the_centre_where_that_is_said(path: Path) ->
     assert (cuts[0].left, cuts[0].top) == (22, 19)
     np.testing.assert_array_equal(cuts[0].picture, whole)
     assert len({(cut.left, cut.top) for cut in cuts}) == 4
-    assert wish.describe()["crop_at"] == "centre"
-    assert Preparation(crop=(16, 12), crops=4).describe()["crop_at"] == "random"
-    assert Preparation(crop=(16, 12)).describe()["crop_at"] == "centre"
-    every = random_places((3, 2), (9, 9), 6, 1, "x", (1, 0))
-    assert every[0] == (1, 0)
-    assert len(set(every)) == 6
 
 
 def test_crops_keep_away_from_each_other() -> None:

@@ -161,12 +161,6 @@ def test_a_grey_profile_is_applied(tmp_path: Path) -> None:
     assert np.abs(reading.picture - code[..., None]).max() <= 1.5
 
 
-def test_a_grey_profile_says_nothing_of_colours(dull: Codes) -> None:
-    codes, word = to_srgb(dull, gamma_profile("Grey 1.8", 1.8, None))
-    np.testing.assert_array_equal(codes, dull)
-    assert word == "Grey 1.8 of grey, not applied to colours, taken as sRGB"
-
-
 @pytest.mark.parametrize("mode", ["YCbCr", "L", "CMYK"])
 def test_jpeg_gives_the_codes_that_pillow_gives(tmp_path: Path, dull: Codes, mode: str) -> None:
     path = tmp_path / "picture.jpg"

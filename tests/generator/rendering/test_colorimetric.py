@@ -86,6 +86,7 @@ def test_a_print_of_known_colours_is_met_where_it_can_be(make_table: MakeTable) 
     shown = (seen - seen[0].mean()) / (seen[-1].mean() - seen[0].mean())
     assert np.abs(shown - wanted)[inside].max() < 0.03
     assert rendering.map.distance[inside].mean() < 0.2
+    assert rendering.black(plain(1)) == pytest.approx(profile_of(lut, 1).black, rel=0.1)
 
 
 @pytest.mark.parametrize(("blue_paper", "white"), [(0.85, 0.99 * 0.85), (0.9, 0.97 * 0.9)])
@@ -114,14 +115,10 @@ def test_places_are_the_inverse_of_what_is_seen() -> None:
 
 
 def test_black_is_as_dark_as_it_can_be_grey(make_table: MakeTable) -> None:
-    lut = make_table(bits=4)
-    profile = profile_of(lut, 1)
-    assert ColorimetricRendering(lut, MINE).black(plain(1)) == pytest.approx(profile.black, rel=0.1)
-
     def redden(samples: npt.NDArray[np.uint16]) -> None:
         samples[:] = np.rint(samples * [1.1, 1.0, 0.9])
 
-    tinted = make_table(bits=4, change=redden, name="tinted")
+    tinted = make_table(bits=4, change=redden)
     profile = profile_of(tinted, 1)
     darker = profile.colours[profile.colours.mean(axis=1) < profile.black]
     assert angles_deg(darker, np.ones(3)).min() > BLACK_WITHIN_DEG
@@ -168,7 +165,7 @@ def test_a_damaged_map_is_as_good_as_none(make_table: MakeTable, cache: Path) ->
     lut = make_table(bits=1)
     whole = ColorimetricRendering(lut, MINE).map.sha256
     (path,) = cache.iterdir()
-    for length in (-9, 0, 400):
+    for length in (-9, 0):
         path.write_bytes(path.read_bytes()[:length])
         assert ColorimetricRendering(lut, MINE).map.sha256 == whole, length
 

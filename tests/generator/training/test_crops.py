@@ -244,6 +244,7 @@ def test_a_gallery_on_disk_is_the_pictures(tmp_path: Path) -> None:
 WITHOUT_TORCH = """
 import sys
 sys.modules["torch"] = None
+import generator.dataset.making, generator.kernels.rendering
 from generator.training import Crops
 try:
     from generator.training.torch_crops import CropDataset
