@@ -87,16 +87,6 @@ def test_ground_truths_that_disagree_are_named(
         open_dataset(out)
 
 
-@pytest.mark.parametrize("light", ["nan,0.5,0.5", "0,0,0", "inf,0,0", "0.3,0.3"])
-def test_a_ground_truth_that_is_no_light_is_named(small: Path, light: str) -> None:
-    table = small / "ground_truth.csv"
-    head, first, second = lines_of(table)
-    row = ",".join([*second.split(",")[:3], light])
-    table.write_text("\n".join([head, first, row]))
-    with pytest.raises(FormatError, match=rf"ground_truth\.csv, line 3: expected image,.* found '{row[:10]}.*; make"):
-        open_dataset(small)
-
-
 def test_a_ground_truth_may_lack_a_channel_and_sums_to_one(small: Path) -> None:
     table, truths = small / "ground_truth.csv", small / "gt.txt"
     head, first, second = lines_of(table)

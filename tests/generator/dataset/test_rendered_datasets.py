@@ -29,7 +29,6 @@ from generator.pictures.sources import find_pictures
 from generator.rendering.black_points import BlackPoint, veil_of, without_veil
 from generator.rendering.colorimetric import ColorimetricRendering
 from generator.rendering.matrices import ColourMatrix
-from generator.rendering.render import render
 from tests.generator.dataset.contents import contents
 from tests.generator.rendering.conftest import make_table as make_table_of_a_print
 
@@ -90,30 +89,11 @@ def test_an_image_is_that_of_its_light_without_a_share_of_black(
         # The ground truth is the light's, whatever becomes of the print.
         assert (entry.truth, entry.truths) == (before.truth, before.truths)
     made_of = dataset.description
-    assert made_of.options["rendering"] == {
-        "name": "colorimetric",
-        "version": 4,
-        "matrix": {"name": "mine", "source": "a test", "rows": MATRIX.rows.tolist()},
-    }
-    assert made_of.options["black_point"] == "random:0.97"
     assert made_of.rendering is not None
     pixels = [sources[entry.source].size for entry in dataset.entries]
     for name in ("outside", "distance"):
         mean = np.average([float(row[name]) for row in rows], weights=pixels)
         assert getattr(made_of.rendering, name) == pytest.approx(mean, abs=1e-6)
-
-
-def test_by_colour_is_what_is_made_unasked_and_rendered_in_one_call(
-    make_lut: MakeLut, pictures: Path, tmp_path: Path
-) -> None:
-    lut = make_lut()
-    wish = (str(lut.folder), str(tmp_path / "out"), "--sources", str(pictures), "--illuminations", "1,3", "--seed", "5")
-    assert main(wish) == 0
-    dataset = open_dataset(tmp_path / "out")
-    assert dataset.description.options["rendering"]["name"] == "colorimetric"
-    (first, *_) = find_pictures(pictures)
-    image = render(lut, first.read().picture, 3, seed=5, image=1)
-    np.testing.assert_array_equal(image, dataset.read_image(dataset.entries[1]))
 
 
 def test_what_was_begun_or_made_by_codes_goes_on_so(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
@@ -146,29 +126,6 @@ def test_workers_shards_shares_and_other_processes_change_no_byte(
     }
 
 
-@pytest.mark.parametrize(
-    "other",
-    [
-        DatasetOptions(previews=False, rendering="codes"),
-        DatasetOptions(previews=False, rendering="colorimetric", matrix=MATRIX),
-        DatasetOptions(
-            previews=False,
-            rendering="colorimetric",
-            matrix=ColourMatrix("mine", MATRIX.rows[::-1].copy(), "a test"),
-            black_point=BlackPoint("random"),
-        ),
-    ],
-)
-def test_work_that_was_begun_with_another_rendering_is_refused(
-    make_lut: MakeLut, pictures: Path, tmp_path: Path, other: DatasetOptions
-) -> None:
-    lut = make_lut()
-    sources, lights = find_pictures(pictures), ListedLights((1, 2))
-    make_share(Plan(lut, sources, lights, 5, BY_COLOUR), tmp_path / "out", (0, 1))
-    with pytest.raises(InputError, match=r"was begun with another plan \(options (rendering|black_point)"):
-        make_share(Plan(lut, sources, lights, 5, other), tmp_path / "out", (0, 1))
-
-
 def test_several_lights_share_an_image(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut(bits=3)
     choice = LightRequest(random=1, lights_per_image=2, masks="half-plane").choose(lut, 5)
@@ -193,37 +150,6 @@ def test_several_lights_share_an_image(make_lut: MakeLut, pictures: Path, tmp_pa
         np.testing.assert_array_equal(dataset.read_image(entry), wanted)
         truth = quantised_chromaticities(weights, lighting.whites(lut), FULL) / FULL
         np.testing.assert_allclose(dataset.read_ground_truth_map(entry), truth, atol=2e-5)
-
-
-@pytest.mark.parametrize("layout", ["webdataset", "parquet"])
-def test_images_in_shards_are_those_of_files_and_say_how_they_were_rendered(
-    make_lut: MakeLut, pictures: Path, tmp_path: Path, layout: Any
-) -> None:
-    lut = make_lut()
-    made(lut, pictures, tmp_path / "files", BY_COLOUR)
-    options = DatasetOptions(rendering="colorimetric", matrix=MATRIX, black_point=BlackPoint("random"), layout=layout)
-    made(lut, pictures, tmp_path / "shards", options)
-    files, shards = open_dataset(tmp_path / "files"), open_dataset(tmp_path / "shards")
-    for one, other in zip(files.entries, shards.entries, strict=True):
-        np.testing.assert_array_equal(files.read_image(one), shards.read_image(other))
-    assert files.details == shards.details
-    assert files.description.rendering == shards.description.rendering
-
-
-def test_a_raw_file_holds_the_sites_of_the_image(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
-    import rawpy
-
-    lut = make_lut()
-    made(lut, pictures, tmp_path / "png", BY_COLOUR)
-    options = DatasetOptions(
-        rendering="colorimetric", matrix=MATRIX, black_point=BlackPoint("random"), form="dng", previews=False
-    )
-    made(lut, pictures, tmp_path / "dng", options)
-    image = open_dataset(tmp_path / "png").read_image(open_dataset(tmp_path / "png").entries[0])
-    with rawpy.imread(str(tmp_path / "dng" / "images" / "000000.dng")) as raw:
-        sites = raw.raw_image.copy()
-    np.testing.assert_array_equal(sites[0::2, 0::2], image[0::2, 0::2, 0])
-    np.testing.assert_array_equal(sites[1::2, 1::2], image[1::2, 1::2, 2])
 
 
 def test_a_mixture_of_lights_has_the_black_of_the_mixture(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:

@@ -108,21 +108,6 @@ def test_workers_layouts_and_kills_do_not_change_an_image(lut: Lut, make: Make, 
             np.testing.assert_array_equal(one.read_image(entry), other.read_image(its))
 
 
-def test_a_place_begun_with_another_variation_is_refused(
-    lut: Lut, pictures: Path, tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from generator.dataset.making import make_share
-    from generator.dataset.plan import Plan
-
-    def plan(variation: Variation) -> Plan:
-        options = DatasetOptions(variation=variation, shard_images=3)
-        return Plan(lut, find_pictures(pictures), RandomLights(2, 4, 5), 5, options)
-
-    make_share(plan(varied_by(lut, parse_exposure(".5"))), tmp_path / "out", (0, 2))
-    with pytest.raises(InputError, match="variation exposure"):
-        make_share(plan(varied_by(lut, parse_exposure(".25"))), tmp_path / "out", (0, 2))
-
-
 def test_the_share_that_is_clipped_is_the_one_asked_for(lut: Lut, make: Make) -> None:
     dataset = make("clipped", varied_by(lut, parse_exposure("clip:share=.05,most=50")))
     white = dataset.description.table.white_level

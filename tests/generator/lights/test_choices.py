@@ -41,12 +41,6 @@ def test_random_lights_are_distinct_even_and_their_seeds() -> None:
     assert isinstance(choice, LightChoice)
 
 
-@pytest.mark.parametrize("count", [0, 11])
-def test_more_random_lights_than_the_table_has_are_refused(count: int) -> None:
-    with pytest.raises(InputError, match=f"{count} random lights a picture were asked for; the table has 10"):
-        RandomLights(count, 10, 0)
-
-
 def test_nearest_is_by_angle(make_lut: Callable[..., Lut]) -> None:
     lut = make_lut(lights=4)
     wanted = lut.white[[2, 0, 3]] * np.array([[1e-4], [7.0], [1.0]]) + [[0, 0, 1e-3]] * 3
@@ -67,17 +61,6 @@ def test_every_ground_truth_of_a_list_is_matched() -> None:
         made = np.asarray(lighting.mixtures[0].weights) @ WHITES[list(lighting.mixtures[0].lights)]
         np.testing.assert_allclose(made / made.sum(), truth / truth.sum(), atol=1e-8)
     assert choice.describe()["lights"][7] == choice.matches[7].mixture.label
-
-
-def test_ground_truths_that_cannot_be_made_are_counted_and_the_farthest_named() -> None:
-    gamut = Gamut(WHITES, "the table T")
-    wanted = np.array([[3.0, 3, 3], [9, 1, 1], [20, 1, 1]])
-    with pytest.raises(
-        InputError,
-        match=r"2 of 3 ground truths of gt\.csv cannot be made; the farthest is number 3: .* outside .*table T",
-    ):
-        matched_lights(gamut, wanted, "gt.csv")
-    assert matched_lights(gamut, wanted, outside="nearest").matches[2].mixture == plain(0)
 
 
 def test_lights_of_a_table_may_have_names(make_lut: Callable[..., Lut]) -> None:
@@ -105,11 +88,3 @@ def test_lights_together_share_an_image() -> None:
     assert [lighting.masks for lighting in lightings] == [masks.maker(12), masks.maker(13)]
     assert pickle.loads(pickle.dumps(choice)).lightings_of(6) == lightings
     assert choice.describe()["lights"] == inner.describe()
-
-
-@pytest.mark.parametrize(("count", "together"), [(3, 2), (1, 2), (2, 1)])
-def test_lights_that_cannot_be_shared_out_are_refused(count: int, together: int) -> None:
-    with pytest.raises(
-        InputError, match=f"{count} lights for each picture cannot be shared out {together} to an image"
-    ):
-        SimultaneousLights(RandomLights(count, 10, 1), together, parse_masks("smooth", 2, 0))

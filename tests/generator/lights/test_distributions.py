@@ -221,15 +221,6 @@ def test_drawn_lights_are_a_function_of_seed_and_position() -> None:
     assert DrawnLights(GAMUT, Uniform(), 5, seed=4).lightings_of(7)[:2] == forwards[7]
 
 
-def test_a_distribution_beside_the_gamut_is_refused() -> None:
-    with pytest.raises(
-        InputError, match=r"0\.0% of the distribution lies within what .* whose mean is r=0\.325, b=0\.325"
-    ):
-        DrawnLights(GAMUT, Gaussian(0.95, 0.02, 0.001, 0.001), 1, 0)
-    with pytest.raises(InputError, match="0 lights a picture"):
-        DrawnLights(GAMUT, Uniform(), 0, 0)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

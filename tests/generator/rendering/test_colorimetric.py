@@ -27,7 +27,7 @@ from generator.rendering.colorimetric import (
     reference_light,
     source_colours,
 )
-from generator.rendering.matrices import ColourMatrix, fitted_matrix, matrix_for
+from generator.rendering.matrices import ColourMatrix, fitted_matrix
 from generator.rendering.print_inverse import corners, invert, nearest_to
 from generator.rendering.print_profiles import PrintProfile, profile_of
 from tests.generator.rendering.conftest import MakeTable
@@ -219,20 +219,6 @@ def test_a_table_of_one_light(make_table: MakeTable) -> None:
     rendering = ColorimetricRendering(make_table(bits=1, lights=1), MINE)
     assert rendering.cells.max() < 8
     assert np.isfinite(rendering.seen(plain(0))).all()
-
-
-def test_the_matrix_is_that_of_the_camera_or_of_the_table(make_table: MakeTable) -> None:
-    lut = make_table()
-    assert matrix_for(lut).name == "Canon EOS 550D"
-    unknown = matrix_for(make_table(camera="Pinhole", name="pinhole"))
-    assert unknown.name == "table"
-    np.testing.assert_allclose(unknown.rows, MATRIX, atol=0.01)
-    assert matrix_for(lut, "table").name == "table"
-    assert matrix_for(lut, "eos 5ds r").name == "Canon EOS 5DS R"
-    assert matrix_for(make_table(camera="Canon EOS 5DS", name="5ds")).name == "Canon EOS 5DS"
-    np.testing.assert_array_equal(matrix_for(lut, "none").rows, np.eye(3))
-    with pytest.raises(InputError, match="neither a file nor a camera"):
-        matrix_for(lut, "pinhole")
 
 
 def test_a_print_that_is_off_makes_a_fitted_matrix_say_so(make_table: MakeTable) -> None:

@@ -201,19 +201,6 @@ def test_mirrored_items_are_the_others_mirrored(make_lut: MakeLut) -> None:
     assert 50 < mirrored.sum() < 150
 
 
-def test_unfit_colours_take_their_stand_ins(make_lut: MakeLut) -> None:
-    lut = make_lut(bits=BITS, unfit=(63,))
-    white = np.full((8, 8, 3), 255, np.uint8)
-    crops = Crops(lut, gallery_of([white]), (4, 4), lights=[1], flip=False, length=9, rendering="codes")
-    images = crops.batch(np.arange(9)).images
-    from generator.kernels.unfit import nearest_fit_colours
-
-    wanted = lut.samples[1, int(nearest_fit_colours([63], BITS)[0])].astype(np.float32) / lut.provenance.white_level
-    values = images.transpose(0, 2, 3, 1).reshape(-1, 1, 3)
-    found = np.isclose(values, wanted[None], rtol=1e-6).all(axis=-1)
-    assert np.count_nonzero(found, axis=1).min() >= 1
-
-
 def test_items_that_are_not_there(make_lut: MakeLut, gallery: Gallery) -> None:
     crops = Crops(make_lut(bits=BITS), gallery, (4, 4), length=3)
     assert crops[2][0].shape == (3, 4, 4)
