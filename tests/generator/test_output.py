@@ -100,14 +100,6 @@ def test_the_matrix_is_told(
     assert not_told not in printed
 
 
-def test_by_codes_no_matrix_is_told(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert (
-        main(["lut", "out", "--sources", "grey.png", "--illuminations", "1", "--no-preview", "--rendering", "codes"])
-        == 0
-    )
-    assert "colour matrix" not in capsys.readouterr().out
-
-
 def test_the_tables_own_camera_needs_no_advice() -> None:
     known = camera_matrix("Canon EOS 550D")
     assert known is not None

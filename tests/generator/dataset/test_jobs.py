@@ -169,20 +169,6 @@ class TestAskedForTwice:
         assert "complete already" in capsys.readouterr().out
 
     @pytest.mark.slow
-    def test_another_wish_is_refused(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(("lut", "out", *self.WISH)) == 0
-        for more, difference in (
-            (("--seed", "3"), "seed 2, now 3"),
-            (("--format", "tiff"), 'options format "png", now "tiff"'),
-            (("--scale", "full"), 'options scale null, now "full"'),
-        ):
-            assert main(("lut", "out", *self.WISH, *more)) == 2
-            assert difference in capsys.readouterr().err
-        shutil.copy("pictures/1.png", "pictures/7.png")
-        assert main(("lut", "out", *self.WISH)) == 2
-        assert "images 6, now 7" in capsys.readouterr().err
-
-    @pytest.mark.slow
     def test_pictures_that_changed_since_are_found(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
         """Whatever the time that a copy brings with it."""
         assert main(("lut", "out", *self.WISH)) == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -12,33 +11,18 @@ import numpy as np
 import pytest
 
 from foundation.errors import InputError
-from generator.lights.choices import SimultaneousLights, matched_lights, nearest_lights, parse_light
-from generator.lights.gamut import Gamut
+from generator.lights.choices import SimultaneousLights, nearest_lights, parse_light
 from generator.lights.lighting import LightChoice, Lighting, RandomLights, plain
 from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-WHITES = np.array([[8.0, 1, 1], [1, 8, 1], [1, 1, 8], [3, 4, 3]])
-
 
 def numbers(lightings: tuple[Lighting, ...]) -> tuple[int, ...]:
     """Return the lights of lightings that are one light of the table each."""
     assert all(len(lighting.mixtures) == 1 and lighting.mixtures[0].weights == (1.0,) for lighting in lightings)
     return tuple(lighting.mixtures[0].lights[0] for lighting in lightings)
-
-
-@pytest.mark.slow
-def test_random_lights_are_distinct_even_and_their_seeds() -> None:
-    choice = RandomLights(3, 10, seed=1)
-    drawn = [numbers(choice.lightings_of(position)) for position in range(2000)]
-    assert all(len(set(lights)) == 3 for lights in drawn)
-    counts = Counter(light for lights in drawn for light in lights)
-    assert all(abs(counts[light] - 600) < 6 * (600 * 0.7) ** 0.5 for light in range(10))
-    other = RandomLights(3, 10, seed=2)
-    assert drawn[:20] != [numbers(other.lightings_of(position)) for position in range(20)]
-    assert isinstance(choice, LightChoice)
 
 
 def test_nearest_is_by_angle(make_lut: Callable[..., Lut]) -> None:
@@ -50,17 +34,6 @@ def test_nearest_is_by_angle(make_lut: Callable[..., Lut]) -> None:
     assert choice.describe() == {"choice": "nearest", "file": "truths.csv", "each": 1, "lights": ["2", "0", "3"]}
     both = nearest_lights(lut, wanted, each=2)
     assert [numbers(both.lightings_of(position)) for position in range(3)] == [(2, 0), (3, 2), (0, 3)]
-
-
-def test_every_ground_truth_of_a_list_is_matched() -> None:
-    gamut = Gamut(WHITES)
-    wanted = np.random.default_rng(2).dirichlet([1, 1, 1], 50) @ WHITES[:3]
-    choice = matched_lights(gamut, wanted, "gt.csv")
-    for position, truth in enumerate(wanted):
-        (lighting,) = choice.lightings_of(position + 50)
-        made = np.asarray(lighting.mixtures[0].weights) @ WHITES[list(lighting.mixtures[0].lights)]
-        np.testing.assert_allclose(made / made.sum(), truth / truth.sum(), atol=1e-8)
-    assert choice.describe()["lights"][7] == choice.matches[7].mixture.label
 
 
 def test_lights_of_a_table_may_have_names(make_lut: Callable[..., Lut]) -> None:

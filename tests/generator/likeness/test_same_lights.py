@@ -11,7 +11,7 @@ import pytest
 
 from calibration.table.lut import open_lut
 from generator.cli import main
-from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.reader import open_dataset
 from tests.generator.likeness.tables import CAMERAS, SPECTRA, make_table
 
 pytestmark = pytest.mark.slow
@@ -33,9 +33,8 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def spectrum(dataset: Dataset, table: str, label: str) -> npt.NDArray[np.float64]:
+def spectrum(table: str, label: str) -> npt.NDArray[np.float64]:
     """Return the light in three bands that a label of a dataset is."""
-    del dataset
     shown = open_lut(Path(table)).illuminations
     parts = [part.partition(":") for part in label.split("+")]
     return np.sum(
@@ -55,8 +54,8 @@ def test_both_cameras_see_the_same_scenes_under_the_same_light(lab: Path, lights
     assert second.description.options["lights"]["table_sha256"] == open_lut(Path("one")).sha256
     for here, there in zip(first.entries, second.entries, strict=True):
         assert here.source == there.source
-        light = spectrum(first, "one", here.lights[0])
-        assert spectrum(second, "two", there.lights[0]) == pytest.approx(light, rel=1e-8)
+        light = spectrum("one", here.lights[0])
+        assert spectrum("two", there.lights[0]) == pytest.approx(light, rel=1e-8)
         for entry, dataset, camera in ((here, first, "one"), (there, second, "two")):
             seen = CAMERAS[camera] @ light
             assert entry.truth == pytest.approx(seen / seen.sum(), abs=1e-4)

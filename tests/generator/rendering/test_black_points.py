@@ -106,17 +106,6 @@ def test_nothing_wraps_at_either_end() -> None:
     assert np.abs(got - exact).transpose(0, 2, 1)[inner].max() <= 1.0
 
 
-def test_colours_that_are_not_wanted_change_no_other() -> None:
-    samples = cells_of(np.linspace(0.02, 1, 64)[:, None] * WHITE)
-    wanted = np.arange(64) % 3 == 1
-    from generator.rendering.black_points import Veil
-
-    whole = without_veil(samples, Veil(*veil(0.9)), 15000)
-    part = without_veil(samples, Veil(*veil(0.9)), 15000, wanted)
-    np.testing.assert_array_equal(part[wanted], whole[wanted])
-    assert (part[~wanted] == 0).all()
-
-
 def test_black_is_that_of_the_light_its_mixture_and_the_nearest_fit_cell(make_lut: MakeLut) -> None:
     lut = make_lut()
     means = lut.samples[:, 0].mean(axis=1)

@@ -199,11 +199,6 @@ def test_black_that_is_taken_out_leaves_means_and_white(make_table: MakeTable) -
     assert bare.mean(axis=1)[0].max() < 1
 
 
-def test_the_reference_is_daylight_or_the_light_that_sees_most(make_table: MakeTable) -> None:
-    assert reference_light(make_table(bits=1)) == 1
-    assert reference_light(make_table(bits=1, lights=1, name="candle")) == 0
-
-
 def test_the_reference_is_near_in_reciprocal_kelvin_and_sees_every_channel() -> None:
     def table(*lights: tuple[float, float]) -> Any:
         """Return what is asked of a table of black bodies, each of so many kelvin and such a share of blue."""
