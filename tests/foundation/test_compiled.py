@@ -125,10 +125,8 @@ def test_code_is_kept_for_its_very_sources_and_setting_while_it_is_whole(kernels
     # Beside a copy of the decorator's files: numba by itself would go on with the old code.
     assert kernels.run(SQUARED) == ["25 True"]
     (kept,) = kernels.code()
-    whole = kept.read_bytes()
-    for damaged in (whole[:-1], b"x" + whole[1:]):
-        kept.write_bytes(damaged)
-        assert kernels.run(SQUARED) == ["25 True"]
+    kept.write_bytes(kept.read_bytes()[:-1])
+    assert kernels.run(SQUARED) == ["25 True"]
     assert kernels.run(SQUARED) == ["25 False"], "the next start compiles nothing"
     assert kernels.run(SQUARED, NUMBA_OPT="1") == ["25 True"]
     assert kernels.code() == [kept], "made anew, and kept in its place"

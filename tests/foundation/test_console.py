@@ -43,12 +43,6 @@ def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr() == ("", "")
 
 
-def test_messages_name_the_first_of_many() -> None:
-    assert errors.first_of(range(3)) == "0, 1, 2"
-    assert errors.first_of(["a", "b", "c"], 2) == "a, b …"
-    assert errors.first_of(range(10)) == "0, 1, 2, 3, 4, 5, 6, 7, 8, 9"
-
-
 @pytest.mark.parametrize(
     ("error", "problem", "waiting"),
     [
@@ -111,11 +105,7 @@ def test_interruption_is_130(capsys: pytest.CaptureFixture[str]) -> None:
     ("number", "beginning"),
     [
         (errno.ENOSPC, "cannot write /disk/samples.npy: No space left on device; free space or"),
-        (errno.EROFS, "cannot write /disk/samples.npy: Read-only file system; name another place"),
-        (errno.EDQUOT, "cannot write /disk/samples.npy: Disk quota exceeded; what this user may use"),
         (errno.EIO, "cannot use /disk/samples.npy: Input/output error; the disk fails: see what dmesg says"),
-        (errno.ENODEV, "cannot use /disk/samples.npy: No such device; the disk is gone: connect and mount it"),
-        (errno.ESTALE, "cannot use /disk/samples.npy: Stale file handle; the folder was taken away or mounted anew"),
     ],
 )
 def test_a_disk_fault_that_nobody_translated_is_5(
@@ -427,9 +417,8 @@ def test_every_command_tells_its_version(main: Callable[[list[str]], int], capsy
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("option", ["-h", "--help"])
-def test_every_command_helps(main: Callable[[list[str]], int], option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([option]) == 0
+def test_every_command_helps(main: Callable[[list[str]], int], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["-h"]) == 0
     printed = capsys.readouterr().out
     assert all(name in printed for name in ("--version", "--verbose", "--quiet", "--install-completion"))
 
@@ -493,7 +482,7 @@ PRINTING = "from foundation.console import run; import sys; sys.exit(run(lambda:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
 def test_a_terminal_gets_what_it_can_show(encoding: str) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": encoding}
     done = subprocess.run([sys.executable, "-c", PRINTING], capture_output=True, check=False, env=environment)

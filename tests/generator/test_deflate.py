@@ -52,7 +52,7 @@ def rows_of(image: Image16, filters: npt.NDArray[np.uint8]) -> bytes:
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(
     image=hnp.arrays(
         np.uint16,
@@ -147,7 +147,7 @@ def test_distances_count_the_filters_between_rows() -> None:
     np.testing.assert_array_equal(distances_of(image), expected)
 
 
-@settings(max_examples=50)
+@settings(max_examples=40)
 @given(st.integers(0, 1 << 32), st.integers(1, 40), st.integers(1, 40), st.integers(2, 40))
 def test_what_is_found_is_equal(seed: int, height: int, width: int, colours: int) -> None:
     image = drawn(height, width, colours, seed)
@@ -187,7 +187,7 @@ frequencies = st.lists(st.integers(0, 1 << 40) | st.just(0), min_size=1, max_siz
 
 
 @pytest.mark.slow
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(frequencies)
 def test_codes_are_complete_and_begin_no_other(counts: list[int]) -> None:
     lengths = code_lengths(np.array(counts), LONGEST)
@@ -202,7 +202,7 @@ def test_codes_are_complete_and_begin_no_other(counts: list[int]) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(st.lists(st.integers(1, 60), min_size=2, max_size=40))
 def test_codes_are_the_shortest(counts: list[int]) -> None:
     """Against Huffman's own construction by a heap, where no code reaches the limit."""

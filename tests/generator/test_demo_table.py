@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,6 +19,7 @@ from calibration.table.lut import open_lut
 from evaluation.cli import main as evaluate
 from foundation.errors import InputError
 from generator.cli import main
+from synthesis.cli import main as sim
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +27,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("kept")
 
 
+def run_here(words: list[str], **_: object) -> subprocess.CompletedProcess[bytes]:
+    """Run `sim` in this process: Python takes longer to start and to read its modules than the table takes."""
+    assert words[:3] == [sys.executable, "-m", "synthesis.cli"]
+    return subprocess.CompletedProcess(words, sim(words[3:]))
+
+
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     """Make it small, and keep it for the tests that use it."""
+    program = SimpleNamespace(run=run_here, DEVNULL=subprocess.DEVNULL)
+    monkeypatch.setattr(demo_table, "subprocess", program)
     monkeypatch.setattr(demo_table, "BITS", 1)
     monkeypatch.setattr(demo_table, "LIGHTS", "D65,A")
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder))

@@ -88,7 +88,6 @@ def place(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         ((), "that of Test camera is not known, so this one was fitted; if the print's colours were", "dcraw"),
         (("--matrix", "table"), "colour matrix: table (least squares", "is not known"),
         (("--matrix", "Canon EOS 600D"), f"colour matrix: Canon EOS 600D ({SOURCE})", "faults"),
-        (("--matrix", "none"), "colour matrix: none (none asked for", "faults"),
     ],
 )
 def test_the_matrix_is_told(
@@ -99,14 +98,6 @@ def test_the_matrix_is_told(
     printed = capsys.readouterr().out
     assert told in printed
     assert not_told not in printed
-
-
-def test_by_codes_no_matrix_is_told(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert (
-        main(["lut", "out", "--sources", "grey.png", "--illuminations", "1", "--no-preview", "--rendering", "codes"])
-        == 0
-    )
-    assert "colour matrix" not in capsys.readouterr().out
 
 
 def test_the_tables_own_camera_needs_no_advice() -> None:

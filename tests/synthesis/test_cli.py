@@ -64,9 +64,7 @@ def test_a_table_that_is_told_nothing_has_no_origin(settings: str, tmp_path: Pat
         (["--licence", "free"], "--licence 'free': "),
         (["--author", ""], "--author '': "),
         (["--camera", "Canon_EOS_1"], "no camera 'Canon_EOS_1'"),
-        (["--lights", "D66"], "no published light 'D66'"),
         (["--paper", "silk"], "the command line: room.paper"),
-        (["--settings", "none.toml"], "cannot read settings none.toml"),
     ],
 )
 def test_what_cannot_be_computed_is_one_sentence(

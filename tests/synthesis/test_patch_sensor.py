@@ -59,15 +59,3 @@ def test_black_is_known_by_the_masked_photosites(masked: tuple[Rectangle, ...], 
     error = np.sqrt((0.09 + 1 / 12) / photosites)
     assert found.std() == pytest.approx(error, rel=4 * 0.018)
     assert abs(found.mean()) < 4 * error / 40
-
-
-def test_what_a_seed_decides_stays_what_it_is() -> None:
-    """Whoever computes a table again gets the same. The numbers were written down once."""
-    sensor = PatchSensor.of(BODY, 2, 3, replace(EVEN, seed=5, response_spread=0.02, hot_per_million=50_000.0), 0.5)
-    mosaic, black = sensor.expose(sensor.light(np.full((2, 3, 1), 900.0)), np.array([1.0, 0, 0]), 100, 7)
-    assert mosaic.counts.shape == (mosaic.visible.height, mosaic.visible.width) == (12, 6)
-    np.testing.assert_array_equal(mosaic.black, np.full((2, 2), BODY.black))
-    assert sensor.response[0, :2] == pytest.approx([1.019968, 0.954887], abs=1e-6)
-    assert sensor.hot.rows.tolist() == [8, 8, 9, 9]
-    assert mosaic.counts[0].tolist() == [2976, 2881, 2972, 2911, 2916, 2949]
-    assert (black - BODY.black).ravel() == pytest.approx([0.089653, -0.191482, -0.090589, -0.044176], abs=1e-6)

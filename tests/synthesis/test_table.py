@@ -121,11 +121,6 @@ def test_threads_do_not_change_the_bytes_and_the_seed_does(computed: Lut, tmp_pa
     assert open_lut(other.folder).provenance.samples_sha256 != computed.provenance.samples_sha256
 
 
-def test_a_window_of_9_samples_is_as_asked(tmp_path: Path) -> None:
-    compute_table(task_of(window=3), tmp_path / "lut", threads=2)
-    assert open_lut(tmp_path / "lut").samples.shape == (len(LIGHTS), 512, 9, 3)
-
-
 def test_overexposed_cells_are_unfit_and_overexposed_paper_is_refused(tmp_path: Path, pinned: Pinned) -> None:
     # The middle of the page is brighter than its corners, where enough references are still below the limit.
     done = compute_table(

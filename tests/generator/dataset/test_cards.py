@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, get_args
 
 import pytest
 
-from calibration.citation import NOT_RECORDED, OriginRecord
-from generator.dataset.cards import CONFORMS_TO, OPEN, card, datasheet, kind_of, size_category
+from calibration.citation import OriginRecord
+from generator.dataset.cards import CONFORMS_TO, OPEN, card, datasheet
 from generator.dataset.joined import JOINED
 from generator.dataset.layouts import Description, Layout, Split
 from generator.dataset.making import generate_dataset
@@ -101,11 +101,6 @@ def test_the_data_set_of_a_folder_loads_by_its_card(plain: Dataset, tmp_path: Pa
     assert [row["image"] for row in rows] == [entry.image for entry in plain.entries]
 
 
-@pytest.mark.parametrize(("images", "name"), [(999, "n<1K"), (1000, "1K<n<10K"), (2_000_000, "1M<n<10M")])
-def test_sizes_are_the_hubs(images: int, name: str) -> None:
-    assert size_category(images) == name
-
-
 @pytest.mark.slow
 def test_the_datasheet_has_its_sections_and_marks_what_is_open(made: Dataset) -> None:
     text = datasheet(made.description)
@@ -120,13 +115,6 @@ def test_the_datasheet_has_its_sections_and_marks_what_is_open(made: Dataset) ->
     assert text == (place_of(made) / "DATASHEET.md").read_text()
 
 
-def test_a_table_without_an_origin_is_said_to_have_none(plain: Dataset) -> None:
-    for text in (card(plain.description), datasheet(plain.description)):
-        assert f"| Lens | {NOT_RECORDED} |" in text
-        assert f"| Licence | {NOT_RECORDED} |" in text
-        assert "does not record whether its frames were photographed or simulated" in text
-
-
 def test_what_a_table_says_is_carried_and_breaks_no_line(plain: Dataset) -> None:
     described = with_origin(plain, ORIGIN)
     for text in (card(described), datasheet(described)):
@@ -136,33 +124,6 @@ def test_what_a_table_says_is_carried_and_breaks_no_line(plain: Dataset) -> None
     assert "The table: CC-BY-4.0." in datasheet(described)
     # The front matter is closed once, whatever the table says.
     assert card(described).count("\n---\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("origin", "computed", "word"),
-    [
-        (OriginRecord(rig="lab"), None, "raw frames of a printed chart"),
-        (OriginRecord(rig="simulated"), None, "simulated laboratory"),
-        (None, {"by": "sim table"}, "computed from spectra"),
-        (OriginRecord(rig="lab"), {"by": "sim table"}, "computed from spectra"),
-    ],
-)
-def test_nothing_that_was_not_photographed_is_called_so(
-    plain: Dataset, origin: OriginRecord | None, computed: dict[str, str] | None, word: str
-) -> None:
-    assert word in kind_of(with_origin(plain, origin, computed=computed))
-
-
-def test_pixels_are_told_by_the_rendering(plain: Dataset) -> None:
-    by_colour = plain.description
-    by_codes = by_colour.model_copy(
-        update={"options": {key: value for key, value in by_colour.options.items() if key != "rendering"}}
-    )
-    for text in (card, datasheet):
-        assert "interpolated between cells" in text(by_colour)
-        assert "Each pixel is one of the" not in text(by_colour)
-        assert "Each pixel is one of the" in text(by_codes)
-        assert "interpolated" not in text(by_codes)
 
 
 def test_a_computed_table_has_neither_frames_nor_report_but_a_known_gain(plain: Dataset) -> None:
@@ -176,19 +137,6 @@ def test_a_computed_table_has_neither_frames_nor_report_but_a_known_gain(plain: 
     assert "The table's report has the verdict" in datasheet(plain.description)
     # A table that others computed need not say it.
     assert "does not state gain" in card(with_origin(plain, None, computed={"by": "others"}))
-
-
-def test_a_picture_is_said_to_repeat_only_where_it_does(plain: Dataset) -> None:
-    assert "Images of one picture repeat it" in datasheet(plain.description.model_copy(update={"images": 9}))
-    assert "Each picture is in one image" in datasheet(
-        plain.description.model_copy(update={"images": plain.description.sources})
-    )
-
-
-def test_the_titles_lights_are_the_tables(plain: Dataset) -> None:
-    assert plain.description.table.lights == 4
-    assert len(plain.description.lights) == 2
-    assert "under 4 lights" in card(plain.description)
 
 
 @pytest.mark.slow

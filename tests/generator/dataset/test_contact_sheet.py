@@ -100,8 +100,7 @@ def test_of_many_lights_as_many_are_shown_as_are_recognised(make_lut: Callable[.
 
 def test_images_of_one_light_a_picture_fill_a_grid(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     """Rows of one image each would be a narrow column with an empty page beside it."""
-    lut = make_lut()
-    made = made_of(lut, tmp_path / "out", 30, RandomLights(1, 4, 0))
+    made = made_of(make_lut(), tmp_path / "out", 30, RandomLights(1, 4, 0))
     whole = draw(made, MAX_ROWS, MAX_COLUMNS)
     words = [text.get_text() for text in whole.texts]
     width, height = whole.get_size_inches()
@@ -117,36 +116,3 @@ def test_images_of_one_light_a_picture_fill_a_grid(make_lut: Callable[..., Lut],
     assert few.get_size_inches()[1] < height
     assert any("4 of 30 pictures shown" in word for word in words)
     assert any("each exposed for itself" in word for word in words)
-    rows = draw(made_of(lut, tmp_path / "rows", 5, [0, 1, 2]), 2, 2)
-    assert any("; 4 of 15 images shown" in text.get_text() for text in rows.texts)
-
-
-@pytest.mark.parametrize(("lights", "columns"), [([1], [0]), ([1, 3], [0, 1])])
-def test_lights_are_named_once_above_what_they_light(
-    make_lut: Callable[..., Lut], tmp_path: Path, lights: list[int], columns: list[int]
-) -> None:
-    """The rows of a grid have one light, and columns one each: it stands above the first picture of each."""
-    made = made_of(make_lut(), tmp_path / "out", 6, lights)
-    sheet = draw(made, MAX_ROWS, MAX_COLUMNS)
-    names = {light.label for light in made.description.lights}
-    pictures = [axes.get_position() for axes in sheet.axes if axes.images]
-    found = [text.get_position() for text in sheet.texts if text.get_text() in names]
-    assert images_on(sheet) == 6 * len(lights)
-    assert len(found) == len(columns) == len(sheet.axes) - len(pictures)
-    for (x, y), column in zip(found, columns, strict=True):
-        assert pictures[column].x0 < x < pictures[column].x1
-        assert y > pictures[column].y1
-    assert f"{len(lights)} light{'s' * (len(lights) > 1)}," in " ".join(text.get_text() for text in sheet.texts)
-
-
-def test_names_and_lights_stand_below_their_pictures(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
-    made = made_of(make_lut(), tmp_path / "out", 12, RandomLights(1, 4, 0), size=(16, 24))
-    sheet = draw(made, MAX_ROWS, MAX_COLUMNS)
-    assert images_on(sheet) == 12
-    pictures = [axes.get_position() for axes in sheet.axes if axes.images]
-    words = [(text.get_text(), *text.get_position()) for text in sheet.texts]
-    labels = {str(light.illumination): light.label for light in made.description.lights}
-    for entry, box in zip(made.entries, pictures, strict=True):
-        below = [other.y1 for other in pictures if other.y1 < box.y0]
-        near = [word for word, x, y in words if box.x0 <= x < box.x0 + 0.2 and max(below, default=0) < y < box.y0]
-        assert near[:2] == [labels[entry.lights[0]], entry.source]

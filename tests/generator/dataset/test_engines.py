@@ -18,6 +18,7 @@ from generator.dataset.shards import SILENT, Callbacks
 from generator.lights.lighting import RandomLights
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import find_pictures
+from tests.generator.conftest import lut_in
 from tests.generator.dataset.contents import contents
 
 pytestmark = pytest.mark.slow
@@ -38,18 +39,19 @@ def make(lut: Lut, out: Path, engine: str, workers: int, callbacks: Callbacks = 
         scenes,
         lights,
         seed=4,
-        options=DatasetOptions(previews=False, shard_images=SHARD, split=(0.8, 0.1, 0.1)),
+        options=DatasetOptions(previews=False, rendering="codes", shard_images=SHARD, split=(0.8, 0.1, 0.1)),
         workers=Workers(engine, workers),
         callbacks=callbacks,
     )
 
 
-@pytest.fixture
-def undisturbed(make_lut: Callable[..., Lut], tmp_path: Path) -> tuple[Lut, dict[str, str]]:
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Lut, dict[str, str]]:
     """Return a table, and the hashes of the files of a dataset that one thread made of it."""
-    lut = make_lut()
-    make(lut, tmp_path / "undisturbed", "local", 1)
-    return lut, contents(tmp_path / "undisturbed")
+    folder = tmp_path_factory.mktemp("undisturbed")
+    lut = lut_in(folder / "lut")
+    make(lut, folder / "out", "local", 1)
+    return lut, contents(folder / "out")
 
 
 def dask_workers() -> list[psutil.Process]:

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from evaluation.datasets.generated import open_generated
-from foundation.errors import FormatError, InputError
+from foundation.errors import InputError
 from generator import open_lut, read_picture, render
 from generator.cli import main
 from generator.dataset.making import generate_dataset
-from generator.dataset.plan import STRETCHED, DatasetOptions, Scale, exact_parts, sizes_of
+from generator.dataset.plan import exact_parts, sizes_of
 from generator.dataset.reader import Dataset, open_dataset
 from generator.files import FULL, from_full_scale, to_full_scale
 from generator.pictures.random_scenes import random_scenes
@@ -52,16 +52,12 @@ class TestBits:
         assert "2 bits a channel" in open_generated("out").treatment["bits"]
 
     @pytest.mark.slow
-    def test_all_bits_of_the_table_change_nothing_and_more_are_refused(
-        self, lut: Lut, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_all_bits_of_the_table_change_nothing(self, lut: Lut) -> None:
         by_codes = ("--rendering", "codes")
         for name, more in (("plain", ()), ("all", ("--bits", "3"))):
             assert main(("lut", name, "--sources", "pictures", *by_codes, *more)) == 0
         assert Path("plain/images/000003.png").read_bytes() == Path("all/images/000003.png").read_bytes()
         assert "bits" not in open_dataset("plain").description.options
-        assert main(("lut", "more", "--sources", "pictures", *by_codes, "--bits", "4")) == 2
-        assert "4 bits of each code were to be kept, where the table has 3; ask for fewer" in capsys.readouterr().err
 
 
 class TestFullScale:
@@ -78,7 +74,7 @@ class TestFullScale:
     def test_our_readers_read_what_was_stretched_as_it_was(self, lut: Lut, layout: str) -> None:
         if layout == "parquet":
             pytest.importorskip("pyarrow")
-        wish = ("--sources", "pictures", "--layout", layout, "--seed", "2")
+        wish = ("--sources", "pictures", "--layout", layout, "--seed", "2", "--rendering", "codes")
         assert main(("lut", "plain", *wish)) == 0
         assert main(("lut", "full", *wish, "--scale", "full")) == 0
         plain, full = open_dataset("plain"), open_dataset("full")
@@ -99,23 +95,6 @@ class TestFullScale:
         else:
             assert f"{white} is white here" in Path("plain/README.md").read_text()
             assert f"round(v * {white} / 65535)" in Path("full/README.md").read_text()
-
-    def test_formats_that_state_their_white_are_refused(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
-        scale: Scale = "full"
-        for form in STRETCHED:
-            DatasetOptions(form=form, scale=scale)
-        assert main(("lut", "out", "--sources", "pictures", "--scale", "full", "--format", "dng")) == 2
-        assert "counts of dng are not stretched: the file says what white is" in capsys.readouterr().err
-
-    @pytest.mark.slow
-    def test_software_that_knows_nothing_of_it_refuses_it(self, lut: Lut) -> None:
-        """By the version, which readers of version 2 hold against 2; a later one is refused by this software, too."""
-        assert main(("lut", "full", "--sources", "pictures", "--scale", "full")) == 0
-        text = Path("full/dataset.json").read_text()
-        assert '"version": 3' in text
-        Path("full/dataset.json").write_text(text.replace('"version": 3', '"version": 4'))
-        with pytest.raises(FormatError, match="of versions 1 to 3"):
-            open_dataset("full")
 
 
 class TestExactSplit:
@@ -158,6 +137,7 @@ class TestExactSplit:
     @pytest.mark.slow
     def test_datasets_are_divided_so_in_every_layout_and_share(self, lut: Lut) -> None:
         wish = ("--sources", "pictures", "--random", "2", "--split", "3,1,2", "--exact-split", "--shard-images", "5")
+        wish += ("--rendering", "codes", "--no-preview")
         assert main(("lut", "whole", *wish)) == 0
         whole = open_dataset("whole")
         assert whole.description.splits == {"train": 6, "validation": 2, "test": 4}
@@ -169,13 +149,9 @@ class TestExactSplit:
         for source in {entry.source for entry in whole.entries}:
             assert len({entry.split for entry in whole.entries if entry.source == source}) == 1
 
-    def test_it_needs_sizes(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(("lut", "out", "--sources", "pictures", "--exact-split")) == 2
-        assert "exact parts were asked for without their sizes" in capsys.readouterr().err
-
 
 class TestAskedForTwice:
-    WISH = ("--sources", "pictures", "--seed", "2")
+    WISH = ("--sources", "pictures", "--seed", "2", "--rendering", "codes")
 
     @pytest.mark.slow
     def test_it_says_so_and_nothing_is_touched(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
@@ -191,20 +167,6 @@ class TestAskedForTwice:
         assert {path: path.stat().st_mtime_ns for path in Path("out").rglob("*")} == before
         assert main(("--finish", "out")) == 0
         assert "complete already" in capsys.readouterr().out
-
-    @pytest.mark.slow
-    def test_another_wish_is_refused(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(("lut", "out", *self.WISH)) == 0
-        for more, difference in (
-            (("--seed", "3"), "seed 2, now 3"),
-            (("--format", "tiff"), 'options format "png", now "tiff"'),
-            (("--scale", "full"), 'options scale null, now "full"'),
-        ):
-            assert main(("lut", "out", *self.WISH, *more)) == 2
-            assert difference in capsys.readouterr().err
-        shutil.copy("pictures/1.png", "pictures/7.png")
-        assert main(("lut", "out", *self.WISH)) == 2
-        assert "images 6, now 7" in capsys.readouterr().err
 
     @pytest.mark.slow
     def test_pictures_that_changed_since_are_found(self, lut: Lut, capsys: pytest.CaptureFixture[str]) -> None:

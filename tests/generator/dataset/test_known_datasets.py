@@ -187,21 +187,13 @@ def told(capsys: pytest.CaptureFixture[str]) -> list[Any]:
 
 REFUSED = """lut new --sources small --crop 5
 lut new --sources small --crop 99x99
-lut new --sources small --cover
-lut new --sources small --crops 2
 lut new --random-scenes 2 --crop 4x4
-lut new --random-scenes 2 --max-side 4
 lut new --sources small --random-scenes 1 --crop 4x4 --crops 2
 lut new --random-scenes 1 --bits 3 --rendering codes
 lut new --random-scenes 1 --scale full --format exr
-lut new --random-scenes 1 --format dng --size 21x30
 lut new --random-scenes 1 --exact-split
-lut new --random-scenes 1 --rendering codes --matrix none
-lut new --random-scenes 1 --matrix nothing
 lut new --random-scenes 1 --black-point like
 lut new --random-scenes 1 --iso 50
-lut new --random-scenes 1 --iso 800/200
-lut new --random-scenes 1 --gradient smooth:colour=.2 --masks smooth --rendering codes
 lut new --random-scenes 1 --like-in lights
 lut new --random-scenes 1 --draw 2
 lut new --random-scenes 1 --like stats.json --like-in lights,other
@@ -213,16 +205,7 @@ lut new --random-scenes 1 --lights-of old
 lut new --sources small --lights-of old --light 1
 lut new --sources small --lights-of old --max-side 9
 lut new --sources small --lights-of lut
-lut new --random-scenes 1 --light none
-lut new --random-scenes 1 --light 1 --random 2
-lut new --random-scenes 1 --light r=.1,b=.1
-lut new --random-scenes 1 --masks smooth --lights-per-image 1
-lut new --random-scenes 1 --masks smooth --illuminations 0-2
-lut new --random-scenes 1 --masks smooth --random 3
 lut new --random-scenes 1 --nearest cat.png
-lut new --random-scenes 1 --match truths.csv
-lut new --sources cat.png --lights-by-name named.csv
-lut new --random-scenes 1 --size 0x4
 lut old --random-scenes 2 --size 9x8
 lut old --random-scenes 1 --size 9x8 --seed 7"""
 

@@ -125,10 +125,10 @@ def test_what_is_in_the_folder(make_lut: Callable[..., Lut], pictures: Path, tmp
 def test_workers_change_no_byte(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
     lut = make_lut(unfit=(3,))
     sources = (*find_pictures([pictures]), *random_scenes(3, 40, 30, 5))
-    for workers in (1, 2, 7):
+    for workers in (1, 7):
         choice = RandomLights(3, 4, 5)
         generate_dataset(lut, tmp_path / f"out{workers}", sources, choice, seed=5, workers=workers)
-    assert contents(tmp_path / "out1") == contents(tmp_path / "out2") == contents(tmp_path / "out7")
+    assert contents(tmp_path / "out1") == contents(tmp_path / "out7")
     generate_dataset(lut, tmp_path / "other", sources, RandomLights(3, 4, 5), seed=6)
     one, other = contents(tmp_path / "out1"), contents(tmp_path / "other")
     assert all(one[name] != other[name] for name in one if name.startswith("images/"))

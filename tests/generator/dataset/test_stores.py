@@ -178,7 +178,7 @@ def contents(place: str | Path) -> dict[str, str]:
 
 
 def make(lut: Lut, out: str | Path, **options: Any) -> None:
-    wishes: dict[str, Any] = {"seed": 3, "shard_images": 3, "split": (0.5, 0.0, 0.5), **options}
+    wishes: dict[str, Any] = {"seed": 3, "shard_images": 3, "split": (0.5, 0.0, 0.5), "rendering": "codes"} | options
     generate_dataset(lut, out, SCENES, [2, 0], **grouped(**wishes))
 
 
@@ -198,8 +198,8 @@ def test_a_dataset_in_a_store_is_the_one_on_the_disk(make_lut: Callable[..., Lut
         make(lut, "memory://bucket/out", layout=layout)
 
 
-STRIDE = 2
-"""Of the writes to a store every second is one at which it fails."""
+STRIDE = 3
+"""Of the writes to a store every third is one at which it fails."""
 
 
 @pytest.mark.parametrize("layout", ["folder", "webdataset"])
@@ -232,7 +232,9 @@ def test_a_store_that_fails_at_any_write_is_gone_on_with(
 
 def test_shares_in_a_store(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     lut = make_lut()
-    plan = Plan(lut, SCENES, ListedLights((2, 0)), 3, DatasetOptions(shard_images=3, split=(0.5, 0.0, 0.5)))
+    plan = Plan(
+        lut, SCENES, ListedLights((2, 0)), 3, DatasetOptions(rendering="codes", shard_images=3, split=(0.5, 0.0, 0.5))
+    )
     make(lut, tmp_path / "out")
     assert make_share(plan, "memory://out", (1, 2)) == (1, 3)
     with pytest.raises(InputError, match=r"memory://out.*3.*4"):
@@ -264,7 +266,10 @@ def test_a_late_worker_of_a_plan_that_was_removed_is_not_believed(
 ) -> None:
     lut = make_lut()
     out = "memory://bucket/out" if remote else str(tmp_path / "out")
-    old, new = (Plan(lut, SCENES, ListedLights((0, 2)), seed, DatasetOptions(shard_images=3)) for seed in (3, 4))
+    old, new = (
+        Plan(lut, SCENES, ListedLights((0, 2)), seed, DatasetOptions(rendering="codes", shard_images=3))
+        for seed in (3, 4)
+    )
     with workplace(out, old.identity()) as late:
         pass
     RemoteStore(out).remove("") if remote else shutil.rmtree(tmp_path / ".out.partial")

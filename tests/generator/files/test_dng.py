@@ -17,7 +17,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.raw.rawfile import camera_matrix, decode_raw
-from foundation.errors import InputError
 from generator import files
 from generator.files import ImageMetadata, decode_image, encode_image
 
@@ -115,32 +114,6 @@ def test_the_tags_are_those_of_the_standard() -> None:
         33421: (2, 2), 33422: bytes([0, 1, 1, 2]), 50706: bytes([1, 4, 0, 0]), 50707: bytes([1, 1, 0, 0]),
         50710: bytes([0, 1, 2]), 50711: 1, 50714: 0, 50717: 11536, 50778: 21,
     }  # fmt: skip
-
-
-def test_a_known_camera_has_its_matrix_and_another_none() -> None:
-    known, other = camera_matrix("Canon EOS 550D"), camera_matrix("Canon EOS 6D Mark II")
-    assert known is not None
-    assert other is not None
-    assert known != other
-    # From XYZ of daylight any camera sees all three channels.
-    assert min(np.array(known) @ [0.9505, 1, 1.089]) > 0.1
-    assert camera_matrix("Benchmark") is None
-    assert camera_matrix("No Such Camera") is None
-    assert camera_matrix("") is None
-
-
-@pytest.mark.parametrize("white", [(0.0, 1.0, 1.0), (float("nan"), 1.0, 1.0), (1.0, -1.0, 1.0), (0.0, 0.0, 0.0)])
-def test_a_light_without_a_channel_is_refused(white: tuple[float, float, float]) -> None:
-    with pytest.raises(InputError, match="DNG expects every channel above 0; choose png"):
-        encode_image(np.zeros((30, 30, 3), np.uint16), "dng", ImageMetadata(12000, white, "Canon EOS 550D"))
-
-
-def test_sizes_that_raw_programs_do_not_open_are_refused() -> None:
-    with pytest.raises(InputError, match="40x21 px is too small for DNG"):
-        encode_image(np.zeros((21, 40, 3), np.uint16), "dng", ImageMetadata(12000, (1.0, 1.0, 1.0), "Canon EOS 550D"))
-    for level in (0, 65536):
-        with pytest.raises(InputError, match=f"white level is {level}"):
-            encode_image(np.zeros((22, 40, 3), np.uint16), "dng", ImageMetadata(level, (1.0, 1.0, 1.0), "EOS 550D"))
 
 
 def test_the_matrix_of_srgb_is_the_inverse_of_the_standards() -> None:

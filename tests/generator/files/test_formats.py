@@ -88,7 +88,7 @@ def test_opencv_reads_the_same(form: Format) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", WHOLE)
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(image=images)
 def test_any_image_comes_back(form: Format, image: Image16) -> None:
     np.testing.assert_array_equal(decode_image(encode_image(image, form, METADATA), form, "image"), image)
@@ -188,32 +188,12 @@ def test_the_head_of_exr_is_that_of_the_standard() -> None:
         assert struct.unpack_from("<2i", data, start) == (line, stop - start - 8)
 
 
-def test_exr_is_float_under_zip_and_tells_its_shot(tmp_path: Path) -> None:
-    image = noisy(40, 30)
-    path = tmp_path / "image.exr"
-    path.write_bytes(encode_image(image, "exr", METADATA))
-    stream = oiio.ImageInput.open(str(path))
-    assert stream is not None
-    spec = stream.spec()
-    assert spec.getattribute("compression") == "zip"
-    assert spec.getattribute("crop:white") == (2046.0, 1579.5, 4520.0)
-    np.testing.assert_array_equal(by_openimageio(path), image)
-
-
 def test_jpeg_xl_is_one_lossless_codestream() -> None:
     image = noisy(20, 30)
     data = encode_image(image, "jxl", METADATA)
     # ISO/IEC 18181-2, 5: the signature box; 16-bit lossless wants level 10, which only a container can tell.
     assert data[:12] == bytes.fromhex("0000000c 4a584c20 0d0a870a")
     np.testing.assert_array_equal(imagecodecs.jpegxl_decode(data), image)
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_other_arrays_are_refused(form: Format) -> None:
-    with pytest.raises(InputError, match=r"the image is uint16 \(4, 4\)"):
-        encode_image(np.zeros((4, 4), np.uint16), form, METADATA)
-    with pytest.raises(InputError, match=r"the image is uint16 \(0, 4, 3\)"):
-        encode_image(np.zeros((0, 4, 3), np.uint16), form, METADATA)
 
 
 @pytest.mark.parametrize(("form", "width", "height"), [("tiff", 30000, 24000), ("dng", 60000, 36000)])

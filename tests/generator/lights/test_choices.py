@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -12,70 +11,18 @@ import numpy as np
 import pytest
 
 from foundation.errors import InputError
-from generator.lights.choices import SimultaneousLights, matched_lights, nearest_lights, parse_light, parse_lights
-from generator.lights.gamut import Gamut
-from generator.lights.lighting import LightChoice, Lighting, ListedLights, Mixture, RandomLights, plain
+from generator.lights.choices import SimultaneousLights, nearest_lights, parse_light
+from generator.lights.lighting import LightChoice, Lighting, RandomLights, plain
 from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-
-WHITES = np.array([[8.0, 1, 1], [1, 8, 1], [1, 1, 8], [3, 4, 3]])
 
 
 def numbers(lightings: tuple[Lighting, ...]) -> tuple[int, ...]:
     """Return the lights of lightings that are one light of the table each."""
     assert all(len(lighting.mixtures) == 1 and lighting.mixtures[0].weights == (1.0,) for lighting in lightings)
     return tuple(lighting.mixtures[0].lights[0] for lighting in lightings)
-
-
-def test_lists_and_ranges() -> None:
-    assert parse_lights("0,5,12-14, 5 ,3 - 3", 15).lights == (0, 5, 12, 13, 14, 3)
-    assert parse_lights("all", 3).lights == (0, 1, 2)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("0,x", "'x' is no light"),
-        ("", "'' is no light"),
-        ("1,,2", "'' is no light"),
-        ("-3", "'-3' is no light"),
-        ("1.5", "'1.5' is no light"),
-        ("3-1", "'3-1' runs backwards; write 1-3"),
-        ("9", "there is no light 9; the table has lights 0 to 8"),
-        ("2-707", "there is no light 707; the table has lights 0 to 8"),
-    ],
-)
-def test_a_bad_list_names_its_bad_entry(text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        parse_lights(text, 9)
-
-
-@pytest.mark.slow
-def test_random_lights_are_distinct_even_and_their_seeds() -> None:
-    choice = RandomLights(3, 10, seed=1)
-    drawn = [numbers(choice.lightings_of(position)) for position in range(2000)]
-    assert all(len(set(lights)) == 3 for lights in drawn)
-    counts = Counter(light for lights in drawn for light in lights)
-    assert all(abs(counts[light] - 600) < 6 * (600 * 0.7) ** 0.5 for light in range(10))
-    other = RandomLights(3, 10, seed=2)
-    assert drawn[:20] != [numbers(other.lightings_of(position)) for position in range(20)]
-    assert isinstance(choice, LightChoice)
-
-
-@pytest.mark.parametrize("count", [0, 11])
-def test_more_random_lights_than_the_table_has_are_refused(count: int) -> None:
-    with pytest.raises(InputError, match=f"{count} random lights a picture were asked for; the table has 10"):
-        RandomLights(count, 10, 0)
-
-
-def test_listed_lights_may_be_mixtures() -> None:
-    mixture = Mixture((1, 3), (0.5, 0.5))
-    choice = ListedLights((2, mixture))
-    assert choice.lights_each == 2
-    assert choice.lightings_of(5) == (Lighting((plain(2),)), Lighting((mixture,)))
-    assert choice.describe() == {"choice": "listed", "lights": [2, "1:0.5+3:0.5"]}
 
 
 def test_nearest_is_by_angle(make_lut: Callable[..., Lut]) -> None:
@@ -89,40 +36,6 @@ def test_nearest_is_by_angle(make_lut: Callable[..., Lut]) -> None:
     assert [numbers(both.lightings_of(position)) for position in range(3)] == [(2, 0), (3, 2), (0, 3)]
 
 
-def test_every_ground_truth_of_a_list_is_matched() -> None:
-    gamut = Gamut(WHITES)
-    wanted = np.random.default_rng(2).dirichlet([1, 1, 1], 50) @ WHITES[:3]
-    choice = matched_lights(gamut, wanted, "gt.csv")
-    for position, truth in enumerate(wanted):
-        (lighting,) = choice.lightings_of(position + 50)
-        made = np.asarray(lighting.mixtures[0].weights) @ WHITES[list(lighting.mixtures[0].lights)]
-        np.testing.assert_allclose(made / made.sum(), truth / truth.sum(), atol=1e-8)
-    assert choice.describe()["lights"][7] == choice.matches[7].mixture.label
-
-
-def test_ground_truths_that_cannot_be_made_are_counted_and_the_farthest_named() -> None:
-    gamut = Gamut(WHITES, "the table T")
-    wanted = np.array([[3.0, 3, 3], [9, 1, 1], [20, 1, 1]])
-    with pytest.raises(
-        InputError,
-        match=r"2 of 3 ground truths of gt\.csv cannot be made; the farthest is number 3: .* outside .*table T",
-    ):
-        matched_lights(gamut, wanted, "gt.csv")
-    assert matched_lights(gamut, wanted, outside="nearest").matches[2].mixture == plain(0)
-
-
-def test_texts_of_lights(make_lut: Callable[..., Lut]) -> None:
-    lut = make_lut(lights=5)
-    assert parse_light("3", lut) == plain(3)
-    assert parse_light("1:0.25+3:0.75", lut) == Mixture((1, 3), (0.25, 0.75))
-    assert parse_light("cct=3001", lut) == plain(1)
-    assert parse_light(" 3001 K", lut) == plain(1)
-    assert parse_light("CCT=3002", lut).lights == (1, 3)
-    r, _, b = lut.ground_truth[2]
-    assert parse_light(f"r={r},b={b}", lut) == plain(2)
-    assert parse_light("r=.9,b=.05", lut, outside="nearest") == plain(4)
-
-
 def test_lights_of_a_table_may_have_names(make_lut: Callable[..., Lut]) -> None:
     lut = make_lut(lights=3)
     named = [replace(light, name=name) for light, name in zip(lut.illuminations, ("A", "FL2", "D65"), strict=True)]
@@ -133,28 +46,6 @@ def test_lights_of_a_table_may_have_names(make_lut: Callable[..., Lut]) -> None:
         parse_light("fl2", lut)
     with pytest.raises(InputError, match="or a name: A, FL2, D65"):
         parse_light("xyzzy", lut)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("5", "there is no light 5; the table"),
-        ("0:0.5+9:0.5", "there is no light 9; the table"),
-        ("blue", "'blue' is no light; write"),
-        ("Sunny", "write 5200K"),
-        ("5600", "write 5600K for the black body"),
-        ("cct=100", "100 K is outside the black bodies"),
-        ("cct=3001,r=.3", "is no light; write cct=4500, or both r and b"),
-        ("r=.3", "is no light; write cct"),
-        ("r=.9,b=.6", "without green is r=0.6,b=0.4"),
-        ("r=-.1,b=.3", "expected a number from 0 to 1"),
-        ("r=.9,b=.05", r"r=0\.9000, b=0\.0500 lies .*° outside what the table .* can make"),
-        ("t=3000", "'t=3000' is no option of a light"),
-    ],
-)
-def test_a_bad_light_is_named(make_lut: Callable[..., Lut], text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        parse_light(text, make_lut(lights=5))
 
 
 def test_lights_together_share_an_image() -> None:
@@ -170,11 +61,3 @@ def test_lights_together_share_an_image() -> None:
     assert [lighting.masks for lighting in lightings] == [masks.maker(12), masks.maker(13)]
     assert pickle.loads(pickle.dumps(choice)).lightings_of(6) == lightings
     assert choice.describe()["lights"] == inner.describe()
-
-
-@pytest.mark.parametrize(("count", "together"), [(3, 2), (1, 2), (2, 1)])
-def test_lights_that_cannot_be_shared_out_are_refused(count: int, together: int) -> None:
-    with pytest.raises(
-        InputError, match=f"{count} lights for each picture cannot be shared out {together} to an image"
-    ):
-        SimultaneousLights(RandomLights(count, 10, 1), together, parse_masks("smooth", 2, 0))

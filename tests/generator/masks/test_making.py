@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError
 from generator.masks.making import (
     FULL,
-    HalfPlanes,
-    MadeMaskPlan,
-    MaskMaker,
     RandomStreams,
-    SmoothFields,
-    Spots,
     Windows,
     find_masks,
     parse_masks,
@@ -100,25 +94,6 @@ def test_sets_follow_one_another_by_name(tmp_path: Path) -> None:
     assert (described["masks"], described["sets"]) == ("files", 3)
     save(tmp_path / "c.png", np.full((2, 2), 0.7), 16)
     assert find_masks(tmp_path, 2).describe()["sha256"] != described["sha256"]
-
-
-@pytest.mark.parametrize(
-    ("files", "lights", "message"),
-    [
-        ((), 2, "there is no mask in"),
-        (
-            ("a_1", "a_2", "a_3"),
-            2,
-            r"a_1\.png, a_2\.png, a_3\.png in .*: 2 lights need 2 masks, or 1 for those after the first; found 3",
-        ),
-        (("a",), 3, r"a\.png in .*: 3 lights need 3 masks, or 2 .* found 1"),
-    ],
-)
-def test_a_set_of_the_wrong_size_is_named(tmp_path: Path, files: tuple[str, ...], lights: int, message: str) -> None:
-    for name in files:
-        save(tmp_path / f"{name}.png", np.ones((2, 2)))
-    with pytest.raises(FormatError, match=message):
-        find_masks(tmp_path, lights)
 
 
 @pytest.mark.parametrize("data", [b"", b"no picture"])
@@ -205,13 +180,6 @@ def test_every_light_falls_somewhere(kind: str) -> None:
     shares = np.array([weights(kind, 30, 40, 3, number=number).mean(axis=(0, 1)) for number in range(40)])
     assert shares.mean(axis=0).min() > 0.08
     assert (shares > 0.01).mean() > 0.8
-
-
-def test_masks_travel_to_other_programs() -> None:
-    plan = parse_masks("window:columns=3", 2, 5)
-    again = pickle.loads(pickle.dumps(plan))
-    assert isinstance(plan.maker(3), MaskMaker)
-    np.testing.assert_array_equal(again.maker(3).weights(40, 50, 2), plan.maker(3).weights(40, 50, 2))
 
 
 def test_a_half_plane_has_its_angle() -> None:
@@ -320,38 +288,3 @@ def test_whole_parts_of_two_are_those_of_three_one_of_which_is_dark(shares: npt.
     quantise_shares(shares, two)
     quantise_shares(np.concatenate([shares, np.zeros_like(shares[:1])]), three)
     np.testing.assert_array_equal(three, np.dstack([two, np.zeros((3, 37))]))
-
-
-def test_texts_of_masks() -> None:
-    assert parse_masks("half-plane", 2, 1) == MadeMaskPlan(HalfPlanes(None, 0.0), 1)
-    assert parse_masks("half-plane:angle=-30,width=.1", 2, 1) == MadeMaskPlan(HalfPlanes(-30.0, 0.1), 1)
-    assert parse_masks("soft-edge", 2, 1) == MadeMaskPlan(HalfPlanes(None, None), 1)
-    assert parse_masks("spots:count=3", 2, 1) == MadeMaskPlan(Spots(3), 1)
-    assert parse_masks("smooth:contrast=8", 2, 1) == MadeMaskPlan(SmoothFields(contrast=8), 1)
-    assert parse_masks("window:rows=1,columns=2", 2, 1) == MadeMaskPlan(Windows(2, 1), 1)
-    assert parse_masks("spots:count=3", 2, 1).describe() == {
-        "masks": "spots",
-        "count": 3,
-        "radius": None,
-        "softness": 0.8,
-    }
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "'' is neither a folder of masks nor a kind of them: half-plane, soft-edge, spots, smooth, window"),
-        ("stripes", "'stripes' is neither a folder"),
-        ("half-plane:angle=361", "expected a number from -360 to 360"),
-        ("soft-edge:angle=-361", "expected a number from -360 to 360"),
-        ("spots:count=0", "'count=0' of the masks spots: expected a number from 1 to 20"),
-        ("spots:count=1.5", "count=1.5 of the masks spots: expected a whole number"),
-        ("spots:size=1", "'size=1' is no option of the masks spots; known are count, radius, softness"),
-        ("smooth:scale", "'scale' is no option of the masks smooth"),
-        ("window:rows=2,rows=3", "rows is given twice for the masks window"),
-    ],
-)
-def test_bad_masks_are_named(text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=message):
-        parse_masks(text, 2, 0)

@@ -22,8 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageCms, features
 
-from foundation.errors import FormatError, InputError
-from generator.pictures import sources
+from foundation.errors import FormatError
 from generator.pictures.conversion import to_srgb
 from generator.pictures.sources import PROFILE_UNUSED, Preparation, find_pictures, open_picture, read_picture
 from tests.generator.pictures.icc import ADOBE_RGB, PROPHOTO_RGB, gamma_profile
@@ -85,10 +84,6 @@ def test_srgb_under_any_name_is_left_alone(tmp_path: Path, dull: Codes) -> None:
     reading = open_picture(save(tmp_path / "picture.png", dull, icc))
     np.testing.assert_array_equal(reading.picture, dull)
     assert reading.profile.endswith("is sRGB")
-
-
-def test_no_profile_is_said(tmp_path: Path, dull: Codes) -> None:
-    assert open_picture(save(tmp_path / "picture.png", dull, None)).profile == "none, taken as sRGB"
 
 
 @pytest.mark.parametrize("icc", [b"", b"nonsense", ADOBE[:200]])
@@ -166,12 +161,6 @@ def test_a_grey_profile_is_applied(tmp_path: Path) -> None:
     assert np.abs(reading.picture - code[..., None]).max() <= 1.5
 
 
-def test_a_grey_profile_says_nothing_of_colours(dull: Codes) -> None:
-    codes, word = to_srgb(dull, gamma_profile("Grey 1.8", 1.8, None))
-    np.testing.assert_array_equal(codes, dull)
-    assert word == "Grey 1.8 of grey, not applied to colours, taken as sRGB"
-
-
 @pytest.mark.parametrize("mode", ["YCbCr", "L", "CMYK"])
 def test_jpeg_gives_the_codes_that_pillow_gives(tmp_path: Path, dull: Codes, mode: str) -> None:
     path = tmp_path / "picture.jpg"
@@ -214,30 +203,15 @@ def test_covering_keeps_all_of_the_narrow_side(tmp_path: Path) -> None:
 def test_random_places_depend_on_name_and_seed_and_reach_every_edge(tmp_path: Path) -> None:
     path = save(tmp_path / "ramp.png", ramp(13, 12), None)
     corners: set[tuple[int, int]] = set()
-    for seed in range(400):
-        cut = Preparation(crop=(10, 10), crop_at="random", seed=seed)
-        seen = open_picture(path, cut, "a").picture
-        np.testing.assert_array_equal(seen, open_picture(path, cut, "a").picture)
+    for seed in range(200):
+        seen = open_picture(path, Preparation(crop=(10, 10), crop_at="random", seed=seed), "a").picture
         corners.add((int(seen[0, 0, 0]), int(seen[0, 0, 1])))
-    # Of 12 places one is missed by 400 draws with a chance below 12 · (11/12)^400 < 1e-14.
+    # Of 12 places one is missed by 200 draws with a chance below 12 · (11/12)^200 < 1e-6.
     assert corners == {(x, y) for x in range(4) for y in range(3)}
     cut = Preparation(crop=(10, 10), crop_at="random")
-    named = {tuple(open_picture(path, cut, str(number)).picture[0, 0]) for number in range(400)}
+    np.testing.assert_array_equal(open_picture(path, cut, "a").picture, open_picture(path, cut, "a").picture)
+    named = {tuple(open_picture(path, cut, str(number)).picture[0, 0]) for number in range(200)}
     assert len(named) == 12
-
-
-def test_a_picture_smaller_than_the_crop_is_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "small.png", ramp(60, 41), None)
-    with pytest.raises(FormatError, match="60x41 px where the crop is 60x42"):
-        open_picture(path, Preparation(crop=(60, 42)))
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"max_side": 0}, {"crop": (0, 5)}, {"crop": (5, 70000)}, {"cover": True}, {"crop_at": "random"}]
-)
-def test_impossible_preparations_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(InputError):
-        Preparation(**wrong)  # pyrefly: ignore[bad-argument-type]
 
 
 needs_avif = pytest.mark.skipif(not features.check("avif"), reason="this Pillow is without libavif")
@@ -460,12 +434,3 @@ def test_what_is_no_picture_is_named_with_the_reason(tmp_path: Path, name: str) 
 def test_a_missing_picture_is_named(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"none\.png: there is no such file"):
         read_picture(tmp_path / "none.png")
-
-
-def test_a_picture_larger_than_any_is_named(
-    tmp_path: Path, colours: npt.NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write(tmp_path / "huge.png", colours, "uint8")
-    monkeypatch.setattr(sources, "LARGEST_PICTURE", 7 * 5 - 1)
-    with pytest.raises(FormatError, match=r"huge\.png: 7x5 px are more than 34; make it smaller"):
-        read_picture(path)

@@ -223,9 +223,3 @@ def test_random_scenes_are_uniform_and_their_own() -> None:
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.005
     assert abs(np.corrcoef(first[..., 0].ravel(), first[..., 1].ravel())[0, 1]) < 0.007
     np.testing.assert_array_equal(RandomScene(1, 500, 30, 9).read().picture, second[:30, :500])
-
-
-@pytest.mark.parametrize(("count", "width", "height"), [(0, 5, 5), (1, 0, 5), (1, 5, 65536)])
-def test_impossible_random_scenes_are_refused(count: int, width: int, height: int) -> None:
-    with pytest.raises(InputError, match="asked for, expected"):
-        random_scenes(count, width, height)

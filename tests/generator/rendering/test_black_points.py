@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from foundation.colorimetry import angles_deg
-from foundation.errors import InputError, QualityError
+from foundation.errors import QualityError
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.shards import photograph
 from generator.kernels.mixing import mix_samples
@@ -106,17 +106,6 @@ def test_nothing_wraps_at_either_end() -> None:
     assert np.abs(got - exact).transpose(0, 2, 1)[inner].max() <= 1.0
 
 
-def test_colours_that_are_not_wanted_change_no_other() -> None:
-    samples = cells_of(np.linspace(0.02, 1, 64)[:, None] * WHITE)
-    wanted = np.arange(64) % 3 == 1
-    from generator.rendering.black_points import Veil
-
-    whole = without_veil(samples, Veil(*veil(0.9)), 15000)
-    part = without_veil(samples, Veil(*veil(0.9)), 15000, wanted)
-    np.testing.assert_array_equal(part[wanted], whole[wanted])
-    assert (part[~wanted] == 0).all()
-
-
 def test_black_is_that_of_the_light_its_mixture_and_the_nearest_fit_cell(make_lut: MakeLut) -> None:
     lut = make_lut()
     means = lut.samples[:, 0].mean(axis=1)
@@ -194,22 +183,6 @@ def test_random_shares_are_even_and_a_function_of_seed_and_image() -> None:
     assert black_point.share(3, 7) == shares[7] != black_point.share(4, 7)
     assert [parse_black_point(text).share(3, 7) for text in ("keep", "compensate")] == [0, 1]
     assert parse_black_point("random") == BlackPoint("random", 0.97)
-
-
-def test_faults_are_named(make_lut: MakeLut) -> None:
-    with pytest.raises(InputError, match="the black point like has a share for each picture"):
-        parse_black_point("like").share(0, 0)
-    for text in ("none", "random:", "random:x", "Random"):
-        with pytest.raises(InputError, match=r"expected keep, compensate, random, random:MAX such as \.97, or like"):
-            parse_black_point(text)
-    with pytest.raises(InputError, match=r"is 1\.5, expected a number above 0 and at most 1"):
-        parse_black_point("random:1.5")
-    lut = make_lut()
-    bright = lut.white.copy()
-    bright[1] = 300
-    object.__setattr__(lut, "white", bright)
-    with pytest.raises(QualityError, match=r"under light 1 the table .* has a black of 0\.6.* of white"):
-        veil_of(lut, plain(1), 0.5)
 
 
 def test_of_greys_a_grey_is_taken_out_and_not_the_tinted_black_cell(make_lut: MakeLut) -> None:

@@ -25,13 +25,6 @@ def test_every_camera_keeps_white() -> None:
         assert (found.rows.argmax(axis=1) == [0, 1, 2]).all()
 
 
-@pytest.mark.parametrize("name", ["Canon EOS 550D", "EOS 550D", "550d", "canon eos550d", "Canon EOS-550D"])
-def test_names_of_a_camera(name: str) -> None:
-    found = camera_matrix(name)
-    assert found is not None
-    assert found.name == "Canon EOS 550D"
-
-
 @pytest.mark.parametrize("name", ["", "Canon", "EOS", "5D", "Nikon 550D", "50D"])
 def test_what_is_no_camera(name: str) -> None:
     assert camera_matrix(name) is None
@@ -68,18 +61,13 @@ def test_files(tmp_path: Path) -> None:
     assert choose_matrix("None") is None
     for text, message in (
         ("1 2\n3 4 5\n6 7 8\n", r"rows have \[2, 3, 3\] numbers"),
-        ("1 0 0\n0 1 0\n", "expected three rows"),
-        ("1 0 0\n0 x 0\n0 0 1", "could not convert"),
         ("1 0 0\n0 nan 0\n0 0 1", "is no colour matrix"),
         # The sum is infinite, and what is divided by it 0: a channel that sees nothing.
         ("1e308 1e308 0\n0 1 0\n0 0 1", r"up to 1e\+06 expected"),
-        ("1 0 0\n0 1 0\n1 0 -1", "sums 1 1 0, expected sums above 0"),
     ):
         path.write_text(text)
         with pytest.raises(InputError, match=message):
             choose_matrix(str(path))
-    with pytest.raises(InputError, match=r"'Pinhole' is neither a file nor a camera.*Canon EOS 550D"):
-        choose_matrix("Pinhole")
 
 
 def test_a_matrix_is_fitted_between_the_print_s_black_and_its_paper() -> None:

@@ -174,18 +174,18 @@ def test_a_batch_fills_the_memory_it_is_given(make_lut: MakeLut, gallery: Galler
 
 def test_choices_are_even(make_lut: MakeLut) -> None:
     gallery = gallery_of([ramp(12, 13)] * 5)
-    count = 6000
+    count = 3000
     crops = Crops(make_lut(bits=BITS), gallery, (4, 4), length=count, exposure=(0.25, 1.0), seed=7)
     batch = crops.batch(np.arange(count))
     for drawn, kinds in ((batch.lights, 4), (batch.pictures, 5)):
         expected = count / kinds
         # Chi-square with 4 degrees of freedom at most: above 28 by chance once in 80 000.
         assert ((np.bincount(drawn, minlength=kinds) - expected) ** 2 / expected).sum() < 28
-    # The gain is even in stops over two stops, mean 1 stop: its error is 2 / sqrt(12 · 6000) = .0075 stops.
+    # The gain is even in stops over two stops, mean 1 stop: its error is 2 / sqrt(12 · 3000) = .0105 stops.
     means = np.log2(batch.images.mean(axis=(1, 2, 3)))
     bright = np.log2(Crops(make_lut(bits=BITS, name="again"), gallery, (4, 4), length=count, seed=7)
                      .batch(np.arange(count)).images.mean(axis=(1, 2, 3)))  # fmt: skip
-    assert abs((means - bright).mean() + 1.0) < 6 * 0.0075
+    assert abs((means - bright).mean() + 1.0) < 6 * 0.0105
     assert np.ptp(means - bright) == pytest.approx(2.0, abs=0.02)
 
 
@@ -201,48 +201,11 @@ def test_mirrored_items_are_the_others_mirrored(make_lut: MakeLut) -> None:
     assert 50 < mirrored.sum() < 150
 
 
-def test_unfit_colours_take_their_stand_ins(make_lut: MakeLut) -> None:
-    lut = make_lut(bits=BITS, unfit=(63,))
-    white = np.full((8, 8, 3), 255, np.uint8)
-    crops = Crops(lut, gallery_of([white]), (4, 4), lights=[1], flip=False, length=9, rendering="codes")
-    images = crops.batch(np.arange(9)).images
-    from generator.kernels.unfit import nearest_fit_colours
-
-    wanted = lut.samples[1, int(nearest_fit_colours([63], BITS)[0])].astype(np.float32) / lut.provenance.white_level
-    values = images.transpose(0, 2, 3, 1).reshape(-1, 1, 3)
-    found = np.isclose(values, wanted[None], rtol=1e-6).all(axis=-1)
-    assert np.count_nonzero(found, axis=1).min() >= 1
-
-
-@pytest.mark.parametrize(
-    ("wrong", "word"),
-    [
-        ({"size": (10, 9)}, "1 of 2 pictures are smaller"),
-        ({"size": (0, 4)}, "0x4"),
-        ({"length": 0}, "0 items"),
-        ({"exposure": (2.0, 1.0)}, "exposure"),
-        ({"exposure": (0.0, 1.0)}, "exposure"),
-        ({"lights": []}, "no light"),
-        ({"lights": [4]}, "no light 4"),
-        ({"seed": -1}, "seed"),
-        ({"epoch": -1}, "epoch"),
-    ],
-)
-def test_what_cannot_be_is_refused(make_lut: MakeLut, gallery: Gallery, wrong: dict[str, object], word: str) -> None:
-    arguments: dict[str, object] = {"size": (4, 4)} | wrong
-    with pytest.raises(InputError, match=word):
-        Crops(make_lut(bits=BITS), gallery, **arguments)  # pyrefly: ignore[bad-argument-type]
-
-
 def test_items_that_are_not_there(make_lut: MakeLut, gallery: Gallery) -> None:
     crops = Crops(make_lut(bits=BITS), gallery, (4, 4), length=3)
     assert crops[2][0].shape == (3, 4, 4)
     with pytest.raises(IndexError):
         crops[3]
-    outside: list[list[int]] = [[3], [-1], []]
-    for wrong in outside:
-        with pytest.raises(InputError):
-            crops.batch(wrong)
 
 
 def test_a_gallery_on_disk_is_the_pictures(tmp_path: Path) -> None:
@@ -268,6 +231,7 @@ def test_a_gallery_on_disk_is_the_pictures(tmp_path: Path) -> None:
 WITHOUT_TORCH = """
 import sys
 sys.modules["torch"] = None
+import generator.dataset.making, generator.kernels.rendering
 from generator.training import Crops
 try:
     from generator.training.torch_crops import CropDataset

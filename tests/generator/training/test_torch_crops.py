@@ -82,9 +82,3 @@ def test_single_items_and_their_bounds(crops: Crops) -> None:
         dataset[22]
     with pytest.raises(InputError, match="batches of 0"):
         CropStream(crops, 0)
-
-
-def test_nothing_else_imports_pytorch() -> None:
-    modules = "generator, generator.training, generator.dataset.making, generator.kernels.rendering"
-    code = f"import sys, {modules}; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

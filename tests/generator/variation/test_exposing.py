@@ -84,18 +84,6 @@ def test_black_that_is_taken_out_is_not_lifted_by_noise(make_lut: Callable[..., 
     assert noisy.min() < 0
 
 
-def test_planes_that_are_refused(make_lut: Callable[..., Lut]) -> None:
-    gallery = gallery_of([np.full((9, 9, 3), 200, np.uint8)])
-    with pytest.raises(InputError, match="noise"):
-        Crops(make_lut(), gallery, (8, 8), iso=IsoSpeed(200, 100))
-    items, seeds = np.zeros((2, 3, 4, 4), np.float32), np.zeros(2, np.uint64)
-    for gains in (np.ones(3), np.array([1.0, 0.0])):
-        with pytest.raises(InputError):
-            add_noise(items, gains, PLANES, seeds, white_level=100)
-    with pytest.raises(InputError):
-        add_noise(items.astype(np.float64), np.ones(2), PLANES, seeds, white_level=100)  # type: ignore[arg-type]
-
-
 NOISE = SensorNoise(read=(6.0, 4.2, 5.0), shot=(0.56, 0.28, 0.4))
 QUIET = SensorNoise((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 Image = npt.NDArray[np.uint16]
@@ -278,10 +266,6 @@ def test_what_is_refused() -> None:
     image = np.zeros((4, 4, 3), np.uint16)
     for wrong in (
         lambda: expose(image.astype(np.float32), 1.0, NOISE),  # type: ignore[arg-type]
-        lambda: expose(image, 0.0, NOISE),
-        lambda: expose(image, 1.0, NOISE, ratio=0.5),
-        lambda: expose(image, 1.0, NOISE, white_level=0),
-        lambda: expose(image, 1.0, NOISE, weights=np.zeros((4, 5, 2), np.float32), end=(0.5, 0.5, 0.5)),
         lambda: expose(image, 1.0, NOISE, weights=np.zeros((4, 4, 2), np.float32), end=(0.5, 1.5, 0.5)),
         lambda: expose(image[:, ::2], 1.0, NOISE),
         lambda: expose(image, 1.0, NOISE, seed=-1),
