@@ -221,6 +221,8 @@ class Covered:
         order = sorted(self.seconds, key=lambda test: self.seconds[test] * (0.3 if near in test else 1.0))
         # What a fixture of a whole file runs is counted for the first test that asks for it.
         files = {test.partition("::")[0] for test in found}
+        # What is run on import is also reached by those who look through all names of a module.
+        files |= _importers(mutation.file) if sought else set()
         mates = [test for test in order if test.partition("::")[0] in files and test not in found]
         return [*(test for test in order if test in found), *mates]
 
@@ -338,6 +340,17 @@ def _uses(name: str) -> list[tuple[str, int]]:
                     case _:
                         pass
     return found
+
+
+def _importers(file: str) -> set[str]:
+    """Return the files of tests that import a module."""
+    package, _, module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".").rpartition(".")
+    taken = re.compile(
+        rf"^(?:from {re.escape(package)}\.{module} import|from {re.escape(package)} import .*\b{module}\b)",
+        re.MULTILINE,
+    )
+    found = {str(path.relative_to(ROOT)): path for path in (ROOT / "tests").rglob("test_*.py")}
+    return {name for name, path in found.items() if taken.search(path.read_text(encoding="utf-8"))}
 
 
 def killed_by(
