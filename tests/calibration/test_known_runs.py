@@ -189,6 +189,7 @@ def test_noise(pinned: Pinned) -> None:
     pinned("noise of samples and light of neighbours", [found, windows, shares, means, medians], **LOOSE)
 
 
+@pytest.mark.slow
 def test_values_among_their_neighbours(pinned: Pinned) -> None:
     values = np.array([5.0, 1, 9, 3, np.nan, 7, 2, 8, np.nan, np.nan])
     around = np.array([[n, *((n + k) % 10 for k in (1, 2, 4, 5))] for n in range(10)])

@@ -30,6 +30,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     assert not circle, f"imports go round: {' <- '.join(circle)}; move what both need to a module below them"
 
 
+@pytest.mark.slow
 def test_no_module_imports_a_private_name_of_another() -> None:
     taken = [
         f"{source.path}: {name.name} of {node.module}"
