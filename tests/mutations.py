@@ -391,12 +391,12 @@ def misfits(mutation: Mutation, folder: Path) -> bool:
     """Return whether the checker of types refuses a mutation in a copy of the checkout."""
     known_text = mutation.apply(folder)
     checker = [Path(sys.executable).with_name("pyrefly"), "check", "--threads", "1", "--summary=none"]
+    words = [*checker, "--python-interpreter-path", sys.executable]
     try:
-        return subprocess.run(
-            [*checker, "--python-interpreter-path", sys.executable], cwd=folder, capture_output=True, check=False
-        ).returncode != 0  # fmt: skip
+        checked = subprocess.run(words, cwd=folder, capture_output=True, check=False)
     finally:
         (folder / mutation.file).write_text(known_text, encoding="utf-8")
+    return checked.returncode != 0
 
 
 def tested(folder: Path, words: list[str], limit_s: float) -> tuple[int | str, str]:

@@ -18,8 +18,6 @@ from tests.calibration.lab import LIGHTS, Lab, blank_pictures, hang, lens_unmeas
 from tests.calibration.whole import LIMITS, sketched, told
 from tests.pinned import Pinned
 
-# What is pinned is of any kind.
-
 __all__ = ["built", "lab", "lens_unmeasured", "rendered_once", "session"]
 
 

@@ -41,8 +41,6 @@ from tests.calibration.spread.test_predicting import ALL, printed
 from tests.calibration.whole import brief, of_fields, sketched, together
 from tests.pinned import Pinned
 
-# What is pinned is of any kind.
-
 _Array = npt.NDArray[np.float64]
 LOOSE = {"same": 1e-4, "nothing": 1e-8}
 """Of what an iterative fit ends at."""

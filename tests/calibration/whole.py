@@ -21,8 +21,6 @@ from calibration.verdict import BuildResult, findings, refusal, remark, retaken_
 from tests.pinned import NOTHING
 from tests.pinned.drawn import drawn
 
-# What is pinned is of any kind.
-
 LIMITS: dict[str, float] = {"same": 1e-3, "nothing": 1e-6}
 """What numbers of whole builds may differ by: they come from fits upon fits, and another BLAS moves some by 3e-4."""
 

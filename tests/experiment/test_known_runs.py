@@ -32,8 +32,6 @@ from tests.experiment.measures.test_stains import print_with
 from tests.experiment.test_config import MINIMAL
 from tests.pinned import Pinned
 
-# What is pinned is of any kind.
-
 _Array = npt.NDArray[np.float64]
 LOOSE = {"same": 1e-4, "nothing": 1e-6}
 """Of what an iterative fit ends at."""

@@ -21,8 +21,6 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-# What is pinned is of any kind.
-
 FOLDER = Path(__file__).parent
 
 SAME = 1e-6

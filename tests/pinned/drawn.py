@@ -17,8 +17,6 @@ from matplotlib.text import Text
 
 from tests.pinned import plain
 
-# What is pinned is of any kind.
-
 
 def drawn(figure: Figure) -> list[Any]:
     """Return what a figure shows, artist by artist, without what depends on fonts."""

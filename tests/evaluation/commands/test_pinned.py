@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -42,14 +41,6 @@ def made_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for layout in ("lsmi", "folder", "nus8"):
         COPIES[layout].make(folder / layout)
     return folder
-
-
-@pytest.fixture
-def place(made_place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a working folder that is a copy of it."""
-    shutil.copytree(made_place, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 SEQUENCES: dict[str, tuple[str, ...]] = {

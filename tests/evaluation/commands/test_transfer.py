@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -55,14 +54,6 @@ def made_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.savez(folder / "real.npz", images=images.astype(np.float32), gt=lights, names=names)
     (folder / "own.py").write_text(OWN)
     return folder
-
-
-@pytest.fixture
-def place(made_place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a working folder that is a copy of it."""
-    shutil.copytree(made_place, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 BASIC = ("transfer", "--train", "made", "--test", "real.npz", "--methods", "own.py:Map", "--statistics", "gray-world")

@@ -31,8 +31,6 @@ from tests.generator.rendering.prints import MATRIX
 from tests.pinned import Pinned
 from tests.pinned.drawn import drawn
 
-# What is pinned is of any kind.
-
 pytestmark = pytest.mark.slow
 
 
