@@ -125,6 +125,7 @@ def test_an_svg_takes_the_page_s_colours_and_is_the_same_each_time() -> None:
     assert not {INK, FAINT, GRID, PAPER} & set(SERIES)
 
 
+@pytest.mark.slow
 def test_a_png_is_the_same_each_time() -> None:
     png = png_of(draw)
     assert png.startswith(b"\x89PNG")

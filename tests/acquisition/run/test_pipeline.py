@@ -332,6 +332,7 @@ class TestFaults:
         assert "bytes" in said[0]
         assert all(len(path.read_bytes()) in (len(WELL), len(NIGHT)) for path in (folder / "frames").iterdir())
 
+    @pytest.mark.slow
     def test_a_device_that_stays_silent_ends_the_run_when_patience_does(self, folder: Path) -> None:
         lab = Lab(folder, dict.fromkeys(range(3, 2000), LinkTimeout("no answer from the camera")))
         said: list[str] = []

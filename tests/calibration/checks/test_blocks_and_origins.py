@@ -13,6 +13,7 @@ from calibration.checks.frame_consistency import ForeignFrame, OriginFigures, or
 from drivers.raw.rawfile import FrameOrigin
 
 
+@pytest.mark.slow
 def test_light_of_blocks_is_a_line_through_the_cells_that_are_seen() -> None:
     expected = np.linspace(100, 10_000, 200)
     top = np.percentile(expected, 99)

@@ -14,6 +14,7 @@ from experiment.measures.sensor import black_drift
 from tests.calibration.lab import Lab
 
 
+@pytest.mark.slow
 def test_saturation_is_what_the_frame_shows(lab: Lab, tmp_path: Path) -> None:
     normal = lab.mosaic(tmp_path)
     assert normal.saturation() == normal.white_level == lab.world.body.saturation

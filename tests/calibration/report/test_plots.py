@@ -135,6 +135,7 @@ def test_what_cells_of_two_tables_differ_by_is_drawn_in_the_channel_that_differs
     assert squares.get_clim() == pytest.approx((-100 * most, 100 * most))
 
 
+@pytest.mark.slow
 def test_lights_are_drawn_at_their_chromaticities_in_the_triangle_of_all() -> None:
     codes = np.array([[255.0, 0, 0], [255, 255, 255], [0, 0, 0], [0, 0, 255]])
     white = np.array([[600.0, 300, 100], [200, 500, 300], [0, 0, 0], [100, 300, 600]])
@@ -272,6 +273,7 @@ def test_the_field_is_drawn_over_the_page_with_contours_of_two_per_cent() -> Non
         assert axes.collections[0].levels == pytest.approx(np.arange(0.9, 1.1201, 0.02))
 
 
+@pytest.mark.slow
 def test_errors_of_cells_are_drawn_in_per_cent_and_their_worst_ringed() -> None:
     deviation = np.linspace(-0.04, 0.03, len(CELLS))
     error, alone = np.full((len(CELLS), 3), 1e-6), np.zeros((len(CELLS), 3))

@@ -86,6 +86,7 @@ def test_one_light_a_chunk_and_32_an_object(lut: Lut, tmp_path: Path) -> None:
     assert len(objects) == 2
 
 
+@pytest.mark.slow
 def test_what_was_never_finished_is_published_anew(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     url = str(tmp_path / "published")
 

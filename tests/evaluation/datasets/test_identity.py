@@ -33,6 +33,7 @@ def test_a_name_and_a_light_make_an_image() -> None:
     assert not is_known(WALL)
 
 
+@pytest.mark.slow
 def test_a_generated_image_is_its_picture(tmp_path: Path) -> None:
     save_pictures(tmp_path / "pictures", ["a.png", "b.png"])
     save_pictures(tmp_path / "others", ["a.png", "b.png"], seed=1)

@@ -51,6 +51,7 @@ def test_names_are_neither_mathematics_nor_left_out() -> None:
     assert {"im $x_1$", "$a$: error, degrees", "_b: error, degrees"} <= set(scatter)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [20.0, 0.02])
 def test_labels_of_images_with_like_errors_stand_one_above_another(error: float) -> None:
     one, other = np.array([0.5, 0.5, 0.52, 5.0, 5.1]), np.array([20.0, error, error, error, 1.0])

@@ -253,6 +253,7 @@ def test_the_display_profile_has_the_published_primaries() -> None:
     assert len(tags["rTRC"]) == 12 + 2 * 1024
 
 
+@pytest.mark.slow
 def test_the_tagged_tiff_has_the_codes_of_the_untagged_one(tmp_path: Path) -> None:
     chart = design_chart(1)
     save_tiff(chart, tmp_path / "plain.tif")

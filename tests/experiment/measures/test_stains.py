@@ -35,6 +35,7 @@ def test_a_broad_reflection_goes_on_around_the_cells_that_are_listed(added: floa
     assert least < found < added
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("radius", "added", "kept"),
     [(0, 0, 1), (40, 0, 0.9), (40, 0.02, 0.6), (40, 0, 1.1), (9, 0.05, 1), (40, 0.03, 1), (40, 0.1, 1)],

@@ -44,6 +44,7 @@ def test_the_noise_is_that_of_the_model(gain: float, ratio: float) -> None:
     assert np.abs(seen.mean(axis=(1, 2)) - gain * mean).max() < 4.5 * np.sqrt(expected.max()) / 300
 
 
+@pytest.mark.slow
 def test_items_are_the_same_whoever_makes_them(make_lut: Callable[..., Lut]) -> None:
     lut = make_lut(bits=3)
     gallery = gallery_of([np.full((40, 50, 3), 200, np.uint8)])
