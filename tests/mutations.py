@@ -1,16 +1,17 @@
 """Draw mutations of the product at random and count those that no test notices.
 
 `python -m tests.mutations [--count 60] [--seed 1] [--results FILE]` changes one place at a time in a copy of the
-repository (a comparison, an operator, a number), runs the tests that can reach it, and prints one JSON object
-a mutation and one for the whole. Every place is as likely, so that packages have their share by size. A mutation is
-killed where `make test` would fail: a test fails or does not end, and passes without it, or types do not fit. Which
-tests run a place is found first, by one run of them all that notes the lines of each (a quarter of an hour), which is
-kept in `build/mutations` until the product or the tests change. They are tried from the quickest on until one fails or
-`--limit` seconds are over: what survives these, and the checker of types, is said to survive. `--results` keeps what
-was tried, so that a run that was stopped goes on; `--again` tries what survived there once more, wherever its line is
-now.
+repository, runs the tests that can reach it, and prints one JSON object a mutation and one for the whole. What is
+changed to what are mutmut's operators (an operator, a number, a text, an argument, an assignment, a branch), also on
+module level and in decorated functions, where mutmut itself does not go. Every mutation is as likely, so that packages
+have their share by size. A mutation is killed where `make test` would fail: a test fails or does not end, and passes
+without it, or types do not fit. Which tests run a place is found first, by one run of them all that notes the lines of
+each (a quarter of an hour), which is kept in `build/mutations` until the product or the tests change. They are tried
+from the quickest on until one fails or `--limit` seconds are over: what survives these, and the checker of types, is
+said to survive. `--results` keeps what was tried, so that a run that was stopped goes on; `--again` tries what survived
+there once more, wherever its line is now.
 
-Not drawn are annotations, messages, numbers that are an index, and what only type checkers read.
+Not drawn are annotations, what is raised, and what only type checkers read.
 """
 
 from __future__ import annotations
@@ -36,11 +37,14 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from queue import Queue
-from typing import Any
+from typing import Any, cast
 
+import libcst as cst
 import pytest
 from coverage import Coverage, CoverageData
 from coverage.data import combine_parallel_data
+from libcst.metadata import CodeRange, MetadataWrapper, PositionProvider
+from mutmut.mutation.mutators import mutation_operators
 
 ROOT = Path(__file__).parents[1]
 PACKAGES: list[str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["root_packages"]
@@ -67,101 +71,87 @@ STOPPED_AT = re.compile(
 )
 """The test at which pytest stopped: it failed, it has no outcome, or its file cannot be imported."""
 
-OTHER: dict[type[ast.AST], type[ast.AST]] = {
-    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
-    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
-    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,
-}  # fmt: skip
-"""What stands in the place of each operator."""
+
+_AROUND = 30
+"""Characters of what stands around a change that are shown."""
 
 
 @dataclass(frozen=True)
 class Mutation:
-    """One changed place: its file, relative to the checkout, line, old and new source of the expression.
+    """One changed place: its file, relative to the checkout, lines, old and new source.
 
-    `text`: the line as it stands, by which the place is found again where others have moved it.
+    `number`: which it is of those of its file. `text`: the line as it stands, by which the place is found again where
+    others have moved it.
     """
 
     file: str
+    number: int
     line: int
+    last_line: int
     before: str
     after: str
-    column: int
-    last_line: int
-    last_column: int
     text: str
 
     def apply(self, folder: Path) -> str:
         """Change the place in a copy of the checkout and return the file's text as it was."""
         path = folder / self.file
         text = path.read_text(encoding="utf-8")
-        lines = text.splitlines(keepends=True)
-        # ast counts columns in bytes of UTF-8.
-        head = lines[self.line - 1].encode()[: self.column].decode()
-        tail = lines[self.last_line - 1].encode()[self.last_column :].decode()
-        lines[self.line - 1 : self.last_line] = [f"{head}({self.after}){tail}"]
-        path.write_text("".join(lines), encoding="utf-8")
+        places = _Places(text)
+        node, changed = places.found[self.number]
+        path.write_text(cst.ensure_type(places.module.deep_replace(node, changed), cst.Module).code, encoding="utf-8")
         return text
 
-
-def mutated(node: ast.expr) -> Iterator[ast.expr]:
-    """Yield an expression's mutations."""
-    match node:
-        case ast.Compare(ops=[op]) if type(op) in OTHER:
-            yield ast.Compare(node.left, [OTHER[type(op)]()], node.comparators)  # pyrefly: ignore[bad-argument-type]
-        case ast.BoolOp(op=op):
-            yield ast.BoolOp(OTHER[type(op)](), node.values)  # pyrefly: ignore[bad-argument-type]
-        case ast.BinOp(op=op) if type(op) in OTHER and not _is_text(node):
-            yield ast.BinOp(node.left, OTHER[type(op)](), node.right)  # pyrefly: ignore[bad-argument-type]
-        case ast.UnaryOp(op=ast.Not(), operand=operand):
-            yield operand
-        case ast.IfExp(test=test):
-            yield ast.IfExp(ast.UnaryOp(ast.Not(), test), node.body, node.orelse)
-        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
-            yield ast.Constant(number * 2 if number not in (0, 1) else 1 - number)
-        case _:
-            pass
+    def __str__(self) -> str:
+        """Return where it is, and what differs with a little of what stands around it."""
+        before, after = " ".join(self.before.split()), " ".join(self.after.split())
+        start = len(os.path.commonprefix([before, after]))  # noqa: RUF071 - not of paths
+        end = len(os.path.commonprefix([before[start:][::-1], after[start:][::-1]]))  # noqa: RUF071
+        first = max(start - _AROUND, 0)
+        changes = (text[first : len(text) - max(end - _AROUND, 0)] for text in (before, after))
+        return f"{self.file}:{self.line}: {'  ->  '.join(changes)}"
 
 
-def _is_text(node: ast.BinOp) -> bool:
-    return any(isinstance(side, ast.JoinedStr) or (isinstance(side, ast.Constant) and isinstance(side.value, str))
-               for side in (node.left, node.right))  # fmt: skip
+class _Places(cst.CSTVisitor):
+    """Finds what of a source text may be changed: `found` has pairs of a node and another one in its place."""
+
+    METADATA_DEPENDENCIES = (PositionProvider,)
+
+    def __init__(self, source: str) -> None:
+        super().__init__()
+        self.found: list[tuple[cst.CSTNode, cst.CSTNode]] = []
+        self.lines: list[tuple[int, int]] = []
+        wrapped = MetadataWrapper(cst.parse_module(source), unsafe_skip_copy=True)
+        self.module = wrapped.visit(self)
+
+    def on_visit(self, node: cst.CSTNode) -> bool:
+        """Note a node's mutations; return whether to look into it."""
+        match node:
+            case cst.Annotation() | cst.Raise() | cst.If(test=cst.Name("TYPE_CHECKING")):
+                return False
+            case _:
+                pass
+        for kind, operator in mutation_operators:
+            for changed in operator(node) if isinstance(node, kind) else ():
+                self.found.append((node, changed))
+                place = cast("CodeRange", self.get_metadata(PositionProvider, node))
+                self.lines.append((place.start.line, place.end.line))
+        return True
 
 
 def places(path: Path) -> Iterator[Mutation]:
     """Yield every mutation of a file."""
     source = path.read_text(encoding="utf-8")
-    tree, lines = ast.parse(source), source.splitlines()
-    left_out = set[int]()
-    for node in ast.walk(tree):
-        skipped: list[ast.AST] = []
-        match node:
-            case ast.arg(annotation=ast.expr() as note) | ast.AnnAssign(annotation=note):
-                skipped = [note]  # pyrefly: ignore[bad-assignment]
-            case ast.FunctionDef(returns=ast.expr() as note):
-                skipped = [note]
-            case ast.JoinedStr() | ast.Raise() | ast.MatchValue():
-                skipped = [node]
-            case ast.If(test=ast.Name(id="TYPE_CHECKING")):
-                skipped = [node]
-            case ast.Subscript(slice=index):
-                skipped = [one for one in ast.walk(index) if isinstance(one, ast.Constant)]
-            case _:
-                pass
-        left_out |= {id(inner) for one in skipped for inner in ast.walk(one)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.expr) and id(node) not in left_out:
-            for after in mutated(node):
-                yield Mutation(
-                    str(path.relative_to(ROOT)),
-                    node.lineno,
-                    ast.unparse(node),
-                    ast.unparse(after),
-                    node.col_offset,
-                    node.end_lineno or node.lineno,
-                    node.end_col_offset or 0,
-                    lines[node.lineno - 1].strip(),
-                )
+    found, lines, module = _Places(source), source.splitlines(), cst.Module([])
+    for number, ((node, changed), (first, last)) in enumerate(zip(found.found, found.lines, strict=True)):
+        yield Mutation(
+            str(path.relative_to(ROOT)),
+            number,
+            first,
+            last,
+            module.code_for_node(node),
+            module.code_for_node(changed),
+            lines[first - 1].strip(),
+        )
 
 
 def drawn(count: int, seed: int) -> list[Mutation]:
@@ -179,7 +169,7 @@ def survivors(results: Path) -> list[Mutation]:
         alike = [one for one in places(ROOT / old.file) if (one.before, one.after, one.text) == said]
         if not alike:
             print(f"{old.file}:{old.line}: {old.text!r} is not there any more", file=sys.stderr)
-        found += sorted(alike, key=lambda one: (abs(one.line - old.line), abs(one.column - old.column)))[:1]
+        found += sorted(alike, key=lambda one: (abs(one.line - old.line), abs(one.number - old.number)))[:1]
     return found
 
 
@@ -435,11 +425,14 @@ def _environment(folder: Path) -> dict[str, str]:
 
 
 def copied(folder: Path) -> Path:
-    """Return a copy of the checkout in a folder."""
+    """Return a copy of the checkout in a folder, with the data beside it that tests look for there."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in listed.split("\0")[:-1]:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, folder / name)
+    data, beside = ROOT.parent / "shared", folder.parent / "shared"
+    if data.is_dir() and not beside.exists():
+        beside.symlink_to(data)
     return folder
 
 
@@ -459,7 +452,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     mutations = survivors(given.results) if given.again else drawn(given.count, given.seed)
     if given.list:
         for one in mutations:
-            print(f"{one.file}:{one.line}: {one.before}  ->  {one.after}")
+            print(one)
         return 0
     covered = Covered(ROOT / "build/mutations" / _digest())
     known = {} if given.again else {Mutation(**row["mutation"]): row["killed by"] for row in _rows(given.results)}
