@@ -266,7 +266,6 @@ def _plan(
 
 
 def _make_whole(plan: Plan, out: str, workers: Workers, output: JsonOutput) -> Dataset:
-    pass
     from generator.dataset.making import make_dataset
 
     with orderly_end(), shown_progress(plan.total) as callbacks:
@@ -276,7 +275,6 @@ def _make_whole(plan: Plan, out: str, workers: Workers, output: JsonOutput) -> D
 
 
 def _make_share(plan: Plan, out: str, shard: str, workers: Workers, output: JsonOutput) -> None:
-    pass
     from generator.dataset.making import make_share, parse_share
 
     share = parse_share(shard)

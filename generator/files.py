@@ -1,14 +1,8 @@
 """A 16-bit linear image as the bytes of a file, losslessly, and back; masks and previews beside it.
 
-    png     16-bit RGB; read by everything; the smallest of photographs
-    tiff    16-bit RGB, uncompressed: the fastest to write and to read
-    exr     OpenEXR, 32-bit float, which holds every 16-bit number (half does not); compressed by zip
-    jxl     JPEG XL, lossless, 16 bits: the smallest of smooth pictures
-    dng     a raw file: the Bayer mosaic of the image, two thirds of the values left out, as by a sensor
-
-Every encoder releases the interpreter's lock while it computes (not while it copies uncompressed pixels into the
-file). Beside image and file a PNG takes some megabytes, however large. `docs/decisions/0011-image-files.md` says what
-else was weighed.
+docs/formats.md says what each format is, and `docs/decisions/0011-image-files.md` what else was weighed. Every encoder
+releases the interpreter's lock while it computes (not while it copies uncompressed pixels into the file). Beside image
+and file a PNG takes some megabytes, however large.
 
 **PNG** (ISO/IEC 15948). Chunks are written here around `generator.deflate`; one of data holds a band of rows. Values
 are the image's own: no gAMA, cICP or iCCP chunk, since camera RGB is no display's and some readers would convert, and
@@ -99,11 +93,6 @@ def to_full_scale(image: Image, white_level: int) -> Image:
     A raw image of 0 … 11 536 looks nearly black to a program that takes the largest number of a type for white. With
     white level w a count v becomes ⌊65535 v / w⌉, which grows by more than 1 from count to count, so that no two become
     the same, and ⌊w s / 65535⌉ is v again: nothing is lost.
-
-    Examples
-    --------
-    >>> to_full_scale(np.array([0, 1, 1000, 11536], np.uint16), 11536)
-    array([    0,     6,  5681, 65535], dtype=uint16)
     """
     white = np.uint32(white_level)
     counts = np.minimum(image, np.uint16(white_level)).astype(np.uint32)
@@ -413,14 +402,7 @@ def encode_dng(image: Image, metadata: ImageMetadata) -> bytes:
 
 
 def mosaic_of(image: Image) -> Image:
-    """Return the RGGB mosaic (H, W) uint16, little-endian, of `image` (H, W, 3) uint16.
-
-    Examples
-    --------
-    >>> mosaic_of(np.full((2, 4, 3), (10, 20, 30), np.uint16))
-    array([[10, 20, 10, 20],
-           [20, 30, 20, 30]], dtype=uint16)
-    """
+    """Return the RGGB mosaic (H, W) uint16, little-endian, of `image` (H, W, 3) uint16."""
     counts = np.empty(image.shape[:2], "<u2")
     counts[0::2, 0::2] = image[0::2, 0::2, 0]
     counts[0::2, 1::2] = image[0::2, 1::2, 1]
@@ -433,11 +415,6 @@ def half_size(counts: Image) -> Image:
     """Return linear RGB (H // 2, W // 2, 3) uint16 of an RGGB mosaic (H, W) uint16.
 
     Each 2×2 block becomes a pixel: red, the mean of both greens rounded up, blue.
-
-    Examples
-    --------
-    >>> half_size(np.array([[10, 20], [25, 30]], np.uint16))
-    array([[[10, 23, 30]]], dtype=uint16)
     """
     height, width = (size // 2 * 2 for size in counts.shape)
     image = np.empty((height // 2, width // 2, 3), np.uint16)
@@ -502,15 +479,6 @@ def encode_image(image: Image, form: Format, metadata: ImageMetadata) -> bytes:
     """Return `image` as the bytes of a file.
 
     `image`: (H, W, 3) uint16, linear camera RGB.
-
-    Examples
-    --------
-    >>> image = np.full((4, 6, 3), 1000, np.uint16)
-    >>> data = encode_image(image, "png", ImageMetadata(white_level=4095, white=(0.4, 1.0, 0.7), camera="Maker Model"))
-    >>> data[1:4]
-    b'PNG'
-    >>> decode_image(data, "png", "a.png")[0, 0]
-    array([1000, 1000, 1000], dtype=uint16)
     """
     _check(image)
     if form == "jxl":
@@ -610,14 +578,6 @@ class Flash:
     - `k`: semi-saturation: a · exp(mean ln V) of the image it was fitted to.
     - `scale`: code that the brightest value became, divided by that value: undone before anything else.
     - `gamma`: display exponent g of y ** (1 / g); 1 for none.
-
-    Examples
-    --------
-    >>> linear = np.array([[0.01, 0.02, 0.05], [0.4, 0.5, 0.2]])
-    >>> operator = fit_flash(linear)
-    >>> operator.invert(operator.apply(linear)).round(6)
-    array([[0.01, 0.02, 0.05],
-           [0.4 , 0.5 , 0.2 ]])
     """
 
     k: float
@@ -645,11 +605,6 @@ def fit_flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2
     """Return the operator fitted to an image.
 
     `linear`: (..., 3) float ≥ 0, linear RGB, 1 = saturation.
-
-    Examples
-    --------
-    >>> fit_flash(np.full((4, 4, 3), 0.5), a=5, gamma=1)
-    Flash(k=2.5, scale=1530.0, gamma=1)
     """
     if not linear.size or a <= 0 or gamma <= 0:
         raise InputError(
@@ -817,13 +772,6 @@ def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREV
     `image`: (H, W, 3) uint16, linear camera RGB. `side`: longest side allowed, px. A pixel of the preview is the mean
     of k × k pixels, k the least whole number that makes it fit. Returns (h, w, 3) uint8, codes for a display; h and w
     are H / k and W / k, rounded up.
-
-    Examples
-    --------
-    >>> wall = np.full((20, 1000, 3), (1000, 2000, 1500), np.uint16)
-    >>> preview = preview_of(wall, white_level=4000, side=100)
-    >>> preview.shape, preview[0, 0]
-    ((2, 100, 3), array([186, 255, 224], dtype=uint8))
     """
     height, width = image.shape[:2]
     factor = -(-max(height, width) // side)

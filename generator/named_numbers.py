@@ -15,13 +15,7 @@ Range = tuple[float, float]
 
 
 def is_number(text: str) -> bool:
-    """Return whether a text is a number to Python's `float`, which takes nan and inf for numbers too.
-
-    Examples
-    --------
-    >>> [is_number(text) for text in (".5", " -3e2 ", "r", "")]
-    [True, True, False, False]
-    """
+    """Return whether a text is a number to Python's `float`, which takes nan and inf for numbers too."""
     try:
         float(text)
     except ValueError:
@@ -30,13 +24,7 @@ def is_number(text: str) -> bool:
 
 
 def parse_numbers(text: str, allowed: Mapping[str, Range], what: str) -> dict[str, float]:
-    """Return the numbers of a text such as ``r=.3,b=.25``; empty text gives none.
-
-    Examples
-    --------
-    >>> parse_numbers("r=.3, b=.25", {"r": (0, 1), "b": (0, 1)}, "a light")
-    {'r': 0.3, 'b': 0.25}
-    """
+    """Return the numbers of a text such as ``r=.3,b=.25``; empty text gives none."""
     found: dict[str, float] = {}
     for entry in text.split(",") if text.strip() else ():
         match = re.fullmatch(r"\s*(\w+)\s*=\s*(\S+)\s*", entry)

@@ -7,7 +7,7 @@ when a group makes something of its options.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from generator.dataset.making import Workers
     from generator.dataset.plan import DatasetOptions
     from generator.lights.lighting import LightChoice
-    from generator.lights.request import LightRequest
     from generator.likeness.real_data import BlackShares, DrawnPictures
     from generator.pictures.sources import Preparation, Source
     from generator.rendering import Rendering
@@ -195,12 +194,63 @@ class LightOptions:
         ),
     ] = None
 
-    def request(self) -> LightRequest:
-        """Return the options as the generator's lights take them."""
-        from generator.lights.request import LightRequest
+    def choose(self, lut: Lut, seed: int, names: Sequence[str] = (), crops: int = 1) -> LightChoice:
+        """Return the choice of lights for pictures of these names; an InputError says which option cannot be used."""
+        from generator.lights.choices import SimultaneousLights
+        from generator.masks.making import parse_masks
 
-        options: dict[str, Any] = {**vars(self), "light": tuple(self.light or ())}
-        return LightRequest(**options)
+        together = self.lights_per_image or (1 if self.masks is None else 2)
+        if self.lights_per_image is not None and self.lights_per_image < 1:
+            raise InputError(f"{self.lights_per_image} lights an image were asked for, expected 1 or more")
+        if self.masks is not None and together == 1:
+            raise InputError(
+                f"--masks {self.masks} says where several lights fall, but each image has one; ask for more with "
+                "--lights-per-image"
+            )
+        choice = self._lights(lut, seed, together, names, crops)
+        if together == 1:
+            return choice
+        return SimultaneousLights(choice, together, parse_masks(self.masks or "smooth", together, seed))
+
+    def _lights(self, lut: Lut, seed: int, together: int, names: Sequence[str], crops: int) -> LightChoice:
+        """Return the choice of lights with as many for each picture as its images have together."""
+        from generator.lights import choices
+        from generator.lights.distributions import load_ground_truths, parse_distribution
+        from generator.lights.gamut import Gamut
+        from generator.lights.lighting import ListedLights, RandomLights
+        from generator.lights.named_lights import load_named_truths, named_lights
+
+        ways = {
+            "--illuminations": self.illuminations is not None,
+            "--light": bool(self.light),
+            "--nearest": self.nearest is not None,
+            "--match": self.match is not None,
+            "--lights-by-name": self.lights_by_name is not None,
+            "--distribution": self.distribution is not None,
+            "--random": self.random is not None and self.distribution is None,
+        }
+        given = [name for name, is_given in ways.items() if is_given]
+        if len(given) > 1:
+            raise InputError(
+                f"{' and '.join(given)} were both given; give one of them (only --random may go with --distribution)"
+            )
+        count = together * (1 if self.random is None else self.random)
+        if self.illuminations is not None:
+            return choices.parse_lights(self.illuminations, len(lut.white))
+        if self.light:
+            gamut = Gamut.of(lut)
+            return ListedLights(tuple(choices.parse_light(text, lut, gamut, self.outside) for text in self.light))
+        if self.nearest is not None:
+            return choices.nearest_lights(lut, load_ground_truths(self.nearest), self.nearest.name, together)
+        if self.match is not None:
+            truths = load_ground_truths(self.match)
+            return choices.matched_lights(Gamut.of(lut), truths, self.match.name, together, self.outside)
+        if self.lights_by_name is not None:
+            truths_by_name, file = load_named_truths(self.lights_by_name), self.lights_by_name.name
+            return named_lights(Gamut.of(lut), truths_by_name, names, file, self.outside, crops)
+        if self.distribution is not None:
+            return choices.DrawnLights(Gamut.of(lut), parse_distribution(self.distribution), count, seed)
+        return RandomLights(count, len(lut.white), seed)
 
 
 @dataclass(frozen=True)
@@ -540,7 +590,7 @@ def choose(
     if likeness.like is None:
         _refuse_more(likeness)
         sources = pictures.find(seed)
-        choice = light.request().choose(lut, seed, [source.name for source in sources], pictures.crops)
+        choice = light.choose(lut, seed, [source.name for source in sources], pictures.crops)
         return Chosen(sources, choice, pictures.preparation(seed).describe(), crops=pictures.crops)
     return _like(lut, likeness, likeness.like, parts, pictures, light, rendered, seed, workers)
 
@@ -610,7 +660,7 @@ def _like(
         sources = drawn_sources(sources, drawn)
         record["pictures"] = drawn.describe()
         lines += [*drawn.sentences(), *remedies(drawn, rendered), light_caution(lut, target)]
-    choice = light.request().choose(lut, seed, [source.name for source in sources], pictures.crops)
+    choice = light.choose(lut, seed, [source.name for source in sources], pictures.crops)
     reading = {**pictures.preparation(seed).describe(), "like": record}
     return Chosen(sources, choice, reading, tuple(lines), pictures.crops, "pictures" in parts, exposure)
 

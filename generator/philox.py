@@ -58,13 +58,7 @@ Words = npt.NDArray[np.uint32]
 
 
 def key_of(seed: int) -> tuple[int, int]:
-    """Return the two key words of a seed 0 … 2⁶⁴ − 1.
-
-    Examples
-    --------
-    >>> key_of(2**32 + 7)
-    (7, 1)
-    """
+    """Return the two key words of a seed 0 … 2⁶⁴ − 1."""
     if not 0 <= seed < 1 << 64:
         raise InputError(f"the seed is {seed}, expected a whole number from 0 to 2^64 - 1")
     return seed & _WORD, seed >> 32
@@ -76,12 +70,6 @@ def words(
     """Return the four random words of each place.
 
     Returns uint32, of the broadcast shape of `a`, `b` and `number`, such as (N,).
-
-    Examples
-    --------
-    >>> first, *others = words(seed=0, a=[0, 1], b=0, number=0, purpose=SAMPLES)
-    >>> first.shape, first.dtype, len(others)
-    ((2,), dtype('uint32'), 3)
     """
     keys = list(key_of(seed))
     c0, c1, c2 = np.broadcast_arrays(*(np.asarray(counter, dtype=np.uint64) for counter in (a, b, number)))
@@ -101,11 +89,6 @@ def distinct(seed: int, count: int, total: int, number: int, purpose: int) -> tu
 
     A shuffle of Fisher and Yates stopped after `count` steps. Step i takes the first word w of place (i, 0) and draws
     i + ⌊w (total − i) / 2³²⌋.
-
-    Examples
-    --------
-    >>> sorted(distinct(seed=0, count=5, total=5, number=0, purpose=LIGHTS))
-    [0, 1, 2, 3, 4]
     """
     drawn = [int(word) for word in words(seed, np.arange(count), 0, number, purpose)[0]]
     moved: dict[int, int] = {}

@@ -49,11 +49,6 @@ def cell_borders(size: int, side: int = CELLS) -> npt.NDArray[np.int64]:
     """Return where cells begin along a side of `size` px, and where the last ends.
 
     `size`: of the image, px. Returns (N,) int64, px, from 0 to `size`, one more than cells.
-
-    Examples
-    --------
-    >>> cell_borders(10, 4).tolist()
-    [0, 2, 5, 7, 10]
     """
     count = min(side or size, size)
     return np.arange(count + 1, dtype=np.int64) * size // count
@@ -64,11 +59,6 @@ def cell_means(image: npt.NDArray[np.generic], light: npt.ArrayLike, side: int =
 
     `image`: (H, W, 3) uint16 or float, linear camera RGB. `light`: (3,) float above 0, linear camera RGB of any length;
     its mean over the channels counts as 1.
-
-    Examples
-    --------
-    >>> cell_means(np.array([[[2, 2, 1], [4, 4, 2]]], np.uint16), [1, 1, 0.5], side=1).round(2).tolist()
-    [[[2.5, 2.5, 2.5]]]
     """
     rows, columns = (cell_borders(size, side) for size in image.shape[:2])
     # In float64, in which sums of 16-bit counts are exact up to 2⁵³.

@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
+from typing import TYPE_CHECKING, BinaryIO, Final, cast
 
 from foundation.errors import CropError, FormatError, InputError, StorageError
 from foundation.files import (
@@ -46,25 +46,13 @@ DESCRIPTION: Final = "dataset.json"
 
 
 def is_remote(place: str) -> bool:
-    """Return whether `place` is a URL of a store and not a path of this machine (file:// is a path).
-
-    Examples
-    --------
-    >>> is_remote("s3://bucket/dataset"), is_remote("file:///data/dataset"), is_remote("dataset")
-    (True, False, False)
-    """
+    """Return whether `place` is a URL of a store and not a path of this machine (file:// is a path)."""
     scheme, found, _ = place.partition("://")
     return bool(found) and scheme not in ("file", "local")
 
 
 def local_path(place: str | Path) -> Path:
-    """Return the path of a place of this machine, of which file:// may be the first part; it ends in a name.
-
-    Examples
-    --------
-    >>> local_path("file:///data/dataset").as_posix()
-    '/data/dataset'
-    """
+    """Return the path of a place of this machine, of which file:// may be the first part; it ends in a name."""
     text = str(place)
     for scheme in ("file://", "local://"):
         text = text.removeprefix(scheme)
@@ -107,47 +95,6 @@ _WITH_FOLDERS: Final = frozenset({"ftp", "sftp", "ssh", "smb", "webdav", "webdav
 of it."""
 
 
-class Store(Protocol):
-    """Files below one place."""
-
-    @property
-    def place(self) -> str:
-        """The path or URL, as a user writes it but for its secrets; for messages and records."""
-        ...
-
-    def put(self, name: str, data: bytes | Pieces) -> None:
-        """Write a file; a StorageError says why it cannot be."""
-        ...
-
-    def create(self, name: str) -> contextlib.AbstractContextManager[BinaryIO]:
-        """Open a file to be written in order; it appears when the block ends well."""
-        ...
-
-    def sync(self, names: Iterable[str]) -> None:
-        """Wait until these files would survive a loss of power."""
-        ...
-
-    def get(self, name: str) -> bytes:
-        """Return a file's bytes; a FormatError says why they cannot be read."""
-        ...
-
-    def open(self, name: str) -> contextlib.AbstractContextManager[BinaryIO]:
-        """Open a file to be read in order; a FormatError says why it cannot be."""
-        ...
-
-    def has(self, name: str) -> bool:
-        """Return whether there is such a file."""
-        ...
-
-    def names(self, folder: str = "") -> Iterator[str]:
-        """Return the names of all files below `folder`, in no order; writes that never finished are left out."""
-        ...
-
-    def remove(self, folder: str) -> None:
-        """Remove a folder with all that is below it, if it is there."""
-        ...
-
-
 @dataclass(frozen=True)
 class LocalStore:
     """A folder of this machine. The folder itself is never made here: a dataset that was finished stays finished."""
@@ -156,11 +103,11 @@ class LocalStore:
 
     @property
     def place(self) -> str:
-        """The folder."""
+        """The folder, for messages and records."""
         return str(self.root)
 
     def put(self, name: str, data: bytes | Pieces) -> None:
-        """Write a file."""
+        """Write a file; a StorageError says why it cannot be."""
         with self.create(name) as stream:
             for piece in (data,) if isinstance(data, bytes) else data:
                 stream.write(piece)
@@ -211,13 +158,13 @@ class LocalStore:
             sync_folder(folder)
 
     def get(self, name: str) -> bytes:
-        """Return a file's bytes."""
+        """Return a file's bytes; a FormatError says why they cannot be read."""
         with self.open(name) as stream:
             return stream.read()
 
     @contextmanager
     def open(self, name: str) -> Generator[BinaryIO]:
-        """Open a file to be read."""
+        """Open a file to be read in order; a FormatError says why it cannot be."""
         try:
             # A dataset may be a stranger's, and its lists may name anything.
             with open_inside(self.root, name) as stream:
@@ -233,7 +180,7 @@ class LocalStore:
             raise reading_error(self.root / name, error, "see that it may be read") from error
 
     def names(self, folder: str = "") -> Iterator[str]:
-        """Return the names of all files below `folder`."""
+        """Return the names of all files below `folder`, in no order; writes that never finished are left out."""
         for path, _, files in os.walk(self.root / folder):
             below = Path(path).relative_to(self.root)
             yield from ((below / file).as_posix() for file in files if not is_partial(file))
@@ -386,6 +333,10 @@ def _require_inside(place: str, name: str) -> None:
         raise FormatError(
             f"{place}: {name!r} is no name of a file inside the dataset; it is damaged, or not to be trusted"
         )
+
+
+Store = LocalStore | RemoteStore
+"""Files below one place."""
 
 
 def read_bounded(store: Store, name: str, most_bytes: int) -> bytes:

@@ -104,12 +104,6 @@ def citation_of(description: Description) -> str:
     return bibtex(table.camera, table.lights, table.software, table.sha256, table.origin, computed)
 
 
-def table_name(description: Description) -> str:
-    """Return what the table is called."""
-    table = description.table
-    return one_line(table_title(table.camera, table.lights, table.origin, table.computed is not None))
-
-
 def truth_of(description: Description) -> str:
     """Return in words where the ground truth comes from."""
     if description.table.computed is not None:
@@ -153,17 +147,11 @@ def noise_of(description: Description) -> str:
     )
 
 
-def _repeats(description: Description) -> str:
-    """Return in words whether pictures come more than once."""
-    if description.images <= description.sources:
-        return "Each picture is in one image."
-    return "Images of one picture repeat it, or parts of it, under another light or with other noise."
-
-
 def _procedure(description: Description) -> str:
     """Return in words how the table's colours were obtained and what vouches for them."""
-    name = table_name(description)
-    if description.table.computed is not None:
+    table = description.table
+    name = one_line(table_title(table.camera, table.lights, table.origin, table.computed is not None))
+    if table.computed is not None:
         return (
             f"{name}: samples of all colours of a chart were computed under known lights. No frame was taken, and "
             "there is no report; `computed` under `table` in `dataset.json` has the model and its settings."
@@ -209,7 +197,9 @@ def datasheet(description: Description) -> str:
         "procedure": _procedure(description),
         "rendering": "colorimetrically, interpolated between the cells of the chart" if by_colour else rendering,
         "replaced": description.replaced_pixels,
-        "repeats": _repeats(description),
+        "repeats": "Each picture is in one image."
+        if description.images <= description.sources
+        else "Images of one picture repeat it, or parts of it, under another light or with other noise.",
         "seed": description.seed,
         "skipped": len(description.skipped),
         "software": description.software,
@@ -382,23 +372,22 @@ def croissant(description: Description, sums: Mapping[str, str]) -> str:
         "citeAs": citation_of(description),
         "isLiveDataset": False,
         "distribution": [
-            *(_table_file(name, sums[name]) for name in (GROUND_TRUTH, SOURCES)),
+            *(
+                {
+                    "@type": "cr:FileObject",
+                    "@id": name,
+                    "name": name,
+                    "contentUrl": name,
+                    "encodingFormat": "text/csv",
+                    "sha256": sums[name],
+                }
+                for name in (GROUND_TRUTH, SOURCES)
+            ),
             *_files_of_images(description),
         ],
         "recordSet": [_ground_truth(), *_images(description)],
     }
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
-
-
-def _table_file(name: str, sha256: str) -> dict[str, Any]:
-    return {
-        "@type": "cr:FileObject",
-        "@id": name,
-        "name": name,
-        "contentUrl": name,
-        "encodingFormat": "text/csv",
-        "sha256": sha256,
-    }
 
 
 def _files_of_images(description: Description) -> list[dict[str, Any]]:

@@ -1,29 +1,9 @@
 """Layouts in which the images of a shard lie in one file, tar and Parquet; and what writes and reads each layout.
 
-WebDataset shards: plain tar files in which the files of an image follow each other under one number.
-
-    000123.png           the image
-    000123.json          its ground truth, source and part
-    000123.preview.jpg   its preview, where there are previews
-    000123.masks_0.png … and 000123.ground_truth.png, where several lights fall on an image
-
-The format is POSIX.1-1988 ustar. Owner, time and mode are the same in every header, so that equal images make equal
-files. Layout of names after the WebDataset specification ("key", then everything after the first dot).
-
-Parquet shards that Hugging Face `datasets` reads: one row an image, the file's bytes in it.
-
-The columns::
-
-    image     struct of bytes and path, feature Image that is not decoded by itself: Pillow, with which `datasets` would
-              decode, keeps 8 of a 16-bit image's bits
-    preview   the same, decoded; where there are previews
-    number, source, split, width, height
-    truth     [r, g, b] of sum 1, the mean of the lights over the image
-    lights    list of illumination and truth
-    details   what options did to the image, a JSON object in text; where the dataset has an `images.csv`
-    masks, ground_truth   where several lights fall on an image: as images of 16 bits, not decoded by themselves either
-
-Needs pyarrow, the extra `parquet`.
+docs/formats.md says what lies in a shard: POSIX.1-1988 ustar files whose members are named after the WebDataset
+specification, all with one owner, time and mode, so that equal images make equal files; or Parquet files that Hugging
+Face `datasets` reads, a row an image, which need pyarrow, the extra `parquet`. Images are not decoded by themselves:
+Pillow, with which `datasets` would decode, keeps 8 of a 16-bit image's bits.
 """
 
 from __future__ import annotations
@@ -45,7 +25,6 @@ from generator.dataset.layouts import (
     FolderWriter,
     Layout,
     Sample,
-    ShardWriter,
     member_name,
     metadata_of,
     shard_key,
@@ -113,6 +92,11 @@ class JoinedWriter:
         for container, _ in self._open.values():
             container.give_up()
         self._stack.__exit__(*error)
+
+
+ShardWriter = FolderWriter | JoinedWriter
+"""Writes the samples of one shard, in a block; files that are still open appear only if the block ends well.
+`store` is called from the thread that made a sample, `append` in the order of their numbers."""
 
 
 class _Tar:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Any, Final, Literal, Protocol, Self
+from typing import Any, Final, Literal, Self
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
@@ -328,29 +328,6 @@ class Sample:
 
 ExitReason = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
 """Arguments of `__exit__`: the type, value and traceback of what ended the block, or None."""
-
-
-class ShardWriter(Protocol):
-    """Writes the samples of one shard, in a block; files that are still open appear only if the block ends well."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *error: *ExitReason) -> None: ...
-
-    def store(self, sample: Sample) -> Sample:
-        """Write what does not depend on the order of samples and return the sample for `append`.
-
-        Called from the thread that made the sample.
-        """
-        ...
-
-    def append(self, sample: Sample) -> None:
-        """Write the rest of the next sample, in the order of their numbers."""
-        ...
-
-    def close(self) -> list[FileSum]:
-        """Finish all files, bring them to the disk and return them in the order of their names or numbers."""
-        ...
 
 
 def metadata_of(sample: Sample) -> dict[str, Any]:

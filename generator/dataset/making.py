@@ -120,13 +120,7 @@ def parse_engine(text: str) -> str | None:
 
 
 def parse_share(text: str) -> tuple[int, int]:
-    """Return (i, n) of a text such as `3/16`: share i of n, i from 0.
-
-    Examples
-    --------
-    >>> parse_share("3/16")
-    (3, 16)
-    """
+    """Return (i, n) of a text such as `3/16`: share i of n, i from 0."""
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip(), re.ASCII)
     if not match or not int(match[1]) < int(match[2]):
         raise InputError(f"{text!r} is no share; write I/N with I from 0 to N - 1, such as 0/16")
@@ -141,18 +135,6 @@ CONNECT_S: Final = 10.0
 """How long a scheduler may take to answer, s: one that runs answers in milliseconds, also on a busy network."""
 
 _Event = Callable[[], None]
-
-
-def _make_shards(
-    plan: Plan, shards: Sequence[int], place: Workplace, workers: Workers, callbacks: Callbacks = SILENT
-) -> None:
-    """Make shards of a plan that are not done."""
-    if not shards:
-        return
-    if workers.address is None:
-        _by_threads(plan, shards, place, workers.count, callbacks)
-    else:
-        _by_dask(workers.address, plan, shards, place, workers.count, callbacks)
 
 
 def _by_threads(plan: Plan, shards: Sequence[int], place: Workplace, workers: int, callbacks: Callbacks) -> None:
@@ -471,7 +453,12 @@ def _make(plan: Plan, place: Workplace, wanted: range, workers: Workers, callbac
     done = place.done()
     missing = [shard for shard in wanted if shard not in done]
     callbacks.on_done(sum(plan.images_of(shard) for shard in wanted if shard in done))
-    _make_shards(plan, missing, place, workers, callbacks)
+    if not missing:
+        return
+    if workers.address is None:
+        _by_threads(plan, missing, place, workers.count, callbacks)
+    else:
+        _by_dask(workers.address, plan, missing, place, workers.count, callbacks)
 
 
 def finished(out: str | Path, identity: PlanIdentity) -> bool:
@@ -480,7 +467,7 @@ def finished(out: str | Path, identity: PlanIdentity) -> bool:
     if not open_store(out).has(DESCRIPTION):
         return False
     planned = notes.has(PLAN)
-    if planned and list(_differences(_load(notes), _read_back(identity))):
+    if planned and differences(_load(notes), identity):
         return False
     remove_notes(notes)
     return planned
@@ -605,12 +592,7 @@ def _text(identity: PlanIdentity) -> bytes:
 
 def _plan_id(identity: PlanIdentity) -> str:
     """Return the first 16 hexadecimal digits of the SHA-256 of the plan's identity."""
-    return hashlib.sha256(json.dumps(_read_back(identity), sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _read_back(identity: PlanIdentity) -> Any:
-    """Return an identity as it is read back."""
-    return json.loads(_text(identity))
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _load(notes: Store) -> dict[str, Any]:
@@ -622,8 +604,7 @@ def _load(notes: Store) -> dict[str, Any]:
 
 
 def _require_same(notes: Store, identity: PlanIdentity, out: str | Path, remedy: str) -> None:
-    stored = _load(notes)
-    differing = list(_differences(stored, _read_back(identity)))
+    differing = differences(_load(notes), identity)
     if differing:
         raise InputError(
             f"{out} was begun with another plan ({'; '.join(differing)}); finish it as it was begun, {remedy}, or name "

@@ -193,11 +193,6 @@ def parse_split(text: str) -> tuple[float, float, float]:
     """Return the shares of train, validation and test of a text such as `0.8,0.1,0.1` or `80,10,10`.
 
     Two numbers are train and test. Whole numbers and percentages are scaled to the sum 1; other shares must have it.
-
-    Examples
-    --------
-    >>> parse_split("80,10,10"), parse_split("3,1")
-    ((0.8, 0.1, 0.1), (0.75, 0.0, 0.25))
     """
     try:
         parts = [float(part) for part in text.split(",")]
@@ -242,13 +237,7 @@ def exact_parts(sources: Sequence[Source], shares: tuple[float, float, float], s
 
 
 def sizes_of(count: int, shares: tuple[float, float, float]) -> tuple[int, int, int]:
-    """Return how many of `count` sources each part has: shares rounded by largest remainders.
-
-    Examples
-    --------
-    >>> sizes_of(10, (0.8, 0.1, 0.1)), sizes_of(11, (0.8, 0.1, 0.1)), sizes_of(1000, (0.7, 0.2, 0.1))
-    ((8, 1, 1), (9, 1, 1), (700, 200, 100))
-    """
+    """Return how many of `count` sources each part has: shares rounded by largest remainders."""
     # Shares are quotients: a product that should be whole may be off by its last bits.
     exact = [round(share * count, 6) for share in shares]
     sizes = [int(size) for size in exact]

@@ -1,20 +1,7 @@
-"""A dataset: what its files hold, how they are read, and whether they are those that were made.
+"""A dataset: how its files are read, and whether they are those that were made; docs/formats.md says what they hold.
 
-    images/NNNNNN.png    linear camera RGB in the units of the table; the number is the one that was planned
-    masks/, ground_truth/  where several lights fall on an image; see `masks.maps`
-    previews/NNNNNN.jpg  the same, tone mapped, at most 512 px: the look of the raw, no white balance
-    ground_truth.csv     image,source,illumination,r,g,b with r + g + b = 1, one row a light
-    gt.txt               r g b a line in image order: the mean of the lights over the image
-    images.csv           where options do something to each image: what they did to it
-    sources.csv          position,name,sha256,width,height,replaced_pixels,split,profile,note
-    splits/train.txt …   names of images, where the dataset was divided
-    dataset.json         the table's hash, seed, options: enough to make every byte again
-    SHA256SUMS           hashes of all files; `sha256sum -c SHA256SUMS` verifies them
-
-Image number `position · lights_each + k` shows the source at `position` under its k-th light. A source that cannot be
-read is listed, and its numbers are not used. In layouts other than `folder` the images of a shard lie in one file, such
-as `data/NNNNNN.tar`, or below the name of their part. No byte depends on the workers, the clock or the machine's paths;
-the versions of the libraries that encode and decode are recorded.
+No byte of them depends on the workers, the clock or the machine's paths; the versions of the libraries that encode and
+decode are recorded.
 """
 
 from __future__ import annotations

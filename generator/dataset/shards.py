@@ -50,7 +50,7 @@ from foundation.folders import publish_folder, require_free
 from foundation.records import from_json
 from foundation.version import software
 from generator.dataset.cards import card, croissant, datasheet
-from generator.dataset.joined import Beside, open_writer
+from generator.dataset.joined import Beside, ShardWriter, open_writer
 from generator.dataset.layouts import (
     CARD,
     COMPLETED_BY_HAND,
@@ -76,7 +76,6 @@ from generator.dataset.layouts import (
     RenderingSummary,
     Sample,
     ShardRecord,
-    ShardWriter,
     Skipped,
     SourceRecord,
     Split,
@@ -426,7 +425,7 @@ def _finished_images(job: ShardJob, place: Workplace, pool: ThreadPoolExecutor) 
 
 
 def _taken_up(image: FinishedImage) -> Sample:
-    """Return a finished image for `ShardWriter.append`."""
+    """Return a finished image for the writer's `append`."""
     source = image.source
     return Sample(image.image, source.name, source.split, source.width, source.height, (), tuple(image.files))
 
@@ -549,7 +548,7 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
         position=job.position + place,
         name=source.name,
         sha256=scene.sha256,
-        profile=scene.profile,
+        profile=scene.profile or None,
         width=width,
         height=height,
         replaced_pixels=sum(replaced for _, replaced in fit),
@@ -749,20 +748,16 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
             sums.write(file.sum.encode())
         sums.write(f"{hashlib.sha256(text).hexdigest()}  {DESCRIPTION}\n".encode())
         known = {file.name: file.sha256 for file in written}
-        _write_cards(place, description, known)
+        # Its makers complete them, so that no hash of them is recorded.
+        texts = {CARD: card(description), DATASHEET: datasheet(description), CROISSANT: croissant(description, known)}
+        for name, card_text in texts.items():
+            place.files.put(name, card_text.encode())
     names = [file.name for file in written]
     place.files.sync([*names, SUMS, *COMPLETED_BY_HAND])
     # In an object store this makes it a dataset, so everything else is there.
     place.files.put(DESCRIPTION, text)
     place.files.sync([DESCRIPTION])
     place.publish()
-
-
-def _write_cards(place: Workplace, description: Description, sums: Mapping[str, str]) -> None:
-    """Write what people and catalogues read of the dataset; its makers complete it, so that no hash is recorded."""
-    texts = {CARD: card(description), DATASHEET: datasheet(description), CROISSANT: croissant(description, sums)}
-    for name, text in texts.items():
-        place.files.put(name, text.encode())
 
 
 def _records(place: Workplace, shards: int) -> Iterator[tuple[ShardRecord, list[SourceRecord], list[Skipped]]]:

@@ -80,16 +80,7 @@ class _Scene:
 class Explorer:
     """A table, and pictures to hold under its lights; may be asked from several threads.
 
-    Parameters
-    ----------
-    given
-        The table as the user named it, for the command.
-    lut
-        The table.
-    sources
-        Pictures on this machine or a store.
-    max_side
-        Longest side of a picture, px.
+    `given`: the table as the user named it, for the command. `max_side`: longest side of a picture, px.
     """
 
     def __init__(self, given: str, lut: Lut, sources: Sequence[PictureFile], max_side: int = MAX_SIDE) -> None:
@@ -231,7 +222,7 @@ class Explorer:
     def _read_source(self, number: int) -> _Scene:
         source = self._sources[number]
         read = source.read()
-        return _Scene(source.name, read.profile or "", read.picture)
+        return _Scene(source.name, read.profile, read.picture)
 
     def _mixture(self, light: str) -> Mixture:
         return parse_light(light, self.lut, self._gamut, "nearest")

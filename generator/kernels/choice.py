@@ -286,13 +286,7 @@ def choose_group(row: int, width: int, group: int, keys: Any, count: Any, bits: 
 
 
 def bits_of(colours: int) -> int:
-    """Return the bits a channel of a table with `colours` = 8**bits colours.
-
-    Examples
-    --------
-    >>> bits_of(32768)
-    5
-    """
+    """Return the bits a channel of a table with `colours` = 8**bits colours."""
     for bits in range(1, 6):
         if colours == 8**bits:
             return bits
@@ -300,15 +294,7 @@ def bits_of(colours: int) -> int:
 
 
 def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
-    """Return the codes (..., 3) int64, red, green, blue 0 … 2**bits − 1, of colour indices (...) int 0 … 8**bits − 1.
-
-    Examples
-    --------
-    >>> channels_of([0, 1, 32767], bits=5)
-    array([[ 0,  0,  0],
-           [ 0,  0,  1],
-           [31, 31, 31]])
-    """
+    """Return the codes (..., 3) int64, red, green, blue, of colour indices (...) int 0 … 8**bits − 1."""
     colours = np.asarray(colours, dtype=np.int64)
     mask = (1 << bits) - 1
     return np.stack([colours >> 2 * bits & mask, colours >> bits & mask, colours & mask], axis=-1)

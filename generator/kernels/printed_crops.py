@@ -79,11 +79,6 @@ def draw_printed_crops(
 
     `lights`, `pictures` and `windows` (N, 4: x, y, width, height, inside the picture) are one for each; `scales`
     (N, 7) float32 as of `planar.scales_of`.
-
-    Raises
-    ------
-    InputError
-        `out` is of another shape or type.
     """
     width, height = windows[0, 2:].tolist()
     check_out(out, (len(pictures), 3, height, width), np.float32)

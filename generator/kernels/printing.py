@@ -124,13 +124,7 @@ def _count_nearest(picture: Any, counts: Any) -> None:
 
 
 def nearest_nodes(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
-    """Return how many pixels of a picture (H, W, 3) uint8 are nearest to each node, (4913,) int64.
-
-    Examples
-    --------
-    >>> np.flatnonzero(nearest_nodes(np.array([[[255, 0, 4], [0, 0, 9]]], np.uint8)))
-    array([   1, 4624])
-    """
+    """Return how many pixels of a picture (H, W, 3) uint8 are nearest to each node, (4913,) int64."""
     check_picture(picture)
     counts = np.zeros(NODES, np.int64)
     _count_nearest(picture, counts)

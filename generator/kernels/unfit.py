@@ -28,11 +28,6 @@ def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64
     Nearest by Euclidean distance of the codes; of several equally near the lowest index.
 
     `unfit`: (N,) int, distinct colour indices 0 … 8**bits − 1. Returns (N,) int64 colour indices, none of them unfit.
-
-    Examples
-    --------
-    >>> nearest_fit_colours([0, 1], bits=2)
-    array([4, 2])
     """
     unfit = np.asarray(unfit, dtype=np.int64)
     is_fit = np.ones(8**bits, dtype=bool)
@@ -52,16 +47,6 @@ def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance
 
     `picture`: (H, W, 3) uint8 sRGB codes. Returns (H, W, 3) uint8, the same array if nothing had to be replaced; and
     the count.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> stained = SimpleNamespace(bits=2, unfit=(SimpleNamespace(colour=0),))
-    >>> picture = np.array([[[0, 10, 20], [255, 255, 255]]], np.uint8)
-    >>> replaced, pixels = replace_unfit_colours(picture, stained)
-    >>> replaced, pixels
-    (array([[[  0,   0,  64],
-            [255, 255, 255]]], dtype=uint8), 1)
     """
     bits = provenance.bits
     unfit = tuple(sorted({cell.colour for cell in provenance.unfit}))
@@ -82,13 +67,7 @@ def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.boo
 
 
 def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool_]:
-    """Return which colours of a table, (8**bits,) bool, are in a picture (H, W, 3) uint8.
-
-    Examples
-    --------
-    >>> np.flatnonzero(colours_in(np.array([[[0, 0, 0], [255, 255, 0]]], np.uint8), bits=5))
-    array([    0, 32736])
-    """
+    """Return which colours of a table, (8**bits,) bool, are in a picture (H, W, 3) uint8."""
     found = np.zeros(8**bits, np.bool_)
     pixels = np.ascontiguousarray(picture)
     scratch = np.ones(EDGE_BYTES + 2 * OFFSETS_BYTES + 1, np.uint8)

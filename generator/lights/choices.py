@@ -45,24 +45,20 @@ class SequentialLights:
     - `method`: how a light was found for a ground truth: the ``nearest`` of the table, or a mixture to ``match`` it.
     - `matches`: for each ground truth the light, and its angle to it.
     - `file`: name of the file that they come from.
-    - `each`: images for each picture.
+    - `lights_each`: images for each picture.
     """
 
     method: Literal["nearest", "match"]
     matches: tuple[Match, ...]
     file: str
-    each: int = 1
-
-    @property
-    def lights_each(self) -> int:
-        """Images for each picture."""
-        return self.each
+    lights_each: int = 1
 
     def lightings_of(self, position: int) -> tuple[Lighting, ...]:
         """Return the lighting of each image of the picture at `position`."""
-        first = position * self.each
+        first = position * self.lights_each
         return tuple(
-            Lighting((self.matches[number % len(self.matches)].mixture,)) for number in range(first, first + self.each)
+            Lighting((self.matches[number % len(self.matches)].mixture,))
+            for number in range(first, first + self.lights_each)
         )
 
     def describe(self) -> dict[str, Any]:
@@ -70,14 +66,14 @@ class SequentialLights:
         return {
             "choice": self.method,
             "file": self.file,
-            "each": self.each,
+            "each": self.lights_each,
             "lights": [match.mixture.label for match in self.matches],
         }
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnLights:
-    """`count` lights for each picture, drawn from a distribution cut to what the table can make; purpose 4 of `philox`.
+    """Lights for each picture, drawn from a distribution cut to what the table can make; purpose 4 of `philox`.
 
     Light j of the picture at position p is the first of the draws 0, 1, 2 … that lies in the gamut, draw i made of
     the words of place (i, j), number p.
@@ -85,12 +81,12 @@ class DrawnLights:
 
     gamut: Gamut
     distribution: Distribution
-    count: int
+    lights_each: int
     seed: int
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise InputError(f"{self.count} lights a picture were asked for, expected 1 or more")
+        if self.lights_each < 1:
+            raise InputError(f"{self.lights_each} lights a picture were asked for, expected 1 or more")
         within = np.mean([self._batch(trial, 0, 0)[1].mean() for trial in range(128)])
         if within < _LEAST_WITHIN:
             raise InputError(
@@ -99,18 +95,13 @@ class DrawnLights:
                 "r={:.3f}, b={:.3f}".format(*self.gamut.rb.mean(axis=0))
             )
 
-    @property
-    def lights_each(self) -> int:
-        """Images for each picture."""
-        return self.count
-
     def lightings_of(self, position: int) -> tuple[Lighting, ...]:
         """Return the lighting of each image of the picture at `position`."""
-        return tuple(Lighting((self._light(position, light),)) for light in range(self.count))
+        return tuple(Lighting((self._light(position, light),)) for light in range(self.lights_each))
 
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values."""
-        return {"choice": "drawn", "count": self.count, **self.distribution.describe()}
+        return {"choice": "drawn", "count": self.lights_each, **self.distribution.describe()}
 
     def _light(self, position: int, light: int) -> Mixture:
         for batch in range(_BATCHES):
@@ -172,13 +163,7 @@ class SimultaneousLights:
 
 
 def parse_lights(text: str, total: int) -> ListedLights:
-    """Return the lights of a list such as `0,5,12-20`, or `all`; each once, in the order written.
-
-    Examples
-    --------
-    >>> parse_lights("0,5,12-14", total=707).lights
-    (0, 5, 12, 13, 14)
-    """
+    """Return the lights of a list such as `0,5,12-20`, or `all`; each once, in the order written."""
     if text.strip().lower() == "all":
         return ListedLights(tuple(range(total)))
     lights: dict[int, None] = {}

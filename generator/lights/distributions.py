@@ -16,7 +16,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -160,13 +160,7 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
 
 
 def is_ground_truth(numbers: Sequence[float]) -> bool:
-    """Return whether numbers are a light's linear RGB: three that are finite and from 0, with a sum above 0.
-
-    Examples
-    --------
-    >>> is_ground_truth([0.3, 0.4, 0.3]), is_ground_truth([0.0, 0.0, 0.0])
-    (True, False)
-    """
+    """Return whether numbers are a light's linear RGB: three that are finite and from 0, with a sum above 0."""
     return len(numbers) == 3 and bool(np.isfinite(numbers).all()) and min(numbers) >= 0 and sum(numbers) > 0
 
 
@@ -177,18 +171,6 @@ def is_statistics(path: Path) -> bool:
 
 _WORD: Final = float(1 << 32)
 """Values of a random word."""
-
-
-class Distribution(Protocol):
-    """Chromaticities r and b as a function of random words."""
-
-    def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
-        """Return (N, 2) float64, r and b, from four (N,) uint32 random words; some may be no chromaticities at all."""
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """Return the distribution as plain values for `dataset.json`."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -281,6 +263,9 @@ class Fitted:
         }
 
 
+Distribution = Uniform | Gaussian | Fitted | LogKernels
+"""Chromaticities r and b as a function of random words; some may be no chromaticities at all."""
+
 _GAUSSIAN: Final = {
     "r": (0.0, 1.0),
     "b": (0.0, 1.0),
@@ -298,11 +283,6 @@ def parse_distribution(text: str) -> Distribution:
     ``uniform``; ``gaussian:r=.3,b=.25,sd=.02`` or ``gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8``; ``fit:GT.csv``
     with a file as `load_ground_truths` reads it, or the file alone; of a `STATS.json` that
     `evaluate describe` wrote the lights are fitted in the plane of ln(R/G) and ln(B/G) (`LogKernels`).
-
-    Examples
-    --------
-    >>> parse_distribution("gaussian:r=.3,b=.25,sd=.02")
-    Gaussian(r=0.3, b=0.25, sd_r=0.02, sd_b=0.02, correlation=0.0)
     """
     kind, _, rest = text.strip().partition(":")
     if kind == "uniform" and not rest:

@@ -47,13 +47,11 @@ class OutsideGamutError(InputError):
     """A light is wanted that no mixture of the table's lights makes.
 
     - `angle`: angle to the nearest light that can be made, degrees.
-    - `nearest`: the mixture that makes the nearest.
     """
 
-    def __init__(self, message: str, angle: float, nearest: Mixture) -> None:
+    def __init__(self, message: str, angle: float) -> None:
         super().__init__(message)
         self.angle = angle
-        self.nearest = nearest
 
 
 @dataclass(frozen=True)
@@ -147,7 +145,6 @@ class Gamut:
             f"the light r={r:.4f}, b={b:.4f} lies {nearest.angle:.2f}° outside what {self.table} can make; the nearest "
             f"it can is r={near_r:.4f}, b={near_b:.4f}: ask for that, or for the nearest with --outside nearest",
             nearest.angle,
-            nearest.mixture,
         )
 
     @cached_property
@@ -205,24 +202,12 @@ class Gamut:
 
 
 def rb_of(rgb: _Array) -> _Array:
-    """Return the chromaticities (..., 2) float64, r and b, of linear RGB (..., 3) float64 of any length.
-
-    Examples
-    --------
-    >>> rb_of(np.array([1.0, 2.0, 1.0])).tolist()
-    [0.25, 0.25]
-    """
+    """Return the chromaticities (..., 2) float64, r and b, of linear RGB (..., 3) float64 of any length."""
     return rgb[..., [0, 2]] / rgb.sum(axis=-1, keepdims=True)
 
 
 def rgb_of(rb: npt.ArrayLike) -> _Array:
-    """Return linear RGB (..., 3) float64 of sum 1 for chromaticities (..., 2), r and b.
-
-    Examples
-    --------
-    >>> rgb_of([0.25, 0.25]).tolist()
-    [0.25, 0.5, 0.25]
-    """
+    """Return linear RGB (..., 3) float64 of sum 1 for chromaticities (..., 2), r and b."""
     rb = np.asarray(rb, dtype=np.float64)
     return np.stack([rb[..., 0], 1 - rb[..., 0] - rb[..., 1], rb[..., 1]], axis=-1)
 

@@ -111,13 +111,7 @@ def plain(light: int) -> Mixture:
 
 
 def mixture_of(parts: Mapping[int, float]) -> Mixture:
-    """Return the mixture of lights in the proportion of `parts` ≥ 0 (light to share); shares of 0 are left out.
-
-    Examples
-    --------
-    >>> mixture_of({40: 3, 12: 1, 7: 0}).label
-    '12:0.25+40:0.75'
-    """
+    """Return the mixture of lights in the proportion of `parts` ≥ 0 (light to share); shares of 0 are left out."""
     total = sum(parts.values())
     kept = {light: parts[light] / total for light in sorted(parts) if parts[light] / total * _BILLION >= 0.5}
     total = sum(kept.values())
@@ -125,13 +119,7 @@ def mixture_of(parts: Mapping[int, float]) -> Mixture:
 
 
 def parse_mixture(label: str) -> Mixture:
-    """Return the mixture that a `Mixture.label` names: ``12``, or ``12:0.25+40:0.75``.
-
-    Examples
-    --------
-    >>> parse_mixture("12:0.25+40:0.75")
-    Mixture(lights=(12, 40), weights=(0.25, 0.75))
-    """
+    """Return the mixture that a `Mixture.label` names: ``12``, or ``12:0.25+40:0.75``."""
     if re.fullmatch(r"\d{1,9}", label, re.ASCII):
         return plain(int(label))
     matches = [re.fullmatch(r"(\d{1,9}):(\d*\.?\d+)", part.strip(), re.ASCII) for part in label.split("+")]
@@ -214,28 +202,24 @@ class ListedLights:
 
 @dataclass(frozen=True)
 class RandomLights:
-    """`count` distinct lights of `total` for each picture, every set equally likely; purpose 1 of `philox`."""
+    """`lights_each` distinct lights of `total` for each picture, every set equally likely; purpose 1 of `philox`."""
 
-    count: int
+    lights_each: int
     total: int
     seed: int
 
     def __post_init__(self) -> None:
-        if not 1 <= self.count <= self.total:
+        if not 1 <= self.lights_each <= self.total:
             raise InputError(
-                f"{self.count} random lights a picture were asked for; the table has {self.total}, expected 1 to that"
+                f"{self.lights_each} random lights a picture were asked for; the table has {self.total}, expected 1 to "
+                "that"
             )
-
-    @property
-    def lights_each(self) -> int:
-        """Images for each picture."""
-        return self.count
 
     def lightings_of(self, position: int) -> tuple[Lighting, ...]:
         """Return the lighting of each image of the picture at `position`."""
-        lights = philox.distinct(self.seed, self.count, self.total, position, philox.LIGHTS)
+        lights = philox.distinct(self.seed, self.lights_each, self.total, position, philox.LIGHTS)
         return tuple(Lighting((plain(light),)) for light in lights)
 
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values."""
-        return {"choice": "random", "count": self.count}
+        return {"choice": "random", "count": self.lights_each}

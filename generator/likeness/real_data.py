@@ -51,13 +51,7 @@ freely, down to 1 %, that is hardly."""
 
 
 def effective_size(weights: _Array) -> float:
-    """Return Kish's effective sample size of weights (N,) float64 ≥ 0.
-
-    Examples
-    --------
-    >>> effective_size(np.array([1.0, 1.0, 1.0, 1.0])), effective_size(np.array([1.0, 0.0]))
-    (4.0, 1.0)
-    """
+    """Return Kish's effective sample size of weights (N,) float64 ≥ 0."""
     return float(weights.sum() ** 2 / np.square(weights).sum())
 
 
@@ -68,12 +62,6 @@ def balance(
 
     `moments`: (N, K) float64, the moments of each image. `wanted`: (K,) float64, their wanted means. `least_effective`:
     least effective sample size as a share of the images, 0 … 1.
-
-    Examples
-    --------
-    >>> weights = balance(np.arange(100.0)[:, None] / 100, np.array([0.6]), np.inf)
-    >>> round(float(weights @ np.arange(100.0)) / 100, 3), round(effective_size(weights))
-    (0.6, 88)
     """
     aside = moments - wanted
     penalty, least = 1 / real, least_effective * len(moments) / variants

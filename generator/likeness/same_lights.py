@@ -110,15 +110,7 @@ class LeftOutPicture:
 
 
 def open_scenes(place: str) -> Dataset:
-    """Return the dataset whose scenes and lights are to be taken.
-
-    Raises
-    ------
-    FormatError
-        There is none.
-    InputError
-        It was made by software that did not record how many images were planned.
-    """
+    """Return the dataset whose scenes and lights are to be taken; an InputError if its images cannot be numbered."""
     dataset = open_dataset(place)
     made = dataset.description
     if made.planned % _scenes(dataset):

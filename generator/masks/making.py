@@ -12,20 +12,9 @@ whole 65535ths that sum to 1, so that a 16-bit file holds them without loss. Rul
 A shape draws its places from an image's streams, and gives a function from places in the picture to the lights'
 shares. The first light is the one that falls where no shape is.
 
-A folder of masks holds one set for each image, in the order of the names, starting over when they end::
-
-    NAME_1.png … NAME_K.png    K grey masks, one a light; the numbers, of three digits at most, give the order and may
-                               begin anywhere
-    NAME_1.png … NAME_K−1.png  one fewer: masks of the second light and those after it
-    NAME.png                   one grey mask for two lights: where the second falls
-    NAME.png                   one colour picture for three lights, a channel each
-
-Full scale is weight 1; 8 or 16 bits, or float from 0 to 1; transparency does not count. A set of any size is made to
-fit the image. Weights are divided by their sum. Where K masks leave a pixel dark, the first light falls.
-
-The masks of a dataset (`masks.maps`) can be given again: in a folder of such names alone a set belongs to the image of
-its number, since a picture that was passed over leaves its numbers out. An image whose number has no set takes one in
-turn.
+docs/formats.md says which files are masks in a folder. Full scale is weight 1; 8 or 16 bits, or float from 0 to 1;
+transparency does not count. A set of any size is made to fit the image. Weights are divided by their sum. Where K masks
+leave a pixel dark, the first light falls.
 """
 
 from __future__ import annotations
@@ -36,7 +25,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol, cast, runtime_checkable
+from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -76,22 +65,6 @@ class RandomStreams:
         return (word + 0.5) / (1 << 32)
 
 
-class Shape(Protocol):
-    """A kind of masks: from the streams of an image to where its lights fall."""
-
-    def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function from rows v (h, 1) to the lights' shares (K, h, W) float32 of their pixels.
-
-        `pixel`: size of a pixel, a share of the longer side. `u`: (1, W) float32, the columns' distances from the
-        picture's centre, shares of the longer side.
-        """
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """Return the kind and its numbers as plain values."""
-        ...
-
-
 @inlined
 def stepped(x: Any) -> Any:
     """Return for float32 x 0 below 0, 1 above 1, and 3x² − 2x³ between (the cubic Hermite step)."""
@@ -111,7 +84,11 @@ class HalfPlanes:
     width: float | None = 0.0
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
+        """Return the function from rows v (h, 1) to the lights' shares (K, h, W) float32 of their pixels.
+
+        `pixel`: size of a pixel, a share of the longer side. `u`: (1, W) float32, the columns' distances from the
+        picture's centre, shares of the longer side.
+        """
         drawn: list[float] = streams.uniform(0).tolist()
         angle = math.radians(360 * drawn[0] if self.angle is None else self.angle)
         width = max(0.1 + 0.5 * drawn[1] if self.width is None else self.width, pixel)
@@ -147,7 +124,7 @@ class Spots:
     softness: float = 0.8
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `HalfPlanes.shares`."""
         discs: list[list[tuple[float, float, float, float]]] = []
         for light in range(1, lights):
             drawn = streams.uniform(light)
@@ -186,7 +163,7 @@ class SmoothFields:
     contrast: float = 2.0
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `HalfPlanes.shares`."""
         del half, pixel
         knots = math.ceil(2 / self.scale) + 4
         fields: list[Array] = []
@@ -197,7 +174,9 @@ class SmoothFields:
             fields.append(np.ascontiguousarray(self._splined(np.ascontiguousarray(field.T), u[0]).T))
 
         def fill(v: Array) -> Array:
-            return np.stack([_growth(self._splined(field, v[:, 0])) for field in fields])
+            levels = np.stack([self._splined(field, v[:, 0]) for field in fields])
+            _grow(levels.reshape(-1, u.shape[1]))
+            return levels
 
         return fill
 
@@ -236,7 +215,7 @@ class Windows:
     softness: float | None = None
 
     def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `HalfPlanes.shares`."""
         windows = [self._window(streams.uniform(light), half, pixel) for light in range(1, lights)]
 
         def fill(v: Array) -> Array:
@@ -281,6 +260,10 @@ class Windows:
         return matrix.tolist(), columns, rows, max(soft, pixel / float(min(width, height)))
 
 
+Shape = HalfPlanes | Spots | SmoothFields | Windows
+"""A kind of masks: from the streams of an image to where its lights fall."""
+
+
 @compiled
 def _fill_strips(u: Any, v: Any, right: Any, down: Any, edges: Any, width: Any, shares: Any) -> None:
     """Fill the lights' shares (K, n, m), all 1, with strips between K − 1 soft edges."""
@@ -317,19 +300,13 @@ def _add_splines(knots: Any, index: Any, weights: Any, total: Any) -> None:
 
 @compiled
 def _grow(levels: Any) -> None:
-    """Replace float32 x in `levels` (n, m) by (x + √(1 + x²))²."""
+    """Replace float32 x in `levels` (n, m) by (x + √(1 + x²))²: it grows from 0 to ∞ as an exponential, of √ alone."""
     for y in range(levels.shape[0]):
         for x in range(levels.shape[1]):
             level = levels[y, x]
             root = np.sqrt(_ONE + level * level)
             grown = root + level if level >= _ZERO else _ONE / (root - level)
             levels[y, x] = grown * grown
-
-
-def _growth(levels: Array) -> Array:
-    """Return (x + √(1 + x²))² for each float32 x, in place: it grows from 0 to ∞ as an exponential, of √ alone."""
-    _grow(levels)
-    return levels
 
 
 def _homography(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -384,27 +361,6 @@ _FULL: Final = np.float32(FULL)
 _WHOLE: Final = np.int32(FULL)
 
 
-@runtime_checkable
-class MaskMaker(Protocol):
-    """Where in one picture each of its lights falls."""
-
-    def weights(self, height: int, width: int, lights: int) -> Weights:
-        """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel."""
-        ...
-
-
-class MaskPlan(Protocol):
-    """Masks for every image of a dataset."""
-
-    def maker(self, number: int) -> MaskMaker:
-        """Return the masks of image `number`."""
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """Return the plan as plain values for `dataset.json`."""
-        ...
-
-
 @compiled
 def _quantise_shares_of_two(first: Any, second: Any, out: Any) -> None:
     """Do as `_quantise_shares` for two lights and `out` (H, 2 W) float32, in a loop that the compiler vectorises."""
@@ -443,13 +399,6 @@ def quantise_shares(shares: npt.NDArray[np.floating[Any]], out: Weights) -> None
     """Fill `out` with shares in whole 65535ths that sum to 1; the largest takes up the rounding error.
 
     `shares`: (K, H, W) float32 ≥ 0, not all 0 in a pixel. `out`: (H, W, K) float32, 0 to 1, contiguous.
-
-    Examples
-    --------
-    >>> weights = np.empty((1, 1, 3), np.float32)
-    >>> quantise_shares(np.ones((3, 1, 1), np.float32), weights)
-    >>> (weights * FULL).tolist()
-    [[[21845.0, 21845.0, 21845.0]]]
     """
     if len(shares) == 2:
         _quantise_shares_of_two(shares[0], shares[1], out.reshape(len(out), -1))
@@ -479,7 +428,7 @@ _Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class GivenMasks:
-    """The masks of one image, from files; a `MaskMaker`."""
+    """The masks of one image, from files."""
 
     files: tuple[Path, ...]
 
@@ -506,7 +455,7 @@ class GivenMasks:
 
 @dataclass(frozen=True)
 class GivenMaskPlan:
-    """Sets of mask files for one image after another, starting over when they end; a `MaskPlan`.
+    """Sets of mask files for one image after another, starting over when they end.
 
     - `folder`: name of the folder.
     - `sets`: in the order of their names.
@@ -519,7 +468,7 @@ class GivenMaskPlan:
     sha256: str
     places: Mapping[int, int] = field(default_factory=dict[int, int])
 
-    def maker(self, number: int) -> MaskMaker:
+    def maker(self, number: int) -> GivenMasks:
         """Return the masks of image `number`."""
         return self.sets[self.places.get(number, number % len(self.sets))]
 
@@ -529,7 +478,7 @@ class GivenMaskPlan:
 
 
 def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
-    """Return the sets of masks in a folder; the head of this file has the rules."""
+    """Return the sets of masks in a folder; docs/formats.md has the rules."""
     try:
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     except OSError as error:
@@ -596,7 +545,7 @@ _PIXELS: Final = 1 << 15
 
 @dataclass(frozen=True)
 class MadeMasks:
-    """The masks of one image; a `MaskMaker`."""
+    """The masks of one image, computed."""
 
     shape: Shape
     streams: RandomStreams
@@ -616,12 +565,12 @@ class MadeMasks:
 
 @dataclass(frozen=True)
 class MadeMaskPlan:
-    """Masks of one shape, anew for each image; a `MaskPlan`."""
+    """Masks of one shape, anew for each image."""
 
     shape: Shape
     seed: int
 
-    def maker(self, number: int) -> MaskMaker:
+    def maker(self, number: int) -> MadeMasks:
         """Return the masks of image `number`."""
         return MadeMasks(self.shape, RandomStreams(self.seed, number))
 
@@ -629,6 +578,12 @@ class MadeMaskPlan:
         """Return the plan as plain values."""
         return self.shape.describe()
 
+
+MaskMaker = GivenMasks | MadeMasks
+"""Where in one picture each of its lights falls."""
+
+MaskPlan = GivenMaskPlan | MadeMaskPlan
+"""Masks for every image of a dataset."""
 
 _SHARE: Range = (0.0, 1.0)
 """Least and most of a share."""
@@ -647,12 +602,6 @@ def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
     ``half-plane``, ``soft-edge``, ``spots``, ``smooth`` or ``window``, with numbers where wanted, as in
     ``soft-edge:angle=30,width=.2``, ``spots:count=3,radius=.1,softness=.5``, ``smooth:scale=.3,contrast=8`` and
     ``window:columns=2,rows=3,softness=.05``; anything else is a folder of masks as `find_masks` reads it.
-
-    Examples
-    --------
-    >>> weights = parse_masks("half-plane:angle=0", lights=2, seed=1).maker(0).weights(2, 6, 2)
-    >>> weights.shape, weights.dtype, weights.sum(axis=2).min()
-    ((2, 6, 2), dtype('float32'), np.float32(1.0))
     """
     if text.strip().partition(":")[0] not in _OPTIONS:
         if not text.strip() or not Path(text).is_dir():
@@ -662,13 +611,7 @@ def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
 
 
 def parse_shape(text: str) -> Shape:
-    """Return the shape of made masks that a text names, as of `parse_masks`.
-
-    Examples
-    --------
-    >>> parse_shape("soft-edge:angle=30,width=.2")
-    HalfPlanes(angle=30.0, width=0.2)
-    """
+    """Return the shape of made masks that a text names, as of `parse_masks`."""
     kind, _, rest = text.strip().partition(":")
     if kind not in _OPTIONS:
         raise InputError(f"{kind!r} is no kind of masks; name one of {', '.join(_OPTIONS)}")

@@ -88,12 +88,6 @@ def quantised_chromaticities(
     `weights`: (H, W, K) float32 ≥ 0, not all 0 in a pixel. `whites`: (K, 3) float64, linear camera RGB above 0. Returns
     whole parts of `full` ≤ 65535: (H, W, 3) uint16, of which each pixel sums to `full`, computed in float32, lights
     added up in their order. Red and blue are rounded, green is the rest.
-
-    Examples
-    --------
-    >>> whites = np.array([[400.0, 400.0, 200.0], [100.0, 400.0, 500.0]])
-    >>> quantised_chromaticities(np.array([[[0.5, 0.5]]], np.float32), whites, 65535)
-    array([[[16384, 26214, 22937]]], dtype=uint16)
     """
     height, width, lights = weights.shape
     out = np.empty((height, width, 3), np.uint16)
@@ -106,15 +100,7 @@ def quantised_chromaticities(
 
 
 def quantised_weights(weights: npt.NDArray[np.float32], full: int) -> npt.NDArray[np.uint16]:
-    """Return weights (H, W, K) float32 from 0 to 1 as whole parts of `full` ≤ 65535, rounded: (K, H, W) uint16.
-
-    Examples
-    --------
-    >>> quantised_weights(np.array([[[0.25, 0.75]]], np.float32), 1000)
-    array([[[250]],
-    <BLANKLINE>
-           [[750]]], dtype=uint16)
-    """
+    """Return weights (H, W, K) float32 from 0 to 1 as whole parts of `full` ≤ 65535, rounded: (K, H, W) uint16."""
     height, width, lights = weights.shape
     out = np.empty((lights, height, width), np.uint16)
     _quantise_weights(weights, np.float32(full), out)
@@ -122,13 +108,7 @@ def quantised_weights(weights: npt.NDArray[np.float32], full: int) -> npt.NDArra
 
 
 def mean_weights(weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-    """Return the mean (K,) float64 of weights (H, W, K) float32, H and W ≥ 1.
-
-    Examples
-    --------
-    >>> mean_weights(np.array([[[1, 0], [0.5, 0.5]]], np.float32))
-    array([0.75, 0.25])
-    """
+    """Return the mean (K,) float64 of weights (H, W, K) float32, H and W ≥ 1."""
     out = np.zeros(weights.shape[2], np.float64)
     _sums(weights, out)
     return out / (weights.shape[0] * weights.shape[1])

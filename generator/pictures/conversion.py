@@ -20,7 +20,7 @@ import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -47,22 +47,19 @@ _HEAD: Final = 1 << 20
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class AvifPicture:
-    """What a file holds.
+class FileValues:
+    """Values of a file: `light` (H, W, 3) uint8 or float64, 0 … 255 or linear 0 … 1; `alpha` (H, W) float64 0 … 1."""
 
-    - `codes`: (H, W, 3) uint8.
-    - `alpha`: (H, W) float64, 0 … 1; None if it is opaque.
-    - `orientation`: 1 … 8, as the TIFF tag.
-    - `icc`: its colour profile, if it has one.
-    """
-
-    codes: npt.NDArray[np.uint8]
+    light: npt.NDArray[Any]
     alpha: npt.NDArray[np.float64] | None
+    associated: bool
+    linear: bool
     orientation: int
     icc: bytes | None
+    adobe_rgb: bool = False
 
 
-def read_avif(path: Path, most_pixels: int) -> AvifPicture:
+def read_avif(path: Path, most_pixels: int) -> FileValues:
     """Return the picture in an AVIF file."""
     from PIL import Image
 
@@ -85,7 +82,8 @@ def read_avif(path: Path, most_pixels: int) -> AvifPicture:
     if not icc:
         _require_srgb(path)
     alpha = pixels[..., 3].astype(np.float64) / 255 if has_alpha and pixels[..., 3].min() < 255 else None
-    return AvifPicture(np.ascontiguousarray(pixels[..., :3]), alpha, orientation, icc or None)
+    codes = np.ascontiguousarray(pixels[..., :3])
+    return FileValues(codes, alpha, associated=False, linear=False, orientation=orientation, icc=icc or None)
 
 
 def _require_srgb(path: Path) -> None:
@@ -102,9 +100,6 @@ def _require_srgb(path: Path) -> None:
             "H.273, not those of sRGB; convert it to PNG in sRGB"
         )
 
-
-ASSUMED: Final = "none, taken as sRGB"
-"""Remark on a picture without a profile."""
 
 _PROBE_STEPS: Final = 9
 """Codes of each channel, every 32nd, of the grid of 729 colours that shows whether a profile is sRGB."""
@@ -124,21 +119,13 @@ _ROWS: Final = 256
 """Rows that are converted together, so that their float32 take little memory beside the picture."""
 
 
-def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArray[np.uint8], str]:
+def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes) -> tuple[npt.NDArray[np.uint8], str]:
     """Return the sRGB codes of a picture, and how its profile was treated.
 
     `codes`: (H, W, 3) uint8 in the space of the profile; a grey profile is applied where the channels are alike. `icc`:
-    the embedded profile; None where there is none. Returns (H, W, 3) uint8, the same array if no code changes; and a
+    the embedded profile. Returns (H, W, 3) uint8, the same array if no code changes; and a
     remark, such as ``"Display P3, converted to sRGB"``.
-
-    Examples
-    --------
-    >>> codes, remark = to_srgb(np.zeros((2, 2, 3), np.uint8), icc=None)
-    >>> remark
-    'none, taken as sRGB'
     """
-    if icc is None:
-        return codes, ASSUMED
     transform, mode, word = _transform(icc)
     if mode == "L" and (codes != codes[..., :1]).any():
         return codes, f"{word.rpartition(', ')[0]} of grey, not applied to colours, taken as sRGB"
@@ -152,14 +139,7 @@ def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArra
 
 
 def from_adobe_rgb(codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return the sRGB codes (H, W, 3) uint8 of Adobe RGB (1998) codes (H, W, 3) uint8, clipped to the gamut of sRGB.
-
-    Examples
-    --------
-    >>> from_adobe_rgb(np.array([[[128, 128, 128], [200, 100, 50]]], np.uint8))
-    array([[[129, 129, 129],
-            [227, 100,  42]]], dtype=uint8)
-    """
+    """Return the sRGB codes (H, W, 3) uint8 of Adobe RGB (1998) codes (H, W, 3) uint8, clipped to the gamut of sRGB."""
     linear = (np.arange(256, dtype=np.float32) / 255) ** _ADOBE_GAMMA
     encoded = srgb_codes(np.arange(_STEPS + 1) / _STEPS)
     out = np.empty_like(codes)

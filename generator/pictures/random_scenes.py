@@ -49,14 +49,7 @@ class RandomScene:
 
 
 def random_scenes(count: int, width: int, height: int, seed: int = 0) -> tuple[RandomScene, ...]:
-    """Return `count` random scenes of `width` × `height` px, numbered from 0.
-
-    Examples
-    --------
-    >>> first, second = random_scenes(2, width=4, height=3)
-    >>> second.name, second.read().picture.shape
-    ('random-000001', (3, 4, 3))
-    """
+    """Return `count` random scenes of `width` × `height` px, numbered from 0."""
     if count < 1:
         raise InputError(f"{count} random scenes were asked for, expected 1 or more")
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):

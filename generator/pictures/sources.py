@@ -40,12 +40,7 @@ from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import file_sha256, sha256_of, stream_sha256
 from foundation.secret_texts import masked
 from generator import philox
-from generator.pictures.conversion import (
-    ASSUMED,
-    from_adobe_rgb,
-    read_avif,
-    to_srgb,
-)
+from generator.pictures.conversion import FileValues, from_adobe_rgb, read_avif, to_srgb
 from generator.stores import DESCRIPTION, filesystem, is_remote, local_path
 
 if TYPE_CHECKING:
@@ -86,11 +81,6 @@ def random_places(
     `free`: columns and rows at which a crop can begin, 1 or more; together `count` or more places. `size`: width and
     height of a crop, px. `first`: column and row of the first crop, px; None for a random place. Returns column and row
     of each, px.
-
-    Examples
-    --------
-    >>> sorted(random_places((2, 2), (8, 8), 4, seed=0, name="a.png"))
-    [(0, 0), (0, 1), (1, 0), (1, 1)]
     """
     digest = hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()
     a, b, number = (int.from_bytes(digest[at : at + 4], "little") for at in (0, 4, 8))
@@ -120,13 +110,7 @@ def _overlap(one: tuple[int, int], other: tuple[int, int], size: tuple[int, int]
 
 
 def clear_bits(codes: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint8]:
-    """Return codes (...) uint8 with their lowest `bits` bits, 0 … 8, set to zero.
-
-    Examples
-    --------
-    >>> clear_bits(np.array([7, 8, 200, 255], np.uint8), 3)
-    array([  0,   8, 200, 248], dtype=uint8)
-    """
+    """Return codes (...) uint8 with their lowest `bits` bits, 0 … 8, set to zero."""
     if not 0 <= bits <= 8:
         raise InputError(f"{bits} bits of a code of 8 were to be set to zero, expected 0 to 8")
     return codes & np.uint8(0xFF << bits & 0xFF)
@@ -222,18 +206,25 @@ class Cut:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Reading:
-    """A picture as it was read.
+class SourcePicture:
+    """A source picture as it was read.
 
     - `picture`: (H, W, 3) uint8, sRGB codes; of several crops the first.
-    - `profile`: how its colour profile was treated, in words, such as ``"Display P3, converted to sRGB"``.
+    - `sha256`: hash of the file's bytes; None where there is no file, or it is opened alone.
+    - `profile`: how its colour profile was treated, in words, such as ``"Display P3, converted to sRGB"``;
+      empty where there is no file.
     - `cuts`: the crops, where several were asked for.
+    - `weight`: by which it was drawn; None where pictures were not drawn by weights.
+    - `black_taken`: share of the print's black, 0 … 1, that is taken out of its images; None where options say it.
     - `notes`: what else of the file was not plain sRGB codes and may look unlike what its owner expects.
     """
 
     picture: Picture
-    profile: str
+    sha256: str | None = None
+    profile: str = ""
     cuts: tuple[Cut, ...] = ()
+    weight: float | None = None
+    black_taken: float | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -271,22 +262,12 @@ def open_picture(
     name: str | None = None,
     data: bytes | None = None,
     most_pixels: int | None = None,
-) -> _Reading:
+) -> SourcePicture:
     """Return the sRGB codes of a picture file and how its profile was treated; the head of this file lists the steps.
 
     `name`: name of the picture, which chooses the place of a random crop; its file's name if None. `data`: the file's
     bytes, where they were read already. `most_pixels`: of the largest file that is read; `LARGEST_PICTURE` if None.
     Returns the codes (H, W, 3) uint8 and the treatment of its profile.
-
-    Examples
-    --------
-    >>> from PIL import Image
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "orange.png"
-    ...     Image.new("RGB", (40, 20), (255, 128, 0)).save(path)
-    ...     reading = open_picture(path, Preparation(crop=(8, 8)))
-    >>> reading.picture.shape, reading.profile
-    ((8, 8, 3), 'none, taken as sRGB')
     """
     values = _read(path, data, LARGEST_PICTURE if most_pixels is None else most_pixels)
     light = values.light
@@ -304,7 +285,7 @@ def open_picture(
     if values.linear:
         word = "linear light, encoded as sRGB"
     elif values.icc is None and not values.adobe_rgb:
-        word = ASSUMED
+        word = "none, taken as sRGB"
     elif preparation.profiles == "ignore":
         word = "ignored, taken as sRGB"
     elif values.icc is not None:
@@ -320,28 +301,15 @@ def open_picture(
     codes = _turn(codes, values.orientation)
     cuts = _fit(codes, preparation, path, path.name if name is None else name)
     notes = tuple(note for note, holds in noted.items() if holds)
-    return _Reading(cuts[0].picture, word, cuts if preparation.crops > 1 else (), notes)
+    several = cuts if preparation.crops > 1 else ()
+    return SourcePicture(cuts[0].picture, profile=word, cuts=several, notes=notes)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Values:
-    """Values of a file: `light` (H, W, 3) uint8 or float64, 0 … 255 or linear 0 … 1; `alpha` (H, W) float64 0 … 1."""
-
-    light: npt.NDArray[Any]
-    alpha: npt.NDArray[np.float64] | None
-    associated: bool
-    linear: bool
-    orientation: int
-    icc: bytes | None
-    adobe_rgb: bool
-
-
-def _read(path: Path, data: bytes | None, most_pixels: int) -> _Values:
+def _read(path: Path, data: bytes | None, most_pixels: int) -> FileValues:
     if not path.is_file():
         raise FormatError(f"cannot read {path}: there is no such file; name a picture")
     if path.suffix.lower() == ".avif":
-        picture = read_avif(path, most_pixels)
-        return _Values(picture.codes, picture.alpha, False, False, picture.orientation, picture.icc, False)
+        return read_avif(path, most_pixels)
     has_profile = _checked_png(path, data)
     with _named_in_text(path) as name:
         values = _read_named(path, name, data, most_pixels)
@@ -380,7 +348,7 @@ def _checked_png(path: Path, data: bytes | None) -> bool:
     return has_profile
 
 
-def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> _Values:
+def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> FileValues:
     import OpenImageIO as oiio  # noqa: N813
 
     request = oiio.ImageSpec()
@@ -442,7 +410,7 @@ def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> 
         associated = associated and not bool(np.any(values > 255.0 * alpha[..., None] + 1.0))
     profile = None if icc is None else np.asarray(icc, dtype=np.uint8).tobytes()
     adobe_rgb = uncalibrated and profile is None and _interoperability(path) == "R03"
-    return _Values(values, alpha, associated, linear, orientation, profile, adobe_rgb)
+    return FileValues(values, alpha, associated, linear, orientation, profile, adobe_rgb)
 
 
 @contextmanager
@@ -570,28 +538,6 @@ _MACHINE_ERRORS: Final = frozenset(
 """Errors of reading that have their cause in the machine or its store, not in the file."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class SourcePicture:
-    """A source picture as it was read.
-
-    - `picture`: (H, W, 3) uint8, sRGB codes; of several crops the first.
-    - `sha256`: hash of the file's bytes; None where there is no file.
-    - `profile`: how its colour profile was treated, in words; None where there is no file.
-    - `cuts`: the crops, where several were asked for.
-    - `weight`: by which it was drawn; None where pictures were not drawn by weights.
-    - `black_taken`: share of the print's black, 0 … 1, that is taken out of its images; None where options say it.
-    - `notes`: as those of `picture.Reading`.
-    """
-
-    picture: Picture
-    sha256: str | None = None
-    profile: str | None = None
-    cuts: tuple[Cut, ...] = ()
-    weight: float | None = None
-    black_taken: float | None = None
-    notes: tuple[str, ...] = ()
-
-
 class Source(Protocol):
     """One picture that can be read, from wherever."""
 
@@ -648,7 +594,7 @@ class PictureFile:
         with _local_file(self.location) as path:
             try:
                 sha256, data = _hashed(path)
-                reading = open_picture(path, self.preparation, self.name, data)
+                read = open_picture(path, self.preparation, self.name, data)
             except FormatError as error:
                 raise FormatError(str(error).replace(str(path), self.location)) from error
             except OSError as error:
@@ -657,7 +603,7 @@ class PictureFile:
                 raise InputError(
                     f"there is not enough memory to read {self.location}; use fewer workers, or leave it out"
                 ) from error
-        return SourcePicture(reading.picture, sha256, reading.profile, reading.cuts, notes=reading.notes)
+        return replace(read, sha256=sha256)
 
 
 def hash_since(source: Source, moment: float) -> str | None:

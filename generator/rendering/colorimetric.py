@@ -225,10 +225,7 @@ def reference_light(lut: Lut) -> int:
 def find_map(lut: Lut, matrix: ColourMatrix) -> PrintMap:
     """Return the map of a table's print for a colour matrix: it takes seconds.
 
-    Raises
-    ------
-    QualityError
-        No cell can be used, or the print has no contrast.
+    A QualityError says that no cell can be used, or that the print has no contrast.
     """
     light, bits = reference_light(lut), lut.provenance.bits
     profile = profile_of(lut, light)
@@ -378,10 +375,7 @@ class ColorimetricRendering:
     def seen(self, light: Mixture) -> _Array:
         """Return what the camera sees of each node under a light, (4913, 3) float64, counts; greys are neutral.
 
-        Raises
-        ------
-        QualityError
-            The print has no contrast under the light.
+        A QualityError says that the print has no contrast under the light.
         """
         white = light.white(self.lut)
         means = np.zeros((NODES, 3))

@@ -48,14 +48,7 @@ _SCALE: Final = _AXES * np.array([[BRIGHTNESS_COST**0.5], [1.0], [1.0]])
 
 
 def corners(places: _Array, bits: int) -> tuple[npt.NDArray[np.int64], _Array]:
-    """Return the eight cells around places (K, 3), and their trilinear weights: (K, 8) int64 and (K, 8) float64.
-
-    Examples
-    --------
-    >>> cells, weights = corners(np.array([[0.0, 0.25, 1.0]]), bits=1)
-    >>> cells[weights > 0].tolist(), weights[weights > 0].tolist()
-    ([1, 3], [0.75, 0.25])
-    """
+    """Return the eight cells around places (K, 3), and their trilinear weights: (K, 8) int64 and (K, 8) float64."""
     top = (1 << bits) - 1
     low = np.clip(np.floor(places).astype(np.int64), 0, max(top - 1, 0))
     part = places - low

@@ -90,16 +90,7 @@ class PrintProfile:
 
 
 def profile_of(lut: Lut, light: int) -> PrintProfile:
-    """Return what the camera of a table sees of each cell under one of its lights.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from calibration.table.lut import open_lut
-    >>> profile = profile_of(open_lut(Path("lut")), 0)
-    >>> profile.colours.shape, bool(profile.usable.all())
-    ((64, 3), True)
-    """
+    """Return what the camera of a table sees of each cell under one of its lights."""
     white = plain(light).white(lut)
     samples = lut.light_samples(light)
     means = samples.mean(axis=1, dtype=np.float64)
@@ -119,13 +110,6 @@ def odd_cells(samples: npt.NDArray[np.uint16], means: _Array) -> npt.NDArray[np.
     """Return which cells have means that a few odd samples have moved: hot photosites, dust.
 
     `samples`: (N, S, 3) uint16, the samples of a light. `means`: (N, 3) float64, their means. Returns (N,) bool.
-
-    Examples
-    --------
-    >>> samples = np.random.default_rng(1).poisson(400, (3, 25, 3)).astype(np.uint16)
-    >>> samples[1, 7, 0] = 9000
-    >>> odd_cells(samples, samples.mean(axis=1)).tolist()
-    [False, True, False]
     """
     medians = np.median(samples, axis=1)
     deviations = np.median(np.abs(samples - medians[:, None]), axis=1)
@@ -142,12 +126,6 @@ def neutral_ends(colours: _Array) -> tuple[float, float] | None:
 
     `colours`: (N, 3) float64, linear. Returns the two values of g; None if no mixture is grey, or the colours lie in a
     plane.
-
-    Examples
-    --------
-    >>> cube = np.stack(np.meshgrid([0.1, 0.9], [0.1, 0.9], [0.2, 0.9]), axis=-1).reshape(-1, 3)
-    >>> [round(end, 6) for end in neutral_ends(cube)]
-    [0.2, 0.9]
     """
     from scipy.spatial import ConvexHull, QhullError
 

@@ -140,12 +140,6 @@ def brightness_reached(
 
     `image`: (H, W, 3) uint16. `share`: 0 … 1. Of share 0, what no pixel reaches: half a count above the largest.
     `weights`, `end`: how its light falls off, (H, W, 2) float32 and three numbers, as of `expose`.
-
-    Examples
-    --------
-    >>> image = np.arange(300, dtype=np.uint16).reshape(10, 10, 3)
-    >>> brightness_reached(image, 0.02), brightness_reached(image, 0.0)
-    (296.0, 299.5)
     """
     counts = np.zeros(65536, np.int64)
     far, uneven = _weights_of(image, weights)
@@ -170,7 +164,6 @@ def expose(
     seed: int = 0,
     number: int = 0,
     first_row: int = 0,
-    threads: int = 1,
     out: Image | None = None,
 ) -> float:
     """Expose an image anew, in place unless `out` is given; the head of this file has the formulas.
@@ -180,15 +173,6 @@ def expose(
     that of the factor as ISO speed. `weights`, `end`: (H, W, 2) float32, how much of each pixel's light is that of the
     near and of the far end, and the light of the far end over that of the near one, above 0 up to 1; None for the same
     light everywhere. `threads`: that share the rows; no count depends on it. `out`: (H, W, 3) uint16 to fill.
-
-    Examples
-    --------
-    >>> noise = SensorNoise(read=(5.0, 4.0, 5.0), shot=(0.5, 0.25, 0.5))
-    >>> image = np.full((100, 100, 3), 1000, np.uint16)
-    >>> expose(image, 0.5, noise)
-    0.0
-    >>> bool(abs(image.mean() - 500) < 1), bool(image.std(axis=(0, 1))[0] > 10)
-    (True, True)
     """
     target = image if out is None else out
     for array in (image, target):
@@ -219,28 +203,21 @@ def expose(
         read**2 > least**2 * own**2 or (speed > least and shot > 0)
         for read, own, shot in zip(aim.read, noise.read, noise.shot, strict=True)
     )
-    clipped: list[int] = []
-
-    def fill(top: int, bottom: int) -> None:
-        clipped.append(
-            _expose(
-                image[top:bottom],
-                far[top:bottom] if uneven else far,
-                uneven,
-                numbers,
-                noisy,
-                normal_deviates(),
-                np.float32(speed),
-                np.float32(white_level),
-                key,
-                number,
-                first_row + top,
-                target[top:bottom],
-            )
-        )
-
-    run_in_threads(fill, len(image), threads)
-    return sum(clipped) / max(1, image.shape[0] * image.shape[1])
+    clipped = _expose(
+        image,
+        far,
+        uneven,
+        numbers,
+        noisy,
+        normal_deviates(),
+        np.float32(speed),
+        np.float32(white_level),
+        key,
+        number,
+        first_row,
+        target,
+    )
+    return clipped / max(1, image.shape[0] * image.shape[1])
 
 
 def _weights_of(image: Image, weights: npt.NDArray[np.float32] | None) -> tuple[npt.NDArray[np.float32], bool]:
@@ -295,14 +272,6 @@ def add_noise(
     a gain above the ratio nothing is added. `seeds`: (N,) uint64, of each item. `wanted`, `ratio`: noise at the wanted
     ISO speed, and that speed over the table's; `noise` and 1 if not given. `threads`: that share the items; no value
     depends on it.
-
-    Examples
-    --------
-    >>> images = np.full((1, 3, 50, 50), 0.1, np.float32)
-    >>> noise = SensorNoise((5.0, 4.0, 5.0), (0.5, 0.25, 0.5))
-    >>> add_noise(images, np.array([0.5]), noise, np.array([7], np.uint64), white_level=10000)
-    >>> bool(images.std() > 0.001), round(float(images.mean()), 3)
-    (True, 0.1)
     """
     if images.dtype != np.float32 or images.ndim != 4 or images.shape[1] != 3 or not images.flags.c_contiguous:
         raise InputError(f"the items are {images.dtype} {images.shape}, expected contiguous float32 (N, 3, H, W)")

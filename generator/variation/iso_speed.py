@@ -58,15 +58,7 @@ class IsoSpeed:
 
 
 def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SENSOR_ELECTRONS) -> IsoSpeed:
-    """Return the speed that a text names: ``1600/100``, wanted over the table's, with ``:read=2.8`` electrons.
-
-    Examples
-    --------
-    >>> parse_iso("1600/100").ratio, parse_iso("1600", base=200).ratio
-    (16.0, 8.0)
-    >>> parse_iso("1600/100:read=2.8").sensor_electrons
-    2.8
-    """
+    """Return the speed that a text names: ``1600/100``, wanted over the table's, with ``:read=2.8`` electrons."""
     speeds, _, rest = text.strip().partition(":")
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*(?:/\s*(\d+(?:\.\d*)?)\s*)?", speeds, re.ASCII)
     own = base if match is None or match[2] is None else float(match[2])

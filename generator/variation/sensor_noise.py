@@ -36,14 +36,7 @@ BITS: Final = 14
 
 @lru_cache(maxsize=1)
 def normal_deviates() -> npt.NDArray[np.float32]:
-    """Return the deviates (16384,) float32, rising.
-
-    Examples
-    --------
-    >>> table = normal_deviates()
-    >>> table.shape, round(float(table.std()), 6), round(float(table[-1]), 2)
-    ((16384,), 1.0, 4.01)
-    """
+    """Return the deviates (16384,) float32, rising."""
     half = 1 << (BITS - 1)
     upper = np.array([NormalDist().inv_cdf(0.5 + (place + 0.5) / (2 * half)) for place in range(half)])
     upper /= np.sqrt(np.mean(upper**2))
@@ -94,14 +87,9 @@ class SensorNoise:
 
 
 def measured_noise(lut: Lut) -> SensorNoise:
-    """Return the noise of a table's samples.
+    """Return the noise of a table's samples; errors as of `noise_curve`.
 
     Numbers have six digits, so that they are the same wherever a dataset is made.
-
-    Raises
-    ------
-    InputError
-        As of `noise_curve`.
     """
     # What measures noise also reads charts: who makes images alone is not to wait for its import.
     from calibration.radiometry.table_noise import noise_curve

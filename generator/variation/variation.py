@@ -27,7 +27,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -102,13 +102,7 @@ class Gradient:
 
 
 def described_gradient(record: Mapping[str, Any]) -> Gradient:
-    """Return the gradient that `Gradient.describe` described.
-
-    Examples
-    --------
-    >>> described_gradient(Gradient(stops=2.0).describe()) == Gradient(stops=2.0)
-    True
-    """
+    """Return the gradient that `Gradient.describe` described."""
     kind = str(record.get("masks"))
     # A half plane is a soft edge of no width, which only its name says.
     given = {name: value for name, value in record.items() if name != "masks" and value is not None}
@@ -118,13 +112,7 @@ def described_gradient(record: Mapping[str, Any]) -> Gradient:
 
 
 def parse_gradient(text: str) -> Gradient:
-    """Return the gradient that a text names: a kind of masks with its numbers, and ``stops``, ``least``, ``colour``.
-
-    Examples
-    --------
-    >>> parse_gradient("soft-edge:width=.8,stops=2").stops
-    2.0
-    """
+    """Return the gradient that a text names: a kind of masks with its numbers, and ``stops``, ``least``, ``colour``."""
     kind, _, rest = text.strip().partition(":")
     entries = [entry for entry in rest.split(",") if entry.strip()]
     own = [entry for entry in entries if entry.partition("=")[0].strip().lower() in _GRADIENT_OPTIONS]
@@ -151,37 +139,11 @@ _EXPOSURE_OPTIONS: Final[dict[str, dict[str, Range]]] = {
 }
 
 
-class ExposureChoice(Protocol):
-    """The factor on the counts of each image."""
-
-    @property
-    def seen(self) -> float | None:
-        """Share of an image's brightest pixels that the factor depends on; None where it does not."""
-        ...
-
-    def factor(self, seed: int, number: int, brightness: float) -> float:
-        """Return the factor > 0 of image `number`.
-
-        `brightness`: largest channel, over saturation, that the share `seen` of the pixels reaches; any number where
-        that is None.
-        """
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """Return the kind and its numbers as plain values."""
-        ...
-
-
 @dataclass(frozen=True)
 class DrawnExposure:
     """A factor of 2 to the power of stops, drawn by quantiles: of probability 0 … 1 in even steps, linear between.
 
     Two quantiles are an even distribution between them, one is a fixed factor.
-
-    Examples
-    --------
-    >>> round(DrawnExposure((-1.0, -1.0)).factor(seed=0, number=7, brightness=0.0), 3)
-    0.5
     """
 
     stops: tuple[float, ...]
@@ -191,11 +153,15 @@ class DrawnExposure:
 
     @property
     def seen(self) -> float | None:
-        """None: the image does not matter."""
+        """Share of an image's brightest pixels that the factor depends on: None, the image does not matter."""
         return None
 
     def factor(self, seed: int, number: int, brightness: float) -> float:
-        """Return the factor of image `number`; see `ExposureChoice.factor`."""
+        """Return the factor > 0 of image `number`.
+
+        `brightness`: largest channel, over saturation, that the share `seen` of the pixels reaches; any number where
+        that is None.
+        """
         del brightness
         return 2.0 ** _quantile(self.stops, _uniform(seed, number))
 
@@ -221,7 +187,7 @@ class NormalExposure:
         return None
 
     def factor(self, seed: int, number: int, brightness: float) -> float:
-        """Return the factor of image `number`; see `ExposureChoice.factor`."""
+        """Return the factor of image `number`; see `DrawnExposure.factor`."""
         del brightness
         tail = NormalDist().cdf(-_TAILS)
         place = tail + (1 - 2 * tail) * _uniform(seed, number)
@@ -240,11 +206,6 @@ class AutomaticExposure:
     - `levels`: over saturation, 0 … 1: quantiles that each image's level is drawn by, as of `DrawnExposure`, in the
       logarithm. Level 1 clips that share.
     - `most`: largest factor, so that a dark picture stays dark.
-
-    Examples
-    --------
-    >>> AutomaticExposure(share=0.01, levels=(1.0,)).factor(seed=0, number=0, brightness=0.25)
-    4.0
     """
 
     share: float
@@ -265,7 +226,7 @@ class AutomaticExposure:
         return self.share
 
     def factor(self, seed: int, number: int, brightness: float) -> float:
-        """Return the factor of image `number`; see `ExposureChoice.factor`."""
+        """Return the factor of image `number`; see `DrawnExposure.factor`."""
         logarithms = tuple(math.log(level) for level in self.levels)
         level = math.exp(_quantile(logarithms, _uniform(seed, number)))
         return min(level / brightness, self.most) if brightness > 0 else self.most
@@ -275,19 +236,16 @@ class AutomaticExposure:
         return {"exposure": "automatic", "share": self.share, "levels": list(self.levels), "most": self.most}
 
 
+ExposureChoice = DrawnExposure | NormalExposure | AutomaticExposure
+"""The factor on the counts of each image."""
+
+
 def parse_exposure(text: str) -> ExposureChoice:
     """Return the exposure that a text names.
 
     A number is a factor; ``stops:low=-2,high=1`` draws evenly in stops, ``normal:mean=-1,sd=.5`` normally;
     ``clip:share=.01`` clips that share of the pixels; ``level:share=.01,low=.3,high=.9`` lets that share of them reach
     a level between those, over saturation. ``most=4`` limits the factor of the last two.
-
-    Examples
-    --------
-    >>> parse_exposure("stops:low=-2,high=1")
-    DrawnExposure(stops=(-2.0, 1.0))
-    >>> parse_exposure("clip:share=.01")
-    AutomaticExposure(share=0.01, levels=(1.0,), most=8.0)
     """
     kind, _, rest = text.strip().partition(":")
     if kind not in _EXPOSURE_OPTIONS:

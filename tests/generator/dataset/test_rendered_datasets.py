@@ -22,9 +22,9 @@ from generator.dataset.shards import make_shard
 from generator.kernels.printing import draw_printed
 from generator.kernels.rendering import draw_samples
 from generator.lights.lighting import ListedLights, Mixture, plain
-from generator.lights.request import LightRequest
 from generator.masks.making import FULL
 from generator.masks.maps import quantised_chromaticities
+from generator.options import LightOptions
 from generator.pictures.sources import find_pictures
 from generator.rendering.black_points import BlackPoint, veil_of, without_veil
 from generator.rendering.colorimetric import ColorimetricRendering
@@ -128,7 +128,7 @@ def test_workers_shards_shares_and_other_processes_change_no_byte(
 
 def test_several_lights_share_an_image(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut(bits=3)
-    choice = LightRequest(random=1, lights_per_image=2, masks="half-plane").choose(lut, 5)
+    choice = LightOptions(random=1, lights_per_image=2, masks="half-plane").choose(lut, 5)
     sources = find_pictures(pictures)
     plan_options = DatasetOptions(rendering="colorimetric", matrix=MATRIX, black_point=BlackPoint("compensate"))
     dataset = generate_dataset(lut, tmp_path / "out", sources, choice, seed=5, options=plan_options)
@@ -156,7 +156,7 @@ def test_a_mixture_of_lights_has_the_black_of_the_mixture(make_lut: MakeLut, pic
     lut = make_lut()
     mixture = Mixture((0, 3), (0.25, 0.75))
     options = DatasetOptions(rendering="codes", black_point=BlackPoint("compensate"))
-    request = LightRequest(light=(mixture.label,)).choose(lut, 5)
+    request = LightOptions(light=[mixture.label]).choose(lut, 5)
     dataset = generate_dataset(lut, tmp_path / "out", find_pictures(pictures), request, seed=5, options=options)
     picture = next(iter(find_pictures(pictures))).read().picture
     samples = without_veil(mixture.samples(lut, 5), veil_of(lut, mixture, 1.0), lut.provenance.white_level)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -14,9 +12,7 @@ from foundation.errors import InputError
 from generator.lights.choices import SimultaneousLights, nearest_lights, parse_light
 from generator.lights.lighting import LightChoice, Lighting, RandomLights, plain
 from generator.masks.making import parse_masks
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
+from tests.generator.conftest import MakeLut
 
 
 def numbers(lightings: tuple[Lighting, ...]) -> tuple[int, ...]:
@@ -25,7 +21,7 @@ def numbers(lightings: tuple[Lighting, ...]) -> tuple[int, ...]:
     return tuple(lighting.mixtures[0].lights[0] for lighting in lightings)
 
 
-def test_nearest_is_by_angle(make_lut: Callable[..., Lut]) -> None:
+def test_nearest_is_by_angle(make_lut: MakeLut) -> None:
     lut = make_lut(lights=4)
     wanted = lut.white[[2, 0, 3]] * np.array([[1e-4], [7.0], [1.0]]) + [[0, 0, 1e-3]] * 3
     choice = nearest_lights(lut, wanted, "truths.csv")
@@ -36,7 +32,7 @@ def test_nearest_is_by_angle(make_lut: Callable[..., Lut]) -> None:
     assert [numbers(both.lightings_of(position)) for position in range(3)] == [(2, 0), (3, 2), (0, 3)]
 
 
-def test_lights_of_a_table_may_have_names(make_lut: Callable[..., Lut]) -> None:
+def test_lights_of_a_table_may_have_names(make_lut: MakeLut) -> None:
     lut = make_lut(lights=3)
     named = [replace(light, name=name) for light, name in zip(lut.illuminations, ("A", "FL2", "D65"), strict=True)]
     lut = replace(lut, illuminations=tuple(named))

@@ -19,7 +19,8 @@ from generator.lights.choices import parse_light, parse_lights
 from generator.lights.distributions import load_ground_truths, parse_distribution
 from generator.lights.gamut import Gamut, OutsideGamut, black_body, rgb_of
 from generator.lights.lighting import LightChoice, mixture_of, parse_mixture
-from generator.lights.request import LightRequest, load_named_truths
+from generator.lights.named_lights import load_named_truths
+from generator.options import LightOptions
 from tests.generator.dataset.known import table_in
 from tests.generator.said import said
 from tests.generator.stats_files import write_stats
@@ -169,10 +170,10 @@ def test_requests(lut: Lut, pinned: Pinned) -> None:
     names = ["one.png", "raw/two.png", "one.png", "raw/two.png"]
     found: dict[str, Any] = {}
     for name, wishes in REQUESTS.items():
-        choice = said(LightRequest(**wishes).choose, lut, SEED, names[:2])
+        choice = said(LightOptions(**wishes).choose, lut, SEED, names[:2])
         scenes = (0, 1) if "by name" in name else (0, 1, 70000)
         found[name] = choice if isinstance(choice, str) else said(shown, choice, scenes)
-    by_name = LightRequest(lights_by_name=Path("many.csv"), outside="nearest")
+    by_name = LightOptions(lights_by_name=Path("many.csv"), outside="nearest")
     found["crops by name"] = shown(by_name.choose(lut, SEED, names[:2], 2), (0, 1, 2, 3))
     found["ambiguous"] = said(by_name.choose, lut, SEED, names)
     pinned("requests of lights", found)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
-
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -13,18 +10,16 @@ from hypothesis import strategies as st
 
 from foundation.errors import InputError
 from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture, plain
-from generator.masks.making import FULL
+from generator.masks.making import FULL, GivenMasks
 from generator.masks.maps import quantised_chromaticities
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
+from tests.generator.conftest import MakeLut
 
 _parts = st.dictionaries(
     st.integers(0, 999_999), st.floats(1e-6, 1e6, allow_nan=False, allow_infinity=False), min_size=1, max_size=5
 )
 
 
-class Halves:
+class Halves(GivenMasks):
     """The first light on the left, the second on the right."""
 
     def weights(self, height: int, width: int, lights: int) -> npt.NDArray[np.float32]:
@@ -69,23 +64,23 @@ def test_lights_that_do_not_ascend_are_refused(lights: tuple[int, ...], weights:
         Mixture(lights, weights)
 
 
-def test_the_ground_truth_is_the_mixture_of_ground_truths(make_lut: Callable[..., Lut]) -> None:
+def test_the_ground_truth_is_the_mixture_of_ground_truths(make_lut: MakeLut) -> None:
     lut = make_lut()
     np.testing.assert_allclose(Mixture((0, 3), (0.25, 0.75)).white(lut), 0.25 * lut.white[0] + 0.75 * lut.white[3])
     np.testing.assert_array_equal(plain(2).white(lut), lut.white[2])
     np.testing.assert_array_equal(plain(2).samples(lut), lut.samples[2])
 
 
-def test_a_light_that_the_table_lacks_is_named(make_lut: Callable[..., Lut]) -> None:
+def test_a_light_that_the_table_lacks_is_named(make_lut: MakeLut) -> None:
     lut = make_lut(lights=4)
     for of in (Mixture((0, 4), (0.5, 0.5)).white, Mixture((0, 4), (0.5, 0.5)).samples):
         with pytest.raises(InputError, match=r"there is no light 4; the table .* has lights 0 to 3"):
             of(lut)
 
 
-def test_ground_truth_of_every_pixel(make_lut: Callable[..., Lut]) -> None:
+def test_ground_truth_of_every_pixel(make_lut: MakeLut) -> None:
     lut = make_lut()
-    lighting = Lighting((plain(0), Mixture((1, 2), (0.5, 0.5))), Halves())
+    lighting = Lighting((plain(0), Mixture((1, 2), (0.5, 0.5))), Halves(()))
     weights = lighting.weights_of(2, 4)
     truth = quantised_chromaticities(weights, lighting.whites(lut), FULL) / FULL
     other = lut.white[1] / 2 + lut.white[2] / 2
@@ -101,5 +96,5 @@ def test_masks_stand_for_several_lights_only() -> None:
     with pytest.raises(InputError, match="2 lights without masks"):
         Lighting((plain(0), plain(1)))
     with pytest.raises(InputError, match="1 lights with masks"):
-        Lighting((plain(0),), Halves())
+        Lighting((plain(0),), Halves(()))
     np.testing.assert_array_equal(Lighting((plain(3),)).weights_of(2, 3), np.ones((2, 3, 1), np.float32))

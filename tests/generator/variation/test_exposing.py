@@ -6,7 +6,6 @@ Training items in less light, and at another ISO speed, are as noisy as a camera
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from statistics import NormalDist
 from typing import Any
 
@@ -14,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.table.lut import Lut
 from foundation.errors import InputError
 from generator import philox
 from generator.rendering.black_points import BlackPoint
@@ -23,6 +21,7 @@ from generator.training.gallery import gallery_of
 from generator.variation.exposing import add_noise, brightness_reached, expose
 from generator.variation.iso_speed import IsoSpeed
 from generator.variation.sensor_noise import SensorNoise, measured_noise, normal_deviates
+from tests.generator.conftest import MakeLut
 
 PLANES = SensorNoise((6.0, 4.2, 5.0), (0.56, 0.28, 0.4))
 WHITE = 10000
@@ -45,7 +44,7 @@ def test_the_noise_is_that_of_the_model(gain: float, ratio: float) -> None:
 
 
 @pytest.mark.slow
-def test_items_are_the_same_whoever_makes_them(make_lut: Callable[..., Lut]) -> None:
+def test_items_are_the_same_whoever_makes_them(make_lut: MakeLut) -> None:
     lut = make_lut(bits=3)
     gallery = gallery_of([np.full((40, 50, 3), 200, np.uint8)])
     noise = measured_noise(lut)
@@ -69,7 +68,7 @@ def test_items_are_the_same_whoever_makes_them(make_lut: Callable[..., Lut]) -> 
     assert np.median(spread) == pytest.approx(4, rel=0.1)
 
 
-def test_black_that_is_taken_out_is_not_lifted_by_noise(make_lut: Callable[..., Lut]) -> None:
+def test_black_that_is_taken_out_is_not_lifted_by_noise(make_lut: MakeLut) -> None:
     lut = make_lut(bits=3)
     gallery = gallery_of([np.zeros((60, 60, 3), np.uint8)])
     black = BlackPoint("random", most=0.97)
@@ -203,16 +202,15 @@ def test_the_steps_are_those_that_are_published() -> None:
     assert word ^ word >> 31 == 0xE220A8397B1DCDAF
 
 
-def test_neither_threads_nor_tiles_change_a_count() -> None:
+def test_tiles_change_no_count() -> None:
     whole = photographed(3000, NOISE, 97)
     source = whole.copy()
     weights = np.random.default_rng(4).random((97, 97, 2), dtype=np.float32)
     options: dict[str, Any] = {"end": (0.3, 0.5, 0.4), "white_level": 2500, "seed": 8, "number": 3}
     share = expose(whole, 0.8, NOISE, weights=weights, **options)
-    for threads in (2, 5):
-        again = np.empty_like(source)
-        assert expose(source, 0.8, NOISE, weights=weights, threads=threads, out=again, **options) == share
-        np.testing.assert_array_equal(again, whole)
+    again = np.empty_like(source)
+    assert expose(source, 0.8, NOISE, weights=weights, out=again, **options) == share
+    np.testing.assert_array_equal(again, whole)
     part = source[40:60].copy()
     expose(part, 0.8, NOISE, weights=weights[40:60], first_row=40, **options)
     np.testing.assert_array_equal(part, whole[40:60])

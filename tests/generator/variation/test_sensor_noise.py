@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,6 +15,7 @@ from foundation.errors import InputError
 from generator.variation.iso_speed import IsoSpeed, known_of_table, parse_iso
 from generator.variation.sensor_noise import SensorNoise, Three, measured_noise
 from sim.world.sensors import BODIES
+from tests.generator.conftest import MakeLut
 
 
 def table(read: float, shot: float, response: float = 0.0, texture: float = 0.0, unfit: tuple[int, ...] = ()) -> Lut:
@@ -62,12 +62,12 @@ def test_samples_that_are_no_photograph_are_refused() -> None:
         measured_noise(lut)
 
 
-def test_too_few_cells_are_refused(make_lut: Callable[..., Lut]) -> None:
+def test_too_few_cells_are_refused(make_lut: MakeLut) -> None:
     with pytest.raises(InputError, match=r"32 cells|expected 32"):
         measured_noise(make_lut(bits=1, lights=1))
 
 
-def test_a_table_of_poisson_samples(make_lut: Callable[..., Lut]) -> None:
+def test_a_table_of_poisson_samples(make_lut: MakeLut) -> None:
     noise = measured_noise(make_lut(bits=3))
     assert noise.shot == pytest.approx([1.0] * 3, rel=0.1)
 
