@@ -17,11 +17,12 @@ from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
 from generator.lights.lighting import LightChoice, ListedLights, RandomLights, mixture_of
 from generator.pictures.random_scenes import random_scenes
+from tests.generator.conftest import MakeLut
 
 pytestmark = pytest.mark.slow
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from matplotlib.figure import Figure
 
@@ -59,7 +60,7 @@ def images_on(figure: Figure) -> int:
 
 
 def test_a_contact_sheet_shows_rows_of_sources(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[str] = []
     load = Dataset.read_image
@@ -82,7 +83,7 @@ def test_a_contact_sheet_shows_rows_of_sources(
     assert part.shape[1] < width
 
 
-def test_of_many_lights_as_many_are_shown_as_are_recognised(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_of_many_lights_as_many_are_shown_as_are_recognised(make_lut: MakeLut, tmp_path: Path) -> None:
     lights = ListedLights(tuple(mixture_of({0: part, 1: 10 - part}) for part in range(1, 10)))
     made = made_of(make_lut(), tmp_path / "out", 1, lights)
     assert made.description.images == 9
@@ -98,7 +99,7 @@ def test_of_many_lights_as_many_are_shown_as_are_recognised(make_lut: Callable[.
     assert np.multiply(dot.get_facecolor()[:3], 255) == pytest.approx([9, 8, 0.9 ** (1 / 2.2)])
 
 
-def test_images_of_one_light_a_picture_fill_a_grid(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_images_of_one_light_a_picture_fill_a_grid(make_lut: MakeLut, tmp_path: Path) -> None:
     """Rows of one image each would be a narrow column with an empty page beside it."""
     made = made_of(make_lut(), tmp_path / "out", 30, RandomLights(1, 4, 0))
     whole = draw(made, MAX_ROWS, MAX_COLUMNS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,7 @@ from generator.dataset.shards import SILENT, Callbacks
 from generator.lights.lighting import RandomLights
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import find_pictures
-from tests.generator.conftest import lut_in
+from tests.generator.conftest import MakeLut, lut_in
 from tests.generator.dataset.contents import contents
 
 pytestmark = pytest.mark.slow
@@ -79,7 +78,7 @@ def test_a_killed_worker_changes_no_byte(undisturbed: tuple[Lut, dict[str, str]]
 
 def test_a_cluster_of_somebody_else_s(
     undisturbed: tuple[Lut, dict[str, str]],
-    make_lut: Callable[..., Lut],
+    make_lut: MakeLut,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -146,9 +145,7 @@ def test_an_unknown_engine_is_refused(name: str) -> None:
         parse_engine(name)
 
 
-def test_a_scheduler_that_does_not_answer(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scheduler_that_does_not_answer(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("generator.dataset.making.CONNECT_S", 0.2)
     with pytest.raises(InputError, match=r"127\.0\.0\.1:1"):
         generate_dataset(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,13 +22,14 @@ from generator.dataset.reader import Dataset, open_dataset
 from generator.files import FULL, from_full_scale, to_full_scale
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import find_pictures
+from tests.generator.conftest import MakeLut
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
 @pytest.fixture
-def lut(make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lut:
+def lut(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lut:
     """Return a table of 512 colours, and go to the folder that holds it and a folder of six pictures."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pictures").mkdir()
@@ -190,9 +190,7 @@ class TestAskedForTwice:
         assert "pictures already exists" in capsys.readouterr().err
 
     @pytest.mark.slow
-    def test_of_another_table_too(
-        self, lut: Lut, make_lut: Callable[..., Lut], capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_of_another_table_too(self, lut: Lut, make_lut: MakeLut, capsys: pytest.CaptureFixture[str]) -> None:
         made: Dataset = generate_dataset(lut, "out", find_pictures("pictures"), [0])
         assert made.description.images == 6
         make_lut(bits=2, name="other")

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import cv2
 import numpy as np
@@ -30,21 +30,19 @@ from generator.masks.making import parse_masks
 from generator.options import ImageOptions
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import SourcePicture
+from tests.generator.conftest import MakeLut
 from tests.generator.groups import grouped
 
 pytestmark = pytest.mark.slow
 
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
-
-    Make = Callable[..., Dataset]
+Make = Callable[..., Dataset]
 
 SCENES = random_scenes(9, 28, 24, 8)
 LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 
 
 @pytest.fixture
-def make(make_lut: Callable[..., Lut], tmp_path: Path) -> Make:
+def make(make_lut: MakeLut, tmp_path: Path) -> Make:
     """Return a maker of datasets of two images of each scene, in shards of 5."""
     lut = make_lut()
 
@@ -86,6 +84,7 @@ def test_every_format_is_the_same_image_in_every_layout(make: Make, form: str) -
 
 READER = """
 import hashlib, json, sys
+from tests.generator.conftest import MakeLut
 # It does without PyTorch, whose import takes longer than all else.
 sys.modules["torch"] = None
 import webdataset
@@ -174,7 +173,7 @@ class Gone:
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_shard_that_cannot_be_ended_is_given_up_quietly(
-    make_lut: Callable[..., Lut], tmp_path: Path, layout: Layout, capfd: pytest.CaptureFixture[str]
+    make_lut: MakeLut, tmp_path: Path, layout: Layout, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """A writer that ends its file when it is thrown away finds the file closed; pytest fails for that."""
     with pytest.raises(StorageError, match="the disk is gone"):
@@ -216,7 +215,7 @@ MAPS_OF = {"folder": maps_in_folder, "webdataset": maps_in_tar, "parquet": maps_
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_several_lights_in_an_image(make: Make, make_lut: Callable[..., Lut], layout: Layout) -> None:
+def test_several_lights_in_an_image(make: Make, make_lut: MakeLut, layout: Layout) -> None:
     choice = SimultaneousLights(ListedLights((2, 0)), 2, parse_masks("half-plane", 2, 5))
     made = make(layout, choice)
     entry = made.entries[3]

@@ -8,7 +8,7 @@ import json
 import os
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -23,14 +23,10 @@ from generator.lights.lighting import ListedLights, RandomLights, mixture_of
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import find_pictures, read_picture
 from generator.rendering.render import render
+from tests.generator.conftest import MakeLut
 from tests.generator.dataset.contents import contents
 
 pytestmark = pytest.mark.slow
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from calibration.table.lut import Lut
 
 
 NUMBERS = (0, 1, 2, 3, 6, 7, 8, 9)
@@ -50,7 +46,7 @@ def pictures(tmp_path: Path) -> Path:
     return folder
 
 
-def test_what_is_in_the_folder(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+def test_what_is_in_the_folder(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     skipped: list[tuple[str, str]] = []
     images: list[int] = []
@@ -122,7 +118,7 @@ def test_what_is_in_the_folder(make_lut: Callable[..., Lut], pictures: Path, tmp
         assert max(preview.shape[:2]) == -(-max(expected.shape[:2]) // factor)
 
 
-def test_workers_change_no_byte(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+def test_workers_change_no_byte(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut(unfit=(3,))
     sources = (*find_pictures([pictures]), *random_scenes(3, 40, 30, 5))
     for workers in (1, 7):
@@ -134,7 +130,7 @@ def test_workers_change_no_byte(make_lut: Callable[..., Lut], pictures: Path, tm
     assert all(one[name] != other[name] for name in one if name.startswith("images/"))
 
 
-def test_replaced_pixels_are_counted(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+def test_replaced_pixels_are_counted(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut(unfit=(0, 21))
     (source,) = find_pictures([pictures / "a.png"])
     made = generate_dataset(
@@ -150,9 +146,7 @@ def test_replaced_pixels_are_counted(make_lut: Callable[..., Lut], pictures: Pat
     assert not (tmp_path / "out" / "previews").exists()
 
 
-def test_images_come_of_samples_as_they_were_measured(
-    make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
-) -> None:
+def test_images_come_of_samples_as_they_were_measured(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     with (lut.folder / "samples.npy").open("r+b") as stream:
         stream.seek(-1, os.SEEK_END)
@@ -169,7 +163,7 @@ def test_images_come_of_samples_as_they_were_measured(
         generate_dataset(lut, tmp_path / "by-colour", sources, [3])
 
 
-def test_pictures_too_small_for_the_format_are_passed_over(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_pictures_too_small_for_the_format_are_passed_over(make_lut: MakeLut, tmp_path: Path) -> None:
     sources = (*random_scenes(1, 21, 40), *random_scenes(1, 22, 22, 5))
     skipped: list[str] = []
     made = generate_dataset(
@@ -185,9 +179,7 @@ def test_pictures_too_small_for_the_format_are_passed_over(make_lut: Callable[..
     assert reason.startswith("random-000000 is 21x40 px, too small for dng, which takes 22x22 and more; choose another")
 
 
-def test_nothing_is_left_of_a_dataset_that_cannot_be(
-    make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
-) -> None:
+def test_nothing_is_left_of_a_dataset_that_cannot_be(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     sources = find_pictures([pictures])
     before, threads = contents(tmp_path), threading.active_count()
@@ -205,9 +197,7 @@ def test_nothing_is_left_of_a_dataset_that_cannot_be(
     assert threading.active_count() == threads
 
 
-def test_a_taken_folder_and_empty_lists_are_refused(
-    make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
-) -> None:
+def test_a_taken_folder_and_empty_lists_are_refused(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut = make_lut()
     with pytest.raises(InputError, match="already exists"):
         generate_dataset(lut, pictures, find_pictures([pictures]), [0])

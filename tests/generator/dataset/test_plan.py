@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,9 +20,7 @@ from generator.dataset.shards import split_of
 from generator.lights.lighting import ListedLights
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import find_pictures
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
+from tests.generator.conftest import MakeLut
 
 SHARES = (0.7, 0.1, 0.2)
 
@@ -58,7 +55,7 @@ def write(path: Path, seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_parts_are_of_sources_and_stay_when_others_come(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_parts_are_of_sources_and_stay_when_others_come(make_lut: MakeLut, tmp_path: Path) -> None:
     lut = make_lut()
     folder = tmp_path / "pictures"
     for number in range(12):
@@ -120,7 +117,7 @@ def test_options_at_their_limits_and_beyond(most: dict[str, Any], beyond: dict[s
         DatasetOptions(**beyond)
 
 
-def test_a_plan_at_its_limits_and_beyond(make_lut: Callable[..., Lut]) -> None:
+def test_a_plan_at_its_limits_and_beyond(make_lut: MakeLut) -> None:
     lut = make_lut(bits=2)
 
     def plan(crops: int = 1, **options: Any) -> Plan:
@@ -136,7 +133,7 @@ def test_a_plan_at_its_limits_and_beyond(make_lut: Callable[..., Lut]) -> None:
         plan(rendering="codes", bits=3)
 
 
-def test_a_shard_takes_the_pictures_that_its_images_show(make_lut: Callable[..., Lut]) -> None:
+def test_a_shard_takes_the_pictures_that_its_images_show(make_lut: MakeLut) -> None:
     """Images 0 to 9 are of two lights of five pictures; three of them make a shard, and the last has one."""
     scenes = random_scenes(5, 4, 4)
     plan = Plan(make_lut(), scenes, ListedLights((0, 3)), 0, DatasetOptions(shard_images=3))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -15,19 +14,15 @@ from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks
 from generator.pictures.random_scenes import random_scenes
+from tests.generator.conftest import MakeLut
 
 pytestmark = pytest.mark.slow
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from calibration.table.lut import Lut
 
 BARE = DatasetOptions(rendering="codes", previews=False)
 
 
 @pytest.fixture
-def small(make_lut: Callable[..., Lut], tmp_path: Path) -> Path:
+def small(make_lut: MakeLut, tmp_path: Path) -> Path:
     """Return a dataset of two random scenes under one light, without previews."""
     generate_dataset(
         make_lut(),
@@ -75,7 +70,7 @@ def lines_of(path: Path) -> list[str]:
     ],
 )
 def test_ground_truths_that_disagree_are_named(
-    make_lut: Callable[..., Lut], tmp_path: Path, written: tuple[int | str, ...], message: str
+    make_lut: MakeLut, tmp_path: Path, written: tuple[int | str, ...], message: str
 ) -> None:
     out = tmp_path / "out"
     made = generate_dataset(make_lut(), out, random_scenes(1, 24, 16), [0, 1, 2, 3], options=BARE)
@@ -107,7 +102,7 @@ def test_a_table_that_is_no_csv_is_named(small: Path) -> None:
         open_dataset(small)
 
 
-def test_the_mean_of_several_lights_lies_between_them(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_the_mean_of_several_lights_lies_between_them(make_lut: MakeLut, tmp_path: Path) -> None:
     choice = SimultaneousLights(ListedLights((0, 3)), 2, parse_masks("half-plane", 2, 5))
     out = tmp_path / "out"
     generate_dataset(make_lut(), out, random_scenes(2, 24, 16), choice, options=BARE)

@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
@@ -30,6 +30,7 @@ from generator.lights.lighting import ListedLights
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import find_pictures
 from generator.stores import LocalStore, RemoteStore, open_store
+from tests.generator.conftest import MakeLut
 from tests.generator.groups import grouped
 
 if TYPE_CHECKING:
@@ -183,7 +184,7 @@ def make(lut: Lut, out: str | Path, **options: Any) -> None:
 
 
 @pytest.mark.parametrize("layout", get_args(Layout))
-def test_a_dataset_in_a_store_is_the_one_on_the_disk(make_lut: Callable[..., Lut], tmp_path: Path, layout: str) -> None:
+def test_a_dataset_in_a_store_is_the_one_on_the_disk(make_lut: MakeLut, tmp_path: Path, layout: str) -> None:
     lut = make_lut()
     make(lut, tmp_path / "out", layout=layout)
     make(lut, "memory://bucket/out", layout=layout, workers=3)
@@ -203,9 +204,7 @@ STRIDE = 3
 
 
 @pytest.mark.parametrize("layout", ["folder", "webdataset"])
-def test_a_store_that_fails_at_any_write_is_gone_on_with(
-    make_lut: Callable[..., Lut], tmp_path: Path, layout: str
-) -> None:
+def test_a_store_that_fails_at_any_write_is_gone_on_with(make_lut: MakeLut, tmp_path: Path, layout: str) -> None:
     lut = make_lut()
     make(lut, tmp_path / "out", layout=layout, previews=False)
     expected = contents(tmp_path / "out")
@@ -230,7 +229,7 @@ def test_a_store_that_fails_at_any_write_is_gone_on_with(
     assert write > 8
 
 
-def test_shares_in_a_store(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_shares_in_a_store(make_lut: MakeLut, tmp_path: Path) -> None:
     lut = make_lut()
     plan = Plan(
         lut, SCENES, ListedLights((2, 0)), 3, DatasetOptions(rendering="codes", shard_images=3, split=(0.5, 0.0, 0.5))
@@ -244,7 +243,7 @@ def test_shares_in_a_store(make_lut: Callable[..., Lut], tmp_path: Path) -> None
     assert contents("memory://out") == contents(tmp_path / "out")
 
 
-def test_sources_in_a_store(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_sources_in_a_store(make_lut: MakeLut, tmp_path: Path) -> None:
     lut = make_lut()
     rng = np.random.default_rng(4)
     (tmp_path / "pictures").mkdir()
@@ -262,7 +261,7 @@ def test_sources_in_a_store(make_lut: Callable[..., Lut], tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("remote", [True, False])
 def test_a_late_worker_of_a_plan_that_was_removed_is_not_believed(
-    make_lut: Callable[..., Lut], tmp_path: Path, remote: bool
+    make_lut: MakeLut, tmp_path: Path, remote: bool
 ) -> None:
     lut = make_lut()
     out = "memory://bucket/out" if remote else str(tmp_path / "out")
@@ -282,7 +281,7 @@ def test_a_late_worker_of_a_plan_that_was_removed_is_not_believed(
 
 
 def test_a_source_out_of_reach_ends_the_work_and_leaves_no_picture_out(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lut = make_lut()
     data = cv2.imencode(".png", np.zeros((9, 8, 3), np.uint8))[1].tobytes()
@@ -302,7 +301,7 @@ def test_a_source_out_of_reach_ends_the_work_and_leaves_no_picture_out(
 
 @pytest.mark.parametrize("unmounted", ["gone", "empty"])
 def test_a_disk_that_is_not_mounted_is_told_from_a_picture_that_is_gone(
-    make_lut: Callable[..., Lut], tmp_path: Path, unmounted: str
+    make_lut: MakeLut, tmp_path: Path, unmounted: str
 ) -> None:
     folder = tmp_path / "pictures"
     folder.mkdir()
@@ -319,14 +318,14 @@ def test_a_disk_that_is_not_mounted_is_told_from_a_picture_that_is_gone(
         generate_dataset(make_lut(name="again"), tmp_path / "none", pictures, [0])
 
 
-def test_a_place_that_holds_something_else_is_left_alone(make_lut: Callable[..., Lut]) -> None:
+def test_a_place_that_holds_something_else_is_left_alone(make_lut: MakeLut) -> None:
     RemoteStore("memory://bucket").put("out/mine.txt", b"mine")
     with pytest.raises(InputError, match="memory://bucket/out"):
         make(make_lut(), "memory://bucket/out")
     assert RemoteStore("memory://bucket").get("out/mine.txt") == b"mine"
 
 
-def test_a_file_url_is_a_folder(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_a_file_url_is_a_folder(make_lut: MakeLut, tmp_path: Path) -> None:
     make(make_lut(), f"file://{tmp_path}/out")
     assert open_dataset(f"file://{tmp_path}/out").store == LocalStore(tmp_path / "out")
 

@@ -24,6 +24,7 @@ from generator.pictures.sources import Preparation, find_pictures, read_picture
 from generator.rendering.render import render
 from generator.variation.iso_speed import parse_iso
 from generator.variation.variation import Variation, parse_exposure, parse_gradient, varied_by
+from tests.generator.conftest import MakeLut
 from tests.generator.dataset.contents import contents
 
 pytestmark = pytest.mark.slow
@@ -32,7 +33,7 @@ Make = Callable[..., Dataset]
 
 
 @pytest.fixture
-def lut(make_lut: Callable[..., Lut]) -> Lut:
+def lut(make_lut: MakeLut) -> Lut:
     """Return a table of 512 colours, enough to tell its noise."""
     return make_lut(bits=3)
 

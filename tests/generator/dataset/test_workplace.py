@@ -31,7 +31,7 @@ from generator.masks.making import parse_masks
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import Source, find_pictures
 from generator.rendering.black_points import BlackPoint
-from tests.generator.conftest import lut_in
+from tests.generator.conftest import MakeLut, lut_in
 from tests.generator.dataset.contents import contents
 from tests.generator.groups import grouped
 
@@ -64,7 +64,7 @@ def interrupt_after(images: int) -> Callable[[], None]:
 
 
 @pytest.mark.parametrize(("layout", "workers"), [("folder", 1), ("folder", 3), ("webdataset", 1), ("parquet", 3)])
-def test_going_on_gives_the_same_bytes(make_lut: Callable[..., Lut], tmp_path: Path, layout: str, workers: int) -> None:
+def test_going_on_gives_the_same_bytes(make_lut: MakeLut, tmp_path: Path, layout: str, workers: int) -> None:
     lut = make_lut()
     make(lut, tmp_path / "whole", layout=layout)
     with pytest.raises(StopIt):
@@ -226,7 +226,7 @@ def test_a_cut_or_changed_image_is_made_again(
 
 
 def test_images_of_a_picture_that_changed_are_made_again(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lut, out, folder = make_lut(), tmp_path / "out", tmp_path / "pictures"
     folder.mkdir()
@@ -247,7 +247,7 @@ def test_images_of_a_picture_that_changed_are_made_again(
 
 
 def test_images_of_a_picture_that_is_gone_do_not_count(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lut, out, folder = make_lut(), tmp_path / "out", tmp_path / "pictures"
     folder.mkdir()
@@ -290,7 +290,7 @@ STRIDE = 7
 """Of a run's file operations every seventh is one that it is killed before: each takes two runs."""
 
 
-def test_a_kill_at_any_file_operation_is_gone_on_from(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_a_kill_at_any_file_operation_is_gone_on_from(make_lut: MakeLut, tmp_path: Path) -> None:
     lut = make_lut()
     make(lut, tmp_path / "whole", 1, shard_images=1)
     below = tmp_path / "below"
@@ -310,7 +310,7 @@ def test_a_kill_at_any_file_operation_is_gone_on_from(make_lut: Callable[..., Lu
 
 @pytest.mark.parametrize(("layout", "begun"), [*((layout, False) for layout in get_args(Layout)), ("folder", True)])
 def test_a_record_is_written_when_its_files_are_on_the_disk(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str, begun: bool
+    make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str, begun: bool
 ) -> None:
     lut = make_lut()
     if begun:
@@ -337,7 +337,7 @@ def test_a_record_is_written_when_its_files_are_on_the_disk(
     assert len(checked) >= 2
 
 
-def test_another_plan_in_the_same_place_is_refused(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_another_plan_in_the_same_place_is_refused(make_lut: MakeLut, tmp_path: Path) -> None:
     lut, out = make_lut(), tmp_path / "out"
     with pytest.raises(StopIt):
         make(lut, out, on_image=interrupt_after(4))
@@ -355,7 +355,7 @@ def test_another_plan_in_the_same_place_is_refused(make_lut: Callable[..., Lut],
     make(lut, out)
 
 
-def test_one_program_makes_a_dataset_at_a_time(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_one_program_makes_a_dataset_at_a_time(make_lut: MakeLut, tmp_path: Path) -> None:
     lut, out = make_lut(), tmp_path / "out"
     plan = Plan(lut, SCENES, ListedLights((0,)), 0, DatasetOptions())
     with (
@@ -371,7 +371,7 @@ def plan_of(lut: Lut) -> Plan:
     )
 
 
-def test_shares_make_the_whole(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_shares_make_the_whole(make_lut: MakeLut, tmp_path: Path) -> None:
     lut, out = make_lut(), tmp_path / "out"
     make_dataset(plan_of(lut), tmp_path / "whole")
     assert make_share(plan_of(lut), out, (1, 3), Workers(count=2)) == (2, 6)
@@ -393,7 +393,7 @@ def test_shares_make_the_whole(make_lut: Callable[..., Lut], tmp_path: Path) -> 
         finish_dataset(tmp_path / "elsewhere")
 
 
-def test_shares_are_made_beside_each_other(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_shares_are_made_beside_each_other(make_lut: MakeLut, tmp_path: Path) -> None:
     lut = make_lut()
     with workplace(tmp_path / "out", plan_of(lut).identity(), alone=False):
         assert make_share(plan_of(lut), tmp_path / "out", (0, 1)) == (6, 6)
@@ -402,7 +402,7 @@ def test_shares_are_made_beside_each_other(make_lut: Callable[..., Lut], tmp_pat
 
 
 def test_a_share_that_waited_for_the_whole_is_refused(
-    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its work could never become a dataset, and would stay under the hidden name."""
     lut, out = make_lut(), tmp_path / "out"
@@ -418,7 +418,7 @@ def test_a_share_that_waited_for_the_whole_is_refused(
     assert not (tmp_path / ".out.partial").exists()
 
 
-def test_a_damaged_record_and_a_changed_source_are_reported(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_a_damaged_record_and_a_changed_source_are_reported(make_lut: MakeLut, tmp_path: Path) -> None:
     lut, out = make_lut(), tmp_path / "out"
     make_share(plan_of(lut), out, (0, 1))
     (record,) = (tmp_path / ".out.partial" / "plan" / "shards").glob("000001.*.json")

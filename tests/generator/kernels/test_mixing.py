@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +12,7 @@ from foundation.errors import InputError
 from generator.kernels import vector as streaming
 from generator.kernels.mixing import mix_samples, mixed_table
 from generator.kernels.rendering import draw_samples
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
+from tests.generator.conftest import MakeLut
 
 Rule = Callable[..., npt.NDArray[np.int64]]
 GAIN, READ = 1.0, 6.0
@@ -32,7 +29,7 @@ def noisy() -> npt.NDArray[np.uint16]:
     return np.rint(lights).astype(np.uint16)
 
 
-def test_a_light_alone_is_that_light_to_the_last_bit(make_lut: Callable[..., Lut]) -> None:
+def test_a_light_alone_is_that_light_to_the_last_bit(make_lut: MakeLut) -> None:
     lut = make_lut()
     for light in range(4):
         weights = np.eye(4)[light]
@@ -61,7 +58,7 @@ def test_mean_and_variance_are_those_of_one_exposure(
         assert abs((plain / true).mean() - 0.5) < 0.02
 
 
-def test_noise_of_the_lights_meets_by_chance(make_lut: Callable[..., Lut]) -> None:
+def test_noise_of_the_lights_meets_by_chance(make_lut: MakeLut) -> None:
     # Twice the same light: were sample i always to meet sample i, every variance would be doubled. The shuffles make
     # the ratio of pooled variances 1 but for 64 x 3 covariances of 25 pairs: standard error
     # sqrt(1 / (24 x 192)) = .015.
@@ -72,7 +69,7 @@ def test_noise_of_the_lights_meets_by_chance(make_lut: Callable[..., Lut]) -> No
     assert not np.array_equal(mixed_table([samples, samples], (0.5, 0.5), seed=2), mixed)
 
 
-def test_colours_that_are_not_wanted_change_no_other(make_lut: Callable[..., Lut]) -> None:
+def test_colours_that_are_not_wanted_change_no_other(make_lut: MakeLut) -> None:
     samples = make_lut().samples[:3]
     whole = mixed_table(samples, (0.2, 0.5, 0.3), seed=8)
     wanted = np.arange(64) % 5 == 2
@@ -89,7 +86,7 @@ def test_saturation_is_kept(noisy: npt.NDArray[np.uint16]) -> None:
     assert mixed.max() == 4095
 
 
-def test_faults_are_named(make_lut: Callable[..., Lut]) -> None:
+def test_faults_are_named(make_lut: MakeLut) -> None:
     samples = make_lut().samples
     with pytest.raises(InputError, match=r"the weights are \[1.0, -0.5\]"):
         mixed_table(samples[:2], [1.0, -0.5])
@@ -141,7 +138,7 @@ def by_formula(
 
 @pytest.mark.parametrize("lights", [1, 2, 3, 4])
 def test_mixed_pixels_follow_the_formula(
-    rule: Rule, make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8], lights: int
+    rule: Rule, make_lut: MakeLut, picture: npt.NDArray[np.uint8], lights: int
 ) -> None:
     tables = make_lut().samples[:lights]
     weights = weight_maps(37, 1053, lights)
@@ -157,7 +154,7 @@ def test_mixed_pixels_follow_the_formula(
 @pytest.mark.parametrize("width", [1, 7, 8, 9, 519, 520, 521, 1053])
 def test_rows_in_which_lights_are_alone_or_missing_follow_the_formula(
     rule: Rule,
-    make_lut: Callable[..., Lut],
+    make_lut: MakeLut,
     picture: npt.NDArray[np.uint8],
     monkeypatch: pytest.MonkeyPatch,
     lights: int,
@@ -185,7 +182,7 @@ def test_rows_in_which_lights_are_alone_or_missing_follow_the_formula(
 
 
 def test_where_one_light_is_alone_its_own_samples_stand(
-    rule: Rule, make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]
+    rule: Rule, make_lut: MakeLut, picture: npt.NDArray[np.uint8]
 ) -> None:
     tables = make_lut().samples[:2]
     first = mix_samples(tables, picture, np.array([1, 0], np.float32), seed=3, image=2)
@@ -196,7 +193,7 @@ def test_where_one_light_is_alone_its_own_samples_stand(
     np.testing.assert_array_equal(second, tables[1][colour, rule(3, 2, *colour.shape, place=1)])
 
 
-def test_bands_and_threads_change_no_mixed_pixel(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
+def test_bands_and_threads_change_no_mixed_pixel(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
     tables = make_lut().samples[1:3]
     weights = weight_maps(37, 1053, 2)
     whole = mix_samples(tables, picture, weights, seed=4)
@@ -223,7 +220,7 @@ def test_mixed_pixels_are_as_noisy_as_one_exposure(noisy: npt.NDArray[np.uint16]
         assert (np.abs(mixed.mean(axis=(0, 1)) - table.mean(axis=1).mean(axis=0)) < 5 * error).all()
 
 
-def test_faults_of_weight_maps_are_named(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
+def test_faults_of_weight_maps_are_named(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
     tables = make_lut().samples[:2]
     weights = weight_maps(37, 1053, 2)
     with pytest.raises(InputError, match=r"the weights are \(37, 1053, 1\), expected \(37, 1053, 2\) or \(2,\)"):

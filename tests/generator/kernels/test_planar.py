@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
-
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -14,9 +11,7 @@ from hypothesis import strategies as st
 from foundation.errors import InputError
 from generator.kernels.planar import draw_batch, draw_planar
 from generator.kernels.rendering import draw_samples
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
+from tests.generator.conftest import MakeLut
 
 WHITE = 3500
 
@@ -30,9 +25,7 @@ def expected(
 
 
 @pytest.mark.slow
-def test_the_whole_picture_is_the_plain_image_in_planes(
-    make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]
-) -> None:
+def test_the_whole_picture_is_the_plain_image_in_planes(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
     samples = make_lut().samples[2]
     image = draw_samples(samples, picture, seed=6, image=4)
     whole = (0, 0, 1053, 37)
@@ -81,9 +74,7 @@ def test_any_window_gain_and_flip_in_a_batch(picture: npt.NDArray[np.uint8], dat
 
 
 @pytest.mark.slow
-def test_a_batch_from_a_table_on_disk_with_one_value_for_all(
-    make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]
-) -> None:
+def test_a_batch_from_a_table_on_disk_with_one_value_for_all(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
     lut = make_lut()
     windows = [(0, 0, 64, 32), (989, 5, 64, 32), (500, 1, 64, 32)]
     target = np.empty((3, 3, 32, 64), np.float32)
@@ -96,7 +87,7 @@ def test_a_batch_from_a_table_on_disk_with_one_value_for_all(
         np.testing.assert_array_equal(crop, expected(image, window, False, 0.5))
 
 
-def test_faults_are_named(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
+def test_faults_are_named(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
     samples = make_lut().samples
     for window in ((-1, 0, 5, 5), (0, 0, 5, 38), (1050, 0, 4, 4), (0, 0, 0, 4)):
         with pytest.raises(InputError, match=r"is not inside the picture of 1053x37 pixels"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mmap
 from collections.abc import Callable
 from inspect import signature
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,9 +21,7 @@ from generator.kernels.planar import draw_batch, draw_planar
 from generator.kernels.printing import draw_printed
 from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples
 from generator.rendering.render import render
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
+from tests.generator.conftest import MakeLut
 
 Rule = Callable[..., npt.NDArray[np.int64]]
 
@@ -85,7 +83,7 @@ def test_any_table_and_size_by_hand(
 
 
 def test_bands_threads_memory_order_and_a_given_target_change_nothing(
-    make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]
+    make_lut: MakeLut, picture: npt.NDArray[np.uint8]
 ) -> None:
     samples = make_lut().samples[1]
     whole = draw_samples(samples, picture, seed=4, image=2)
@@ -170,7 +168,7 @@ def test_seeds_and_images_are_independent(one: tuple[int, int], other: tuple[int
         assert chi_square(a * 25 + swapped, 625) < LIMIT_624
 
 
-def test_a_patch_measures_what_the_table_holds(make_lut: Callable[..., Lut]) -> None:
+def test_a_patch_measures_what_the_table_holds(make_lut: MakeLut) -> None:
     # 1600 pixels of one colour: each channel's mean is the table's within 5.5 standard errors; 64 colours x 3 channels
     # x 2 lights at a two-sided probability of 4e-8 each: one false alarm in 70 000 seeds, and the seed is fixed.
     lut = make_lut(bits=2)
@@ -188,7 +186,7 @@ def test_a_patch_measures_what_the_table_holds(make_lut: Callable[..., Lut]) -> 
         assert (np.abs(spread / table.var(axis=1) - 1) < 6 * np.sqrt(3 / 1600)).all()
 
 
-def test_render_replaces_unfit_colours_by_the_nearest(make_lut: Callable[..., Lut]) -> None:
+def test_render_replaces_unfit_colours_by_the_nearest(make_lut: MakeLut) -> None:
     lut = make_lut(bits=2, unfit=(0, 1))
     black = render(lut, np.zeros((4, 8, 3), np.uint8), 0, rendering="codes", seed=1)
     # Colour 0 is (0, 0, 0) and 1 (0, 0, 1), both unfit; at distance 1 of black remain 4 (0, 1, 0) and 16 (1, 0, 0).
@@ -196,12 +194,12 @@ def test_render_replaces_unfit_colours_by_the_nearest(make_lut: Callable[..., Lu
     np.testing.assert_array_equal(black, green)
 
 
-def test_a_picture_of_another_type_is_refused_before_anything_is_drawn(make_lut: Callable[..., Lut]) -> None:
+def test_a_picture_of_another_type_is_refused_before_anything_is_drawn(make_lut: MakeLut) -> None:
     with pytest.raises(InputError, match="float64"):
         render(make_lut(unfit=(0,)), np.zeros((4, 4, 3)), 0)  # pyrefly: ignore[bad-argument-type]
 
 
-def test_a_light_that_is_not_there_is_named(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
+def test_a_light_that_is_not_there_is_named(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
     lut = make_lut()
     for light in (-1, 4):
         with pytest.raises(InputError, match=rf"there is no light {light}; the table .* has lights 0 to 3"):
@@ -247,7 +245,7 @@ def test_what_is_not_said_is_image_0_of_seed_0(function: Callable[..., object]) 
 
 
 @pytest.mark.slow
-def test_a_mosaic_has_each_site_s_own_channel(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
+def test_a_mosaic_has_each_site_s_own_channel(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
     samples = make_lut().samples[1]
     image = draw_samples(samples, picture, seed=8, image=1)
     red, green, blue = image[..., 0], image[..., 1], image[..., 2]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import imagecodecs
@@ -22,13 +20,11 @@ from generator.files import encode_map
 from generator.lights.lighting import Lighting, plain
 from generator.masks.making import FULL, find_masks, parse_masks
 from generator.masks.maps import decode_ground_truth, decode_weights, encode_maps
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
+from tests.generator.conftest import MakeLut
 
 
 @pytest.mark.parametrize("lights", [2, 3])
-def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: Callable[..., Lut], lights: int) -> None:
+def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: MakeLut, lights: int) -> None:
     lut = make_lut()
     shining = [0, 2, 3][:lights]
     lighting = Lighting(tuple(plain(light) for light in shining), parse_masks("smooth", lights, 1).maker(0))
