@@ -33,7 +33,7 @@ import numpy.typing as npt
 from llvmlite import ir
 from numpy import uint32, uint64
 
-from foundation.compiled import inlined, intrinsic
+from foundation.compiled import inlined
 from foundation.errors import InputError, kind_of
 from generator.kernels.vector import (
     ADDRESS,
@@ -54,8 +54,8 @@ from generator.kernels.vector import (
     load,
     pixel_codes,
     pointer_at,
+    step,
     store,
-    void,
 )
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES, key_of
 
@@ -129,102 +129,77 @@ def _digits(builder: Builder, h: Value, count: Value) -> tuple[Value, ...]:
     )
 
 
-@intrinsic
-def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, bits: Any, target: Any) -> Any:
+@step(ADDRESS, "uint32", "uint32", "uint32", "uint32", "uint32", "uint32", ADDRESS)
+def choose(
+    builder: Builder,
+    picture: Value,
+    word: Value,
+    k0: Value,
+    k1: Value,
+    k2: Value,
+    count: Value,
+    bits: Value,
+    target: Value,
+) -> None:
     """Write to `target` the offsets, uint32 bytes, of the samples chosen for the 32 pixels at `picture`.
 
     `word` is the number of the group's first word; 96 bytes are read, 128 written.
     """
-    del typing, picture, word, k0, k1, k2, count, bits, target
-    number = "uint32"
-
-    def emit(
-        builder: Builder,
-        picture: Value,
-        word: Value,
-        k0: Value,
-        k1: Value,
-        k2: Value,
-        count: Value,
-        bits: Value,
-        target: Value,
-    ) -> None:
-        stride = broadcast(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
-        for half, choices in enumerate(_digits(builder, _hashed(builder, word, (k0, k1, k2)), count)):
-            begin = builder.add(picture, ir.Constant(I64, 3 * LANES * half))
-            colours = builder.mul(_colours(builder, begin, bits), stride)
-            offsets = builder.add(colours, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
-            store(builder, offsets, target, 4 * LANES * half)
-
-    return void(emit, ADDRESS, number, number, number, number, number, number, ADDRESS)
+    stride = broadcast(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
+    for half, choices in enumerate(_digits(builder, _hashed(builder, word, (k0, k1, k2)), count)):
+        begin = builder.add(picture, ir.Constant(I64, 3 * LANES * half))
+        colours = builder.mul(_colours(builder, begin, bits), stride)
+        offsets = builder.add(colours, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
+        store(builder, offsets, target, 4 * LANES * half)
 
 
-@intrinsic
+@step(ADDRESS, "uint32", "uint32", ADDRESS, "uint32", ADDRESS)
 def write_colours(
-    typing: Any, picture: Any, bits: Any, stride: Any, target: Any, other_stride: Any, other_target: Any
-) -> Any:
+    builder: Builder,
+    picture: Value,
+    bits: Value,
+    stride: Value,
+    target: Value,
+    other_stride: Value,
+    other_target: Value,
+) -> None:
     """Write the colours of the 32 pixels at `picture` as uint32: their indices times each stride, at each target."""
-    del typing, picture, bits, stride, target, other_stride, other_target
-
-    def emit(
-        builder: Builder,
-        picture: Value,
-        bits: Value,
-        stride: Value,
-        target: Value,
-        other_stride: Value,
-        other_target: Value,
-    ) -> None:
-        for half in range(2):
-            colours = _colours(builder, builder.add(picture, ir.Constant(I64, 3 * LANES * half)), bits)
-            for factor, place in ((stride, target), (other_stride, other_target)):
-                store(builder, builder.mul(colours, broadcast(builder, factor, WORDS)), place, 4 * LANES * half)
-
-    return void(emit, ADDRESS, "uint32", "uint32", ADDRESS, "uint32", ADDRESS)
+    for half in range(2):
+        colours = _colours(builder, builder.add(picture, ir.Constant(I64, 3 * LANES * half)), bits)
+        for factor, place in ((stride, target), (other_stride, other_target)):
+            store(builder, builder.mul(colours, broadcast(builder, factor, WORDS)), place, 4 * LANES * half)
 
 
-@intrinsic
-def choose_for_colours(typing: Any, colours: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, target: Any) -> Any:
+@step(ADDRESS, "uint32", "uint32", "uint32", "uint32", "uint32", ADDRESS)
+def choose_for_colours(
+    builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
+) -> None:
     """Write what `choose` writes for the 32 pixels whose colours stand at `colours`, times the bytes of a colour."""
-    del typing, colours, word, k0, k1, k2, count, target
-    number = "uint32"
-
-    def emit(
-        builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
-    ) -> None:
-        for half, choices in enumerate(_digits(builder, _hashed(builder, word, (k0, k1, k2)), count)):
-            named = load(builder, colours, 4 * LANES * half, WORDS)
-            offsets = builder.add(named, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
-            store(builder, offsets, target, 4 * LANES * half)
-
-    return void(emit, ADDRESS, number, number, number, number, number, ADDRESS)
+    for half, choices in enumerate(_digits(builder, _hashed(builder, word, (k0, k1, k2)), count)):
+        named = load(builder, colours, 4 * LANES * half, WORDS)
+        offsets = builder.add(named, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
+        store(builder, offsets, target, 4 * LANES * half)
 
 
-def prefetching(locality: int) -> Callable[..., None]:
-    """Return an emitter of LLVM's prefetch with that locality: 3 keeps the line in every cache, 0 in none."""
-
-    def emit(builder: Builder, address: Value) -> None:
-        pointer = I8.as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [pointer, I32, I32, I32])
-        function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
-        numbers = [ir.Constant(I32, number) for number in (0, locality, 1)]  # to read, how near, data
-        builder.call(function, [pointer_at(builder, address, 0, I8), *numbers])
-
-    return emit
+def emit_prefetch(builder: Builder, address: Value, locality: int) -> None:
+    """Write LLVM's prefetch with that locality: 3 keeps the line in every cache, 0 in none."""
+    pointer = I8.as_pointer()
+    kind = ir.FunctionType(ir.VoidType(), [pointer, I32, I32, I32])
+    function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
+    numbers = [ir.Constant(I32, number) for number in (0, locality, 1)]  # to read, how near, data
+    builder.call(function, [pointer_at(builder, address, 0, I8), *numbers])
 
 
-@intrinsic
-def prefetch(typing: Any, address: Any) -> Any:
+@step(ADDRESS)
+def prefetch(builder: Builder, address: Value) -> None:
     """Prefetch the line of `address` into all caches; an address without memory is ignored."""
-    del typing, address
-    return void(prefetching(3), ADDRESS)
+    emit_prefetch(builder, address, 3)
 
 
-@intrinsic
-def prefetch_once(typing: Any, address: Any) -> Any:
+@step(ADDRESS)
+def prefetch_once(builder: Builder, address: Value) -> None:
     """Prefetch a line that is read once, so that it takes no place in the larger caches."""
-    del typing, address
-    return void(prefetching(0), ADDRESS)
+    emit_prefetch(builder, address, 0)
 
 
 @inlined

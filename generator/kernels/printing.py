@@ -22,7 +22,7 @@ and deviations count with the root of the light's weight, as in `kernels/mixing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
@@ -33,16 +33,16 @@ from llvmlite import ir
 from numpy import uint32
 
 from foundation.colorimetry import decode_srgb
-from foundation.compiled import compiled, inlined, intrinsic
+from foundation.compiled import compiled, inlined
 from generator.kernels.choice import (
     check_out,
     check_picture,
     check_seed,
     choose_for_colours,
     copied_back,
+    emit_prefetch,
     packed_rows,
     prefetch,
-    prefetching,
     readable,
     row_keys,
     run_in_threads,
@@ -69,8 +69,8 @@ from generator.kernels.vector import (
     load,
     minimum,
     pixel_codes,
+    step,
     store,
-    void,
 )
 
 SIDE: Final = 17
@@ -181,84 +181,75 @@ _SEGMENT_GROUPS: Final = _SEGMENT * PRINTED_BLOCK // GROUP + 2
 """Groups of 32 pixels, whose choices are made together, that a segment may touch."""
 
 
-@intrinsic
-def plan_block(typing: Any, picture: Any, part: Any, target: Any) -> Any:
+@step(ADDRESS, ADDRESS, ADDRESS)
+def plan_block(builder: Builder, picture: Value, part: Value, target: Value) -> None:
     """Write the plan of the 16 pixels at `picture`; of them 48 bytes are read, and of `part` 256 float32."""
-    del typing, picture, part, target
 
-    def emit(builder: Builder, picture: Value, part: Value, target: Value) -> None:
-        def number(value: int) -> Value:
-            return constant(WORDS, value)
+    def number(value: int) -> Value:
+        return constant(WORDS, value)
 
-        codes = pixel_codes(builder, picture)
-        channels = [builder.and_(builder.lshr(codes, number(shift)), number(255)) for shift in (16, 8, 0)]
-        parts: list[Value] = []
-        for channel in range(3):
-            vector: Value = ir.Constant(FLOATS, ir.Undefined)
-            for pixel in range(PRINTED_BLOCK):
-                code = builder.zext(load(builder, picture, 3 * pixel + channel, I8), I64)
-                its = load(builder, builder.add(part, builder.shl(code, ir.Constant(I64, 2))), 0, F32)
-                vector = builder.insert_element(vector, its, ir.Constant(I32, pixel))
-            parts.append(vector)
-        red, green, blue = parts
-        strides = [number(16 * int(stride)) for stride in (_RED, _GREEN, _BLUE)]
+    codes = pixel_codes(builder, picture)
+    channels = [builder.and_(builder.lshr(codes, number(shift)), number(255)) for shift in (16, 8, 0)]
+    parts: list[Value] = []
+    for channel in range(3):
+        vector: Value = ir.Constant(FLOATS, ir.Undefined)
+        for pixel in range(PRINTED_BLOCK):
+            code = builder.zext(load(builder, picture, 3 * pixel + channel, I8), I64)
+            its = load(builder, builder.add(part, builder.shl(code, ir.Constant(I64, 2))), 0, F32)
+            vector = builder.insert_element(vector, its, ir.Constant(I32, pixel))
+        parts.append(vector)
+    red, green, blue = parts
+    strides = [number(16 * int(stride)) for stride in (_RED, _GREEN, _BLUE)]
 
-        def node(added: int, size: int) -> Value:
-            """Return `size` times the node whose places in the channels are those of codes with something added."""
-            total: Value = None
-            for codes, stride in zip(channels, (_RED, _GREEN, _BLUE), strict=True):
-                place = builder.lshr(builder.add(codes, number(added)), number(4))
-                part = builder.mul(place, number(size * int(stride)))
-                total = part if total is None else builder.add(total, part)
-            return total
+    def node(added: int, size: int) -> Value:
+        """Return `size` times the node whose places in the channels are those of codes with something added."""
+        total: Value = None
+        for codes, stride in zip(channels, (_RED, _GREEN, _BLUE), strict=True):
+            place = builder.lshr(builder.add(codes, number(added)), number(4))
+            part = builder.mul(place, number(size * int(stride)))
+            total = part if total is None else builder.add(total, part)
+        return total
 
-        def not_less(first: Value, second: Value) -> Value:
-            return builder.fcmp_ordered(">=", first, second)
+    def not_less(first: Value, second: Value) -> Value:
+        return builder.fcmp_ordered(">=", first, second)
 
-        def least(first: Value, second: Value) -> Value:
-            return builder.select(builder.fcmp_ordered("<", first, second), first, second)
+    def least(first: Value, second: Value) -> Value:
+        return builder.select(builder.fcmp_ordered("<", first, second), first, second)
 
-        def most(first: Value, second: Value) -> Value:
-            return builder.select(builder.fcmp_ordered(">", first, second), first, second)
+    def most(first: Value, second: Value) -> Value:
+        return builder.select(builder.fcmp_ordered(">", first, second), first, second)
 
-        red_green, red_blue, green_blue = (not_less(*two) for two in ((red, green), (red, blue), (green, blue)))
-        green_red, blue_least = not_less(red, green), builder.and_(not_less(red, blue), not_less(green, blue))
-        high = builder.select(green_blue, strides[1], strides[2])
-        high = builder.select(builder.and_(red_green, red_blue), strides[0], high)
-        low = builder.select(blue_least, strides[2], builder.select(green_red, strides[1], strides[0]))
-        upper, lower = most(red, green), least(red, green)
-        middle = least(upper, most(lower, blue))
-        upper, lower = most(upper, blue), least(lower, blue)
-        base = node(0, 16)
-        nodes = base, builder.add(base, high), builder.sub(builder.add(base, number(16 * int(_ALL))), low)
-        one = ir.Constant(FLOATS, [1.0] * LANES)
-        weights = builder.fsub(one, upper), builder.fsub(upper, middle), builder.fsub(middle, lower), lower
-        for row, its in enumerate(nodes):
-            store(builder, its, target, _ROW * row)
-        for row, its in enumerate(weights):
-            store(builder, its, target, _ROW * (3 + row))
-        store(builder, node(int(_HALF), 32), target, _ROW * 7)
-
-    return void(emit, ADDRESS, ADDRESS, ADDRESS)
+    red_green, red_blue, green_blue = (not_less(*two) for two in ((red, green), (red, blue), (green, blue)))
+    green_red, blue_least = not_less(red, green), builder.and_(not_less(red, blue), not_less(green, blue))
+    high = builder.select(green_blue, strides[1], strides[2])
+    high = builder.select(builder.and_(red_green, red_blue), strides[0], high)
+    low = builder.select(blue_least, strides[2], builder.select(green_red, strides[1], strides[0]))
+    upper, lower = most(red, green), least(red, green)
+    middle = least(upper, most(lower, blue))
+    upper, lower = most(upper, blue), least(lower, blue)
+    base = node(0, 16)
+    nodes = base, builder.add(base, high), builder.sub(builder.add(base, number(16 * int(_ALL))), low)
+    one = ir.Constant(FLOATS, [1.0] * LANES)
+    weights = builder.fsub(one, upper), builder.fsub(upper, middle), builder.fsub(middle, lower), lower
+    for row, its in enumerate(nodes):
+        store(builder, its, target, _ROW * row)
+    for row, its in enumerate(weights):
+        store(builder, its, target, _ROW * (3 + row))
+    store(builder, node(int(_HALF), 32), target, _ROW * 7)
 
 
-@intrinsic
-def place_samples(typing: Any, plan: Any, cells: Any, choices: Any, samples: Any, target: Any) -> Any:
+@step(*[ADDRESS] * 5)
+def place_samples(builder: Builder, plan: Value, cells: Value, choices: Value, samples: Value, target: Value) -> None:
     """Write where in `samples` those of a block's pixels are, uint32 bytes, and prefetch them.
 
     At `cells` is an uint32 for each node, where its samples begin, and at `choices` for each pixel what is added.
     """
-    del typing, plan, cells, choices, samples, target
-
-    def emit(builder: Builder, plan: Value, cells: Value, choices: Value, samples: Value, target: Value) -> None:
-        for pixel in range(PRINTED_BLOCK):
-            near = load(builder, plan, _ROW * 7 + 4 * pixel, I32)
-            cell = builder.zext(builder.lshr(near, ir.Constant(I32, 3)), I64)
-            place = builder.add(load(builder, builder.add(cells, cell), 0, I32), load(builder, choices, 4 * pixel, I32))
-            store(builder, place, target, 4 * pixel)
-            prefetching(3)(builder, builder.add(samples, builder.zext(place, I64)))
-
-    return void(emit, *[ADDRESS] * 5)
+    for pixel in range(PRINTED_BLOCK):
+        near = load(builder, plan, _ROW * 7 + 4 * pixel, I32)
+        cell = builder.zext(builder.lshr(near, ir.Constant(I32, 3)), I64)
+        place = builder.add(load(builder, builder.add(cells, cell), 0, I32), load(builder, choices, 4 * pixel, I32))
+        store(builder, place, target, 4 * pixel)
+        emit_prefetch(builder, builder.add(samples, builder.zext(place, I64)), 3)
 
 
 def _of_pixels(builder: Builder, base: Value, offsets: Sequence[Value], shift: int, kind: Any) -> Value:
@@ -303,93 +294,82 @@ def _deviating(builder: Builder, seen: Value, first: int, addresses: Sequence[Va
     return builder.fadd(seen, builder.fmul(deviation, scale))
 
 
-@intrinsic
+@step(*[ADDRESS] * 7)
 def draw_block(
-    typing: Any, plan: Any, bases: Any, samples: Any, places: Any, factors: Any, means: Any, line: Any
-) -> Any:
+    builder: Builder,
+    plan: Value,
+    bases: Value,
+    samples: Value,
+    places: Value,
+    factors: Value,
+    means: Value,
+    line: Value,
+) -> None:
     """Write a block's pixels, four float32 each: `means` interpolated between the nodes of each, with deviations.
 
     A deviation is how far a sample is from its cell's mean, which is in `bases`; it is multiplied by the pixel's
     float32 at `factors`, by its noise, and by what stands behind the mean, whose fourth number is 0.
     """
-    del typing, plan, bases, samples, places, factors, means, line
-
-    def emit(builder: Builder, *addresses: Value) -> None:
-        *those, means, line = addresses
-        for first in range(0, PRINTED_BLOCK, 4):
-            seen = _interpolated(builder, those[0], means, first)
-            store(builder, _deviating(builder, seen, first, those), line, 16 * first)
-
-    return void(emit, *[ADDRESS] * 7)
+    for first in range(0, PRINTED_BLOCK, 4):
+        seen = _interpolated(builder, plan, means, first)
+        seen = _deviating(builder, seen, first, (plan, bases, samples, places, factors))
+        store(builder, seen, line, 16 * first)
 
 
-@intrinsic
-def add_deviations(typing: Any, plan: Any, bases: Any, samples: Any, places: Any, factors: Any, line: Any) -> Any:
+@step(*[ADDRESS] * 6)
+def add_deviations(
+    builder: Builder, plan: Value, bases: Value, samples: Value, places: Value, factors: Value, line: Value
+) -> None:
     """Add to the pixels at `line` the deviations of another light's samples, as `draw_block` does."""
-    del typing, plan, bases, samples, places, factors, line
-
-    def emit(builder: Builder, *addresses: Value) -> None:
-        *those, line = addresses
-        for first in range(0, PRINTED_BLOCK, 4):
-            seen = load(builder, line, 16 * first, FLOATS)
-            store(builder, _deviating(builder, seen, first, those), line, 16 * first)
-
-    return void(emit, *[ADDRESS] * 6)
+    for first in range(0, PRINTED_BLOCK, 4):
+        seen = load(builder, line, 16 * first, FLOATS)
+        seen = _deviating(builder, seen, first, (plan, bases, samples, places, factors))
+        store(builder, seen, line, 16 * first)
 
 
-def _writing_planes(mirrored: bool) -> Callable[..., None]:
-    """Return what emits the writing of a block to three planes."""
+def _write_planes(builder: Builder, line: Value, scales: Value, targets: Sequence[Value], mirrored: bool) -> None:
+    """Write a block to three planes."""
 
-    def emit(builder: Builder, line: Value, scales: Value, red: Value, green: Value, blue: Value) -> None:
-        def number(place: int) -> Value:
-            return broadcast(builder, load(builder, scales, 4 * place, F32), FLOATS)
+    def number(place: int) -> Value:
+        return broadcast(builder, load(builder, scales, 4 * place, F32), FLOATS)
 
-        quarters = [load(builder, line, 64 * quarter, FLOATS) for quarter in range(4)]
-        for channel, target in enumerate((red, green, blue)):
-            lanes = [4 * pixel + channel for pixel in range(8)]
-            lanes = lanes[::-1] if mirrored else lanes
-            eight = ir.VectorType(I32, 8)
-            halves = [builder.shuffle_vector(*quarters[i : i + 2], constant(eight, lanes)) for i in (0, 2)]
-            whole = concatenated(builder, halves[::-1] if mirrored else halves)
-            value = builder.fadd(builder.fmul(whole, number(channel)), number(3 + channel))
-            store(builder, minimum(builder, value, number(6)), target, 0)
-
-    return emit
+    quarters = [load(builder, line, 64 * quarter, FLOATS) for quarter in range(4)]
+    for channel, target in enumerate(targets):
+        lanes = [4 * pixel + channel for pixel in range(8)]
+        lanes = lanes[::-1] if mirrored else lanes
+        eight = ir.VectorType(I32, 8)
+        halves = [builder.shuffle_vector(*quarters[i : i + 2], constant(eight, lanes)) for i in (0, 2)]
+        whole = concatenated(builder, halves[::-1] if mirrored else halves)
+        value = builder.fadd(builder.fmul(whole, number(channel)), number(3 + channel))
+        store(builder, minimum(builder, value, number(6)), target, 0)
 
 
-@intrinsic
-def write_planes(typing: Any, line: Any, scales: Any, red: Any, green: Any, blue: Any) -> Any:
+@step(*[ADDRESS] * 5)
+def write_planes(builder: Builder, line: Value, scales: Value, red: Value, green: Value, blue: Value) -> None:
     """Write a block as float32 to three planes; `scales` are those of `vector.planes8`."""
-    del typing, line, scales, red, green, blue
-    return void(_writing_planes(False), ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+    _write_planes(builder, line, scales, (red, green, blue), mirrored=False)
 
 
-@intrinsic
-def write_mirrored(typing: Any, line: Any, scales: Any, red: Any, green: Any, blue: Any) -> Any:
+@step(*[ADDRESS] * 5)
+def write_mirrored(builder: Builder, line: Value, scales: Value, red: Value, green: Value, blue: Value) -> None:
     """Do `write_planes` from right to left."""
-    del typing, line, scales, red, green, blue
-    return void(_writing_planes(True), ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+    _write_planes(builder, line, scales, (red, green, blue), mirrored=True)
 
 
-@intrinsic
-def write_pixels(typing: Any, line: Any, most: Any, target: Any) -> Any:
+@step(ADDRESS, "float32", ADDRESS)
+def write_pixels(builder: Builder, line: Value, most: Value, target: Value) -> None:
     """Write a block as uint16, red, green and blue of each pixel in turn: rounded, from 0 to `most`; 96 bytes."""
-    del typing, line, most, target
-
-    def emit(builder: Builder, line: Value, most: Value, target: Value) -> None:
-        zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
-        top, shorts = broadcast(builder, most, FLOATS), ir.VectorType(I16, LANES)
-        rounded: list[Value] = []
-        for quarter in range(4):
-            value = builder.fadd(load(builder, line, 64 * quarter, FLOATS), half)
-            value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
-            rounded.append(builder.trunc(builder.fptosi(minimum(builder, value, top), WORDS), shorts))
-        lanes = [lane for lane in range(2 * LANES) if lane % 4 < 3]
-        for i in (0, 2):
-            kind = ir.VectorType(I32, len(lanes))
-            store(builder, builder.shuffle_vector(*rounded[i : i + 2], constant(kind, lanes)), target, 24 * i)
-
-    return void(emit, ADDRESS, "float32", ADDRESS)
+    zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
+    top, shorts = broadcast(builder, most, FLOATS), ir.VectorType(I16, LANES)
+    rounded: list[Value] = []
+    for quarter in range(4):
+        value = builder.fadd(load(builder, line, 64 * quarter, FLOATS), half)
+        value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
+        rounded.append(builder.trunc(builder.fptosi(minimum(builder, value, top), WORDS), shorts))
+    lanes = [lane for lane in range(2 * LANES) if lane % 4 < 3]
+    for i in (0, 2):
+        kind = ir.VectorType(I32, len(lanes))
+        store(builder, builder.shuffle_vector(*rounded[i : i + 2], constant(kind, lanes)), target, 24 * i)
 
 
 @inlined

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from typing import Any, Final
 
 from llvmlite import ir
@@ -115,85 +116,77 @@ def void(emit: Callable[..., None], *kinds: str) -> Any:
     return signature("void", *kinds), generate
 
 
-@intrinsic
-def offset_at(typing: Any, source: Any) -> Any:
+def step(*kinds: str, returned: str = "void") -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that makes a step for compiled functions to call of a function that writes it in LLVM's terms.
+
+    The function takes a builder and a value of each of `kinds`, by numba's names, and returns what the step does.
+    """
+
+    def decorate(emit: Callable[..., Any]) -> Any:
+        def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
+            del signature
+            value = emit(builder, *arguments)
+            return context.get_dummy_value() if returned == "void" else value
+
+        @wraps(emit)
+        def typed(typing: Any, *arguments: Any) -> Any:
+            del typing, arguments
+            return signature(returned, *kinds), generate
+
+        return intrinsic(typed)
+
+    return decorate
+
+
+@step(ADDRESS, returned="int64")
+def offset_at(builder: Builder, source: Value) -> Value:
     """Return the uint32 at `source` as an address can be added to it."""
-    del typing, source
-
-    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
-        del context, signature
-        return builder.zext(load(builder, arguments[0], 0, I32), I64)
-
-    return signature("int64", ADDRESS), generate
+    return builder.zext(load(builder, source, 0, I32), I64)
 
 
-def _copying(*parts: tuple[int, Any]) -> Callable[..., None]:
-    """Return what emits the copying of values, each given by its offset in bytes and its kind."""
-
-    def emit(builder: Builder, source: Value, target: Value) -> None:
-        for offset, kind in parts:
-            store(builder, load(builder, source, offset, kind), target, offset)
-
-    return emit
-
-
-@intrinsic
-def copy8(typing: Any, source: Any, target: Any) -> Any:
+@step(ADDRESS, ADDRESS)
+def copy8(builder: Builder, source: Value, target: Value) -> None:
     """Copy a sample and the two bytes behind it."""
-    del typing, source, target
-    return void(_copying((0, I64)), ADDRESS, ADDRESS)
+    store(builder, load(builder, source, 0, I64), target, 0)
 
 
-@intrinsic
-def copy6(typing: Any, source: Any, target: Any) -> Any:
+@step(ADDRESS, ADDRESS)
+def copy6(builder: Builder, source: Value, target: Value) -> None:
     """Copy a sample."""
-    del typing, source, target
-    return void(_copying((0, I32), (4, I16)), ADDRESS, ADDRESS)
+    store(builder, load(builder, source, 0, I32), target, 0)
+    store(builder, load(builder, source, 4, I16), target, 4)
 
 
-@intrinsic
-def copy2(typing: Any, source: Any, target: Any) -> Any:
+@step(ADDRESS, ADDRESS)
+def copy2(builder: Builder, source: Value, target: Value) -> None:
     """Copy one channel of a sample."""
-    del typing, source, target
-    return void(_copying((0, I16)), ADDRESS, ADDRESS)
+    store(builder, load(builder, source, 0, I16), target, 0)
 
 
-@intrinsic
-def copy_line(typing: Any, source: Any, target: Any) -> Any:
+@step(ADDRESS, ADDRESS)
+def copy_line(builder: Builder, source: Value, target: Value) -> None:
     """Copy a line's bytes."""
-    del typing, source, target
-    return void(_copying((0, _LINE)), ADDRESS, ADDRESS)
+    store(builder, load(builder, source, 0, _LINE), target, 0)
 
 
-@intrinsic
-def stream_line(typing: Any, source: Any, target: Any) -> Any:
+@step(ADDRESS, ADDRESS)
+def stream_line(builder: Builder, source: Value, target: Value) -> None:
     """Copy a line's bytes past the caches to `target`, a multiple of `LINE`; to be followed by `store_fence`."""
-    del typing, source, target
-
-    def emit(builder: Builder, source: Value, target: Value) -> None:
-        written = builder.store(load(builder, source, 0, _LINE), pointer_at(builder, target, 0, _LINE))
-        written.align = LINE
-        written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(I32, 1)]))
-
-    return void(emit, ADDRESS, ADDRESS)
+    written = builder.store(load(builder, source, 0, _LINE), pointer_at(builder, target, 0, _LINE))
+    written.align = LINE
+    written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(I32, 1)]))
 
 
-@intrinsic
-def store_fence(typing: Any) -> Any:
+@step()
+def store_fence(builder: Builder) -> None:
     """Wait until all threads can see what was streamed."""
-    del typing
-
-    def emit(builder: Builder) -> None:
-        builder.fence("seq_cst")
-
-    return void(emit)
+    builder.fence("seq_cst")
 
 
-@intrinsic
-def copy1(typing: Any, source: Any, target: Any) -> Any:
+@step(ADDRESS, ADDRESS)
+def copy1(builder: Builder, source: Value, target: Value) -> None:
     """Copy one byte."""
-    del typing, source, target
-    return void(_copying((0, I8)), ADDRESS, ADDRESS)
+    store(builder, load(builder, source, 0, I8), target, 0)
 
 
 def _channels(builder: Builder, samples: Value, offsets: Value, step: int) -> list[Value]:
@@ -225,50 +218,43 @@ def minimum(builder: Builder, first: Value, second: Value) -> Value:
     return builder.select(builder.fcmp_ordered("<", first, second), first, second)
 
 
-def _planes8(step: int) -> Callable[..., None]:
-    """Return what emits the writing of eight pixels whose offsets are `step` bytes apart."""
+def _write_planes8(
+    builder: Builder, samples: Value, offsets: Value, stride: int, line: Value, targets: Sequence[Value]
+) -> None:
+    """Write eight pixels whose offsets are `stride` bytes apart to three planes."""
 
-    def emit(
-        builder: Builder, samples: Value, offsets: Value, line: Value, red: Value, green: Value, blue: Value
-    ) -> None:
-        def number(place: int) -> Value:
-            return broadcast(builder, load(builder, line, 4 * place, F32), _EIGHT_FLOATS)
+    def number(place: int) -> Value:
+        return broadcast(builder, load(builder, line, 4 * place, F32), _EIGHT_FLOATS)
 
-        channels = _channels(builder, samples, offsets, step)
-        for place, (channel, target) in enumerate(zip(channels, (red, green, blue), strict=True)):
-            value = builder.fadd(builder.fmul(channel, number(place)), number(3 + place))
-            store(builder, minimum(builder, value, number(6)), target, 0)
-
-    return emit
+    for place, (channel, target) in enumerate(zip(_channels(builder, samples, offsets, stride), targets, strict=True)):
+        value = builder.fadd(builder.fmul(channel, number(place)), number(3 + place))
+        store(builder, minimum(builder, value, number(6)), target, 0)
 
 
-@intrinsic
-def planes8(typing: Any, samples: Any, offsets: Any, line: Any, red: Any, green: Any, blue: Any) -> Any:
+@step(*[ADDRESS] * 6)
+def planes8(
+    builder: Builder, samples: Value, offsets: Value, line: Value, red: Value, green: Value, blue: Value
+) -> None:
     """Write eight pixels as float32 to three planes: sample times factor, plus summand, at most a limit.
 
     At `line` are seven float32: factors and summands of red, green and blue, and the limit.
     """
-    del typing, samples, offsets, line, red, green, blue
-    return void(_planes8(4), ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+    _write_planes8(builder, samples, offsets, 4, line, (red, green, blue))
 
 
-@intrinsic
-def planes8_mirrored(typing: Any, samples: Any, offsets: Any, line: Any, red: Any, green: Any, blue: Any) -> Any:
+@step(*[ADDRESS] * 6)
+def planes8_mirrored(
+    builder: Builder, samples: Value, offsets: Value, line: Value, red: Value, green: Value, blue: Value
+) -> None:
     """Do `planes8` from right to left: `offsets` points to the first pixel's offset, the others' stand before it."""
-    del typing, samples, offsets, line, red, green, blue
-    return void(_planes8(-4), ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+    _write_planes8(builder, samples, offsets, -4, line, (red, green, blue))
 
 
-@intrinsic
-def plane1(typing: Any, source: Any, factor: Any, summand: Any, limit: Any, target: Any) -> Any:
+@step(ADDRESS, "float32", "float32", "float32", ADDRESS)
+def plane1(builder: Builder, source: Value, factor: Value, summand: Value, limit: Value, target: Value) -> None:
     """Write one channel of one pixel as float32: `planes8` for what is narrower."""
-    del typing, source, factor, summand, limit, target
-
-    def emit(builder: Builder, source: Value, factor: Value, summand: Value, limit: Value, target: Value) -> None:
-        value = builder.fmul(builder.uitofp(load(builder, source, 0, I16), F32), factor)
-        store(builder, minimum(builder, builder.fadd(value, summand), limit), target, 0)
-
-    return void(emit, ADDRESS, "float32", "float32", "float32", ADDRESS)
+    value = builder.fmul(builder.uitofp(load(builder, source, 0, I16), F32), factor)
+    store(builder, minimum(builder, builder.fadd(value, summand), limit), target, 0)
 
 
 BLOCK: Final = 8
@@ -289,38 +275,31 @@ _ORDER: Final = tuple((_PIXEL_PAIRS[lane % _QUAD][lane // (2 * _QUAD)], lane // 
 """Pixel and light of each of a block's weights in the order of `arrange_weights`, in the quarters of `_PIXEL_PAIRS`."""
 
 
-@intrinsic
-def mean4(typing: Any, source: Any, count: Any, target: Any) -> Any:
+@step(ADDRESS, "int64", ADDRESS, returned="int64")
+def mean4(builder: Builder, source: Value, count: Value, target: Value) -> Value:
     """Write the mean of `count` ≥ 1 samples in a row as four float32, the fourth is padding.
 
     Returns the largest number of the samples.
     """
-    del typing, source, count, target
+    from numba.core import cgutils
 
-    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
-        from numba.core import cgutils
-
-        del context, signature
-        source, count, target = arguments
-        wide, real = ir.VectorType(I64, _QUAD), ir.VectorType(ir.DoubleType(), _QUAD)
-        total, most = (cgutils.alloca_once_value(builder, ir.Constant(wide, [0] * _QUAD)) for _ in range(2))
-        with cgutils.for_range(builder, count) as loop:
-            at = builder.add(source, builder.mul(loop.index, ir.Constant(I64, SAMPLE_BYTES)))
-            sample = builder.zext(load(builder, at, 0, ir.VectorType(I16, _QUAD)), wide)
-            builder.store(builder.add(builder.load(total), sample), total)
-            before = builder.load(most)
-            builder.store(builder.select(builder.icmp_unsigned(">", sample, before), sample, before), most)
-        mean = builder.fdiv(
-            builder.sitofp(builder.load(total), real), broadcast(builder, builder.sitofp(count, ir.DoubleType()), real)
-        )
-        store(builder, builder.fptrunc(mean, ir.VectorType(F32, _QUAD)), target, 0)
-        largest = ir.Constant(I64, 0)
-        for channel in range(3):
-            value = builder.extract_element(builder.load(most), ir.Constant(I32, channel))
-            largest = builder.select(builder.icmp_unsigned(">", value, largest), value, largest)
-        return largest
-
-    return signature("int64", ADDRESS, "int64", ADDRESS), generate
+    wide, real = ir.VectorType(I64, _QUAD), ir.VectorType(ir.DoubleType(), _QUAD)
+    total, most = (cgutils.alloca_once_value(builder, ir.Constant(wide, [0] * _QUAD)) for _ in range(2))
+    with cgutils.for_range(builder, count) as loop:
+        at = builder.add(source, builder.mul(loop.index, ir.Constant(I64, SAMPLE_BYTES)))
+        sample = builder.zext(load(builder, at, 0, ir.VectorType(I16, _QUAD)), wide)
+        builder.store(builder.add(builder.load(total), sample), total)
+        before = builder.load(most)
+        builder.store(builder.select(builder.icmp_unsigned(">", sample, before), sample, before), most)
+    mean = builder.fdiv(
+        builder.sitofp(builder.load(total), real), broadcast(builder, builder.sitofp(count, ir.DoubleType()), real)
+    )
+    store(builder, builder.fptrunc(mean, ir.VectorType(F32, _QUAD)), target, 0)
+    largest = ir.Constant(I64, 0)
+    for channel in range(3):
+        value = builder.extract_element(builder.load(most), ir.Constant(I32, channel))
+        largest = builder.select(builder.icmp_unsigned(">", value, largest), value, largest)
+    return largest
 
 
 def _for_each_line(builder: Builder, weights: Value, count: Value, do: Callable[[Value, Value], None]) -> None:
@@ -341,77 +320,59 @@ def _any_nonzero(builder: Builder, words: Value) -> Value:
     return answer
 
 
-@intrinsic
-def weight_flags(typing: Any, weights: Any, count: Any) -> Any:
+@step(ADDRESS, "int64", returned="int64")
+def weight_flags(builder: Builder, weights: Value, count: Value) -> Value:
     """Return four bits on the weights of two lights, two float32 for each of `count` ≥ 8 pixels.
 
     Bits 0 and 1 are set where some weight of the first and of the second light is not 0, bits 2 and 3 where some weight
     of theirs is not 1.
     """
-    del typing, weights, count
+    from numba.core import cgutils
 
-    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
-        from numba.core import cgutils
+    ones = builder.bitcast(ir.Constant(FLOATS, [1.0] * LANES), WORDS)
+    found = [cgutils.alloca_once_value(builder, constant(WORDS, 0)) for _ in range(2)]
 
-        del context, signature
-        ones = builder.bitcast(ir.Constant(FLOATS, [1.0] * LANES), WORDS)
-        found = [cgutils.alloca_once_value(builder, constant(WORDS, 0)) for _ in range(2)]
+    def see(line: Value, block: Value) -> None:
+        del block
+        for seen, other in zip(found, (line, builder.xor(line, ones)), strict=True):
+            builder.store(builder.or_(builder.load(seen), other), seen)
 
-        def see(line: Value, block: Value) -> None:
-            del block
-            for seen, other in zip(found, (line, builder.xor(line, ones)), strict=True):
-                builder.store(builder.or_(builder.load(seen), other), seen)
-
-        _for_each_line(builder, arguments[0], arguments[1], see)
-        lit, less = (_any_nonzero(builder, builder.load(seen)) for seen in found)
-        return builder.or_(lit, builder.shl(less, ir.Constant(I64, 2)))
-
-    return signature("int64", ADDRESS, "int64"), generate
+    _for_each_line(builder, weights, count, see)
+    lit, less = (_any_nonzero(builder, builder.load(seen)) for seen in found)
+    return builder.or_(lit, builder.shl(less, ir.Constant(I64, 2)))
 
 
-@intrinsic
-def interleave_weights(typing: Any, first: Any, first_step: Any, second: Any, second_step: Any, target: Any) -> Any:
+@step(ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+def interleave_weights(
+    builder: Builder, first: Value, first_step: Value, second: Value, second_step: Value, target: Value
+) -> None:
     """Write eight pixels' weights of two lights by turns, as `weight_flags` takes them; steps are bytes to the next."""
-    del typing, first, first_step, second, second_step, target
-
-    def emit(
-        builder: Builder, first: Value, first_step: Value, second: Value, second_step: Value, target: Value
-    ) -> None:
-        line = ir.Constant(FLOATS, ir.Undefined)
-        for lane in range(LANES):
-            weights, step = ((first, first_step), (second, second_step))[lane % 2]
-            at = builder.add(weights, builder.mul(step, ir.Constant(I64, lane // 2)))
-            line = builder.insert_element(line, load(builder, at, 0, F32), ir.Constant(I32, lane))
-        store(builder, line, target, 0)
-
-    return void(emit, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
+    line = ir.Constant(FLOATS, ir.Undefined)
+    for lane in range(LANES):
+        weights, stride = ((first, first_step), (second, second_step))[lane % 2]
+        at = builder.add(weights, builder.mul(stride, ir.Constant(I64, lane // 2)))
+        line = builder.insert_element(line, load(builder, at, 0, F32), ir.Constant(I32, lane))
+    store(builder, line, target, 0)
 
 
-@intrinsic
-def arrange_weights(typing: Any, weights: Any, count: Any, target: Any) -> Any:
+@step(ADDRESS, "int64", ADDRESS, returned="int64")
+def arrange_weights(builder: Builder, weights: Value, count: Value, target: Value) -> Value:
     """Write the weights that `weight_flags` takes in the order in which `mix` takes them, 64 bytes for eight pixels.
 
     Returns bits 0 and 1 of `weight_flags`.
     """
-    del typing, weights, count, target
+    from numba.core import cgutils
 
-    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
-        from numba.core import cgutils
+    lanes = constant(WORDS, [2 * pixel + light for pixel, light in _ORDER])
+    seen = cgutils.alloca_once_value(builder, constant(WORDS, 0))
 
-        del context, signature
-        weights, count, target = arguments
-        lanes = constant(WORDS, [2 * pixel + light for pixel, light in _ORDER])
-        seen = cgutils.alloca_once_value(builder, constant(WORDS, 0))
+    def put(line: Value, block: Value) -> None:
+        builder.store(builder.or_(builder.load(seen), line), seen)
+        to = builder.add(target, builder.shl(block, ir.Constant(I64, 6)))
+        store(builder, builder.shuffle_vector(line, line, lanes), to, 0)
 
-        def put(line: Value, block: Value) -> None:
-            builder.store(builder.or_(builder.load(seen), line), seen)
-            to = builder.add(target, builder.shl(block, ir.Constant(I64, 6)))
-            store(builder, builder.shuffle_vector(line, line, lanes), to, 0)
-
-        _for_each_line(builder, weights, count, put)
-        return _any_nonzero(builder, builder.load(seen))
-
-    return signature("int64", ADDRESS, "int64", ADDRESS), generate
+    _for_each_line(builder, weights, count, put)
+    return _any_nonzero(builder, builder.load(seen))
 
 
 @contextmanager
@@ -488,8 +449,10 @@ def _pair(
     return totals, fault
 
 
-@intrinsic
-def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any, white: Any, target: Any) -> Any:
+@step(ADDRESS, "int64", "int64", ADDRESS, ADDRESS, "float32", ADDRESS)
+def mix(
+    builder: Builder, plan: Value, pairs: Value, count: Value, means: Value, faults: Value, white: Value, target: Value
+) -> None:
     """Write `count` ≥ 8 pixels under pairs of lights as uint16, rounded, from 0 to `white`; see `mixing.py`.
 
     `plan` is the address of `PLAN_ENTRIES` addresses a pair: of the weights as `arrange_weights` has them, of the first
@@ -497,67 +460,53 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
     that of the offsets in the means. Of the 16 float32 at `faults` some become NaN as soon as a weight is negative,
     infinite or NaN.
     """
-    del typing, plan, pairs, count, means, faults, white, target
+    from numba.core import cgutils
 
-    def emit(
-        builder: Builder,
-        plan: Value,
-        pairs: Value,
-        count: Value,
-        means: Value,
-        faults: Value,
-        white: Value,
-        target: Value,
-    ) -> None:
+    def number(value: int) -> Value:
+        return ir.Constant(I64, value)
+
+    def addresses(pair: Value) -> list[Value]:
+        entry = builder.add(plan, builder.mul(pair, number(8 * PLAN_ENTRIES)))
+        return [load(builder, entry, 8 * i, I64) for i in range(PLAN_ENTRIES)]
+
+    zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
+    most = broadcast(builder, white, FLOATS)
+    fault = cgutils.alloca_once_value(builder, load(builder, faults, 0, FLOATS))
+    sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(2)]
+
+    def fill(total: Callable[[Value, Value], Sequence[Value]]) -> None:
+        with _blocks(builder, count) as (block, begin):
+            rounded: list[Value] = []
+            for value in total(block, builder.shl(begin, number(2))):
+                lifted = builder.fadd(value, half)
+                lifted = builder.select(builder.fcmp_ordered(">", lifted, zero), lifted, zero)
+                rounded.append(builder.fptosi(minimum(builder, lifted, most), WORDS))
+            _store_pixels(
+                builder, rounded[0], rounded[1], builder.add(target, builder.mul(begin, number(SAMPLE_BYTES)))
+            )
+
+    def of_pair(entries: Sequence[Value], block: Value, place: Value) -> Sequence[Value]:
+        totals, nothing = _pair(builder, entries, block, place, means)
+        builder.store(builder.fadd(builder.load(fault), nothing), fault)
+        return totals
+
+    def of_all(block: Value, place: Value) -> Sequence[Value]:
         from numba.core import cgutils
 
-        def number(value: int) -> Value:
-            return ir.Constant(I64, value)
+        for one in sums:
+            builder.store(zero, one)
+        with cgutils.for_range(builder, pairs) as loop:
+            for one, value in zip(sums, of_pair(addresses(loop.index), block, place), strict=True):
+                builder.store(builder.fadd(builder.load(one), value), one)
+        return [builder.load(one) for one in sums]
 
-        def addresses(pair: Value) -> list[Value]:
-            entry = builder.add(plan, builder.mul(pair, number(8 * PLAN_ENTRIES)))
-            return [load(builder, entry, 8 * i, I64) for i in range(PLAN_ENTRIES)]
-
-        zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
-        most = broadcast(builder, white, FLOATS)
-        fault = cgutils.alloca_once_value(builder, load(builder, faults, 0, FLOATS))
-        sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(2)]
-
-        def fill(total: Callable[[Value, Value], Sequence[Value]]) -> None:
-            with _blocks(builder, count) as (block, begin):
-                rounded: list[Value] = []
-                for value in total(block, builder.shl(begin, number(2))):
-                    lifted = builder.fadd(value, half)
-                    lifted = builder.select(builder.fcmp_ordered(">", lifted, zero), lifted, zero)
-                    rounded.append(builder.fptosi(minimum(builder, lifted, most), WORDS))
-                _store_pixels(
-                    builder, rounded[0], rounded[1], builder.add(target, builder.mul(begin, number(SAMPLE_BYTES)))
-                )
-
-        def of_pair(entries: Sequence[Value], block: Value, place: Value) -> Sequence[Value]:
-            totals, nothing = _pair(builder, entries, block, place, means)
-            builder.store(builder.fadd(builder.load(fault), nothing), fault)
-            return totals
-
-        def of_all(block: Value, place: Value) -> Sequence[Value]:
-            from numba.core import cgutils
-
-            for one in sums:
-                builder.store(zero, one)
-            with cgutils.for_range(builder, pairs) as loop:
-                for one, value in zip(sums, of_pair(addresses(loop.index), block, place), strict=True):
-                    builder.store(builder.fadd(builder.load(one), value), one)
-            return [builder.load(one) for one in sums]
-
-        with builder.if_else(builder.icmp_signed("==", pairs, number(1))) as (single, several):
-            with single:
-                entries = addresses(number(0))
-                fill(lambda block, place: of_pair(entries, block, place))
-            with several:
-                fill(of_all)
-        store(builder, builder.load(fault), faults, 0)
-
-    return void(emit, ADDRESS, "int64", "int64", ADDRESS, ADDRESS, "float32", ADDRESS)
+    with builder.if_else(builder.icmp_signed("==", pairs, number(1))) as (single, several):
+        with single:
+            entries = addresses(number(0))
+            fill(lambda block, place: of_pair(entries, block, place))
+        with several:
+            fill(of_all)
+    store(builder, builder.load(fault), faults, 0)
 
 
 STREAMED_BYTES: Final = 24 << 20
