@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -17,22 +16,16 @@ from generator.lights.gamut import black_body, rb_of
 from generator.pictures.sources import Preparation, find_pictures, read_picture
 from generator.rendering import Rendering
 from tests.generator.conftest import MakeLut
+from tests.generator.explore.conftest import png
 from tests.generator.rendering.conftest import MakeTable
-from tests.generator.rendering.conftest import make_table as make_table_of_a_print
 from tests.pinned import Pinned
 
-make_table = make_table_of_a_print
 SIDE = 60
 
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-
-
-def png(seed: int, width: int = 90, height: int = 50) -> bytes:
-    codes = np.random.default_rng(seed).integers(0, 256, (height // 10, width // 10, 3)).astype(np.uint8)
-    return cv2.imencode(".png", codes.repeat(10, axis=0).repeat(10, axis=1))[1].tobytes()
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -29,20 +28,14 @@ from tests.acquisition.monitor.browser import (
     browser_tab,
     needs_chromium,
 )
+from tests.generator.explore.conftest import png
 from tests.generator.rendering.conftest import MakeTable
-from tests.generator.rendering.conftest import make_table as make_table_of_a_print
 from tests.serving import serving
 
 pytestmark = [pytest.mark.slow, needs_chromium]
-make_table = make_table_of_a_print
 HOSTILE = "<img src=x onerror='window.hacked=1'>&{data}.png"
 DRAWN = "panels.length === 2 && panels.every((panel) => panel.drawn === `${state.picture} ${shown?.light}`)"
 """Both renderings of what is chosen are drawn."""
-
-
-def png(seed: int, width: int, height: int) -> bytes:
-    codes = np.random.default_rng(seed).integers(0, 256, (height // 10, width // 10, 3)).astype(np.uint8)
-    return cv2.imencode(".png", codes.repeat(10, axis=0).repeat(10, axis=1))[1].tobytes()
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from generator.dataset.shards import photograph
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Lighting, Mixture, plain
-from generator.rendering.black_points import BlackPoint, black_of, parse_black_point, veil_of, without_veil
+from generator.rendering.black_points import BlackPoint, Veil, black_of, parse_black_point, veil_of, without_veil
 from generator.rendering.matrices import ColourMatrix
 from tests.generator.conftest import MakeLut
 from tests.generator.rendering.conftest import MakeTable
@@ -40,8 +41,6 @@ def veil(share: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]
 
 
 def taken_out(samples: npt.NDArray[np.uint16], share: float, white_level: int = 15000) -> npt.NDArray[np.uint16]:
-    from generator.rendering.black_points import Veil
-
     return without_veil(samples, Veil(*veil(share)), white_level)
 
 
@@ -82,8 +81,6 @@ def test_white_stays_to_the_last_bit_and_saturation_stays_saturated() -> None:
         np.testing.assert_array_equal(got[0], white[0])
         np.testing.assert_array_equal(got[1], full[0])
     # With saturation below the white of a light, as in an overexposed table, clipped highlights stay without colour.
-    from types import SimpleNamespace
-
     samples = np.concatenate([np.repeat(BLACK[None, None], 25, axis=1), np.full((7, 25, 3), 3500)]).astype(np.uint16)
     provenance = SimpleNamespace(bits=1, white_level=3500, unfit=())
     lut = SimpleNamespace(samples=samples[None], white=WHITE[None] * 1.5, provenance=provenance, folder="lut")
@@ -119,8 +116,6 @@ def test_black_is_that_of_the_light_its_mixture_and_the_nearest_fit_cell(make_lu
 
 
 def test_taken_out_of_each_light_it_is_taken_out_of_their_mixture() -> None:
-    from generator.rendering.black_points import Veil
-
     # Two lights whose black over white differ as much as those of real tables: .03 and .045.
     whites = np.array([[3000.0, 6000, 4000], [5000.0, 4000, 2000]])
     blacks = whites * [[0.03], [0.045]]
