@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib
+import inspect
 import io
 import json
 import os
@@ -117,6 +118,8 @@ def compiled_into(dispatcher: Any) -> tuple[Function, ...]:
         if source is None or id(one) in seen:
             continue
         seen.add(id(one))
+        # That of a step in LLVM's terms is made by a decorator from what writes it.
+        source = inspect.unwrap(source)
         function = function_of(source.__code__)
         if function is not None:
             found[function] = None
