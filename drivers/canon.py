@@ -87,7 +87,7 @@ from drivers.ptp.protocol import (
     encode_array,
     encode_integer,
 )
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 _RAW: Final = 6
@@ -1366,7 +1366,6 @@ class EosBody:
 REDISCOVERY_S = 10.0
 """Time for a frame to be announced on a new connection, on which the body sends its whole state at once."""
 
-_SYSTEM_CLOCK = SystemClock()
 _CERTAIN_SHARE = 0.9
 """Share of the nominal shutter time that passes at least: 1/6 s is really 0.149 s."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 5.0
@@ -1432,7 +1431,7 @@ class CanonEos:
     """A `drivers.camera.Camera` over PTP, whatever the cable."""
 
     def __init__(
-        self, open_transport: Callable[[], Transport], clock: Clock = _SYSTEM_CLOCK, limits: CanonLimits = _LIMITS
+        self, open_transport: Callable[[], Transport], clock: Clock = SYSTEM_CLOCK, limits: CanonLimits = _LIMITS
     ) -> None:
         self._open_transport = open_transport
         self._clock = clock

@@ -27,7 +27,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, BinaryIO
 
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import RUN_AGAIN, ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
 
 if TYPE_CHECKING:
@@ -244,7 +244,6 @@ BUSY_PAUSE_S = 1.0
 _LOOK_AGAIN_S = 0.1
 """Between two looks at a value that is to settle; each costs an exchange with the body."""
 
-_SYSTEM_CLOCK = SystemClock()
 _IDENTITY = {
     "maker": ("manufacturer",),
     "model": ("cameramodel",),
@@ -260,7 +259,7 @@ class Gphoto2Camera:
     `model`: libgphoto2's name of the model; None lets it find out, which works on USB. ``PTP/IP Camera`` on a network.
     """
 
-    def __init__(self, port: str | None = None, model: str | None = None, clock: Clock = _SYSTEM_CLOCK) -> None:
+    def __init__(self, port: str | None = None, model: str | None = None, clock: Clock = SYSTEM_CLOCK) -> None:
         self._port = port
         self._model = model
         self._clock = clock

@@ -38,7 +38,7 @@ import numpy.typing as npt
 
 from drivers.display.x11 import XScreen, is_dark, is_lost, outlive
 from drivers.presenter import BLACK, Colour
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import RUN_AGAIN, ConfigurationError, DeviceError
 from foundation.holds import hold
 
@@ -234,8 +234,6 @@ _DIGITS: Final = (
 
 _LOOK: Final = "look for a window or notification in front, desktop scaling, or a colour filter"
 
-_SYSTEM_CLOCK = SystemClock()
-
 
 class FullScreen:
     """A `drivers.presenter.Presenter` on a display; black from the moment it opens.
@@ -243,7 +241,7 @@ class FullScreen:
     Use it from the thread that opened it. It takes no keys: it ends by `close`, or with the process.
     """
 
-    def __init__(self, display: str | int | None = None, clock: Clock = _SYSTEM_CLOCK) -> None:
+    def __init__(self, display: str | int | None = None, clock: Clock = SYSTEM_CLOCK) -> None:
         self._clock = clock
         self._thread = threading.get_ident()
         self._closing = contextlib.ExitStack()
@@ -594,7 +592,7 @@ def _is_noise(ramp: npt.NDArray[np.float64]) -> bool:
     return travel > 2 * float(np.ptp(ramp)) and travel > 0.1
 
 
-def identify_displays(seconds: float, clock: Clock = _SYSTEM_CLOCK) -> tuple[Display, ...]:
+def identify_displays(seconds: float, clock: Clock = SYSTEM_CLOCK) -> tuple[Display, ...]:
     """Show on every display its number for a while, and return them."""
     with contextlib.ExitStack() as opened:
         displays = list_displays()

@@ -25,7 +25,7 @@ from collections.abc import Callable
 
 from drivers.links.link import Exchange, Link, MessageParser
 from drivers.presenter import BLACK, Colour
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceError, DeviceRefused, ProtocolError
 
 PORT = 20554
@@ -40,7 +40,6 @@ _SILENT = "check that it is on, and that its model knows the flat field"
 _CHECK_MODEL = "check that it is a JVC D-ILA"
 
 _OPERATION, _ACKNOWLEDGED, _END = b"!", b"\x06", b"\n"
-_SYSTEM_CLOCK = SystemClock()
 
 
 def encode_operation(text: bytes) -> bytes:
@@ -78,7 +77,7 @@ class JvcFlatField:
         self,
         connect: Callable[[], Link],
         label: str = "the JVC projector",
-        clock: Clock = _SYSTEM_CLOCK,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._label = label
         self._exchange = Exchange(connect, TIMEOUT_S, label, clock, self._greet, _SILENT, _CHECK_MODEL)

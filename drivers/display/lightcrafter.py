@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 
 from drivers.links.usb import HidDevice, open_hid
 from drivers.presenter import BLACK, Colour
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 if TYPE_CHECKING:
@@ -172,7 +172,6 @@ _SETTLED = (
     (LightCrafterCommand.INPUT_SOURCE, SOURCE_TEST_PATTERN, 0x07),
     (LightCrafterCommand.DISPLAY_MODE, MODE_VIDEO, 0x03),
 )
-_SYSTEM_CLOCK = SystemClock()
 
 
 def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = None) -> HidDevice:
@@ -190,7 +189,7 @@ def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = N
 class LightCrafter:
     """A `drivers.presenter.Presenter`; black from the moment it opens."""
 
-    def __init__(self, connect: Callable[[], HidDevice], clock: Clock = _SYSTEM_CLOCK) -> None:
+    def __init__(self, connect: Callable[[], HidDevice], clock: Clock = SYSTEM_CLOCK) -> None:
         self._connect = connect
         self._clock = clock
         self._reports: HidDevice | None = None

@@ -2,7 +2,7 @@
 
 Rules that hold inside:
 
-- Eight data bits and one stop bit, no flow control: every projector in `drivers.serial_projectors` wants that.
+- Eight data bits, no parity, one stop bit, no flow control: every projector in `drivers.serial_projectors` wants that.
 - The port is ours alone while it is open, and what waited in it before is thrown away.
 - The system's errors become ours here and nowhere else; every message names the port.
 - A cable that is pulled out loses what the system had not handed over yet: last words may be missing.
@@ -18,9 +18,6 @@ from serial.tools import list_ports
 
 from foundation.errors import ConfigurationError, DeviceRefused, LinkClosed, LinkError, LinkTimeout
 
-PARITIES = ("N", "E", "O")
-"""None, even, odd."""
-
 
 class SerialLink:
     """A `drivers.links.link.Link` over one serial port."""
@@ -30,12 +27,10 @@ class SerialLink:
         self._device = device
 
     @classmethod
-    def open(cls, device: str, baud: int, parity: str = "N") -> SerialLink:
+    def open(cls, device: str, baud: int) -> SerialLink:
         """Open the port `device`, such as ``/dev/ttyUSB0`` or ``COM3``, at `baud` bits per second."""
-        if parity not in PARITIES:
-            raise ConfigurationError(f"parity {parity!r} for {device}; expected one of {', '.join(PARITIES)}")
         try:
-            port = serial.Serial(device, baud, parity=parity, timeout=0, write_timeout=0, exclusive=True)
+            port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
         except (ValueError, OverflowError) as error:
             raise ConfigurationError(
                 f"{device} cannot be opened at {baud} baud: {error}; choose another speed"

@@ -173,9 +173,7 @@ class TestOverAPseudoTerminal(ProjectorContract):
         spoken = LANGUAGES[request.param]
         device = SimulatedProjector(SimulatedClock())
         with PseudoTerminal(PEERS[spoken.name](device)) as terminal:
-            projector = spoken.projector(
-                lambda: SerialLink.open(terminal.path, spoken.baud, spoken.parity), clock=device.clock
-            )
+            projector = spoken.projector(lambda: SerialLink.open(terminal.path, spoken.baud), clock=device.clock)
             yield bench_of(spoken.name, device, projector, terminal.catch_up)
             projector.close()
 
@@ -867,7 +865,7 @@ def test_a_cable_pulled_out_is_told(name: str) -> None:
 
     spoken = language(name)
     with PseudoTerminal(PEERS[name](SimulatedProjector(SimulatedClock(), Power.ON))) as terminal:
-        projector = spoken.projector(lambda: SerialLink.open(terminal.path, spoken.baud, spoken.parity))
+        projector = spoken.projector(lambda: SerialLink.open(terminal.path, spoken.baud))
         assert projector.power() is Power.ON
     with pytest.raises(LinkClosed, match=terminal.path):
         projector.power()
@@ -891,4 +889,3 @@ def test_users_are_told_of_every_language() -> None:
         for name, spoken in LANGUAGES.items()
         if pattern.format(name, spoken.baud) not in texts[page]
     ] == []
-    assert {spoken.parity for spoken in LANGUAGES.values()} == {"N"}, "docs/devices.md says so of all"
