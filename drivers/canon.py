@@ -3,42 +3,29 @@
 First what these bodies say beyond the standard, as values: events, lists, codes of shutter, aperture and ISO. GetEvent
 answers a chain of records: size (32 bits, these included), type (32), body; a record of size 8 and type 0 ends it,
 which some bodies leave out. The first answer after SetEventMode holds the camera's whole state, later ones what has
-changed since. Then a body's state, its connection, and the camera.
+changed since. Properties travel as bytes: 32 bits for every number, text with a closing NUL, structures for a few.
+``decode`` and ``encode`` undo each other on well-formed bytes; a record whose type or form is not known stays as it
+came, in `OtherRecord`, and one that contradicts itself raises `ProtocolError`.
 
-Rules that hold inside, of values:
+Then a body's state and its connection (`EosBody`):
 
-- ``decode`` and ``encode`` undo each other on well-formed bytes. A record whose type or inner form is not known stays
-  as it came, in `OtherRecord`, and is skipped by its size; a record that contradicts itself raises `ProtocolError`.
-- Counts and sizes are checked before they are believed; more than `MAX_EVENTS` bytes are refused unread, and more than
-  `MAX_RECORDS` records once so many have been read.
-- Properties travel as bytes: 32 bits for every number, text with a closing NUL, structures for a few. No value here
-  knows which property it is of, except for the image formats, whose lists cannot be cut without it.
-
-Of one connection (`EosBody`):
-
-- Every step is one that the recorded conversations have, or one that libgphoto2 takes; an operation that the body does
-  not list is never sent. One that it lists and does not know all the same (0x2005) is not sent again, and done without
-  where that is possible: serial number, room on the host, staying awake, the other ways to release and to fetch.
-- GetEvent is asked until it has nothing more, but never without end: some firmware repeats itself. `EosState` takes its
-  records in their order and holds nothing that was not reported, and no more of it than `MAX_PROPERTIES` values of
-  `MAX_VALUE` bytes and as many lists, which no real body comes near.
-- What a body does not report is no problem: properties come and go between bodies, and only what is known to spoil a
-  series is named. Nothing is taken for settable that the body does not list.
+- Every step is one that the recorded conversations have, or one that libgphoto2 takes. Nothing is sent or taken for
+  settable that the body does not list, and what it lists and does not know all the same is done without where it can
+  be.
+- What a body claims costs little: counts and sizes are checked before they are believed, and what it reports is
+  held up to limits that no real body comes near.
 - A body keeps a frame in its memory until TransferComplete, and refuses the next when that memory is full. So every
   object that it announces is fetched or thrown away, and freed in either case.
-- Sizes and counts that a body reports are checked against what arrives.
-- A fault of cable or protocol ends the session, and goes to `CanonEos`, which begins a new one.
 
-Of the camera (`CanonEos`):
+And the camera (`CanonEos`):
 
-- A connection that fails is renewed, a limited number of times and for a limited time in one call (`CanonLimits`):
-  reset, closed, opened again wherever the body is now, and given the settings again. Then the call fails, with its
-  first cause: longer patience is the caller's, who can say what is awaited.
+- A connection that fails is renewed, a limited number of times and for a limited time in one call (`CanonLimits`). Then
+  the call fails, with its first cause: longer patience is the caller's, who can say what is awaited.
 - A release is never repeated once it may have happened: after a fault the frame is looked for in the camera's memory,
-  and what is not found there is an error. So no frame is ever taken for another one's.
-- What waits in the memory before a release belongs to nobody any more, and is thrown away.
+  and what is not found there is an error. What waits there before a release belongs to nobody any more. So no frame is
+  ever taken for another one's.
 - The exposed frame stays in the memory until it has been downloaded whole, or the next is exposed: a cable that fails
-  and a file that cannot be written cost a download, not a frame. Once downloaded, the memory is emptied.
+  and a file that cannot be written cost a download, not a frame.
 
 Source: no public standard; layouts and conversations as recorded from an EOS 60D and an EOS 400D with a host;
 libgphoto2 2.5.34 for how these are read, and for the order of a release; the number of mirror lockup among the custom

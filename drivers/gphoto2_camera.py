@@ -1,17 +1,12 @@
 """Any tethered camera that libgphoto2 supports, as a `Camera`: for makers that have no driver of their own here.
 
-Rules that hold inside:
+python-gphoto2 is an optional extra and is imported only when a camera is opened. After a fault the connection is
+dropped, and the next call opens a new one; a frame that was being transferred is lost and may be retaken.
 
-- python-gphoto2 is an optional extra and is imported only when a camera is opened.
-- libgphoto2's errors become ours in `_speaking`. After a fault the connection is dropped, and the next call opens a
-  new one; a frame that was being transferred is lost and may be retaken.
-- libgphoto2 names one thing differently for each maker, and one maker's bodies differ: the first of some names that a
-  body has is used. Labels are those of libgphoto2's own tables, untranslated; a setting is read back.
-- Nothing is taken for settable that the body does not show. A raw format that cannot be asked for is refused, and so
-  is what is known to spoil a series; what a body does not show at all is no problem.
-- A file that is no raw file is refused, whatever the body was asked for.
-
-libgphoto2 may focus before it releases, so that a body that does not focus by hand is refused.
+libgphoto2 names one thing differently for each maker, and one maker's bodies differ: the first of some names that a
+body has is used. Labels are those of libgphoto2's own tables, untranslated; a setting is read back. A raw format that
+cannot be asked for is refused, and so is what is known to spoil a series; what a body does not show at all is no
+problem. libgphoto2 may focus before it releases, so that a body that does not focus by hand is refused.
 
 Source: libgphoto2 2.5.34, camlibs/ptp2/config.c (names and labels), camlibs/ptp2/cameras (what bodies of each maker
 show).

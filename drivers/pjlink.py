@@ -1,21 +1,14 @@
 """PJLink, the projector industry's control protocol over TCP: its bytes, a projector with it, and the search for them.
 
-Rules that hold inside, of the bytes:
-
-- A line is at most 136 bytes with its CR: ``%``, class digit, four letters, a space or ``=``, up to 128 bytes of
-  parameter. Whoever sends more gets `ProtocolError`, never memory.
-- What we send follows the standard to the letter; what we accept is wider: any case, LF after or instead of CR, empty
-  lines, NUL between lines (some projectors fill their packets up with it).
-- Bytes that do not fit raise `ProtocolError`, which quotes them. A datagram, which arrives unasked and from anybody, is
-  no error: one that holds nothing of ours is an empty answer.
+What we send follows the standard to the letter; what we accept is wider: any case, LF after or instead of CR, empty
+lines, NUL between lines (some projectors fill their packets up with it). A datagram, which arrives unasked and from
+anybody, is no error: one that holds nothing of ours is an empty answer.
 
 Of the projector:
 
-- One connection at a time, opened when first needed: many projectors serve one controller only.
-- Projectors hang up on an idle connection after about 30 s. A command that meets a connection so lost is sent once
-  more over a new one; every command here may be repeated without harm.
+- One connection at a time, opened when first needed: many projectors serve one controller only. They hang up on an idle
+  one after about 30 s; a command that meets a connection so lost is sent once more, and may be without harm.
 - After a fault of cable or protocol the connection is dropped, so that a late answer never meets a later question.
-- Class 2 is used only where the projector reports that it has it: others may never answer.
 - Projectors in the field do not know all of their class. What a question cannot be asked for (`ERR1`, `ERR2`) is None,
   or empty, and not asked again; `ERR3` means that it may be asked later. Only commands are refused.
 

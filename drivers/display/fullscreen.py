@@ -1,16 +1,14 @@
 """Plain colours on a display of the desktop: exact codes, read back from the screen before a frame is taken.
 
+The picture fills one whole display in the mode that the desktop set. `show` returns when the drawn frame and what the
+display's server shows are exactly the colour, in every pixel: on X, the screen is read over another connection, as a
+screenshot program does; on Windows and macOS, the front buffer. A display that was away for a while is filled again by
+the next `show`, if it comes back in the mode that it had; one that the window of another process fills is not filled.
+
 Rules that hold inside:
 
-- The picture fills one whole display in the mode that the desktop set: no scaling, no cursor, no frame.
-- `show` returns when the drawn frame and what the display's server shows are exactly the colour, in every pixel: on X,
-  the screen is read over another connection, as a screenshot program does; on Windows and macOS, the front buffer.
-  `verify` reads it again, as often as is asked.
-- A display that was away for a while is filled again by the next `show`, if it comes back in the mode that it had.
 - One thread owns the window: the one that opened it. OpenGL contexts and GLFW want it so.
 - The window belongs to this process: however that ends, killed included, the window goes with it.
-- A display that the window of another process fills is not filled: neither would show what it is told to. What is
-  asked without a window (`display_warnings`, `list_displays`) covers nothing.
 - GLFW and OpenGL are used here and nowhere else; GLFW runs while anything here is open.
 
 On Linux the window is an X window. Under Wayland that is XWayland, whose compositor may scale and tint behind our back:

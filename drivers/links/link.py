@@ -1,11 +1,7 @@
 """What a cable is: three verbs and a time limit; and one question at a time over it.
 
-Rules that hold inside:
-
-- An implementation translates the system's errors into `LinkTimeout` and `LinkClosed` at this border and nowhere else.
-- What was sent before hanging up can still be read after it.
-- `PeerLink` has no thread and never waits: its peer has answered by the time `write` returns, so an empty read can only
-  mean that nothing will come.
+An implementation translates the system's errors into `LinkTimeout` and `LinkClosed` at this border and nowhere else.
+What was sent before hanging up can still be read after it.
 """
 
 from __future__ import annotations

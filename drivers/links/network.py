@@ -1,10 +1,7 @@
 """Cables of the network: TCP connections, the loopback servers of simulated devices, and datagrams over UDP.
 
-Rules that hold inside:
-
-- The system's errors become `LinkTimeout` and `LinkClosed` here and nowhere else; every message names host and port.
-- `TcpServer` listens on loopback unless a host is given, has one thread for each connection, and leaves none behind.
-- A datagram comes whole or not at all, and from anybody: whoever reads it judges sender and content.
+The system's errors become `LinkTimeout` and `LinkClosed` here and nowhere else; every message names host and port. A
+datagram comes whole or not at all, and from anybody: whoever reads it judges sender and content.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """The serial cable: the one file that imports pyserial.
 
-Rules that hold inside:
-
-- Eight data bits, no parity, one stop bit, no flow control: every projector in `drivers.serial_projectors` wants that.
-- The port is ours alone while it is open, and what waited in it before is thrown away.
-- The system's errors become ours here and nowhere else; every message names the port.
-- A cable that is pulled out loses what the system had not handed over yet: last words may be missing.
+Eight data bits, no parity, one stop bit, no flow control: every projector in `drivers.serial_projectors` wants that.
+The port is ours alone while it is open, and what waited in it before is thrown away. A cable that is pulled out loses
+what the system had not handed over yet: last words may be missing.
 """
 
 from __future__ import annotations

@@ -1,14 +1,9 @@
 """USB cables: the pipes of still image devices, and the reports of HID devices.
 
-Rules that hold inside:
-
-- Devices are distinguished by vendor, product and serial number, or by the port they are plugged into: the address
-  changes whenever a device restarts.
-- The kernel's own driver is asked to step aside, and given the interface back at the end.
-- The system's errors are translated here and nowhere else, and say what helps: ETIMEDOUT is `LinkTimeout`; ENODEV, EIO
-  and whatever else ends the transfer is `LinkClosed`; EPIPE is `PipeStalled`; EBUSY and EACCES are `DeviceRefused`.
-- pyusb opens anew what was closed as soon as it is used; here, closed is closed.
-- Of a HID device only the interrupt pipes are used, one report a transfer; a report is never cut and never joined.
+Devices are distinguished by vendor, product and serial number, or by the port they are plugged into: the address
+changes whenever a device restarts. The kernel's own driver is asked to step aside, and given the interface back at the
+end. The system's errors are translated here and nowhere else, and say what helps. pyusb opens anew what was closed as
+soon as it is used; here, closed is closed.
 
 Sources: USB 2.0, clauses 5.8 (bulk), 5.7 (interrupt), 9.4 (SetConfiguration) and 9.6 (descriptors); Device Class
 Definition for HID 1.11, clauses 4.1 and 4.4; libusb 1.0's error codes.

@@ -1,22 +1,17 @@
 """PTP on any cable: datasets as bytes and as values, and a session of numbered transactions.
 
-A transaction is a request, at most one data phase, and a response; events come beside.
+A transaction is a request, at most one data phase, and a response; events come beside. Everything is little-endian. A
+string is a count of UTF-16 units with the closing NUL, then the units; an empty string is the count 0 alone. An array
+is a count of 32 bits, then the items.
 
 Rules that hold inside:
 
 - ``decode`` and ``encode`` undo each other on well-formed bytes, so that both ends of the cable share one type.
-- Whatever bytes a device sends, the only error is `ProtocolError`; it names the dataset, the field, the place, what was
-  expected and what came. A count is compared with the bytes that are left before anything is made from it, and a
-  dataset of more than `MAX_DATASET` bytes is refused unread. Bytes behind a dataset's last field are no fault, for
-  later editions append.
-- ``encode`` raises ValueError for what the wire cannot hold; that is our own mistake, never a device's.
-- A response other than OK raises `OperationDeclined`, which has its code by number and by name; what a device declines
-  for the moment only (`PASSING`) is asked again, for a limited time.
+- Whatever bytes a device sends, the only error is `ProtocolError`; a count is compared with the bytes that are left
+  before anything is made from it. Bytes behind a dataset's last field are no fault, for later editions append.
+  ``encode`` raises ValueError for what the wire cannot hold; that is our own mistake, never a device's.
 - A fault of cable or protocol goes straight to the caller: whether an operation may be repeated is not known here.
   After one, the session is spent; a new one begins with `Transport.reset` or a new transport.
-
-Everything is little-endian, as USB and TCP carry it. A string is a count of UTF-16 units with the closing NUL, then
-the units; an empty string is the count 0 alone. An array is a count of 32 bits, then the items.
 
 Source: ISO 15740:2013, clauses 5 (types and datasets), 9.3 (sessions and transactions) and 13 (properties).
 """

@@ -4,27 +4,18 @@ Rules that hold inside:
 
 - Nothing is subtracted, scaled, rotated or interpolated: `Mosaic.counts` equals what ``dcraw -D -4 -T`` writes, but for
   the rotation that dcraw applies.
-- Whatever the bytes, the outcome is a `Mosaic` or one `FormatError`. A file that has been cut is an error wherever its
-  structure betrays it, since LibRaw fills what is missing with zeros or ones without a word in some formats, and so
-  does whoever copies a file from a bad card (`filled_fault`). What a file does not state of camera, lens and exposure,
-  or states in a damaged place, is empty or None.
-- A `Plane` is one colour of a mosaic, above black. Its places are half-size pixels, x right, y down, centres at
-  integers. A plane of red or blue photosites lies a quarter pixel beside the blocks' centres, and `Plane.offset_px`
-  puts its places right; green is the mean of its two photosites and lies in the middle. A sum of planes under deep red
-  or blue would be a fifth of a pixel off.
-- LibRaw chooses by itself which picture of a file it decodes, and reads behind the end of what is stored without a
-  word. So each picture of a sensor that a file describes must be whole, and what LibRaw makes must have the size of
-  one of them (`Stored.holds`). A file of whose layout neither can be told is refused.
+- Whatever the bytes, the outcome is a `Mosaic` or one `FormatError`. LibRaw fills what is missing, and reads behind the
+  end of what is stored, without a word: so each picture of a sensor that a file describes must be whole, and what
+  LibRaw makes must have the size of one of them (`Stored.holds`). A file of whose layout neither can be told is
+  refused.
 - LibRaw is called here and nowhere else in the suite. A DNG that holds its counts as memory does needs none: it is read
-  as LibRaw would, and what is not sure of it is left to LibRaw. Rows and columns of colour filters and of black levels
-  count from the active area's corner (DNG 1.7, ActiveArea). LibRaw's table of colour matrices is asked by opening a raw
-  file of nothing but a camera's name, made here: no matrix is copied into the suite.
+  as LibRaw would. LibRaw's table of colour matrices is asked by opening a raw file of nothing but a camera's name.
 
-Sources: TIFF 6.0 (strips), TIFF technical note 1 and DNG 1.7.1 (tiles, CameraSerialNumber); LibRaw 0.22 for which
-directory, size and packing it takes (src/metadata/tiff.cpp); Exif 2.32, section 4.6.5 (BodySerialNumber, LensModel).
-Canon's note, which bodies before Exif 2.3 (such as the 550D) have instead, is a TIFF directory without a standard: P.
-Harvey, ExifTool, lib/Image/ExifTool/Canon.pm (0x000c SerialNumber, 0x0095 LensModel), whose offsets count from the
-file's beginning.
+Sources: TIFF 6.0 (strips), TIFF technical note 1 and DNG 1.7.1 (tiles, CameraSerialNumber; ActiveArea, from whose
+corner colour filters and black levels count); LibRaw 0.22 for which directory, size and packing it takes
+(src/metadata/tiff.cpp); Exif 2.32, section 4.6.5 (BodySerialNumber, LensModel). Canon's note, which bodies before Exif
+2.3 have instead, is a TIFF directory without a standard, whose offsets count from the file's beginning: P. Harvey,
+ExifTool, lib/Image/ExifTool/Canon.pm (0x000c SerialNumber, 0x0095 LensModel).
 """
 
 from __future__ import annotations
