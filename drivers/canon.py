@@ -19,8 +19,8 @@ Then a body's state and its connection (`EosBody`):
 
 And the camera (`CanonEos`):
 
-- A connection that fails is renewed, a limited number of times and for a limited time in one call (`CanonLimits`). Then
-  the call fails, with its first cause: longer patience is the caller's, who can say what is awaited.
+- A connection that fails is renewed, a limited number of times and for a limited time in one call. Then the call fails,
+  with its first cause: longer patience is the caller's, who can say what is awaited.
 - A release is never repeated once it may have happened: after a fault the frame is looked for in the camera's memory,
   and what is not found there is an error. What waits there before a release belongs to nobody any more. So no frame is
   ever taken for another one's.
@@ -1350,6 +1350,14 @@ class EosBody:
         return operation in self._info.operations and operation not in self._unsupported
 
 
+RECOVERIES = 3
+"""How often a call renews the connection: a fault that comes back more often lasts. Chosen, as the next two."""
+RECOVERY_S = 30.0
+"""Time after the first fault of a call in which the connection may be renewed; a body that was switched off and on, or
+put back on its cable, is there within 10 s."""
+FRAME_S = 30.0
+"""Time after its exposure within which a frame may be announced, beside as much time again as it was exposed: so long a
+dark frame takes that some bodies subtract."""
 REDISCOVERY_S = 10.0
 """Time for a frame to be announced on a new connection, on which the body sends its whole state at once."""
 
@@ -1377,25 +1385,6 @@ _REMEDY = (
 _Result = TypeVar("_Result")
 
 
-@dataclass(frozen=True)
-class CanonLimits:
-    """How long one call to a body may go on against trouble before it fails; chosen, not measured.
-
-    - `recoveries`: how often a call renews the connection: a fault that comes back more often lasts.
-    - `recovery_s`: seconds after the first fault of a call in which the connection may be renewed; a body that was
-      switched off and on, or put back on its cable, is there within 10 s.
-    - `frame_s`: seconds after its exposure within which a frame may be announced, beside as much time again as it was
-      exposed: so long a dark frame takes that some bodies subtract.
-    """
-
-    recoveries: int = 3
-    recovery_s: float = 30.0
-    frame_s: float = 30.0
-
-
-_LIMITS = CanonLimits()
-
-
 @dataclass
 class _Shot:
     """A release that has happened, or may have.
@@ -1417,12 +1406,9 @@ class _Shot:
 class CanonEos:
     """A `drivers.camera.Camera` over PTP, whatever the cable."""
 
-    def __init__(
-        self, open_transport: Callable[[], Transport], clock: Clock = SYSTEM_CLOCK, limits: CanonLimits = _LIMITS
-    ) -> None:
+    def __init__(self, open_transport: Callable[[], Transport], clock: Clock = SYSTEM_CLOCK) -> None:
         self._open_transport = open_transport
         self._clock = clock
-        self._limits = limits
         self._fault: DeviceError | None = None
         self._renewable_until = math.inf
         self._transport: Transport | None = None
@@ -1536,7 +1522,7 @@ class CanonEos:
                 # A body that is busy in every session is kept so by its own settings, not by a fault.
                 busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
                 late = self._clock.monotonic() >= self._renewable_until
-                if renewals == self._limits.recoveries or late or (busy and was_busy):
+                if renewals == RECOVERIES or late or (busy and was_busy):
                     kind = DeviceRefused if busy else DeviceError
                     times = "once" if renewals == 1 else f"{renewals} times"
                     raise kind(self._given_up(error, f"the connection was renewed {times} without success")) from error
@@ -1550,7 +1536,7 @@ class CanonEos:
         """
         if self._fault is None:
             self._fault = fault
-            self._renewable_until = self._clock.monotonic() + self._limits.recovery_s
+            self._renewable_until = self._clock.monotonic() + RECOVERY_S
         self._drop(fault)
 
     def _given_up(self, last: DeviceError, tried: str) -> str:
@@ -1566,7 +1552,7 @@ class CanonEos:
             _apply(body, settings)  # sends nothing unless a dial was turned
             now = self._clock.monotonic()
             exposed = now + _CERTAIN_SHARE * settings.shutter_s
-            until = now + 2 * settings.shutter_s + self._limits.frame_s
+            until = now + 2 * settings.shutter_s + FRAME_S
             shot = _Shot(body, self._clock.now(), exposed, until, settings.shutter_s, absent=set(body.state.waiting))
             try:
                 body.release()
@@ -1634,7 +1620,7 @@ class CanonEos:
             return self._body
         first = self._identity is None
         begun = self._clock.monotonic()
-        end = min(self._renewable_until, begun + self._limits.recovery_s)
+        end = min(self._renewable_until, begun + RECOVERY_S)
         pause = _FIRST_PAUSE_S
         while True:
             try:

@@ -234,7 +234,6 @@ def list_devices(*, backend: IBackend | None = None) -> tuple[UsbDevice, ...]:
 def open_usb(
     *,
     vendor: int | None = None,
-    product: int | None = None,
     serial: str | None = None,
     port: str | None = None,
     backend: IBackend | None = None,
@@ -244,7 +243,7 @@ def open_usb(
     others: list[UsbDevice] = []
     hidden: DeviceRefused | None = None
     for device, description, refusal in _found(backend):
-        marks = ((vendor, description.vendor), (product, description.product), (port, description.port))
+        marks = ((vendor, description.vendor), (port, description.port))
         alike = all(wanted is None or wanted == is_ for wanted, is_ in marks)
         if alike and (serial is None or serial == description.serial):
             matching.append((device, description))
@@ -255,7 +254,7 @@ def open_usb(
     if not matching:
         if hidden is not None:
             raise hidden
-        raise LinkClosed(_absent(vendor, product, serial, port, others))
+        raise LinkClosed(_absent(vendor, serial, port, others))
     if len(matching) > 1:
         choice = "; ".join(str(description) for _, description in matching)
         raise InputError(f"{len(matching)} cameras on USB fit: {choice}; name one by serial number or port")
@@ -431,12 +430,9 @@ def _is_still_image(interface: usb.core.Interface) -> bool:
     return kind == STILL_IMAGE_CLASS
 
 
-def _absent(
-    vendor: int | None, product: int | None, serial: str | None, port: str | None, others: list[UsbDevice]
-) -> str:
+def _absent(vendor: int | None, serial: str | None, port: str | None, others: list[UsbDevice]) -> str:
     marks = [
         f"vendor {vendor:04x}" if vendor is not None else "",
-        f"product {product:04x}" if product is not None else "",
         f"serial number {serial}" if serial is not None else "",
         f"port {port}" if port is not None else "",
     ]
