@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -115,37 +115,19 @@ def bench_of(name: str, device: SimulatedProjector, projector: Projector, catch_
             device.switch_on()
         catch_up()
 
-    traits, expected = device.traits, EXPECTED[name]
-    return Bench(
-        projector,
-        wait,
-        break_part,
-        repair,
-        expected.identity,
-        traits.warm_up_s,
-        traits.cool_down_s,
-        expected.reported,
-    )
+    own = {"wait": wait, "break_part": break_part, "repair": repair}
+    identity, told = EXPECTED[name].identity, EXPECTED[name].reported
+    return replace(Bench.of(projector, device), **own, identity=identity, told=told)
 
 
 class TestOverMemory(ProjectorContract):
-    @pytest.fixture(params=NAMES)
+    @pytest.fixture(params=[(name, whole) for name in NAMES for whole in (True, False)], ids=str)
     def bench(self, request: pytest.FixtureRequest) -> Bench:
-        name: str = request.param
+        name, whole = request.param
         device = SimulatedProjector(SimulatedClock())
         peer = PEERS[name](device)
-        projector = LANGUAGES[name].projector(lambda: SerialPeerLink(peer), clock=device.clock)
-        return bench_of(name, device, projector, lambda: None)
-
-
-class TestByteByByte(ProjectorContract):
-    @pytest.fixture(params=NAMES)
-    def bench(self, request: pytest.FixtureRequest) -> Bench:
-        name: str = request.param
-        device = SimulatedProjector(SimulatedClock())
-        peer = PEERS[name](device)
-        projector = LANGUAGES[name].projector(lambda: Dribbling(SerialPeerLink(peer)), clock=device.clock)
-        return bench_of(name, device, projector, lambda: None)
+        cable = (lambda: SerialPeerLink(peer)) if whole else (lambda: Dribbling(SerialPeerLink(peer)))
+        return bench_of(name, device, LANGUAGES[name].projector(cable, clock=device.clock), lambda: None)
 
 
 class TestOverTheNetwork(ProjectorContract):
@@ -616,14 +598,11 @@ def test_nec_names_itself() -> None:
     assert script.ended()
 
 
-def test_nec_error_bits() -> None:
+def test_nec_bits_of_the_manual_s_table() -> None:
+    """Error status, 009: of each bit of the first four bytes the part, in capitals where it is a fault."""
     # Fan (bit 4 of the first byte) and dust (bit 2 of the fourth).
     projector, _ = nec_script(("00 88 00 00 00 88", "20 88 01 40 0C 10 00 00 04" + " 00" * 8 + "09"))
     assert set(projector.faults()) == {Fault("fan", Severity.ERROR), Fault("temperature", Severity.WARNING)}
-
-
-def test_nec_bits_of_the_manual_s_table() -> None:
-    """Error status, 009: of each bit of the first four bytes the part, in capitals where it is a fault."""
     manual = (
         {0: "COVER", 1: "TEMPERATURE", 4: "FAN", 6: "LAMP", 7: "lamp"},
         {0: "lamp", 2: "LAMP"},
