@@ -773,8 +773,6 @@ class EosState:
                     self.busy = status == CameraStatus.BUSY
                 case Notice(EosEvent.WILL_SOON_SHUT_DOWN):
                     self.shutting_down = True
-                case _:
-                    pass
 
     def number(self, code: int) -> int | None:
         """Return the value of a property that is a number, None where it was not reported."""

@@ -471,18 +471,9 @@ def _translated(error: gphoto2.GPhoto2Error, label: str) -> DeviceError:
 
 
 def _text(camera: gphoto2.Camera, names: Iterable[str]) -> str:
-    """Return the value of the first of some widgets that the body has, empty where it has none."""
-    gp = library()
-    for name in names:
-        try:
-            value = camera.get_single_config(name).get_value()
-        except gp.GPhoto2Error as error:
-            if error.code != gp.GP_ERROR_BAD_PARAMETERS:
-                raise
-            continue
-        if value:
-            return str(value)
-    return ""
+    """Return the value of the first of some settings that the body has, empty where it has none."""
+    found = (_setting(camera, name) for name in names)
+    return next((setting.value for setting in found if setting is not None and setting.value), "")
 
 
 def _setting(camera: gphoto2.Camera, name: str) -> BodySetting | None:

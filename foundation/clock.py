@@ -17,15 +17,12 @@ class Clock(Protocol):
 
     def now(self) -> datetime:
         """Return the wall-clock time, timezone-aware, UTC."""
-        ...
 
     def monotonic(self) -> float:
         """Return seconds since an arbitrary origin; never goes back."""
-        ...
 
     def sleep(self, seconds: float) -> None:
         """Let `seconds` (≥ 0) pass."""
-        ...
 
 
 class SystemClock:

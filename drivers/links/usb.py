@@ -54,52 +54,41 @@ class UsbPipes(Protocol):
     @property
     def label(self) -> str:
         """What messages call the device."""
-        ...
 
     @property
     def packet_size(self) -> int:
         """Bytes of a full packet on the bulk pipes (wMaxPacketSize)."""
-        ...
 
     @property
     def polling_s(self) -> float:
         """Seconds between two looks of the bus at the interrupt pipe; who waits less may never see anything."""
-        ...
 
     def bulk_write(self, data: bytes, timeout: float) -> None:
         """Send all of `data`; none is a zero-length packet."""
-        ...
 
     def bulk_read(self, limit: int, timeout: float) -> bytes:
         """Return what one transfer brings, up to `limit` bytes; b"" for a zero-length packet.
 
         A transfer ends with a packet that is not full, or with `limit`, which must be a multiple of `packet_size`.
         """
-        ...
 
     def interrupt_read(self, timeout: float) -> bytes:
         """Return the next packet of the interrupt pipe; b"" where none comes in time, as most often."""
-        ...
 
     def control_out(self, request: int, data: bytes, timeout: float) -> None:
         """Send a request of the interface's class on the control pipe."""
-        ...
 
     def control_in(self, request: int, limit: int, timeout: float) -> bytes:
         """Return the answer to a request of the interface's class, up to `limit` bytes."""
-        ...
 
     def clear_halt(self, pipe: Pipe) -> None:
         """Let a stalled pipe transfer again."""
-        ...
 
     def reset_port(self) -> None:
         """Have the bus reset the device, as if it had been unplugged and plugged in again."""
-        ...
 
     def close(self) -> None:
         """Release the interface; a second call does nothing."""
-        ...
 
 
 UDEV_RULE = "70-crop-cameras.rules"

@@ -562,8 +562,6 @@ class IpTransport(CableTransport):
                         self._events.append(event)
                     case Ping():
                         self._event.send(Pong(), _PING_EVERY_S)
-                    case _:
-                        pass
 
     def _connect(self, *passing: type[Exception]) -> tuple[Channel, Channel, str]:
         # A device needs a moment to see that a connection is gone, ours or that of the command that ran before; until

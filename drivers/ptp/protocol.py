@@ -577,7 +577,6 @@ class Transport(Protocol):
     @property
     def label(self) -> str:
         """What messages call the device: address and name as far as known."""
-        ...
 
     def transact(
         self,
@@ -593,19 +592,15 @@ class Transport(Protocol):
         the device piece by piece; None collects up to `MAX_COLLECTED` bytes. `timeout`: longest wait for each answer of
         the device, seconds.
         """
-        ...
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come since the last call; never waits."""
-        ...
 
     def reset(self) -> None:
         """Bring cable and device back to where a session can be opened; costs a session that is open."""
-        ...
 
     def close(self) -> None:
         """Release the device; a second call does nothing."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -625,23 +620,18 @@ class Responder(Protocol):
 
     def takes_data(self, request: PtpRequest) -> bool:
         """Return whether the initiator sends a data phase with this operation."""
-        ...
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Carry out a request; `data` is the initiator's data phase."""
-        ...
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come up since the last call."""
-        ...
 
     def cancelled(self, transaction: int) -> None:
         """Note that the initiator gave up a transaction."""
-        ...
 
     def unplugged(self) -> None:
         """Note that the cable was pulled or reset: the session is over."""
-        ...
 
 
 class Reception:
@@ -713,17 +703,12 @@ class Reception:
         )
 
 
-class CableTransport(ABC):
+class CableTransport(Transport, ABC):
     """A `Transport` over a real cable: one transaction after the other, and none where one was left unfinished."""
 
     def __init__(self) -> None:
         self.closed = False
         self.between_transactions = True
-
-    @property
-    @abstractmethod
-    def label(self) -> str:
-        """What messages call the device: address and name as far as known."""
 
     @abstractmethod
     def exchange(self, reception: Reception, send: bytes | None, timeout: float) -> Transaction:

@@ -276,7 +276,9 @@ def read_cr3(data: bytes | memoryview) -> Cr3:
             if part.kind == b"uuid" and bytes(data[part.start : part.start + _UUID_LENGTH]) == _CANON:
                 for entry in _boxes(data, part.start + _UUID_LENGTH, part.end, left):
                     if entry.kind == b"CMT1":
-                        maker, model = _camera(data[entry.start : entry.end])
+                        known = _directories(data[entry.start : entry.end])
+                        named = ((one.text(TiffTag.MAKE), one.text(TiffTag.MODEL)) for one in known)
+                        maker, model = next((names for names in named if names[1]), ("", ""))
                     elif entry.kind == b"CMT2":
                         exif = _directories(data[entry.start : entry.end])
             elif part.kind == b"trak":
@@ -314,14 +316,6 @@ def _boxes(data: bytes | memoryview, start: int, end: int, left: list[int], *, w
         start += size
     if whole and start != end:
         raise RawDamaged(f"{end - start} bytes follow its last part, too few for another")
-
-
-def _camera(content: bytes | memoryview) -> tuple[str, str]:
-    """Return maker and model of the TIFF in a box CMT1."""
-    for directory in _directories(content):
-        if directory.text(TiffTag.MODEL):
-            return directory.text(TiffTag.MAKE), directory.text(TiffTag.MODEL)
-    return "", ""
 
 
 def _directories(content: bytes | memoryview) -> tuple[Directory, ...]:

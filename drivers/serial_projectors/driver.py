@@ -89,23 +89,19 @@ class SerialProjector(Projector, ABC):
 
     def switch_on(self) -> None:
         """Begin to switch on; refused while it cools down."""
-        match self.power():
-            case Power.STANDBY:
-                self.switch(True)
-            case Power.COOLING:
-                raise DeviceRefused(f"{self.label} is cooling down; wait until it is in standby and try again")
-            case Power.ON | Power.WARMING:
-                pass
+        power = self.power()
+        if power is Power.COOLING:
+            raise DeviceRefused(f"{self.label} is cooling down; wait until it is in standby and try again")
+        if power is Power.STANDBY:
+            self.switch(True)
 
     def switch_off(self) -> None:
         """Begin to switch off; refused while it warms up."""
-        match self.power():
-            case Power.ON:
-                self.switch(False)
-            case Power.WARMING:
-                raise DeviceRefused(f"{self.label} is warming up; wait until it is on and try again")
-            case Power.STANDBY | Power.COOLING:
-                pass
+        power = self.power()
+        if power is Power.WARMING:
+            raise DeviceRefused(f"{self.label} is warming up; wait until it is on and try again")
+        if power is Power.ON:
+            self.switch(False)
 
     def lamps(self) -> tuple[Lamp, ...]:
         """Return every lamp; empty for a lampless projector, and for one that does not count hours."""
