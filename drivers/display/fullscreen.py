@@ -2,8 +2,8 @@
 
 The picture fills one whole display in the mode that the desktop set. `show` returns when the drawn frame and what the
 display's server shows are exactly the colour, in every pixel: on X, the screen is read over another connection, as a
-screenshot program does; on Windows and macOS, the front buffer. A display that was away for a while is filled again by
-the next `show`, if it comes back in the mode that it had; one that the window of another process fills is not filled.
+screenshot program does; on macOS, the front buffer. A display that was away for a while is filled again by the next
+`show`, if it comes back in the mode that it had; one that the window of another process fills is not filled.
 
 Rules that hold inside:
 
@@ -192,7 +192,7 @@ class OpenGl:
     """The functions of the current context."""
 
     def __init__(self, glfw: ModuleType) -> None:
-        kind: Callable[..., Any] = ctypes.WINFUNCTYPE if sys.platform == "win32" else ctypes.CFUNCTYPE
+        kind: Callable[..., Any] = ctypes.CFUNCTYPE
         number, enum, real = ctypes.c_int, ctypes.c_uint, ctypes.c_float
 
         def function(name: str, *arguments: type) -> Callable[..., None]:
@@ -276,8 +276,8 @@ class FullScreen:
     def verify(self, colour: Colour) -> None:
         """Return if every pixel of the screen is exactly `colour` now, read once; see `drivers.presenter.ReadsBack`.
 
-        On X what the server shows is read, whoever drew it, and a window in front is named. On Windows and macOS it is
-        the window's own front buffer, which knows nothing of a window in front.
+        On X what the server shows is read, whoever drew it, and a window in front is named. On macOS it is the window's
+        own front buffer, which knows nothing of a window in front.
         """
         self._require_usable()
         self._require_server()

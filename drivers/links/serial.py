@@ -25,7 +25,7 @@ class SerialLink:
 
     @classmethod
     def open(cls, device: str, baud: int) -> SerialLink:
-        """Open the port `device`, such as ``/dev/ttyUSB0`` or ``COM3``, at `baud` bits per second."""
+        """Open the port `device`, such as ``/dev/ttyUSB0``, at `baud` bits per second."""
         try:
             port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
         except (ValueError, OverflowError) as error:
@@ -81,21 +81,19 @@ class SerialLink:
 
 
 def _unopened(error: OSError, device: str) -> LinkError | DeviceRefused:
-    # On Windows pyserial hides the number of the system's error and gives its name only.
-    reason = str(error)
-    if error.errno in (errno.EACCES, errno.EPERM) or "PermissionError" in reason:
+    if error.errno in (errno.EACCES, errno.EPERM):
         return DeviceRefused(
             f"{device} may not be opened by this user, or another program has it; on Linux run "
             f"sudo usermod -aG dialout $USER (on Arch: uucp) and log in again"
         )
     if error.errno in (errno.EBUSY, errno.EAGAIN):
         return DeviceRefused(f"{device} is in use by another program; close it and try again")
-    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in reason:
+    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         found = ", ".join(sorted(port.device for port in list_ports.comports())) or "none at all"
         return LinkClosed(
             f"there is no serial port {device}; found: {found}: plug the adapter in, or name one of these"
         )
-    return LinkClosed(f"{device} cannot be opened: {reason}; check that it is a serial port")
+    return LinkClosed(f"{device} cannot be opened: {error}; check that it is a serial port")
 
 
 def list_serial_ports() -> tuple[str, ...]:

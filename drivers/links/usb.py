@@ -189,10 +189,6 @@ class _ClaimedDevice:
                 case _:
                     fault = LinkClosed(f"{label} is gone ({reason}); check cable and power, and open it again")
             raise fault from error
-        except NotImplementedError as error:
-            raise DeviceRefused(
-                f"{label} cannot be used with the driver that the system has for it; on Windows install WinUSB for it"
-            ) from error
 
 
 @dataclass(frozen=True)

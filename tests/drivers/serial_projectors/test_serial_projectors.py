@@ -6,7 +6,6 @@ marked "not confirmed" follows other drivers, as the driver's docstring says.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,7 +42,6 @@ from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Ga
 
 ROOT = Path(__file__).parents[3]
 NAMES = sorted(LANGUAGES)
-on_posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 
 OPTOMA_STATE = bytes.fromhex("7E 30 30 31 32 34 20 31 0D")
 RUNNING = "00 85 00 00 01 01 87"
@@ -144,7 +142,6 @@ class TestOverTheNetwork(ProjectorContract):
         return bench_of("epson", device, projector, lambda: None)
 
 
-@on_posix
 @pytest.mark.slow
 class TestOverAPseudoTerminal(ProjectorContract):
     @pytest.fixture(params=NAMES)
@@ -836,7 +833,6 @@ def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
     assert projector.power() is Power.ON
 
 
-@on_posix
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cable_pulled_out_is_told(name: str) -> None:
     from drivers.links.serial import SerialLink
