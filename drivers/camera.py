@@ -65,7 +65,6 @@ class Camera(Protocol):
 
     def identity(self) -> CameraIdentity:
         """Return maker, model, serial number and firmware."""
-        ...
 
     def configure(self, settings: ExposureSettings) -> None:
         """Set and verify the exposure, raw format and manual mode.
@@ -75,7 +74,6 @@ class Camera(Protocol):
         DeviceRefused
             The body does not offer a value; the message lists what it offers.
         """
-        ...
 
     def shutter_speeds(self) -> tuple[float, ...]:
         """Return the shutter times that the body offers now, as engraved, seconds, rising; empty if it lists none.
@@ -85,7 +83,6 @@ class Camera(Protocol):
         DeviceError
             It cannot be reached.
         """
-        ...
 
     def expose(self) -> datetime:
         """Release the shutter without autofocus; return when it was released, UTC, once the light may change.
@@ -99,7 +96,6 @@ class Camera(Protocol):
         DeviceError
             No frame was taken, or none can be found; it may be exposed again.
         """
-        ...
 
     def download(self, into: BinaryIO) -> CapturedFrame:
         """Write the raw file of the frame exposed last, whole and unchanged, to `into`.
@@ -112,11 +108,9 @@ class Camera(Protocol):
             The frame did not arrive, and what `into` holds is worthless; or the body holds no frame, or no longer, and
             the message says so: then it must be exposed again.
         """
-        ...
 
     def close(self) -> None:
         """Give the camera back to its user; a second call does nothing."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -153,7 +147,6 @@ class ReportsSupplies(Protocol):
         DeviceError
             It cannot be reached.
         """
-        ...
 
 
 @runtime_checkable
@@ -162,7 +155,6 @@ class NeedsKeepAlive(Protocol):
 
     def idle(self) -> None:
         """Keep the camera awake and empty its queue of events; call it every few seconds of a pause."""
-        ...
 
 
 def capture(camera: Camera, into: BinaryIO) -> CapturedFrame:

@@ -3,42 +3,29 @@
 First what these bodies say beyond the standard, as values: events, lists, codes of shutter, aperture and ISO. GetEvent
 answers a chain of records: size (32 bits, these included), type (32), body; a record of size 8 and type 0 ends it,
 which some bodies leave out. The first answer after SetEventMode holds the camera's whole state, later ones what has
-changed since. Then a body's state, its connection, and the camera.
+changed since. Properties travel as bytes: 32 bits for every number, text with a closing NUL, structures for a few.
+``decode`` and ``encode`` undo each other on well-formed bytes; a record whose type or form is not known stays as it
+came, in `OtherRecord`, and one that contradicts itself raises `ProtocolError`.
 
-Rules that hold inside, of values:
+Then a body's state and its connection (`EosBody`):
 
-- ``decode`` and ``encode`` undo each other on well-formed bytes. A record whose type or inner form is not known stays
-  as it came, in `OtherRecord`, and is skipped by its size; a record that contradicts itself raises `ProtocolError`.
-- Counts and sizes are checked before they are believed; more than `MAX_EVENTS` bytes are refused unread, and more than
-  `MAX_RECORDS` records once so many have been read.
-- Properties travel as bytes: 32 bits for every number, text with a closing NUL, structures for a few. No value here
-  knows which property it is of, except for the image formats, whose lists cannot be cut without it.
-
-Of one connection (`EosBody`):
-
-- Every step is one that the recorded conversations have, or one that libgphoto2 takes; an operation that the body does
-  not list is never sent. One that it lists and does not know all the same (0x2005) is not sent again, and done without
-  where that is possible: serial number, room on the host, staying awake, the other ways to release and to fetch.
-- GetEvent is asked until it has nothing more, but never without end: some firmware repeats itself. `EosState` takes its
-  records in their order and holds nothing that was not reported, and no more of it than `MAX_PROPERTIES` values of
-  `MAX_VALUE` bytes and as many lists, which no real body comes near.
-- What a body does not report is no problem: properties come and go between bodies, and only what is known to spoil a
-  series is named. Nothing is taken for settable that the body does not list.
+- Every step is one that the recorded conversations have, or one that libgphoto2 takes. Nothing is sent or taken for
+  settable that the body does not list, and what it lists and does not know all the same is done without where it can
+  be.
+- What a body claims costs little: counts and sizes are checked before they are believed, and what it reports is
+  held up to limits that no real body comes near.
 - A body keeps a frame in its memory until TransferComplete, and refuses the next when that memory is full. So every
   object that it announces is fetched or thrown away, and freed in either case.
-- Sizes and counts that a body reports are checked against what arrives.
-- A fault of cable or protocol ends the session, and goes to `CanonEos`, which begins a new one.
 
-Of the camera (`CanonEos`):
+And the camera (`CanonEos`):
 
-- A connection that fails is renewed, a limited number of times and for a limited time in one call (`CanonLimits`):
-  reset, closed, opened again wherever the body is now, and given the settings again. Then the call fails, with its
-  first cause: longer patience is the caller's, who can say what is awaited.
+- A connection that fails is renewed, a limited number of times and for a limited time in one call. Then the call fails,
+  with its first cause: longer patience is the caller's, who can say what is awaited.
 - A release is never repeated once it may have happened: after a fault the frame is looked for in the camera's memory,
-  and what is not found there is an error. So no frame is ever taken for another one's.
-- What waits in the memory before a release belongs to nobody any more, and is thrown away.
+  and what is not found there is an error. What waits there before a release belongs to nobody any more. So no frame is
+  ever taken for another one's.
 - The exposed frame stays in the memory until it has been downloaded whole, or the next is exposed: a cable that fails
-  and a file that cannot be written cost a download, not a frame. Once downloaded, the memory is emptied.
+  and a file that cannot be written cost a download, not a frame.
 
 Source: no public standard; layouts and conversations as recorded from an EOS 60D and an EOS 400D with a host;
 libgphoto2 2.5.34 for how these are read, and for the order of a release; the number of mirror lockup among the custom
@@ -87,7 +74,7 @@ from drivers.ptp.protocol import (
     encode_array,
     encode_integer,
 )
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 _RAW: Final = 6
@@ -786,8 +773,6 @@ class EosState:
                     self.busy = status == CameraStatus.BUSY
                 case Notice(EosEvent.WILL_SOON_SHUT_DOWN):
                     self.shutting_down = True
-                case _:
-                    pass
 
     def number(self, code: int) -> int | None:
         """Return the value of a property that is a number, None where it was not reported."""
@@ -1363,10 +1348,17 @@ class EosBody:
         return operation in self._info.operations and operation not in self._unsupported
 
 
+RECOVERIES = 3
+"""How often a call renews the connection: a fault that comes back more often lasts. Chosen, as the next two."""
+RECOVERY_S = 30.0
+"""Time after the first fault of a call in which the connection may be renewed; a body that was switched off and on, or
+put back on its cable, is there within 10 s."""
+FRAME_S = 30.0
+"""Time after its exposure within which a frame may be announced, beside as much time again as it was exposed: so long a
+dark frame takes that some bodies subtract."""
 REDISCOVERY_S = 10.0
 """Time for a frame to be announced on a new connection, on which the body sends its whole state at once."""
 
-_SYSTEM_CLOCK = SystemClock()
 _CERTAIN_SHARE = 0.9
 """Share of the nominal shutter time that passes at least: 1/6 s is really 0.149 s."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 5.0
@@ -1391,25 +1383,6 @@ _REMEDY = (
 _Result = TypeVar("_Result")
 
 
-@dataclass(frozen=True)
-class CanonLimits:
-    """How long one call to a body may go on against trouble before it fails; chosen, not measured.
-
-    - `recoveries`: how often a call renews the connection: a fault that comes back more often lasts.
-    - `recovery_s`: seconds after the first fault of a call in which the connection may be renewed; a body that was
-      switched off and on, or put back on its cable, is there within 10 s.
-    - `frame_s`: seconds after its exposure within which a frame may be announced, beside as much time again as it was
-      exposed: so long a dark frame takes that some bodies subtract.
-    """
-
-    recoveries: int = 3
-    recovery_s: float = 30.0
-    frame_s: float = 30.0
-
-
-_LIMITS = CanonLimits()
-
-
 @dataclass
 class _Shot:
     """A release that has happened, or may have.
@@ -1431,12 +1404,9 @@ class _Shot:
 class CanonEos:
     """A `drivers.camera.Camera` over PTP, whatever the cable."""
 
-    def __init__(
-        self, open_transport: Callable[[], Transport], clock: Clock = _SYSTEM_CLOCK, limits: CanonLimits = _LIMITS
-    ) -> None:
+    def __init__(self, open_transport: Callable[[], Transport], clock: Clock = SYSTEM_CLOCK) -> None:
         self._open_transport = open_transport
         self._clock = clock
-        self._limits = limits
         self._fault: DeviceError | None = None
         self._renewable_until = math.inf
         self._transport: Transport | None = None
@@ -1550,7 +1520,7 @@ class CanonEos:
                 # A body that is busy in every session is kept so by its own settings, not by a fault.
                 busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
                 late = self._clock.monotonic() >= self._renewable_until
-                if renewals == self._limits.recoveries or late or (busy and was_busy):
+                if renewals == RECOVERIES or late or (busy and was_busy):
                     kind = DeviceRefused if busy else DeviceError
                     times = "once" if renewals == 1 else f"{renewals} times"
                     raise kind(self._given_up(error, f"the connection was renewed {times} without success")) from error
@@ -1564,7 +1534,7 @@ class CanonEos:
         """
         if self._fault is None:
             self._fault = fault
-            self._renewable_until = self._clock.monotonic() + self._limits.recovery_s
+            self._renewable_until = self._clock.monotonic() + RECOVERY_S
         self._drop(fault)
 
     def _given_up(self, last: DeviceError, tried: str) -> str:
@@ -1580,7 +1550,7 @@ class CanonEos:
             _apply(body, settings)  # sends nothing unless a dial was turned
             now = self._clock.monotonic()
             exposed = now + _CERTAIN_SHARE * settings.shutter_s
-            until = now + 2 * settings.shutter_s + self._limits.frame_s
+            until = now + 2 * settings.shutter_s + FRAME_S
             shot = _Shot(body, self._clock.now(), exposed, until, settings.shutter_s, absent=set(body.state.waiting))
             try:
                 body.release()
@@ -1648,7 +1618,7 @@ class CanonEos:
             return self._body
         first = self._identity is None
         begun = self._clock.monotonic()
-        end = min(self._renewable_until, begun + self._limits.recovery_s)
+        end = min(self._renewable_until, begun + RECOVERY_S)
         pause = _FIRST_PAUSE_S
         while True:
             try:

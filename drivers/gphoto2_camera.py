@@ -1,17 +1,12 @@
 """Any tethered camera that libgphoto2 supports, as a `Camera`: for makers that have no driver of their own here.
 
-Rules that hold inside:
+python-gphoto2 is an optional extra and is imported only when a camera is opened. After a fault the connection is
+dropped, and the next call opens a new one; a frame that was being transferred is lost and may be retaken.
 
-- python-gphoto2 is an optional extra and is imported only when a camera is opened.
-- libgphoto2's errors become ours in `_speaking`. After a fault the connection is dropped, and the next call opens a
-  new one; a frame that was being transferred is lost and may be retaken.
-- libgphoto2 names one thing differently for each maker, and one maker's bodies differ: the first of some names that a
-  body has is used. Labels are those of libgphoto2's own tables, untranslated; a setting is read back.
-- Nothing is taken for settable that the body does not show. A raw format that cannot be asked for is refused, and so
-  is what is known to spoil a series; what a body does not show at all is no problem.
-- A file that is no raw file is refused, whatever the body was asked for.
-
-libgphoto2 may focus before it releases, so that a body that does not focus by hand is refused.
+libgphoto2 names one thing differently for each maker, and one maker's bodies differ: the first of some names that a
+body has is used. Labels are those of libgphoto2's own tables, untranslated; a setting is read back. A raw format that
+cannot be asked for is refused, and so is what is known to spoil a series; what a body does not show at all is no
+problem. libgphoto2 may focus before it releases, so that a body that does not focus by hand is refused.
 
 Source: libgphoto2 2.5.34, camlibs/ptp2/config.c (names and labels), camlibs/ptp2/cameras (what bodies of each maker
 show).
@@ -27,7 +22,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, BinaryIO
 
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import RUN_AGAIN, ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
 
 if TYPE_CHECKING:
@@ -244,7 +239,6 @@ BUSY_PAUSE_S = 1.0
 _LOOK_AGAIN_S = 0.1
 """Between two looks at a value that is to settle; each costs an exchange with the body."""
 
-_SYSTEM_CLOCK = SystemClock()
 _IDENTITY = {
     "maker": ("manufacturer",),
     "model": ("cameramodel",),
@@ -260,7 +254,7 @@ class Gphoto2Camera:
     `model`: libgphoto2's name of the model; None lets it find out, which works on USB. ``PTP/IP Camera`` on a network.
     """
 
-    def __init__(self, port: str | None = None, model: str | None = None, clock: Clock = _SYSTEM_CLOCK) -> None:
+    def __init__(self, port: str | None = None, model: str | None = None, clock: Clock = SYSTEM_CLOCK) -> None:
         self._port = port
         self._model = model
         self._clock = clock
@@ -477,18 +471,9 @@ def _translated(error: gphoto2.GPhoto2Error, label: str) -> DeviceError:
 
 
 def _text(camera: gphoto2.Camera, names: Iterable[str]) -> str:
-    """Return the value of the first of some widgets that the body has, empty where it has none."""
-    gp = library()
-    for name in names:
-        try:
-            value = camera.get_single_config(name).get_value()
-        except gp.GPhoto2Error as error:
-            if error.code != gp.GP_ERROR_BAD_PARAMETERS:
-                raise
-            continue
-        if value:
-            return str(value)
-    return ""
+    """Return the value of the first of some settings that the body has, empty where it has none."""
+    found = (_setting(camera, name) for name in names)
+    return next((setting.value for setting in found if setting is not None and setting.value), "")
 
 
 def _setting(camera: gphoto2.Camera, name: str) -> BodySetting | None:

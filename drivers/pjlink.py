@@ -1,21 +1,14 @@
 """PJLink, the projector industry's control protocol over TCP: its bytes, a projector with it, and the search for them.
 
-Rules that hold inside, of the bytes:
-
-- A line is at most 136 bytes with its CR: ``%``, class digit, four letters, a space or ``=``, up to 128 bytes of
-  parameter. Whoever sends more gets `ProtocolError`, never memory.
-- What we send follows the standard to the letter; what we accept is wider: any case, LF after or instead of CR, empty
-  lines, NUL between lines (some projectors fill their packets up with it).
-- Bytes that do not fit raise `ProtocolError`, which quotes them. A datagram, which arrives unasked and from anybody, is
-  no error: one that holds nothing of ours is an empty answer.
+What we send follows the standard to the letter; what we accept is wider: any case, LF after or instead of CR, empty
+lines, NUL between lines (some projectors fill their packets up with it). A datagram, which arrives unasked and from
+anybody, is no error: one that holds nothing of ours is an empty answer.
 
 Of the projector:
 
-- One connection at a time, opened when first needed: many projectors serve one controller only.
-- Projectors hang up on an idle connection after about 30 s. A command that meets a connection so lost is sent once
-  more over a new one; every command here may be repeated without harm.
+- One connection at a time, opened when first needed: many projectors serve one controller only. They hang up on an idle
+  one after about 30 s; a command that meets a connection so lost is sent once more, and may be without harm.
 - After a fault of cable or protocol the connection is dropped, so that a late answer never meets a later question.
-- Class 2 is used only where the projector reports that it has it: others may never answer.
 - Projectors in the field do not know all of their class. What a question cannot be asked for (`ERR1`, `ERR2`) is None,
   or empty, and not asked again; `ERR3` means that it may be asked later. Only commands are refused.
 
@@ -36,12 +29,12 @@ import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from drivers.links.link import Exchange, Link, quoted
-from drivers.links.network import BROADCAST, Address, UdpSocket
+from drivers.links.network import BROADCAST, UdpSocket
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceFault, DeviceRefused, LinkError, LinkTimeout, ProtocolError
 
 PORT = 4352
@@ -396,7 +389,6 @@ _PTPIP_QUESTION = struct.pack("<II16s10sI", 38, 1, b"", "CroP".encode("utf-16-le
 _PTPIP_ANSWERS = tuple(struct.pack("<I", kind) for kind in (2, 5))
 """Types of packets, behind their length: InitCommandAck and InitFail (same place)."""
 
-_SYSTEM_CLOCK = SystemClock()
 
 _Answer = TypeVar("_Answer")
 
@@ -416,7 +408,7 @@ class PjLinkProjector:
         password: str | None = None,
         timeout: float = DEFAULT_TIMEOUT_S,
         label: str = "the projector",
-        clock: Clock = _SYSTEM_CLOCK,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._class: int | None = None
         self._password = password
@@ -641,23 +633,6 @@ ASKED = 3
 ASK_EVERY_S = 1.0
 """Far enough apart that one disturbance of the network does not swallow two."""
 
-
-class Datagrams(Protocol):
-    """The part of `drivers.links.network.UdpSocket` that is used here."""
-
-    def send(self, data: bytes, address: Address) -> None:
-        """Send one datagram to host and port."""
-        ...
-
-    def receive(self, timeout: float) -> tuple[bytes, Address]:
-        """Return the next datagram and who sent it; `LinkTimeout` when none comes in time."""
-        ...
-
-    def close(self) -> None:
-        """Stop listening."""
-        ...
-
-
 _MAC = re.compile("[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")
 
 
@@ -675,16 +650,15 @@ def search(
     address: str = BROADCAST,
     port: int = PORT,
     listen_port: int = PORT,
-    open_socket: Callable[[int], Datagrams] = UdpSocket,
-    clock: Clock = _SYSTEM_CLOCK,
+    open_socket: Callable[[int], UdpSocket] = UdpSocket,
+    clock: Clock = SYSTEM_CLOCK,
 ) -> tuple[FoundProjector, ...]:
     """Ask all projectors of the network to answer, and return those that do, in the order of their answers.
 
     `enough`: return as soon as so many have answered; None waits the whole time. `clock`: measures `seconds`.
     """
     found: dict[FoundProjector, None] = {}
-    datagrams = open_socket(listen_port)
-    try:
+    with open_socket(listen_port) as datagrams:
         start = clock.monotonic()
         asked = 0
         while enough is None or len(found) < enough:
@@ -702,6 +676,4 @@ def search(
             for reply in replies_in(datagram):
                 if reply.command == "ACKN" and _MAC.fullmatch(reply.value):
                     found[FoundProjector(host, reply.value.lower())] = None
-    finally:
-        datagrams.close()
     return tuple(found)

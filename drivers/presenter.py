@@ -28,11 +28,9 @@ class Presenter(Protocol):
         DeviceError
             The colour is not, or not exactly, on the screen.
         """
-        ...
 
     def close(self) -> None:
         """Leave the screen black and release it; a second call does nothing."""
-        ...
 
 
 @runtime_checkable
@@ -47,7 +45,6 @@ class ReadsBack(Protocol):
         DeviceError
             It does not, or cannot be read; with what covers it where that is known.
         """
-        ...
 
 
 @runtime_checkable
@@ -56,4 +53,3 @@ class ReportsWarnings(Protocol):
 
     def warnings(self) -> tuple[str, ...]:
         """Return a sentence with its remedy for each such cause, a gamma ramp for one; empty when there is none."""
-        ...

@@ -57,39 +57,30 @@ class Projector(Protocol):
 
     def identity(self) -> ProjectorIdentity:
         """Return maker, model and name."""
-        ...
 
     def power(self) -> Power:
         """Return the power state now."""
-        ...
 
     def switch_on(self) -> None:
         """Begin to switch on; returns at once, `power` shows when it is done."""
-        ...
 
     def switch_off(self) -> None:
         """Begin to switch off; returns at once, `power` shows when it is done."""
-        ...
 
     def muted(self) -> bool | None:
         """Return whether the picture is blanked by mute; None where the projector is on and cannot tell."""
-        ...
 
     def set_muted(self, muted: bool) -> None:
         """Blank the picture, or show it."""
-        ...
 
     def faults(self) -> tuple[Fault, ...]:
         """Return every fault reported now; empty when healthy, and where the projector cannot tell."""
-        ...
 
     def lamps(self) -> tuple[Lamp, ...]:
         """Return every lamp; empty for a lampless projector, and for one that does not count hours."""
-        ...
 
     def close(self) -> None:
         """Release the control port; a second call does nothing. The power state stays."""
-        ...
 
 
 @runtime_checkable
@@ -98,4 +89,3 @@ class ReportsPictureFault(Protocol):
 
     def picture_fault(self) -> str | None:
         """Return why the picture does not follow the signal (frozen, no signal); None if it does, or is not known."""
-        ...

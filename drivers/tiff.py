@@ -1,12 +1,8 @@
 """TIFF files: their tags, their directories read, and the head of a new file laid out; never the pixels themselves.
 
-Rules that hold inside:
-
-- Pure functions of bytes and numbers: every byte sequence whatever ends in a result or in `TiffDamaged`, and the same
-  tags give the same head.
-- Only the tags in `_DECODED` are decoded, each of the types that it may have; maker notes and previews are not touched.
-  Makers' own magic numbers (Olympus, Panasonic) pass, since what follows is TIFF all the same.
-- A head has one picture in one uncompressed strip, little-endian; the pixels follow as they lie in memory.
+Every byte sequence whatever ends in a result or in `TiffDamaged`. Only the tags in `_DECODED` are decoded; maker notes
+and previews are not touched. Makers' own magic numbers (Olympus, Panasonic) pass, since what follows is TIFF all the
+same. A head has one picture in one uncompressed strip, little-endian; the pixels follow as they lie in memory.
 
 Sources: TIFF 6.0, sections 2, 8 and 15 and supplement 1 (SubIFDs); TIFF/EP (ISO 12234-2) for the colour filter array;
 Exif 2.32, section 4.6; DNG 1.7.1, chapters 2 and 4. Tags of Canon, Panasonic and Fujifilm, of which there is no public

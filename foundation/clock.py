@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
-from typing import Protocol
+from typing import Final, Protocol
 
 
 class Clock(Protocol):
@@ -17,15 +17,12 @@ class Clock(Protocol):
 
     def now(self) -> datetime:
         """Return the wall-clock time, timezone-aware, UTC."""
-        ...
 
     def monotonic(self) -> float:
         """Return seconds since an arbitrary origin; never goes back."""
-        ...
 
     def sleep(self, seconds: float) -> None:
         """Let `seconds` (≥ 0) pass."""
-        ...
 
 
 class SystemClock:
@@ -44,6 +41,10 @@ class SystemClock:
         time.sleep(seconds)
 
 
+SYSTEM_CLOCK: Final = SystemClock()
+"""The clock of whoever is given none."""
+
+
 def elapsed_s() -> float:
     """Return seconds since an arbitrary origin that nobody sets; those of a suspended machine count on Linux."""
     # time.monotonic() stands still there while the machine is suspended.
@@ -57,17 +58,8 @@ SET_S = 10.0
 class SteadyClock:
     """A clock whose date goes on as seconds pass, and never back, whatever the machine's clock is set to meanwhile.
 
-    White frames are interpolated in time: where the machine's clock is set back during a session, lights would lie
-    between the wrong ones.
-
-    Parameters
-    ----------
-    clock
-        Tells the date once, and measures and makes every pause.
-    not_before
-        The date at the start is this at least; timezone-aware. None: whatever `clock` says.
-    elapsed
-        Returns seconds since an arbitrary origin; never goes back.
+    White frames are interpolated in time: where that clock is set back during a session, lights would lie between the
+    wrong ones. `clock` tells the date once, which is `not_before` at least, and makes every pause.
     """
 
     def __init__(

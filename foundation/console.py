@@ -402,12 +402,23 @@ def _type_name(parameter: Any) -> str:
     return name.removesuffix(" range")
 
 
-class StyledCommand(TyperCommand):
-    """A command whose help is in the style of all."""
+class _Styled:
+    """What gives a command of typer's its help in the style of all."""
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
         _in_one_style(self)
+
+    def get_help_option(self, ctx: Any) -> Any:
+        """Return the option ``--help`` without a type."""
+        option = super().get_help_option(ctx)  # type: ignore[misc]
+        if option is not None:
+            option.metavar = ""
+        return option
+
+
+class StyledCommand(_Styled, TyperCommand):
+    """A command whose help is in the style of all."""
 
     def make_context(self, *arguments: Any, **named: Any) -> Any:
         """Return the context of parsed arguments; what is wrong with a value is said without a library's words."""
@@ -417,27 +428,9 @@ class StyledCommand(TyperCommand):
             error.message = error.message.removeprefix("Value error, ")
             raise
 
-    def get_help_option(self, ctx: Any) -> Any:
-        """Return the option ``--help`` without a type."""
-        return _untyped(super().get_help_option(ctx))
 
-
-class _StyledGroup(TyperGroup):
+class _StyledGroup(_Styled, TyperGroup):
     """A command with others below it, whose help is in the style of all."""
-
-    def __init__(self, *arguments: Any, **named: Any) -> None:
-        super().__init__(*arguments, **named)
-        _in_one_style(self)
-
-    def get_help_option(self, ctx: Any) -> Any:
-        """Return the option ``--help`` without a type."""
-        return _untyped(super().get_help_option(ctx))
-
-
-def _untyped(option: Any) -> Any:
-    if option is not None:
-        option.metavar = ""
-    return option
 
 
 class _StyledTyper(typer.Typer):

@@ -4,17 +4,15 @@ Every file that CroP writes under a final name goes through here, folders throug
 its place under a hidden name, flushed to the disk, then renamed. A crash leaves a hidden leftover, never a half file;
 nothing is ever overwritten that the caller did not mean to replace. What is hashed is hashed by SHA-256 (FIPS 180-4).
 
-A folder of others is copied from a stranger's disk or an archive, and any file of it may hold anything. Rules that
-every reader keeps by going through here:
+Any file of a folder that came from others may hold anything; all that is refused is a `FormatError` that names the
+file:
 
 - A name that stands in a file leads to a file inside the folder, or nowhere: no ``..``, no root, no link that leads
   out.
 - What is opened is a regular file: a device or a pipe never ends, and some do something when they are read.
 - What is read whole has a size that its reader has stated; what is read by lines has lines that end.
-- JSON is of a depth that a reader survives, and its texts can be written again.
 
-All that is refused is a `FormatError` that names the file. Folders are looked at once, when they are opened: who may
-change a folder while it is read may change what it says, too.
+Folders are looked at once, when they are opened: who may change one while it is read may change what it says, too.
 """
 
 from __future__ import annotations

@@ -34,18 +34,14 @@ from foundation.files import (
 
 
 def cache_folder() -> Path | None:
-    r"""Return the user's folder for what can be computed again, or None if there is no home.
+    """Return the user's folder for what can be computed again, or None if there is no home.
 
-    `$XDG_CACHE_HOME/croplab` or `~/.cache/croplab` (XDG Base Directory Specification 0.8), on macOS
-    `~/Library/Caches/croplab`, on Windows `%LOCALAPPDATA%\croplab\Cache`. A relative `XDG_CACHE_HOME` is ignored, as
-    that specification says.
+    `$XDG_CACHE_HOME/croplab` or `~/.cache/croplab` (XDG Base Directory Specification 0.8, which has a relative one
+    ignored), on macOS `~/Library/Caches/croplab`.
     """
     given = Path(os.environ.get("XDG_CACHE_HOME", ""))
     if given.is_absolute():
         return given / "croplab"
-    local = os.environ.get("LOCALAPPDATA")
-    if sys.platform == "win32" and local:
-        return Path(local) / "croplab" / "Cache"
     try:
         home = Path.home()
     except RuntimeError:

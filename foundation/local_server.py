@@ -1,14 +1,9 @@
 """A page's own server on this machine: a few addresses, answered to anybody whom `Access` lets look.
 
-It holds nothing open between two requests; any number of pages may look, and it may be ended at any time. A page's
-server is a subclass that answers requests (`LocalServer.answer`); all else is the same for each.
-
-Who may look, and at what, is decided from a request's text alone. A page on this machine's loopback needs no token: who
-is logged in here may read the files anyway. Names that another site has made to point here are still refused there (DNS
-rebinding, by which a web page could read what answers on loopback), and so is what another site's page sends: browsers
+A page on this machine's loopback needs no token: who is logged in here may read the files anyway. Names that another
+site has made to point here are still refused there (DNS rebinding), and so is what another site's page sends: browsers
 ask before a PUT, and say where the page is from. For other machines the address itself holds a token, as its first
-part, so that the page's relative addresses carry it on and nothing has to be typed; a QR code (ISO/IEC 18004) in the
-terminal gives it to a phone.
+part, so that the page's relative addresses carry it on; a QR code (ISO/IEC 18004) in the terminal gives it to a phone.
 
 Everybody can connect, with or without a token, so connections cost little and give way: a request's head must be there
 in `HEAD_S` from its first byte; and where there are as many connections as there may be, a new one takes the place of

@@ -52,7 +52,8 @@ def render(
     sheet. `connects`: whether the page asks the server that it came from.
     """
     script = Markup("".join(_text(package, name) for name in scripts))
-    style = Markup("".join([*map(_own_text, ("colours.css", "style.css")), *(_text(package, name) for name in styles)]))
+    sheets = (("foundation", "colours.css"), ("foundation", "style.css"), *((package, name) for name in styles))
+    style = Markup("".join(_text(*sheet) for sheet in sheets))
     # A page without a script may style its elements, as figures do: nothing in it can run.
     policy = (
         f"default-src 'none'; {f'script-src {_hash(script)}; ' if script else ''}"
@@ -156,10 +157,6 @@ def _piece(name: str, *values: Any) -> Markup:
 @cache
 def _text(package: str, name: str) -> str:
     return (resources.files(package) / "templates" / name).read_text(encoding="utf-8")
-
-
-def _own_text(name: str) -> str:
-    return _text("foundation", name)
 
 
 def _hash(text: str) -> str:

@@ -72,12 +72,9 @@ def to_json(record: Any, kind: Any = None) -> str:
 
 
 def from_plain(kind: type[T], value: Any, about: object, remedy: str) -> T:
-    """Return the record of a type, or a dataclass, from JSON's or TOML's objects.
+    """Return the record of a type, or a dataclass, from JSON or TOML objects; a FormatError says which key is wrong.
 
-    Raises
-    ------
-    FormatError
-        A key is missing or its value is none of its type; `about` is the file, `remedy` what helps.
+    `about`: the file; `remedy`: what helps.
     """
     try:
         return _adapter(kind).validate_python(value)

@@ -41,13 +41,7 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 
 
 def require_own_packages() -> None:
-    """Import each package, so that no file that is found later can hide it.
-
-    Raises
-    ------
-    InputError
-        Another file or folder was found by the name of one.
-    """
+    """Import each package, so that no file that is found later can hide it; an InputError names one that does."""
     for name in PACKAGES:
         module = import_module(name)
         found = module.__file__ or next(iter(getattr(module, "__path__", [])), "something without a file")

@@ -1,16 +1,14 @@
 """Plain colours on a display of the desktop: exact codes, read back from the screen before a frame is taken.
 
+The picture fills one whole display in the mode that the desktop set. `show` returns when the drawn frame and what the
+display's server shows are exactly the colour, in every pixel: on X, the screen is read over another connection, as a
+screenshot program does; on macOS, the front buffer. A display that was away for a while is filled again by the next
+`show`, if it comes back in the mode that it had; one that the window of another process fills is not filled.
+
 Rules that hold inside:
 
-- The picture fills one whole display in the mode that the desktop set: no scaling, no cursor, no frame.
-- `show` returns when the drawn frame and what the display's server shows are exactly the colour, in every pixel: on X,
-  the screen is read over another connection, as a screenshot program does; on Windows and macOS, the front buffer.
-  `verify` reads it again, as often as is asked.
-- A display that was away for a while is filled again by the next `show`, if it comes back in the mode that it had.
 - One thread owns the window: the one that opened it. OpenGL contexts and GLFW want it so.
 - The window belongs to this process: however that ends, killed included, the window goes with it.
-- A display that the window of another process fills is not filled: neither would show what it is told to. What is
-  asked without a window (`display_warnings`, `list_displays`) covers nothing.
 - GLFW and OpenGL are used here and nowhere else; GLFW runs while anything here is open.
 
 On Linux the window is an X window. Under Wayland that is XWayland, whose compositor may scale and tint behind our back:
@@ -38,7 +36,7 @@ import numpy.typing as npt
 
 from drivers.display.x11 import XScreen, is_dark, is_lost, outlive
 from drivers.presenter import BLACK, Colour
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import RUN_AGAIN, ConfigurationError, DeviceError
 from foundation.holds import hold
 
@@ -194,7 +192,7 @@ class OpenGl:
     """The functions of the current context."""
 
     def __init__(self, glfw: ModuleType) -> None:
-        kind: Callable[..., Any] = ctypes.WINFUNCTYPE if sys.platform == "win32" else ctypes.CFUNCTYPE
+        kind: Callable[..., Any] = ctypes.CFUNCTYPE
         number, enum, real = ctypes.c_int, ctypes.c_uint, ctypes.c_float
 
         def function(name: str, *arguments: type) -> Callable[..., None]:
@@ -234,8 +232,6 @@ _DIGITS: Final = (
 
 _LOOK: Final = "look for a window or notification in front, desktop scaling, or a colour filter"
 
-_SYSTEM_CLOCK = SystemClock()
-
 
 class FullScreen:
     """A `drivers.presenter.Presenter` on a display; black from the moment it opens.
@@ -243,7 +239,7 @@ class FullScreen:
     Use it from the thread that opened it. It takes no keys: it ends by `close`, or with the process.
     """
 
-    def __init__(self, display: str | int | None = None, clock: Clock = _SYSTEM_CLOCK) -> None:
+    def __init__(self, display: str | int | None = None, clock: Clock = SYSTEM_CLOCK) -> None:
         self._clock = clock
         self._thread = threading.get_ident()
         self._closing = contextlib.ExitStack()
@@ -280,8 +276,8 @@ class FullScreen:
     def verify(self, colour: Colour) -> None:
         """Return if every pixel of the screen is exactly `colour` now, read once; see `drivers.presenter.ReadsBack`.
 
-        On X what the server shows is read, whoever drew it, and a window in front is named. On Windows and macOS it is
-        the window's own front buffer, which knows nothing of a window in front.
+        On X what the server shows is read, whoever drew it, and a window in front is named. On macOS it is the window's
+        own front buffer, which knows nothing of a window in front.
         """
         self._require_usable()
         self._require_server()
@@ -594,7 +590,7 @@ def _is_noise(ramp: npt.NDArray[np.float64]) -> bool:
     return travel > 2 * float(np.ptp(ramp)) and travel > 0.1
 
 
-def identify_displays(seconds: float, clock: Clock = _SYSTEM_CLOCK) -> tuple[Display, ...]:
+def identify_displays(seconds: float, clock: Clock = SYSTEM_CLOCK) -> tuple[Display, ...]:
     """Show on every display its number for a while, and return them."""
     with contextlib.ExitStack() as opened:
         displays = list_displays()

@@ -1,13 +1,9 @@
 """Plain colours from a JVC D-ILA projector's own flat field, over its network port.
 
-Rules that hold inside:
-
-- The projector makes the colour itself, 0 … 255 a channel, so no desktop, cable or scaler can change it.
-- A command is ``!``, the unit, text and LF; the projector acknowledges with 06, the unit, the text's first two letters
-  and LF. `show` returns when the raster and all three levels have been acknowledged: the projector confirms commands,
-  not what it shows.
-- The projector greets with PJ_OK, wants PJREQ within 5 s and answers PJACK; it serves one controller at a time. A
-  command that meets a connection lost meanwhile is sent once more over a new one, and all of the colour after it.
+The projector makes the colour itself, 0 … 255 a channel, so no desktop, cable or scaler can change it. A command is
+``!``, the unit, text and LF; the projector acknowledges with 06, the unit, the text's first two letters and LF: it
+confirms commands, not what it shows. It greets with PJ_OK, wants PJREQ within 5 s and answers PJACK. A command that
+meets a connection lost meanwhile is sent once more over a new one, and all of the colour after it.
 
 Not confirmed on hardware: that the raster (SSTP02) is the flat field on every model, that its levels (SSFR, SSFG, SSFB)
 are encoded as video is and pass the picture mode's gamma, and that they last through a lost connection; photograph a
@@ -25,7 +21,7 @@ from collections.abc import Callable
 
 from drivers.links.link import Exchange, Link, MessageParser
 from drivers.presenter import BLACK, Colour
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceError, DeviceRefused, ProtocolError
 
 PORT = 20554
@@ -40,7 +36,6 @@ _SILENT = "check that it is on, and that its model knows the flat field"
 _CHECK_MODEL = "check that it is a JVC D-ILA"
 
 _OPERATION, _ACKNOWLEDGED, _END = b"!", b"\x06", b"\n"
-_SYSTEM_CLOCK = SystemClock()
 
 
 def encode_operation(text: bytes) -> bytes:
@@ -78,7 +73,7 @@ class JvcFlatField:
         self,
         connect: Callable[[], Link],
         label: str = "the JVC projector",
-        clock: Clock = _SYSTEM_CLOCK,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._label = label
         self._exchange = Exchange(connect, TIMEOUT_S, label, clock, self._greet, _SILENT, _CHECK_MODEL)

@@ -1,15 +1,9 @@
 """Plain colours from the test pattern generator of a TI LightCrafter 4500 (DLPC350), 6500 or 9000 (DLPC900).
 
-A report has 64 bytes: flags, sequence number, length (u16), then `length` bytes, padded with zeros. To the device they
-begin with the command (u16) and go on with its data; in an answer they are the data alone. All is little endian.
-
-Rules that hold inside:
-
-- The controller makes the colour itself, so no desktop, cable or scaler can change it. It takes 10 bits a channel;
-  an 8-bit code c becomes round(c · 1023 / 255).
-- `show` returns when the controller reports the colour, and that it is shown.
-- After a fault of cable or protocol the connection is dropped; the next `show` makes a new one and sets everything up
-  again. An answer that comes late never meets a later question: every one carries its question's number.
+The controller makes the colour itself, so no desktop, cable or scaler can change it. A report has 64 bytes: flags,
+sequence number, length (u16), then `length` bytes, padded with zeros. To the device they begin with the command (u16)
+and go on with its data; in an answer they are the data alone. All is little endian. After a fault of cable or protocol
+the connection is dropped; the next `show` makes a new one and sets everything up again.
 
 Not confirmed on hardware: the USB numbers of the DLPC900 boards, that the DLPC350 gives the pattern's colours back when
 asked, and whether the pattern passes the degamma of video mode (`Colour` is then encoded as video is, otherwise linear:
@@ -31,7 +25,7 @@ from typing import TYPE_CHECKING
 
 from drivers.links.usb import HidDevice, open_hid
 from drivers.presenter import BLACK, Colour
-from foundation.clock import Clock, SystemClock
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 if TYPE_CHECKING:
@@ -172,7 +166,6 @@ _SETTLED = (
     (LightCrafterCommand.INPUT_SOURCE, SOURCE_TEST_PATTERN, 0x07),
     (LightCrafterCommand.DISPLAY_MODE, MODE_VIDEO, 0x03),
 )
-_SYSTEM_CLOCK = SystemClock()
 
 
 def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = None) -> HidDevice:
@@ -190,7 +183,7 @@ def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = N
 class LightCrafter:
     """A `drivers.presenter.Presenter`; black from the moment it opens."""
 
-    def __init__(self, connect: Callable[[], HidDevice], clock: Clock = _SYSTEM_CLOCK) -> None:
+    def __init__(self, connect: Callable[[], HidDevice], clock: Clock = SYSTEM_CLOCK) -> None:
         self._connect = connect
         self._clock = clock
         self._reports: HidDevice | None = None

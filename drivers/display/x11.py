@@ -1,18 +1,14 @@
 """What an X server has on its screen, and which window lies in front; a hold on its screen saver; its end.
 
-Rules that hold inside:
-
-- A connection of its own, beside that of the window: what it reads is what the server shows, whoever drew it.
-- Through libxcb, which returns errors to its caller. Xlib, which the window needs, ends the process when its server
-  goes; `outlive` prevents that.
-- The hold on screen saver and power saving ends with the connection, hence with the process, however that ends.
-- A window may vanish at any moment, and a reply that does not come is a window that is not there. Windows are asked
-  from the top of the stack down; a window manager frames each, so that its name stands on a descendant.
+It has a connection of its own, so that what it reads is what the server shows, whoever drew it; through libxcb, which
+returns errors to its caller. Xlib, which the window needs, ends the process when its server goes; `outlive` prevents
+that. A window may vanish at any moment, and a reply that does not come is a window that is not there. A window manager
+frames each, so that its name stands on a descendant.
 
 Sources: X Window System Protocol, GetImage, QueryExtension, QueryTree, GetWindowAttributes, GetGeometry and
 GetProperty; MIT-SCREEN-SAVER extension 1.1, Suspend; DPMS extension 1.2; Xlib, XSetIOErrorHandler(3) and
-XSetIOErrorExitHandler(3), the latter from libX11 1.7 on; Extended Window Manager Hints 1.5, _NET_WM_NAME;
-Inter-Client Communication Conventions 2.0, 4.1.2 (WM_NAME, WM_CLASS).
+XSetIOErrorExitHandler(3), the latter from libX11 1.7 on; Extended Window Manager Hints 1.5, _NET_WM_NAME; Inter-Client
+Communication Conventions 2.0, 4.1.2 (WM_NAME, WM_CLASS).
 """
 
 from __future__ import annotations

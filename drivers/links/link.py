@@ -1,11 +1,7 @@
 """What a cable is: three verbs and a time limit; and one question at a time over it.
 
-Rules that hold inside:
-
-- An implementation translates the system's errors into `LinkTimeout` and `LinkClosed` at this border and nowhere else.
-- What was sent before hanging up can still be read after it.
-- `PeerLink` has no thread and never waits: its peer has answered by the time `write` returns, so an empty read can only
-  mean that nothing will come.
+An implementation translates the system's errors into `LinkTimeout` and `LinkClosed` at this border and nowhere else.
+What was sent before hanging up can still be read after it.
 """
 
 from __future__ import annotations
@@ -23,18 +19,15 @@ class Link(Protocol):
 
     def write(self, data: bytes, timeout: float) -> None:
         """Send all of `data` within `timeout` seconds."""
-        ...
 
     def read(self, limit: int, timeout: float) -> bytes:
         """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first.
 
         A timeout of 0 asks whether something is there: it brings b"" where nothing is, and is no fault.
         """
-        ...
 
     def close(self) -> None:
         """Hang up; a second call does nothing."""
-        ...
 
 
 class ClosedAtEnd:
@@ -56,16 +49,13 @@ class Peer(Protocol):
 
     def connect(self) -> bytes:
         """Begin a new connection, forgetting any other, and return what the far side sends first."""
-        ...
 
     def receive(self, data: bytes) -> bytes:
         """Take the next bytes from the near side and return the answer so far; may hang up."""
-        ...
 
     @property
     def closed(self) -> bool:
         """Whether the far side has hung up."""
-        ...
 
 
 class PeerLink:

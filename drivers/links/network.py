@@ -1,10 +1,7 @@
 """Cables of the network: TCP connections, the loopback servers of simulated devices, and datagrams over UDP.
 
-Rules that hold inside:
-
-- The system's errors become `LinkTimeout` and `LinkClosed` here and nowhere else; every message names host and port.
-- `TcpServer` listens on loopback unless a host is given, has one thread for each connection, and leaves none behind.
-- A datagram comes whole or not at all, and from anybody: whoever reads it judges sender and content.
+The system's errors become `LinkTimeout` and `LinkClosed` here and nowhere else; every message names host and port. A
+datagram comes whole or not at all, and from anybody: whoever reads it judges sender and content.
 """
 
 from __future__ import annotations
@@ -12,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-import time
 from collections.abc import Callable
 
 from drivers.links.link import ClosedAtEnd, Peer
@@ -237,19 +233,14 @@ class UdpSocket(ClosedAtEnd):
     def receive(self, timeout: float) -> tuple[bytes, Address]:
         """Return the next datagram and who sent it, waiting at most `timeout` seconds."""
         host, port = self.address
-        deadline = time.monotonic() + timeout
-        while True:
-            try:
-                self._socket.settimeout(max(deadline - time.monotonic(), 0.0))
-                data, (sender, sender_port, *_) = self._socket.recvfrom(MAX_DATAGRAM)
-            except ConnectionResetError:
-                # Windows reports here that an earlier datagram found nobody; for us that is no news.
-                continue
-            except (TimeoutError, BlockingIOError) as error:
-                raise LinkTimeout(f"no datagram came to {host}:{port} for {timeout:g} s") from error
-            except OSError as error:
-                raise LinkClosed(f"no more datagrams can be received at {host}:{port}: {error}") from error
-            return data, (sender, sender_port)
+        try:
+            self._socket.settimeout(timeout)
+            data, (sender, sender_port, *_) = self._socket.recvfrom(MAX_DATAGRAM)
+        except (TimeoutError, BlockingIOError) as error:
+            raise LinkTimeout(f"no datagram came to {host}:{port} for {timeout:g} s") from error
+        except OSError as error:
+            raise LinkClosed(f"no more datagrams can be received at {host}:{port}: {error}") from error
+        return data, (sender, sender_port)
 
     def close(self) -> None:
         """Stop listening; a second call does nothing."""

@@ -1,11 +1,8 @@
 """The serial cable: the one file that imports pyserial.
 
-Rules that hold inside:
-
-- Eight data bits and one stop bit, no flow control: every projector in `drivers.serial_projectors` wants that.
-- The port is ours alone while it is open, and what waited in it before is thrown away.
-- The system's errors become ours here and nowhere else; every message names the port.
-- A cable that is pulled out loses what the system had not handed over yet: last words may be missing.
+Eight data bits, no parity, one stop bit, no flow control: every projector in `drivers.serial_projectors` wants that.
+The port is ours alone while it is open, and what waited in it before is thrown away. A cable that is pulled out loses
+what the system had not handed over yet: last words may be missing.
 """
 
 from __future__ import annotations
@@ -18,9 +15,6 @@ from serial.tools import list_ports
 
 from foundation.errors import ConfigurationError, DeviceRefused, LinkClosed, LinkError, LinkTimeout
 
-PARITIES = ("N", "E", "O")
-"""None, even, odd."""
-
 
 class SerialLink:
     """A `drivers.links.link.Link` over one serial port."""
@@ -30,12 +24,10 @@ class SerialLink:
         self._device = device
 
     @classmethod
-    def open(cls, device: str, baud: int, parity: str = "N") -> SerialLink:
-        """Open the port `device`, such as ``/dev/ttyUSB0`` or ``COM3``, at `baud` bits per second."""
-        if parity not in PARITIES:
-            raise ConfigurationError(f"parity {parity!r} for {device}; expected one of {', '.join(PARITIES)}")
+    def open(cls, device: str, baud: int) -> SerialLink:
+        """Open the port `device`, such as ``/dev/ttyUSB0``, at `baud` bits per second."""
         try:
-            port = serial.Serial(device, baud, parity=parity, timeout=0, write_timeout=0, exclusive=True)
+            port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
         except (ValueError, OverflowError) as error:
             raise ConfigurationError(
                 f"{device} cannot be opened at {baud} baud: {error}; choose another speed"
@@ -89,21 +81,19 @@ class SerialLink:
 
 
 def _unopened(error: OSError, device: str) -> LinkError | DeviceRefused:
-    # On Windows pyserial hides the number of the system's error and gives its name only.
-    reason = str(error)
-    if error.errno in (errno.EACCES, errno.EPERM) or "PermissionError" in reason:
+    if error.errno in (errno.EACCES, errno.EPERM):
         return DeviceRefused(
             f"{device} may not be opened by this user, or another program has it; on Linux run "
             f"sudo usermod -aG dialout $USER (on Arch: uucp) and log in again"
         )
     if error.errno in (errno.EBUSY, errno.EAGAIN):
         return DeviceRefused(f"{device} is in use by another program; close it and try again")
-    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in reason:
+    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         found = ", ".join(sorted(port.device for port in list_ports.comports())) or "none at all"
         return LinkClosed(
             f"there is no serial port {device}; found: {found}: plug the adapter in, or name one of these"
         )
-    return LinkClosed(f"{device} cannot be opened: {reason}; check that it is a serial port")
+    return LinkClosed(f"{device} cannot be opened: {error}; check that it is a serial port")
 
 
 def list_serial_ports() -> tuple[str, ...]:

@@ -1,14 +1,9 @@
 """USB cables: the pipes of still image devices, and the reports of HID devices.
 
-Rules that hold inside:
-
-- Devices are distinguished by vendor, product and serial number, or by the port they are plugged into: the address
-  changes whenever a device restarts.
-- The kernel's own driver is asked to step aside, and given the interface back at the end.
-- The system's errors are translated here and nowhere else, and say what helps: ETIMEDOUT is `LinkTimeout`; ENODEV, EIO
-  and whatever else ends the transfer is `LinkClosed`; EPIPE is `PipeStalled`; EBUSY and EACCES are `DeviceRefused`.
-- pyusb opens anew what was closed as soon as it is used; here, closed is closed.
-- Of a HID device only the interrupt pipes are used, one report a transfer; a report is never cut and never joined.
+Devices are distinguished by vendor, product and serial number, or by the port they are plugged into: the address
+changes whenever a device restarts. The kernel's own driver is asked to step aside, and given the interface back at the
+end. The system's errors are translated here and nowhere else, and say what helps. pyusb opens anew what was closed as
+soon as it is used; here, closed is closed.
 
 Sources: USB 2.0, clauses 5.8 (bulk), 5.7 (interrupt), 9.4 (SetConfiguration) and 9.6 (descriptors); Device Class
 Definition for HID 1.11, clauses 4.1 and 4.4; libusb 1.0's error codes.
@@ -59,52 +54,41 @@ class UsbPipes(Protocol):
     @property
     def label(self) -> str:
         """What messages call the device."""
-        ...
 
     @property
     def packet_size(self) -> int:
         """Bytes of a full packet on the bulk pipes (wMaxPacketSize)."""
-        ...
 
     @property
     def polling_s(self) -> float:
         """Seconds between two looks of the bus at the interrupt pipe; who waits less may never see anything."""
-        ...
 
     def bulk_write(self, data: bytes, timeout: float) -> None:
         """Send all of `data`; none is a zero-length packet."""
-        ...
 
     def bulk_read(self, limit: int, timeout: float) -> bytes:
         """Return what one transfer brings, up to `limit` bytes; b"" for a zero-length packet.
 
         A transfer ends with a packet that is not full, or with `limit`, which must be a multiple of `packet_size`.
         """
-        ...
 
     def interrupt_read(self, timeout: float) -> bytes:
         """Return the next packet of the interrupt pipe; b"" where none comes in time, as most often."""
-        ...
 
     def control_out(self, request: int, data: bytes, timeout: float) -> None:
         """Send a request of the interface's class on the control pipe."""
-        ...
 
     def control_in(self, request: int, limit: int, timeout: float) -> bytes:
         """Return the answer to a request of the interface's class, up to `limit` bytes."""
-        ...
 
     def clear_halt(self, pipe: Pipe) -> None:
         """Let a stalled pipe transfer again."""
-        ...
 
     def reset_port(self) -> None:
         """Have the bus reset the device, as if it had been unplugged and plugged in again."""
-        ...
 
     def close(self) -> None:
         """Release the interface; a second call does nothing."""
-        ...
 
 
 UDEV_RULE = "70-crop-cameras.rules"
@@ -205,10 +189,6 @@ class _ClaimedDevice:
                 case _:
                     fault = LinkClosed(f"{label} is gone ({reason}); check cable and power, and open it again")
             raise fault from error
-        except NotImplementedError as error:
-            raise DeviceRefused(
-                f"{label} cannot be used with the driver that the system has for it; on Windows install WinUSB for it"
-            ) from error
 
 
 @dataclass(frozen=True)
@@ -239,7 +219,6 @@ def list_devices(*, backend: IBackend | None = None) -> tuple[UsbDevice, ...]:
 def open_usb(
     *,
     vendor: int | None = None,
-    product: int | None = None,
     serial: str | None = None,
     port: str | None = None,
     backend: IBackend | None = None,
@@ -249,7 +228,7 @@ def open_usb(
     others: list[UsbDevice] = []
     hidden: DeviceRefused | None = None
     for device, description, refusal in _found(backend):
-        marks = ((vendor, description.vendor), (product, description.product), (port, description.port))
+        marks = ((vendor, description.vendor), (port, description.port))
         alike = all(wanted is None or wanted == is_ for wanted, is_ in marks)
         if alike and (serial is None or serial == description.serial):
             matching.append((device, description))
@@ -260,7 +239,7 @@ def open_usb(
     if not matching:
         if hidden is not None:
             raise hidden
-        raise LinkClosed(_absent(vendor, product, serial, port, others))
+        raise LinkClosed(_absent(vendor, serial, port, others))
     if len(matching) > 1:
         choice = "; ".join(str(description) for _, description in matching)
         raise InputError(f"{len(matching)} cameras on USB fit: {choice}; name one by serial number or port")
@@ -436,12 +415,9 @@ def _is_still_image(interface: usb.core.Interface) -> bool:
     return kind == STILL_IMAGE_CLASS
 
 
-def _absent(
-    vendor: int | None, product: int | None, serial: str | None, port: str | None, others: list[UsbDevice]
-) -> str:
+def _absent(vendor: int | None, serial: str | None, port: str | None, others: list[UsbDevice]) -> str:
     marks = [
         f"vendor {vendor:04x}" if vendor is not None else "",
-        f"product {product:04x}" if product is not None else "",
         f"serial number {serial}" if serial is not None else "",
         f"port {port}" if port is not None else "",
     ]

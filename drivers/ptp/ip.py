@@ -3,17 +3,12 @@
 A packet is its length (32 bits, these included), its type (32), then the fields of that type. The initiator opens the
 command channel and sends `InitCommandRequest`, the responder answers `InitCommandAck` with a number; the initiator
 opens the event channel and sends that number in `InitEventRequest`, the responder answers `InitEventAck`. `InitFail`
-may stand for either answer. Transactions run on the command channel; events, `Ping` and `Pong` on the other.
+may stand for either answer. Transactions run on the command channel; events, `Ping` and `Pong` on the other: whoever
+waits for the device also answers its pings, at least once a second, for nothing here has a thread.
 
-Rules that hold inside:
-
-- `PacketCutter` takes a stream in any pieces. Data packets may be of any length, whatever comes of them is handed on
-  as `Data` at once and only their last bytes as `EndData`, which means the same; every other packet is at most
-  `MAX_PACKET` bytes. Whatever arrives, its only error is `ProtocolError`; after it the stream has lost its place and
-  every further `feed` raises too.
-- Whoever waits for the device also answers its pings, at least once a second; nothing here has a thread.
-- Events are kept until asked for, the newest `MAX_EVENTS` of them.
-- A transaction that is called off is awaited to its response.
+`PacketCutter` takes a stream in any pieces. Whatever comes of a data packet is handed on as `Data` at once and only its
+last bytes as `EndData`, which means the same. After its only error, `ProtocolError`, the stream has lost its place and
+every further `feed` raises too.
 
 Source: CIPA DC-005-2005, PTP-IP, clauses 2.2 (connections) and 2.3 (packets).
 """
@@ -567,8 +562,6 @@ class IpTransport(CableTransport):
                         self._events.append(event)
                     case Ping():
                         self._event.send(Pong(), _PING_EVERY_S)
-                    case _:
-                        pass
 
     def _connect(self, *passing: type[Exception]) -> tuple[Channel, Channel, str]:
         # A device needs a moment to see that a connection is gone, ours or that of the command that ran before; until

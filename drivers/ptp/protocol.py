@@ -1,22 +1,17 @@
 """PTP on any cable: datasets as bytes and as values, and a session of numbered transactions.
 
-A transaction is a request, at most one data phase, and a response; events come beside.
+A transaction is a request, at most one data phase, and a response; events come beside. Everything is little-endian. A
+string is a count of UTF-16 units with the closing NUL, then the units; an empty string is the count 0 alone. An array
+is a count of 32 bits, then the items.
 
 Rules that hold inside:
 
 - ``decode`` and ``encode`` undo each other on well-formed bytes, so that both ends of the cable share one type.
-- Whatever bytes a device sends, the only error is `ProtocolError`; it names the dataset, the field, the place, what was
-  expected and what came. A count is compared with the bytes that are left before anything is made from it, and a
-  dataset of more than `MAX_DATASET` bytes is refused unread. Bytes behind a dataset's last field are no fault, for
-  later editions append.
-- ``encode`` raises ValueError for what the wire cannot hold; that is our own mistake, never a device's.
-- A response other than OK raises `OperationDeclined`, which has its code by number and by name; what a device declines
-  for the moment only (`PASSING`) is asked again, for a limited time.
+- Whatever bytes a device sends, the only error is `ProtocolError`; a count is compared with the bytes that are left
+  before anything is made from it. Bytes behind a dataset's last field are no fault, for later editions append.
+  ``encode`` raises ValueError for what the wire cannot hold; that is our own mistake, never a device's.
 - A fault of cable or protocol goes straight to the caller: whether an operation may be repeated is not known here.
   After one, the session is spent; a new one begins with `Transport.reset` or a new transport.
-
-Everything is little-endian, as USB and TCP carry it. A string is a count of UTF-16 units with the closing NUL, then
-the units; an empty string is the count 0 alone. An array is a count of 32 bits, then the items.
 
 Source: ISO 15740:2013, clauses 5 (types and datasets), 9.3 (sessions and transactions) and 13 (properties).
 """
@@ -582,7 +577,6 @@ class Transport(Protocol):
     @property
     def label(self) -> str:
         """What messages call the device: address and name as far as known."""
-        ...
 
     def transact(
         self,
@@ -598,19 +592,15 @@ class Transport(Protocol):
         the device piece by piece; None collects up to `MAX_COLLECTED` bytes. `timeout`: longest wait for each answer of
         the device, seconds.
         """
-        ...
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come since the last call; never waits."""
-        ...
 
     def reset(self) -> None:
         """Bring cable and device back to where a session can be opened; costs a session that is open."""
-        ...
 
     def close(self) -> None:
         """Release the device; a second call does nothing."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -630,23 +620,18 @@ class Responder(Protocol):
 
     def takes_data(self, request: PtpRequest) -> bool:
         """Return whether the initiator sends a data phase with this operation."""
-        ...
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Carry out a request; `data` is the initiator's data phase."""
-        ...
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come up since the last call."""
-        ...
 
     def cancelled(self, transaction: int) -> None:
         """Note that the initiator gave up a transaction."""
-        ...
 
     def unplugged(self) -> None:
         """Note that the cable was pulled or reset: the session is over."""
-        ...
 
 
 class Reception:
@@ -718,17 +703,12 @@ class Reception:
         )
 
 
-class CableTransport(ABC):
+class CableTransport(Transport, ABC):
     """A `Transport` over a real cable: one transaction after the other, and none where one was left unfinished."""
 
     def __init__(self) -> None:
         self.closed = False
         self.between_transactions = True
-
-    @property
-    @abstractmethod
-    def label(self) -> str:
-        """What messages call the device: address and name as far as known."""
 
     @abstractmethod
     def exchange(self, reception: Reception, send: bytes | None, timeout: float) -> Transaction:

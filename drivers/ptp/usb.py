@@ -1,22 +1,16 @@
 """PTP over USB: commands, data and responses as containers on the bulk pipes, events on the interrupt pipe.
 
-A container is its length (32 bits, header included), its type (16), a code (16), the transaction (32), then up to
-five parameters of 32 bits, or a payload.
+A container is its length (32 bits, header included), its type (16), a code (16), the transaction (32), then up to five
+parameters of 32 bits, or a payload. A device may cut its containers as it likes: header alone, data and response in one
+transfer, a zero-length packet or none.
 
-Rules that hold inside:
+`ContainerReader` takes a stream in any pieces and hands the payload of a data phase on as it comes. The one thing a
+stream alone does not show is where a data phase of unknown length ends: only there a piece must be what one read of the
+pipe returned, for a short packet ends it. Lengths are checked before they are believed; after its only error,
+`ProtocolError`, the stream has lost its place: every further `feed` raises too, until a new reader is taken.
 
-- `ContainerReader` takes a stream in any pieces and keeps nothing but an unfinished header: the payload of a data
-  phase is handed on as it comes, so that no object ever lies here in full.
-- Lengths are checked before they are believed; whatever arrives, its only error is `ProtocolError`. The stream has
-  then lost its place: every further `feed` raises too, until a new reader is taken.
-- The one thing a stream alone does not show is where a data phase of unknown length ends. Only there a piece must be
-  what one read of the pipe returned, for a short packet ends it.
-- What is read is never less than a packet nor more than 512 KiB, and always whole packets. A device may cut its
-  containers as it likes: header alone, data and response in one transfer, a zero-length packet or none.
-- A stalled pipe is cleared and the transfer tried once more; a second stall in the same transaction is an error.
-
-Sources: USB Still Image Capture Device Definition 1.0, clauses 5 (control requests) and 7 (containers);
-ISO 15740:2013, annex D.
+Sources: USB Still Image Capture Device Definition 1.0, clauses 5 (control requests) and 7 (containers); ISO 15740:2013,
+annex D.
 """
 
 from __future__ import annotations

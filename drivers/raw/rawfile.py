@@ -4,27 +4,18 @@ Rules that hold inside:
 
 - Nothing is subtracted, scaled, rotated or interpolated: `Mosaic.counts` equals what ``dcraw -D -4 -T`` writes, but for
   the rotation that dcraw applies.
-- Whatever the bytes, the outcome is a `Mosaic` or one `FormatError`. A file that has been cut is an error wherever its
-  structure betrays it, since LibRaw fills what is missing with zeros or ones without a word in some formats, and so
-  does whoever copies a file from a bad card (`filled_fault`). What a file does not state of camera, lens and exposure,
-  or states in a damaged place, is empty or None.
-- A `Plane` is one colour of a mosaic, above black. Its places are half-size pixels, x right, y down, centres at
-  integers. A plane of red or blue photosites lies a quarter pixel beside the blocks' centres, and `Plane.offset_px`
-  puts its places right; green is the mean of its two photosites and lies in the middle. A sum of planes under deep red
-  or blue would be a fifth of a pixel off.
-- LibRaw chooses by itself which picture of a file it decodes, and reads behind the end of what is stored without a
-  word. So each picture of a sensor that a file describes must be whole, and what LibRaw makes must have the size of
-  one of them (`Stored.holds`). A file of whose layout neither can be told is refused.
+- Whatever the bytes, the outcome is a `Mosaic` or one `FormatError`. LibRaw fills what is missing, and reads behind the
+  end of what is stored, without a word: so each picture of a sensor that a file describes must be whole, and what
+  LibRaw makes must have the size of one of them (`Stored.holds`). A file of whose layout neither can be told is
+  refused.
 - LibRaw is called here and nowhere else in the suite. A DNG that holds its counts as memory does needs none: it is read
-  as LibRaw would, and what is not sure of it is left to LibRaw. Rows and columns of colour filters and of black levels
-  count from the active area's corner (DNG 1.7, ActiveArea). LibRaw's table of colour matrices is asked by opening a raw
-  file of nothing but a camera's name, made here: no matrix is copied into the suite.
+  as LibRaw would. LibRaw's table of colour matrices is asked by opening a raw file of nothing but a camera's name.
 
-Sources: TIFF 6.0 (strips), TIFF technical note 1 and DNG 1.7.1 (tiles, CameraSerialNumber); LibRaw 0.22 for which
-directory, size and packing it takes (src/metadata/tiff.cpp); Exif 2.32, section 4.6.5 (BodySerialNumber, LensModel).
-Canon's note, which bodies before Exif 2.3 (such as the 550D) have instead, is a TIFF directory without a standard: P.
-Harvey, ExifTool, lib/Image/ExifTool/Canon.pm (0x000c SerialNumber, 0x0095 LensModel), whose offsets count from the
-file's beginning.
+Sources: TIFF 6.0 (strips), TIFF technical note 1 and DNG 1.7.1 (tiles, CameraSerialNumber; ActiveArea, from whose
+corner colour filters and black levels count); LibRaw 0.22 for which directory, size and packing it takes
+(src/metadata/tiff.cpp); Exif 2.32, section 4.6.5 (BodySerialNumber, LensModel). Canon's note, which bodies before Exif
+2.3 have instead, is a TIFF directory without a standard, whose offsets count from the file's beginning: P. Harvey,
+ExifTool, lib/Image/ExifTool/Canon.pm (0x000c SerialNumber, 0x0095 LensModel).
 """
 
 from __future__ import annotations
@@ -600,7 +591,6 @@ def _of_maker(data: bytes | memoryview, directory: Directory, extents: tuple[Ext
 def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Contents) -> Mosaic:
     import rawpy
 
-    directories, cr3 = contents.directories, contents.cr3
     pattern = raw.raw_pattern
     if raw.raw_type is not rawpy.RawType.Flat or pattern is None or pattern.shape != (2, 2):
         raise _not_bayer(path, "its pixels do not follow a 2×2 pattern of colour filters")
@@ -621,7 +611,6 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Content
     # LibRaw leaves what it does not decode as memory was before.
     if stored.bits < 16 and int(sensor.max()) >> stored.bits:
         raise _unreadable(path, f"its counts reach {sensor.max()}, and have {stored.bits} bits")
-    camera = _camera_name(data, directories) if cr3 is None else _joined(cr3.maker, cr3.model)
     framed = Area(sizes.top_margin, sizes.left_margin, sizes.height, sizes.width)
     rows, columns = sensor.shape
     if (
@@ -646,29 +635,43 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Content
     for level in (raw.white_level, *white):
         _require_levels(path, black, level, stored.bits)
     black.setflags(write=False)
+    exposure = raw.other.iso_speed, raw.other.aperture, raw.other.shutter_speed
+    return _made(data, contents, stored, sensor, visible, letters, black, int(raw.white_level), exposure)
+
+
+def _made(
+    data: bytes | memoryview,
+    contents: _Contents,
+    stored: Stored,
+    sensor: NDArray[np.uint16],
+    visible: Area,
+    pattern: str,
+    black: NDArray[np.float64],
+    white_level: int,
+    exposure: tuple[float, float, float],
+) -> Mosaic:
+    """Return the mosaic of a sensor; `exposure`: ISO speed, f-number and seconds, 0 where the file does not say."""
+    directories, cr3 = contents.directories, contents.cr3
+    camera = _camera_name(data, directories) if cr3 is None else _joined(cr3.maker, cr3.model)
     serial, lens = body_and_lens(data, directories if cr3 is None else cr3.exif)
-    exposure = raw.other
+    iso, aperture, shutter_s = exposure
     # LibRaw makes up 1 s at f/1 for a file that states nothing; such a file has no ISO speed either.
-    stated_exposure = exposure.iso_speed > 0
+    stated = iso > 0
     return Mosaic(
-        counts=_part(sensor, visible),
-        pattern=letters,
+        counts=sensor[visible.top : visible.top + visible.height, visible.left : visible.left + visible.width],
+        pattern=pattern,
         black=black,
-        white_level=int(raw.white_level),
+        white_level=white_level,
         camera=camera,
         sensor=sensor,
         visible=visible,
-        masked=_masked_areas(pixels, camera, visible, (rows, columns), cr3),
-        iso=round(exposure.iso_speed) if stated_exposure else None,
-        aperture=(round(exposure.aperture, 4) or None) if stated_exposure else None,
-        shutter_s=(exposure.shutter_speed or None) if stated_exposure else None,
+        masked=_masked_areas(stored.directory, camera, visible, (sensor.shape[0], sensor.shape[1]), cr3),
+        iso=round(iso) if stated else None,
+        aperture=(round(aperture, 4) or None) if stated else None,
+        shutter_s=(shutter_s or None) if stated else None,
         serial=serial,
         lens=lens,
     )
-
-
-def _part(sensor: NDArray[np.uint16], area: Area) -> NDArray[np.uint16]:
-    return sensor[area.top : area.top + area.height, area.left : area.left + area.width]
 
 
 def _read_bytes(path: Path) -> memoryview:
@@ -886,23 +889,7 @@ def _plain_mosaic(path: Path, data: bytes | memoryview, contents: _Contents) -> 
         _exposure(directories, tag)
         for tag in (TiffTag.PHOTOGRAPHIC_SENSITIVITY, TiffTag.F_NUMBER, TiffTag.EXPOSURE_TIME)
     )
-    camera = _camera_name(data, directories)
-    serial, lens = body_and_lens(data, directories)
-    return Mosaic(
-        counts=_part(sensor, visible),
-        pattern=letters,
-        black=black,
-        white_level=int(white[0]),
-        camera=camera,
-        sensor=sensor,
-        visible=visible,
-        masked=_masked_areas(pixels, camera, visible, size),
-        iso=round(iso) if iso else None,
-        aperture=(round(aperture, 4) or None) if iso else None,
-        shutter_s=(shutter or None) if iso else None,
-        serial=serial,
-        lens=lens,
-    )
+    return _made(data, contents, stored, sensor, visible, letters, black, int(white[0]), (iso, aperture, shutter))
 
 
 def _exposure(directories: Sequence[Directory], tag: TiffTag) -> float:

@@ -1,15 +1,10 @@
 """Where makers' raw files that are no plain TIFF keep the photosites of a frame: CR3, CRW, RAF, RW2 and IIQ.
 
 What says it in every kind of file is a `Stored`; `drivers.raw.rawfile` reads those of TIFF files, a DNG's among them.
-
-Rules that hold inside:
-
-- Pure functions of bytes: every byte sequence whatever ends in frames or `RawDamaged`.
-- What the compressed codes of a maker decode to is LibRaw's to say; here a photosite only needs bits at all.
-- A CR3 (EOS R, EOS M50, EOS 250D and later) is an ISO base media file, not TIFF: boxes in boxes, each a size of 32 bits
-  (1: of 64 bits, behind the type; 0: up to the end), a type of four letters, and content; big-endian. Boxes are walked,
-  never searched for, and at most `MAX_BOXES` of them. One that reaches beyond the file's end betrays a cut; what is
-  inside a box and makes no sense is left out.
+Every byte sequence whatever ends in frames or `RawDamaged`; what the compressed codes of a maker decode to is LibRaw's
+to say. A CR3 (EOS R, EOS M50, EOS 250D and later) is an ISO base media file: boxes in boxes, each a size of 32 bits (1:
+of 64 bits, behind the type; 0: up to the end), a type of four letters, and content; big-endian. One that reaches beyond
+the file's end betrays a cut; what is inside a box and makes no sense is left out.
 
 Sources: Canon, CIFF 1.0 revision 4 (CRW); ISO/IEC 14496-12, 4.2 (boxes), 8.7.3 (sizes of samples) and 8.7.5 (places of
 chunks). For the rest, of which there is no public standard: P. Harvey, ExifTool (PanasonicRaw.pm, FujiFilm.pm,
@@ -281,7 +276,9 @@ def read_cr3(data: bytes | memoryview) -> Cr3:
             if part.kind == b"uuid" and bytes(data[part.start : part.start + _UUID_LENGTH]) == _CANON:
                 for entry in _boxes(data, part.start + _UUID_LENGTH, part.end, left):
                     if entry.kind == b"CMT1":
-                        maker, model = _camera(data[entry.start : entry.end])
+                        known = _directories(data[entry.start : entry.end])
+                        named = ((one.text(TiffTag.MAKE), one.text(TiffTag.MODEL)) for one in known)
+                        maker, model = next((names for names in named if names[1]), ("", ""))
                     elif entry.kind == b"CMT2":
                         exif = _directories(data[entry.start : entry.end])
             elif part.kind == b"trak":
@@ -319,14 +316,6 @@ def _boxes(data: bytes | memoryview, start: int, end: int, left: list[int], *, w
         start += size
     if whole and start != end:
         raise RawDamaged(f"{end - start} bytes follow its last part, too few for another")
-
-
-def _camera(content: bytes | memoryview) -> tuple[str, str]:
-    """Return maker and model of the TIFF in a box CMT1."""
-    for directory in _directories(content):
-        if directory.text(TiffTag.MODEL):
-            return directory.text(TiffTag.MAKE), directory.text(TiffTag.MODEL)
-    return "", ""
 
 
 def _directories(content: bytes | memoryview) -> tuple[Directory, ...]:

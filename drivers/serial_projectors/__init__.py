@@ -17,14 +17,13 @@ from foundation.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class Language:
-    """How a maker's projectors are spoken to; `baud` and `parity` as they leave the factory.
+    """How a maker's projectors are spoken to; `baud` as they leave the factory.
 
     `network` is the driver for the same text over TCP, at `tcp_port`; None where the maker has no such thing.
     """
 
     name: str
     baud: int
-    parity: str
     projector: type[SerialProjector]
     tcp_port: int = 0
     network: type[SerialProjector] | None = None
@@ -38,10 +37,10 @@ class Language:
 LANGUAGES: Mapping[str, Language] = {
     language.name: language
     for language in (
-        Language("benq", benq.BAUD, "N", benq.BenqProjector, benq.TCP_PORT, benq.BenqProjector),
-        Language("epson", epson.BAUD, "N", epson.EpsonProjector, epson.TCP_PORT, epson.EpsonOnNetwork),
-        Language("nec", nec.BAUD, "N", nec.NecProjector, nec.TCP_PORT, nec.NecProjector),
-        Language("optoma", optoma.BAUD, "N", optoma.OptomaProjector),
+        Language("benq", benq.BAUD, benq.BenqProjector, benq.TCP_PORT, benq.BenqProjector),
+        Language("epson", epson.BAUD, epson.EpsonProjector, epson.TCP_PORT, epson.EpsonOnNetwork),
+        Language("nec", nec.BAUD, nec.NecProjector, nec.TCP_PORT, nec.NecProjector),
+        Language("optoma", optoma.BAUD, optoma.OptomaProjector),
     )
 }
 

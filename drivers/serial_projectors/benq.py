@@ -85,8 +85,6 @@ def value_of(name: str, reply: str) -> str:
             raise DeviceRefused(f"the projector answers {UNSUPPORTED} to {name}; do it with its remote control")
         case "illegal format":
             raise DeviceRefused(f"the projector answers {ILLEGAL} to {name}; do it with its remote control")
-        case _:
-            pass
     found, equals, value = text.partition("=")
     if not equals and name == "modelname":
         # Some models say their name and nothing else.

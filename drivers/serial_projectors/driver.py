@@ -14,11 +14,9 @@ from collections.abc import Callable
 from typing import ClassVar
 
 from drivers.links.link import Exchange, Link, quoted
-from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
-from foundation.clock import Clock, SystemClock
+from drivers.projector import Lamp, Power, Projector, ProjectorIdentity
+from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceRefused, ProtocolError
-
-SYSTEM_CLOCK = SystemClock()
 
 DEFAULT_TIMEOUT_S = 5.0
 """Epson's manual asks for an answer within 3 s, 5 s after a change of source; the others say nothing."""
@@ -43,7 +41,7 @@ def take_line(data: bytes) -> tuple[str, int] | None:
     return None if end < 0 else (data[:end].decode("ascii", "replace").strip(), end + 1)
 
 
-class SerialProjector(ABC):
+class SerialProjector(Projector, ABC):
     """A `drivers.projector.Projector` of one maker, whose subclass knows the words; nothing is opened before its use.
 
     Every question and command may raise `DeviceRefused`, `DeviceFault`, `LinkError` and `ProtocolError`.
@@ -61,22 +59,6 @@ class SerialProjector(ABC):
         self.label = label
         self.clock = clock
         self.exchange = Exchange(connect, timeout, label, clock, self.greet, _CHECK_CABLE, CHECK_SPEED)
-
-    @abstractmethod
-    def power(self) -> Power:
-        """Return the power state now."""
-
-    @abstractmethod
-    def muted(self) -> bool | None:
-        """Return whether the picture is blanked, None where it cannot tell; refused unless the projector is on."""
-
-    @abstractmethod
-    def set_muted(self, muted: bool) -> None:
-        """Blank the picture, or show it; refused unless the projector is on."""
-
-    @abstractmethod
-    def faults(self) -> tuple[Fault, ...]:
-        """Return every fault reported now; empty when healthy, and where the projector cannot tell."""
 
     @abstractmethod
     def switch(self, on: bool) -> None:
@@ -107,23 +89,19 @@ class SerialProjector(ABC):
 
     def switch_on(self) -> None:
         """Begin to switch on; refused while it cools down."""
-        match self.power():
-            case Power.STANDBY:
-                self.switch(True)
-            case Power.COOLING:
-                raise DeviceRefused(f"{self.label} is cooling down; wait until it is in standby and try again")
-            case Power.ON | Power.WARMING:
-                pass
+        power = self.power()
+        if power is Power.COOLING:
+            raise DeviceRefused(f"{self.label} is cooling down; wait until it is in standby and try again")
+        if power is Power.STANDBY:
+            self.switch(True)
 
     def switch_off(self) -> None:
         """Begin to switch off; refused while it warms up."""
-        match self.power():
-            case Power.ON:
-                self.switch(False)
-            case Power.WARMING:
-                raise DeviceRefused(f"{self.label} is warming up; wait until it is on and try again")
-            case Power.STANDBY | Power.COOLING:
-                pass
+        power = self.power()
+        if power is Power.WARMING:
+            raise DeviceRefused(f"{self.label} is warming up; wait until it is on and try again")
+        if power is Power.ON:
+            self.switch(False)
 
     def lamps(self) -> tuple[Lamp, ...]:
         """Return every lamp; empty for a lampless projector, and for one that does not count hours."""

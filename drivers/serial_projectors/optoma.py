@@ -15,13 +15,11 @@ Source: Optoma, RS232 Protocol Function List of several models (syntax, P, F, OK
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.links.link import Link, quoted
+from drivers.links.link import quoted
 from drivers.projector import Fault, Power, Severity
-from drivers.serial_projectors.driver import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, SerialProjector, text_of
-from foundation.clock import Clock
+from drivers.serial_projectors.driver import CHECK_SPEED, SerialProjector, text_of
 from foundation.errors import DeviceRefused, ProtocolError
 
 BAUD = 9600
@@ -112,16 +110,7 @@ class OptomaProjector(SerialProjector):
     maker = "Optoma"
     _on_the_way: Power | None = None
     _muted: bool | None = None
-
-    def __init__(
-        self,
-        connect: Callable[[], Link],
-        timeout: float = DEFAULT_TIMEOUT_S,
-        label: str = "the projector",
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> None:
-        super().__init__(connect, timeout, label, clock)
-        self._faults: dict[str, None] = {}
+    _faults: tuple[str, ...] = ()
 
     def model(self) -> str:
         """Return the number that the language has for the model."""
@@ -208,7 +197,7 @@ class OptomaProjector(SerialProjector):
             self._on_the_way = None if power is Power.STANDBY else power
             self._muted = None if power is Power.STANDBY else self._muted
             if power is Power.WARMING:
-                self._faults.clear()
-        if number in _PARTS:
-            self._faults[_PARTS[number]] = None
+                self._faults = ()
+        if number in _PARTS and _PARTS[number] not in self._faults:
+            self._faults += (_PARTS[number],)
         return True

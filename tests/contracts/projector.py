@@ -12,6 +12,7 @@ import pytest
 
 from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
 from foundation.errors import DeviceRefused
+from sim.projectors.projector import SimulatedProjector
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,13 @@ class Bench:
     warm_up_s: float
     cool_down_s: float
     told: Callable[[frozenset[Fault]], frozenset[Fault]] = lambda faults: faults
+
+    @classmethod
+    def of(cls, projector: Projector, device: SimulatedProjector) -> Bench:
+        """Return the bench of a driver on a simulated projector, all of whose faults it can tell."""
+        traits = device.traits
+        play = device.clock.sleep, device.break_part, device.repair
+        return cls(projector, *play, traits.identity, traits.warm_up_s, traits.cool_down_s)
 
     def switched_on(self) -> Projector:
         """Return the projector when it has warmed up."""

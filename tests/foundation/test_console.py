@@ -37,6 +37,15 @@ from foundation.errors import FormatError, InputError
 from foundation.version import software
 
 
+def failing(error: BaseException) -> Callable[[], None]:
+    """Return a command that ends with an error."""
+
+    def fail() -> None:
+        raise error
+
+    return fail
+
+
 def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(lambda: None) == 0
     assert run(lambda: 7) == 0
@@ -84,10 +93,7 @@ def test_an_error_knows_its_remedy_apart_however_it_was_given(
     ],
 )
 def test_every_error_has_its_code(error: type[errors.CropError], code: int, capsys: pytest.CaptureFixture[str]) -> None:
-    def fail() -> None:
-        raise error("lab.toml: shutter_s is -1, more than 0 was expected; correct it")
-
-    assert run(fail) == code
+    assert run(failing(error("lab.toml: shutter_s is -1, more than 0 was expected; correct it"))) == code
     assert capsys.readouterr() == ("", "error: lab.toml: shutter_s is -1, more than 0 was expected; correct it\n")
 
 
@@ -111,29 +117,20 @@ def test_interruption_is_130(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_disk_fault_that_nobody_translated_is_5(
     number: int, beginning: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail() -> None:
-        raise OSError(number, os.strerror(number), "/disk/samples.npy")
-
-    assert run(fail) == 5
+    assert run(failing(OSError(number, os.strerror(number), "/disk/samples.npy"))) == 5
     said = capsys.readouterr().err
     assert said.startswith(f"error: {beginning}")
     assert said.endswith("then run the same command again\n")
 
 
 def test_a_disk_fault_of_an_open_file_is_5(capsys: pytest.CaptureFixture[str]) -> None:
-    def fail() -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-    assert run(fail) == 5
+    assert run(failing(OSError(errno.EIO, os.strerror(errno.EIO)))) == 5
     assert "cannot use the disk: Input/output error; the disk fails" in capsys.readouterr().err
 
 
 def test_a_missing_file_that_nobody_translated_is_no_disk_fault() -> None:
-    def fail() -> None:
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), "/nowhere")
-
     with pytest.raises(FileNotFoundError):
-        run(fail)
+        run(failing(FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), "/nowhere")))
 
 
 @pytest.mark.parametrize("name", ["/theirs/dataset.json", b"/theirs/dataset.json"])
@@ -151,10 +148,7 @@ def test_a_missing_file_that_nobody_translated_is_no_disk_fault() -> None:
 def test_a_path_that_cannot_be_used_is_2(
     number: int, remedy: str, name: str | bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail() -> None:
-        raise OSError(number, os.strerror(number), name)
-
-    assert run(fail) == 2
+    assert run(failing(OSError(number, os.strerror(number), name))) == 2
     assert capsys.readouterr().err == f"error: cannot use /theirs/dataset.json: {os.strerror(number)}; {remedy}\n"
 
 
@@ -163,10 +157,7 @@ def test_a_path_that_cannot_be_used_is_2(
     [(MemoryError(), "none is left"), (MemoryError("Unable to allocate 9 TiB"), "Unable to allocate 9 TiB")],
 )
 def test_no_memory_is_2(error: MemoryError, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
-    def fail() -> None:
-        raise error
-
-    assert run(fail) == 2
+    assert run(failing(error)) == 2
     assert capsys.readouterr().err == (
         f"error: not enough memory ({reason}); use fewer --workers, or smaller pictures\n"
     )
@@ -183,11 +174,8 @@ def test_no_memory_is_2(error: MemoryError, reason: str, capsys: pytest.CaptureF
     ],
 )
 def test_our_own_mistakes_are_not_hidden(error: Exception) -> None:
-    def fail() -> None:
-        raise error
-
     with pytest.raises(type(error)):
-        run(fail)
+        run(failing(error))
 
 
 @pytest.mark.parametrize(("given", "code"), [(0, 0), (2, 2), (None, 0), ("words", 1)])
@@ -308,11 +296,8 @@ def test_nobody_reads_the_error_any_more(monkeypatch: pytest.MonkeyPatch) -> Non
         def write(self, text: str, /) -> int:
             raise OSError(errno.EIO, "Input/output error")
 
-    def refuse() -> None:
-        raise errors.InputError("no such lab")
-
     monkeypatch.setattr(sys, "stderr", Gone())
-    assert run(refuse) == 2
+    assert run(failing(errors.InputError("no such lab"))) == 2
 
 
 def test_no_bar_before_there_is_something_to_count(capsys: pytest.CaptureFixture[str]) -> None:
@@ -371,10 +356,8 @@ def test_a_working_folder_that_is_gone_is_said(
     assert run(lambda: Path("x").resolve()) == 2
     assert said in capsys.readouterr().err
 
-    def missing() -> None:
-        raise FormatError("x is no session: it holds no journal.sqlite; name a folder made by acquire run or import")
-
-    assert run(missing) == 2
+    missing = FormatError("x is no session: it holds no journal.sqlite; name a folder made by acquire run or import")
+    assert run(failing(missing)) == 2
     assert said in capsys.readouterr().err
     monkeypatch.chdir(tmp_path)
 

@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
-from io import BufferedRandom
 from pathlib import Path
 
 import pytest
@@ -26,7 +25,7 @@ from foundation.files import (
     whole_file,
     write_whole,
 )
-from foundation.folders import require_free, require_free_file, whole_folder
+from foundation.folders import require_free_file, whole_folder
 
 
 def names(folder: Path) -> list[str]:
@@ -65,6 +64,7 @@ class TestWholeFile:
 
         with whole_file(tmp_path / "frame", named) as stream:
             stream.write(b"raw")
+            assert stream.tell() == 3
             stream.seek(0)
             assert stream.read() == b"raw"
         assert names(tmp_path) == ["frame.CR2"]
@@ -314,14 +314,6 @@ def test_partial_names_are_told_from_others() -> None:
     assert not is_partial(".hidden")
 
 
-def test_require_free(tmp_path: Path) -> None:
-    require_free(tmp_path / "new", "the session")
-    require_free(tmp_path, "the session")
-    write_whole(tmp_path / "x", "")
-    with pytest.raises(InputError, match="already exists"):
-        require_free(tmp_path, "the session")
-
-
 def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
     require_free_file(tmp_path / "new", "the lights")
     require_free_file(tmp_path / "no" / "such" / "new", "the lights")
@@ -329,13 +321,6 @@ def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "link"):
         with pytest.raises(InputError, match="for the lights"):
             require_free_file(path, "the lights")
-
-
-def test_whole_file_yields_a_stream_that_can_be_sized(tmp_path: Path) -> None:
-    with whole_file(tmp_path / "a") as stream:
-        assert isinstance(stream, BufferedRandom)
-        stream.write(b"123")
-        assert stream.tell() == 3
 
 
 @pytest.mark.parametrize("size", [0, 1, 70_000, 5 << 20])

@@ -25,16 +25,15 @@ MEMORY = 8 << 30
 """Bytes that a process may claim: a folder of kilobytes that asks for more fails for it."""
 
 
-def _work(task: tuple[dict[str, Seed], str, int, int, int]) -> list[str]:
-    seeds, place, first, count, step = task
+def _work(task: tuple[dict[str, Seed], str, range]) -> list[str]:
+    seeds, place, numbers = task
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     work = Path(place) / str(os.getpid())
     work.mkdir(parents=True, exist_ok=True)
     trials = Trials(work)
-    kinds = sorted(seeds)
     found: list[str] = []
-    for number in range(first, first + count, step):
-        for kind in kinds:
+    for number in numbers:
+        for kind in sorted(seeds):
             # A loop in a library hears no signal.
             faulthandler.dump_traceback_later(120, exit=True)
             (work / "number").write_text(f"{kind} {number}")
@@ -58,24 +57,18 @@ def main() -> int:
         seeds = make_seeds(Path(place) / "seeds")
         seeds = {kind: seed for kind, seed in seeds.items() if not chosen.kind or kind in chosen.kind}
         begun = time.monotonic()
-        tasks = [
-            (seeds, place, first, min(200, chosen.first + chosen.count - first), 1)
-            for first in range(chosen.first, chosen.first + chosen.count, 200)
-        ]
-        done = 0
-        if chosen.workers == 1:
-            results = map(_work, tasks)
-        else:
-            pool = multiprocessing.get_context("fork").Pool(chosen.workers)
-            results = pool.imap_unordered(_work, tasks)
-        for found in results:
-            done += min(200, chosen.count) * len(seeds)
+        numbers = range(chosen.first, chosen.first + chosen.count)
+        tasks = [(seeds, place, numbers[at : at + 200]) for at in range(0, len(numbers), 200)]
+        # One process alone ends where a folder makes it hang; a pool would wait for it.
+        tried = map if chosen.workers == 1 else multiprocessing.get_context("fork").Pool(chosen.workers).imap_unordered
+        for done, found in enumerate(tried(_work, tasks), 1):
             for fault in found:
                 last = fault.strip().splitlines()[-1]
                 faults[last[:100]] += 1
                 if faults[last[:100]] <= 2:
                     print(fault, flush=True)
-            print(f"{done} folders, {sum(faults.values())} faults, {time.monotonic() - begun:.0f} s", flush=True)
+            took = time.monotonic() - begun
+            print(f"{done} of {len(tasks)} parts, {sum(faults.values())} faults, {took:.0f} s", flush=True)
     for fault, count in faults.most_common():
         print(f"{count:6} {fault}")
     return min(sum(faults.values()), 99)

@@ -150,7 +150,7 @@ def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector 
         )
     device = _required(cable.device, "lab.projector.device", "the serial port", file)
     return spoken.projector(
-        lambda: SerialLink.open(device, cable.baud or spoken.baud, spoken.parity),
+        lambda: SerialLink.open(device, cable.baud or spoken.baud),
         label=f"the projector at {device}",
         clock=clock,
     )

@@ -61,7 +61,7 @@ def test_opens_by_any_mark() -> None:
     assert "1-2" in pipes.label
     pipes.close()
     assert "1-1" in open_usb(port="1-1", backend=bus).label
-    assert "32ca" in open_usb(vendor=0x04A9, product=0x32CA, backend=bus).label
+    assert "serial number 3" in open_usb(vendor=0x04A9, serial="3", backend=bus).label
 
 
 def test_says_what_is_there_when_the_camera_is_not() -> None:

@@ -22,7 +22,7 @@ from sim.buses.ptp import serve_ptpip
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
 from sim.projectors.pjlink import PjLinkPeer, serve_pjlink
-from sim.projectors.projector import ProjectorTraits, SimulatedProjector
+from sim.projectors.projector import SimulatedProjector
 from tests.contracts.camera import SeededFilm
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling, Slow
@@ -382,74 +382,42 @@ def test_an_answer_that_never_ends_is_a_timeout() -> None:
         PjLinkProjector(lambda: Endless(b""), timeout=5.0, clock=clock).power()
 
 
-def simulated_bench(
-    connect: Callable[[SimulatedProjector], Callable[[], Link]],
-    password: str | None = None,
-    traits: ProjectorTraits | None = None,
-) -> Bench:
-    """Return the driver on a simulated projector behind `connect`."""
-    clock = SimulatedClock()
-    device = SimulatedProjector(clock, traits=traits)
-    return Bench(
-        PjLinkProjector(connect(device), password),
-        clock.sleep,
-        device.break_part,
-        device.repair,
-        device.traits.identity,
-        device.traits.warm_up_s,
-        device.traits.cool_down_s,
-    )
+def noisy(link: Link) -> Link:
+    """Have a projector answer in small letters, with LF and filling, and announce its start in between."""
+
+    def garble(data: bytes) -> bytes:
+        data = data.replace(b"%1POWR=", b"%1powr=").replace(b"=OK", b"=Ok").replace(b"=ERR", b"=err")
+        return b"\n%2LKUP=00:11:22:33:44:55\r\0" + data.replace(b"\r", b"\r\n\0\0")
+
+    return Garbling(link, garble)
+
+
+WAYS: dict[str, tuple[Callable[[Link], Link], str | None]] = {
+    "open": (lambda link: link, None),
+    "password": (lambda link: link, PASSWORD),
+    "byte by byte": (Dribbling, None),
+    "dropped at every second command": (lambda link: DroppedAfter(link, 1), None),
+    "dropped, password": (lambda link: DroppedAfter(link, 1), PASSWORD),
+    "noisy line ends": (noisy, None),
+}
 
 
 class TestOverMemory(ProjectorContract):
-    @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
+    @pytest.fixture(params=WAYS)
     def bench(self, request: pytest.FixtureRequest) -> Bench:
-        return simulated_bench(lambda device: lambda: PeerLink(PjLinkPeer(device, request.param)), request.param)
+        trouble, password = WAYS[request.param]
+        device = SimulatedProjector(SimulatedClock())
+        return Bench.of(PjLinkProjector(lambda: trouble(PeerLink(PjLinkPeer(device, password))), password), device)
 
 
 class TestOverLoopback(ProjectorContract):
     @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
     def bench(self, request: pytest.FixtureRequest) -> Iterator[Bench]:
-        clock = SimulatedClock()
-        device = SimulatedProjector(clock)
+        device = SimulatedProjector(SimulatedClock())
         with serve_pjlink(device, password=request.param) as server:
             projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), request.param, 10.0)
-            yield Bench(
-                projector,
-                clock.sleep,
-                device.break_part,
-                device.repair,
-                device.traits.identity,
-                device.traits.warm_up_s,
-                device.traits.cool_down_s,
-            )
+            yield Bench.of(projector, device)
             projector.close()
-
-
-class TestByteByByte(ProjectorContract):
-    @pytest.fixture
-    def bench(self) -> Bench:
-        return simulated_bench(lambda device: lambda: Dribbling(PeerLink(PjLinkPeer(device))))
-
-
-class TestDroppedAtEverySecondCommand(ProjectorContract):
-    @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
-    def bench(self, request: pytest.FixtureRequest) -> Bench:
-        return simulated_bench(
-            lambda device: lambda: DroppedAfter(PeerLink(PjLinkPeer(device, request.param)), 1), request.param
-        )
-
-
-class TestNoisyLineEnds(ProjectorContract):
-    """A projector that answers in small letters, with LF and filling, and announces its start in between."""
-
-    @pytest.fixture
-    def bench(self) -> Bench:
-        def garble(data: bytes) -> bytes:
-            data = data.replace(b"%1POWR=", b"%1powr=").replace(b"=OK", b"=Ok").replace(b"=ERR", b"=err")
-            return b"\n%2LKUP=00:11:22:33:44:55\r\0" + data.replace(b"\r", b"\r\n\0\0")
-
-        return simulated_bench(lambda device: lambda: Garbling(PeerLink(PjLinkPeer(device)), garble))
 
 
 class TestAnswersThatTakeTheirTime(ProjectorContract):
@@ -457,17 +425,9 @@ class TestAnswersThatTakeTheirTime(ProjectorContract):
 
     @pytest.fixture
     def bench(self) -> Bench:
-        clock, cable_clock = SimulatedClock(), SimulatedClock()
-        device = SimulatedProjector(clock)
-        return Bench(
-            PjLinkProjector(lambda: Slow(PeerLink(PjLinkPeer(device)), cable_clock, 4.0), clock=cable_clock),
-            clock.sleep,
-            device.break_part,
-            device.repair,
-            device.traits.identity,
-            device.traits.warm_up_s,
-            device.traits.cool_down_s,
-        )
+        cable_clock, device = SimulatedClock(), SimulatedProjector(SimulatedClock())
+        slow = lambda: Slow(PeerLink(PjLinkPeer(device)), cable_clock, 4.0)  # noqa: E731
+        return Bench.of(PjLinkProjector(slow, clock=cable_clock), device)
 
 
 def test_an_answer_that_comes_too_late_is_a_timeout() -> None:

@@ -62,7 +62,7 @@ def test_any_datagram_is_read_without_complaint(datagram: bytes) -> None:
     assert len(wire.replies_in(datagram)) <= len(datagram)
 
 
-class PaperNetwork:
+class PaperNetwork(UdpSocket):
     """Datagrams that arrive at given times, whoever asks; keeps what was sent and when."""
 
     def __init__(self, clock: SimulatedClock, *arrivals: tuple[float, bytes, str]) -> None:

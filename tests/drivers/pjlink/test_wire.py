@@ -7,14 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import pjlink as wire
-from drivers.pjlink import (
-    ErrorCode,
-    NoResolution,
-    PjLinkReply,
-    PjLinkRequest,
-    Refused,
-    Resolution,
-)
+from drivers.pjlink import NoResolution, PjLinkReply, PjLinkRequest, Refused, Resolution
 from drivers.projector import Fault, Lamp, Power, Severity
 from foundation.errors import ProtocolError
 
@@ -118,14 +111,6 @@ def test_what_is_no_reply_is_quoted(line: bytes) -> None:
         wire.parse_reply(line)
 
 
-def test_errors_are_values_of_their_own() -> None:
-    assert PjLinkReply("POWR", "ERR1").error is ErrorCode.UNDEFINED
-    assert PjLinkReply("POWR", "err2").error is ErrorCode.OUT_OF_PARAMETER
-    assert PjLinkReply("POWR", "ERR3").error is ErrorCode.UNAVAILABLE
-    assert PjLinkReply("POWR", "ERR4").error is ErrorCode.FAILURE
-    assert PjLinkReply("NAME", "ERR5").error is None
-
-
 def test_values_of_the_standard() -> None:
     assert [wire.parse_power(digit) for digit in "0123"] == [Power.STANDBY, Power.ON, Power.COOLING, Power.WARMING]
     assert [wire.parse_mute(code) for code in ("11", "31", "21", "30")] == [True, True, False, False]
@@ -186,47 +171,13 @@ def test_values_outside_the_standard_are_protocol_errors(parse: object, value: s
         parse(value)
 
 
-@given(st.sampled_from(Power))
-def test_power_comes_back(power: Power) -> None:
-    assert wire.parse_power(wire.format_power(power)) is power
-
-
-@given(st.dictionaries(st.sampled_from(wire.FAULT_PARTS), st.sampled_from(Severity)))
-def test_faults_come_back(faults: dict[str, Severity]) -> None:
-    listed = [Fault(part, severity) for part, severity in faults.items()]
-    assert set(wire.parse_faults(wire.format_faults(listed))) == set(listed)
-
-
-@given(st.lists(st.builds(Lamp, st.integers(0, 99999), st.booleans()), min_size=1, max_size=8))
-def test_lamps_come_back(lamps: list[Lamp]) -> None:
-    assert wire.parse_lamps(wire.format_lamps(lamps)) == tuple(lamps)
-
-
-@given(st.one_of(st.sampled_from(NoResolution), st.builds(Resolution, st.integers(0, 99999), st.integers(0, 99999))))
-def test_resolutions_come_back(resolution: Resolution | NoResolution) -> None:
-    assert wire.parse_input_resolution(wire.format_resolution(resolution)) == resolution
-
-
-@given(st.from_regex("[1-6][1-9A-Za-z]", fullmatch=True))
-def test_inputs_come_back_as_capitals(code: str) -> None:
-    assert wire.parse_input(code) == code.upper()
-
-
-@given(st.binary(min_size=16, max_size=16), st.binary(min_size=16, max_size=16), PRINTABLE)
-def test_a_sha256_digest_before_a_command_comes_back(challenge: bytes, nonce: bytes, password: str) -> None:
-    digest = wire.sha256_digest(challenge, nonce, password)
-    assert len(digest) == wire.MAX_DIGEST
-    request = PjLinkRequest("POWR", digest=digest)
-    assert wire.parse_request(wire.encode_request(request)[:-1]) == request
-
-
 @given(
     st.builds(
         PjLinkRequest,
         st.from_regex("[A-Z0-9]{4}", fullmatch=True),
         PRINTABLE.filter(bool),
         st.sampled_from((1, 2)),
-        st.sampled_from(("", "5d8409bc1c3fa39749434aa3a5c38682")),
+        st.sampled_from(("", "5d8409bc1c3fa39749434aa3a5c38682", 3 * "5d8409bc1c3fa39749434aa3a5c38682")),
     )
 )
 def test_requests_come_back(request_: PjLinkRequest) -> None:

@@ -191,6 +191,7 @@ def packet(kind: int, body: bytes = b"") -> bytes:
 
 ACK = packet(2, (7).to_bytes(4, "little") + bytes(16) + "cam\0".encode("utf-16-le") + bytes.fromhex("00000100"))
 EVENT_ACK = packet(4)
+DONE = packet(7, bytes.fromhex("0120 05000000"))
 
 
 class FarEnd:
@@ -222,6 +223,12 @@ class FarEnd:
         return link.read(1 << 20, 0)
 
 
+def connected() -> tuple[FarEnd, IpTransport]:
+    """Return a device and the transport to it."""
+    far = FarEnd()
+    return far, far.connect()
+
+
 def connect_in_turn(far_end: Callable[[], FarEnd], clock: SimulatedClock) -> IpTransport:
     """Connect to a device that is another at each try."""
     current: list[FarEnd] = []
@@ -235,8 +242,7 @@ def connect_in_turn(far_end: Callable[[], FarEnd], clock: SimulatedClock) -> IpT
 
 def test_greets_in_the_standards_bytes() -> None:
     # CIPA DC-005-2005, 2.3.1 and 2.3.3.
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     hello = GUID + "Cr\0".encode("utf-16-le") + bytes.fromhex("00000100")
     assert far.heard(far.command) == packet(1, hello)
     assert far.heard(far.event) == packet(3, bytes.fromhex("07000000"))
@@ -244,10 +250,9 @@ def test_greets_in_the_standards_bytes() -> None:
 
 
 def test_asks_and_sends_data_in_the_standards_bytes() -> None:
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     far.heard(far.command)
-    far.command.write(packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
+    far.command.write(DONE, PATIENCE_S)
     done = transport.transact(PtpRequest(0x9110, 5, (1, 2)), send=bytes(70000), timeout=PATIENCE_S)
     assert done.response == PtpResponse(0x2001, 5)
     assert far.heard(far.command) == (
@@ -258,34 +263,24 @@ def test_asks_and_sends_data_in_the_standards_bytes() -> None:
     )
 
 
-def test_takes_data_in_any_packets() -> None:
-    far = FarEnd()
-    transport = far.connect()
-    start = packet(9, bytes.fromhex("05000000 0600000000000000"))
+@pytest.mark.parametrize("total", ["0600000000000000", "ffffffffffffffff"], ids=["announced", "of unknown length"])
+def test_takes_data_in_any_packets(total: str) -> None:
+    far, transport = connected()
+    start = packet(9, bytes.fromhex("05000000" + total))
     pieces = packet(10, bytes.fromhex("05000000") + b"ab") + packet(10, bytes.fromhex("05000000") + b"cdef")
     end = packet(12, bytes.fromhex("05000000"))
-    far.command.write(start + pieces + end + packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
+    far.command.write(start + pieces + end + DONE, PATIENCE_S)
     assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).data == b"abcdef"
 
 
 @pytest.mark.parametrize(("total", "wrong"), [(5, "announced 5"), (7, "announced 7")])
 def test_data_must_be_as_long_as_announced(total: int, wrong: str) -> None:
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     start = packet(9, bytes.fromhex("05000000") + total.to_bytes(8, "little"))
     end = packet(12, bytes.fromhex("05000000") + b"abcdef")
-    far.command.write(start + end + packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
+    far.command.write(start + end + DONE, PATIENCE_S)
     with pytest.raises(ProtocolError, match=wrong):
         transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S)
-
-
-def test_data_of_unknown_length_are_taken() -> None:
-    far = FarEnd()
-    transport = far.connect()
-    start = packet(9, bytes.fromhex("05000000") + b"\xff" * 8)
-    end = packet(12, bytes.fromhex("05000000") + b"abcdef")
-    far.command.write(start + end + packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
-    assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).data == b"abcdef"
 
 
 def test_waits_for_the_event_connection_to_be_accepted() -> None:
@@ -325,8 +320,7 @@ def test_what_is_no_camera_is_named() -> None:
 
 
 def test_pings_are_answered_between_transactions() -> None:
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     far.heard(far.event)
     far.event.write(packet(13), PATIENCE_S)
     assert transport.events() == ()
@@ -335,15 +329,14 @@ def test_pings_are_answered_between_transactions() -> None:
 
 def test_a_long_wait_for_a_response_answers_pings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drivers.ptp.ip._PING_EVERY_S", 0.01)
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     far.heard(far.event)
     far.event.write(packet(13), PATIENCE_S)
     answers: list[bytes] = []
 
     def device() -> None:
         answers.append(read_exactly(far.event, 8))
-        far.command.write(packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
+        far.command.write(DONE, PATIENCE_S)
 
     thread = threading.Thread(target=device)
     thread.start()
@@ -353,8 +346,7 @@ def test_a_long_wait_for_a_response_answers_pings(monkeypatch: pytest.MonkeyPatc
 
 
 def test_events_split_over_reads_are_joined() -> None:
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     event = packet(8, bytes.fromhex("01c1 ffffffff 2a000000"))
     far.event.write(event[:5], PATIENCE_S)
     assert transport.events() == ()
@@ -363,8 +355,7 @@ def test_events_split_over_reads_are_joined() -> None:
 
 
 def test_a_flood_of_events_keeps_the_newest() -> None:
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     far.event.write(
         b"".join(packet(8, bytes.fromhex("01c1 ffffffff") + n.to_bytes(4, "little")) for n in range(9000)), PATIENCE_S
     )
@@ -374,16 +365,14 @@ def test_a_flood_of_events_keeps_the_newest() -> None:
 
 
 def test_an_event_connection_that_is_lost_is_told() -> None:
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     far.event.close()
     with pytest.raises(LinkClosed):
         transport.events()
 
 
 def test_a_stranger_in_the_middle_of_a_transaction_is_refused() -> None:
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     far.command.write(packet(4), PATIENCE_S)
     with pytest.raises(ProtocolError, match="InitEventAck"):
         transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S)
@@ -404,13 +393,12 @@ def answer(size: int) -> bytes:
     pieces = packet(10, bytes.fromhex("05000000") + bytes(size - 10)) + packet(
         12, bytes.fromhex("05000000") + bytes(10)
     )
-    return start + pieces + packet(7, bytes.fromhex("0120 05000000"))
+    return start + pieces + DONE
 
 
 @given(cut=st.integers(0, len(answer(100)) - 1), hangs_up=st.booleans())
 def test_a_stream_that_ends_at_any_byte_is_closed_or_late(cut: int, hangs_up: bool) -> None:
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     far.command.write(answer(100)[:cut], PATIENCE_S)
     if hangs_up:
         far.command.close()
@@ -422,8 +410,7 @@ def test_a_stream_that_ends_at_any_byte_is_closed_or_late(cut: int, hangs_up: bo
 
 @given(at=st.integers(0, len(answer(100)) - 1), value=st.integers(0, 255))
 def test_a_garbled_byte_never_ends_in_anything_but_our_errors(at: int, value: int) -> None:
-    far = FarEnd()
-    transport = far.connect()
+    far, transport = connected()
     stream = bytearray(answer(100))
     stream[at] = value
     far.command.write(bytes(stream), PATIENCE_S)
@@ -454,7 +441,7 @@ def test_reset_is_a_new_connection() -> None:
     transport.reset()
     with pytest.raises(LinkClosed):
         first.command.write(b"x", PATIENCE_S)
-    second.command.write(packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
+    second.command.write(DONE, PATIENCE_S)
     assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).response.ok
 
 

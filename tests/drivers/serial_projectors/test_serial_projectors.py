@@ -6,9 +6,8 @@ marked "not confirmed" follows other drivers, as the driver's docstring says.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -43,7 +42,6 @@ from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Ga
 
 ROOT = Path(__file__).parents[3]
 NAMES = sorted(LANGUAGES)
-on_posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 
 OPTOMA_STATE = bytes.fromhex("7E 30 30 31 32 34 20 31 0D")
 RUNNING = "00 85 00 00 01 01 87"
@@ -115,37 +113,19 @@ def bench_of(name: str, device: SimulatedProjector, projector: Projector, catch_
             device.switch_on()
         catch_up()
 
-    traits, expected = device.traits, EXPECTED[name]
-    return Bench(
-        projector,
-        wait,
-        break_part,
-        repair,
-        expected.identity,
-        traits.warm_up_s,
-        traits.cool_down_s,
-        expected.reported,
-    )
+    own = {"wait": wait, "break_part": break_part, "repair": repair}
+    identity, told = EXPECTED[name].identity, EXPECTED[name].reported
+    return replace(Bench.of(projector, device), **own, identity=identity, told=told)
 
 
 class TestOverMemory(ProjectorContract):
-    @pytest.fixture(params=NAMES)
+    @pytest.fixture(params=[(name, whole) for name in NAMES for whole in (True, False)], ids=str)
     def bench(self, request: pytest.FixtureRequest) -> Bench:
-        name: str = request.param
+        name, whole = request.param
         device = SimulatedProjector(SimulatedClock())
         peer = PEERS[name](device)
-        projector = LANGUAGES[name].projector(lambda: SerialPeerLink(peer), clock=device.clock)
-        return bench_of(name, device, projector, lambda: None)
-
-
-class TestByteByByte(ProjectorContract):
-    @pytest.fixture(params=NAMES)
-    def bench(self, request: pytest.FixtureRequest) -> Bench:
-        name: str = request.param
-        device = SimulatedProjector(SimulatedClock())
-        peer = PEERS[name](device)
-        projector = LANGUAGES[name].projector(lambda: Dribbling(SerialPeerLink(peer)), clock=device.clock)
-        return bench_of(name, device, projector, lambda: None)
+        cable = (lambda: SerialPeerLink(peer)) if whole else (lambda: Dribbling(SerialPeerLink(peer)))
+        return bench_of(name, device, LANGUAGES[name].projector(cable, clock=device.clock), lambda: None)
 
 
 class TestOverTheNetwork(ProjectorContract):
@@ -162,7 +142,6 @@ class TestOverTheNetwork(ProjectorContract):
         return bench_of("epson", device, projector, lambda: None)
 
 
-@on_posix
 @pytest.mark.slow
 class TestOverAPseudoTerminal(ProjectorContract):
     @pytest.fixture(params=NAMES)
@@ -173,9 +152,7 @@ class TestOverAPseudoTerminal(ProjectorContract):
         spoken = LANGUAGES[request.param]
         device = SimulatedProjector(SimulatedClock())
         with PseudoTerminal(PEERS[spoken.name](device)) as terminal:
-            projector = spoken.projector(
-                lambda: SerialLink.open(terminal.path, spoken.baud, spoken.parity), clock=device.clock
-            )
+            projector = spoken.projector(lambda: SerialLink.open(terminal.path, spoken.baud), clock=device.clock)
             yield bench_of(spoken.name, device, projector, terminal.catch_up)
             projector.close()
 
@@ -618,14 +595,11 @@ def test_nec_names_itself() -> None:
     assert script.ended()
 
 
-def test_nec_error_bits() -> None:
+def test_nec_bits_of_the_manual_s_table() -> None:
+    """Error status, 009: of each bit of the first four bytes the part, in capitals where it is a fault."""
     # Fan (bit 4 of the first byte) and dust (bit 2 of the fourth).
     projector, _ = nec_script(("00 88 00 00 00 88", "20 88 01 40 0C 10 00 00 04" + " 00" * 8 + "09"))
     assert set(projector.faults()) == {Fault("fan", Severity.ERROR), Fault("temperature", Severity.WARNING)}
-
-
-def test_nec_bits_of_the_manual_s_table() -> None:
-    """Error status, 009: of each bit of the first four bytes the part, in capitals where it is a fault."""
     manual = (
         {0: "COVER", 1: "TEMPERATURE", 4: "FAN", 6: "LAMP", 7: "lamp"},
         {0: "lamp", 2: "LAMP"},
@@ -859,7 +833,6 @@ def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
     assert projector.power() is Power.ON
 
 
-@on_posix
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cable_pulled_out_is_told(name: str) -> None:
     from drivers.links.serial import SerialLink
@@ -867,7 +840,7 @@ def test_a_cable_pulled_out_is_told(name: str) -> None:
 
     spoken = language(name)
     with PseudoTerminal(PEERS[name](SimulatedProjector(SimulatedClock(), Power.ON))) as terminal:
-        projector = spoken.projector(lambda: SerialLink.open(terminal.path, spoken.baud, spoken.parity))
+        projector = spoken.projector(lambda: SerialLink.open(terminal.path, spoken.baud))
         assert projector.power() is Power.ON
     with pytest.raises(LinkClosed, match=terminal.path):
         projector.power()
@@ -891,4 +864,3 @@ def test_users_are_told_of_every_language() -> None:
         for name, spoken in LANGUAGES.items()
         if pattern.format(name, spoken.baud) not in texts[page]
     ] == []
-    assert {spoken.parity for spoken in LANGUAGES.values()} == {"N"}, "docs/devices.md says so of all"

@@ -181,7 +181,7 @@ def test_serves_a_serial_projector_until_interrupted(name: str) -> None:
             line = process.stdout.readline()
             assert line.startswith(f"{spoken.maker} projector at /dev/")
             path = line.split()[-1]
-            projector = spoken.projector(lambda: SerialLink.open(path, spoken.baud, spoken.parity))
+            projector = spoken.projector(lambda: SerialLink.open(path, spoken.baud))
             assert projector.power() is Power.STANDBY
             projector.switch_on()
             assert projector.power() is Power.WARMING
