@@ -1,32 +1,16 @@
 """The journal of a session, `journal.sqlite`: the plan, every attempt at its frames, their verdicts, and events.
 
-Its facts stand a second time in `ledger.jsonl`, from which a journal that was lost is made anew.
-
-Rules that hold inside:
-
-- The journal is written before and after each frame; every write is a transaction of its own and on the disk when the
-  call returns, since a committed row is what makes a frame count.
-- Rows are never deleted; a frame that was accepted can be voided. Times are ISO 8601 text with microseconds and zone,
-  files are named relative to the session's folder.
-- While a run has it open the journal is in SQLite's write-ahead mode: readers see the last commit and hold nobody up.
-  When the run ends in order it is put back to one file (`-wal` and `-shm` are gone). Where write-ahead mode does not
-  work (file systems of a network share no memory) the journal stays in the older mode.
-- A reader creates, migrates and changes nothing, and never stops a run. What cannot be read in place without doing so
-  (a journal copied with its `-wal`, one in a folder that cannot be written) is read from a copy in memory.
-- A session may be a stranger's, and an SQLite file can hold more than rows: views that never end, triggers that delete,
-  columns that are computed, text where a number is meant, names of files outside. All that is refused when the journal
-  is opened, so that nothing behind this has to expect it.
-- Files are deleted, replaced and cut, and nobody says so: a program goes on writing a file that has no name any more,
-  and SQLite does not look twice at pages that it has read. So a run looks whether the journal on the disk is its own,
-  and whole (`_JournalGuard`).
-- A line of the ledger is a transaction: the rows that it put or changed, by table, as a JSON object. It is on the disk
-  before the journal commits the same, so that the lines hold all that the journal holds, and at most one transaction
-  more. A later row of the same key changes the columns that it names. Signs of life, and where the session lies, are no
-  facts and are not kept. What a crash cut off is the last line alone, and is no fact.
-- A raw file may be downloaded in one thread and made whole in another (`IncomingFile`), before its row is committed.
-
-How the file is opened, and what is refused then, is `experiment.session.opening`; which raw files are really there,
-`experiment.session.folder` knows.
+- It is written before and after each frame; every write is a transaction of its own and on the disk when the call
+  returns, since a committed row is what makes a frame count. Rows are never deleted; an accepted frame can be voided.
+- While a run has it open the journal is in SQLite's write-ahead mode, where that works: readers see the last commit and
+  hold nobody up. When the run ends in order it is one file again. A reader creates, migrates and changes nothing.
+- A session may be a stranger's: what an SQLite file can hold beside rows is refused when the journal is opened
+  (`experiment.session.opening`), so that nothing behind this has to expect it.
+- Files are deleted, replaced and cut, and nobody says so; SQLite does not look twice at pages that it has read. So a
+  run looks whether the journal on the disk is its own, and whole (`_JournalGuard`).
+- Its facts stand a second time in `ledger.jsonl`, from which a journal that was lost is made anew. A line of it is a
+  transaction: the rows that it put or changed, by table, as a JSON object, on the disk before the journal commits the
+  same. Signs of life, and where the session lies, are no facts. What a crash cut off is the last line alone.
 
 Source: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvantages".
 """

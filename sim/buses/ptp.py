@@ -1,10 +1,7 @@
-"""A PTP device on a TCP port, for any initiator (PTP/IP).
+"""A PTP device on a TCP port, for one initiator at a time (PTP/IP).
 
-- One initiator at a time, known by the number that joins its two connections; a second one hears that the device is
-  busy.
-- The responder is asked by one thread only, that of the command connection. It is asked for events after each
-  operation, before the response goes out, and 20 times a second between operations.
-- A data phase to the initiator is announced even if it is empty, for initiators wait for it.
+The responder is asked by one thread only, that of the command connection: for events after each operation, before the
+response goes out, and 20 times a second between operations.
 
 Source: CIPA DC-005-2005, PTP-IP, clauses 2.2 and 2.3.
 """

@@ -1,28 +1,10 @@
 """Simulated USB devices lent over a network: Linux attaches them as if they were plugged in, so do USB/IP libraries.
 
-On Linux, as root: ``modprobe vhci-hcd``, then ``usbip attach -r 127.0.0.1 -b 1-1``.
-
-Rules that hold inside:
-
-- A device is lent to one client at a time, and only the thread of its connection uses it.
-- A transfer in that finds nothing waits, in order, until the device has something to say or the client unlinks it;
-  interrupt pipes are looked at 50 times a second.
-- Where a transfer that must not be short is short, those queued behind it on its pipe are held, as host controllers
-  hold them, until the client unlinks them: they were parts of the same read.
+On Linux, as root: ``modprobe vhci-hcd``, then ``usbip attach -r 127.0.0.1 -b 1-1``. A device is lent to one client at a
+time, and only the thread of its connection uses it. Numbers are big-endian, save the eight bytes of a control request,
+which are USB's own. Whatever arrives, the only error is `ProtocolError`.
 
 Source: the Linux kernel's documentation, usb/usbip_protocol; URB semantics, driver-api/usb/URB.
-
-**The wire.** A connection begins with one operation: to list the devices, or to import one. Once a device is
-imported, the same connection carries its transfers, each with a number under which its result comes back, in any
-order.
-
-Rules that hold inside:
-
-- `RequestReader` takes a stream in any pieces. Whatever arrives, the only error is `ProtocolError`; after it the
-  stream has lost its place.
-- Numbers are big-endian here, save the eight bytes of a control request, which are USB's own.
-
-Source: the Linux kernel's documentation, usb/usbip_protocol.
 """
 
 from __future__ import annotations
@@ -345,6 +327,7 @@ class _Loan:
                 return False
             short = bool(submit.flags & SHORT_NOT_OK) and len(data) < submit.length
             if short:
+                # They were parts of the same read: host controllers hold them until the client unlinks them.
                 self._held |= {other.number for other in self._waiting if other.endpoint == submit.endpoint}
             self._end(submit, -_EREMOTEIO if short else 0, data)
         return True

@@ -1,8 +1,5 @@
 """PJLink for the simulated projector: the far side of a connection, and a TCP port that speaks for it.
 
-Rules that hold inside: a peer deals with bytes alone; what they do happens in
-`sim.projectors.projector.SimulatedProjector`.
-
 Over UDP a projector of class 2 answers searches and gives notice of its changes.
 """
 

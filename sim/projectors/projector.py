@@ -1,10 +1,6 @@
 """The simulated projector itself, a lamp that takes its time, and the screen: one plain colour that a camera sees.
 
-Rules that hold inside:
-
-- It has states and no bytes; `sim.projectors.pjlink` and `sim.projectors.serial` translate for it.
-- State moves with the time that is handed in, and only when somebody looks.
-- What the world needs is `light`: how much of the full light reaches the screen now.
+It has states and no bytes, and moves with the time that is handed in, only when somebody looks.
 """
 
 from __future__ import annotations

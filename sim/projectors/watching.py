@@ -1,16 +1,8 @@
 """What a projector throws on the chart: the pixels of a real screen, through the lamp of a projector that is asked.
 
-Rules that hold inside:
-
-- The screen is read as a screenshot program reads it, whoever drew there, several times while the shutter is open;
-  codes become light before they are averaged, so that what was there for half the time gives half its light.
-- The projector is asked over its control port for power, mute, input, and freeze where it knows that. One that does
-  not answer gives no light; a screen that cannot be read is black, as is an input without signal.
-- A picture that was frozen stays what the screen showed when the projector was last heard of unfrozen: the time of a
-  freeze is known to `POLL_S`.
-- The watch holds neither screen saver nor power saving off.
-
-What only the monitor knows cannot be seen: power saving and gamma ramps act behind the screen's memory.
+The screen is read as a screenshot program reads it, several times while the shutter is open; codes become light before
+they are averaged. A projector that does not answer gives no light; a screen that cannot be read is black. What only the
+monitor knows cannot be seen: power saving and gamma ramps act behind the screen's memory.
 """
 
 from __future__ import annotations
