@@ -164,19 +164,14 @@ def encode_unlinked(unlink: Unlink, status: int) -> bytes:
     return _URB.pack(_UNLINKED, unlink.number, 0, 0, 0, status & 0xFFFFFFFF, 0, 0, 0, 0, b"")
 
 
-def device_number(bus_id: str) -> tuple[int, int]:
-    """Return bus and device number for a bus id such as ``1-2``."""
-    bus, _, port = bus_id.partition("-")
-    return int(bus), int(port) + 1
-
-
 def _describe(bus_id: str, device: PtpUsbDevice) -> bytes:
-    bus, number = device_number(bus_id)
+    """Return what a client is told of a device, whose bus id is such as ``1-2``."""
+    bus, port = (int(part) for part in bus_id.split("-"))
     vendor, product, release = struct.unpack_from("<HHH", device.device_descriptor(), 8)
     path = f"/sys/devices/simulated/usb{bus}/{bus_id}"
     names = path.encode("ascii"), bus_id.encode("ascii")
     return struct.pack(
-        ">256s32sIIIHHHBBBBBB", *names, bus, number, HIGH_SPEED, vendor, product, release, 0, 0, 0, 1, 1, 1
+        ">256s32sIIIHHHBBBBBB", *names, bus, port + 1, HIGH_SPEED, vendor, product, release, 0, 0, 0, 1, 1, 1
     )
 
 
