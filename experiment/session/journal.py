@@ -39,8 +39,7 @@ from experiment.session.opening import (
     Retry,
     beside,
     close_after_run,
-    connect_to_read,
-    connect_to_write,
+    connect,
     create_file,
     is_busy,
     open_for_run,
@@ -197,7 +196,9 @@ class Journal:
         copy.unlink(missing_ok=True)
         with closing(create_file(copy)) as connection, connection:
             connection.execute("BEGIN")
-            _insert_rows(connection, rows)
+            for table, row in ((table, row) for table, of_table in rows.items() for row in of_table.values()):
+                marks = ", ".join("?" * len(row))
+                connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
         Journal.open(copy).close()
         set_aside(path)
         copy.replace(path)
@@ -532,7 +533,7 @@ def without_journal(folder: Path) -> str:
 
 def beat_beside(path: Path, state: RunState, sentence: str, until: datetime) -> None:
     """Give a sign of life from another thread than the one that has the journal open; none where that fails."""
-    with suppress(sqlite3.Error), closing(connect_to_write(path)) as connection:
+    with suppress(sqlite3.Error), closing(connect(path, "rw")) as connection:
         connection.execute("BEGIN IMMEDIATE")
         _put_beat(connection, path, state, sentence, until)
         connection.execute("COMMIT")
@@ -644,7 +645,7 @@ class _JournalGuard:
     def require_whole(self) -> None:
         """Raise `LostJournalError` where the journal, as everybody else reads it, does not hold what the run wrote."""
         try:
-            with closing(connect_to_read(self._path)) as connection:
+            with closing(connect(self._path, "ro")) as connection:
                 sound = connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
                 same = sound and rows_of(connection) == self._ledger.rows()
         except sqlite3.DatabaseError as error:
@@ -745,14 +746,6 @@ def rows_of(connection: sqlite3.Connection) -> Rows:
     return {table: of_table for table, of_table in rows.items() if of_table}
 
 
-def _insert_rows(connection: sqlite3.Connection, rows: Rows) -> None:
-    """Write facts into a journal that has its tables and nothing in them."""
-    for table, of_table in rows.items():
-        for row in of_table.values():
-            marks = ", ".join("?" * len(row))
-            connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
-
-
 def read_ledger(path: Path) -> Rows:
     """Return the facts that a ledger holds."""
     return _gathered(_read_transactions(path))
@@ -846,7 +839,7 @@ class _Ledger:
         except OSError as error:
             raise storage_error(path, error, "look at") from error
         if not is_there or not self._is_of(rows):
-            self._write_anew(rows)
+            write_whole(path, _ledger_lines(rows))
         self._handle, self._end = self._opened()
         self._next = self._end
 
@@ -885,7 +878,7 @@ class _Ledger:
     def restore(self, rows: Rows) -> None:
         """Write the file anew, which was removed or changed while it was open."""
         self.close()
-        self._write_anew(rows)
+        write_whole(self._path, _ledger_lines(rows))
         self._handle, self._end = self._opened()
         self._next = self._end
 
@@ -903,9 +896,6 @@ class _Ledger:
             return True
         _require_none_lacking(self._path, _lacking_frames(_frames_in(_gathered(transactions[:-1])), _frames_in(rows)))
         return False
-
-    def _write_anew(self, rows: Rows) -> None:
-        write_whole(self._path, _ledger_lines(rows))
 
     def _opened(self) -> tuple[int, int]:
         """Return a handle of the file, and its size."""

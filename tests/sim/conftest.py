@@ -10,6 +10,8 @@ from sim.world.sensors import BODIES
 from sim.world.world import Room, World
 
 PAGE_MM = (180.0, 125.0)
+BARE = Print(PAGE_MM, np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+"""A sheet on which nothing is printed."""
 
 
 def squares() -> Print:
