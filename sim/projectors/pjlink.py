@@ -292,8 +292,8 @@ def _class_2(projector: SimulatedProjector) -> _Answers:
             "0": lambda: projector.set_frozen(False),
             "1": lambda: projector.set_frozen(True),
         },
-        "SVOL": {wire.RAISE: lambda: projector.turn_speaker(1), wire.LOWER: lambda: projector.turn_speaker(-1)},
-        "MVOL": {wire.RAISE: lambda: projector.turn_microphone(1), wire.LOWER: lambda: projector.turn_microphone(-1)},
+        "SVOL": {wire.RAISE: projector.turn_volume, wire.LOWER: projector.turn_volume},
+        "MVOL": {wire.RAISE: projector.turn_volume, wire.LOWER: projector.turn_volume},
     }
     if traits.filter_hours is not None:
         answers["FILT"] = {wire.QUERY: lambda: str(traits.filter_hours)}

@@ -61,8 +61,6 @@ INPUTS = (
     Input("61", "Test pattern"),
 )
 PANEL = Resolution(1920, 1080)
-MAX_VOLUME = 20
-"""Steps of the volume; of no consequence here."""
 
 
 @dataclass(frozen=True)
@@ -110,8 +108,6 @@ class SimulatedProjector:
         """Whether a shutter before the lens holds the light back; change it at will."""
         self.signal: Resolution | NoResolution = self.traits.panel
         """What arrives at its input; change it at will."""
-        self.speaker = MAX_VOLUME // 2
-        self.microphone = MAX_VOLUME // 2
 
     def identity(self) -> ProjectorIdentity:
         """Return maker, model and name."""
@@ -170,15 +166,10 @@ class SimulatedProjector:
         with self._while_on():
             self._frozen = frozen
 
-    def turn_speaker(self, step: int) -> None:
-        """Turn the speaker by `step`, as far as it goes; refused unless it is on."""
+    def turn_volume(self) -> None:
+        """Do nothing, for nobody can hear it; refused unless it is on."""
         with self._while_on():
-            self.speaker = min(max(self.speaker + step, 0), MAX_VOLUME)
-
-    def turn_microphone(self, step: int) -> None:
-        """Turn the microphone by `step`, as far as it goes; refused unless it is on."""
-        with self._while_on():
-            self.microphone = min(max(self.microphone + step, 0), MAX_VOLUME)
+            pass
 
     def faults(self) -> tuple[Fault, ...]:
         """Return every fault that has been injected and not repaired."""
