@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -28,6 +26,7 @@ from sim.buses.serial import PseudoTerminal
 from sim.cli import main
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from sim.projectors.serial import SERIAL_NUMBER, BenqPeer, EpsonPeer
+from tests.sim.conftest import sim_serving
 
 AT_ONCE = ProjectorTraits(warm_up_s=0.0, cool_down_s=0.0)
 """Other software waits by its own clock; a projector that is on at once keeps it short."""
@@ -143,31 +142,18 @@ def test_a_pseudo_terminal_that_nobody_reads_can_be_closed(device: SimulatedProj
         link.close()
 
 
-SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["epson", "nec"])
 def test_serves_a_serial_projector_until_interrupted(name: str) -> None:
     spoken = LANGUAGES[name]
-    with subprocess.Popen(
-        [*SIM, "projector", "--serial", name], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            assert line.startswith(f"{spoken.maker} projector at /dev/")
-            path = line.split()[-1]
-            projector = spoken.projector(lambda: SerialLink.open(path, spoken.baud, spoken.parity))
-            assert projector.power() is Power.STANDBY
-            projector.switch_on()
-            assert projector.power() is Power.WARMING
-            projector.close()
-            process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=30)
-        finally:
-            process.kill()
-    assert (process.returncode, out, err) == (0, "stopped\n", "")
+    with sim_serving("projector", "--serial", name) as (line,):
+        assert line.startswith(f"{spoken.maker} projector at /dev/")
+        path = line.split()[-1]
+        projector = spoken.projector(lambda: SerialLink.open(path, spoken.baud, spoken.parity))
+        assert projector.power() is Power.STANDBY
+        projector.switch_on()
+        assert projector.power() is Power.WARMING
+        projector.close()
 
 
 @pytest.mark.parametrize(
