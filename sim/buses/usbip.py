@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers.links.link import Link
-from drivers.links.network import LOOPBACK, TcpServer
+from drivers.links.network import TcpServer
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb import BULK_OUT, PACKET, Overflowed, PtpUsbDevice, Setup, Stalled
 
@@ -185,12 +185,12 @@ _EREMOTEIO = 121
 """Linux's number for a transfer that was short although that was not allowed; not every system has it in errno."""
 
 
-def serve_usbip(devices: Sequence[PtpUsbDevice], port: int = PORT, *, host: str = LOOPBACK) -> TcpServer:
+def serve_usbip(devices: Sequence[PtpUsbDevice], port: int = PORT) -> TcpServer:
     """Lend devices under the bus ids 1-1, 1-2, …; port 0 picks a free one.
 
     Use the result in a ``with`` block; its `address` is host and port.
     """
-    return TcpServer(UsbIpService(devices).handle, port, host)
+    return TcpServer(UsbIpService(devices).handle, port)
 
 
 class UsbIpService:

@@ -306,11 +306,7 @@ def _selecting(projector: SimulatedProjector, codes: Iterable[str]) -> dict[str,
 
 
 def serve_pjlink(
-    projector: SimulatedProjector,
-    port: int = 0,
-    password: str | None = None,
-    host: str = LOOPBACK,
-    answer_s: float = 0.0,
+    projector: SimulatedProjector, port: int = 0, password: str | None = None, answer_s: float = 0.0
 ) -> TcpServer:
     """Return a running server that speaks PJLink for `projector`; close it, or use it in a `with` block.
 
@@ -320,4 +316,4 @@ def serve_pjlink(
     def think() -> None:
         projector.clock.sleep(answer_s)
 
-    return serve_peer(lambda: PjLinkPeer(projector, password), port, host, think)
+    return serve_peer(lambda: PjLinkPeer(projector, password), port, think=think)
