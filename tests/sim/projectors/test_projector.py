@@ -7,7 +7,7 @@ import hashlib
 import pytest
 
 from drivers.links.network import UdpSocket
-from drivers.pjlink import NoResolution, PjLinkReply, search
+from drivers.pjlink import NoResolution, PjLinkReply
 from drivers.projector import Power, Severity
 from foundation.clock import SimulatedClock
 from foundation.errors import DeviceFault, LinkTimeout
@@ -211,13 +211,6 @@ def test_answers_a_search_in_the_standards_bytes() -> None:
         asker.send(b"who is there?\r", datagrams.address)
         asker.send(b"%2SRCH\r", datagrams.address)
         assert asker.receive(10.0) == (b"%2ACKN=02:00:00:00:00:01\r", datagrams.address)
-
-
-def test_is_found_over_loopback() -> None:
-    with ProjectorDatagrams(SimulatedProjector(SimulatedClock())) as datagrams:
-        host, port = datagrams.address
-        (found,) = search(30.0, enough=1, address=host, port=port, listen_port=0)
-    assert (found.host, found.mac) == ("127.0.0.1", "02:00:00:00:00:01")
 
 
 def test_sends_notices_to_the_controller_in_its_menu() -> None:
