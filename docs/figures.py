@@ -344,7 +344,7 @@ def draw_data(plan: Plan, bands: Mapping[str, tuple[float, float]]) -> list[str]
 def draw_step() -> str:
     """Return the drawing of what a step of a session goes through."""
     sys.path.insert(0, str(ROOT))
-    from experiment.session.records import AHEAD, ENDS, TRANSITIONS, UNDER_WAY, StepState
+    from docs.states import AHEAD, ENDS, TRANSITIONS, UNDER_WAY, StepState
 
     wide, left, right, lane = 112, 340, 680, 830
     path = [*AHEAD, *UNDER_WAY, StepState.ACCEPTED]

@@ -1,22 +1,13 @@
 """What lights the chart (the projector under its codes, or any spectra), and the frames of patches that come of it.
 
 Light adds: a frame under a projector's light is the weighted sum of the same frame under each of its three primaries.
-A luminaire has one spectrum a light, and so one frame of its own for each.
+A luminaire has one spectrum a light, and so one frame of its own for each. Its spectra are a file's, on any grid from
+400 to 700 nm or beyond, or published ones by name (`sim.spectral`; `--lights` of docs/how-to/table-without-a-lab.md).
 
-**Spectra.** A file has a column ``wavelength`` (nm) and one for each light, whose head is its name and no number; any
-even or uneven grid from 400 to 700 nm or beyond, in proportions that are each light's own. Published spectra are
-those of `sim.spectral`: CIE A to E, daylights D, fluorescent lamps FL1 to FL12 and FL3.1 to FL3.15, high-pressure
-lamps HP1 to HP5, LED-B1 to LED-V2, indoor daylights ID50 and ID65 (CIE 15:2018), the sources of ISO 7589, and
-measured light sources by their names there. ``5600K`` is a black body by Planck's law, ``daylight:6000`` the CIE
-daylight of a correlated colour temperature; ranges are ``FIRST:LAST:STEP`` with the ``K`` or the word ``daylight``
-before them.
-
-**Frames** hold nothing but the middle of each patch. A frame of a session has some twenty million photosites, of
-which a table takes a sixth: the 10 by 10 photosites in the middle of each cell (25 half-size pixels), and those of
-the references. Here these alone exist, patch below patch in a frame as wide as one patch. Their light is what the
+**Frames** hold nothing but the middle of each patch: the 10 by 10 photosites in the middle of each cell (25 half-size
+pixels), and those of the references, patch below patch in a frame as wide as one patch. Their light is what the
 simulated room would let fall on them without the lens's blur; their counts come from the simulated sensor itself
-(`sim.world.sensors.counts`), so that response, shot and read noise, rounding and saturation are those of a
-photographed frame, and calibration's own functions sample them as they do any other frame.
+(`sim.world.sensors.counts`), and calibration's own functions sample them as they do any other frame.
 
 What differs from a photographed frame: nothing is blurred, so no light leaks between neighbouring cells; all of a
 patch has the light of its middle; the chart lies exactly where it is looked for.
@@ -30,7 +21,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -352,30 +343,6 @@ def _random(*key: int) -> np.random.Generator:
     return np.random.Generator(np.random.SFC64(key))
 
 
-class ChartLamp(Protocol):
-    """What lights the chart."""
-
-    @property
-    def illuminations(self) -> Sequence[Illumination]:
-        """The lights."""
-        ...
-
-    def lit(self, light: int) -> tuple[_Float, _Array]:
-        """Return the light on every photosite by primary, (3, rows, columns) float32, and the primaries' weights (3,).
-
-        As `synthesis.lamps.PatchSensor.expose` takes them, for the frame of a light.
-        """
-        ...
-
-    def even(self) -> tuple[_Float, _Array]:
-        """Return the same, (3, rows, columns) and (3,), for the frame that the flat field is read from first."""
-        ...
-
-    def pure(self) -> tuple[int, int, int] | None:
-        """Return the lights of red, green and blue alone; None where the light has no primaries."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class ProjectorLamp:
     """The simulated projector.
@@ -391,24 +358,12 @@ class ProjectorLamp:
     illuminations: tuple[Illumination, ...]
     light: _Float
 
-    @staticmethod
-    def of(
-        world: World,
-        settings: ExposureSettings,
-        illuminations: tuple[Illumination, ...],
-        sensor: PatchSensor,
-        rgb: npt.NDArray[np.uint8],
-        points_mm: _Array,
-    ) -> ProjectorLamp:
-        """Return the projector in front of patches of printed codes (N, 3) at points (N, 2) of the print."""
-        return ProjectorLamp(world, settings, illuminations, sensor.light(world.of_primaries(rgb, points_mm)))
-
     def lit(self, light: int) -> tuple[_Float, _Array]:
-        """Return light (3, rows, columns) float32 and weights (3,) of a light's frame; see `ChartLamp.lit`."""
+        """Return light (3, rows, columns) float32 and weights (3,) of a light's frame; see `PatchSensor.expose`."""
         return self.light, self.world.drive(self.illuminations[light].colour, self.settings)
 
     def even(self) -> tuple[_Float, _Array]:
-        """Return light (3, rows, columns) float32 and weights (3,) of a white frame."""
+        """Return light (3, rows, columns) float32 and weights (3,) of a white frame, which the field is read from."""
         return self.light, self.world.drive(WHITE, self.settings)
 
     def pure(self) -> tuple[int, int, int] | None:
@@ -431,25 +386,10 @@ class SpectralLamp:
     """
 
     world: World
-    illuminations: tuple[Illumination, ...]
     powers: _Array
     sensor: PatchSensor
     reflectance: _Array
     field: _Array
-
-    @staticmethod
-    def of(
-        world: World,
-        illuminations: tuple[Illumination, ...],
-        powers: _Array,
-        sensor: PatchSensor,
-        rgb: npt.NDArray[np.uint8],
-        points_mm: _Array,
-    ) -> SpectralLamp:
-        """Return a luminaire of spectra (L, 81) before patches of printed codes (N, 3) at points (N, 2), mm."""
-        room = world.room
-        reflectance = printed_reflectance(rgb, room.profile, room.paper)
-        return SpectralLamp(world, illuminations, powers, sensor, reflectance, world.field(points_mm)[:, 1])
 
     def signals(self, light: int) -> _Array:
         """Return what each patch gives under a light, (N, 3) float64 DN above black, where nothing is blurred."""
@@ -460,7 +400,7 @@ class SpectralLamp:
         return (self.reflectance @ seen) * level * self.field[:, None]
 
     def lit(self, light: int) -> tuple[_Float, _Array]:
-        """Return light (3, rows, columns) float32 and weights (3,) of a light's frame; see `ChartLamp.lit`."""
+        """Return light (3, rows, columns) float32 and weights (3,) of a light's frame; see `PatchSensor.expose`."""
         return self.sensor.light(self.signals(light)[:, :, None]), np.array([1.0, 0.0, 0.0])
 
     def even(self) -> tuple[_Float, _Array]:
@@ -472,3 +412,7 @@ class SpectralLamp:
     def pure(self) -> tuple[int, int, int] | None:
         """Return None: one field holds for all wavelengths, so that a coloured cell's is that of paper."""
         return None
+
+
+ChartLamp = ProjectorLamp | SpectralLamp
+"""What lights the chart."""

@@ -1,14 +1,9 @@
 """A whole table, lights by cells by samples, computed light by light and written as `build-lut` writes one.
 
-Rules that hold inside:
-
-- The same camera, lights, settings and seed give the same bytes, on any number of threads.
-- The table appears whole or not at all; what it needs of the disk is asked for before the work.
-- Its provenance says that it was computed, from what, and with which settings; no frame is listed.
-
-A light's frame is treated as `calibration.pipeline.frames` treats a photographed one that lies exactly where it
-was registered: black subtracted, field and white read from the white references, samples divided by the field, and by
-how much the field of a cell differs from that of paper. So the ground truth has the error that a photographed one has.
+The same camera, lights, settings and seed give the same bytes, on any number of threads. A light's frame is treated as
+`calibration.pipeline.frames` treats a photographed one that lies exactly where it was registered: black subtracted,
+field and white read from the white references, samples divided by the field, and by how much the field of a cell
+differs from that of paper. So the ground truth has the error that a photographed one has.
 """
 
 from __future__ import annotations
@@ -38,6 +33,7 @@ from foundation.compiled import ordered_map
 from foundation.errors import QualityError, StorageError
 from foundation.folders import require_free, whole_folder
 from foundation.version import software
+from sim.spectral import printed_reflectance
 from sim.world.rendering import Print
 from sim.world.sensors import Body
 from sim.world.world import Room, World
@@ -52,6 +48,7 @@ class ComputedFrame:
 
     - `light`: number of the light.
     - `values`: (C, S, 3) uint16, the table's samples.
+    - `share_at_zero`: of the samples, how many are 0.
     - `highest`: (C,) uint16, the highest raw count of each cell.
     - `black`: (2, 2) float64 counts, the black level that was subtracted.
     - `paper`: field, ground truth and its standard error.
@@ -60,6 +57,7 @@ class ComputedFrame:
 
     light: int
     values: npt.NDArray[np.uint16]
+    share_at_zero: float
     highest: npt.NDArray[np.uint16]
     black: _Array
     paper: Paper
@@ -116,7 +114,8 @@ class PatchMeasurement:
             shape = shape * self.primaries.field_ratio(paper.white)
         grey_values, grey_errors = self.points.levels.read(greys, paper.field.at(self.points.greys_mm))
         values, highest = gather_values(mosaic, black, cells, shape)
-        return ComputedFrame(light, values, highest, black, paper, grey_values, grey_errors)
+        at_zero = 1 - int(np.count_nonzero(values)) / values.size
+        return ComputedFrame(light, values, at_zero, highest, black, paper, grey_values, grey_errors)
 
     def _paper_of_even_frame(self) -> Paper:
         mosaic, black = self.sensor.expose(*self.lamp.even(), self.iso, 0)
@@ -184,18 +183,12 @@ class TableTask:
 
 @dataclass(frozen=True, eq=False)
 class ComputedTable:
-    """What came of it.
-
-    - `lights`, `cells`: how many it has.
-    - `unfit`: cells that are listed as unfit.
-    - `white`: (L, 3) float64 counts, the ground truth.
-    """
+    """What came of it: where it is, how many lights and cells it has, and how many cells are listed as unfit."""
 
     folder: Path
     lights: int
     cells: int
     unfit: int
-    white: _Array
 
 
 def compute_table(task: TableTask, out: Path, threads: int, progress: ReportLights | None = None) -> ComputedTable:
@@ -210,42 +203,28 @@ def compute_table(task: TableTask, out: Path, threads: int, progress: ReportLigh
     with whole_folder(out, "the table") as folder:
         writer = LutWriter(folder, lights, cells, task.window**2)
 
-        def compute(light: int) -> _Kept:
+        def compute(light: int) -> ComputedFrame:
+            """Return all of a light's frame but its samples, which are written."""
             frame = measurement.measure(light)
             writer.put(light, frame.values)
-            return _Kept.of(frame)
+            return replace(frame, values=frame.values[:0].copy())
 
-        kept: list[_Kept] = []
+        kept: list[ComputedFrame] = []
         for one in ordered_map(compute, range(lights), threads):
             kept.append(one)
             if progress is not None:
                 progress(len(kept), lights)
         unfit = _clipped_cells(kept, task.body.saturation)
-        white = np.array([one.frame.paper.white for one in kept])
+        white = np.array([one.paper.white for one in kept])
         provenance = _provenance(task, measurement, kept, white, unfit)
         levels = measurement.points.levels.names
         files: dict[str, str] = {}
         if levels:
-            errors = np.array([one.frame.paper.error for one in kept])
-            greys, grey_errors = (
-                np.array([getattr(one.frame, name) for one in kept]) for name in ("greys", "grey_errors")
-            )
+            errors = np.array([one.paper.error for one in kept])
+            greys, grey_errors = (np.array([getattr(one, name) for one in kept]) for name in ("greys", "grey_errors"))
             files[REFERENCES] = references_csv(levels, white, errors, greys, grey_errors)
         writer.finish(task.illuminations, white, provenance, files=files)
-    return ComputedTable(out, lights, cells, len(unfit), white)
-
-
-@dataclass(frozen=True, eq=False)
-class _Kept:
-    """What is kept of a frame: all but its samples."""
-
-    frame: ComputedFrame
-    share_at_zero: float
-
-    @staticmethod
-    def of(frame: ComputedFrame) -> _Kept:
-        share = 1 - int(np.count_nonzero(frame.values)) / frame.values.size
-        return _Kept(replace(frame, values=frame.values[:0].copy()), share)
+    return ComputedTable(out, lights, cells, len(unfit))
 
 
 def _measurement(task: TableTask) -> PatchMeasurement:
@@ -264,16 +243,18 @@ def _measurement(task: TableTask) -> PatchMeasurement:
     world = World(blank, task.body, task.room)
     lamp: ChartLamp
     if task.powers is None:
-        lamp = ProjectorLamp.of(world, task.exposure, task.illuminations, sensor, codes, places)
+        light = sensor.light(world.of_primaries(codes, places))
+        lamp = ProjectorLamp(world, task.exposure, task.illuminations, light)
     else:
-        lamp = SpectralLamp.of(world, task.illuminations, task.powers, sensor, codes, places)
+        reflectance = printed_reflectance(codes, task.room.profile, task.room.paper)
+        lamp = SpectralLamp(world, task.powers, sensor, reflectance, world.field(places)[:, 1])
     return PatchMeasurement.of(points, chart.page_mm, bool(chart.tags), sensor, lamp, task.exposure.iso)
 
 
-def _clipped_cells(kept: Sequence[_Kept], saturation: int) -> list[Unfit]:
+def _clipped_cells(kept: Sequence[ComputedFrame], saturation: int) -> list[Unfit]:
     """Return the cells of which a photosite came near saturation under a light."""
     allowed = CLIPPING_SHARE * saturation
-    highest = np.array([one.frame.highest for one in kept])
+    highest = np.array([one.highest for one in kept])
     found: list[Unfit] = []
     for colour in np.flatnonzero(highest.max(axis=0) >= allowed).tolist():
         light = int(highest[:, colour].argmax())
@@ -283,14 +264,14 @@ def _clipped_cells(kept: Sequence[_Kept], saturation: int) -> list[Unfit]:
 
 
 def _provenance(
-    task: TableTask, measurement: PatchMeasurement, kept: Sequence[_Kept], white: _Array, unfit: list[Unfit]
+    task: TableTask, measurement: PatchMeasurement, kept: Sequence[ComputedFrame], white: _Array, unfit: list[Unfit]
 ) -> Provenance:
-    black = np.array([one.frame.black for one in kept])
+    black = np.array([one.black for one in kept])
     done = corrections(
         task.chart.page_mm,
         black,
         task.body.saturation,
-        [one.frame.paper.field for one in kept],
+        [one.paper.field for one in kept],
         at_zero=np.array([one.share_at_zero for one in kept]),
     )
     if measurement.primaries is not None:

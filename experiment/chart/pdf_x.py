@@ -174,10 +174,13 @@ def srgb_output_profile() -> bytes:
     It is of the class ``prtr``, which output intents need (ISO 32000-1, 14.11.5), with the tags of a table-based output
     profile. All rendering intents are alike: relative to the medium's white.
     """
-    to_pcs = _lut16(np.eye(3), _curves(decode_srgb(np.linspace(0, 1, _CURVE))), _corners_xyz(), _LINEAR)
+    corners = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    # Between the corners XYZ is linear in linear RGB, so that two points a side are exact.
+    xyz, rgb = np.rint(_ONE_XYZ * (corners @ _PRIMARIES.T)).astype(np.uint16), (_FULL * corners).astype(np.uint16)
+    to_pcs = _lut16(np.eye(3), _curves(decode_srgb(np.linspace(0, 1, _CURVE))), xyz, _LINEAR)
     # The matrix works on encoded values, of which 1 is 65535 / 32768 in XYZ.
     from_xyz = np.linalg.inv(_PRIMARIES) * _FULL / _ONE_XYZ
-    from_pcs = _lut16(from_xyz, _LINEAR, _corners_rgb(), _curves(encode_srgb(np.linspace(0, 1, _CURVE))))
+    from_pcs = _lut16(from_xyz, _LINEAR, rgb, _curves(encode_srgb(np.linspace(0, 1, _CURVE))))
     tags = {
         "desc": _description("CroP RGB codes taken as sRGB (no printer is characterised)"),
         "cprt": _text("No copyright, use freely"),
@@ -210,20 +213,6 @@ def _curves(curve: _Array) -> npt.NDArray[np.uint16]:
 
 _LINEAR = _curves(np.array([0.0, 1.0]))
 """A curve that changes nothing."""
-
-
-def _corners() -> _Array:
-    """Return the corners of the cube of RGB, (8, 3), the last channel running fastest."""
-    return np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _corners_xyz() -> npt.NDArray[np.uint16]:
-    """Return XYZ of the corners; between them XYZ is linear in linear RGB, so that two points a side are exact."""
-    return np.rint(_ONE_XYZ * (_corners() @ _PRIMARIES.T)).astype(np.uint16)
-
-
-def _corners_rgb() -> npt.NDArray[np.uint16]:
-    return (_FULL * _corners()).astype(np.uint16)
 
 
 def _gamut() -> bytes:

@@ -1,16 +1,10 @@
-"""The chart as a print: a list of rectangles, field and marks, and from it a TIFF, a PDF and a preview.
+"""The chart as a print: a list of rectangles on bare paper, field and marks, and from it a TIFF, a PDF and a preview.
 
-Laws that hold here:
-
-- Everything is made of filled rectangles on bare paper; the three files show the same list.
-- A file is at true size: print it at 100 %, never "fit to page".
+- A file is at true size: print it at 100 %, never "fit to page". In the TIFF every cell and every tag module is the
+  same whole number of pixels, because modules of unequal size move the corners that detectors find.
 - The codes name inks rather than colours: what they look like is measured. They stand untagged on the page of the PDF
   and in the TIFF; the PDF's output intent, which PDF/X asks for, and the tagged TIFF say what they are taken for where
-  colours are managed all the same. The same code must be the same ink everywhere, and the paper matte.
-- In the TIFF every cell and every tag module is the same whole number of pixels; a resolution at which they are not
-  is refused (300 dpi, for one), because modules of unequal size move the corners that detectors find.
-- Cells do not only touch in the PDF: each reaches a fifth of a pixel below its right and lower neighbours, because
-  renderers leave hairlines of paper between parts that meet in one line.
+  colours are managed all the same.
 - An A0 sheet at 600 dpi has 1.7 GB of pixels; it is never held: rows that look alike are drawn once and packed strip
   by strip.
 """

@@ -1,19 +1,12 @@
 """A chart without tags in a picture: the field of its cells is found by its outline, and recognised by its colours.
 
-Rules that hold inside:
+Candidates come from the outlines in the picture (the field against its white margin, the sheet against what is behind),
+or from corners given by hand. Each is drawn onto the edge between cells and paper and tried in all four turns, and
+mirrored; the one whose cells have the chart's colours is the field. A light that does not tell turns apart is an error.
 
-- Candidates for the field come from the outlines in the picture (the field against its white margin, the sheet
-  against what is behind), or from corners given by hand; each is drawn onto the edge between cells and paper, and the
-  one whose cells have the chart's colours is the field. A rectangle of other colours is not.
-- The orientation of the chart is decided by its colours: each candidate is tried in all four turns, and mirrored. Where
-  the light does not distinguish turns (a single colour, on a chart whose order is the same both ways), it is an error.
-- Corners given by hand are those that a person reads off a raw picture: pixels of the raw file as it is stored, not
-  turned by a viewer; x right, y down, the first pixel of the visible picture at 0,0; clockwise from the corner that is
-  printed top-left.
-- Faults of the picture are a `RegistrationError` that says what was looked for, what was found, and what helps.
-
-Places are half-size pixels. Knows the chart and planes of counts; nothing of lenses, which bend the outline: an outline
-is followed as it is, and `homography` is the straight one nearest to it.
+Corners given by hand are pixels of the raw file as it is stored, not turned by a viewer; x right, y down, the first
+pixel of the visible picture at 0,0; clockwise from the corner that is printed top-left. All other places are half-size
+pixels. Lenses bend the outline: it is followed as it is, and `homography` is the straight one nearest to it.
 """
 
 from __future__ import annotations

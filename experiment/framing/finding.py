@@ -1,18 +1,8 @@
 """Where the chart is in a picture: its tags, or the field of a chart without tags, found and its pose measured.
 
-Rules that hold inside:
-
-- One linear colour plane at a time, the strongest of the frame: a square root moves a tag's corner by a quarter pixel,
-  a sum of planes under deep red or blue by a fifth.
-- Places are half-size pixels (`drivers.raw.rawfile`).
-- Faults of the picture are a `RegistrationError` that says what was looked for, what was found, and what helps.
-
-`annotated_png` draws a frame with what was found on it, or with what was looked for and not found, with ticks along its
-border that count raw pixels, in which corners are given by hand (`experiment.framing.field`); `small_parts_warning`
-says of a chart, before it is printed, whether a camera will find its tags and cells.
-
-Knows the chart and a mosaic of counts; nothing of sessions, cells' colours or lenses
-(`calibration.registration.register`).
+One linear colour plane at a time is searched, the strongest of the frame: a square root moves a tag's corner by a
+quarter pixel, a sum of planes under deep red or blue by a fifth. Places are half-size pixels (`drivers.raw.rawfile`).
+Faults of the picture are a `RegistrationError` that says what was looked for, what was found, and what helps.
 
 Sources of the tags: E. Olson, "AprilTag: A robust and flexible visual fiducial system", ICRA 2011; J. Wang and E.
 Olson, "AprilTag 2: Efficient and robust fiducial detection", IROS 2016; detected by the AprilTag authors' library

@@ -1,11 +1,7 @@
 """What the picture of a chart shows once it is found: how far it has moved, and itself, made small.
 
-Movement is measured in one colour plane on a few gauges. A gauge is a tag, or without tags a strip across the edge
-between the field of cells and its margin, which is there in every light. Movements are in half-size pixels.
-Sharpness is `experiment.framing.sharpness`.
-
-`preview_jpeg` is the small picture that a session keeps of each frame; `experiment.framing.finding` draws what was
-found on a frame.
+Movement is measured in one colour plane on a few gauges, in half-size pixels. A gauge is a tag, or without tags a strip
+across the edge between the field of cells and its margin, which is there in every light.
 
 Source: B. D. Lucas and T. Kanade, "An iterative image registration technique", IJCAI 1981.
 """

@@ -1,13 +1,8 @@
 """Weighted linear least squares without threads, and the polynomial bases that are fitted with it.
 
-Rules that hold inside:
-
-- Frames are decoded by threads of ours; a linear-algebra library that starts its own beside them is slower than one
-  that starts none, for problems of a few dozen unknowns.
-- The inner loops stand at the end, compiled for the processor at hand at the first call and kept on disk. No state, no
-  lock, and the interpreter's is released. Without licence to reorder sums: a table's bytes depend on neither processor
-  nor thread.
-- Bases are Legendre polynomials, orthogonal and of order unity on their ranges, as normal equations need them.
+Frames are decoded by threads of ours: a linear-algebra library that starts its own beside them is slower for a few
+dozen unknowns. The inner loops stand at the end, compiled without licence to reorder sums, so that a table's bytes
+depend on neither processor nor thread. Bases are Legendre polynomials, as normal equations need them.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
-"""A session: the folder in which an experiment is taken.
+"""A session: the folder in which an experiment is taken; nothing here touches a device.
 
-Rules that hold inside:
-
-- A frame counts as taken when its raw file is complete on disk (written, flushed, renamed) *and* its journal row is
-  committed, in that order. Whatever a crash leaves between the two is set aside, never counted, never deleted.
-- The journal (`experiment.session.journal`) is the truth; `frames.csv` is derived from it.
-- Nothing here touches a device; readers of a session need nothing else from this package than its folder, plan and
-  journal, the chart and the illuminations.
+A frame counts as taken when its raw file is complete on disk (written, flushed, renamed) *and* its journal row is
+committed, in that order. Whatever a crash leaves between the two is set aside, never counted, never deleted. The
+journal is the truth; `frames.csv` is derived from it.
 """
 
 from __future__ import annotations
@@ -213,18 +209,14 @@ class Session:
         self.journal.add_steps(steps)
         self.steps = self.journal.steps()
 
-    def verify(
-        self, observe: Callable[[int, int], None] = lambda done, total: None, at: datetime | None = None
-    ) -> tuple[str, ...]:
+    def verify(self, observe: Callable[[int, int], None] = lambda done, total: None) -> tuple[str, ...]:
         """Void the accepted frames whose files are gone or changed, so that they are taken again; return why, each.
 
         Where older software left a step with several accepted frames, all but the newest sound one are voided too.
-
-        `at`: when this happens, for the journal; now by the machine's clock if None.
         """
         unsound = unsound_files(self.folder, self.journal.accepted_files(), observe)
         for attempt, reason in unsound.items():
-            self.journal.void([attempt], at or datetime.now(UTC), reason)
+            self.journal.void([attempt], datetime.now(UTC), reason)
         return tuple(unsound.values())
 
     def asked_again(self, selection: str) -> Retake:
@@ -256,15 +248,12 @@ class Session:
         chosen = tuple(frame for frame in accepted if frame.illumination in lights)
         return Retake(lights, chosen, f"to be taken again, as asked for with --retake {asked}", asked)
 
-    def retake(self, selection: str, at: datetime | None = None) -> tuple[int, ...]:
-        """Void accepted frames so that they are taken again; return the lights that this is about.
-
-        `at`: when this happens, for the journal; now by the machine's clock if None.
-        """
+    def retake(self, selection: str) -> tuple[int, ...]:
+        """Void accepted frames so that they are taken again; return the lights that this is about."""
         asked = self.asked_again(selection)
         if asked.text and asked.reason:
             self.journal.record("retake", asked.text)
-        self.journal.void([frame.attempt for frame in asked.frames], at or datetime.now(UTC), asked.reason)
+        self.journal.void([frame.attempt for frame in asked.frames], datetime.now(UTC), asked.reason)
         return asked.lights
 
     def done_steps(self) -> set[int]:

@@ -1,32 +1,16 @@
 """The journal of a session, `journal.sqlite`: the plan, every attempt at its frames, their verdicts, and events.
 
-Its facts stand a second time in `ledger.jsonl`, from which a journal that was lost is made anew.
-
-Rules that hold inside:
-
-- The journal is written before and after each frame; every write is a transaction of its own and on the disk when the
-  call returns, since a committed row is what makes a frame count.
-- Rows are never deleted; a frame that was accepted can be voided. Times are ISO 8601 text with microseconds and zone,
-  files are named relative to the session's folder.
-- While a run has it open the journal is in SQLite's write-ahead mode: readers see the last commit and hold nobody up.
-  When the run ends in order it is put back to one file (`-wal` and `-shm` are gone). Where write-ahead mode does not
-  work (file systems of a network share no memory) the journal stays in the older mode.
-- A reader creates, migrates and changes nothing, and never stops a run. What cannot be read in place without doing so
-  (a journal copied with its `-wal`, one in a folder that cannot be written) is read from a copy in memory.
-- A session may be a stranger's, and an SQLite file can hold more than rows: views that never end, triggers that delete,
-  columns that are computed, text where a number is meant, names of files outside. All that is refused when the journal
-  is opened, so that nothing behind this has to expect it.
-- Files are deleted, replaced and cut, and nobody says so: a program goes on writing a file that has no name any more,
-  and SQLite does not look twice at pages that it has read. So a run looks whether the journal on the disk is its own,
-  and whole (`_JournalGuard`).
-- A line of the ledger is a transaction: the rows that it put or changed, by table, as a JSON object. It is on the disk
-  before the journal commits the same, so that the lines hold all that the journal holds, and at most one transaction
-  more. A later row of the same key changes the columns that it names. Signs of life, and where the session lies, are no
-  facts and are not kept. What a crash cut off is the last line alone, and is no fact.
-- A raw file may be downloaded in one thread and made whole in another (`IncomingFile`), before its row is committed.
-
-How the file is opened, and what is refused then, is `experiment.session.opening`; which raw files are really there,
-`experiment.session.folder` knows.
+- It is written before and after each frame; every write is a transaction of its own and on the disk when the call
+  returns, since a committed row is what makes a frame count. Rows are never deleted; an accepted frame can be voided.
+- While a run has it open the journal is in SQLite's write-ahead mode, where that works: readers see the last commit and
+  hold nobody up. When the run ends in order it is one file again. A reader creates, migrates and changes nothing.
+- A session may be a stranger's: what an SQLite file can hold beside rows is refused when the journal is opened
+  (`experiment.session.opening`), so that nothing behind this has to expect it.
+- Files are deleted, replaced and cut, and nobody says so; SQLite does not look twice at pages that it has read. So a
+  run looks whether the journal on the disk is its own, and whole (`_JournalGuard`).
+- Its facts stand a second time in `ledger.jsonl`, from which a journal that was lost is made anew. A line of it is a
+  transaction: the rows that it put or changed, by table, as a JSON object, on the disk before the journal commits the
+  same. Signs of life, and where the session lies, are no facts. What a crash cut off is the last line alone.
 
 Source: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvantages".
 """
@@ -55,8 +39,7 @@ from experiment.session.opening import (
     Retry,
     beside,
     close_after_run,
-    connect_to_read,
-    connect_to_write,
+    connect,
     create_file,
     is_busy,
     open_for_run,
@@ -213,7 +196,9 @@ class Journal:
         copy.unlink(missing_ok=True)
         with closing(create_file(copy)) as connection, connection:
             connection.execute("BEGIN")
-            _insert_rows(connection, rows)
+            for table, row in ((table, row) for table, of_table in rows.items() for row in of_table.values()):
+                marks = ", ".join("?" * len(row))
+                connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
         Journal.open(copy).close()
         set_aside(path)
         copy.replace(path)
@@ -548,7 +533,7 @@ def without_journal(folder: Path) -> str:
 
 def beat_beside(path: Path, state: RunState, sentence: str, until: datetime) -> None:
     """Give a sign of life from another thread than the one that has the journal open; none where that fails."""
-    with suppress(sqlite3.Error), closing(connect_to_write(path)) as connection:
+    with suppress(sqlite3.Error), closing(connect(path, "rw")) as connection:
         connection.execute("BEGIN IMMEDIATE")
         _put_beat(connection, path, state, sentence, until)
         connection.execute("COMMIT")
@@ -660,7 +645,7 @@ class _JournalGuard:
     def require_whole(self) -> None:
         """Raise `LostJournalError` where the journal, as everybody else reads it, does not hold what the run wrote."""
         try:
-            with closing(connect_to_read(self._path)) as connection:
+            with closing(connect(self._path, "ro")) as connection:
                 sound = connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
                 same = sound and rows_of(connection) == self._ledger.rows()
         except sqlite3.DatabaseError as error:
@@ -761,14 +746,6 @@ def rows_of(connection: sqlite3.Connection) -> Rows:
     return {table: of_table for table, of_table in rows.items() if of_table}
 
 
-def _insert_rows(connection: sqlite3.Connection, rows: Rows) -> None:
-    """Write facts into a journal that has its tables and nothing in them."""
-    for table, of_table in rows.items():
-        for row in of_table.values():
-            marks = ", ".join("?" * len(row))
-            connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
-
-
 def read_ledger(path: Path) -> Rows:
     """Return the facts that a ledger holds."""
     return _gathered(_read_transactions(path))
@@ -862,7 +839,7 @@ class _Ledger:
         except OSError as error:
             raise storage_error(path, error, "look at") from error
         if not is_there or not self._is_of(rows):
-            self._write_anew(rows)
+            write_whole(path, _ledger_lines(rows))
         self._handle, self._end = self._opened()
         self._next = self._end
 
@@ -901,7 +878,7 @@ class _Ledger:
     def restore(self, rows: Rows) -> None:
         """Write the file anew, which was removed or changed while it was open."""
         self.close()
-        self._write_anew(rows)
+        write_whole(self._path, _ledger_lines(rows))
         self._handle, self._end = self._opened()
         self._next = self._end
 
@@ -919,9 +896,6 @@ class _Ledger:
             return True
         _require_none_lacking(self._path, _lacking_frames(_frames_in(_gathered(transactions[:-1])), _frames_in(rows)))
         return False
-
-    def _write_anew(self, rows: Rows) -> None:
-        write_whole(self._path, _ledger_lines(rows))
 
     def _opened(self) -> tuple[int, int]:
         """Return a handle of the file, and its size."""

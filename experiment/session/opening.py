@@ -19,7 +19,7 @@ import tempfile
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Final, Literal, Protocol, TypeVar
 from urllib.parse import quote
 
 from experiment.session.heartbeat import file_system_of
@@ -149,21 +149,11 @@ def is_busy(error: sqlite3.DatabaseError) -> bool:
 def create_file(path: Path) -> sqlite3.Connection:
     """Return a connection to a new journal with its tables and nothing in them."""
     try:
-        connection = _connect(path, "rwc")
+        connection = connect(path, "rwc")
         _execute_all(connection, _VERSION_1 + _VERSION_2, JOURNAL_VERSION)
     except sqlite3.DatabaseError as error:
         raise StorageError(f"cannot write {path}: {error}; free space or choose another disk") from error
     return connection
-
-
-def connect_to_read(path: Path) -> sqlite3.Connection:
-    """Return a connection that cannot write to a journal that this program has open and trusts."""
-    return _connect(path, "ro")
-
-
-def connect_to_write(path: Path) -> sqlite3.Connection:
-    """Return one more connection to a journal that this program has open, for another thread."""
-    return _connect(path, "rw")
 
 
 def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
@@ -187,7 +177,7 @@ def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
     """
     require_plain_folder(path.parent, MOST_BYTES)
     try:
-        connection = retry.run(lambda: _connect(path, "rw"))
+        connection = retry.run(lambda: connect(path, "rw"))
         version = retry.run(lambda: _checked(path, connection))
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_fault(path, error) from error
@@ -227,8 +217,8 @@ def set_aside(path: Path) -> None:
             beside(path, suffix).rename(beside(path, f"{suffix}.{number}.lost"))
 
 
-def _connect(path: Path, mode: str) -> sqlite3.Connection:
-    """Return a connection; without locks where the file system has none."""
+def connect(path: Path, mode: Literal["ro", "rw", "rwc"]) -> sqlite3.Connection:
+    """Return a connection in a mode of SQLite's URIs, nothing checked; without locks where the file system has none."""
     try:
         return _connect_with(path, mode)
     except sqlite3.OperationalError:
@@ -275,7 +265,7 @@ def _is_lockless(path: Path) -> bool:
 def _opened_or_copied(path: Path) -> sqlite3.Connection:
     """Return a reader of the file in its place, or of a copy where SQLite would have to write in order to read."""
     try:
-        return _connect(path, "ro")
+        return connect(path, "ro")
     except sqlite3.OperationalError as error:
         if _primary_code(error) not in _CANNOT_IN_PLACE:
             raise
@@ -290,7 +280,7 @@ def _copied(path: Path) -> sqlite3.Connection:
         for suffix in ("", "-wal", "-journal"):
             if (source := beside(path, suffix)).exists() or not suffix:
                 shutil.copyfile(source, beside(copy, suffix))
-        with closing(_connect(copy, "rw")) as connection:
+        with closing(connect(copy, "rw")) as connection:
             connection.backup(memory)
     memory.execute("PRAGMA query_only = ON")
     return memory
@@ -321,13 +311,13 @@ def _in_write_ahead(path: Path, connection: sqlite3.Connection, retry: Retry) ->
         copy = partial_path(path)
         # No other writer may be at work meanwhile.
         retry.run(lambda: connection.execute("BEGIN IMMEDIATE"))
-        with closing(_connect(path, "ro")) as source, closing(_connect(copy, "rwc")) as target:
+        with closing(connect(path, "ro")) as source, closing(connect(copy, "rwc")) as target:
             source.backup(target)
         connection.execute("ROLLBACK")
         connection.close()
         copy.replace(path)
         sync_folder(path.parent)
-        renewed = _connect(path, "rw")
+        renewed = connect(path, "rw")
         renewed.execute("PRAGMA journal_mode = WAL").fetchall()
         return renewed
     return connection
@@ -450,7 +440,7 @@ def _is_damage(error: sqlite3.DatabaseError) -> bool:
 def _is_sound(path: Path) -> bool:
     """Return whether a journal that was called damaged is whole, read once more."""
     try:
-        with closing(_connect(path, "ro")) as connection:
+        with closing(connect(path, "ro")) as connection:
             return connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
     except sqlite3.DatabaseError:
         return False

@@ -1,13 +1,8 @@
 """What puts a session right: files that are damaged, lights that are to be taken again, and secrets in its settings.
 
-- Raw files are held against the hashes in the journal. What is missing, cut off or altered is found by its cause; the
-  session voids it (`Session.verify`), so that the next run takes it again. Nothing is deleted. A few files that the
-  disk does not read are taken again, too; where it fails at more, or permissions are in the way, files may be sound,
-  and an error names them when all were looked at.
-- Lights are named as `12,40-44`, or are those whose frames `build-lut` refused. A report names frames by their hashes
-  too, so that asking twice for what one report refused takes nothing twice.
-- Until version 2 of the journal `session.toml` held the projector's password and the whole of `sequence.notify`,
-  readable by everybody; sessions are copied, shown and published.
+Raw files are held against the hashes in the journal; the session voids what is missing, cut off or altered, so that the
+next run takes it again. Nothing is deleted. Until version 2 of the journal `session.toml` held the projector's password
+and the whole of `sequence.notify`, readable by everybody; sessions are copied, shown and published.
 """
 
 from __future__ import annotations

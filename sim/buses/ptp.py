@@ -1,10 +1,7 @@
-"""A PTP device on a TCP port, for any initiator (PTP/IP).
+"""A PTP device on a TCP port, for one initiator at a time (PTP/IP).
 
-- One initiator at a time, known by the number that joins its two connections; a second one hears that the device is
-  busy.
-- The responder is asked by one thread only, that of the command connection. It is asked for events after each
-  operation, before the response goes out, and 20 times a second between operations.
-- A data phase to the initiator is announced even if it is empty, for initiators wait for it.
+The responder is asked by one thread only, that of the command connection: for events after each operation, before the
+response goes out, and 20 times a second between operations.
 
 Source: CIPA DC-005-2005, PTP-IP, clauses 2.2 and 2.3.
 """
@@ -14,7 +11,7 @@ from __future__ import annotations
 import itertools
 import threading
 
-from drivers.links.network import LOOPBACK, TcpLink, TcpServer
+from drivers.links.network import TcpLink, TcpServer
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.ip import (
     PORT,
@@ -37,7 +34,7 @@ from drivers.ptp.protocol import Answer, NoAnswer, PtpRequest, PtpResponse, Resp
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
 GUID = bytes(range(16))
-"""Identifier of a simulated device unless another is given."""
+"""Identifier of a simulated device."""
 NAME = "CroP camera"
 """What a simulated device calls itself unless another is given; ptpy fails on names of more than 19 characters."""
 DATA_PIECE = 256 * 1024
@@ -49,28 +46,20 @@ _TIMEOUT_S = 10.0
 """For the first packet, a data phase under way, and a host that reads slowly; long beside a transfer on one machine."""
 
 
-def serve_ptpip(
-    responder: Responder,
-    port: int = PORT,
-    *,
-    name: str = NAME,
-    guid: bytes = GUID,
-    host: str = LOOPBACK,
-) -> TcpServer:
+def serve_ptpip(responder: Responder, port: int = PORT, *, name: str = NAME) -> TcpServer:
     """Put a device on a TCP port; 0 picks a free one.
 
     Use the result in a ``with`` block; its `address` is host and port, both connections go there.
     """
-    return TcpServer(PtpIpService(responder, name, guid).handle, port, host)
+    return TcpServer(PtpIpService(responder, name).handle, port)
 
 
 class PtpIpService:
     """Speaks PTP/IP for a responder on connections that it is given."""
 
-    def __init__(self, responder: Responder, name: str = NAME, guid: bytes = GUID) -> None:
+    def __init__(self, responder: Responder, name: str) -> None:
         self._responder = responder
         self._name = name
-        self._guid = guid
         self._numbers = itertools.count(1)
         self._guard = threading.Lock()
         self._initiator: _Initiator | None = None
@@ -99,7 +88,7 @@ class PtpIpService:
             _send(channel, InitFail(FailReason.BUSY))
             return
         try:
-            _send(channel, InitCommandAck(initiator.number, self._guid, self._name))
+            _send(channel, InitCommandAck(initiator.number, GUID, self._name))
             while True:
                 try:
                     packet = channel.next(_TICK_S)

@@ -1,10 +1,7 @@
 """Serial cables to a simulated device: a pseudo-terminal (Linux and macOS), and one in memory.
 
-Rules of the pseudo-terminal:
-
-- One thread serves the device; it is joined when the terminal is closed.
-- To close it is to pull the cable out: whoever has the port open finds it gone.
-- What nobody reads is lost when the system's buffer is full, as on a cable without flow control.
+One thread serves a pseudo-terminal's device. To close it is to pull the cable out; what nobody reads is lost when the
+system's buffer is full, as on a cable without flow control.
 """
 
 from __future__ import annotations

@@ -1,24 +1,11 @@
 """USB without hardware: a device as a pure machine, and a bus for pyusb that opens it by the calls for real ones.
 
-**The bus.** Hand a `SimulatedBus` to `drivers.links.usb` as its backend:
+Packets count, as on a wire: a transfer from the host has ended only with a packet that is not full, and one to the host
+is closed by a zero-length packet when it fills its last one. Nothing waits: a pipe without anything to say is a NAK, on
+the bus a timeout at once. A transfer that is no PTP halts the bulk pipes, until the host clears them.
 
-- A device that is plugged in gets an address that none had before, as on a real bus; its port stays.
-- Nothing waits: a pipe that says nothing is a timeout at once.
-- Errors are those that pyusb raises over libusb, with the same numbers.
-
-Sources: pyusb's `usb.backend`; libusb 1.0's error codes.
-
-**The device.** Descriptors, control requests, and PTP on the bulk pipes:
-
-- Packets count, as on a wire: a transfer from the host has ended only with a packet that is not full, and one to the
-  host is closed by a zero-length packet when it fills its last one.
-- Nothing waits: a pipe without anything to say returns None, which on a bus is a NAK.
-- A transfer that is no PTP halts the bulk pipes, until the host clears them.
-
-`sim.buses.usbip` puts it on a network for USB/IP.
-
-Sources: USB 2.0, clauses 8.5 (transactions), 9.4 (standard requests) and 9.6 (descriptors); USB Still Image Capture
-Device Definition 1.0, clauses 5 to 7.
+Sources: pyusb's `usb.backend`; libusb 1.0's error codes; USB 2.0, clauses 8.5 (transactions), 9.4 (standard requests)
+and 9.6 (descriptors); USB Still Image Capture Device Definition 1.0, clauses 5 to 7.
 """
 
 from __future__ import annotations

@@ -1,28 +1,10 @@
 """Simulated USB devices lent over a network: Linux attaches them as if they were plugged in, so do USB/IP libraries.
 
-On Linux, as root: ``modprobe vhci-hcd``, then ``usbip attach -r 127.0.0.1 -b 1-1``.
-
-Rules that hold inside:
-
-- A device is lent to one client at a time, and only the thread of its connection uses it.
-- A transfer in that finds nothing waits, in order, until the device has something to say or the client unlinks it;
-  interrupt pipes are looked at 50 times a second.
-- Where a transfer that must not be short is short, those queued behind it on its pipe are held, as host controllers
-  hold them, until the client unlinks them: they were parts of the same read.
+On Linux, as root: ``modprobe vhci-hcd``, then ``usbip attach -r 127.0.0.1 -b 1-1``. A device is lent to one client at a
+time, and only the thread of its connection uses it. Numbers are big-endian, save the eight bytes of a control request,
+which are USB's own. Whatever arrives, the only error is `ProtocolError`.
 
 Source: the Linux kernel's documentation, usb/usbip_protocol; URB semantics, driver-api/usb/URB.
-
-**The wire.** A connection begins with one operation: to list the devices, or to import one. Once a device is
-imported, the same connection carries its transfers, each with a number under which its result comes back, in any
-order.
-
-Rules that hold inside:
-
-- `RequestReader` takes a stream in any pieces. Whatever arrives, the only error is `ProtocolError`; after it the
-  stream has lost its place.
-- Numbers are big-endian here, save the eight bytes of a control request, which are USB's own.
-
-Source: the Linux kernel's documentation, usb/usbip_protocol.
 """
 
 from __future__ import annotations
@@ -34,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers.links.link import Link
-from drivers.links.network import LOOPBACK, TcpServer
+from drivers.links.network import TcpServer
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb import BULK_OUT, PACKET, Overflowed, PtpUsbDevice, Setup, Stalled
 
@@ -182,19 +164,14 @@ def encode_unlinked(unlink: Unlink, status: int) -> bytes:
     return _URB.pack(_UNLINKED, unlink.number, 0, 0, 0, status & 0xFFFFFFFF, 0, 0, 0, 0, b"")
 
 
-def device_number(bus_id: str) -> tuple[int, int]:
-    """Return bus and device number for a bus id such as ``1-2``."""
-    bus, _, port = bus_id.partition("-")
-    return int(bus), int(port) + 1
-
-
 def _describe(bus_id: str, device: PtpUsbDevice) -> bytes:
-    bus, number = device_number(bus_id)
+    """Return what a client is told of a device, whose bus id is such as ``1-2``."""
+    bus, port = (int(part) for part in bus_id.split("-"))
     vendor, product, release = struct.unpack_from("<HHH", device.device_descriptor(), 8)
     path = f"/sys/devices/simulated/usb{bus}/{bus_id}"
     names = path.encode("ascii"), bus_id.encode("ascii")
     return struct.pack(
-        ">256s32sIIIHHHBBBBBB", *names, bus, number, HIGH_SPEED, vendor, product, release, 0, 0, 0, 1, 1, 1
+        ">256s32sIIIHHHBBBBBB", *names, bus, port + 1, HIGH_SPEED, vendor, product, release, 0, 0, 0, 1, 1, 1
     )
 
 
@@ -208,12 +185,12 @@ _EREMOTEIO = 121
 """Linux's number for a transfer that was short although that was not allowed; not every system has it in errno."""
 
 
-def serve_usbip(devices: Sequence[PtpUsbDevice], port: int = PORT, *, host: str = LOOPBACK) -> TcpServer:
+def serve_usbip(devices: Sequence[PtpUsbDevice], port: int = PORT) -> TcpServer:
     """Lend devices under the bus ids 1-1, 1-2, …; port 0 picks a free one.
 
     Use the result in a ``with`` block; its `address` is host and port.
     """
-    return TcpServer(UsbIpService(devices).handle, port, host)
+    return TcpServer(UsbIpService(devices).handle, port)
 
 
 class UsbIpService:
@@ -345,6 +322,7 @@ class _Loan:
                 return False
             short = bool(submit.flags & SHORT_NOT_OK) and len(data) < submit.length
             if short:
+                # They were parts of the same read: host controllers hold them until the client unlinks them.
                 self._held |= {other.number for other in self._waiting if other.endpoint == submit.endpoint}
             self._end(submit, -_EREMOTEIO if short else 0, data)
         return True

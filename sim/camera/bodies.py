@@ -1,19 +1,11 @@
 """The EOS bodies that the simulated camera can be: how each identifies itself, its properties, its lists.
 
 A body is a table of facts, without behaviour. Nobody has published a recording of an EOS 550D or a 6D Mark II on the
-wire, so that much is borrowed from the one body that was recorded, an EOS 60D; each table says what. The rules:
-
-- Properties stand in the order in which the 60D sends them; one whose value is None has a list record, but its value
-  is sent on request only, as by the 60D.
+wire, so that much is borrowed from the one body that was recorded, an EOS 60D; each table says what. Properties stand
+in the order in which the 60D sends them; one whose value is None is sent on request only, as by the 60D.
 
 Sources: a recorded EOS 60D (firmware 1.1.0); the settings of an EOS 550D (firmware 1.0.9) and a 6D Mark II (1.0.2) as
-users of libgphoto2 have listed them; battery and burst figures of Canon's specifications.
-
-What all bodies share:
-
-- `EVENTS_EX` are the record types that the 60D names in GetDeviceInfoEx.
-
-Source: a recorded EOS 60D (firmware 1.1.0); libgphoto2 2.5.34 for the structures.
+users of libgphoto2 have listed them; libgphoto2 2.5.34 for structures; specifications of Canon for battery and burst.
 """
 
 from __future__ import annotations
@@ -82,7 +74,6 @@ class EosModel:
     - `write_s`: time from the end of an exposure until the file is ready.
     - `shots_per_charge`: frames that a full battery lasts for.
     - `wide_objects`: whether objects are announced by the records with sizes of 64 bits.
-    - `borrowed`: what is not known of this very body, and where it was taken from.
     """
 
     info: DeviceInfo
@@ -95,7 +86,6 @@ class EosModel:
     frame_bytes: int
     write_s: float
     shots_per_charge: int
-    borrowed: tuple[str, ...]
     wide_objects: bool = False
 
     @property
@@ -373,13 +363,12 @@ EOS_550D = EosModel(
     frame_bytes=25 << 20,
     write_s=0.783,
     shots_per_charge=440,
-    borrowed=(
-        "60D: vendor extension id, operations, events, third-stop apertures, white balance shifts, structures, order",
-        "60D: capture destinations 2, 4, 6; camera time and counters reported as there",
-        "factory settings (third stops, no highlight priority) and 30 s to power off: general knowledge of the body",
-    ),
 )
-"""An EOS 550D as it leaves the factory."""
+"""An EOS 550D as it leaves the factory: third stops, no highlight priority, off after 30 s, as is generally known.
+
+Of the 60D are vendor extension id, operations, events, third-stop apertures, white balance shifts, structures, order,
+capture destinations 2, 4, 6, and that camera time and counters are reported.
+"""
 
 EOS_550D_AS_LISTED = replace(
     EOS_550D,
@@ -435,22 +424,20 @@ EOS_6D_MARK_II = EosModel(
     frame_bytes=35 << 20,
     write_s=0.617,
     shots_per_charge=1200,
-    borrowed=(
-        "60D: vendor extension id, operations, events, structures, order, nine focus points where it has 45",
-        "60D: capture destinations 2, 4, 6; objects announced by the records of 32 bits",
-        "lists of shutter times and apertures: third stops of the body and the lens that its owner listed",
-        "mirror lockup as property 0xd13a: named by libgphoto2, in no listing of this body",
-        "mRAW and sRAW are listed as there, but frames come in full size",
-    ),
 )
-"""An EOS 6D Mark II; bulb is on its dial, not in its list."""
+"""An EOS 6D Mark II; bulb is on its dial, not in its list. mRAW and sRAW are listed, but frames come in full size.
+
+Of the 60D are vendor extension id, operations, events, structures, order, nine focus points where it has 45, capture
+destinations 2, 4, 6, and that objects are announced by the records of 32 bits. Shutter times and apertures are third
+stops of the body and the lens that its owner listed; mirror lockup as property 0xd13a is named by libgphoto2, and in no
+listing of this body.
+"""
 
 TEST_BODY = replace(
     EOS_550D,
     info=replace(EOS_550D.info, model="CroP Test"),
     frame_bytes=1 << 20,
     write_s=0.113,
-    borrowed=(*EOS_550D.borrowed, "everything else: the EOS 550D"),
 )
 """A 550D with the small frames of the test sensor."""
 

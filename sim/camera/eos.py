@@ -1,16 +1,9 @@
 """The simulated EOS: a PTP responder that behaves as a Canon EOS body does, with a `Film` where the sensor would be.
 
-Rules that hold inside:
-
-- State moves with the time that is handed in, and only when somebody asks or touches the camera: what falls due in
-  between happens then, in its order. With a `SimulatedClock` an initiator that waits must sleep by the same clock;
-  a camera on a real cable needs the `SystemClock`.
-- The picture is what the film shows when the shutter opens. It reaches the initiator byte for byte.
-- The camera announces nothing by itself: changes queue up for GetEvent, as on the real body.
-- What no public recording shows is marked "assumed" where it is decided; the rest follows the recorded EOS 60D.
-
-An initiator reaches it through `answer`; a hand on the camera through `turn_dial`, `switch_focus`, `set_menu`,
-`insert_card`, `remove_card` and `wake`. Both may be used from several threads.
+State moves with the time that is handed in, and only when somebody asks or touches the camera: what falls due in
+between happens then, in its order. With a `SimulatedClock` an initiator that waits must sleep by the same clock. What
+no public recording shows is marked "assumed" where it is decided; the rest follows the recorded EOS 60D. An initiator's
+side and the hand on the camera may be used from several threads.
 
 Source: a recorded EOS 60D; ISO 15740:2013 for what is standard; libgphoto2 2.5.34 for what initiators expect.
 """

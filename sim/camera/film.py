@@ -1,19 +1,9 @@
 """What is on a simulated camera's pictures, apart from how its body behaves, and the raw files that hold it.
 
 `sim.camera.eos` has settings, names and time; a `Film` makes the picture: the `World` as it is lit now (`WorldFilm`)
-or by a real screen (`WatchedFilm`), or the frames of a recorded session. Nothing here draws.
-
-**Replay.** Each raw file of a recorded session again when its light is shown: this is how a lab's own recordings
-become tests. The files are handed out byte for byte, in the order in which they were taken under each colour; nothing
-is decoded.
-
-**Raw files.** Adobe DNG 1.4, one uncompressed 16-bit colour-filter mosaic, the whole sensor.
-
-What raw converters need to read it as they read a camera's own file: the visible part (ActiveArea) inside the masked
-borders (MaskedAreas), the colour filters counted from the visible part's corner, black and white level, and the
-exposure in an Exif directory. `Software` says that no camera took the picture. Laid out by `drivers.tiff`, for the
-Exif directory (LibRaw takes the ISO speed from nowhere else) and because it is one head before the counts as they lie
-in memory. The same arguments give the same bytes.
+or by a real screen (`WatchedFilm`), or the frames of a recorded session, byte for byte, in the order in which they were
+taken under each colour (`ReplayFilm`). Raw files are Adobe DNG 1.4, one uncompressed 16-bit mosaic of the whole sensor,
+with what raw converters need to read it as a camera's own file; `Software` says that no camera took the picture.
 
 Sources: DNG 1.4 chapter 2 and 4, Exif 2.32 section 4.6.
 """

@@ -1,9 +1,7 @@
 """The simulated JVC projector's network port: bytes in, bytes out, and a flat field on the simulated screen.
 
-Rules that hold inside:
-
-- It knows the raster and the three levels; anything else gets no answer, as from the real one.
-- Until the flat field is chosen its video input is seen, which is white.
+It knows the raster and the three levels; anything else gets no answer, as from the real one. Until the flat field is
+chosen its video input is seen, which is white.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
 """The simulated LightCrafter: a controller that shows its test pattern, and its HID interface on the simulated bus.
 
-Rules that hold inside:
-
-- `Controller` is the device: registers, and what they put on the screen. `LightCrafterUsb` speaks reports for it.
-- Found as it is switched on: showing its video input, which is white.
-- It changes its display mode with delay, as the real one: only after `lag` further questions does it say so.
+It is found as it is switched on: showing its video input, which is white. It changes its display mode with delay, as
+the real one: only after `lag` further questions does it say so.
 """
 
 from __future__ import annotations

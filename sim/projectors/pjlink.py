@@ -1,8 +1,5 @@
 """PJLink for the simulated projector: the far side of a connection, and a TCP port that speaks for it.
 
-Rules that hold inside: a peer deals with bytes alone; what they do happens in
-`sim.projectors.projector.SimulatedProjector`.
-
 Over UDP a projector of class 2 answers searches and gives notice of its changes.
 """
 
@@ -295,8 +292,8 @@ def _class_2(projector: SimulatedProjector) -> _Answers:
             "0": lambda: projector.set_frozen(False),
             "1": lambda: projector.set_frozen(True),
         },
-        "SVOL": {wire.RAISE: lambda: projector.turn_speaker(1), wire.LOWER: lambda: projector.turn_speaker(-1)},
-        "MVOL": {wire.RAISE: lambda: projector.turn_microphone(1), wire.LOWER: lambda: projector.turn_microphone(-1)},
+        "SVOL": {wire.RAISE: projector.turn_volume, wire.LOWER: projector.turn_volume},
+        "MVOL": {wire.RAISE: projector.turn_volume, wire.LOWER: projector.turn_volume},
     }
     if traits.filter_hours is not None:
         answers["FILT"] = {wire.QUERY: lambda: str(traits.filter_hours)}
@@ -309,11 +306,7 @@ def _selecting(projector: SimulatedProjector, codes: Iterable[str]) -> dict[str,
 
 
 def serve_pjlink(
-    projector: SimulatedProjector,
-    port: int = 0,
-    password: str | None = None,
-    host: str = LOOPBACK,
-    answer_s: float = 0.0,
+    projector: SimulatedProjector, port: int = 0, password: str | None = None, answer_s: float = 0.0
 ) -> TcpServer:
     """Return a running server that speaks PJLink for `projector`; close it, or use it in a `with` block.
 
@@ -323,4 +316,4 @@ def serve_pjlink(
     def think() -> None:
         projector.clock.sleep(answer_s)
 
-    return serve_peer(lambda: PjLinkPeer(projector, password), port, host, think)
+    return serve_peer(lambda: PjLinkPeer(projector, password), port, think=think)

@@ -1,10 +1,6 @@
 """The simulated projector itself, a lamp that takes its time, and the screen: one plain colour that a camera sees.
 
-Rules that hold inside:
-
-- It has states and no bytes; `sim.projectors.pjlink` and `sim.projectors.serial` translate for it.
-- State moves with the time that is handed in, and only when somebody looks.
-- What the world needs is `light`: how much of the full light reaches the screen now.
+It has states and no bytes, and moves with the time that is handed in, only when somebody looks.
 """
 
 from __future__ import annotations
@@ -65,8 +61,6 @@ INPUTS = (
     Input("61", "Test pattern"),
 )
 PANEL = Resolution(1920, 1080)
-MAX_VOLUME = 20
-"""Steps of the volume; of no consequence here."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +108,6 @@ class SimulatedProjector:
         """Whether a shutter before the lens holds the light back; change it at will."""
         self.signal: Resolution | NoResolution = self.traits.panel
         """What arrives at its input; change it at will."""
-        self.speaker = MAX_VOLUME // 2
-        self.microphone = MAX_VOLUME // 2
 
     def identity(self) -> ProjectorIdentity:
         """Return maker, model and name."""
@@ -174,15 +166,10 @@ class SimulatedProjector:
         with self._while_on():
             self._frozen = frozen
 
-    def turn_speaker(self, step: int) -> None:
-        """Turn the speaker by `step`, as far as it goes; refused unless it is on."""
+    def turn_volume(self) -> None:
+        """Do nothing, for nobody can hear it; refused unless it is on."""
         with self._while_on():
-            self.speaker = min(max(self.speaker + step, 0), MAX_VOLUME)
-
-    def turn_microphone(self, step: int) -> None:
-        """Turn the microphone by `step`, as far as it goes; refused unless it is on."""
-        with self._while_on():
-            self.microphone = min(max(self.microphone + step, 0), MAX_VOLUME)
+            pass
 
     def faults(self) -> tuple[Fault, ...]:
         """Return every fault that has been injected and not repaired."""

@@ -1,14 +1,8 @@
 """The simulated projector on a serial cable: one peer a language, bytes in and bytes out.
 
-Rules that hold inside:
-
-- A peer deals with bytes alone; what they do happens in `sim.projectors.projector.SimulatedProjector`.
-- A serial cable has no connections: a peer goes on where it was when its cable is opened again, and forgets only a
-  half-heard command.
-- `receive` with no bytes asks what a peer has to say by now: a late answer, or news. Whoever joins a peer to a cable
-  asks often (`sim.buses.serial`, `sim.buses.serial`).
-- Where the manuals leave open what a projector does, a peer does what is harder on the driver: it falls silent, or
-  refuses.
+A cable has no connections: a peer goes on where it was when it is opened again, and forgets only a half-heard command.
+`receive` with no bytes asks what a peer has to say by now: a late answer, or news. Where the manuals leave open what a
+projector does, a peer does what is harder on the driver: it falls silent, or refuses.
 """
 
 from __future__ import annotations

@@ -1,16 +1,8 @@
 """What a projector throws on the chart: the pixels of a real screen, through the lamp of a projector that is asked.
 
-Rules that hold inside:
-
-- The screen is read as a screenshot program reads it, whoever drew there, several times while the shutter is open;
-  codes become light before they are averaged, so that what was there for half the time gives half its light.
-- The projector is asked over its control port for power, mute, input, and freeze where it knows that. One that does
-  not answer gives no light; a screen that cannot be read is black, as is an input without signal.
-- A picture that was frozen stays what the screen showed when the projector was last heard of unfrozen: the time of a
-  freeze is known to `POLL_S`.
-- The watch holds neither screen saver nor power saving off.
-
-What only the monitor knows cannot be seen: power saving and gamma ramps act behind the screen's memory.
+The screen is read as a screenshot program reads it, several times while the shutter is open; codes become light before
+they are averaged. A projector that does not answer gives no light; a screen that cannot be read is black. What only the
+monitor knows cannot be seen: power saving and gamma ramps act behind the screen's memory.
 """
 
 from __future__ import annotations
@@ -21,13 +13,13 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.display.x11 import XScreen
-from drivers.pjlink import Input
+from drivers.pjlink import PjLinkProjector
 from drivers.projector import Power
 from foundation.clock import Clock
 from foundation.errors import DeviceError, InputError
@@ -81,7 +73,7 @@ class ScreenPlace:
 
 
 class Screenshots:
-    """A `Pictures` of an X screen. Reaches the server when it is first asked, and again after it was gone."""
+    """Pictures of an X screen. Reaches the server when it is first asked, and again after it was gone."""
 
     def __init__(self, place: ScreenPlace) -> None:
         self._place = place
@@ -105,42 +97,6 @@ class Screenshots:
             screen.close()
 
 
-class Pictures(Protocol):
-    """Where pictures come from."""
-
-    def take(self) -> NDArray[np.uint32]:
-        """Return a picture (height, width) uint32, 0xRRGGBB, or raise DeviceError where there is none."""
-        ...
-
-    def close(self) -> None:
-        """Release it."""
-        ...
-
-
-class WatchedProjector(Protocol):
-    """What is asked of a projector; `drivers.pjlink.PjLinkProjector` is one."""
-
-    def power(self) -> Power:
-        """Return the power state now."""
-        ...
-
-    def muted(self) -> bool | None:
-        """Return whether the picture is blanked; None where it cannot tell."""
-        ...
-
-    def frozen(self) -> bool | None:
-        """Return whether the picture is frozen; refused, or None, where it cannot tell."""
-        ...
-
-    def input(self) -> Input:
-        """Return the input that is shown; refused where it cannot tell."""
-        ...
-
-    def close(self) -> None:
-        """Hang up."""
-        ...
-
-
 @dataclass(frozen=True)
 class LampState:
     """What a projector says of itself.
@@ -157,7 +113,7 @@ class LampState:
     trouble: str = ""
 
 
-def ask(projector: WatchedProjector) -> LampState:
+def ask(projector: PjLinkProjector) -> LampState:
     """Return a projector's state; one that does not answer gives no light."""
     try:
         power = projector.power()
@@ -204,8 +160,8 @@ class Beam:
 
     def __init__(
         self,
-        pictures: Pictures,
-        projector: WatchedProjector | None,
+        pictures: Screenshots,
+        projector: PjLinkProjector | None,
         light_of: Callable[[NDArray[np.int64]], NDArray[np.float64]],
         clock: Clock,
     ) -> None:
@@ -283,7 +239,7 @@ class Beam:
         while not self._ended.wait(POLL_S):
             self._ask_once(self._projector)
 
-    def _ask_once(self, projector: WatchedProjector) -> None:
+    def _ask_once(self, projector: PjLinkProjector) -> None:
         state = ask(projector)
         with self._looking:
             self._state = state

@@ -210,26 +210,31 @@ _BORDER: Final = (50, 140)
 """Masked rows above and masked columns left of the picture, as Canon's sensors have about as many."""
 
 
+def _areas(width: int, height: int) -> dict[str, Any]:
+    """Return sensor, visible and masked areas for so many columns and rows that see light."""
+    top, left = _BORDER
+    sensor = height + top, width + left
+    return {
+        "sensor": sensor,
+        "visible": Rectangle(top, left, height, width),
+        "masked": (Rectangle(0, 0, sensor[0], left - 2),),
+    }
+
+
 def _body(
     name: str, size: tuple[int, int], black: int, saturation: int, gain_e: float, noise_dn: float, early_e: float
 ) -> Body:
-    """Return a body of `size` columns and rows that see light; the rest as `sim.world.sensors.Body` has it."""
-    (width, height), (top, left) = size, _BORDER
-    sensor = height + top, width + left
-    return Body(
-        maker="Canon",
+    """Return a Canon of `size` columns and rows that see light; the rest as `Body` has it."""
+    return replace(
+        _EOS_550D,
         model=name.replace("_", " "),
-        sensor=sensor,
-        visible=Rectangle(top, left, height, width),
-        pattern="RGGB",
         black=black,
         saturation=saturation,
-        bits=14,
         electrons_per_dn=gain_e,
         read_noise_dn=noise_dn,
         sensor_noise_e=early_e,
         sensitivities=name,
-        masked=(Rectangle(0, 0, sensor[0], left - 2),),
+        **_areas(*size),
     )
 
 
@@ -253,7 +258,7 @@ def find_body(
     given = dict(changes)
     pixels = given.pop("pixels", None)
     if pixels is not None:
-        given = _areas(pixels, where, key) | given
+        given = _areas(*_checked_pixels(pixels, where, key)) | given
     facts = {field.name: getattr(body, field.name) for field in fields(Body)}
     changed = from_settings(Body, given, where, key, [*facts, "pixels"], **facts)
     _require_sensor(changed, where, key)
@@ -267,8 +272,8 @@ def _of_sensitivities(camera: str, found: Sensitivities) -> Body:
     return replace(usual, maker=found.maker or "unknown", model=found.camera, sensitivities=camera)
 
 
-def _areas(pixels: Any, where: str, key: str) -> dict[str, Any]:
-    """Return sensor, visible and masked areas for so many columns and rows that see light."""
+def _checked_pixels(pixels: Any, where: str, key: str) -> tuple[int, int]:
+    """Return how many columns and rows see light, as settings say."""
     try:
         width, height = TypeAdapter(tuple[int, int]).validate_python(pixels)
     except ValidationError as error:
@@ -277,13 +282,7 @@ def _areas(pixels: Any, where: str, key: str) -> dict[str, Any]:
         ) from error
     if min(width, height) < 16:
         raise ConfigurationError(f"{where}: {key}.pixels = {pixels!r}: at least 16 columns and rows expected")
-    top, left = _BORDER
-    sensor = height + top, width + left
-    return {
-        "sensor": sensor,
-        "visible": Rectangle(top, left, height, width),
-        "masked": (Rectangle(0, 0, sensor[0], left - 2),),
-    }
+    return width, height
 
 
 def _require_sensor(body: Body, where: str, key: str) -> None:

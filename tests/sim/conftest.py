@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 
@@ -10,6 +16,8 @@ from sim.world.sensors import BODIES
 from sim.world.world import Room, World
 
 PAGE_MM = (180.0, 125.0)
+BARE = Print(PAGE_MM, np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+"""A sheet on which nothing is printed."""
 
 
 def squares() -> Print:
@@ -26,6 +34,21 @@ def patches() -> Print:
     rgb = np.random.default_rng(5).integers(0, 32, (35, 3)) * 8
     rgb[:3] = [[0, 0, 0], [255, 255, 255], [128, 128, 128]]
     return Print(PAGE_MM, np.stack([x, y, x + 24, y + 24], axis=-1).astype(np.float64), rgb.astype(np.uint8))
+
+
+@contextmanager
+def sim_serving(*arguments: str, lines: int = 1) -> Generator[list[str]]:
+    """Yield the first lines that `sim` prints, run as a program, and interrupt it, which is its proper end."""
+    command = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            yield [process.stdout.readline() for _ in range(lines)]
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    assert (process.returncode, out, err) == (0, "stopped\n", "")
 
 
 @pytest.fixture(scope="session")

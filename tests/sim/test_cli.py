@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,59 +14,29 @@ from drivers.projector import Power
 from sim.cli import main
 from tests.drivers.display.x_servers import virtual_screen
 from tests.drivers.pjlink.notice_port import NoticePort
-
-SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
+from tests.sim.conftest import sim_serving
 
 
 @pytest.mark.slow
 def test_serves_a_projector_until_interrupted() -> None:
-    with subprocess.Popen(
-        [*SIM, "projector", "--pjlink", "0", "--password", "secret"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            host, port = line.split()[-1].split(":")
-            projector = PjLinkProjector(lambda: TcpLink.connect(host, int(port), 10.0), "secret", 10.0)
-            projector.switch_on()
-            assert projector.power() is Power.WARMING
-            process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=30)
-            projector.close()
-        finally:
-            process.kill()
-    assert process.returncode == 0
-    assert out == "stopped\n"
-    assert err == ""
+    with sim_serving("projector", "--pjlink", "0", "--password", "secret") as (line,):
+        host, port = line.split()[-1].split(":")
+        projector = PjLinkProjector(lambda: TcpLink.connect(host, int(port), 10.0), "secret", 10.0)
+        projector.switch_on()
+        assert projector.power() is Power.WARMING
+    projector.close()
 
 
 @pytest.mark.slow
 def test_is_found_and_announces_itself() -> None:
-    with (
-        NoticePort(0, "127.0.0.1") as controller,
-        subprocess.Popen(
-            [*SIM, "projector", "--pjlink", "0", "--udp", "0", "--notify", f"127.0.0.1:{controller.address[1]}"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        ) as process,
-    ):
-        try:
-            assert process.stdout is not None
-            host, port = process.stdout.readline().split()[-1].split(":")
-            process.stdout.readline()
+    with NoticePort(0, "127.0.0.1") as controller:
+        cables = ("--pjlink", "0", "--udp", "0", "--notify", f"127.0.0.1:{controller.address[1]}")
+        with sim_serving("projector", *cables, lines=2) as (line, _):
+            host, port = line.split()[-1].split(":")
             found = search(30.0, enough=1, address=host, port=int(port), listen_port=0)
             _, notice = controller.receive(30.0)
-            process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=30)
-        finally:
-            process.kill()
     assert [projector.mac for projector in found] == ["02:00:00:00:00:01"]
     assert notice == PjLinkReply("LKUP", "02:00:00:00:00:01", 2)
-    assert (process.returncode, out, err) == (0, "stopped\n", "")
 
 
 @pytest.mark.parametrize(
@@ -102,9 +69,7 @@ def test_a_taken_udp_port_is_one_line(capsys: pytest.CaptureFixture[str]) -> Non
         ["projector", "--pjlink", "0", "--notify", "here"],
         ["projector", "--pjlink", "0", "--notify", "127.0.0.1:0"],
         ["projector", "--pjlink", "0", "--notify", "127.0.0.1:65536"],
-        ["camera"],
         ["toaster"],
-        ["camera", "--port", "0", "--usbip", "0"],
     ],
 )
 def test_wrong_arguments_end_with_2(arguments: list[str]) -> None:
@@ -135,24 +100,11 @@ def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.slow
 def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
-    with subprocess.Popen(
-        [*SIM, "camera", "--usbip", "0", "--model", "EOS 6D Mark II"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            assert line.endswith("bus id 1-1\n")
-            host, port = line.split(" at ")[1].split(",")[0].split(":")
-            found = usbip.host.list_devices(usbip.USBIP(host, int(port)))
-            process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=30)
-        finally:
-            process.kill()
+    with sim_serving("camera", "--usbip", "0", "--model", "EOS 6D Mark II") as (line,):
+        assert line.endswith("bus id 1-1\n")
+        host, port = line.split(" at ")[1].split(",")[0].split(":")
+        found = usbip.host.list_devices(usbip.USBIP(host, int(port)))
     assert [(entry["idVendor"], entry["idProduct"]) for entry in found] == [(0x04A9, 0x32CA)]
-    assert (process.returncode, out, err) == (0, "stopped\n", "")
 
 
 @pytest.mark.parametrize(
@@ -197,20 +149,16 @@ def test_a_screen_or_projector_that_is_not_there_ends_with_3(
 
 @pytest.mark.slow
 def test_a_projector_takes_its_time_as_told() -> None:
-    options = ["--warm-up", "0", "--cool-down", "0", "--class", "1", "--answer-after", "0.01"]
-    with subprocess.Popen([*SIM, "projector", "--pjlink", "0", *options], stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            host, port = process.stdout.readline().split()[-1].split(":")
-            projector = PjLinkProjector(lambda: TcpLink.connect(host, int(port), 10.0), timeout=10.0)
-            assert projector.pjlink_class() == 1
-            projector.switch_on()
-            assert projector.power() is Power.ON
-            projector.switch_off()
-            assert projector.power() is Power.STANDBY
-            projector.close()
-        finally:
-            process.kill()
+    options = ("--warm-up", "0", "--cool-down", "0", "--class", "1", "--answer-after", "0.01")
+    with sim_serving("projector", "--pjlink", "0", *options) as (line,):
+        host, port = line.split()[-1].split(":")
+        projector = PjLinkProjector(lambda: TcpLink.connect(host, int(port), 10.0), timeout=10.0)
+        assert projector.pjlink_class() == 1
+        projector.switch_on()
+        assert projector.power() is Power.ON
+        projector.switch_off()
+        assert projector.power() is Power.STANDBY
+        projector.close()
 
 
 def test_a_serial_projector_answers_at_its_own_pace(capsys: pytest.CaptureFixture[str]) -> None:

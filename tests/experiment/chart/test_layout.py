@@ -18,7 +18,6 @@ from experiment.chart.layout import (
     LEAST_WHITES,
     design_chart,
     paper_chart,
-    smallest_page,
     spread,
 )
 from experiment.chart.model import Chart
@@ -150,18 +149,6 @@ def test_the_greys_halve_the_light_of_srgb_and_are_no_colours_of_the_chart() -> 
         assert code % 8 != 0
 
 
-def test_the_same_seed_gives_the_same_chart_and_another_seed_another() -> None:
-    assert design_chart(3, seed=5).to_json() == design_chart(3, seed=5).to_json()
-    assert design_chart(3, seed=5).sha256 != design_chart(3, seed=6).sha256
-    assert not np.array_equal(design_chart(3, seed=5).colours, np.sort(design_chart(3, seed=5).colours))
-
-
-@pytest.mark.parametrize(("bits", "name"), [(1, "A7"), (2, "A7"), (3, "A5"), (4, "A2"), (5, "A0")])
-def test_the_smallest_page(bits: int, name: str) -> None:
-    assert smallest_page(bits) == name
-    assert design_chart(bits).page_mm == A_SERIES_MM[name]
-
-
 def test_a_page_can_be_larger_named_or_measured() -> None:
     assert design_chart(2, "a4").page_mm == (297, 210)
     portrait = design_chart(3, (148, 210))
@@ -262,17 +249,6 @@ def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:
     assert codes[0, 31].tolist() == [248, 0, 0]
     assert codes[31, 0].tolist() == [0, 248, 0]
     assert codes[0, 255].tolist() == [0, 0, 56]
-
-
-@pytest.mark.parametrize("bits", [1, 2, 3, 4])
-def test_a_small_paper_s_arrangement_is_of_the_same_kind(bits: int) -> None:
-    chart = paper_chart("A4", bits)
-    assert sorted(chart.colours.tolist()) == list(range(8**bits))
-    assert len(chart.white_references) >= 6
-    columns = len(np.unique(chart.centres_mm[:, 0].round(3)))
-    codes = chart.rgb.astype(np.int64).reshape(-1, columns, 3) >> (8 - bits)
-    # Along a row neighbours differ by one step in one channel.
-    assert np.abs(np.diff(codes, axis=1)).sum(axis=2).max() == 1
 
 
 def test_the_paper_s_references_are_bare_margin() -> None:

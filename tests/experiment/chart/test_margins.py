@@ -15,7 +15,6 @@ from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.margins import (
     Margins,
     Side,
-    bar_boxes,
     edge_boxes,
     margin_marks,
     number_every_mm,
@@ -98,22 +97,6 @@ def test_the_rulers_ticks_are_true(chart: Chart) -> None:
         int(place - left): int(length) for place, length in zip(below[:, 0], below[:, 3] - below[:, 1], strict=True)
     }
     assert lengths[0] > lengths[round(10 / PX_MM)] > lengths[round(5 / PX_MM)] > lengths[round(1 / PX_MM)]
-
-
-def test_bars_are_as_wide_as_their_gaps() -> None:
-    bars = bar_boxes().reshape(-1, 3, 4)
-    for group in bars:
-        width = group[0, 2] - group[0, 0]
-        assert group[:, 2].tolist() == (group[:, 0] + width).tolist()
-        assert np.diff(group[:, 0]).tolist() == [2 * width, 2 * width]
-    # As far from the next group as a bar is wide, and 12 px at least.
-    apart = bars[1:, 0, 0] - bars[:-1, -1, 2]
-    assert apart.tolist() == [max(int(group[0, 2] - group[0, 0]), 12) for group in bars[:-1]]
-    assert [int(group[0, 2] - group[0, 0]) for group in bars] == [30, 20, 15, 12, 10, 8, 6, 5, 4, 3, 2, 1]
-    # 3.2 mm long: several pixels of a half-size image of A0.
-    assert {*(bars[..., 3] - bars[..., 1]).ravel().tolist()} == {75}
-    # 12 px are 0.98 line pairs a millimetre, 6 px twice as many: what the proof page names.
-    assert abs(600 / 25.4 / 24 - 0.98) < 0.01
 
 
 def test_the_edge_falls_by_one_in_twelve_and_the_star_has_twelve_spokes() -> None:

@@ -278,50 +278,6 @@ def test_a_blurred_step_is_found_to_a_hundredth_beside_cells_that_slope() -> Non
     np.testing.assert_allclose(np.stack([off, rise], axis=1), expected, atol=0.01)
 
 
-def test_sides_bend_outwards_and_meet_in_corners() -> None:
-    corners = np.array([[10.0, 20], [110, 30], [100, 90], [5, 80]])
-    curve = np.array([1.0, -0.5, -2])
-    ends = np.roll(corners, -1, axis=0)
-    middle = corners.mean(axis=0)
-    share = np.linspace(0, 1, 41)
-    for start, end in zip(corners, ends, strict=True):
-        normal = field._outwards(start, end)
-        assert np.linalg.norm(normal) == pytest.approx(1)
-        assert normal @ (end - start) == pytest.approx(0)
-        assert normal @ (start - middle) > 0
-        bent = field._bent(share, curve, start, end)
-        # At its ends a Legendre series is the sum of its terms with alternating and with equal signs.
-        np.testing.assert_allclose(bent[[0, -1]], [start - 0.5 * normal, end - 1.5 * normal])
-        np.testing.assert_allclose(bent[20], (start + end) / 2 + 2 * normal)
-        found = field._curve_between(start, end, bent, 2)
-        np.testing.assert_allclose(found, curve, atol=1e-9)
-    sides = [start + share[3:-5, None] * (end - start) for start, end in zip(corners, ends, strict=True)]
-    np.testing.assert_allclose(field._corners_of(sides), corners)
-    np.testing.assert_allclose(field._sum(np.array([1.0, 2]), np.array([3.0])), [4, 2])
-
-
-def test_outlines_are_the_same_whichever_corner_they_begin_with() -> None:
-    corners = np.array([[10.0, 20], [110, 30], [100, 90], [5, 80]])
-    for turn in range(4):
-        moved = np.roll(corners, turn, axis=0) + np.array([2.9, -2.9])
-        assert field.same_corners(corners, moved, 3.0)
-        assert not field.same_corners(corners, moved, 2.8)
-    assert not field.same_corners(corners, corners[::-1], 3.0)
-
-
-def test_a_step_on_a_profile_is_where_it_rises_to_paper() -> None:
-    across = np.arange(-24, 24.01, 0.5)
-    at = np.array([-6.2, 0.0, 3.3])
-    rows = np.repeat(0.3 + 0.7 * ndtr((across - at[:, None]) / 0.7), 3, axis=0).astype(np.float32)
-    # Beyond the margin it is dark again, and a mark stands in the margin.
-    rows[:, across > 16] = 0.1
-    off, strength = field._edges(rows, across, 1e3)
-    np.testing.assert_allclose(off[1::3], at, atol=0.05)
-    # A step of 0.7 between two sigma to either side, its own blur and that of the profile taken together.
-    wide = float(np.hypot(0.7, 1.0))
-    np.testing.assert_allclose(strength[1::3], 0.7 * (2 * ndtr(1 / wide) - 1), atol=0.02)
-
-
 @pytest.mark.parametrize(("side", "is_taken"), [(190, False), (194, True)])
 def test_corners_by_hand_are_192_raw_pixels_apart(side: int, is_taken: bool) -> None:
     texts = ["100,100", f"{100 + side},100", f"{100 + side},400", "100,400"]

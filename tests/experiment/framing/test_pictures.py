@@ -11,14 +11,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy import ndimage
-from scipy.special import ndtr
 
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, Plane, plane_of, read_raw, strongest_plane
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
-from experiment.framing import pictures, sharpness
-from experiment.framing.field import FoundField, field_mm
+from experiment.framing.field import field_mm
 from experiment.framing.finding import Framing, annotated_png, apparent_sizes, find_chart, small_parts_warning
 from experiment.framing.pictures import gauge_boxes, preview_jpeg, shift_between
 from sim.world.world import Room
@@ -214,31 +212,3 @@ def test_a_preview_is_brightened_to_a_hundredth_of_white_and_marks_what_deviates
     rows, columns = np.flatnonzero(red.any(axis=1)), np.flatnonzero(red.any(axis=0))
     assert (columns[0], rows[0], columns[-1], rows[-1]) == pytest.approx((40, 20, 59, 49), abs=1)
     assert not red[25:45, 45:55].any()
-
-
-@pytest.mark.parametrize("sigma", [0.3, 0.62, 1.4])
-@pytest.mark.parametrize("steps", [(0.0,), (-6.0, 0.0, 6.0)])
-def test_the_blur_of_steps_is_found_without_their_heights(sigma: float, steps: tuple[float, ...]) -> None:
-    aside = np.random.default_rng(0).uniform(-9, 9, 800)
-    seen = 100 + sum((300 - 170 * number) * ndtr((aside - at) / sigma) for number, at in enumerate(steps))
-    assert sharpness._sigma(np.asarray(seen), aside, steps) == pytest.approx(sigma, rel=0.01)
-
-
-def test_a_movement_across_sides_is_a_shift_a_turn_and_a_growth() -> None:
-    corners = np.array([[100.0, 50], [500, 50], [500, 350], [100, 350]])
-    centre, reach = np.array([300.0, 200]), 200
-    share = np.linspace(0.1, 0.9, 8)[:, None]
-    middles = np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
-    normals = np.repeat([[0.0, -1], [1, 0], [0, 1], [-1, 0]], 8, axis=0)
-    made = FoundField(corners, np.eye(3), middles, middles, normals, 1.0)
-    x, y = ((middles - centre) / reach).T
-    dx, dy, turn, growth = 0.4, -0.3, 0.2, 0.1
-    away = np.stack([dx - turn * y + growth * x, dy + turn * x + growth * y], axis=1)
-    moved = (away * normals).sum(axis=1)
-    moved[5] = 3
-    found = pictures._similarity(middles, normals, moved, np.full(32, 100.0), made, 0.25)
-    assert (found.dx, found.dy, found.gauges, found.blur_growth_px2) == pytest.approx((dx, dy, 32, 0.25), abs=0.02)
-    u, v = ((corners - centre) / reach).T
-    at_corners = np.hypot(dx - turn * v + growth * u, dy + turn * u + growth * v)
-    assert found.largest_px == pytest.approx(at_corners.max(), abs=0.02)
-    assert found.length_px == pytest.approx(0.5, abs=0.02)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from experiment.measures.stains import Stains, added_light, find_stains, joined_cells, light_of_spot, spots_of
+from experiment.measures.stains import Stains, added_light, find_stains, light_of_spot, spots_of
 
 _Array = npt.NDArray[np.float64]
 SIDE = 16
@@ -107,11 +107,6 @@ def test_a_line_is_through_six_cells_that_are_not_black() -> None:
     stains.alone[there[0]] = stains.alone[there[25]]
     stains.level[there[0]] = stains.level[there[25]]
     assert light_of_spot(stains, there, 0) == pytest.approx((0.05, 0.9), abs=1e-6)
-
-
-def test_cells_with_one_between_them_are_of_one_place() -> None:
-    groups = joined_cells(reflected(20, 1, 0), np.array([0, 2, 5, 9, 11, 2 * 64 + 11]))
-    assert [group.tolist() for group in groups] == [[9, 11, 2 * 64 + 11], [0, 2], [5]]
 
 
 def test_what_deviates_is_large_and_significant() -> None:

@@ -16,6 +16,7 @@ from acquisition.run.devices import Devices
 from acquisition.run.pipeline import StepQueue
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import take_session
+from docs.states import AHEAD, TRANSITIONS, UNDER_WAY, StepState
 from drivers.camera import Camera, CapturedFrame
 from drivers.presenter import BLACK, Colour, Presenter
 from experiment.chart.layout import design_chart
@@ -24,16 +25,7 @@ from experiment.lights import Illumination
 from experiment.session import records
 from experiment.session.folder import Session
 from experiment.session.journal import IncomingFile, ReceivedFile
-from experiment.session.records import (
-    AHEAD,
-    TRANSITIONS,
-    UNDER_WAY,
-    Check,
-    Judgement,
-    SessionStep,
-    StepState,
-    plan_steps,
-)
+from experiment.session.records import Check, Judgement, SessionStep, plan_steps
 from foundation.clock import Clock
 from foundation.errors import DeviceError, LinkTimeout, StorageError
 

@@ -62,7 +62,7 @@ def device() -> Echo:
 @pytest.fixture
 def server(device: Echo) -> Iterator[TcpServer]:
     before = set(threading.enumerate())
-    with serve_ptpip(device, 0, name="EOS", guid=bytes(16)) as server:
+    with serve_ptpip(device, 0, name="EOS") as server:
         yield server
     assert set(threading.enumerate()) <= before
 
@@ -71,7 +71,7 @@ def server(device: Echo) -> Iterator[TcpServer]:
 def joined(server: TcpServer) -> Iterator[tuple[Client, Client]]:
     command, event = Client(server), Client(server)
     kind, body = command.greet()
-    assert (kind, body[4:]) == (2, bytes(16) + "EOS\0".encode("utf-16-le") + VERSION)
+    assert (kind, body[4:]) == (2, bytes(range(16)) + "EOS\0".encode("utf-16-le") + VERSION)
     event.say(3, body[:4])
     assert event.hear() == (4, b"")
     yield command, event

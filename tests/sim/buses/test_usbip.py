@@ -251,12 +251,6 @@ def test_transfers_in_end_in_their_order_once_there_is_something() -> None:
     ]
 
 
-def test_unlinked_transfers_do_not_end() -> None:
-    unlink = URB.pack(2, 101, 0x10002, 0, 0, 1, 0, 0, 0, 0, b"")
-    heard = Conversation(Echo()).say(IMPORT, submit(1, 1, 1, 512), unlink, unlink)
-    assert results(heard) == [(4, 101, -104, b""), (4, 101, 0, b"")]
-
-
 def test_the_rest_of_a_read_that_came_up_short_is_held() -> None:
     command = encode(PtpRequest(GIVE, 1, (4,)))
     conversation = (

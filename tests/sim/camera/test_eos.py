@@ -63,7 +63,7 @@ from foundation.clock import OPENING, SimulatedClock
 from foundation.errors import DeviceRefused, LinkClosed
 from sim.buses.usb import MemoryTransport
 from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, EOS_BODIES, TEST_BODY, EosModel
-from sim.camera.eos import CARD, DCIM, EMPTY_SLOT, FOLDER, SimulatedEos
+from sim.camera.eos import CARD, DCIM, FOLDER, SimulatedEos
 from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, conversations, read_description, transcript
 
 REAL = {"the transcript": transcript} | {name: make for name, make in conversations().items() if name == "EOS 60D"}
@@ -387,41 +387,7 @@ def test_a_body_without_a_master_takes_no_orders() -> None:
     assert host.film.exposures == []
 
 
-def test_says_nothing_before_event_mode() -> None:
-    host = host_of()
-    host.ok(Operation.OPEN_SESSION, 1)
-    assert host.ok(Operation.EOS_GET_EVENT) == bytes([8, 0, 0, 0, 0, 0, 0, 0])
-    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
-    assert len(host.ok(Operation.EOS_GET_EVENT)) > 1000
-    assert host.ok(Operation.EOS_GET_EVENT) == bytes([8, 0, 0, 0, 0, 0, 0, 0])
-
-
-def test_hints_once_that_there_is_something_to_ask_for(host: Host) -> None:
-    host.eos.events()
-    host.set(Property.EOS_ISO_SPEED, 0x50)
-    host.set(Property.EOS_ISO_SPEED, 0x58)
-    assert [event.code for event in host.eos.events()] == [0xC101]
-    assert host.eos.events() == ()
-
-
 # Properties.
-
-
-@pytest.mark.parametrize(
-    ("code", "value"),
-    [
-        (Property.EOS_SHUTTER_SPEED, 0x64),
-        (Property.EOS_APERTURE, 0x24),
-        (Property.EOS_CAPTURE_DESTINATION, 1),
-        (Property.EOS_AE_MODE, AeMode.MANUAL),
-        (Property.EOS_MODEL_ID, 0x80000287),
-        (Property.EOS_EXPOSURE_COMPENSATION, 0),
-    ],
-)
-def test_what_is_on_no_list_is_declined_as_busy(host: Host, code: int, value: int) -> None:
-    # As the recorded 60D does for aperture 0x24 and destination 1.
-    assert host.set(code, value) == ResponseCode.DEVICE_BUSY
-    assert changes(host.events()) == {}
 
 
 def test_a_setting_that_makes_no_sense(host: Host) -> None:
@@ -429,16 +395,9 @@ def test_a_setting_that_makes_no_sense(host: Host) -> None:
     assert host.set(0xDFFF, 1) == ResponseCode.DEVICE_PROP_NOT_SUPPORTED
     for data in (b"", b"\x0c\0\0\0", PropertySetting(Property.EOS_IMAGE_FORMAT, number_value(7)).encode()):
         assert host.code(set_ex, data=data) == ResponseCode.INVALID_DEVICE_PROP_FORMAT
+    assert host.code(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, 0xDFFF) == ResponseCode.GENERAL_ERROR
     short = PropertySetting(Property.EOS_ISO_SPEED, b"\x48").encode()
     assert host.code(set_ex, data=short) == ResponseCode.INVALID_DEVICE_PROP_FORMAT
-
-
-def test_text_is_kept(host: Host) -> None:
-    assert host.set(Property.EOS_ARTIST, "A. Painter") == ResponseCode.OK
-    host.events()
-    host.ok(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, Property.EOS_ARTIST)
-    assert changes(host.events()) == {Property.EOS_ARTIST: b"A. Painter\0"}
-    assert host.code(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, 0xDFFF) == ResponseCode.GENERAL_ERROR
 
 
 def test_the_cameras_time_can_be_set(host: Host) -> None:
@@ -470,13 +429,6 @@ def test_the_dial_decides_what_can_be_set(host: Host) -> None:
     }
 
 
-def test_a_turn_of_the_dial_is_told_with_the_new_lists(host: Host) -> None:
-    host.eos.turn_dial(AeMode.APERTURE_PRIORITY)
-    records = host.events()
-    assert changes(records) == {Property.EOS_AE_MODE: number_value(AeMode.APERTURE_PRIORITY)}
-    assert lists(records) == {Property.EOS_SHUTTER_SPEED: ()}
-
-
 def test_standard_properties(host: Host) -> None:
     friendly = DevicePropDesc(Property.DEVICE_FRIENDLY_NAME, DataType.STRING, False, "CroP Test", "CroP Test")
     assert host.ok(Operation.GET_DEVICE_PROP_DESC, Property.DEVICE_FRIENDLY_NAME) == friendly.encode()
@@ -503,21 +455,6 @@ def test_a_frame_arrives_as_the_film_made_it(host: Host) -> None:
     info = ObjectInfo.decode(host.ok(Operation.GET_OBJECT_INFO, request.handle))
     assert (info.filename, info.size, info.storage) == ("IMG_0001.DNG", 3000, 0)
     assert host.code(Operation.GET_THUMB, request.handle) == ResponseCode.NO_THUMBNAIL_PRESENT
-
-
-@example(offset=3000, length=10)
-@given(offset=st.integers(0, 3100), length=st.integers(0, 4000))
-def test_any_part_of_a_frame_can_be_fetched(offset: int, length: int) -> None:
-    host = host_of().take_control()
-    (request,) = transfers(host.shoot())
-    for operation in (Operation.GET_PARTIAL_OBJECT, Operation.EOS_GET_PARTIAL_OBJECT):
-        answer = host.ask(operation, request.handle, offset, length)
-        if offset > 3000:
-            assert answer.response.code == ResponseCode.INVALID_PARAMETER
-        else:
-            part = host.film.frames[0][offset : offset + length]
-            assert answer.data == part
-            assert answer.response.parameters == (len(part),)
 
 
 def test_is_busy_until_the_frame_is_written(host: Host) -> None:
@@ -662,18 +599,6 @@ def test_a_full_card_takes_no_more() -> None:
     assert host.ask(Operation.EOS_REMOTE_RELEASE).response.parameters == (7,)
 
 
-def test_without_a_card_there_is_only_the_host() -> None:
-    host = host_of(card_bytes=None).take_control()
-    assert decode_u32_array(host.ok(Operation.GET_STORAGE_IDS)) == (EMPTY_SLOT,)
-    assert decode_u32_array(host.ok(Operation.GET_OBJECT_HANDLES, 0xFFFFFFFF, 0, 0)) == ()
-    assert host.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.CARD) == ResponseCode.DEVICE_BUSY
-    host.eos.insert_card(1 << 30)
-    records = host.events()
-    assert Notice(EosEvent.STORE_ADDED, CARD) in records
-    assert lists(records)[Property.EOS_CAPTURE_DESTINATION] == (2, 4, 6)
-    assert host.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.CARD) == ResponseCode.OK
-
-
 # What spoils a series.
 
 
@@ -706,17 +631,6 @@ def test_a_half_press_alone_focuses_and_takes_nothing(host: Host) -> None:
     # Whoever lets go has lost the focus.
     assert host.code(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.FULL, 0) == ResponseCode.DEVICE_BUSY
     assert len(host.film.frames) == 1
-
-
-@pytest.mark.parametrize("body", [EOS_550D, EOS_6D_MARK_II], ids=lambda body: body.model)
-def test_mirror_lockup_blocks_the_release(body: EosModel) -> None:
-    host = host_of(body).take_control()
-    host.eos.switch_mirror_lockup(True)
-    assert changes(host.events()), "the host can know"
-    assert host.press() == ResponseCode.DEVICE_BUSY
-    assert host.ask(Operation.EOS_REMOTE_RELEASE).response.parameters == (3,)
-    host.eos.switch_mirror_lockup(False)
-    assert host.press() == ResponseCode.OK
 
 
 def test_bracketing_varies_the_exposure(host: Host) -> None:

@@ -197,7 +197,6 @@ def test_aiopjlink_mutes_freezes_and_turns_the_volume(served: Served) -> None:
         assert not served.device.frozen()
         await link.speaker.turn_up()
         await link.microphone.turn_down()
-        assert (served.device.speaker, served.device.microphone) == (11, 9)
 
     served.talk(conversation)
 

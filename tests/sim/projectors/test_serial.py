@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -19,7 +17,7 @@ from epson_projector import Projector
 
 from drivers.links.network import TcpLink, serve_peer
 from drivers.links.serial import SerialLink
-from drivers.projector import Power, Severity
+from drivers.projector import Power
 from drivers.serial_projectors import LANGUAGES
 from drivers.serial_projectors.benq import BenqProjector
 from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
@@ -27,7 +25,8 @@ from foundation.clock import SimulatedClock
 from sim.buses.serial import PseudoTerminal
 from sim.cli import main
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
-from sim.projectors.serial import SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
+from sim.projectors.serial import SERIAL_NUMBER, BenqPeer, EpsonPeer
+from tests.sim.conftest import sim_serving
 
 AT_ONCE = ProjectorTraits(warm_up_s=0.0, cool_down_s=0.0)
 """Other software waits by its own clock; a projector that is on at once keeps it short."""
@@ -103,29 +102,6 @@ def test_epson_warming_up_by_remote_control_tells_its_power_only() -> None:
     assert peer.receive(b"PWR?\rLAMP?\r") == b"PWR=02\r:ERR\r:"
 
 
-def test_epson_whose_lamp_dies_on_the_way_answers_err() -> None:
-    device = SimulatedProjector(SimulatedClock())
-    peer = EpsonPeer(device)
-    peer.receive(b"PWR ON\r")
-    device.break_part("lamp", Severity.ERROR)
-    device.clock.sleep(60)
-    assert peer.receive(b"") == b"ERR\r:"
-
-
-def test_optoma_tells_its_way_unasked() -> None:
-    clock = SimulatedClock()
-    device = SimulatedProjector(clock)
-    peer = OptomaPeer(device)
-    assert peer.receive(b"~0000 1\r") == b"P\rINFO1\r"
-    clock.sleep(30)
-    assert peer.receive(b"") == b""
-    device.break_part("lamp", Severity.ERROR)
-    assert peer.receive(b"") == b"INFO4\rINFO2\r"
-    clock.sleep(60)
-    assert peer.receive(b"~00124 1\r") == b"INFO0\rOK0\r"
-    assert peer.receive(b"~0100 1\r") == b"", "another projector's number"
-
-
 @pytest.fixture(params=["benq", "epson"])
 def served(request: pytest.FixtureRequest, device: SimulatedProjector) -> Iterator[BenqProjector | EpsonProjector]:
     def peer() -> BenqPeer | EpsonPeer:
@@ -166,31 +142,18 @@ def test_a_pseudo_terminal_that_nobody_reads_can_be_closed(device: SimulatedProj
         link.close()
 
 
-SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["epson", "nec"])
 def test_serves_a_serial_projector_until_interrupted(name: str) -> None:
     spoken = LANGUAGES[name]
-    with subprocess.Popen(
-        [*SIM, "projector", "--serial", name], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            assert line.startswith(f"{spoken.maker} projector at /dev/")
-            path = line.split()[-1]
-            projector = spoken.projector(lambda: SerialLink.open(path, spoken.baud))
-            assert projector.power() is Power.STANDBY
-            projector.switch_on()
-            assert projector.power() is Power.WARMING
-            projector.close()
-            process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=30)
-        finally:
-            process.kill()
-    assert (process.returncode, out, err) == (0, "stopped\n", "")
+    with sim_serving("projector", "--serial", name) as (line,):
+        assert line.startswith(f"{spoken.maker} projector at /dev/")
+        path = line.split()[-1]
+        projector = spoken.projector(lambda: SerialLink.open(path, spoken.baud))
+        assert projector.power() is Power.STANDBY
+        projector.switch_on()
+        assert projector.power() is Power.WARMING
+        projector.close()
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def light_of(codes: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 @dataclass
-class Shown:
+class Shown(Screenshots):
     """A screen whose pixels are a function of the time."""
 
     clock: SimulatedClock
@@ -138,7 +138,7 @@ def test_a_large_picture_is_averaged_in_light() -> None:
 
 
 @dataclass
-class Answers:
+class Answers(PjLinkProjector):
     """A projector that says what it is told to say; a test changes it and waits until it was asked again."""
 
     state: Power = Power.ON

@@ -44,7 +44,7 @@ from sim.world.disturbances import (
 from sim.world.rendering import Print
 from sim.world.sensors import BODIES
 from sim.world.world import OVERSCAN, REFERENCE_EXPOSURE, Blob, Room, Situation, World, moved, moved_back, projected_mm
-from tests.sim.conftest import PAGE_MM
+from tests.sim.conftest import BARE, PAGE_MM
 
 RED, GREEN, GREY = Colour(255, 0, 0), Colour(0, 255, 0), Colour(128, 128, 128)
 TEST = BODIES["Test"]
@@ -58,7 +58,7 @@ STRAIGHT = Room(
 def bare() -> World:
     """Return bare paper in even light, seen straight on by photosites without noise to speak of."""
     quiet = replace(TEST, read_noise_dn=0.01, sensor_noise_e=0.0, electrons_per_dn=1e6)
-    return World(Print(PAGE_MM, np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8)), quiet, STRAIGHT)
+    return World(BARE, quiet, STRAIGHT)
 
 
 def taken(world: World, *events: AnyDisturbance, colour: Colour = WHITE, frame: int = 5) -> NDArray[np.float64]:
@@ -181,7 +181,7 @@ def test_a_turned_chart_turns_about_its_middle() -> None:
 
 def test_the_projector_does_not_move_with_the_chart() -> None:
     room = replace(STRAIGHT, projector_falloff=0.4)
-    world = World(Print(PAGE_MM, np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8)), TEST, room)
+    world = World(BARE, TEST, room)
     inner = (slice(100, -100), slice(100, -100))
     still, pushed = taken(world)[inner], taken(world, Bump(mm=8.0))[inner]
     # Bare paper shows no movement but that of the light: there is none beyond the noise.
