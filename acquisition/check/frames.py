@@ -35,13 +35,7 @@ from foundation.errors import DeviceError, RegistrationError
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One frame.
-
-    `mosaic`: its counts.
-
-    - `shutter_s`: the shutter time that was set, seconds.
-    - `size`: bytes of its file.
-    """
+    """One frame: the shutter time that was set, seconds, its counts, and the bytes of its file."""
 
     shutter_s: float
     mosaic: Mosaic
@@ -79,9 +73,7 @@ class Photographer:
         """Return a frame of a plain colour, at the shutter time of the settings unless another is given."""
         devices, settings = self._devices, self._settings
         wanted = settings.camera.shutter_s if shutter_s is None else shutter_s
-        if wanted != self._shutter_s:
-            devices.camera.configure(replace(settings.camera.exposure, shutter_s=wanted))
-            self._shutter_s = wanted
+        self._set(wanted)
         devices.presenter.show(colour)
         devices.clock.sleep(settings.sequence.settle_s)
         begun = devices.clock.monotonic()
@@ -95,9 +87,12 @@ class Photographer:
 
     def restore(self) -> None:
         """Set the shutter time of the settings again."""
-        if self._shutter_s != self._settings.camera.shutter_s:
-            self._devices.camera.configure(self._settings.camera.exposure)
-            self._shutter_s = self._settings.camera.shutter_s
+        self._set(self._settings.camera.shutter_s)
+
+    def _set(self, shutter_s: float) -> None:
+        if shutter_s != self._shutter_s:
+            self._devices.camera.configure(replace(self._settings.camera.exposure, shutter_s=shutter_s))
+            self._shutter_s = shutter_s
 
     @contextmanager
     def muted(self) -> Generator[None]:

@@ -212,7 +212,11 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
         steps, rows, events = journal.steps(), journal.attempts(), journal.events()
         accepted = journal.accepted_files()
         known = {view.id: view for view in before.attempts} if before else {}
-        changed = [row for row in rows if row.id not in known or not _is_same(known[row.id], row)]
+        changed = [
+            row
+            for row in rows
+            if (old := known.get(row.id)) is None or (old.verdict, old.started_at) != (row.verdict, row.started_at)
+        ]
         details, nothing = journal.details([row.id for row in changed]), AttemptDetails()
         known |= {row.id: AttemptView(**vars(row), **vars(details.get(row.id, nothing))) for row in changed}
         records, heartbeat = journal.records(), journal.heartbeat()
@@ -238,10 +242,6 @@ def _without_own_files(folder: Path) -> str:
     """Return that chart or lights of a session are gone, and what helps; nothing where they are there."""
     gone = [str(folder / name) for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
     return f"{' and '.join(gone)}: gone; restore it from a copy of the session" if gone else ""
-
-
-def _is_same(view: AttemptView, row: Attempt) -> bool:
-    return (view.verdict, view.started_at) == (row.verdict, row.started_at)
 
 
 def _lights_of(folder: Path) -> tuple[Illumination, ...]:
@@ -702,7 +702,10 @@ def write_session_report(folder: Path, path: Path | None = None) -> Path:
     now = datetime.now(UTC)
     head = _ended(view).head(now)
     state["head"] = _head_json(head)
-    state["pictures"] = {str(number): _data_url(data) for number, data in _pictures(folder, view.attempts)}
+    state["pictures"] = {
+        str(number): f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+        for number, data in _pictures(folder, view.attempts)
+    }
     text = _filled(
         title=f"{view.name}, report of {now.astimezone():%Y-%m-%d %H:%M}",
         plain=_plain(head),
@@ -741,10 +744,6 @@ def _spread(count: int) -> list[int]:
         step = (step + 1) // 2
         places |= dict.fromkeys(range(0, count, step))
     return list(places)
-
-
-def _data_url(data: bytes) -> str:
-    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 
 
 def _plain(head: Head) -> str:

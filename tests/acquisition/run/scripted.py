@@ -177,10 +177,8 @@ class Hurried(SimulatedClock):
     def __init__(self) -> None:
         super().__init__()
         self.calls: dict[float, Callable[[], None]] = {}
-        self.slept: list[float] = []
 
     def sleep(self, seconds: float) -> None:
         super().sleep(seconds)
-        self.slept.append(seconds)
         if call := self.calls.pop(seconds, None):
             call()
