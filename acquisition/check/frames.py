@@ -364,12 +364,7 @@ PRIMARIES = {"red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colou
 
 @dataclass(frozen=True, eq=False)
 class PlacedChart:
-    """The chart in the frames of a check, which all have it in one place.
-
-    - `framing`: where it was found.
-    - `place`: the map from the print to the frames.
-    - `window`: side of the windows that patches are read in, px.
-    """
+    """The chart in the frames of a check, which all have it in one place; `window`: side, px, that patches have."""
 
     framing: Framing
     place: ChartMap
@@ -390,19 +385,13 @@ class CheckFrames:
     """What a check looked at.
 
     - `first`: white at the shutter time of the settings.
-    - `trials`: shutter times tried, that of the settings first.
-    - `times_s`: those that can be used.
-    - `saturation`: the sensor's.
-    - `chart`: where the chart is; None where it was not found.
-    - `trouble`: why not.
+    - `trials`, `times_s`: shutter times tried, that of the settings first, and those that can be used.
+    - `chart`, `trouble`: where the chart is; None where it was not found, and why not.
     - `whites`: frames of white at `used_s`; one of a recording.
     - `white_levels`: levels of paper in each, (3,) counts above black; none of a recording.
-    - `dark`: A frame of black there.
-    - `muted`: the same with the projector muted; None where it could not be.
-    - `why_not_muted`: why not.
+    - `dark`, `muted`: a frame of black there, and with the projector muted; None where it could not be.
     - `primaries`: levels of paper, (3,) counts above black, under "white", "red", "green", "blue" and "black"; None of
       a recording.
-    - `series`: exposures for linearity; None where not asked for.
     - `focal_px`: the focal length that files state, half-size px.
     """
 
@@ -614,11 +603,8 @@ def chart_levels(
 class ChartMeasurements:
     """What was measured of the chart, where it was found.
 
-    - `placed`: where it is.
-    - `blur`: its sharpness from place to place.
     - `cells`, `references`: what white shows of it, in the chart's order.
-    - `light`: the light on it; None where it has too few white references.
-    - `state`: stains on it; None likewise.
+    - `light`, `state`: the light on it, and its stains; None where it has too few white references.
     """
 
     placed: PlacedChart

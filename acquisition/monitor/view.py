@@ -146,15 +146,12 @@ class Head:
 
 @dataclass(frozen=True)
 class SessionView:
-    """A session as it was read.
+    """A session as it was read; attempts and events oldest first.
 
-    - `name`: name of its folder.
-    - `given`: the same as it was named by who asked, for the sentence that says what comes next.
-    - `steps`, `lights`: the plan, and the lights that it shows; no lights if their file cannot be read.
+    - `name`, `given`: its folder, by name and as it was named by who asked, for the sentence that says what comes next.
+    - `lights`: those of the plan; none if their file cannot be read.
     - `records`: what the journal says of devices, software and plan.
-    - `attempts`, `events`: all of them, oldest first.
-    - `heartbeat`: the newest sign of life; None where there is none.
-    - `place`: where it lies; None if that is not known.
+    - `heartbeat`, `place`: the newest sign of life, and where it lies; None where that is not known.
     - `frame_bytes`: size of its largest frame; 0 before the first.
     - `lost`: files of frames that count and are gone or cut, by step; only looked for where all frames are there.
     - `unreadable`: why no table can be made of it, and what helps, such as a lost chart; only looked for where all

@@ -339,7 +339,6 @@ def _say(report: Report, what: str, sentence: str) -> None:
 class Devices:
     """The open devices of a rig.
 
-    - `camera`: takes the frames.
     - `presenter`: fills the projector's picture with one plain colour.
     - `projector`: the control port of the projector; None where its lamp is not under control.
     - `clock`: measures and makes every pause.

@@ -1,6 +1,7 @@
 """From LAB.toml to a session on disk: creates it or takes it up, opens the rig, and takes every frame that is open.
 
 First who is told of a run: the terminal, a command, a URL, systemd, a dead man's switch; nothing waits for them.
+docs/how-to/night-run.md says what they get.
 
 Rules that hold inside for a session that is taken up:
 
@@ -16,14 +17,6 @@ For telling:
   libraries, whose text may hold it, are told by their number or kind.
 - Signs of life (`Life`) come from the steps of the run itself, a frame, a try in a pause: a run that hangs gives none,
   and its silence tells that it hangs.
-
-What a receiver gets, on its standard input or as the body of a POST (`application/json`)::
-
-    {"event": "paused", "message": "the screen: covered by a window …", "text": "night: paused: the screen …",
-     "content": "night: paused: the screen …", "session": "night", "host": "lab", "at": "2026-01-01T03:12:45+00:00"}
-
-``text`` is what Slack, Mattermost and their likes show, ``content`` what Discord does. A command finds event, message
-and session in its environment, too: ``CROP_EVENT``, ``CROP_MESSAGE``, ``CROP_SESSION``.
 """
 
 from __future__ import annotations
@@ -122,6 +115,7 @@ class Notices:
         if not self._target:
             return
         text = f"{self._session}: {event}: {message}"
+        # Slack, Mattermost and their likes show `text`, Discord `content`.
         body = {
             "event": event,
             "message": message,
