@@ -55,18 +55,9 @@ def lab_with_response(folder: Path) -> Lab:
 def interrupt_after(lab: Lab, frames: int, first: tuple[int, ...] = ()) -> None:
     """Take some frames and end the run."""
     ending = Ending(lambda sentence: None)
-    expose, before = lab.camera.expose, lab.camera.captures
-
-    def exposing() -> object:
-        released = expose()
-        if lab.camera.captures - before == frames:
-            ending.ask()
-        return released
-
-    lab.camera.expose = exposing  # type: ignore[method-assign, assignment]
+    lab.camera.after[lab.camera.captures + frames] = ending.ask
     with pytest.raises(KeyboardInterrupt):
         take_session(lab.session, lab.devices, SETTINGS, ending=ending, first=first)
-    lab.camera.expose = expose  # type: ignore[method-assign]
 
 
 def test_nothing_is_tied_to_nothing(folder: Path) -> None:
