@@ -455,7 +455,7 @@ def run_session(
                 state(f"checking frame {done} of {total}")
                 alive(f"{BEGINS}; frame {done} of {total}")
 
-            if damaged := session.verify(checking):
+            if session.journal.accepted_files() and (damaged := session.verify(checking)):
                 announce(f"voided: {first_of(damaged, 5)}")
             total = len(session.steps)
             if len(session.done_steps()) == total:
