@@ -270,7 +270,7 @@ def check(
     Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all
     named at once, each with its remedy, and end it with 3, or with 2 where LAB.toml alone is at fault.
     """
-    from acquisition.check.check import CheckOptions, check_lab
+    from acquisition.check.check import check_lab
     from experiment.config import load_lab
 
     settings = load_lab(lab)
@@ -283,9 +283,15 @@ def check(
         from acquisition.run.rig.lab import identify_displays
 
         identify_displays(10.0)
-    options = CheckOptions(picture, given, linearity, session)
     with orderly_end():
-        report = check_lab(settings, options, lambda sentence: print(sentence, file=sys.stderr))
+        report = check_lab(
+            settings,
+            lambda sentence: print(sentence, file=sys.stderr),
+            picture=picture,
+            corners=given,
+            linearity=linearity,
+            session=session,
+        )
     if told.asked:
         told.add(**report.values())
     else:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from acquisition.check.findings import LIMITS, Finding, Grade, amount, judged, not_checked, percent, worst
 from acquisition.check.light_and_print import AREAS, area_name, areas_of
-from acquisition.check.places import ChartMap
+from acquisition.check.places import ChartMap, smallest_cell_px
 from acquisition.run.plan import bytes_text, free_bytes_at, needed_bytes
 from calibration.figures.light import LINEARITY
 from calibration.sampling import bleed, largest_blur_px
@@ -171,9 +171,7 @@ def tilt_deg(homography: _Array, focal_px: float, centre_px: tuple[float, float]
 
 def judge_size(framing: Framing, chart: Chart, place: ChartMap) -> Finding:
     """Return the finding on how large cells and tags are, and whether the sheet lies in the picture."""
-    width, height = chart.page_mm
-    scale = place.scale([(0, 0), (width, 0), (width, height), (0, height), (width / 2, height / 2)])
-    cell = float((scale * chart.cell_mm).min())
+    cell = smallest_cell_px(chart, place)
     module = "" if framing.field is not None else f", a tag module {framing.module_px:.1f} px"
     found = judged(
         LIMITS["size"],

@@ -49,7 +49,7 @@ from acquisition.check.light_and_print import (
     judge_room_light,
     no_light,
 )
-from acquisition.check.places import Levels
+from acquisition.check.places import Levels, smallest_cell_px
 from acquisition.judge.measure import disagreement
 from acquisition.run.devices import Devices, RetryPolicy, ask_all, make_ready, period_s, reported_error
 from acquisition.run.plan import planned_steps, settings_doubts
@@ -84,29 +84,21 @@ CLIPPED = "white is clipped at every shutter time that was tried"
 """Why nothing can be said of the light."""
 
 
-@dataclass(frozen=True)
-class CheckOptions:
-    """What is asked of a check.
-
-    - `picture`: where to draw what was found, PNG; None for nowhere.
-    - `corners`: of the field of a chart without tags, as given by hand, half-size px; `experiment.framing.field`.
-    - `linearity`: whether to take a series of exposures that shows the sensor's linearity and noise.
-    - `session`: where the session is to lie, for the disk's free space; the settings' folder if not given.
-    """
-
-    picture: Path | None = None
-    corners: Corners | None = None
-    linearity: bool = False
-    session: Path | None = None
-
-
 def check_lab(
     settings: LabSettings,
-    options: CheckOptions | None = None,
     announce: Callable[[str], None] = lambda sentence: None,
+    *,
+    picture: Path | None = None,
+    corners: Corners | None = None,
+    linearity: bool = False,
+    session: Path | None = None,
 ) -> CheckReport:
-    """Check the rig that the settings name; record nothing."""
-    options = options or CheckOptions()
+    """Check the rig that the settings name; record nothing.
+
+    `picture`: where to draw what was found, PNG. `corners`: of the field of a chart without tags, as given by hand,
+    half-size px. `linearity`: whether to take a series of exposures that shows the sensor's linearity and noise.
+    `session`: where the session is to lie, for the disk's free space; the settings' folder if not given.
+    """
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
     frames = len(planned_steps(settings, lights))
@@ -116,20 +108,19 @@ def check_lab(
         lines += described
         camera = Photographer(devices, settings, Path(scratch))
         seen = look(
-            camera, settings, chart, devices.camera.shutter_speeds(), period_s(settings), options.corners,
-            options.linearity, announce,
+            camera, settings, chart, devices.camera.shutter_speeds(), period_s(settings), corners, linearity, announce,
         )  # fmt: skip
         supplies = judge_supplies(devices.camera, frames, seen.first.size)
     figures = None if seen.chart is None else measure_chart(seen, seen.chart, chart)
     recorded = settings.rig == "replay"
     findings = [
         *_exposure_findings(seen, settings, recorded),
-        *_chart_findings(seen, figures, chart, options),
+        *_chart_findings(seen, figures, chart, picture),
         *_light_findings(seen, figures, chart, bool(lights), settings.judge.dark_percent),
-        *_sensor_findings(seen, camera.timings, figures, chart, options),
+        *_sensor_findings(seen, camera.timings, figures, chart, linearity),
         *screen,
         *(Finding("settings", "remark", doubt) for doubt in settings_doubts(settings)),
-        judge_disk(options.session or Path(settings.file).parent, frames, seen.first.size),
+        judge_disk(session or Path(settings.file).parent, frames, seen.first.size),
         *supplies,
     ]
     if seen.used_s != seen.first.shutter_s:
@@ -139,10 +130,10 @@ def check_lab(
     findings += forecast_findings(table, chart, why_not)
     outcome = None if seen.chart is None else table.outcome
     report = CheckReport(tuple(lines), tuple(findings), outcome, table.figures, table.not_known)
-    if options.picture is not None:
+    if picture is not None:
         from acquisition.check.picture import check_png
 
-        write_whole(options.picture, check_png(seen, figures, chart, report))
+        write_whole(picture, check_png(seen, figures, chart, report))
     return report
 
 
@@ -164,10 +155,10 @@ def _exposure_findings(seen: CheckFrames, settings: LabSettings, recorded: bool)
 
 
 def _chart_findings(
-    seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart, options: CheckOptions
+    seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart, picture: Path | None
 ) -> list[Finding]:
     if figures is None:
-        look_at = "" if options.picture is None else f"see {options.picture}"
+        look_at = "" if picture is None else f"see {picture}"
         names = ("evenness", "colour evenness", "sharpness", "turn", "tilt", "size", "stains")
         why = "the chart was not found"
         return [Finding("chart", "fault", seen.trouble or why, remedy=look_at), *not_checked_all(names, why)]
@@ -183,7 +174,7 @@ def _chart_findings(
     return [
         judge_chart(framing, chart),
         *lit,
-        judge_sharpness(figures.blur, chart, framing.module_px, smallest_cell_px(chart, figures.placed)),
+        judge_sharpness(figures.blur, chart, framing.module_px, smallest_cell_px(chart, place)),
         judge_turn(framing),
         judge_tilt(framing, chart, seen.focal_px),
         judge_size(framing, chart, place),
@@ -248,7 +239,7 @@ def _sensor_findings(
     timings: list[tuple[float, float]],
     figures: ChartMeasurements | None,
     chart: Chart,
-    options: CheckOptions,
+    linearity: bool,
 ) -> list[Finding]:
     share = 0.0
     if figures is not None:
@@ -261,7 +252,7 @@ def _sensor_findings(
         hot if seen.usable and figures is not None else not_checked("hot photosites", "white does not show the print"),
         judge_noise_reduction(timings),
     ]
-    if not options.linearity:
+    if not linearity:
         return findings
     if seen.series is None:
         why = "the chart was not found" if seen.chart is None else "a recording cannot be exposed anew"
@@ -305,7 +296,6 @@ def _make_devices_ready(
 
 
 def _require_sound(projector: Projector) -> None:
-    """Require that a projector reports no error of its parts; a DeviceFault names them."""
     if (fault := reported_error(projector)) is not None:
         raise fault
 
@@ -395,7 +385,7 @@ def measure_table(
     found = len(framing.tags)
     return CheckMeasurements(
         tags_found=None if framing.field is not None else found / max(found + len(framing.missing), 1),
-        cell_px=smallest_cell_px(chart, placed),
+        cell_px=smallest_cell_px(chart, placed.place),
         blur_px=blur_px(framing),
         unfit={cause: float(mask.mean()) for cause, mask in unfit.items()},
         unfit_share=float(np.any(list(unfit.values()), axis=0).mean()),
@@ -421,13 +411,6 @@ def darkest_counts(
     black = primaries["black"]
     alone = np.stack([primaries[name] - black for name in ("red", "green", "blue")])
     return float(((shares @ alone + black) * exposure_ratio).max(axis=1).min())
-
-
-def smallest_cell_px(chart: Chart, placed: PlacedChart) -> float:
-    """Return the shorter side of the chart's smallest cell, half-size px."""
-    width, height = chart.page_mm
-    corners = [(0, 0), (width, 0), (width, height), (0, height), (width / 2, height / 2)]
-    return float((placed.place.scale(corners) * chart.cell_mm).min())
 
 
 def _places(chart: Chart) -> _Array:

@@ -35,13 +35,7 @@ from foundation.errors import DeviceError, RegistrationError
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One frame.
-
-    `mosaic`: its counts.
-
-    - `shutter_s`: the shutter time that was set, seconds.
-    - `size`: bytes of its file.
-    """
+    """One frame: the shutter time that was set, seconds, its counts, and the bytes of its file."""
 
     shutter_s: float
     mosaic: Mosaic
@@ -79,9 +73,7 @@ class Photographer:
         """Return a frame of a plain colour, at the shutter time of the settings unless another is given."""
         devices, settings = self._devices, self._settings
         wanted = settings.camera.shutter_s if shutter_s is None else shutter_s
-        if wanted != self._shutter_s:
-            devices.camera.configure(replace(settings.camera.exposure, shutter_s=wanted))
-            self._shutter_s = wanted
+        self._set(wanted)
         devices.presenter.show(colour)
         devices.clock.sleep(settings.sequence.settle_s)
         begun = devices.clock.monotonic()
@@ -95,9 +87,12 @@ class Photographer:
 
     def restore(self) -> None:
         """Set the shutter time of the settings again."""
-        if self._shutter_s != self._settings.camera.shutter_s:
-            self._devices.camera.configure(self._settings.camera.exposure)
-            self._shutter_s = self._settings.camera.shutter_s
+        self._set(self._settings.camera.shutter_s)
+
+    def _set(self, shutter_s: float) -> None:
+        if shutter_s != self._shutter_s:
+            self._devices.camera.configure(replace(self._settings.camera.exposure, shutter_s=shutter_s))
+            self._shutter_s = shutter_s
 
     @contextmanager
     def muted(self) -> Generator[None]:
@@ -369,12 +364,7 @@ PRIMARIES = {"red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colou
 
 @dataclass(frozen=True, eq=False)
 class PlacedChart:
-    """The chart in the frames of a check, which all have it in one place.
-
-    - `framing`: where it was found.
-    - `place`: the map from the print to the frames.
-    - `window`: side of the windows that patches are read in, px.
-    """
+    """The chart in the frames of a check, which all have it in one place; `window`: side, px, that patches have."""
 
     framing: Framing
     place: ChartMap
@@ -395,19 +385,13 @@ class CheckFrames:
     """What a check looked at.
 
     - `first`: white at the shutter time of the settings.
-    - `trials`: shutter times tried, that of the settings first.
-    - `times_s`: those that can be used.
-    - `saturation`: the sensor's.
-    - `chart`: where the chart is; None where it was not found.
-    - `trouble`: why not.
+    - `trials`, `times_s`: shutter times tried, that of the settings first, and those that can be used.
+    - `chart`, `trouble`: where the chart is; None where it was not found, and why not.
     - `whites`: frames of white at `used_s`; one of a recording.
     - `white_levels`: levels of paper in each, (3,) counts above black; none of a recording.
-    - `dark`: A frame of black there.
-    - `muted`: the same with the projector muted; None where it could not be.
-    - `why_not_muted`: why not.
+    - `dark`, `muted`: a frame of black there, and with the projector muted; None where it could not be.
     - `primaries`: levels of paper, (3,) counts above black, under "white", "red", "green", "blue" and "black"; None of
       a recording.
-    - `series`: exposures for linearity; None where not asked for.
     - `focal_px`: the focal length that files state, half-size px.
     """
 
@@ -619,11 +603,8 @@ def chart_levels(
 class ChartMeasurements:
     """What was measured of the chart, where it was found.
 
-    - `placed`: where it is.
-    - `blur`: its sharpness from place to place.
     - `cells`, `references`: what white shows of it, in the chart's order.
-    - `light`: the light on it; None where it has too few white references.
-    - `state`: stains on it; None likewise.
+    - `light`, `state`: the light on it, and its stains; None where it has too few white references.
     """
 
     placed: PlacedChart

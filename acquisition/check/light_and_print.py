@@ -266,13 +266,12 @@ def judge_primaries(levels: Mapping[str, _Array], plan_has: bool) -> list[Findin
         "switch off what dims a full picture in the projector's menu (dynamic contrast, eco mode), or expose less",
         {"primaries_of_white": over.tolist()},
     )
-    missing = float(np.max(np.abs((alone.sum(axis=0) - 2 * black) / white - 1)))
     signed = (alone.sum(axis=0) - 2 * black) / white - 1
     off = float(signed[int(np.argmax(np.abs(signed)))])
     additive = judged(
         LIMITS[ADDITIVITY.name],
         off,
-        f"the three primaries together are {percent(missing)} {'above' if off > 0 else 'below'} white",
+        f"the three primaries together are {percent(abs(off))} {'above' if off > 0 else 'below'} white",
         "switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
         {"by_channel": signed.tolist()},
     )

@@ -206,6 +206,13 @@ class Levels:
     clipped: npt.NDArray[np.bool_]
 
 
+def smallest_cell_px(chart: Chart, place: ChartMap) -> float:
+    """Return the shorter side of the chart's smallest cell, half-size px."""
+    width, height = chart.page_mm
+    corners = [(0, 0), (width, 0), (width, height), (0, height), (width / 2, height / 2)]
+    return float((place.scale(corners) * chart.cell_mm).min())
+
+
 def window_px(chart: Chart, place: ChartMap) -> int:
     """Return the side of the window that is looked at of a patch, px: half the smallest patch, odd, 3 … 9."""
     width, height = chart.page_mm

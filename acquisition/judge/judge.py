@@ -165,7 +165,11 @@ class LiveJudge:
         state, settings = self._state, self._settings
         measured = measure(mosaic, black)
         frame = Frame(measured, np.full(3, np.nan), UNKNOWN_PLACE)
-        checks = [*_judge_file(state, mosaic, measured, step, settings)]
+        checks = [
+            *_judge_origin(state, mosaic, measured, settings),
+            _judge_repeated(state, measured, settings),
+            *_judge_exposure(state, measured, step, settings),
+        ]
         if any(check.reason for check in checks):
             return _Findings(frame, tuple(checks))
         if state.awaits_primaries and (step.kind == "light" or (step.kind == "response" and not _is_compared(step))):
@@ -223,7 +227,8 @@ class LiveJudge:
         of_light, lamp = _judge_light(state, step, light, self._plan, judge.light_deg, judge.drift_percent)
         checks += [*evenness, *of_light]
         if step.kind == "white" and state.modelled:
-            checks.append(_white_overlap(state))
+            # Told, and never a reason to refuse.
+            checks.append(Check("additivity", round(100 * state.model.overlap, 2), None, None, "%"))
         return _Findings(frame, tuple(checks), light, off, lamp)
 
     def _preview(
@@ -272,17 +277,6 @@ def _judge_basis(state: JudgeState, following: JudgeState) -> Check | None:
         uneven,
         reason="the frames of the three primaries do not add up to the white or grey frame before them everywhere; did "
         "somebody pass, or a window cover the picture? all of them are taken again",
-    )
-
-
-def _judge_file(
-    state: JudgeState, mosaic: Mosaic, measured: Measured, step: SessionStep, settings: LabSettings
-) -> tuple[Check, ...]:
-    """Return what is said of a frame's file and exposure, before anything is looked for in its picture."""
-    return (
-        *_judge_origin(state, mosaic, measured, settings),
-        _judge_repeated(state, measured, settings),
-        *_judge_exposure(state, measured, step, settings),
     )
 
 
@@ -405,7 +399,7 @@ def _judge_movement(
     (2,) float64 px right and down from the anchor's frame; NaN where that is not told.
     """
     channel, _ = _best_channel(frame.measured)
-    paper = _paper_in(frame, channel)
+    paper = float(np.nan_to_num(frame.paper[CHANNELS.index(channel)]))
     if paper < limits.DIM_DN:
         return [
             Check("movement", None, None, judge.moved_px, "px"),
@@ -448,11 +442,6 @@ def _moved(by: tuple[float, float]) -> str:
         f"the chart has moved by {np.hypot(x, y):.2f} px in the picture ({x:+.2f} right, {y:+.2f} down); was camera or "
         "chart touched? fix them, and let nobody walk about"
     )
-
-
-def _paper_in(frame: Frame, channel: Channel) -> float:
-    paper = float(frame.paper[CHANNELS.index(channel)])
-    return 0.0 if np.isnan(paper) else paper
 
 
 _SIGMAS = 6.0
@@ -528,11 +517,6 @@ def _by_region(tiles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     side = round(_TILES**0.5)
     grid = tiles.reshape(TILE_ROWS // side, side, TILE_COLUMNS // side, side, 3)
     return np.asarray(grid.mean(axis=(1, 3))).reshape(-1, 3)
-
-
-def _white_overlap(state: JudgeState) -> Check:
-    """Return how far white is beyond the sum of the primaries; told, and never a reason to refuse."""
-    return Check("additivity", round(100 * state.model.overlap, 2), None, None, "%")
 
 
 def judge_white(first: Frame | None, frame: Frame) -> Check:

@@ -120,25 +120,13 @@ class FramePlaces:
         return int(x[column]), int(y[row]), int(x[column + 1]), int(y[row + 1])
 
 
-@dataclass(frozen=True, eq=False)
-class Sums:
-    """Mean counts at the places of a frame.
+def _mean_counts(
+    counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: float, floor: float
+) -> tuple[_Array, _Array, _Array]:
+    """Return the mean counts at all places, of counts (H, W), in one pass, and the shares of odd photosites.
 
-    - `tiles`: (384, 4) float64, mean count of each tile, row by row, for the four positions of the block, row by row.
-    - `strips`: (rows, 4, 4) float64, of each row of blocks and segment, likewise.
-    - `clipped`, `empty`: photosites at or above the clipping level, and those that no light and no darkness gives.
-    """
-
-    tiles: npt.NDArray[np.float64]
-    strips: npt.NDArray[np.float64]
-    clipped: int
-    empty: int
-
-
-def _sum_counts(counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: float, floor: float) -> Sums:
-    """Return the mean counts at all places, in one pass.
-
-    `counts`: (H, W) uint16, the visible area.
+    Tiles (T, 4) and strips (rows, 4, 4) for the four positions of the block, row by row; shares (2,) of photosites at
+    or above the clipping level, and of those that no light and no darkness gives.
     """
     sums = np.zeros((places.rows, TILE_COLUMNS, 4), dtype=np.int64)
     top = min(int(np.ceil(clipping)), 65535)
@@ -148,7 +136,7 @@ def _sum_counts(counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: f
     ends = np.arange(0, TILE_COLUMNS, TILE_COLUMNS // SEGMENTS)
     widths = np.add.reduceat(np.diff(places.x_edges), ends)
     strips = np.add.reduceat(sums, ends, axis=1) / widths[:, None]
-    return Sums(tiles, strips, int(tallies[0]), int(tallies[1]))
+    return tiles, strips, tallies / counts.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +196,7 @@ def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
     black = frame_black(mosaic) if black is None else black
     mean_black = float(black.mean())
     floor = _EMPTY_SHARE * mean_black if mean_black >= _LEAST_BLACK else 0.0
-    sums = _sum_counts(mosaic.counts, places, CLIPPING_SHARE * mosaic.white_level, floor)
+    *means, odd = _mean_counts(mosaic.counts, places, CLIPPING_SHARE * mosaic.white_level, floor)
     rows, columns = places.sampled
     sampled = np.stack([blocks[r, c][rows, columns] for r in range(2) for c in range(2)], axis=-1)
     of = phases(mosaic)
@@ -218,7 +206,7 @@ def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
         float(np.percentile(sampled[:, 2 * r + c], BRIGHTEST_PERCENTILE) - black[r, c]) for places_of in of.values()
         for r, c in places_of
     )  # fmt: skip
-    tiles, strips = (_channels(means - black.ravel(), of) for means in (sums.tiles, sums.strips))
+    tiles, strips = (_channels(mean - black.ravel(), of) for mean in means)
     return Measured(
         tiles=tiles,
         strips=strips.reshape(-1, 3),
@@ -229,8 +217,8 @@ def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
         black_measured=bool(mosaic.masked),
         range_dn=float(mosaic.white_level - mean_black),
         brightest_dn=bright,
-        clipped=sums.clipped / mosaic.counts.size,
-        empty=sums.empty / mosaic.counts.size,
+        clipped=float(odd[0]),
+        empty=float(odd[1]),
         camera=mosaic.camera,
         serial=mosaic.serial,
         places=places,

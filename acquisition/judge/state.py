@@ -579,14 +579,7 @@ def combined(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Examined:
-    """What was found of a frame, and said of it.
-
-    - `frame`: what was measured.
-    - `light`: its light, where a basis is known.
-    - `accepted`: whether it may be used.
-    - `cause`: name of the check that refused it; empty if none did.
-    - `lamp`: what it showed of the lamp.
-    """
+    """What was found of a frame, its light where a basis is known, and the check that refused it, if any did."""
 
     frame: Frame
     light: FrameLight | None

@@ -146,15 +146,12 @@ class Head:
 
 @dataclass(frozen=True)
 class SessionView:
-    """A session as it was read.
+    """A session as it was read; attempts and events oldest first.
 
-    - `name`: name of its folder.
-    - `given`: the same as it was named by who asked, for the sentence that says what comes next.
-    - `steps`, `lights`: the plan, and the lights that it shows; no lights if their file cannot be read.
+    - `name`, `given`: its folder, by name and as it was named by who asked, for the sentence that says what comes next.
+    - `lights`: those of the plan; none if their file cannot be read.
     - `records`: what the journal says of devices, software and plan.
-    - `attempts`, `events`: all of them, oldest first.
-    - `heartbeat`: the newest sign of life; None where there is none.
-    - `place`: where it lies; None if that is not known.
+    - `heartbeat`, `place`: the newest sign of life, and where it lies; None where that is not known.
     - `frame_bytes`: size of its largest frame; 0 before the first.
     - `lost`: files of frames that count and are gone or cut, by step; only looked for where all frames are there.
     - `unreadable`: why no table can be made of it, and what helps, such as a lost chart; only looked for where all
@@ -212,7 +209,11 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
         steps, rows, events = journal.steps(), journal.attempts(), journal.events()
         accepted = journal.accepted_files()
         known = {view.id: view for view in before.attempts} if before else {}
-        changed = [row for row in rows if row.id not in known or not _is_same(known[row.id], row)]
+        changed = [
+            row
+            for row in rows
+            if (old := known.get(row.id)) is None or (old.verdict, old.started_at) != (row.verdict, row.started_at)
+        ]
         details, nothing = journal.details([row.id for row in changed]), AttemptDetails()
         known |= {row.id: AttemptView(**vars(row), **vars(details.get(row.id, nothing))) for row in changed}
         records, heartbeat = journal.records(), journal.heartbeat()
@@ -238,10 +239,6 @@ def _without_own_files(folder: Path) -> str:
     """Return that chart or lights of a session are gone, and what helps; nothing where they are there."""
     gone = [str(folder / name) for name in ("chart.json", "illuminations.csv") if not (folder / name).exists()]
     return f"{' and '.join(gone)}: gone; restore it from a copy of the session" if gone else ""
-
-
-def _is_same(view: AttemptView, row: Attempt) -> bool:
-    return (view.verdict, view.started_at) == (row.verdict, row.started_at)
 
 
 def _lights_of(folder: Path) -> tuple[Illumination, ...]:
@@ -702,7 +699,10 @@ def write_session_report(folder: Path, path: Path | None = None) -> Path:
     now = datetime.now(UTC)
     head = _ended(view).head(now)
     state["head"] = _head_json(head)
-    state["pictures"] = {str(number): _data_url(data) for number, data in _pictures(folder, view.attempts)}
+    state["pictures"] = {
+        str(number): f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+        for number, data in _pictures(folder, view.attempts)
+    }
     text = _filled(
         title=f"{view.name}, report of {now.astimezone():%Y-%m-%d %H:%M}",
         plain=_plain(head),
@@ -741,10 +741,6 @@ def _spread(count: int) -> list[int]:
         step = (step + 1) // 2
         places |= dict.fromkeys(range(0, count, step))
     return list(places)
-
-
-def _data_url(data: bytes) -> str:
-    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 
 
 def _plain(head: Head) -> str:

@@ -1,24 +1,6 @@
 """What a session is taken with, by contract only: made ready, asked at each frame, waited for where it fails or hangs.
 
-Camera, presenter and projector are the devices; the disk is waited for in the same way::
-
-    retry = RetryPolicy(clock, settings.sequence.patience_s, report, idle, on_wait)
-    retry.attempt(lambda: presenter.show(colour), "the screen")
-    retry.attempt(lambda: journal.begin(step, file, clock.now()), "the disk")
-
-or, where a try is more than one call::
-
-    pause = retry.pause("the camera", idle=False)
-    while True:
-        try:
-            frame = …
-        except DeviceError as fault:
-            pause.wait(fault)  # returns after some seconds for the next try; raises when the time is over
-        else:
-            pause.over()  # says that the run goes on, if it had said that it paused
-            break
-
-Rules that hold inside:
+The disk is waited for as camera, presenter and projector are. Rules that hold inside:
 
 - The first failure is tried again after a second (`retry`), so that what passes at once pauses nothing. What lasts
   pauses the run (`paused`) with the cause that holds *now*; another cause is told as soon as it is there (`still
@@ -30,9 +12,6 @@ Rules that hold inside:
 - Nothing that is told may end the run: a full disk, which cannot take the note of a pause, gets it when there is space.
 - What is no `CropError` passes through at once: Ctrl-C ends a pause; `on_wait` and `idle` may raise
   `KeyboardInterrupt`.
-- A step that hangs, a camera that does not answer for one, leaves the run unable to say so itself: `RunWatch` looks
-  each second in a thread of its own. It sees, too, that the machine slept or the process was stopped: nobody knows what
-  the screen showed meanwhile.
 - A lamp that was lit when it was first asked for is taken as warm; one that was lit meanwhile gets its warm-up, and
   gets it anew where it goes out during that.
 - A projector that reports a fault, shows no picture or does not answer is unhealthy: the run pauses. One that was out
@@ -61,7 +40,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from enum import Enum
-from typing import Final, Protocol, Self, TypeVar
+from typing import Final, Self, TypeVar
 
 from drivers.camera import Camera
 from drivers.presenter import BLACK, Colour, Presenter
@@ -81,6 +60,9 @@ from foundation.errors import (
     LinkError,
     StorageError,
 )
+
+Report = Callable[[str, str], object]
+"""Where words and sentences of a run go: terminal first, then journal, then whoever is notified."""
 
 POWER_LIMIT_S: Final = 300.0
 """How long a lamp may take to light; makers state up to 130 s with repeated ignition."""
@@ -135,8 +117,7 @@ def reported_error(projector: Projector) -> DeviceFault | None:
 
 
 def _power_fault(projector: Projector) -> DeviceFault | None:
-    power = projector.power()
-    if power is Power.ON:
+    if (power := projector.power()) is Power.ON:
         return None
     remedy = "it is waited for" if power is Power.WARMING else "switch it on"
     return DeviceFault(f"the projector is in {power.value} during the session", remedy=remedy)
@@ -358,7 +339,6 @@ def _say(report: Report, what: str, sentence: str) -> None:
 class Devices:
     """The open devices of a rig.
 
-    - `camera`: takes the frames.
     - `presenter`: fills the projector's picture with one plain colour.
     - `projector`: the control port of the projector; None where its lamp is not under control.
     - `clock`: measures and makes every pause.
@@ -393,12 +373,8 @@ class LightNotShown:
         """Do nothing."""
 
 
-Questions = Mapping[str, Callable[[], object]]
-"""What is asked, by the name of the device; each raises what its device says against it."""
-
-
-def ask_all(questions: Questions) -> None:
-    """Ask each question, in their order, and raise what went wrong with all of them together."""
+def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
+    """Ask each question, by the name of its device, and raise what went wrong with all of them together."""
     faults: dict[str, CropError] = {}
     for name, question in questions.items():
         try:
@@ -511,25 +487,6 @@ INSTANT_S: Final = 1e-6
 _Result = TypeVar("_Result")
 
 
-class Report(Protocol):
-    """Where words and sentences of a run go: terminal first, then journal, then whoever is notified."""
-
-    def __call__(self, what: str, sentence: str, /) -> None:
-        """Tell what happens, with its cause.
-
-        ``retry``, ``paused``, ``still paused``, ``resumed``, ``relit`` or ``warming up``.
-        """
-        ...
-
-
-class _WaitCallback(Protocol):
-    """Where signs of life of a wait go: the journal's heartbeat, and a line on the terminal."""
-
-    def __call__(self, state: str, sentence: str, within_s: float, /) -> None:
-        """Tell the state (``paused`` or ``waiting``), what is waited for and how long, and when the next is due."""
-        ...
-
-
 def is_curable(fault: CropError) -> bool:
     """Return whether waiting may help: any fault of a device or of the disk, but nothing that the user gave."""
     return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, HeldJournalError | LostJournalError)
@@ -538,8 +495,9 @@ def is_curable(fault: CropError) -> bool:
 class RetryPolicy:
     """How long, and how, a run waits for what fails.
 
-    `idle`: keeps the other devices awake; called every few seconds. Its `DeviceError` is left to the device's own next
-    use. `on_wait`: told every few seconds of a wait, with the time left in the sentence.
+    `report`: told a word, such as ``retry`` or ``paused``, and a sentence. `idle`: keeps the other devices awake every
+    few seconds; its `DeviceError` is left to the device's own next use. `on_wait`: told every few seconds the state
+    (``paused`` or ``waiting``), what is waited for and how long, and in how many seconds the next sign is due.
     `breakable`: a block in which somebody's request ends the run at once, put around every wait.
     """
 
@@ -549,7 +507,7 @@ class RetryPolicy:
         limit_s: float,
         report: Report = lambda what, sentence: None,
         idle: Callable[[], None] = lambda: None,
-        on_wait: _WaitCallback = lambda state, sentence, within_s: None,
+        on_wait: Callable[[str, str, float], object] = lambda state, sentence, within_s: None,
         breakable: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
         self.clock = clock

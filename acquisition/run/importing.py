@@ -85,7 +85,8 @@ def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int
     try:
         illumination = int(cell("illumination")) if kind == "light" else None
         exposure_s = float(cell("exposure_s") or 0)
-        taken_at = datetime.fromisoformat(cell("taken_at")) if cell("taken_at") else _modified(file)
+        stated = cell("taken_at")
+        taken_at = datetime.fromisoformat(stated) if stated else datetime.fromtimestamp(file.stat().st_mtime, UTC)
     except ValueError as error:
         raise FormatError(str(error), about=where) from error
     if illumination is not None and not 0 <= illumination < lights:
@@ -122,8 +123,15 @@ def import_session(
         try:
             for step, frame in zip(steps, frames, strict=True):
                 reason, sha256 = _take_over(session, step, frame, settings)
-                if frame.kind == "light":
-                    _require_another_light(taken.setdefault(sha256, frame), frame, frame_list)
+                first = taken.setdefault(sha256, frame) if frame.kind == "light" else frame
+                if first.illumination != frame.illumination:
+                    raise FormatError(
+                        f"lights {first.illumination} and {frame.illumination} have the same raw file, "
+                        f"{first.path.name} and {frame.path.name}",
+                        about=frame_list,
+                        remedy="list each light's own",
+                        value=(first.illumination, frame.illumination),
+                    )
                 if reason:
                     refused.append(f"{frame.path.name}: {reason}")
                 observe(step.number + 1, len(frames))
@@ -182,19 +190,3 @@ def _take_over(
         ended_at=frame.taken_at,
     )
     return reason, received.sha256
-
-
-def _require_another_light(first: ListedFrame, frame: ListedFrame, frame_list: Path) -> None:
-    """Refuse a raw file that is listed for two lights."""
-    if first.illumination != frame.illumination:
-        raise FormatError(
-            f"lights {first.illumination} and {frame.illumination} have the same raw file, "
-            f"{first.path.name} and {frame.path.name}",
-            about=frame_list,
-            remedy="list each light's own",
-            value=(first.illumination, frame.illumination),
-        )
-
-
-def _modified(path: Path) -> datetime:
-    return datetime.fromtimestamp(path.stat().st_mtime, UTC)

@@ -1,20 +1,11 @@
 """A frame's way: while one is downloaded the next light settles, while one is exposed the last is judged.
 
-Order of a frame n, on one thread for the devices and one that saves and judges::
-
-    devices   settle n | begin n | expose n | screen? | show n+1 | projector? | download n | collect n-1 | settle …
-    saving             |        judge n-1                                     | hash, flush, rename, judge n …
-
-`StepQueue` says which frame is next, `Pipeline` moves the devices, `Verdicts` lets frames count and draws what follows
-for others, `LastingCause` waits for what would refuse every frame.
-
-Rules that hold inside, of time and order:
+docs/explanation/steps.md has the order of its steps. `StepQueue` says which frame is next, `Pipeline` moves the
+devices, `Verdicts` lets frames count and draws what follows for others, `LastingCause` waits for what would refuse
+every frame. Rules that hold inside, of time and order:
 
 - Settling counts from when the light was shown, so that it passes during the download and while verdicts are awaited.
-- The verdict of n is collected after the download of n+1, never earlier, and so before n+2 is exposed. The rule does
-  not depend on how fast anything is: a session in simulated time is the same each time.
-- The saving thread touches no device and no journal. The order on the disk is write, flush, rename; a frame counts when
-  its row is committed, which happens on the devices' thread, in the order of taking.
+- The saving thread touches no device and no journal: rows are committed on the devices' thread, in the order of taking.
 - An attempt's row gets `started_at` when its light was shown and `ended_at` when the exposure was over and the light
   could change: what they enclose are parts of the run's time that do not overlap, though the work on the frames does.
 - A light that is shown and not taken, because a refused one came first, leaves no row.
@@ -175,15 +166,6 @@ class Saved:
     preview_fault: str = ""
 
 
-def take_open(job: Job, observe: Callable[[Taken], object], ending: Ending) -> None:
-    """Take what the job's queue lists, and journal it.
-
-    Whatever ends it, frames that the camera has given are completed, judged and journalled first.
-    """
-    with ThreadPoolExecutor(1, "saving") as saving:
-        Pipeline(job, saving, observe, ending).run()
-
-
 class Pipeline:
     """Moves the devices; `saving` is the thread that completes files and judges them, one after another."""
 
@@ -201,7 +183,10 @@ class Pipeline:
         self._exposed: Colour | None = None
 
     def run(self) -> None:
-        """Take frames until the queue is empty or the end was asked for."""
+        """Take frames until the queue is empty or the end was asked for.
+
+        Whatever ends it, frames that the camera has given are completed, judged and journalled first.
+        """
         try:
             with self._ending.finishing(PROMISE):
                 light = self._next_light()
@@ -469,22 +454,19 @@ class Verdicts:
         self._lacks_previews = False
         self._last_before = lasting.last_before
         self._unused_bytes = 0
-
-    @property
-    def _budget_bytes(self) -> float:
-        return self._job.settings.sequence.refused_gb * 1e9
+        self._budget_gb = job.settings.sequence.refused_gb
 
     @property
     def is_spent(self) -> bool:
         """Whether this run has filled the disk with more frames that are not used than it may."""
-        return self._unused_bytes > self._budget_bytes
+        return self._unused_bytes > self._budget_gb * 1e9
 
     def require_budget(self) -> None:
         """Raise if `is_spent`: what refuses so many frames is not chance, and fills the disk."""
         if self.is_spent:
             raise QualityError(
                 f"refused and voided frames of this run take {self._unused_bytes / 1e9:.3g} GB of the disk, "
-                f"{self._budget_bytes / 1e9:g} allowed (sequence.refused_gb); acquire status names the causes: mend "
+                f"{self._budget_gb:g} allowed (sequence.refused_gb); acquire status names the causes: mend "
                 "them, then run the same command again; it has the same budget anew"
             )
 
@@ -712,7 +694,7 @@ and two neighbours may share a cause that passes."""
 class StepQueue:
     """The steps of a session that are still to be taken in this run.
 
-    `append`: given a reference's kind, puts one behind the plan and returns it; None: nothing is put there.
+    `append`: given a reference's kind, puts one behind the plan and returns it.
     `reference_every`: lights that are taken in a row without references between them; None: as many as the plan has.
     """
 
@@ -721,9 +703,9 @@ class StepQueue:
         steps: Sequence[SessionStep],
         done: Collection[int],
         attempts: int,
+        append: Callable[[FrameKind], SessionStep],
         first: Iterable[int] = (),
         unclosed: Collection[str] = (),
-        append: Callable[[FrameKind], SessionStep] | None = None,
         reference_every: int | None = None,
     ) -> None:
         self._steps = {step.number: step for step in steps}
@@ -851,9 +833,9 @@ class StepQueue:
     def _closed(self) -> int | None:
         """Put a reference behind the plan that closes the last lights; None where none is needed."""
         for kind in self._closing:
-            if self._append is not None and kind in self._unclosed:
+            if kind in self._unclosed:
                 self._unclosed.discard(kind)
-                return self._appended(self._append, kind)
+                return self._appended(kind)
         return None
 
     def _between(self, light: int) -> int:
@@ -861,32 +843,24 @@ class StepQueue:
 
         References that will follow are in the plan when this returns.
         """
-        if self._append is None:
-            return light
         for kind in self._closing:
             if not any(number > light and self._steps[number].kind == kind for number in self._open):
-                self._appended(self._append, kind)
+                self._appended(kind)
             coming = any(self._steps[number].kind == kind for number in self._under_way)
             if self._reference_every and self._lights_since[kind] >= self._reference_every and not coming:
                 self._lights_since[kind] = 0
-                return self._appended(self._append, kind)
+                return self._appended(kind)
         return light
 
-    def _appended(self, append: Callable[[FrameKind], SessionStep], kind: FrameKind) -> int:
-        step = append(kind)
+    def _appended(self, kind: FrameKind) -> int:
+        step = self._append(kind)
         self._steps[step.number] = step
         self._open.add(step.number)
         return step.number
 
 
 def unclosed_kinds(taken: Iterable[str]) -> frozenset[str]:
-    """Return the kinds of references that are missing behind the last light of accepted frames in taking order.
-
-    Examples
-    --------
-    >>> sorted(unclosed_kinds(["white", "dark", "light", "white"]))
-    ['dark']
-    """
+    """Return the kinds of references that are missing behind the last light of accepted frames in taking order."""
     unclosed: set[str] = set()
     for kind in taken:
         if kind == "light":

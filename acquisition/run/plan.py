@@ -69,12 +69,10 @@ KNOWN_AFTER: Final = 5
 class Work:
     """What a run has to do, known from files alone.
 
-    - `folder`: of the session.
     - `new`: whether the session is yet to be made.
-    - `steps`, `done`: the plan, and the numbers of its steps that have their frame.
+    - `done`: numbers of the steps that have their frame.
     - `order`: of the lights, in words.
-    - `chart`, `lights`: what hangs on the wall, and what is shown.
-    - `lights_sha256`: SHA-256 of the file of the lights, hexadecimal.
+    - `lights_sha256`: of the file of the lights, hexadecimal.
     - `frame_bytes`, `frame_s`: largest raw file of the session, and median seconds from one frame to the next; None
       where too few were taken.
     """
@@ -294,13 +292,11 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Answers:
-    """What the devices said.
+    """What the devices said; None, or empty, where they could not be asked, or do not tell.
 
-    - `camera`: who it is; None if it could not be asked.
-    - `offered_s`: shutter times that it offers, seconds; empty if it lists none.
-    - `supplies`: its battery and card; None if it does not tell.
-    - `projector`: its name and state, in words; empty where it could not be asked, or there is none under control.
-    - `lit`: whether its lamp burns; None if that is not known.
+    - `offered_s`: shutter times that the camera offers, seconds.
+    - `projector`: its name and state, in words.
+    - `lit`: whether its lamp burns.
     - `warnings`: what changes the light behind the codes, each with its remedy.
     - `unasked`: what could not be asked, and why.
     - `faults`: what would end the run.
@@ -388,15 +384,10 @@ OFFERED_WITHIN: Final = 0.01
 class RunPlan:
     """What a run will take, need and find.
 
-    - `settings`: as given.
-    - `work`: what is to be done.
-    - `answers`: what the devices said.
-    - `frame_bytes`: A raw file, bytes.
-    - `frame_s`: A frame's time, seconds.
+    - `frame_bytes`, `frame_s`: a raw file, bytes, and a frame's time, seconds.
     - `warm_up_s`: of the lamp before the first frame, seconds; of one that is known to burn, none.
     - `free_bytes`: on the disk of the session.
-    - `faults`: what would end the run, each with its remedy.
-    - `doubts`: what may; a sentence each.
+    - `faults`, `doubts`: what would end the run, each with its remedy; what may, a sentence each.
     """
 
     settings: LabSettings

@@ -1,6 +1,7 @@
 """From LAB.toml to a session on disk: creates it or takes it up, opens the rig, and takes every frame that is open.
 
 First who is told of a run: the terminal, a command, a URL, systemd, a dead man's switch; nothing waits for them.
+docs/how-to/night-run.md says what they get.
 
 Rules that hold inside for a session that is taken up:
 
@@ -16,14 +17,6 @@ For telling:
   libraries, whose text may hold it, are told by their number or kind.
 - Signs of life (`Life`) come from the steps of the run itself, a frame, a try in a pause: a run that hangs gives none,
   and its silence tells that it hangs.
-
-What a receiver gets, on its standard input or as the body of a POST (`application/json`)::
-
-    {"event": "paused", "message": "the screen: covered by a window …", "text": "night: paused: the screen …",
-     "content": "night: paused: the screen …", "session": "night", "host": "lab", "at": "2026-01-01T03:12:45+00:00"}
-
-``text`` is what Slack, Mattermost and their likes show, ``content`` what Discord does. A command finds event, message
-and session in its environment, too: ``CROP_EVENT``, ``CROP_MESSAGE``, ``CROP_SESSION``.
 """
 
 from __future__ import annotations
@@ -42,19 +35,20 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Self
 from urllib.parse import unquote, urlsplit, urlunsplit
 
 from acquisition.judge.judge import LiveJudge
 from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.view import write_session_report
 from acquisition.run.devices import TRY_S, Devices, RetryPolicy, RunEnd, RunWatch, leave_lab, make_ready, pause_cause
-from acquisition.run.pipeline import Job, StepQueue, Taken, link_runs, step_name, take_open, unclosed_kinds, white_first
+from acquisition.run.pipeline import Job, Pipeline, StepQueue, Taken, link_runs, step_name, unclosed_kinds, white_first
 from acquisition.run.plan import nothing_to_retake, planned_steps, require_plan, require_same
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
@@ -73,7 +67,6 @@ from experiment.session.records import (
     Check,
     FrameJudge,
     FrameKind,
-    Judgement,
     SessionStep,
     TimedAttempt,
     doubts_of,
@@ -122,6 +115,7 @@ class Notices:
         if not self._target:
             return
         text = f"{self._session}: {event}: {message}"
+        # Slack, Mattermost and their likes show `text`, Discord `content`.
         body = {
             "event": event,
             "message": message,
@@ -257,37 +251,11 @@ SHOWN = ("light", "movement", "blur", "white drift", "dark", "ambient", "exposur
 """Checks that the line about the last frame has, as far as they have a number."""
 
 
-class TimeLeft:
-    """Tells the time left by the machine's clock as the page and `acquire status` tell it by the journal's.
-
-    `clock`: returns seconds; the machine's own unless a test has another.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._since: float | None = None
-        self._attempts: deque[TimedAttempt] = deque(maxlen=RECENT)
-
-    def taken(self, accepted: bool = True) -> None:
-        """Note that a frame was taken now, and whether it counts."""
-        now = self._clock()
-        self._attempts.append(TimedAttempt(None if self._since is None else now - self._since, accepted))
-        self._since = now
-
-    def paused(self) -> None:
-        """Note that the run waits: the time until the next frame is no frame's."""
-        self._since = None
-
-    def left_s(self, frames: int) -> float | None:
-        """Return seconds that so many frames will take, retaken ones included; None before the second frame."""
-        return time_left(self._attempts, frames)
-
-
 def verdict_line(taken: Taken) -> str:
     """Return what is said of the last frame in a line: its verdict, and numbers with their units."""
-    judgement = taken.judgement
-    numbers = [_number_text(check) for name in SHOWN for check in _of_name(judgement, name)]
-    said = "accepted" if judgement.accepted else "refused"
+    checks = [check for check in taken.judgement.checks if check.name in SHOWN and check.value is not None]
+    numbers = map(_number_text, sorted(checks, key=lambda check: SHOWN.index(check.name)))
+    said = "accepted" if taken.judgement.accepted else "refused"
     return ", ".join([f"{step_name(taken.step)} {said}", *numbers])
 
 
@@ -295,10 +263,6 @@ def _number_text(check: Check) -> str:
     """Return a check's name and number, as in ``light 0.21°``."""
     unit = "" if not check.unit else check.unit if check.unit.startswith("°") else f" {check.unit}"
     return f"{check.name} {check.value:.3g}{unit}{' (beyond its limit)' if check.is_beyond else ''}"
-
-
-def _of_name(judgement: Judgement, name: str) -> list[Check]:
-    return [check for check in judgement.checks if check.name == name and check.value is not None]
 
 
 PLAIN_S: Final = 30.0
@@ -318,8 +282,8 @@ class Terminal:
 
         console = Console(stderr=True)
         self._clock = clock
-        self._time = TimeLeft(clock)
-        self._left = self._total = 0
+        self._since: float | None = None
+        self._attempts: deque[TimedAttempt] = deque(maxlen=RECENT)
         self._said = ""
         self._plain = shows_progress() and not console.is_terminal
         self._plain_due = -math.inf
@@ -351,15 +315,17 @@ class Terminal:
         # What is refused before there is anything to count gets no bar.
         if not self._bar.live.is_started:
             self._bar.start()
-        self._left, self._total = total - done, total
-        left_s = self._time.left_s(self._left)
-        left = "" if left_s is None or not self._left else f"left {duration_text(left_s)}"
+        left_s = time_left(self._attempts, total - done)
+        left = "" if left_s is None or done == total else f"left {duration_text(left_s)}"
         self._bar.update(self._task, completed=done, total=total, left=left)
         self._say_plainly(", ".join(filter(None, [f"{done} of {total} frames", left, self._said])), done == total)
 
     def taken(self, taken: Taken) -> None:
         """Show the verdict of a frame, and take its time for that of those to come."""
-        self._time.taken(taken.judgement.accepted)
+        now = self._clock()
+        seconds = None if self._since is None else now - self._since
+        self._attempts.append(TimedAttempt(seconds, taken.judgement.accepted))
+        self._since = now
         self._said = verdict_line(taken)
         self._bar.update(self._task, said=self._said)
 
@@ -368,8 +334,8 @@ class Terminal:
         _print(sentence)
 
     def state(self, sentence: str) -> None:
-        """Show what the run waits for, until the next frame."""
-        self._time.paused()
+        """Show what the run waits for until the next frame; the time until then is no frame's."""
+        self._since = None
         self._bar.update(self._task, said=sentence, left="")
         self._say_plainly(sentence)
 
@@ -489,7 +455,8 @@ def run_session(
                 state(f"checking frame {done} of {total}")
                 alive(f"{BEGINS}; frame {done} of {total}")
 
-            check_frames(session, checking, announce)
+            if session.journal.accepted_files() and (damaged := session.verify(checking)):
+                announce(f"voided: {first_of(damaged, 5)}")
             total = len(session.steps)
             if len(session.done_steps()) == total:
                 observe(total, total)
@@ -509,10 +476,10 @@ def run_session(
         # When the screen is dark and the journal at rest.
         at_last.callback(_report, session, announce)
         sign = alive or opened.enter_context(_signs_of(session))
-        sign()
+        sign("")
 
         def count(frame: Taken) -> None:
-            sign()
+            sign("")
             taken(frame)
             # A reference may have been put behind the plan.
             total = len(session.steps)
@@ -563,19 +530,6 @@ def _begun(settings: LabSettings, folder: Path) -> Session:
         if session_exists(folder):
             raise InputError(busy_sentence(folder)) from None
         raise
-
-
-def check_frames(
-    session: Session,
-    observe: Callable[[int, int], None] = lambda done, total: None,
-    announce: Callable[[str], object] = lambda sentence: None,
-) -> None:
-    """Hold every accepted frame against its hash; what is damaged is voided, and said."""
-    if not session.journal.accepted_files():
-        return
-    damaged = session.verify(observe)
-    if damaged:
-        announce(f"voided: {first_of(damaged, 5)}")
 
 
 def require_same_devices(session: Session, devices: Devices, settings: LabSettings) -> None:
@@ -692,7 +646,8 @@ def take_session(
             job = Job(session, devices, settings, queue, judge or ExposureJudge(settings), retry, watch)
             if len(job.queue):
                 _make_ready(job)
-                take_open(job, count, asked)
+                with ThreadPoolExecutor(1, "saving") as saving:
+                    Pipeline(job, saving, count, asked).run()
         session.journal.require_whole()
         doubts = tuple(doubts_of(session.journal.events()))
         outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up, doubts)
@@ -730,9 +685,9 @@ def _open_steps(session: Session, settings: LabSettings, first: Sequence[int]) -
         session.steps,
         session.done_steps(),
         sequence.attempts,
+        append,
         first,
         unclosed_kinds(taken),
-        append,
         sequence.reference_every,
     )
 
@@ -753,11 +708,8 @@ BEGINS = "a run begins: it looks at its frames and opens its devices"
 """What a run says before it takes frames."""
 
 
-class SignOfLife(Protocol):
-    """A run's way to say that it is there."""
-
-    def __call__(self, waits_for: str = "", /) -> None:
-        """Say what is waited for, or, with nothing, that frames are taken."""
+SignOfLife = Callable[[str], None]
+"""A run's way to say that it is there, and what is waited for; with nothing, that frames are taken."""
 
 
 @contextmanager
@@ -776,7 +728,7 @@ def signs_of_life(
             return newest() not in (None, state)
         return False
 
-    def alive(waits_for: str = "", /) -> None:
+    def alive(waits_for: str) -> None:
         nonlocal last, said
         state: RunState = "waiting" if waits_for else "running"
         if time.monotonic() - last >= BEAT_S or state != said or changes(state):

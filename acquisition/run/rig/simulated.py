@@ -45,7 +45,8 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
 
     `session`: the session that is taken up; None for a check that records nothing.
     """
-    exposed = _exposed(session)
+    before = _taken_before(session)
+    exposed = Counter(colour for _, colour in before)
     last = None if session is None else last_moment(session.journal.attempts())
     clock = SimulatedClock(last or OPENING)
     screen = Screen()
@@ -54,9 +55,7 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     if settings.rig == "simulated":
         world = World(sheet(chart), sensor, simulated_room(settings))
         events = read_disturbances(settings.simulated.events, settings.file)
-        film: Film = WorldFilm(
-            world, lambda: screen.colour, simulated.light, SERIAL, exposed, events, _taken_before(session)
-        )
+        film: Film = WorldFilm(world, lambda: screen.colour, simulated.light, SERIAL, exposed, events, before)
     else:
         assert settings.replay is not None
         film = ReplayFilm(_recording(settings.replay.session), lambda: screen.colour, exposed)
@@ -104,13 +103,6 @@ def simulated_frame_bytes(settings: LabSettings) -> int:
 def simulated_room(settings: LabSettings) -> Room:
     """Return the default room with the seed and the changes of the settings."""
     return read_room(settings.simulated.seed, settings.simulated.room, settings.file, "simulated.room")
-
-
-def _exposed(session: Session | None) -> Counter[Colour]:
-    if session is None:
-        return Counter()
-    colours = {step.number: step.colour for step in session.steps}
-    return Counter(colours[attempt.step] for attempt in session.journal.attempts() if attempt.has_frame)
 
 
 def _taken_before(session: Session | None) -> list[tuple[float, Colour]]:

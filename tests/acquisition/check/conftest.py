@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from acquisition.check.check import CheckOptions, check_lab
+from acquisition.check.check import check_lab
 from acquisition.check.findings import CheckReport
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
@@ -48,13 +48,13 @@ def checking(folder: Path) -> Check:
         camera: str = "",
         more: str = "",
         chart: str | None = None,
-        options: CheckOptions | None = None,
+        linearity: bool = False,
         seed: int = 1,
         **room: Any,
     ) -> CheckReport:
         lab = folder / "LAB.toml"
         lab.write_text(lab_toml(chart or f"chart{bits}.json", camera, more, seed, **room))
-        return check_lab(load_lab(lab), options or CheckOptions())
+        return check_lab(load_lab(lab), linearity=linearity)
 
     return run
 

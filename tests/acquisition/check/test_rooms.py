@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from acquisition.check import check as check_module
-from acquisition.check.check import CheckOptions, check_lab
+from acquisition.check.check import check_lab
 from acquisition.check.findings import GRADES, CheckReport, Finding
 from acquisition.cli import main
 from benchmarks.sessions import record_session
@@ -163,7 +163,7 @@ def test_a_chart_without_tags(check: Check, folder: Path) -> None:
 
 
 def test_linearity_and_noise_are_those_of_the_sensor(check: Check) -> None:
-    report = check(3, options=CheckOptions(linearity=True))
+    report = check(3, linearity=True)
     assert of(report, "linearity").grade == "good"
     noise = of(report, "photon transfer").details
     assert noise["gain_e"] == pytest.approx([1.8] * 3, rel=0.1)
@@ -186,8 +186,8 @@ def test_the_command_prints_faults_first_draws_them_and_ends_with_4(
     reports, drawn = list[CheckReport](), list[Figure]()
     save = cast(Any, Figure).savefig
 
-    def checked(*given: Any) -> CheckReport:
-        reports.append(check_lab(*given))
+    def checked(*given: Any, **named: Any) -> CheckReport:
+        reports.append(check_lab(*given, **named))
         return reports[-1]
 
     def saved(figure: Figure, *given: Any, **more: Any) -> None:
@@ -252,7 +252,7 @@ def test_the_command_says_it_in_json(
 ) -> None:
     found = CheckReport((), (Finding("disk", "good", "seen"), Finding("exposure", "remark", "seen")))
 
-    def checked(*_: object) -> CheckReport:
+    def checked(*_: object, **named: object) -> CheckReport:
         return found
 
     monkeypatch.setattr(check_module, "check_lab", checked)

@@ -125,16 +125,6 @@ def test_a_dark_frame_with_the_light_of_the_frame_before_is_named_a_screen_that_
     assert "stand still" in same.reason
 
 
-def test_what_a_frame_leaves_is_told_of_all_that_is_expected_darkness_and_light() -> None:
-    dark, white = measured((500, 500, 500)), measured((1500, 1500, 1500))
-    tiles = white.tiles.copy()
-    tiles[7] *= 1.1
-    left = Basis.of_white(white, dark).light(measured(tiles)).tiles
-    assert left.relative[7] == pytest.approx(0.1, abs=1e-3)
-    assert left.signed[7] == pytest.approx(0.1, abs=1e-3)
-    assert np.delete(left.relative, 7).max() < 1e-3
-
-
 @pytest.mark.parametrize("sign", [1, -1])
 def test_paper_white_is_held_against_the_first_of_the_session(sign: int) -> None:
     paper = np.array([500.0, 1000.0, 700.0])
@@ -318,9 +308,3 @@ def test_a_chart_s_place_of_rest_is_another_only_if_it_is_shown_twice_or_after_a
     after = before.after(LIGHT, Examined(frame, None, True)).moved_px
     assert after is not None
     assert after.tolist() == list(rests)
-
-
-def test_tiles_begin_at_the_frame_s_first_block_and_end_at_its_last() -> None:
-    places = FramePlaces(160, 240)
-    assert places.x_edges.tolist() == list(range(0, 241, 10))
-    assert places.y_edges.tolist() == list(range(0, 161, 10))

@@ -42,15 +42,6 @@ def seen_light(
     return judge._SeenLight(MODEL, light, codes, frame, plan)
 
 
-def test_two_frames_show_one_light_where_amounts_differ_by_their_scatter() -> None:
-    same = judge._same_light
-    one, zero = np.array([1.0, 0, 0]), np.zeros(3)
-    assert same(one, np.array([0.99, 0, 0]), 0.005) == pytest.approx(0.01 / np.sqrt(2 * (0.005**2 + 4e-4**2)))
-    assert same(one, np.array([0.99, 0, 0]), 0.0) == pytest.approx(0.01 / np.sqrt(2 * (0.0015**2 + 4e-4**2)))
-    assert same(zero, np.array([8e-4, 0, 0]), 0.0) == pytest.approx(2**0.5, rel=1e-4)
-    assert same(np.array([1.0, 1, 1]), np.array([0.99, 1, 1.01]), 0.01) == pytest.approx(1.0, rel=0.02)
-
-
 @pytest.mark.parametrize(
     ("codes", "amounts", "named"),
     [

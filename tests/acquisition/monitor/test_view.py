@@ -44,21 +44,6 @@ def head(
     return head_of(SessionView("night", "night", STEPS, (), {}, tuple(views), (), beat, here), now, alive)
 
 
-def test_time_left_is_that_of_the_frames_left() -> None:
-    stands = head(attempts(3), heartbeat("running"))
-    assert (stands.done, stands.total, stands.lights_done) == (3, 8, 1)
-    assert stands.seconds_per_frame == 5.0
-    assert stands.remaining_s == 25.0
-    assert stands.eta == NOW + timedelta(seconds=25)
-
-
-def test_where_the_labs_time_is_another_no_time_of_day_is_told() -> None:
-    simulated = [replace(one, started_at=one.started_at - timedelta(days=40), taken_at=None) for one in attempts(3)]
-    stands = head(simulated, heartbeat("running"))
-    assert stands.remaining_s == 25.0
-    assert stands.eta is None
-
-
 @pytest.mark.parametrize(
     ("ago", "state"), [(0.0, "running"), (49.0, "running"), (51.0, "late"), (329.0, "late"), (331.0, "silent")]
 )
@@ -84,14 +69,6 @@ def test_a_step_that_hangs_is_late_by_what_the_run_says_of_it_and_then_silent() 
     assert "then: late since 23:00: the camera exposes light 3" in after.sentence
 
 
-@pytest.mark.parametrize("state", ["running", "waiting", "paused", "late"])
-def test_a_process_that_was_stopped_is_told_at_once(state: RunState) -> None:
-    view = SessionView("night", "night", STEPS, (), {}, attempts(3), (), heartbeat(state), None)
-    stands = head_of(view, NOW, True, is_stopped=True)
-    assert (stands.state, stands.alive) == ("silent", False)
-    assert f"kill -CONT {HERE.pid}" in stands.sentence
-
-
 @pytest.mark.parametrize(
     ("state", "sentence", "free_mb", "expected"),
     [
@@ -110,19 +87,6 @@ def test_a_full_disk_is_said_as_such(state: RunState, sentence: str, free_mb: fl
     assert (stands.state, stands.cause) == expected
 
 
-def test_a_pause_is_silent_only_after_the_sign_that_it_announced() -> None:
-    assert head(attempts(3), heartbeat("paused", ago=339.0, within=310.0)).state == "paused"
-    assert head(attempts(3), heartbeat("paused", ago=341.0, within=310.0)).state == "silent"
-
-
-def test_a_killed_run_is_told_at_once_where_it_ran() -> None:
-    stands = head(attempts(3), heartbeat("running", ago=1.0), alive=False)
-    assert stands.state == "stopped"
-    assert not stands.alive
-    assert "killed or power lost: run the same command again" in stands.sentence
-    assert stands.eta is None
-
-
 @pytest.mark.parametrize("alive", [True, False, None])
 def test_a_copy_of_a_session_is_no_run(alive: bool | None) -> None:
     there, here = SessionPlace("/data/night", 5, 10, 11, 0), SessionPlace("/backup/night", 5, 20, 21, 0)
@@ -136,13 +100,6 @@ def test_a_copy_of_a_session_is_no_run(alive: bool | None) -> None:
     assert head(attempts(3), ended, alive, here=here).state == "incomplete"
     where_it_is = head(attempts(3), beat, here=there)
     assert where_it_is.state == "running"
-
-
-@pytest.mark.parametrize(("late_s", "state"), [(29.0, "paused"), (31.0, "stopped")])
-def test_elsewhere_a_missing_sign_of_life_is_waited_for(late_s: float, state: str) -> None:
-    beat = heartbeat("paused", process=ELSEWHERE)
-    stands = head(attempts(3), beat, alive=None, now=beat.until + timedelta(seconds=late_s))
-    assert stands.state == state
 
 
 def test_all_frames_there_and_nobody_at_work_is_complete_and_says_what_comes_next() -> None:

@@ -20,11 +20,9 @@ from acquisition.run.devices import Devices
 from acquisition.run.run import RunOutcome, take_session
 from drivers.camera import ExposureSettings
 from drivers.canon import CanonEos
-from drivers.links.link import Link, PeerLink
 from drivers.links.usb import Pipe, UsbPipes, open_usb
-from drivers.pjlink import PjLinkProjector
 from drivers.presenter import BLACK, Colour
-from drivers.projector import Power, Severity
+from drivers.projector import Severity
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.protocol import Responder, Transport
 from drivers.ptp.usb import UsbTransport
@@ -35,13 +33,12 @@ from experiment.session.folder import Session
 from experiment.session.journal import Journal
 from experiment.session.records import Judgement, SessionStep, plan_steps
 from foundation.clock import SimulatedClock
-from foundation.errors import CropError, DeviceError, LinkClosed, StorageError
+from foundation.errors import CropError, DeviceError, StorageError
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.bodies import EOS_550D
 from sim.camera.eos import SimulatedEos
-from sim.projectors.pjlink import PjLinkPeer
-from sim.projectors.projector import SimulatedProjector
 from tests import cable_faults as faults
+from tests.acquisition.run.scripted import Beamer
 from tests.cable_faults import Occasion
 
 LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 12 * n, 255 - n)) for n in range(20))
@@ -138,9 +135,7 @@ class TroubledLab:
         self.film = ColourFilm(lambda: self.screen.colour)
         self.eos = SimulatedEos(EOS_550D, self.film, self.clock, auto_power_off_s=0)
         self.device: Responder = self.eos
-        self.beamer = SimulatedProjector(self.clock, power=Power.ON)
-        self.beamer_cable: Link | None = None
-        self.pulled = False
+        self.beamer = Beamer(self.clock)
         self.openings = 0
         self.pipes: dict[int, Callable[[UsbPipes], UsbPipes]] = {}
         self.cables: dict[int, Callable[[Transport], Transport]] = {}
@@ -156,17 +151,10 @@ class TroubledLab:
         pipes = self.pipes.get(number, lambda good: good)(open_usb(backend=SimulatedBus(PtpUsbDevice(self.device))))  # pyrefly: ignore[implicit-any-lambda]
         return self.cables.get(number, lambda good: good)(UsbTransport(pipes, self.clock))  # pyrefly: ignore[implicit-any-lambda]
 
-    def connect_beamer(self) -> Link:
-        if self.pulled:
-            raise LinkClosed("nothing listens at 127.0.0.1:4352")
-        cable = self.beamer_cable = PeerLink(PjLinkPeer(self.beamer))
-        return cable
-
     def take(self, session: Session) -> RunOutcome | CropError:
         """Take the session as far as it goes; return how it ended."""
         camera = CanonEos(self.open, self.clock)
-        projector = PjLinkProjector(self.connect_beamer, clock=self.clock)
-        devices = Devices(camera, self.screen, projector, self.clock)
+        devices = Devices(camera, self.screen, self.beamer.projector, self.clock)
         try:
             with ExitStack() as broken:
                 for one in self.breaks:
@@ -181,8 +169,7 @@ class TroubledLab:
         self.device, self.pipes, self.cables, self.breaks = self.eos, {}, {}, []
         self.screen.fails, self.screen.covered, self.screen.stuck = set(), set(), set()
         self.clock.events = []
-        self.pulled = False
-        self.beamer = SimulatedProjector(self.clock, power=Power.ON)
+        self.beamer = Beamer(self.clock)
 
     def occasion(self) -> Occasion:
         return Occasion(after=self.chance.randrange(OPERATIONS))
@@ -278,25 +265,20 @@ def sticks(lab: TroubledLab) -> None:
 
 def is_muted(lab: TroubledLab) -> None:
     begins = lab.moment()
-    lab.clock.events.append((begins, lambda: lab.beamer.set_muted(True)))
-    lab.clock.events.append((begins + lab.chance.uniform(1, 40), lambda: lab.beamer.set_muted(False)))
+    lab.clock.events.append((begins, lambda: lab.beamer.device.set_muted(True)))
+    lab.clock.events.append((begins + lab.chance.uniform(1, 40), lambda: lab.beamer.device.set_muted(False)))
 
 
 def lamp_fails(lab: TroubledLab) -> None:
     begins = lab.moment()
-    lab.clock.events.append((begins, lambda: lab.beamer.break_part("lamp", Severity.ERROR)))
-    lab.clock.events.append((begins + lab.chance.uniform(1, 60), lab.beamer.repair))
+    lab.clock.events.append((begins, lambda: lab.beamer.device.break_part("lamp", Severity.ERROR)))
+    lab.clock.events.append((begins + lab.chance.uniform(1, 60), lab.beamer.device.repair))
 
 
 def beamer_is_unplugged(lab: TroubledLab) -> None:
-    def pull(pulled: bool) -> None:
-        lab.pulled = pulled
-        if lab.beamer_cable is not None:
-            lab.beamer_cable.close()
-
     begins = lab.moment()
-    lab.clock.events.append((begins, lambda: pull(True)))
-    lab.clock.events.append((begins + lab.chance.uniform(1, 40), lambda: pull(False)))
+    lab.clock.events.append((begins, lambda: lab.beamer.pull(True)))
+    lab.clock.events.append((begins + lab.chance.uniform(1, 40), lambda: lab.beamer.pull(False)))
 
 
 def disk_is_full(lab: TroubledLab) -> None:

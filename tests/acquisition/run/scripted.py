@@ -13,6 +13,8 @@ import numpy as np
 
 from acquisition.run.devices import Devices
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
+from drivers.links.link import Link, PeerLink
+from drivers.pjlink import PjLinkProjector
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power
 from experiment.chart.layout import design_chart
@@ -21,8 +23,9 @@ from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.records import plan_steps
 from foundation.clock import SimulatedClock
-from foundation.errors import DeviceError
+from foundation.errors import DeviceError, LinkClosed
 from sim.camera.film import write_dng
+from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import SimulatedProjector
 from sim.world.sensors import BODIES
 
@@ -85,12 +88,13 @@ class ScriptedCamera:
     """Photographs black as dark and every other colour as well exposed, unless the script says otherwise.
 
     The script maps the number of an exposure, from 0, to the bytes it gives or the error that it raises; `downloads`
-    maps the number of a download to the error that it raises.
+    maps the number of a download to the error that it raises, `after` how many exposures are over to what happens then.
     """
 
     def __init__(self, screen: Screen, clock: SimulatedClock, script: dict[int, bytes | Exception]) -> None:
         self.screen, self.clock, self.script = screen, clock, script
         self.downloads: dict[int, Exception] = {}
+        self.after: dict[int, Callable[[], object]] = {}
         self.exposed: list[Colour] = []
         self.released: list[datetime] = []
         self.fetched = 0
@@ -121,6 +125,7 @@ class ScriptedCamera:
         self.clock.sleep(EXPOSE_S)
         assert self.held is None, "a frame was exposed before the last was fetched"
         self.held = scripted
+        self.after.pop(self.captures, lambda: None)()
         return self.released[-1]
 
     def download(self, into: BinaryIO) -> CapturedFrame:
@@ -171,16 +176,35 @@ class Lab:
         return [(f"{attempt.kind[0]}{attempt.step}", attempt.verdict) for attempt in self.session.journal.attempts()]
 
 
+class Beamer:
+    """A projector on a PJLink cable that can be pulled."""
+
+    def __init__(self, clock: SimulatedClock, power: Power = Power.ON) -> None:
+        self.device = SimulatedProjector(clock, power=power)
+        self.projector = PjLinkProjector(self._connect, clock=clock)
+        self._pulled = False
+        self._cable: Link | None = None
+
+    def _connect(self) -> Link:
+        if self._pulled:
+            raise LinkClosed("nothing listens at 127.0.0.1:4352")
+        cable = self._cable = PeerLink(PjLinkPeer(self.device))
+        return cable
+
+    def pull(self, pulled: bool = True) -> None:
+        self._pulled = pulled
+        if self._cable is not None:
+            self._cable.close()
+
+
 class Hurried(SimulatedClock):
     """A clock that calls somebody when a pause is slept through."""
 
     def __init__(self) -> None:
         super().__init__()
         self.calls: dict[float, Callable[[], None]] = {}
-        self.slept: list[float] = []
 
     def sleep(self, seconds: float) -> None:
         super().sleep(seconds)
-        self.slept.append(seconds)
         if call := self.calls.pop(seconds, None):
             call()

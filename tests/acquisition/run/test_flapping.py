@@ -120,15 +120,6 @@ class Flapping(Seen):
         return Judgement((Check("light"),))
 
 
-def test_what_comes_back_after_a_few_frames_has_one_patience(night: Night) -> None:
-    judge = Flapping(night.lab)
-    judge.good = RECURS_WITHIN - 4
-    with pytest.raises(QualityError, match="flash"):
-        night.run(judge)
-    assert night.of("resumed"), "it does go on in between"
-    assert night.lab.clock.monotonic() < 3 * PATIENCE_S
-
-
 def test_what_comes_back_after_many_frames_lets_the_run_get_on(night: Night) -> None:
     judge = Flapping(night.lab)
     judge.good = RECURS_WITHIN + 4

@@ -25,7 +25,7 @@ from acquisition.run.devices import (
     leave_lab,
     make_ready,
 )
-from drivers.links.link import Link, PeerLink
+from drivers.links.link import PeerLink
 from drivers.pjlink import NoResolution, PjLinkProjector
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, Projector, Severity
@@ -37,7 +37,7 @@ from sim.buses.serial import SerialPeerLink
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import SimulatedProjector
 from sim.projectors.serial import OptomaPeer
-from tests.acquisition.run.scripted import Screen, ScriptedCamera
+from tests.acquisition.run.scripted import Beamer, Screen, ScriptedCamera
 
 ON, OFF = Power.ON, Power.COOLING
 
@@ -174,21 +174,7 @@ class Room:
     beats: list[tuple[float, str]] = field(default_factory=list[tuple[float, str]])
 
     def __post_init__(self) -> None:
-        self.device = SimulatedProjector(self.clock, power=self.power)
-        self.pulled = False
-        self.cable: Link | None = None
-        self.projector = PjLinkProjector(self._connect, clock=self.clock)
-
-    def _connect(self) -> Link:
-        if self.pulled:
-            raise LinkClosed("nothing listens at 127.0.0.1:4352")
-        cable = self.cable = PeerLink(PjLinkPeer(self.device))
-        return cable
-
-    def pull(self, pulled: bool = True) -> None:
-        self.pulled = pulled
-        if self.cable is not None:
-            self.cable.close()
+        self.beamer = Beamer(self.clock, self.power)
 
     @property
     def retry(self) -> RetryPolicy:
@@ -283,7 +269,7 @@ def test_a_lamp_that_never_lights_is_given_up() -> None:
 
 def test_the_minutes_of_a_warm_up_are_counted_down() -> None:
     room = Room(Power.STANDBY)
-    make_ready(room.projector, SEQUENCE, room.retry)
+    make_ready(room.beamer.projector, SEQUENCE, room.retry)
     assert room.words == ["warming up"]
     assert room.said[0][2] == "the lamp was just lit; waiting 10 min 00 s until its colour is steady"
     assert any("the lamp is being lit" in sentence for _, sentence in room.beats)
@@ -296,7 +282,7 @@ def test_the_minutes_of_a_warm_up_are_counted_down() -> None:
 
 def test_a_warm_up_ends_though_nothing_so_short_can_be_waited_for() -> None:
     room = Room(Power.STANDBY)
-    make_ready(room.projector, SEQUENCE.model_copy(update={"warm_up_s": 1e-7}), room.retry)
+    make_ready(room.beamer.projector, SEQUENCE.model_copy(update={"warm_up_s": 1e-7}), room.retry)
     assert room.words == ["warming up"]
 
 
@@ -305,23 +291,23 @@ def test_a_lamp_that_goes_out_while_it_warms_up_gets_all_its_minutes_again() -> 
     lit_again = 600.0
 
     def relit() -> None:
-        room.device = SimulatedProjector(room.clock, power=Power.ON)
-        room.pull(False)
+        room.beamer.device = SimulatedProjector(room.clock, power=Power.ON)
+        room.beamer.pull(False)
 
-    room.at(400, room.pull)
+    room.at(400, room.beamer.pull)
     room.at(lit_again, relit)
-    make_ready(room.projector, SEQUENCE, room.retry)
+    make_ready(room.beamer.projector, SEQUENCE, room.retry)
     assert room.words == ["warming up", "retry", "paused", "resumed", "warming up"]
     assert room.clock.monotonic() >= lit_again + SEQUENCE.warm_up_s
 
 
 def test_a_picture_muted_while_the_lamp_warms_up_costs_no_minutes() -> None:
     room = Room(Power.STANDBY)
-    room.at(200, lambda: room.device.set_muted(True))
-    room.at(300, lambda: room.device.set_muted(False))
-    make_ready(room.projector, SEQUENCE, room.retry)
+    room.at(200, lambda: room.beamer.device.set_muted(True))
+    room.at(300, lambda: room.beamer.device.set_muted(False))
+    make_ready(room.beamer.projector, SEQUENCE, room.retry)
     assert room.words == ["warming up", "retry", "paused", "resumed"]
-    assert room.clock.monotonic() <= 600 + room.device.traits.warm_up_s + 2 * PAUSE_S
+    assert room.clock.monotonic() <= 600 + room.beamer.device.traits.warm_up_s + 2 * PAUSE_S
 
 
 def test_a_projector_without_power_is_lit_again_if_asked_to() -> None:
@@ -329,28 +315,28 @@ def test_a_projector_without_power_is_lit_again_if_asked_to() -> None:
     switched: list[float] = []
 
     def power_back() -> None:
-        room.device = SimulatedProjector(room.clock)
-        lit = room.device.switch_on
-        room.device.switch_on = lambda: (switched.append(room.clock.monotonic()), lit())  # pyrefly: ignore[bad-assignment, method-assign]
-        room.pull(False)
+        room.beamer.device = SimulatedProjector(room.clock)
+        lit = room.beamer.device.switch_on
+        room.beamer.device.switch_on = lambda: (switched.append(room.clock.monotonic()), lit())  # pyrefly: ignore[bad-assignment, method-assign]
+        room.beamer.pull(False)
 
-    room.at(0, room.pull)
+    room.at(0, room.beamer.pull)
     room.at(60, power_back)
     room.clock.sleep(0)
-    await_health(room.projector, SEQUENCE.model_copy(update={"relight": True}), room.retry)
+    await_health(room.beamer.projector, SEQUENCE.model_copy(update={"relight": True}), room.retry)
     assert len(switched) == 1
     assert room.words == ["retry", "paused", "relit", "still paused", "still paused", "warming up", "resumed"]
-    assert room.device.power() is Power.ON
+    assert room.beamer.device.power() is Power.ON
     assert room.clock.monotonic() >= switched[0] + SEQUENCE.warm_up_s
 
 
 def test_a_lamp_that_does_not_light_is_not_switched_on_again_and_again() -> None:
     room = Room()
     tries: list[float] = []
-    room.device.switch_off()
-    room.device.switch_on = lambda: tries.append(room.clock.monotonic())  # pyrefly: ignore[method-assign]
+    room.beamer.device.switch_off()
+    room.beamer.device.switch_on = lambda: tries.append(room.clock.monotonic())  # pyrefly: ignore[method-assign]
     with pytest.raises(DeviceFault, match="standby"):
-        await_health(room.projector, SEQUENCE.model_copy(update={"relight": True}), room.retry)
+        await_health(room.beamer.projector, SEQUENCE.model_copy(update={"relight": True}), room.retry)
     assert len(tries) == 1
 
 
@@ -358,14 +344,14 @@ def test_a_projector_that_came_back_in_standby_is_said_to_be_so() -> None:
     room = Room()
 
     def power_back() -> None:
-        room.device = SimulatedProjector(room.clock)
-        room.pull(False)
+        room.beamer.device = SimulatedProjector(room.clock)
+        room.beamer.pull(False)
 
-    room.at(0, room.pull)
+    room.at(0, room.beamer.pull)
     room.at(60, power_back)
-    room.at(200, lambda: room.device.switch_on())
+    room.at(200, lambda: room.beamer.device.switch_on())
     room.clock.sleep(0)
-    await_health(room.projector, SEQUENCE, room.retry)
+    await_health(room.beamer.projector, SEQUENCE, room.retry)
     assert room.words == ["retry", "paused", "still paused", "still paused", "warming up", "resumed"]
     assert "nothing listens" in room.said[1][2]
     assert "standby" in room.said[2][2]
@@ -381,9 +367,9 @@ def test_a_projector_that_came_back_in_standby_is_said_to_be_so() -> None:
 @pytest.mark.parametrize(("away_s", "warms"), [(10.0, False), (15.0, True)])
 def test_who_was_out_of_reach_for_long_may_have_lost_its_power(away_s: float, warms: bool) -> None:
     room = Room()
-    room.pull()
-    room.at(away_s, lambda: room.pull(False))
-    await_health(room.projector, SEQUENCE, room.retry)
+    room.beamer.pull()
+    room.at(away_s, lambda: room.beamer.pull(False))
+    await_health(room.beamer.projector, SEQUENCE, room.retry)
     assert ("warming up" in room.words) == warms
 
 
@@ -411,9 +397,9 @@ def test_a_lamp_reported_dark_while_power_is_on_is_no_warm_lamp() -> None:
 
 def test_a_projector_unreachable_at_the_start_is_waited_for() -> None:
     room = Room()
-    room.pull()
-    room.at(100, lambda: room.pull(False))
-    make_ready(room.projector, SEQUENCE, room.retry)
+    room.beamer.pull()
+    room.at(100, lambda: room.beamer.pull(False))
+    make_ready(room.beamer.projector, SEQUENCE, room.retry)
     assert room.words == ["retry", "paused", "resumed"]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -85,13 +84,6 @@ class TestTime:
         assert lab.projector.power() is Power.COOLING, "a complete session switches the lamp off"
         assert lab.verdicts() == ["accepted"] * 6
 
-    def test_the_download_hides_in_the_settling(self, folder: Path) -> None:
-        assert DOWNLOAD_S < SETTLE_S
-        lab = Lab(folder)
-        run(lab)
-        periods = [later - earlier for earlier, later in pairwise(lab.camera.released)]
-        assert periods == [timedelta(seconds=EXPOSE_S + SETTLE_S)] * 5
-
     def test_no_light_is_exposed_before_it_has_settled(self, folder: Path) -> None:
         lab = Lab(folder, {1: NIGHT, 3: NIGHT})
         shown: list[float] = []
@@ -169,16 +161,6 @@ class TestRefusals:
         monkeypatch.setattr(Session, "lost_files", look)
         assert run(Lab(folder, lights=FOUR, reference_every=2)).complete
         assert len(looked) == 3 + 1
-
-    def test_a_step_without_a_try_left_is_left_for_the_next_run(self, folder: Path) -> None:
-        lab = Lab(folder)
-        judge = ScriptedJudge({2: refused("a"), 4: refused("b"), 6: refused("c")})
-        outcome = run(lab, judge)
-        assert not outcome.complete
-        assert outcome.refused == ("light 0: c",)
-        assert outcome.left == 1
-        assert lab.projector.power() is Power.COOLING, "nobody may be there: `sequence.lamp_if_unfinished`"
-        assert run(lab, ScriptedJudge()).complete
 
     @pytest.mark.slow
     def test_what_was_measured_of_earlier_frames_is_recalled(self, folder: Path) -> None:
@@ -258,29 +240,6 @@ class TestRefusals:
         assert sorted(accepted) == list(range(16)), "each step once, and no light of the earlier run is voided"
         assert lab.verdicts()[:before] == ["accepted"] * before
 
-    @pytest.mark.parametrize(("moved_px", "told"), [(5.97, True), (0.15, False), (None, False)])
-    def test_a_chart_that_is_followed_is_told_of(self, folder: Path, moved_px: float | None, told: bool) -> None:
-        lab = Lab(folder)
-        said: list[str] = []
-        followed = Judgement((Check("movement", moved_px, None, None, "px"),), measurement=b"moved")
-        assert run(lab, ScriptedJudge({2: followed}), announce=said.append).complete
-        words = [sentence for sentence in said if sentence.startswith("moved: ")]
-        assert len(words) == told
-        assert not told or "lies 5.97 px from where it was" in words[0]
-        assert [event.what for event in lab.session.journal.events()].count("moved") == told
-
-    def test_what_is_tried_again_after_a_pause_is_not_said_to_be_left(self, folder: Path) -> None:
-        said: list[str] = []
-        with pytest.raises(QualityError):
-            run(
-                Lab(folder),
-                ScriptedJudge(dict.fromkeys(range(60), refused("night", lasting=True))),
-                announce=said.append,
-            )
-        refusals = [sentence for sentence in said if sentence.startswith("refused: ")]
-        assert any("it is tried again after a pause" in sentence for sentence in refusals)
-        assert not any("it is left for the next run" in sentence for sentence in refusals)
-
     @pytest.mark.slow
     def test_what_lasts_ends_the_run_when_patience_does(self, folder: Path) -> None:
         lab = Lab(folder, dict.fromkeys(range(1000), NIGHT))
@@ -294,13 +253,6 @@ class TestRefusals:
 
 
 class TestFaults:
-    @pytest.mark.parametrize("fault", [LinkTimeout("no answer"), DeviceError("lost")])
-    def test_a_lost_frame_is_taken_again(self, folder: Path, fault: Exception) -> None:
-        lab = Lab(folder, {2: fault})
-        assert run(lab).complete
-        assert lab.verdicts() == ["accepted", "accepted", "failed", "accepted", "accepted", "accepted", "accepted"]
-        assert len(list((folder / "frames").iterdir())) == 6
-
     def test_a_download_is_tried_again_while_the_body_holds_the_frame(self, folder: Path) -> None:
         lab = Lab(folder)
         lab.camera.downloads = {2: LinkTimeout("the cable")}
@@ -412,13 +364,9 @@ class TestFaults:
         from drivers.projector import Severity
 
         lab = Lab(folder)
-
-        def fail(taken: Taken) -> None:
-            if lab.camera.captures == 3:
-                lab.projector.break_part("lamp", Severity.ERROR)
-
+        lab.camera.after[3] = lambda: lab.projector.break_part("lamp", Severity.ERROR)
         with pytest.raises(DeviceFault, match="lamp"):
-            run(lab, observe=fail)
+            run(lab)
         assert lab.clock.monotonic() >= PATIENT.sequence.patience_s
         lab.projector.repair()
         lab.projector.switch_on()
@@ -450,15 +398,7 @@ class TestEnding:
         lab = Lab(folder)
         said: list[str] = []
         ending = Ending(said.append)
-        expose = lab.camera.expose
-
-        def asked() -> Any:
-            released = expose()
-            if lab.camera.captures == 3:
-                ending.ask()
-            return released
-
-        lab.camera.expose = asked  # type: ignore[method-assign]
+        lab.camera.after[3] = ending.ask
         with pytest.raises(KeyboardInterrupt):
             run(lab, ending=ending)
         assert said == ["ending after this frame; press Ctrl-C again to end at once"]

@@ -17,7 +17,7 @@ STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in
 
 
 def queue_of(done: Collection[int], attempts: int = 3, **more: Any) -> StepQueue:
-    """Return an queue of `STEPS` that puts closing references behind them, from 10 on."""
+    """Return a queue of `STEPS` that puts closing references behind them, from 10 on."""
     behind: list[SessionStep] = []
 
     def append(kind: FrameKind) -> SessionStep:
@@ -42,7 +42,7 @@ def take(queue: StepQueue, refused: dict[int, int] | None = None) -> list[int]:
 
 
 def test_what_is_under_way_is_not_taken_twice() -> None:
-    queue = StepQueue(STEPS, set(), 3)
+    queue = queue_of(set(), 3)
     first = begun(queue)
     assert begun(queue).number == 1
     queue.refuse(first, "too dark")
@@ -59,7 +59,7 @@ def begun(queue: StepQueue) -> SessionStep:
 
 
 def test_a_fault_of_a_device_is_no_try() -> None:
-    queue = StepQueue(STEPS, set(), 1)
+    queue = queue_of(set(), 1)
     queue.withdraw(begun(queue))
     assert take(queue) == list(range(10))
 
@@ -72,7 +72,7 @@ def test_lights_of_an_earlier_run_are_closed_too() -> None:
 
 
 def test_a_reference_that_voids_is_probed_before_what_it_voids() -> None:
-    queue = StepQueue(STEPS, {0, 1, 2, 3}, 3)
+    queue = queue_of({0, 1, 2, 3}, 3)
     white = begun(queue)
     assert white.number == 4
     queue.refuse(white, "the picture is stuck", before_others=True)
@@ -81,11 +81,11 @@ def test_a_reference_that_voids_is_probed_before_what_it_voids() -> None:
 
 
 def test_first_frames_that_are_voided_come_before_all_others_with_all_their_tries() -> None:
-    queue = StepQueue(STEPS, {0, 1, 2, 8, 9}, 2, first=(8,))
+    queue = queue_of({0, 1, 2, 8, 9}, 2, first=(8,))
     queue.accept(begun(queue))
     queue.refuse(begun(queue), "somebody passed")
     queue.begin_with([STEPS[9], STEPS[8], STEPS[3]])
-    assert take(queue, {3: 1}) == [3, 3, 8, 9, 4, 5, 6, 7]
+    assert take(queue, {3: 1}) == [3, 3, 8, 9, 4, 5, 6, 7, 10, 11]
     assert not queue.given_up
 
 
@@ -119,7 +119,7 @@ def test_the_last_lights_that_are_voided_are_closed_again() -> None:
 
 
 def test_frames_are_not_voided_for_ever() -> None:
-    queue = StepQueue(STEPS, set(), 2)
+    queue = queue_of(set(), 2)
     for _ in range(2):
         for _ in range(4):
             queue.accept(begun(queue))
@@ -129,7 +129,7 @@ def test_frames_are_not_voided_for_ever() -> None:
 
 
 def test_some_steps_given_up_in_a_row_are_a_lasting_cause() -> None:
-    queue = StepQueue(STEPS, set(), 1)
+    queue = queue_of(set(), 1)
     for number in range(GIVEN_UP_IN_A_ROW):
         assert not queue.is_stuck
         queue.refuse(begun(queue), f"{number}")
@@ -141,7 +141,7 @@ def test_some_steps_given_up_in_a_row_are_a_lasting_cause() -> None:
 
 @pytest.mark.parametrize(("kind", "stuck"), [("dark", True), ("white", False)])
 def test_a_dark_frame_shows_nothing_of_the_light(kind: str, stuck: bool) -> None:
-    queue = StepQueue(STEPS, {0, 1, 2, 3, 6, 7, 8, 9}, 1)
+    queue = queue_of({0, 1, 2, 3, 6, 7, 8, 9}, 1)
     steps = {step.kind: step for step in (begun(queue), begun(queue))}
     for step in STEPS[2:4]:
         queue.void([step.number], "")
@@ -154,5 +154,5 @@ def test_a_dark_frame_shows_nothing_of_the_light(kind: str, stuck: bool) -> None
 
 
 def test_what_comes_first_comes_first_though_it_was_done() -> None:
-    queue = StepQueue(STEPS, set(range(9)), 3, first=[4, 1])
+    queue = queue_of(set(range(9)), 3, first=[4, 1])
     assert take(queue) == [4, 1, 9]

@@ -81,39 +81,6 @@ def until(end_s: float, fault: CropError) -> Callable[[float], CropError | None]
     return lambda now: fault if now < end_s else None
 
 
-def test_a_notification_of_less_than_a_second_pauses_nothing() -> None:
-    room = Room()
-    covered = DeviceError("the screen shows (255, 136, 0)")
-    assert room.retry.attempt(room.broken(until(0.9, covered)), "the screen") == "done"
-    assert room.words == ["retry"]
-    assert room.clock.monotonic() == 1
-
-
-@pytest.mark.parametrize("length_s", [3, 20, 590])
-def test_what_lasts_pauses_and_goes_on_by_itself(length_s: float) -> None:
-    room = Room()
-    assert room.retry.attempt(room.broken(until(length_s, DeviceError("covered"))), "the screen") == "done"
-    assert room.words == ["retry", "paused", "resumed"]
-    assert room.said[1][1] == "the screen: covered (the run waits up to 9 min 59 s, and goes on by itself)"
-    assert "the screen is ready again after a pause of" in room.said[2][1]
-    assert length_s <= room.clock.monotonic() < length_s + PAUSE_S
-
-
-def test_the_cause_that_holds_now_is_told() -> None:
-    room = Room()
-
-    def causes(now: float) -> CropError | None:
-        if now < 60:
-            return LinkClosed("nothing listens at 192.168.1.30:4352")
-        return DeviceFault("the projector is in standby") if now < 120 else None
-
-    room.retry.attempt(room.broken(causes), "the projector")
-    assert room.words == ["retry", "paused", "still paused", "resumed"]
-    assert "standby" in room.said[2][1]
-    assert all("listens" in sentence for at, _, sentence, _ in room.beats if at < 60)
-    assert all("standby" in sentence for at, _, sentence, _ in room.beats if at > 60 + PAUSE_S)
-
-
 def test_a_cause_with_other_numbers_is_the_same_cause() -> None:
     room = Room()
     room.retry.attempt(room.broken(lambda now: DeviceError(f"{now:g} of 8 pixels") if now < 99 else None), "it")
@@ -178,15 +145,6 @@ def test_patience_ends_in_time_with_the_first_cause(limit_s: float) -> None:
     assert isinstance(caught.value.__cause__, DeviceError)
     assert room.clock.monotonic() == pytest.approx(limit_s, abs=1e-5)
     assert len(room.tries) >= 2
-
-
-def test_without_patience_the_first_fault_is_the_end() -> None:
-    room = Room(0.0)
-    fault = DeviceError("covered")
-    with pytest.raises(DeviceError) as caught:
-        room.retry.attempt(room.broken(lambda now: fault), "the screen")
-    assert caught.value is fault
-    assert len(room.tries) == 1
 
 
 def test_what_waiting_does_not_cure_is_raised_at_once() -> None:

@@ -15,7 +15,6 @@ from acquisition.run.pipeline import link_runs
 from acquisition.run.rig.lab import session_clock
 from acquisition.run.run import (
     BEGINS,
-    check_frames,
     clock_note,
     killed_note,
     require_same_devices,
@@ -56,35 +55,9 @@ def lab_with_response(folder: Path) -> Lab:
 def interrupt_after(lab: Lab, frames: int, first: tuple[int, ...] = ()) -> None:
     """Take some frames and end the run."""
     ending = Ending(lambda sentence: None)
-    expose, before = lab.camera.expose, lab.camera.captures
-
-    def exposing() -> object:
-        released = expose()
-        if lab.camera.captures - before == frames:
-            ending.ask()
-        return released
-
-    lab.camera.expose = exposing  # type: ignore[method-assign, assignment]
+    lab.camera.after[lab.camera.captures + frames] = ending.ask
     with pytest.raises(KeyboardInterrupt):
         take_session(lab.session, lab.devices, SETTINGS, ending=ending, first=first)
-    lab.camera.expose = expose  # type: ignore[method-assign]
-
-
-def test_a_damaged_frame_is_said_and_taken_again(folder: Path) -> None:
-    lab = Lab(folder)
-    interrupt_after(lab, 3)
-    victim = folder / lab.session.frames()[2].file
-    content = bytearray(victim.read_bytes())
-    content[1000] ^= 1
-    victim.write_bytes(content)
-    said: list[str] = []
-    looked: list[int] = []
-    check_frames(lab.session, lambda done, total: looked.append(done), said.append)
-    assert looked[-1] == 3
-    assert len(said) == 1
-    assert victim.name in said[0]
-    assert take_session(lab.session, lab.devices, SETTINGS).complete
-    assert [step for step, _ in lab.taken()].count("l2") == 2
 
 
 def test_nothing_is_tied_to_nothing(folder: Path) -> None:

@@ -11,13 +11,10 @@ import pytest
 from acquisition.run.devices import PAUSE_S, Devices
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import take_session
-from drivers.links.link import Link, PeerLink
-from drivers.pjlink import PjLinkProjector
 from drivers.projector import Power
 from foundation.errors import LinkClosed
-from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import SimulatedProjector
-from tests.acquisition.run.scripted import EXPOSE_S, SETTINGS, Hurried, Lab, ScriptedCamera
+from tests.acquisition.run.scripted import EXPOSE_S, SETTINGS, Beamer, Hurried, Lab, ScriptedCamera
 
 ONE_AGAIN = ["accepted", "accepted", "refused", "accepted", "accepted", "accepted", "accepted"]
 """The light that is on the screen when something happens is taken again: its frame cannot be trusted."""
@@ -66,29 +63,15 @@ class Disturbed:
     def __init__(self, folder: Path) -> None:
         self.lab = Lab(folder)
         self.lab.clock = self.clock = self.lab.camera.clock = Hurried()
-        self.beamer = SimulatedProjector(self.clock, power=Power.ON)
-        self.pulled = False
-        self.cable: Link | None = None
+        self.beamer = Beamer(self.clock)
         self.said: list[str] = []
-
-    def connect(self) -> Link:
-        if self.pulled:
-            raise LinkClosed("nothing listens at 127.0.0.1:4352")
-        cable = self.cable = PeerLink(PjLinkPeer(self.beamer))
-        return cable
-
-    def pull(self, pulled: bool = True) -> None:
-        self.pulled = pulled
-        if self.cable is not None:
-            self.cable.close()
 
     def run(self, disturb: Callable[[], None]) -> None:
         def disturbing(taken: Taken) -> None:
             if self.lab.camera.captures == 2:
                 disturb()
 
-        projector = PjLinkProjector(self.connect, clock=self.clock)
-        devices = Devices(self.lab.camera, self.lab.screen, projector, self.clock)
+        devices = Devices(self.lab.camera, self.lab.screen, self.beamer.projector, self.clock)
         assert take_session(self.lab.session, devices, SETTINGS, observe=disturbing, announce=self.said.append).complete
 
     @property
@@ -99,8 +82,8 @@ class Disturbed:
 
 def test_a_pulled_cable_pauses_the_run_until_it_is_back(folder: Path) -> None:
     disturbed = Disturbed(folder)
-    disturbed.clock.calls[PAUSE_S] = lambda: disturbed.pull(False)
-    disturbed.run(disturbed.pull)
+    disturbed.clock.calls[PAUSE_S] = lambda: disturbed.beamer.pull(False)
+    disturbed.run(disturbed.beamer.pull)
     assert disturbed.words == ["refused", "retry", "paused", "resumed"]
     assert "nothing listens at 127.0.0.1:4352" in disturbed.said[0]
     assert disturbed.lab.verdicts() == ONE_AGAIN
@@ -109,9 +92,9 @@ def test_a_pulled_cable_pauses_the_run_until_it_is_back(folder: Path) -> None:
 def test_a_lost_cable_ends_the_run_when_patience_does(folder: Path) -> None:
     disturbed = Disturbed(folder)
     with pytest.raises(LinkClosed, match=r"waited 10 min 00 s"):
-        disturbed.run(disturbed.pull)
+        disturbed.run(disturbed.beamer.pull)
     assert disturbed.lab.verdicts() == ONE_AGAIN[:3]
-    disturbed.pull(False)
+    disturbed.beamer.pull(False)
     disturbed.run(lambda: None)
     assert disturbed.lab.verdicts() == ONE_AGAIN
 

@@ -14,26 +14,6 @@ from foundation.errors import ConfigurationError
 WHEEL = ProjectorCable()
 
 
-@pytest.mark.parametrize("shutter_s", [1 / 60, 0.01667, 0.25, 0.5, 0.6, 1.0, 2.0, 4.98])
-def test_whole_turns_of_the_wheel_are_accepted(shutter_s: float) -> None:
-    require_whole_turns(CameraSettings(shutter_s=shutter_s), WHEEL)
-
-
-@pytest.mark.parametrize(
-    ("shutter_s", "near"),
-    [
-        (1 / 125, "set it to 0.01667 s, better"),
-        (1 / 8, "set it to 0.1 or 0.1667 s"),
-        (0.51, "set it to 0.5 or 0.6 s"),
-    ],
-)
-def test_a_part_of_a_turn_is_refused_with_the_nearest_times_that_cameras_have(shutter_s: float, near: str) -> None:
-    with pytest.raises(ConfigurationError, match=r"turns of the colour wheel \(60 a second\)") as caught:
-        require_whole_turns(CameraSettings(shutter_s=shutter_s), WHEEL)
-    assert near in caught.value.remedy
-    assert "lab.projector.colour_wheel_hz" in caught.value.remedy
-
-
 def test_a_projector_without_a_wheel_needs_whole_pictures() -> None:
     steady = ProjectorCable(colour_wheel_hz=0, refresh_hz=50)
     require_whole_turns(CameraSettings(shutter_s=0.02), steady)

@@ -7,8 +7,9 @@ import io
 
 import pytest
 
+from acquisition.run import run
 from acquisition.run.pipeline import Taken
-from acquisition.run.run import PLAIN_S, Terminal, TimeLeft, verdict_line
+from acquisition.run.run import PLAIN_S, Terminal, verdict_line
 from drivers.presenter import Colour
 from experiment.session.records import Check, Judgement, SessionStep
 
@@ -24,24 +25,27 @@ def test_the_verdict_has_its_numbers() -> None:
     assert verdict_line(Taken(STEP, dark, 3)) == "light 5 refused, exposure 0.4 %"
 
 
-def test_the_time_left_is_that_of_the_last_frames_without_pauses() -> None:
+def test_the_time_left_is_that_of_the_last_frames_without_pauses(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run, "PLAIN_S", 0.0)
     now = [0.0]
-    left = TimeLeft(lambda: now[0])
-    assert left.left_s(10) is None
-    for seconds in (0, 2, 2, 3):
-        now[0] += seconds
-        left.taken()
-    assert left.left_s(10) == 20
-    left.paused()
-    now[0] += 600
-    left.taken()
-    now[0] += 2
-    left.taken()
-    assert left.left_s(10) == 20
-    for _ in range(6):
-        now[0] += 2
-        left.taken(accepted=False)
-    assert left.left_s(10) == 40, "each frame costs two attempts of late, as the page has it"
+    with Terminal(lambda: now[0]) as terminal:
+
+        def left(*frames_s: float, reason: str = "") -> str:
+            """Return what is said of ten frames left after others that took so long."""
+            for seconds in frames_s:
+                now[0] += seconds
+                terminal.taken(Taken(STEP, Judgement((Check("file", reason=reason),)), 10))
+            terminal.progress(0, 10)
+            return capsys.readouterr().err
+
+        assert "left" not in left(0)
+        assert "left 20 s" in left(2, 2, 3)
+        terminal.state("paused")
+        assert "left 20 s" in left(600, 2)
+        # Each frame costs two attempts of late, as the page has it.
+        assert "left 40 s" in left(*[2] * 6, reason="too dark")
 
 
 def test_lines_stay_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
