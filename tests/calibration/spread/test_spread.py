@@ -442,9 +442,9 @@ def test_a_lens_that_is_not_measured_has_a_usual_veil(sharp: Photograph) -> None
     levels = (sharp.true / sharp.field / PAPER)[: sharp.chart.colour_count]
     levels[7] = np.nan
     figures = LensFigures.unknown("no tags", levels)
-    assert figures.assumed
+    assert not figures.measured
     assert figures.to_json()["assumed"] is True
-    assert not sharp.measured()[1].assumed
+    assert sharp.measured()[1].measured
     veiled = photograph(veil=(0.005, 0.008, 0.011))
     nothing = PointSpread(np.zeros(TERMS), np.zeros((TERMS, TERMS)), 0, 0, 1, np.zeros(TERMS))
     tint, stated = white_angles(veiled.white_error(nothing), figures.white_covariance)
