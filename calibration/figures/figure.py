@@ -1,11 +1,8 @@
 """A judged figure is one object with all that is ever asked of it; judging, reporting and forecasting loop over them.
 
-Rules that hold inside:
-
-- Limits stand in the figure alone; the check and the live judge take them from there.
-- A value within `accept` is accepted; between `accept` and `refuse` it is remarked on; beyond `refuse` there is no
-  table. Without `refuse` it is only ever remarked on: what it measures does not make the table wrong.
-- Where a measurement refuses by itself (`calibration.registration.register`), the number is defined there and imported.
+Limits stand in the figure alone. A value within `accept` is accepted; between `accept` and `refuse` it is remarked on;
+beyond `refuse` there is no table. Where a measurement refuses by itself (`calibration.registration.register`), the
+number is defined there and imported.
 """
 
 from __future__ import annotations
@@ -67,7 +64,6 @@ _LARGE = 1000.0
 class Explanation:
     """How the cause of a figure beyond its limit is found (`calibration.causes`).
 
-    - `about`: what the figure is about, which rules ask for.
     - `gather`: what is known of it, its frames and places, from which value on (the limit accepted).
     - `follows`: names of figures that it moves along with: whose cause it shares where it has none of its own.
     """
@@ -81,7 +77,6 @@ class Explanation:
 class Worst:
     """Where the worst of a figure is, whether or not it is beyond a limit.
 
-    - `what`: what is worst, in few words.
     - `file`: the frame, relative to the session; "" where it is of no frame alone.
     - `light`: the light's number; None where it is of no light alone.
     - `place`: where on the print; None where it has no place.
@@ -104,7 +99,6 @@ class Worst:
 class SummaryRow:
     """What was measured, in words.
 
-    - `name`, `value`: what, and the number with its unit.
     - `note`: what it means, or what is usual; may be "".
     - `brief`: whether it is among the few that a command prints.
     """
@@ -131,8 +125,6 @@ class CheckMeasurements:
     - `cell_px`, `blur_px`: shorter side of the smallest cell, and σ of the median blur, half-size px.
     - `unfit`: share of the cells that would be unfit, by cause: ``outside``, ``clipped``, ``stained``.
     - `unfit_share`: share of those that are one of these.
-    - `stains`: where the print does not have its codes' colours.
-    - `paper`: flat field and white of bare paper.
     - `tint_deg`: largest angle between a printed grey and paper.
     - `leak`: (3,) float64, light while the projector shows black, of white.
     - `brightest_share`, `darkest_counts`: paper under white, of saturation, and under the plan's darkest light, at the
@@ -160,8 +152,6 @@ class Figure:
     """One figure that a table is judged by.
 
     - `name`: as in `report.json`.
-    - `title`: the figure for people.
-    - `group`: of the report's page.
     - `unit`: of the value and both limits; "" for a count or a plain number, "share" for 0 … 1.
     - `sense`: on which side of the limits a value is accepted.
     - `accept`: up to here nothing is remarked.
@@ -175,9 +165,6 @@ class Figure:
     - `worst`: where its worst is on the report's page, whatever the verdict.
     - `where`: frames, lights or place beyond the limit accepted, for a remark; else those of its cause.
     - `retake`: the frames that are beyond a limit by themselves; it returns None where all of them are.
-    - `cause`: how its cause is found; None where it explains itself.
-    - `drawing`: the picture that shows it.
-    - `lines`: its lines in the summary.
     - `foremost`: whether a refusal speaks of it before others, which may follow from it.
     - `found`: what a refusal or remark adds, and the remedy, where that depends on what was found.
     """
