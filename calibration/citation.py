@@ -296,9 +296,8 @@ def bibtex(
     """
     known = origin or OriginRecord()
     year = known.year
-    key = "-".join(
-        part for part in (_word(_family(known.authors)), _word(camera), year or "", sha256[:KEY_DIGITS]) if part
-    )
+    family = known.authors[0].partition(",")[0] if known.authors else "crop"
+    key = "-".join(part for part in (_word(family), _word(camera), year or "", sha256[:KEY_DIGITS]) if part)
     made = "computed" if computed else "simulated" if known.rig == "simulated" else "photographed"
     fields = {
         "author": " and ".join(_name(author) for author in known.authors),
@@ -325,10 +324,6 @@ def _name(author: str) -> str:
     """Return an author's name for BibTeX: "Family, Given" as it is, a name without a comma in braces as one whole."""
     text = tex_text(author)
     return text if "," in author else f"{{{text}}}"
-
-
-def _family(authors: list[str]) -> str:
-    return authors[0].partition(",")[0] if authors else "crop"
 
 
 def _word(text: str) -> str:

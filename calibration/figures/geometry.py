@@ -10,7 +10,6 @@ from calibration.causes.gathering import PrintPlace, chart_evidence
 from calibration.figures.figure import (
     JUDGEMENT,
     SIMULATED,
-    CheckMeasurements,
     Explanation,
     Figure,
     Line,
@@ -98,10 +97,6 @@ def _bleed(table: TableMeasurements) -> float:
     return bleed(registration.cell_px, registration.blur_px, window) + table.lens.uncorrected_in_worst
 
 
-def _bleed_in_check(check: CheckMeasurements) -> float | None:
-    return None if check.cell_px is None or check.blur_px is None else bleed(check.cell_px, check.blur_px)
-
-
 def _smallest_cell(table: TableMeasurements, chart: Chart) -> Worst:
     file, sides = table.session.registered_file, cell_sides_px(table.registration.to_pixels, chart)
     smallest = int(np.argmin(sides))
@@ -129,7 +124,11 @@ BLEED = Figure(
     "0.6 % at 8.6 px; of a cell's mean a thirtieth as much, which is in its uncertainty",
     remedy="focus on the print, stop down to f/8, bring the camera nearer, or take a smaller window "
     "(build-lut --window)",
-    measure=_bleed, forecast=_bleed_in_check, worst=_smallest_cell, drawing="chart",
+    measure=_bleed,
+    forecast=lambda check: (
+        None if check.cell_px is None or check.blur_px is None else bleed(check.cell_px, check.blur_px)
+    ),
+    worst=_smallest_cell, drawing="chart",
     lines=(
         Line(50, _window_row),
         Line(60, lambda table: SummaryRow("Blur", f"σ {table.registration.blur_px:.2f} px", "about 0.6 is sharp")),

@@ -104,10 +104,6 @@ REPEATED_FILES = Figure(
 )  # fmt: skip
 
 
-def _white_drift(table: TableMeasurements) -> float | None:
-    return table.white_drift if _has_drift(table) and table.lights.drift is None else None
-
-
 def _drift_row(table: TableMeasurements) -> SummaryRow | None:
     if not _has_drift(table):
         return None
@@ -118,7 +114,8 @@ WHITE_DRIFT = Figure(
     "white_drift", "Drift of paper white between white frames", "light", "share", "at most", 0.01, 0.15,
     why="lights taken at other times differ in brightness; each has its own ground truth, so its colour is right",
     source=JUDGEMENT + "; 1 % between whites is usual for a warm lamp", remedy=_WARM_UP,
-    measure=_white_drift, cause=Explanation("drift", drift_evidence), drawing="course", lines=(Line(130, _drift_row),),
+    measure=lambda table: table.white_drift if _has_drift(table) and table.lights.drift is None else None,
+    cause=Explanation("drift", drift_evidence), drawing="course", lines=(Line(130, _drift_row),),
 )  # fmt: skip
 
 
@@ -188,10 +185,6 @@ DARK_DRIFT = Figure(
 )  # fmt: skip
 
 
-def _stray(table: TableMeasurements) -> float | None:
-    return table.lights.stray.share if table.lights.stray is not None and _are_alike(table) else None
-
-
 def _stray_row(table: TableMeasurements) -> SummaryRow | None:
     """Return what light single frames have beyond the dark ones, and how many lights could be asked."""
     name, stray = "Light that no dark frame shows", table.lights.stray
@@ -214,7 +207,8 @@ STRAY_SHARE = Figure(
     "deep lights 1 to 2 degrees off, which is a good method's error",
     remedy="darken the room, see that no door, lamp or display changes during the session, switch power saving and "
     "dynamic contrast off, and take the frames again",
-    measure=_stray, cause=Explanation("stray", stray_evidence), lines=(Line(250, _stray_row),),
+    measure=lambda table: table.lights.stray.share if table.lights.stray is not None and _are_alike(table) else None,
+    cause=Explanation("stray", stray_evidence), lines=(Line(250, _stray_row),),
 )  # fmt: skip
 
 
@@ -229,10 +223,6 @@ def _bend(table: TableMeasurements) -> float | None:
     off, _ = found.relative(level)
     bend = np.abs(off - off[-1])
     return float(np.maximum(bend - 2 * np.sqrt(np.maximum(errors - bend**2, 0)), 0).max())
-
-
-def _linearity(table: TableMeasurements) -> float | None:
-    return _bend(table) if table.sensor.linearity is None else table.sensor.linearity.worst
 
 
 def _linearity_row(table: TableMeasurements) -> SummaryRow:
@@ -255,12 +245,9 @@ LINEARITY = Figure(
     source="EMVA 1288; 1 % is " + JUDGEMENT,
     remedy="expose less, switch the camera's highlight priority and noise reduction off; a series of exposures of the "
     "chart, given with --linearity, shows where counts bend",
-    measure=_linearity, lines=(Line(185, _linearity_row),),
+    measure=lambda table: _bend(table) if table.sensor.linearity is None else table.sensor.linearity.worst,
+    lines=(Line(185, _linearity_row),),
 )  # fmt: skip
-
-
-def _linearity_known(table: TableMeasurements) -> float:
-    return float(table.sensor.linearity is not None or table.sensor.superposition.measured)
 
 
 def _linearity_lacks(table: TableMeasurements) -> tuple[str, str] | None:
@@ -275,7 +262,8 @@ LINEARITY_KNOWN = Figure(
     source="uncertainty budget",
     remedy="plan red, green and blue each alone (acquire illuminations does) for a chart of 512 colours or more, or "
     "give a series of exposures of the chart with --linearity",
-    found=_linearity_lacks, measure=_linearity_known,
+    measure=lambda table: float(table.sensor.linearity is not None or table.sensor.superposition.measured),
+    found=_linearity_lacks,
 )  # fmt: skip
 
 

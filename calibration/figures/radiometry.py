@@ -106,10 +106,6 @@ def _most_deviating(table: TableMeasurements, chart: Chart) -> Worst | None:
     return Worst(f"colour {colour}, {100 * off[colour]:+.2g} %", file, place=PrintPlace(file, x, y, 0.0))
 
 
-def _doubtful_in_check(check: CheckMeasurements) -> float | None:
-    return None if check.stains is None or not check.stains.known else float(check.stains.doubtful.mean())
-
-
 DOUBTFUL_SHARE = Figure(
     "doubtful_share", "Cells in surroundings 1 % off their codes' colours", "radiometry", "share", "at most", 0.0003,
     None,
@@ -117,12 +113,9 @@ DOUBTFUL_SHARE = Figure(
     source=SIMULATED + ": none on a clean flat print",
     remedy="clean the print, hang it flatter, and look for shadows on it",
     measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.known else None,
-    forecast=_doubtful_in_check, worst=_most_deviating, cause=Explanation("spot", spot_evidence), drawing="print",
+    forecast=lambda check: float(check.stains.doubtful.mean()) if check.stains and check.stains.known else None,
+    worst=_most_deviating, cause=Explanation("spot", spot_evidence), drawing="print",
 )  # fmt: skip
-
-
-def _added_in_check(check: CheckMeasurements) -> float | None:
-    return None if check.stains is None or not check.stains.known else added_light(check.stains)
 
 
 ADDED_LIGHT = Figure(
@@ -133,7 +126,8 @@ ADDED_LIGHT = Figure(
     "of a thirtieth 30 %; a reflection of 3 % leaves a table with cells 57 % off",
     remedy="turn print or projector until nothing is mirrored on it, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
-    forecast=_added_in_check, cause=Explanation("spot", spot_evidence), drawing="print",
+    forecast=lambda check: added_light(check.stains) if check.stains and check.stains.known else None,
+    cause=Explanation("spot", spot_evidence), drawing="print",
 )  # fmt: skip
 
 
@@ -152,10 +146,6 @@ def _softest(table: TableMeasurements) -> FrameMeasurements:
     return max(table.frames, key=lambda frame: frame.blur_px)
 
 
-def _softest_text(table: TableMeasurements, accepted: float) -> str:
-    return f"in {_softest(table).record.file}, whose blur is σ = {_softest(table).blur_px:.2f} px"
-
-
 SOFTER_BLEED = Figure(
     "softer_bleed", "Light of neighbouring cells added in the most blurred frame", "geometry", "share", "at most",
     0.003, 0.012,
@@ -165,7 +155,8 @@ SOFTER_BLEED = Figure(
     remedy="switch off autofocus and stabilisation, see that nothing shakes the camera",
     measure=lambda table: table.added_bleed(_softest(table)),
     worst=lambda table, chart: Worst(f"blur σ {_softest(table).blur_px:.2f} px", _softest(table).record.file),
-    where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
+    where=lambda table, _: f"in {_softest(table).record.file}, whose blur is σ = {_softest(table).blur_px:.2f} px",
+    retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
     cause=Explanation("frame", blur_evidence), drawing="course",
 )  # fmt: skip
 

@@ -22,7 +22,7 @@ from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.framing.field import MIN_SIGNAL
 
 if TYPE_CHECKING:
-    from calibration.measurements import FrameMeasurements, TableMeasurements
+    from calibration.measurements import TableMeasurements
     from experiment.chart.model import Chart
     from experiment.measures.paper import Paper
 
@@ -101,13 +101,9 @@ def _spread(paper: Paper) -> float:
     return float(paper.spread[int(np.argmax(paper.white))])
 
 
-def _spread_of(frame: FrameMeasurements) -> float:
-    return _spread(frame.paper)
-
-
 def _most_spread(table: TableMeasurements, chart: Chart) -> Worst | None:
-    worst = max(table.white_frames, key=_spread_of, default=None)
-    return None if worst is None else Worst(f"{100 * _spread_of(worst):.2g} %", worst.record.file)
+    worst = max(table.white_frames, key=lambda frame: _spread(frame.paper), default=None)
+    return None if worst is None else Worst(f"{100 * _spread(worst.paper):.2g} %", worst.record.file)
 
 
 REFERENCE_SPREAD = Figure(
@@ -115,7 +111,7 @@ REFERENCE_SPREAD = Figure(
     why="what is not smooth, or falls off otherwise than lenses do, is left in the samples by the flat field",
     source=SIMULATED + ": 0.3 % of noise and photosites' response",
     remedy="clean or flatten the print, and look for shadows on it",
-    measure=lambda table: max(map(_spread_of, table.white_frames), default=None),
+    measure=lambda table: max((_spread(frame.paper) for frame in table.white_frames), default=None),
     forecast=lambda check: None if check.paper is None else _spread(check.paper),
     worst=_most_spread, cause=Explanation("references", reference_evidence), drawing="rest",
 )  # fmt: skip
