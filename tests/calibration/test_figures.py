@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
-import numpy as np
 import pytest
 
 from calibration.figures import geometry, light, radiometry, truth
@@ -71,23 +68,3 @@ def test_some_figures_are_asked_more_than_others() -> None:
 def test_a_check_that_saw_nothing_forecasts_nothing() -> None:
     nothing = CheckMeasurements()
     assert [figure.name for figure in FIGURES if figure.forecast is not None and figure.forecast(nothing)] == []
-
-
-@pytest.mark.parametrize(
-    ("cells", "measured", "left_in", "told"),
-    [(4096, True, False, True), (4095, True, False, False), (512, True, True, True), (4096, False, True, False)],
-)
-def test_what_a_lens_leaves_is_a_figure_where_cells_are_enough_to_tell_it(
-    cells: int, measured: bool, left_in: bool, told: bool
-) -> None:
-    table: Any = SimpleNamespace(
-        registration=SimpleNamespace(mismatched_cells=np.zeros(cells)),
-        lens=SimpleNamespace(measured=measured, is_left_in=left_in, left=0.003, left_worst=0.02),
-    )
-    assert geometry.CORRECTION_RESIDUAL.measure(table) == (0.003 if told else None)
-
-
-@pytest.mark.parametrize(("frames", "expected"), [(1, None), (2, 1.0), (5, 1.0)])
-def test_white_frames_are_counted_where_there_is_more_than_one_frame(frames: int, expected: float | None) -> None:
-    table: Any = SimpleNamespace(white_frames=("white",), frames=("frame",) * frames)
-    assert radiometry.WHITE_FRAMES.measure(table) == expected
