@@ -85,3 +85,7 @@ def test_a_stretch_without_dark_frames_has_nothing_hot() -> None:
     hot = HotPixels.none(4, 25)
     assert not hot.hottest(np.full(3, np.nan)).any()
     assert not hot.restarted(np.full(3, np.nan)).hottest(np.full(3, 6.0)).any()
+
+
+def test_without_dark_frames_nothing_is_known() -> None:
+    assert np.isnan(dark_summary([], HotPixels.none(2, 25)).light).all()

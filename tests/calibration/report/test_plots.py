@@ -110,7 +110,9 @@ def test_what_a_print_is_off_by_is_drawn_in_per_cent_where_its_cells_lie() -> No
     deviation = np.linspace(-0.02, 0.03, len(CELLS))
     off = np.stack([deviation, deviation / 2, 0 * deviation], axis=-1)
     stained = np.arange(len(CELLS)) == 5
-    drawn(draw_print, CHART, Stains(off, np.full_like(off, 1e-6), off, stained, np.ones_like(off), CELLS))
+    figure = drawn(draw_print, CHART, Stains(off, np.full_like(off, 1e-6), off, stained, np.ones_like(off), CELLS))
+    (squares,) = figure.axes[0].collections
+    np.testing.assert_allclose(np.asarray(squares.get_array()), 100 * deviation)
 
 
 def test_what_cells_of_two_tables_differ_by_is_drawn_in_the_channel_that_differs_most() -> None:
@@ -120,7 +122,10 @@ def test_what_cells_of_two_tables_differ_by_is_drawn_in_the_channel_that_differs
     offset = np.array([0.001, -0.002, 0.0])
     count = np.ones((len(CELLS), 3), dtype=np.int64)
     cells = CellDifferences(count, mean, none, none, none, count, none, (), (), 1.0, 0.0, 0.0, offset)
-    drawn(draw_map, CHART, cells)
+    (squares,) = drawn(draw_map, CHART, cells).axes[0].collections
+    left = mean - offset
+    largest = [row[np.abs(row).argmax()] if np.isfinite(row).all() else 0.0 for row in left]
+    np.testing.assert_allclose(np.asarray(squares.get_array()), 100 * np.array(largest))
 
 
 @pytest.mark.slow
@@ -266,9 +271,13 @@ def test_errors_of_cells_are_drawn_in_per_cent_and_their_worst_ringed() -> None:
     known = np.repeat(deviation[:, None], 3, axis=1)
     stains = Stains(known, error, alone, np.zeros(len(CELLS), np.bool_), np.ones((len(CELLS), 3)), CELLS)
     table = SimpleNamespace(cells=SimpleNamespace(stains=stains), registration=registered())
-    (squares,) = drawn(draw_errors, table, CHART).axes[0].collections
-    # Squares 4.1 inches of 72 points over the page are as wide as a cell.
-    assert np.sqrt(squares.get_sizes()[0]) * PAGE_W / (72 * 4.1) == pytest.approx(CELL_W)
+    for axes, values in zip(
+        drawn(draw_errors, table, CHART).axes, (100 * deviation, np.linspace(0.01, 0.05, len(CELLS))), strict=False
+    ):
+        (squares,) = axes.collections
+        np.testing.assert_allclose(np.asarray(squares.get_array()), values)
+        # Squares 4.1 inches of 72 points over the page are as wide as a cell.
+        assert np.sqrt(squares.get_sizes()[0]) * PAGE_W / (72 * 4.1) == pytest.approx(CELL_W)
     table.cells.stains = replace(stains, deviation=np.full_like(known, np.nan))
     assert not drawn(draw_errors, table, CHART).axes[0].collections, "too few colours to compare"
 
