@@ -1,12 +1,9 @@
 """The uncertainty budget of a table: what ground truth and cells may be off by, cause by cause, and altogether.
 
 Errors are relative, of the white of bare paper under each light and of the mean of each cell, channel by channel. Each
-component is a mean square error: its variance and, where an effect is measured but not taken out, its square. It comes
-from what the session shows of it, else from what is usual, which is then named as assumed. Components are independent
-and add up (JCGM 100:2008, GUM, 5.1); what is stated is expanded, k = 2 (6.2), for about 95 % of cases.
-
-The noise of samples is no error of a cell: it is the camera's, and belongs to the table. What each component is taken
-from is said in `calibration.pipeline.collecting`.
+component is a mean square error: its variance and, where an effect is measured but not taken out, its square.
+Components are independent and add up (JCGM 100:2008, GUM, 5.1); what is stated is expanded, k = 2 (6.2), for about 95 %
+of cases. The noise of samples is no error of a cell: it is the camera's. `calibration.pipeline.collecting` fills it.
 
 L lights, C cells in the order of colour indices.
 """
@@ -35,7 +32,6 @@ class Component:
 
     - `name`, `title`: for programs and for people.
     - `assumed`: whether it is what is usual, since the session does not show it.
-    - `source`: where it comes from.
     - `lights`: (L, 3, 3) float64, mean square relative error of each light's white in R, G and B.
     - `cells`: (C, 3) float64, mean square relative error of each cell's mean, bare paper's error aside, under the light
       that the chart was registered in.

@@ -1,20 +1,12 @@
 """What a table says of its own origin: camera, lens, exposure, dates, projector, authors, licence; and how it is cited.
 
-`origin_record` makes the record of what a session and its lab state, once for a build; `lut.json` keeps it, for those
-who cite a table and those who make data sets of it. What is not known is None and is said to be so (`NOT_RECORDED`):
-tables made before this was kept have none of it.
-
-How the serial number of a camera is published. Every photograph of a body names its number, so that a published number
-ties a table to all other pictures of its owner, and to registers of sales and warranties; yet readers want to know
-whether two tables are of one body. A hash tells that alone: equal hashes, equal bodies, and whoever holds the camera
-can show that it is the one. Serial numbers are short, and a plain hash of ten digits is undone in seconds by trying
-all. So the hash is scrypt (RFC 7914), which takes some hundredths of a second and 16 MiB a try: all numbers of ten
-digits take a core twelve years and more. It is no secret from somebody who has a list of bodies to try. A lab that
-wants no trace withholds the number.
+Every photograph of a body names its serial number, so that a published one ties a table to all other pictures of its
+owner; yet readers want to know whether two tables are of one body. A hash tells that alone. Serial numbers are short,
+and a plain hash of ten digits is undone in seconds by trying all, so it is scrypt (RFC 7914): all numbers of ten digits
+take a core twelve years and more. A lab that wants no trace withholds the number.
 
 A citation is a BibTeX entry of type `misc`, which all styles of BibTeX know (O. Patashnik, BibTeXing, 1988, section
-3.1); `dataset` is BibLaTeX's alone. What the table does not say is left out of the entry and named in a comment, never
-invented.
+3.1). What the table does not say is left out of the entry and named in a comment, never invented.
 """
 
 from __future__ import annotations
@@ -109,7 +101,6 @@ class OriginRecord(Record):
     - `iso`, `aperture`, `shutter_s`: ISO speed, f-number and exposure time in seconds of most frames.
     - `exposure_by`: who states the exposure: the ``raw files``, or the session's ``settings`` where these are silent.
     - `first_frame`, `last_frame`: when the first and the last frame of the table were released, ISO 8601, UTC.
-    - `frames`: how many frames the table was made from.
     - `projector`: maker and model as its control port names it, or as the lab does where it has none.
     - `screen`: what showed the colours, as the session names it.
     - `taken_by`: name and version of the software that took the session; `Provenance.software` is what built the table.
@@ -208,7 +199,6 @@ def _rig_text(rig: Rig | None) -> str | None:
 class StatedOrigin:
     """What `session.toml` and the journal state beside the frames.
 
-    - `citation`: what the lab states.
     - `rig`: what stood at the end of the cables; None where the settings do not say.
     - `camera`: the exposure as it was set; None where nothing set it, or it is not known.
     - `devices`: names in the journal: ``camera``, ``projector``, ``screen``, ``software``; those that are known.
@@ -306,9 +296,8 @@ def bibtex(
     """
     known = origin or OriginRecord()
     year = known.year
-    key = "-".join(
-        part for part in (_word(_family(known.authors)), _word(camera), year or "", sha256[:KEY_DIGITS]) if part
-    )
+    family = known.authors[0].partition(",")[0] if known.authors else "crop"
+    key = "-".join(part for part in (_word(family), _word(camera), year or "", sha256[:KEY_DIGITS]) if part)
     made = "computed" if computed else "simulated" if known.rig == "simulated" else "photographed"
     fields = {
         "author": " and ".join(_name(author) for author in known.authors),
@@ -335,10 +324,6 @@ def _name(author: str) -> str:
     """Return an author's name for BibTeX: "Family, Given" as it is, a name without a comma in braces as one whole."""
     text = tex_text(author)
     return text if "," in author else f"{{{text}}}"
-
-
-def _family(authors: list[str]) -> str:
-    return authors[0].partition(",")[0] if authors else "crop"
 
 
 def _word(text: str) -> str:

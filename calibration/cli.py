@@ -32,7 +32,6 @@ from foundation.errors import FormatError, InputError, QualityError
 from foundation.secret_texts import masked, printable
 
 if TYPE_CHECKING:
-    from calibration.pipeline.build import TableProgress
     from calibration.pipeline.frames import BuildOptions
     from calibration.table.lut import Lut
     from calibration.verdict import BuildResult
@@ -42,10 +41,7 @@ app = new_app()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `build-lut` and return its exit code.
-
-    `argv`: the arguments; those of the process if None.
-    """
+    """Run `build-lut` with arguments, those of the process if None, and return its exit code."""
     return console.run(lambda: app(args=None if argv is None else list(argv), prog_name="build-lut"))
 
 
@@ -392,29 +388,54 @@ def _make(
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
     if session is None:
         raise InputError("a session is expected: build-lut SESSION LUT; see build-lut --help")
+    if lut is None and not check:
+        raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
+    from calibration.citation import with_changes
+    from calibration.pipeline.baseline import stated_origin
     from experiment.session.folder import Session
 
-    if check:
-        with Session.open(session) as opened:
-            _check(opened, _with_citation(options, opened, changes), linearity, picture, output)
-        return
-    if lut is None:
-        raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
+    with Session.open(session) as opened:
+        if changes:
+            options = replace(options, citation=with_changes(stated_origin(opened).citation, changes))
+        if lut is None:
+            _check(opened, options, linearity, picture, output)
+        else:
+            _build(opened, lut, append, options, linearity, output)
+
+
+def _check(
+    session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None, output: JsonOutput
+) -> None:
+    from calibration.pipeline.build import check
+    from calibration.verdict import refusal
+
+    result = check(session, options, linearity, picture)
+    _print_result(result, output)
+    if result.verdict.refused:
+        raise QualityError(f"{session.folder}: {refusal(result.verdict, result.figures)}")
+    print(f"{session.folder}: the chart is found and is the one expected; a table can be built")
+
+
+def _build(
+    session: Session, lut: Path, so_far: bool, options: BuildOptions, linearity: Path | None, output: JsonOutput
+) -> None:
     import json
 
-    from calibration.pipeline.build import TableProgress, refused_folder
+    from calibration.pipeline.build import TableProgress, append, build, refused_folder
+    from calibration.report.report import write_report
     from calibration.table.lut import REPORT_JSON, REPORT_PAGE
 
     kept = refused_folder(lut) / REPORT_JSON
     before = kept.stat().st_mtime_ns if kept.is_file() else None
-    with Session.open(session) as opened:
-        try:
-            result = _build(opened, lut, append, _with_citation(options, opened, changes), linearity)
-        except QualityError:
-            # A report of an earlier build says nothing of this one.
-            if output.asked and kept.is_file() and kept.stat().st_mtime_ns != before:
-                output.add(**json.loads(kept.read_text(encoding="utf-8")))
-            raise
+    make = append if so_far else build
+    try:
+        with _progress_bar("finding the chart") as progress:
+            result = make(session, lut, progress, write_report, options, linearity)
+    except QualityError:
+        # A report of an earlier build says nothing of this one.
+        if output.asked and kept.is_file() and kept.stat().st_mtime_ns != before:
+            output.add(**json.loads(kept.read_text(encoding="utf-8")))
+        raise
     if isinstance(result, TableProgress):
         output.add(table=lut, progress=result)
         print(
@@ -425,38 +446,6 @@ def _make(
     output.add(table=lut)
     _print_result(result, output)
     print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / REPORT_PAGE}")
-
-
-def _with_citation(options: BuildOptions, session: Session, changes: dict[str, Any]) -> BuildOptions:
-    """Return the options with what was given of the table's origin in place of what the session's settings state."""
-    from calibration.citation import with_changes
-    from calibration.pipeline.baseline import stated_origin
-
-    return replace(options, citation=with_changes(stated_origin(session).citation, changes)) if changes else options
-
-
-def _check(
-    session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None, output: JsonOutput
-) -> None:
-    from calibration.pipeline.build import check
-
-    result = check(session, options, linearity, picture)
-    _print_result(result, output)
-    if result.verdict.refused:
-        from calibration.verdict import refusal
-
-        raise QualityError(f"{session.folder}: {refusal(result.verdict, result.figures)}")
-    print(f"{session.folder}: the chart is found and is the one expected; a table can be built")
-
-
-def _build(
-    session: Session, lut: Path, so_far: bool, options: BuildOptions, linearity: Path | None
-) -> BuildResult | TableProgress:
-    from calibration.pipeline.build import append, build
-    from calibration.report.report import write_report
-
-    with _progress_bar("finding the chart") as progress:
-        return (append if so_far else build)(session, lut, progress, write_report, options, linearity)
 
 
 def _compare(
@@ -513,12 +502,7 @@ def _progress_bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not shows_progress()) as bar:
         task = bar.add_task(beginning, total=None)
         yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)

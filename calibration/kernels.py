@@ -1,11 +1,8 @@
 """Inner loops of calibration, compiled: the lens's spread, cells among neighbours, moments.
 
-Compiled for the processor at hand at the first call and kept on disk for the next. No state, no lock, and the
-interpreter's is released, so that each frame has a thread to itself. Without licence to reorder sums: a table's bytes
-depend on neither processor nor thread. What the numbers mean stands where the kernels are called, in
-`calibration.spread.surroundings` and `calibration.spread.predicting`, `calibration.checks.frame_consistency` and
-`calibration.comparison.comparing`; those of sampling stand in `calibration.sampling`. Nothing of ours but the compiler
-is imported: whatever is, its change has all of them compiled again.
+Without licence to reorder sums: a table's bytes depend on neither processor nor thread. What the numbers mean stands
+where the kernels are called. Nothing of ours but the compiler is imported: whatever is, its change has all of them
+compiled again.
 """
 
 from __future__ import annotations

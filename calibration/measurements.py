@@ -50,15 +50,12 @@ class FrameMeasurements:
     - `channel`: the channel in which the chart's movement was measured.
     - `shift`: movement against the frame that was registered last.
     - `reregistered`: whether the chart had moved so far that it was registered again in this frame.
-    - `paper`: flat field and white of bare paper.
-    - `consistency`: how much the frame differs from the print as it was first registered.
     - `greys`, `grey_errors`: (G, 3) float64 counts above black of each level of grey, field divided out, and their
       standard errors.
     - `dark`: (3,) float64 counts, dark light of bare paper that was subtracted; zeros where none was.
     - `share_at_zero`: share, 0 … 1, of the frame's samples in the table that are 0.
     - `blur_px`: σ of the frame's blur, half-size px: that of the frame registered last, plus the change since.
     - `exposure`: shutter time × ISO speed / f-number² by the raw file, s; 0 where it does not state them.
-    - `origin`: camera, lens and exposure as the raw file states them.
     """
 
     record: FrameRecord
@@ -116,11 +113,7 @@ class LinearityMeasurements:
 class SessionMeasurements:
     """What was read.
 
-    - `folder`: the session's folder.
-    - `camera`: maker and model as the raw files name it.
-    - `lights`: lights with an accepted frame.
     - `registered_file`: the frame that was registered first, relative to the session.
-    - `white_references`: white references that the chart has.
     - `codes`: codes of each light of the plan, 0 … 255.
     """
 
@@ -201,7 +194,6 @@ class LightMeasurements:
 class GreyMeasurements:
     """What was measured of the printed levels of grey.
 
-    - `names`: of the G levels, brightest first.
     - `values`, `errors`: (L, G, 3) float64 counts under each light, field divided out, and their standard errors; NaN
       where no patch of a level can be used.
     """
@@ -232,7 +224,6 @@ class SensorMeasurements:
     - `white_level`: saturation as a sample value: counts above black.
     - `noise`: (3,) float64, median standard deviation of one sample under white, relative to paper white.
     - `transfer`: photon-transfer curve of the frame that was registered first.
-    - `linearity`: what a series of exposures shows; None where none was given.
     - `superposition`: what lights of several primaries show of it beside the primaries alone.
     """
 
@@ -250,7 +241,6 @@ class CellMeasurements:
     """What was found of the chart's cells.
 
     - `window`: pixels along the side of a cell's window; S = window².
-    - `unfit`: cells not to be used, each with its cause.
     - `stains`: where the print does not have its codes' colours, in the order of colour indices.
     - `levels`: (C, 3) float64, of each cell in the frame that was registered first, bare paper 1.
     - `added`: light that lies on some of them whatever is printed there.
@@ -267,7 +257,6 @@ class CellMeasurements:
 class TableMeasurements:
     """All that was measured by a build, or by a check.
 
-    - `registration`: of the frame that was registered first.
     - `frames`: figures of every light and white frame read, in the order taken.
     - `dark_frames`: what the dark frames show; of a check, the first of them.
     - `origins`: which frames' files state another camera, lens or exposure than most.
@@ -276,7 +265,6 @@ class TableMeasurements:
     - `lens`, `point_spread`: what the lens spreads beside its sharp core, and what of it was subtracted; None where it
       was not measured.
     - `origin`: with what, when and by whom the frames were taken.
-    - `budget`: what ground truth and cells may be off by, cause by cause.
     """
 
     session: SessionMeasurements

@@ -1,14 +1,9 @@
 """The samples of every cell, taken as the sensor gave them, and their statistics.
 
-Rules that hold inside:
-
-- A cell's samples are the 5×5 half-size pixels around its rounded centre (paper, section 3.2), or another odd window.
-  Pixels are taken whole; nothing is interpolated, which would alter the noise that the samples are for.
-- A cell that is cut off, clipped, or not of one colour is listed with its cause. It is never filled from elsewhere.
-- The inner loops are compiled without licence to reorder sums: a table's bytes depend on neither processor nor thread.
-
-Works on the raw photosites under the cells and nowhere else: a frame need not be debayered to be sampled. How large a
-window may be is a matter of the light of neighbouring cells that the lens's blur mixes in.
+A cell's samples are the 5×5 half-size pixels around its rounded centre (paper, section 3.2), or another odd window.
+Pixels are taken whole, from the raw photosites: nothing is interpolated, which would alter the noise that the samples
+are for. The inner loops are compiled without licence to reorder sums: a table's bytes depend on neither processor nor
+thread.
 """
 
 from __future__ import annotations

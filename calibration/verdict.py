@@ -1,13 +1,8 @@
 """Whether a table may be used: figures against their limits, why one is beyond, what to take again, all in words.
 
-Rules that hold inside:
-
-- Judging is a pure function of values: the same values give the same verdict, whoever measured them. A value that could
-  not be measured is not judged. The verdict is its worst row.
-- Taken again are frames that are beyond a refusing limit by themselves, and those that are a cause. What all frames
-  share (focus from the first on, a stained print, too little light) is not mended so; nothing is named for it. A hand
-  in one white frame looks like a stain to the mean of the white frames: its cause names the frame.
-- All that differs from figure to figure stands in the figure (`calibration.figures`).
+Judging is a pure function of values. A value that could not be measured is not judged. Taken again are frames that are
+beyond a refusing limit by themselves, and those that are a cause; what all frames share is not mended so. All that
+differs from figure to figure stands in the figure (`calibration.figures`).
 """
 
 from __future__ import annotations
@@ -78,8 +73,6 @@ class Verdict:
 class BuildResult:
     """A table, or a check, as measured and judged.
 
-    - `figures`: what was measured.
-    - `verdict`: the judgement on it.
     - `lut`: the table's folder; None after a check.
     """
 
@@ -92,11 +85,8 @@ class BuildResult:
 class ProbableCause:
     """Why a figure is beyond its limit.
 
-    - `figure`: its name.
     - `decision`: the cause, and the rule that says so.
-    - `evidence`: what it was decided by.
     - `frames`: the frames in which it shows, the worst first; empty where all share it.
-    - `places`: where on the print.
     """
 
     figure: str

@@ -111,7 +111,8 @@ def _block_of(table: TableMeasurements, worst: FrameMeasurements, limit: float) 
         moved_px=worst.shift.length_px,
     )
     in_first = evidence.in_first == 1
-    frames = [table.registered_frame] if in_first else _frames_beyond(table, worst, limit)
+    beyond = [frame for frame in table.frames if frame.consistency.block > limit] or [worst]
+    frames = [table.registered_frame] if in_first else sorted(beyond, key=lambda frame: -frame.consistency.block)
     x, y = seen.at_mm
     if in_first and (lying := _of_residuals(table, table.registered_frame)[1]):
         # Cells under it were not compared, as they did not look like the chart's.
@@ -250,12 +251,13 @@ def _of_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.int6
     added, kept = light_of_spot(stains, spot, int(np.argmax(np.abs(colour))))
     size_mm, least = max(place.size_mm, 1e-9), _HALF * abs(deviation)
     hottest = table.dark_frames.hottest
-    white_residual = _white_residual(table, at_mm, place.size_mm, least)
+    whites_off = _white_off(table, at_mm, place.size_mm, least)
+    white_residual = len(whites_off) / max(len(table.white_frames), 1)
     evidence = Evidence(
         **_across_frames(table, at_mm, size_mm, least),
         white_residual=white_residual,
         some_whites=float(0 < white_residual < 1),
-        rim_frames=float(np.mean([frame.paper.left.rim < RIM_OFF for frame in table.white_frames] or [0])),
+        rim_frames=_dark_rims(table),
         spot=1.0,
         share=len(spot) / len(stains.places_mm),
         deviation=deviation,
@@ -270,7 +272,7 @@ def _of_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.int6
     if evidence.in_first == 1:
         frames = [table.registered_frame]
     elif 0 < white_residual <= _HALF:
-        frames = _white_off(table, at_mm, place.size_mm, least)
+        frames = whites_off
     elif evidence.even_showing > 0:
         frames = [frame for frame in _showing(table, at_mm, size_mm, least) if frame.record.kind == "white"]
     if frames:
@@ -289,10 +291,9 @@ def _white_off(table: TableMeasurements, at_mm: _Array, size_mm: float, least: f
     ]
 
 
-def _white_residual(table: TableMeasurements, at_mm: _Array, size_mm: float, least: float) -> float:
-    """Return the share of the white frames whose references are off at a place by `least` or more."""
-    whites = table.white_frames
-    return len(_white_off(table, at_mm, size_mm, least)) / len(whites) if whites else 0.0
+def _dark_rims(table: TableMeasurements) -> float:
+    """Return the share of the white frames whose corners are darker than their fields; 0 of none."""
+    return float(np.mean([frame.paper.left.rim < RIM_OFF for frame in table.white_frames] or [0]))
 
 
 def _of_residuals(
@@ -318,7 +319,7 @@ def _of_residuals(
         "deviation": deviation,
         "tint": tint,
         "share": left.share,
-        "rim_frames": float(np.mean([other.paper.left.rim < RIM_OFF for other in whites])),
+        "rim_frames": _dark_rims(table),
     }
     x, y = left.at_mm
     return known, (PrintPlace(frame.record.file, x, y, 0.0),)
@@ -336,12 +337,12 @@ def reference_evidence(table: TableMeasurements, limit: float) -> Gathered | Non
         "frames": float(len(whites)),
         "rim": left.rim,
         "radial": left.radial,
-        "rim_frames": float(np.mean([frame.paper.left.rim < RIM_OFF for frame in whites])),
+        "rim_frames": _dark_rims(table),
     }
     if 0 < known.get("white_residual", 0.0) <= _HALF:
         return Gathered(Evidence(**known), (worst.record,), places)
-    at_mm = np.array(left.at_mm)
-    near = [spot for spot in spots_of(stains) if _distance(stains, spot, at_mm) < 4 * cell_mm(stains)]
+    away = np.linalg.norm(stains.places_mm - left.at_mm, axis=1)
+    near = [spot for spot in spots_of(stains) if away[spot].min() < 4 * cell_mm(stains)]
     if not near:
         place = PrintPlace(worst.record.file, *left.at_mm, 0.0)
         return Gathered(Evidence(**known), (), (place,))
@@ -381,11 +382,6 @@ def _showing(table: TableMeasurements, at_mm: _Array, size_mm: float, least: flo
     return sorted(found, key=lambda frame: -frame.consistency.block)
 
 
-def _frames_beyond(table: TableMeasurements, worst: FrameMeasurements, limit: float) -> list[FrameMeasurements]:
-    beyond = [frame for frame in table.frames if frame.consistency.block > limit]
-    return sorted(beyond or [worst], key=lambda frame: -frame.consistency.block)
-
-
 def _colour(colour: _Array) -> tuple[float, float]:
     """Return the deviation of the channel that is off most, and how unlike the channels are, over its size."""
     deviation = float(colour[int(np.argmax(np.abs(colour)))])
@@ -396,10 +392,6 @@ def _colour(colour: _Array) -> tuple[float, float]:
 def _place_of(stains: Stains, spot: npt.NDArray[np.int64], file: str) -> PrintPlace:
     x, y = stains.places_mm[spot].mean(axis=0).tolist()
     return PrintPlace(file, x, y, 2 * float(np.sqrt(len(spot) / np.pi)) * cell_mm(stains))
-
-
-def _distance(stains: Stains, spot: npt.NDArray[np.int64], at_mm: _Array) -> float:
-    return float(np.linalg.norm(stains.places_mm[spot] - at_mm, axis=1).min())
 
 
 def _spot_share(stains: Stains, at_mm: _Array, size_mm: float) -> float:

@@ -1,14 +1,8 @@
 """Why a figure is beyond its limit: the causes there are, the evidence that is asked for, and the table that decides.
 
-Rules that hold inside:
-
-- A rule holds where every one of its conditions does; a condition is an interval, both ends included. What was not
-  measured is NaN, which lies in none.
-- The first rule that holds decides; those that rest on what files say, or dark frames show, stand before those that
-  rest on what a deviation looks like.
-- Where none holds, the cause is unknown and said to be. A cause that is wrong costs a session; one that is not named
-  costs a look at the report. So intervals leave gaps between causes.
-- Figures are known by what they are about (`Subject`), never by name.
+The first rule that holds decides; those that rest on what files say, or dark frames show, stand before those that rest
+on what a deviation looks like. Where none holds, the cause is unknown and said to be: one that is wrong costs a
+session, one that is not named a look at the report. So intervals leave gaps between causes.
 """
 
 from __future__ import annotations
@@ -341,8 +335,6 @@ class Rule:
 
     - `cause`: what is said where it holds.
     - `about`: what the figures are about that it may explain.
-    - `conditions`: all of which must hold.
-    - `why`: why the cause follows.
     """
 
     cause: Cause
@@ -649,7 +641,6 @@ RULES: tuple[Rule, ...] = (
 class Decision:
     """The probable cause of a figure beyond its limit, and the rule that says so; None where it is unknown.
 
-    - `cause`, `rule`: as said.
     - `follows`: the figure that the rule explains where it is another one, which this one goes with; "" else.
     """
 

@@ -1,21 +1,16 @@
 """Whether a frame is of the same camera and exposure and shows the same print as the registered one.
 
-White frames are compared cell by cell, but taken only every so often. A light's own frame may be spoilt between two of
-them, and its part of the table with it, while the tags are where they were. So every frame is compared with the
-registered one. The ratio of a cell's channel to the same under the first light is a smooth function of the printed
-code, for any two lights and whatever the inks. It is estimated by a polynomial in the code, fitted on the frame itself.
-What is left is noise, the polynomial's own error, which is spread over the sheet at random as the codes are, and what
-is wrong with the frame:
+A light's own frame may be spoilt between two white ones, while the tags are where they were. The ratio of a cell's
+channel to the same under the first light is a smooth function of the printed code, for any two lights and whatever the
+inks: a polynomial in the code, fitted on the frame itself. What is left is noise, the polynomial's own error, which is
+spread over the sheet at random as the codes are, and what is wrong with the frame:
 
-- `scatter`, over all cells: blur mixes neighbours, and another order of cells fits nothing. Of few cells, as a dim
-  light leaves, noise itself is known badly: what it may be by chance is taken off;
-- `block`, the mean over neighbouring cells: a hand, a shadow or a reflection lies in one place. A cell that none of
-  its neighbours is like, as a hot photosite makes it, counts as the one next to it in value;
-- `disturbed`, cells next to each other that are far off: a finger's tip, a fly, a scrap of paper covers too few of them
-  to move a block's mean (`calibration.checks.small_places`).
-
-What else is known of that place, so that its cause can be told (`calibration.causes`): its colour, how large it is, and
-whether light was added there, as a reflection adds it, or taken in proportion, as a shadow does.
+- `scatter`, over all cells: blur mixes neighbours, and another order of cells fits nothing. What noise may be by chance
+  is taken off;
+- `block`, the mean over neighbouring cells: a hand, a shadow or a reflection lies in one place. A cell that none of its
+  neighbours is like, as a hot photosite makes it, counts as the one next to it in value;
+- `disturbed`, cells next to each other that are far off: what covers too few of them to move a block's mean
+  (`calibration.checks.small_places`).
 
 Charts of 8 and 64 cells have no more cells than the polynomial has terms, or twice as many, and cannot be checked.
 """
@@ -292,8 +287,10 @@ class ConsistencyCheck:
         noise2 = float(np.median(variance[there] / expected[there] ** 2))
         # That of a square is twice that of its root.
         error = _CERTAIN * 2 * float(np.sqrt(_SPREAD_ERROR2 / len(there)))
-        deviation[:-1] = _like_a_neighbour(deviation[:-1], self._around)
-        average, count = _known_means(deviation[self._members])
+        kernels.clipped_to_neighbours(deviation[:-1].copy(), self._around, deviation[:-1])
+        of_blocks = deviation[self._members]
+        count = np.isfinite(of_blocks).sum(axis=1)
+        average = np.nansum(of_blocks, axis=1) / np.maximum(count, 1)
         off = np.abs(average) - _CERTAIN * np.sqrt(spread2 / np.maximum(count, 1))
         compared = np.isfinite(deviation[:-1])
         return _Deviations(
@@ -305,24 +302,6 @@ class ConsistencyCheck:
             mean=average,
             off=np.where(count >= LEAST_CELLS, off, 0.0),
         )
-
-
-def _like_a_neighbour(values: _Array, around: npt.NDArray[np.int64]) -> _Array:
-    """Return values (N,) brought between the second lowest and second highest of themselves and their neighbours.
-
-    `around` (N, K) are each one's places in `values`, its own among them. NaN is no value and stays; a value with fewer
-    than two others around becomes NaN, since a hot photosite in it would not be told from what covers cells.
-    """
-    brought = np.empty_like(values)
-    kernels.clipped_to_neighbours(values, around, brought)
-    return brought
-
-
-def _known_means(values: _Array) -> tuple[_Array, npt.NDArray[np.int64]]:
-    """Return the means (B,) of the rows of values (B, M), NaN left out, and of how many; 0 of none."""
-    known = np.isfinite(values)
-    count = known.sum(axis=1)
-    return np.where(known, values, 0).sum(axis=1) / np.maximum(count, 1), count
 
 
 def _light_of(channels: list[_Deviations], members: npt.NDArray[np.int64]) -> tuple[float, float]:
@@ -389,13 +368,7 @@ class ForeignFrame:
 
 @dataclass(frozen=True)
 class OriginFigures:
-    """What the files of a session state of where they come from.
-
-    - `other_camera`: frames of another model or body.
-    - `other_lens`: frames through another lens.
-    - `other_exposure`: frames exposed otherwise by a hundredth or more.
-    - `other_iso`: frames of another ISO speed, or than the session's settings have.
-    """
+    """Frames whose files state another thing than most: a camera, a lens, an exposure by 1 % or more, an ISO speed."""
 
     other_camera: tuple[ForeignFrame, ...] = ()
     other_lens: tuple[ForeignFrame, ...] = ()

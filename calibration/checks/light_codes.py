@@ -1,20 +1,15 @@
 """Whether each light's white is what its codes give: frames that bear another light's name.
 
-The ground truth is measured and stays true whatever a light is called; its codes and temperature do not. So each white
-is held against what its codes give by all the other lights of the session and by what is known of any projector, and
-each statement is as certain as these are: from seven hundred lights to hundredths of a degree, from two lights to tens
-of degrees. There is no number of lights below which nothing is said. Two questions are asked:
+Each white is held against what its codes give by all the other lights of the session and by what is known of any
+projector (`calibration.checks.projector_model`), and each statement is as certain as these are. Two questions are
+asked:
 
 - Is a white off its codes? By how much beyond four standard errors.
-- Would two lights fit better if their names were exchanged? By how much more likely that is. This finds neighbours that
-  are nearer to each other than any limit on an angle could be; how near two lights may be for their exchange to go
-  unnoticed is a figure.
+- Would two lights fit better if their names were exchanged? By how much more likely that is. How near two lights may be
+  for their exchange to go unnoticed is a figure.
 
-Where names do not fit, the lights that others are held against must not be the misnamed ones. Of many lights the
-majority decides; of few, lights are left out, and names exchanged, until the rest agree
+Of many lights the majority decides; of few, lights are left out, and names exchanged, until the rest agree
 (docs/decisions/0015-lights-are-held-against-their-codes.md).
-
-What the other lights predict of each, and how surely, is fitted to them (`calibration.checks.projector_model`).
 """
 
 from __future__ import annotations
@@ -128,16 +123,8 @@ class CodeAgreement:
 
     def rows(self, lights: slice) -> CodeAgreement:
         """Return the same of some lights alone; `seen_as` and `exchanges` name lights by the numbers they had."""
-        return replace(
-            self,
-            angle_deg=self.angle_deg[lights],
-            error_deg=self.error_deg[lights],
-            off_deg=self.off_deg[lights],
-            brightness=self.brightness[lights],
-            off_brightness=self.off_brightness[lights],
-            seen_as=self.seen_as[lights],
-            held=self.held[lights],
-        )
+        own = {name: value[lights] for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        return replace(self, **own)
 
 
 def code_agreement(

@@ -1,13 +1,10 @@
 """Cells next to each other that are far off: what covers too few to move a block's mean, as a finger's tip does.
 
 A cell counts as far off that is beyond noise and the model's usual error, and beyond those whose codes are next to its
-own, so that it is no part of a colour that the model misses. What a polynomial cannot follow is spread over the print
-at random and a hot photosite stands alone, so that two such cells next to each other are a place; how many are enough
-follows from how many of the frame are far off at all. What touches such a place and is off by less, or is too dark to
-be compared, belongs to it. Two hot photosites side by side are a place, too: the dark frames tell them, and
-`cells_without_hot` leaves such cells out. A cell that stands alone and is off by far more is told apart: it is no hand,
-but not its colour either. A chart whose colours lie in order has its neighbours in code next to each other on the
-print: there nothing is found.
+own. What a polynomial cannot follow is spread over the print at random and a hot photosite stands alone, so that two
+such cells next to each other are a place; how many are enough follows from how many of the frame are far off at all.
+What touches such a place and is off by less, or is too dark to be compared, belongs to it. On a chart whose colours lie
+in order nothing is found.
 """
 
 from __future__ import annotations

@@ -1,19 +1,14 @@
 """Light in single frames that no dark frame shows: a door that opened, a lamp, daylight, whose share is in some frames.
 
-What the dark frames show is known, and may be subtracted. What was there in other frames alone makes deep colours pale,
-and hardly moves a white; its amount is not found by what codes predict of a light, which is known to some per cent at
-best (`calibration.checks.projector_model`). Two sums are known far better, whatever the projector's response to codes:
+Its amount is not found by what codes predict of a light. Two sums are known far better:
 
-- *Codes of 0.* A light is a sum of the three primaries, each of which has a frame of its own. Of a primary whose code
-  is 0 it has nothing beyond the dark light. What it seems to have is room light in its own frame; what it seems to lack
-  was in the frame of a primary that it is made of, as much of it as the light takes of that primary. Light that is in a
-  primary's frame is missed so in all of them.
+- *Codes of 0.* Of a primary whose code is 0 a light has nothing beyond the dark light. What it seems to have is room
+  light in its own frame; what it seems to lack was in the frame of a primary that it is made of.
 - *White.* Red, green and blue alone together give white. Where they give more, by as much in each primary and under a
-  lamp that is steady, light that is no projector's was in their frames, and is counted as often as it was there. A
-  projector that holds full white back looks the same, and this has to be said. One that brightens white hides it.
+  lamp that is steady, light that is no projector's was in their frames. A projector that holds full white back looks
+  the same; one that brightens white hides it.
 
-Lights without a code of 0 that are no primaries are not checked, and how many are is a figure. The amounts are solved
-for in the whites of bare paper, which are means over hundreds of patches: three equations for three amounts.
+The amounts are solved for in the whites of bare paper: three equations for three amounts.
 """
 
 from __future__ import annotations

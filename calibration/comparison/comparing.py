@@ -1,17 +1,12 @@
 """Two tables compared light by light, in bounded memory; whether they are the same within noise; B over A, always.
 
-Rules that hold inside:
-
-- A light of either table is held at a time for each thread. A session is compared by its table, built for the
-  comparison and thrown away (`table_of`).
+- A light of either table is held at a time for each thread.
 - What noise alone predicts is taken from the tables themselves: a cell's standard error from the scatter of its own
-  samples, a white's from `references.csv`. Where photosites differ in response, samples scatter by that too; it is the
-  same in both tables where the chart did not move between them, so that noise then predicts a little more than there
-  is.
-- With 700 lights and 32 768 cells any difference is significant, however small. So what is asked is not whether noise
-  is the only cause, but whether what is beyond it matters: limits are those of noise at a chance of one in a hundred
-  for the whole table, widened by what standard errors that are themselves estimated may be off, and a floor of what no
-  use of a table would notice.
+  samples, a white's from `references.csv`. Where photosites differ in response, samples scatter by that too, and noise
+  then predicts a little more than there is.
+- With 700 lights and 32 768 cells any difference is significant, however small. So what is asked is whether what is
+  beyond noise matters: limits are those of noise at a chance of one in a hundred for the whole table, widened by what
+  standard errors may be off themselves, and a floor of what no use of a table would notice.
 
 L common lights, C colours.
 """
@@ -106,9 +101,7 @@ class ComparedTable:
     """One of the two tables.
 
     - `place`: its folder, or that of the session that it was made of for the comparison.
-    - `camera`, `software`: as `lut.json` has them.
     - `lights`, `samples`: lights, and samples of each cell.
-    - `drift_corrected`: whether the lamp's drift was taken out of it.
     """
 
     place: Path
@@ -196,8 +189,6 @@ class CellDifferences:
 class ColourGroup:
     """Cells of one part of the colour cube.
 
-    - `name`: which channels of the code are in the upper half: ``black``, ``blue`` … ``white``.
-    - `cells`: how many of them count.
     - `mean`, `spread`: mean and standard deviation over the cells of their mean difference, in the channel that
       deviates most.
     - `worst`: the largest mean difference, with its sign.
@@ -230,12 +221,7 @@ class GeometryDifference:
 
 @dataclass(frozen=True)
 class NoiseAnswer:
-    """Whether one thing is the same within noise.
-
-    - `name`: ``colour of lights``, ``brightness of lights``, ``cells``.
-    - `same`: yes, no, or None where it cannot be said.
-    - `said`: the numbers, in words.
-    """
+    """Whether one thing is the same within noise, None where it cannot be said, and the numbers in words."""
 
     name: str
     same: bool | None
@@ -244,7 +230,7 @@ class NoiseAnswer:
 
 @dataclass(frozen=True, eq=False)
 class TableComparison:
-    """All of it."""
+    """How two tables differ."""
 
     one: ComparedTable
     other: ComparedTable
@@ -262,71 +248,34 @@ class TableComparison:
         return False if False in said else None if None in said else True
 
 
-@dataclass(frozen=True)
-class LightPairs:
-    """The lights that two tables have in common, in the order of the first.
-
-    - `one`, `other`: their numbers in either table.
-    - `only_one`, `only_other`: lights that only one of the tables has.
-    """
-
-    one: tuple[int, ...]
-    other: tuple[int, ...]
-    only_one: tuple[int, ...]
-    only_other: tuple[int, ...]
-
-
-def light_pairs(one: Sequence[Illumination], other: Sequence[Illumination]) -> LightPairs:
-    """Return which lights are the same: kind, temperature, codes and name, whatever their numbers.
+def light_pairs(one: Sequence[Illumination], other: Sequence[Illumination]) -> list[tuple[int, int]]:
+    """Return the numbers in either table of lights of the same kind, temperature, codes and name, by the first's order.
 
     Where a table has a light more than once, the first of it is that of the other's first, and so on.
     """
     there: dict[object, list[int]] = {}
     for light in reversed(other):
         there.setdefault(_key(light), []).append(light.index)
-    pairs: list[tuple[int, int]] = []
-    alone: list[int] = []
-    for light in one:
-        found = there.get(_key(light))
-        if found:
-            pairs.append((light.index, found.pop()))
-        else:
-            alone.append(light.index)
-    left = sorted(index for found in there.values() for index in found)
-    return LightPairs(tuple(i for i, _ in pairs), tuple(j for _, j in pairs), tuple(alone), tuple(left))
+    return [(light.index, found.pop()) for light in one if (found := there.get(_key(light)))]
 
 
-def require_one_chart(one: Lut, other: Lut) -> None:
-    """Refuse two tables of different charts: a colour then means another place, and nothing can be compared."""
-    differs = chart_difference(one, other)
-    if differs:
-        raise FormatError(
-            f"{one.folder} and {other.folder} are of different charts ({differs}), so that their cells cannot be "
-            "compared; name two tables or sessions of one chart.json"
-        )
+def _key(light: Illumination) -> object:
+    return light.kind, light.cct_k, light.colour, light.name
 
 
-def require_common_lights(pairs: LightPairs, one: Lut, other: Lut) -> None:
-    """Refuse two tables without a light in common."""
-    if not pairs.one:
-        raise FormatError(
-            f"{one.folder} has {counted(len(one.illuminations), 'light')} and {other.folder} "
-            f"{len(other.illuminations)}, none of them the same: expected at least one of the same kind and codes"
-        )
-
-
-def warnings_of(one: Lut, other: Lut, pairs: LightPairs) -> tuple[str, ...]:
-    """Return what a reader of the comparison must know of the two tables, a sentence each."""
+def warnings_of(one: Lut, other: Lut, common: int) -> tuple[str, ...]:
+    """Return what a reader must know of two tables with so many lights in common, a sentence each."""
     ours, theirs = one.provenance, other.provenance
     found: list[str] = []
     if ours.camera != theirs.camera:
         found.append(
             f"two cameras, {ours.camera} and {theirs.camera}: what differs is first of all the cameras, not the lab"
         )
-    if pairs.only_one or pairs.only_other:
+    alone, others = len(one.illuminations) - common, len(other.illuminations) - common
+    if alone or others:
         found.append(
-            f"{len(pairs.one)} lights are compared, which both have; {len(pairs.only_one)} of the first and "
-            f"{len(pairs.only_other)} of the second are not in the other"
+            f"{common} lights are compared, which both have; {alone} of the first and {others} of the second are not "
+            "in the other"
         )
     if (ours.computed is None) != (theirs.computed is None):
         found.append("one of the tables was computed, and nothing was photographed for it")
@@ -338,10 +287,6 @@ def warnings_of(one: Lut, other: Lut, pairs: LightPairs) -> tuple[str, ...]:
             "of a cell's rim"
         )
     return tuple(found)
-
-
-def _key(light: Illumination) -> object:
-    return light.kind, light.cct_k, light.colour, light.name
 
 
 def answers_of(lights: LightDifferences, cells: CellDifferences) -> tuple[NoiseAnswer, ...]:
@@ -476,37 +421,36 @@ def compare(
     places: tuple[Path | None, Path | None] = (None, None),
 ) -> TableComparison:
     """Return how far two tables of one chart differ, and whether noise alone explains it."""
-    require_one_chart(one, other)
+    differs = chart_difference(one, other)
+    if differs:
+        raise FormatError(
+            f"{one.folder} and {other.folder} are of different charts ({differs}), so that their cells cannot be "
+            "compared; name two tables or sessions of one chart.json"
+        )
     pairs = light_pairs(one.illuminations, other.illuminations)
-    require_common_lights(pairs, one, other)
+    if not pairs:
+        raise FormatError(
+            f"{one.folder} has {counted(len(one.illuminations), 'light')} and {other.folder} "
+            f"{len(other.illuminations)}, none of them the same: expected at least one of the same kind and codes"
+        )
     lights, cells = _differences(one, other, pairs, progress)
-    geometry = _geometry(one, other)
     first, second = (
         _described(table, place or table.folder) for table, place in zip((one, other), places, strict=True)
     )
     return TableComparison(
         one=first,
         other=second,
-        warnings=warnings_of(one, other, pairs),
+        warnings=warnings_of(one, other, len(pairs)),
         lights=lights,
         cells=cells,
         groups=colour_groups(cells, one.provenance.bits),
-        geometry=geometry,
+        geometry=_geometry(one, other),
         answers=answers_of(lights, cells),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _CellsOfALight:
-    """Differences of a light's cells, (C, 3) float64 each; NaN where a cell does not count."""
-
-    share: _Array
-    score: _Array
-    variance: _Array
-
-
 def _differences(
-    one: Lut, other: Lut, pairs: LightPairs, progress: ReportLights | None
+    one: Lut, other: Lut, pairs: Sequence[tuple[int, int]], progress: ReportLights | None
 ) -> tuple[LightDifferences, CellDifferences]:
     unfit = [{cell.colour for cell in table.provenance.unfit} for table in (one, other)]
     usable = np.ones(one.samples.shape[1], dtype=np.bool_)
@@ -517,29 +461,31 @@ def _differences(
     freedoms = float((1 / sizes).sum() ** 2 / (1 / sizes**2 / (sizes - 1)).sum())
     widening = float(np.sqrt(freedoms / (freedoms - 2)))
 
-    def work(pair: tuple[int, int]) -> _CellsOfALight:
+    def work(pair: tuple[int, int]) -> tuple[_Array, _Array, _Array]:
         return _compare_light(one, other, *pair, usable, widening)
 
     sums = _Sums.empty(len(usable))
-    rms, noise, score = (np.full(len(pairs.one), np.nan) for _ in range(3))
-    todo = list(zip(pairs.one, pairs.other, strict=True))
-    for number, found in enumerate(ordered_map(work, todo, min(processor_count(), MOST_THREADS))):
-        there = np.isfinite(found.share)
+    squares = np.full((3, len(pairs)), np.nan)
+    for number, found in enumerate(ordered_map(work, pairs, min(processor_count(), MOST_THREADS))):
+        there = np.isfinite(found[0])
+        share, deviation, variance = (np.where(there, values, 0.0) for values in found)
         if there.any():
-            rms[number] = np.sqrt((found.share[there] ** 2).mean())
-            noise[number] = np.sqrt(found.variance[there].mean())
-            score[number] = np.sqrt((found.score[there] ** 2).mean())
-        sums.add(found, there, pairs.one[number])
+            of_light = (share[there] ** 2, variance[there], deviation[there] ** 2)
+            squares[:, number] = [values.mean() for values in of_light]
+        sums.add(share, deviation, variance, there, pairs[number][0])
         if progress is not None:
-            progress(number + 1, len(todo))
+            progress(number + 1, len(pairs))
     cells = sums.result(tuple(sorted(unfit[0] - unfit[1])), tuple(sorted(unfit[1] - unfit[0])))
-    return _light_differences(one, other, pairs, rms, noise, score), cells
+    return _light_differences(one, other, pairs, *np.sqrt(squares)), cells
 
 
 def _compare_light(
     one: Lut, other: Lut, light: int, counterpart: int, usable: npt.NDArray[np.bool_], widening: float
-) -> _CellsOfALight:
-    """Return what differs of the cells of one light, each mean over its own table's white."""
+) -> tuple[_Array, _Array, _Array]:
+    """Return what differs of the cells of one light, each mean over its own table's white: shares (C, 3) float64.
+
+    And the same in units of its standard error, and the square of that; NaN where a cell does not count.
+    """
     relative: list[_Array] = []
     variance: list[_Array] = []
     bright = np.broadcast_to(usable[:, None], (len(usable), 3)).copy()
@@ -556,7 +502,7 @@ def _compare_light(
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(bright, relative[1] / relative[0] - 1, np.nan)
         both = np.where(bright, variance[0] + variance[1], np.nan)
-    return _CellsOfALight(share, share / np.sqrt(both) / widening, both)
+    return share, share / np.sqrt(both) / widening, both
 
 
 @dataclass(frozen=True, eq=False)
@@ -586,8 +532,8 @@ class _Sums:
             worst_light=np.full(shape, -1, dtype=np.int64),
         )
 
-    def add(self, found: _CellsOfALight, there: npt.NDArray[np.bool_], light: int) -> None:
-        share, score, variance = (np.where(there, each, 0.0) for each in (found.share, found.score, found.variance))
+    def add(self, share: _Array, score: _Array, variance: _Array, there: npt.NDArray[np.bool_], light: int) -> None:
+        """Add a light's differences, 0 where a cell does not count."""
         self.count[...] += there
         self.share[...] += share
         self.squares[...] += share**2
@@ -620,9 +566,9 @@ class _Sums:
 
 
 def _light_differences(
-    one: Lut, other: Lut, pairs: LightPairs, rms: _Array, noise: _Array, score: _Array
+    one: Lut, other: Lut, pairs: Sequence[tuple[int, int]], rms: _Array, noise: _Array, score: _Array
 ) -> LightDifferences:
-    numbers = [np.array(each, dtype=np.int64) for each in (pairs.one, pairs.other)]
+    numbers = np.array(pairs, dtype=np.int64).T
     whites = [table.white[at] for table, at in zip((one, other), numbers, strict=True)]
     errors = [white_errors(table)[at] for table, at in zip((one, other), numbers, strict=True)]
     gains = [recorded_drift(table)[at] for table, at in zip((one, other), numbers, strict=True)]
@@ -742,11 +688,9 @@ def colour_groups(cells: CellDifferences, bits: int) -> tuple[ColourGroup, ...]:
 
 
 def _described(lut: Lut, place: Path) -> ComparedTable:
-    corrected = any(done.get("name") == "drift" and done.get("applied") for done in lut.provenance.corrections)
     known = lut.provenance
-    return ComparedTable(
-        place, known.camera, known.software, len(lut.illuminations), lut.samples.shape[2], bool(corrected)
-    )
+    corrected = any(done.get("name") == "drift" and bool(done.get("applied")) for done in known.corrections)
+    return ComparedTable(place, known.camera, known.software, len(lut.illuminations), lut.samples.shape[2], corrected)
 
 
 def _geometry(one: Lut, other: Lut) -> GeometryDifference | None:

@@ -31,7 +31,7 @@ from foundation.errors import first_of
 from foundation.files import write_whole
 from foundation.folders import whole_folder
 from foundation.pages import figure, heading, note, page, table, verdict
-from foundation.plots import FAINT, INK, MARK, draw_squares, png_of
+from foundation.plots import CHANNEL_INK, FAINT, INK, MARK, draw_squares, png_of
 from foundation.records import to_plain
 
 FORMAT = "crop.comparison"
@@ -49,7 +49,6 @@ _VERDICTS: dict[bool | None, tuple[Literal["accept", "remark"], str]] = {
     False: ("remark", "They differ by more than noise."),
     None: ("remark", "Whether they are the same within noise cannot be said of everything."),
 }
-_CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
 
 
 def lines(comparison: TableComparison) -> list[str]:
@@ -232,10 +231,10 @@ def draw_cells(figure: Any, cells: CellDifferences) -> None:
         if not known.any():
             continue
         mean, noise = cells.mean[known, channel], cells.noise[known, channel]
-        share.hist(100 * mean, bins=80, histtype="step", color=_CHANNEL_INK[channel], label="RGB"[channel])
+        share.hist(100 * mean, bins=80, histtype="step", color=CHANNEL_INK[channel], label="RGB"[channel])
         score.hist(
             np.clip((mean - cells.offset[channel]) / noise, -8, 8), bins=80, range=(-8, 8), histtype="step",
-            color=_CHANNEL_INK[channel], density=True,
+            color=CHANNEL_INK[channel], density=True,
         )  # fmt: skip
     at = np.linspace(-8, 8, 200)
     score.plot(at, np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi), color=FAINT, linewidth=0.9, label="noise alone")

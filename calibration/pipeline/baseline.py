@@ -16,7 +16,7 @@ from dataclasses import replace
 from datetime import timedelta
 from itertools import chain, pairwise
 from statistics import median
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -33,10 +33,10 @@ from calibration.pipeline.frames import (
     DecodedFrame,
     RegisteredFrame,
     SelectedFrames,
-    SensorLayout,
     beyond_print,
     compared_cells,
     register_frame,
+    sensor_layout,
     usable_means,
 )
 from calibration.radiometry.primaries import Primaries, pure_lights
@@ -54,9 +54,7 @@ from calibration.spread.fitting import DARK_LEVEL, LEAST_COUNTS, LOOSE_UNEVENNES
 from calibration.spread.predicting import VARYING_BITS
 from calibration.spread.surroundings import FrameLevels, photosite_offsets_px, printed_grid, unsuitable
 from calibration.table.lut import Lut, SourceFrame
-from drivers.raw.rawfile import (
-    CLIPPING_SHARE,
-)
+from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.chart.model import Chart
 from experiment.config import CameraSettings, CitationSettings
 from experiment.framing.pictures import STILL_PX
@@ -324,7 +322,7 @@ def _baseline(
         points=points,
         options=options,
         camera=first.mosaic.camera,
-        layout=SensorLayout.of(first.mosaic),
+        layout=sensor_layout(first.mosaic),
         first=registered,
         whites=whites,
         means=np.concatenate([level, references.mean(axis=1, dtype=np.float64)]),
@@ -350,8 +348,6 @@ def _consistency_check(
 
 ReportProgress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and what is being done."""
-
-_RIGS: tuple[Rig, ...] = ("lab", "simulated", "replay", "imported")
 
 _SETTING_RIGS = ("lab", "simulated")
 """Rigs whose settings set the camera; of others they say nothing of the exposure."""
@@ -430,7 +426,7 @@ def stated_origin(session: Session) -> StatedOrigin:
     """Return what a session states; what older software did not write, or is damaged, is not known."""
     try:
         document: dict[str, Any] = tomllib.loads(session.settings_text())
-        rig: Rig | None = next((known for known in _RIGS if known == document.get("rig")), None)
+        rig: Rig | None = next((known for known in get_args(Rig) if known == document.get("rig")), None)
         citation = CitationSettings.model_validate(document.get("citation", {}))
         set_by = CameraSettings.model_validate(document["camera"]) if rig in _SETTING_RIGS else None
     except (CropError, ValidationError, ValueError, KeyError, RecursionError) as error:

@@ -1,17 +1,10 @@
 """A session becomes a table: frames → measured → taken in → saved → figures → verdict → table.
 
-Rules that hold inside:
-
-- A session that lacks a light makes no table.
-- The table appears whole or not at all. Until then it stands beside its place under a hidden name, and a build that was
-  stopped, anywhere, goes on from its last checkpoint and ends in the bytes of one that was not: frames enter in the
-  order taken, and what one adds depends on those before it alone.
-- A checkpoint is one file, replaced whole: the accumulator, and the hashes of the samples on the disk. It is used only
-  if it was made of what is asked for now, and if the samples have these hashes; otherwise the work begins anew.
-- One program makes a table at a time.
-
-Threads read, decode and measure frames before their turn, each with what holds at that moment; where that has changed
-by the time a frame is taken in, it is measured again. The memory is that of a few frames whatever the session.
+The table appears whole or not at all. Until then it stands beside its place under a hidden name, and a build that was
+stopped, anywhere, goes on from its last checkpoint and ends in the bytes of one that was not. A checkpoint is one file,
+replaced whole: the accumulator, and the hashes of the samples on the disk. It is used only if it was made of what is
+asked for now and the samples have these hashes. Threads read, decode and measure frames before their turn, each with
+what holds at that moment; the memory is that of a few frames whatever the session.
 """
 
 from __future__ import annotations
@@ -52,8 +45,8 @@ from calibration.pipeline.frames import (
     MeasuredFrame,
     SelectedFrames,
     decode_frame,
+    measure_at,
     measure_primaries,
-    measure_registered_frame,
     sample_dark_frame,
     stored_names,
 )
@@ -78,11 +71,9 @@ from experiment.session.records import FrameRecord
 from foundation.compiled import processor_count
 from foundation.errors import CropError, FormatError, QualityError, RegistrationError, counted, first_of
 from foundation.files import write_whole
+from foundation.folders import clear_folder
 from foundation.records import to_plain
 from foundation.version import software
-
-REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
-"""What is kept of a refused table, where a report was written."""
 
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
@@ -101,11 +92,7 @@ WriteReport = Callable[[BuildResult, Session, Path], None]
 
 @dataclass(frozen=True)
 class TableProgress:
-    """How far a table has come that still lacks frames.
-
-    - `lights`, `lights_planned`: lights that it has, and lights of the session.
-    - `new_frames`, `frames`: frames taken in now, and in all.
-    """
+    """How far a table has come that still lacks frames; `new_frames` of them were taken in now."""
 
     lights: int
     lights_planned: int
@@ -147,7 +134,7 @@ def build(
             report(result, session, unfinished.folder)
         _write_table(done, figures, writer)
         if result.verdict.refused:
-            unfinished.discard()
+            unfinished.keep = False
             raise _refused(result, out, unfinished.folder)
         unfinished.publish()
         return result
@@ -207,7 +194,7 @@ def check(
     if picture is not None:
         write_whole(picture, annotated_png(first.mosaic, session.chart, baseline.first.registration.framing))
     in_place = Shift(0.0, 0.0, 0.0, 0)
-    measured = measure_registered_frame(baseline, first, baseline.first, in_place, keep_samples=True)
+    measured = measure_at(baseline, first, baseline.first, in_place, reregistered=False, keep_samples=True)
     done = Accumulator.empty(session, selected, baseline, first.saturation).with_frame(measured)
     dark = next((record for record in selected.records if record.kind == "dark"), None)
     if dark is not None:
@@ -359,7 +346,7 @@ def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWrite
 def _refused(result: BuildResult, out: Path, folder: Path) -> QualityError:
     """Return why there is no table; its report is kept beside the place where the table would be."""
     refused = refused_folder(out)
-    kept = [name for name in REPORT_FILES if (folder / name).exists()]
+    kept = [name for name in (REPORT_PAGE, REPORT_JSON) if (folder / name).exists()]
     for name in kept:
         write_whole(refused / name, (folder / name).read_bytes())
     where = f"; see {refused / kept[0]}" if kept else ""
@@ -441,5 +428,5 @@ def _writer(
         writer = LutWriter(unfinished.folder, *shape, written=written)
         if not writer.damaged():
             return writer, stored
-    unfinished.begin_anew()
+    clear_folder(unfinished.folder)
     return LutWriter(unfinished.folder, *shape), None

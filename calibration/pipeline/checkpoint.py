@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from calibration.table.lut import SAMPLES
 from foundation.files import partial_path, storage_error, sync_folder, write_whole
-from foundation.folders import clear_folder, held_folder, publish_folder, require_free
+from foundation.folders import held_folder, publish_folder, require_free
 
 CHECKPOINT = "checkpoint.npz"
 """Name of the checkpoint in the hidden folder."""
@@ -34,7 +34,6 @@ class Checkpoint:
     - `identity`: what it is made of and by what; a build goes on from a checkpoint of the same identity only.
     - `frames`: what names each frame taken in, in their order.
     - `values`: anything JSON can hold; numbers are restored to the last bit.
-    - `arrays`: arrays of plain numbers, by name.
     """
 
     identity: dict[str, Any]
@@ -44,12 +43,15 @@ class Checkpoint:
 
 
 class UnfinishedTable:
-    """The hidden folder of a table that is being made; made by `unfinished_table`."""
+    """The hidden folder of a table that is being made; made by `unfinished_table`.
+
+    `keep`: whether a later program may go on from here; no where that would lead to the same end.
+    """
 
     def __init__(self, folder: Path, out: Path) -> None:
         self.folder = folder
         self.out = out
-        self._keep = True
+        self.keep = True
 
     def load(self, identity: dict[str, Any], frames: list[str]) -> Checkpoint | None:
         """Return how far an earlier program came; None where there is no checkpoint, or it was made of something else.
@@ -76,14 +78,6 @@ class UnfinishedTable:
         np.savez(stream, allow_pickle=False, **{**checkpoint.arrays, _TEXT: text})
         write_whole(self.folder / CHECKPOINT, stream.getvalue())
 
-    def begin_anew(self) -> None:
-        """Empty the folder."""
-        clear_folder(self.folder)
-
-    def discard(self) -> None:
-        """Leave nothing behind when the block ends, since going on would lead to the same end."""
-        self._keep = False
-
     def publish(self) -> None:
         """Give the table its final name."""
         require_free(self.out, "the table")
@@ -93,11 +87,6 @@ class UnfinishedTable:
         except OSError as error:
             raise storage_error(self.out, error) from error
         publish_folder(self.folder, self.out, "the table")
-
-    @property
-    def worth_keeping(self) -> bool:
-        """Whether a later program could go on from here."""
-        return self._keep and (self.folder / CHECKPOINT).is_file()
 
 
 @contextmanager
@@ -111,6 +100,6 @@ def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
         try:
             yield unfinished
         finally:
-            if folder.is_dir() and not unfinished.worth_keeping:
+            if folder.is_dir() and not (unfinished.keep and (folder / CHECKPOINT).is_file()):
                 with contextlib.suppress(OSError):
                     shutil.rmtree(folder)

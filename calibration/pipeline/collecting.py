@@ -1,9 +1,7 @@
 """The figures of a whole table, or of a check, collected from its frames; and what is made of all of them.
 
-- A series of exposures of the chart, under one light, in its place: how linear the sensor is (`read_linearity`). What
-  its patches show is computed by `experiment.measures.sensor`. It is no part of a table: no sample depends on it, and
-  its figures are in the report alone. A frame that is not of the series (another camera, ISO speed or aperture, the
-  chart elsewhere) is refused by name.
+- A series of exposures of the chart, in its place: how linear the sensor is (`read_linearity`). No sample depends on
+  it.
 - The components of the uncertainty budget (`budget_of`): what each cause may leave, from what a session shows of it.
   What it does not show is what is usual, and says so; nothing is taken to be 0.
 
@@ -41,7 +39,7 @@ from calibration.radiometry.primaries import additivity, drift_gains, pure_light
 from calibration.radiometry.superposition import Superposition
 from calibration.sampling import mean_bleed
 from calibration.spread.added_light import LEAST_LEVEL
-from drivers.raw.rawfile import CLIPPING_SHARE, Mosaic, frame_black, read_raw, strongest_channel
+from drivers.raw.rawfile import CLIPPING_SHARE, frame_black, read_raw, strongest_channel
 from experiment.framing.pictures import REREGISTER_PX, Shift
 from experiment.lights import Illumination
 from experiment.measures.sensor import HIGHEST, LOWEST, deviations
@@ -243,7 +241,9 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
     limits: list[float] = []
     for path in paths:
         mosaic = read_raw(path)
-        times.append(_exposure_s(mosaic, path))
+        if not mosaic.shutter_s:
+            raise FormatError(f"{path} does not state its exposure time; take the series with a camera that writes it")
+        times.append(mosaic.shutter_s)
         settings.append((mosaic.iso, mosaic.aperture))
         if settings[-1] != settings[0]:
             raise FormatError(
@@ -270,12 +270,6 @@ def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
             "take the series with times less far apart, from dim to nearly saturated"
         )
     return LinearityMeasurements(tuple(paths[number].name for number in order), level, deviation)
-
-
-def _exposure_s(mosaic: Mosaic, path: Path) -> float:
-    if not mosaic.shutter_s:
-        raise FormatError(f"{path} does not state its exposure time; take the series with a camera that writes it")
-    return mosaic.shutter_s
 
 
 def _require_in_place(shift: Shift, path: Path) -> None:
@@ -417,7 +411,8 @@ def _light_figures(done: Accumulator, by_light: Sequence[FrameMeasurements]) -> 
     # A channel without light may be measured at or below 0; its standard error is what is known of it.
     white = np.maximum([frame.paper.white for frame in by_light], np.maximum(error, _LEAST_WHITE))
     whites = [frame for frame in done.frames if frame.record.kind == "white"]
-    gains = _gains(by_light, whites)
+    paper = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
+    gains = drift_gains(*_times_s(by_light, whites), paper)
     dark = np.zeros(3) if options.subtract_dark else done.dark_summary().light
     full_white = whites[0].paper.white if whites else None
     compared = whites[:1] if _drift_is_one(whites) else whites
@@ -434,9 +429,7 @@ def _light_figures(done: Accumulator, by_light: Sequence[FrameMeasurements]) -> 
         codes=agreement.rows(slice(len(by_light))),
         white_frames=agreement.rows(slice(len(by_light), None)) if whites else None,
         stray=_stray_light(illuminations, by_light, whites, dark, gains),
-        drift=drift_correction(*_times_s(by_light, whites), np.array([frame.paper.white for frame in whites]))
-        if options.correct_drift
-        else None,
+        drift=drift_correction(*_times_s(by_light, whites), paper) if options.correct_drift else None,
     )
 
 
@@ -499,16 +492,9 @@ def _stray_light(
     return stray_light(codes, white[:lights], error[:lights], full, pure_lights(illuminations))
 
 
-def _gains(by_light: Sequence[FrameMeasurements], whites: Sequence[FrameMeasurements]) -> _Array:
-    """Return the lamp's light at each light over that in the first white frame, (L, 3) float64; ones without one."""
-    if not whites:
-        return np.ones((len(by_light), 3))
-    return drift_gains(*_times_s(by_light, whites), np.array([frame.paper.white for frame in whites]))
-
-
 def _times_s(by_light: Sequence[FrameMeasurements], whites: Sequence[FrameMeasurements]) -> tuple[_Array, _Array]:
-    """Return when lights (L,) and white frames (W,) were taken, seconds since the first white frame."""
-    start = whites[0].record.taken_at
+    """Return when lights (L,) and white frames (W,) were taken, seconds since the first of these, if any."""
+    start = (*whites, *by_light)[0].record.taken_at
     at_s, white_at_s = (
         np.array([(frame.record.taken_at - start).total_seconds() for frame in frames]) for frames in (by_light, whites)
     )

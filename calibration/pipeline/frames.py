@@ -1,25 +1,11 @@
 """The frames of a table: each is read once and measured, with what holds for all of them, and taken in.
 
-- What a user may choose about how a table is built (`BuildOptions`), where the chart lies from a frame in which it was
-  registered until it moves too far from there (`RegisteredFrame`), and what holds for all frames (`Baseline`, made by
-  `calibration.pipeline.baseline`).
-- A frame as read, its hash checked (`DecodedFrame`); as measured: how the chart has moved, its paper and greys, its
-  samples (`MeasuredFrame`).
-- What the frames taken in so far have given (`Accumulator`): one frozen value after each, which a checkpoint stores.
-
-Rules that hold inside:
-
-- Cells are in the order of colour indices, as in the table, and not in the chart's own order. References follow the
-  cells, the white ones before the grey ones.
-- A frame is measured with the baseline, the frame registered last, and the dark light, and with nothing else, so that
-  frames can be measured in any order and by any thread.
-- The chart must lie where it was registered: a movement up to a tenth of a pixel is neglected, up to half a pixel the
-  sampling grid is moved along, and beyond it the chart is registered again in that frame.
+- Cells are in the order of colour indices, not in the chart's own; references follow them, the white ones first.
+- A frame is measured with the baseline, the frame registered last, and the dark light (that of the last dark frame, or
+  of the first for frames before it), and with nothing else, so that any thread may measure it in any order. Measured
+  before its turn, it counts only if the frame registered last is still the same.
 - Frames enter in the order taken. What one adds depends on those before it alone, so that a build that was stopped goes
   on to the same bits.
-- A frame measured before its turn counts only if the frame registered last is still the one it was measured with.
-- The dark light of a frame is that of the last dark frame before it, or of the first, for frames before that.
-- A cell that is cut off, clipped, covered or not of one colour is listed with its cause. It is never filled.
 
 C cells of S samples, W white references, N grey references; places on the print in millimetres, in frames in half-size
 pixels.
@@ -28,7 +14,7 @@ pixels.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -104,8 +90,6 @@ from foundation.robust import MAD_TO_SIGMA
 
 _BRIGHTEST_PERCENTILE = 99.5
 """Of the cells' levels, what is taken for paper white: the brightest of all may be a reflection."""
-
-_BEGIN_ANEW = "begin the build anew"
 
 _Array = npt.NDArray[np.float64]
 _Arrays = dict[str, npt.NDArray[Any]]
@@ -211,7 +195,6 @@ class ChartPoints:
 
     - `cells_mm`: (C, 2) float64 mm, centres of the cells in the order of colour indices.
     - `whites_mm`, `greys_mm`: (W, 2) and (N, 2) float64 mm, centres of the white and of the grey references.
-    - `levels`: the level of each grey reference.
     """
 
     cells_mm: _Array
@@ -239,9 +222,6 @@ class ChartPoints:
 class RegisteredFrame:
     """A frame in which the chart was registered; it holds for those after it until the chart moves too far.
 
-    - `registration`: the chart's place in it.
-    - `cells`: where the C cells are sampled.
-    - `references`: where the W + N references are sampled.
     - `gauges`: the frame around its tags, or the outline of its field, to measure movements against.
     - `lens`: corrects frames sampled at these places for what the lens spreads; None where nothing is corrected.
     """
@@ -281,36 +261,23 @@ def sites_of(
     return cells, references
 
 
-@dataclass(frozen=True)
-class SensorLayout:
-    """What all frames of a session have in common: visible area, shape of the sensor, Bayer pattern."""
+SensorLayout = tuple[Area, tuple[int, ...], str]
+"""What all frames of a session have in common: visible area, shape of the sensor, Bayer pattern."""
 
-    visible: Area
-    shape: tuple[int, ...]
-    pattern: str
 
-    @staticmethod
-    def of(mosaic: Mosaic) -> SensorLayout:
-        """Return the layout of a frame."""
-        return SensorLayout(mosaic.visible, mosaic.sensor.shape, mosaic.pattern)
-
-    def __str__(self) -> str:
-        return f"{self.shape[1]}×{self.shape[0]} photosites {self.pattern}"
+def sensor_layout(mosaic: Mosaic) -> SensorLayout:
+    """Return the layout of a frame's sensor."""
+    return mosaic.visible, mosaic.sensor.shape, mosaic.pattern
 
 
 @dataclass(frozen=True, eq=False)
 class Baseline:
     """What holds for all frames of a session; made by `baseline_of`.
 
-    - `chart`, `points`: the chart, and its points: C cells, W white and N grey references.
-    - `options`: how the table is built.
     - `camera`, `layout`: maker and model, and the sensor's layout, the same in all frames.
-    - `first`: the frame that is registered first.
     - `whites`: (W, 3) float64 counts above black of its white references; NaN where one cannot be used.
     - `means`: (C + W + N, 3) float64 counts above black of its cells and references.
     - `paper`: reads flat field and white of frames, with the shape of this one's as base.
-    - `transfer`: photon-transfer curve of its cells.
-    - `consistency_check`: compares other frames' cells with those of this one.
     - `primaries`: the primaries each alone; None where they were not given or cannot be used.
     - `lens`: what the lens spreads beside its sharp core, measured; None where it was not, or could not be.
     - `superposition`: what the first frame and those of the primaries show of the sensor's linearity; None where one of
@@ -340,11 +307,12 @@ class Baseline:
 
     def require_layout(self, mosaic: Mosaic, what: str) -> None:
         """Refuse a frame, called `what`, whose sensor or setting is not that of the first."""
-        found = SensorLayout.of(mosaic)
+        found = sensor_layout(mosaic)
         if found != self.layout:
+            has, had = (f"{shape[1]}×{shape[0]} photosites {pattern}" for _, shape, pattern in (found, self.layout))
             raise FormatError(
-                f"{what}: the sensor has {found}, that of {self.first.file} {self.layout}; a session has one camera "
-                "with one setting, so take the session anew"
+                f"{what}: the sensor has {has}, that of {self.first.file} {had}; a session has one camera with one "
+                "setting, so take the session anew"
             )
 
     def register(self, decoded: DecodedFrame) -> RegisteredFrame:
@@ -400,11 +368,6 @@ class Baseline:
         with threadpool_limits(limits=1, user_api="blas"):
             return added_light(self.levels, noise, usable, self.points.cells_mm, self.chart.page_mm, self.chart.bits)
 
-    def dark_light_estimate(self) -> DarkLightEstimate:
-        """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""
-        inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
-        return DarkLightEstimate.none(self.reflectances(), inside, self.options.samples)
-
     def reflectances(self) -> _Array:
         """Return the reflectance (C + W + N, 3) float64 of cells and references in the first frame, bare paper 1."""
         paper, shape = self.paper.read(self.whites, self.first.file)
@@ -445,8 +408,6 @@ class ChangedFrame(FormatError):
 class DecodedFrame:
     """A frame as read.
 
-    `mosaic`: its counts.
-
     - `black`: (2, 2) float64 counts, black level of each position of the block.
     - `strongest`: the channel with the brightest paper.
     - `saturation`: raw count of saturation, as far as it can be seen in this frame.
@@ -464,8 +425,6 @@ class SelectedFrames:
     """The frames that a table is made of.
 
     - `records`: every light's last accepted frame, and the accepted white and dark ones, in the order taken.
-    - `lights_without`: lights that have no accepted frame.
-    - `registered`: the frame in which the chart is registered first.
     - `primaries`: the frames of red, green and blue alone; () where one of the three is lacking.
     - `more_whites`: of a chart of few colours, further frames of the light in which it is registered.
     """
@@ -476,16 +435,14 @@ class SelectedFrames:
     primaries: tuple[FrameRecord, ...]
     more_whites: tuple[FrameRecord, ...]
 
-    @cached_property
-    def first_lit(self) -> FrameRecord:
-        """The first frame that is not dark."""
-        return next(record for record in self.records if record.kind != "dark")
-
     @property
     def newest(self) -> FrameRecord:
         """The frame that was taken last, dark ones apart."""
-        lit = (record for record in self.records if record.kind != "dark")
-        return max(lit, key=lambda record: record.attempt)
+        return max(self._lit, key=lambda record: record.attempt)
+
+    @property
+    def _lit(self) -> Iterator[FrameRecord]:
+        return (record for record in self.records if record.kind != "dark")
 
     def is_even(self, record: FrameRecord) -> bool:
         """Return whether a frame's samples show how even cells are: the white ones, or the first with any light.
@@ -493,7 +450,7 @@ class SelectedFrames:
         A file counts once, whatever it stands for: its noise is the same each time, and would not average out.
         """
         first = next((one for one in self.records if one.kind == "white" and one.sha256 == record.sha256), None)
-        return record == first or record is self.first_lit
+        return record == first or record is next(self._lit)
 
 
 def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
@@ -528,9 +485,7 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
 class MeasuredFrame:
     """A light or white frame as measured; C cells of S samples.
 
-    - `figures`: for the report, the ground truth and the flat field.
     - `registered`: the frame registered last, with which it was measured.
-    - `saturation`: raw count of saturation, as far as it can be seen in this frame.
     - `values`: (C, S, 3) uint16, the table's samples.
     - `highest`: (C,) uint16, the highest raw count of each cell.
     - `inside`: (C,) bool, whether all pixels of a cell lie in the frame.
@@ -552,7 +507,6 @@ class MeasuredFrame:
 class MeasuredDarkFrame:
     """A dark frame as measured; C cells of S samples.
 
-    - `figures`: what it shows.
     - `registered`: the frame registered last, with which it was measured.
     - `excess`: (C, S, 3) int16 counts, how far samples stand above their cells.
     - `means`: (C + W + N, 3) float64 counts above black of cells, then references.
@@ -586,23 +540,7 @@ def measure_frame(
         cells, references = sites_of(moved, baseline.points, shape, baseline.options.window)
         lens = baseline.correction(moved, cells, references)
         at = replace(registered, cells=cells, references=references, lens=lens)
-    return _measured(baseline, decoded, at, shift, False, keep_samples, dark, registered)
-
-
-def measure_registered_frame(
-    baseline: Baseline,
-    decoded: DecodedFrame,
-    registered: RegisteredFrame,
-    shift: Shift,
-    keep_samples: bool,
-    dark: DarkLight | None = None,
-) -> MeasuredFrame:
-    """Return what a frame shows in which the chart was registered, `shift` px from the frame registered before.
-
-    Parameters and errors are otherwise those of `measure_frame`.
-    """
-    again = registered is not baseline.first
-    return _measured(baseline, decoded, registered, shift, again, keep_samples, dark, registered)
+    return replace(measure_at(baseline, decoded, at, shift, False, keep_samples, dark), registered=registered)
 
 
 def sample_dark_frame(baseline: Baseline, decoded: DecodedFrame, registered: RegisteredFrame) -> MeasuredDarkFrame:
@@ -633,7 +571,7 @@ def measure_primaries(baseline: Baseline, frames: Iterable[DecodedFrame]) -> Pri
                 registered = baseline.register(decoded)
             except RegistrationError:
                 return None
-            measured = measure_registered_frame(baseline, decoded, registered, measured, keep_samples=False)
+            measured = measure_at(baseline, decoded, registered, measured, reregistered=True, keep_samples=False)
         light = decoded.record.illumination
         assert light is not None
         lights.append(light)
@@ -650,17 +588,16 @@ def movement_of(baseline: Baseline, before: RegisteredFrame, after: RegisteredFr
     return Shift(dx, dy, float(np.linalg.norm(by, axis=1).max()), len(by))
 
 
-def _measured(
+def measure_at(
     baseline: Baseline,
     decoded: DecodedFrame,
     at: RegisteredFrame,
     shift: Shift,
     reregistered: bool,
     keep_samples: bool,
-    dark: DarkLight | None,
-    registered: RegisteredFrame,
+    dark: DarkLight | None = None,
 ) -> MeasuredFrame:
-    """Return what a frame shows that is sampled `at` these places."""
+    """Return what a frame shows that is sampled `at` these places, `shift` px from the frame registered before."""
     points = baseline.points
     samples, highest = gather(decoded.mosaic, decoded.black, at.references)
     seen = usable_means(samples, highest, at.references, decoded.saturation)
@@ -704,7 +641,7 @@ def _measured(
         exposure=decoded.mosaic.origin.exposure,
         origin=decoded.mosaic.origin,
     )
-    return MeasuredFrame(figures, registered, decoded.saturation, values, highest, at.cells.inside, kept, noise)
+    return MeasuredFrame(figures, at, decoded.saturation, values, highest, at.cells.inside, kept, noise)
 
 
 def _to_subtract(
@@ -734,13 +671,9 @@ EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
 class Accumulator:
     """What the frames of a session that were taken in so far have given; each frame makes a new one.
 
-    - `session`, `selected`, `baseline`: where frames are read, which, and what holds for all of them.
-    - `figures`: of each frame taken in, in order.
     - `saturation`: raw count of saturation, the lowest that a frame shows.
-    - `registered`: the frame registered last.
     - `dark`: what is subtracted from the frames that follow; None where nothing is.
     - `estimate`: of the dark light; only dark frames that are subtracted enter it.
-    - `hot`: samples that stand out in every dark frame.
     - `highest`: (C,) uint16, the highest raw count of each cell.
     - `highest_at`: (C,) int64, the light under which it was reached; −1 for a white frame.
     - `outside`: (C,) bool, whether a cell was cut off in a frame.
@@ -749,7 +682,6 @@ class Accumulator:
       which the chart was registered; over the clearance of its samples (`Registration.clearance`).
     - `even_sum`: (C, S, 3) float32, sum of the frames of even light, counts above black.
     - `even_noise2`: (C, 3) float64, sum of the variances of one sample in these frames, counts².
-    - `even_frames`: how many they are.
     """
 
     session: Session
@@ -776,22 +708,23 @@ class Accumulator:
 
         The dark light that frames before the first dark one get is that one's, which is read for it.
         """
-        count, samples = baseline.chart.colour_count, baseline.options.samples
+        count, samples, first = baseline.chart.colour_count, baseline.options.samples, baseline.first
+        inside = np.concatenate([first.cells.inside, first.references.inside])
         found = Accumulator(
             session=session,
             selected=selected,
             baseline=baseline,
             figures=(),
             saturation=saturation,
-            registered=baseline.first,
+            registered=first,
             dark=None,
-            estimate=baseline.dark_light_estimate(),
+            estimate=DarkLightEstimate.none(baseline.reflectances(), inside, samples),
             hot=HotPixels.none(count, samples),
             highest=np.zeros(count, dtype=np.uint16),
             highest_at=np.zeros(count, dtype=np.int64),
             outside=np.zeros(count, dtype=np.bool_),
-            covered=_covered_cells(baseline, baseline.first),
-            place_error=baseline.first.registration.expanded_px(baseline.points.cells_mm),
+            covered=_covered_cells(baseline, first),
+            place_error=first.registration.expanded_px(baseline.points.cells_mm),
             even_sum=np.zeros((count, samples, 3), dtype=np.float32),
             even_noise2=np.zeros((count, 3)),
             even_frames=0,
@@ -799,7 +732,7 @@ class Accumulator:
         if not baseline.options.subtract_dark:
             return found
         record = next(record for record in selected.records if record.kind == "dark")
-        measured = sample_dark_frame(baseline, decode_frame(session, record), baseline.first)
+        measured = sample_dark_frame(baseline, decode_frame(session, record), first)
         return replace(found, dark=found._learned(measured).dark)
 
     @cached_property
@@ -874,7 +807,7 @@ class Accumulator:
         registered = self.baseline.register(decoded)
         shift = movement_of(self.baseline, self.registered, registered)
         even = self.selected.is_even(record)
-        measured = measure_registered_frame(self.baseline, decoded, registered, shift, even, self.dark)
+        measured = measure_at(self.baseline, decoded, registered, shift, True, even, self.dark)
         after = replace(
             self,
             registered=registered,
@@ -899,10 +832,7 @@ class Accumulator:
 
     def to_json(self) -> dict[str, Any]:
         """Return what a checkpoint stores as text; the rest is `to_arrays`."""
-        return {
-            "registered": self.registered.file,
-            "figures": to_plain(self.figures, _Figures),
-        }
+        return {"registered": self.registered.file, "figures": to_plain(self.figures, _Figures)}
 
     def to_arrays(self) -> _Arrays:
         """Return what a checkpoint stores as arrays, (...) of any dtype, by name: those of this value and its parts."""
@@ -911,7 +841,7 @@ class Accumulator:
 
     def restored(self, values: Mapping[str, Any], arrays: _Arrays) -> Accumulator:
         """Return what was stored of a build of the same frames, `arrays` (...) of any dtype; this one is empty."""
-        found = from_plain(_Figures, values["figures"], self.session.folder, _BEGIN_ANEW)
+        found = from_plain(_Figures, values["figures"], self.session.folder, "begin the build anew")
         figures = tuple(
             replace(each, record=record) for each, record in zip(found, self.selected.records, strict=False)
         )

@@ -1,18 +1,13 @@
 """Dark frames: the light that is there while the projector shows black, read noise, and hot photosites.
 
-Rules that hold inside:
+The projector's leak and ambient light are one figure, read on bare paper, and part of every light: nothing is
+subtracted unless the user asks for it. A photosite is hot when it is an outlier in every dark frame. What a dark frame
+adds depends on those before it alone, so that a build that was stopped goes on to the same bits.
 
-- The projector's leak and ambient light cannot be separated and are one figure, read on bare paper.
-- They are part of every light: samples and ground truth contain them alike, so nothing is subtracted unless the user
-  asks for it.
-- A photosite is hot when it is an outlier in every dark frame; an outlier in a single one is a cosmic ray.
-- What a dark frame adds depends on those before it alone, so that a build that was stopped goes on to the same bits.
-
-What is subtracted is predicted (docs/decisions/0009-dark-light-is-predicted.md). A dark frame shows the light at each
-cell, but with the noise of a few samples: 1.2 counts in a single frame, as much as the light itself often is. So it is
-dark paper × field × the cell's reflectance, and what cells show beyond the prediction is added as far as it is more
-than noise: the share w = 1 − noise² / variance of what is left over, one for each channel (empirical Bayes; B. Efron
-and C. Morris, Journal of the American Statistical Association 68, 1973).
+What is subtracted is predicted (docs/decisions/0009-dark-light-is-predicted.md), since a single dark frame shows each
+cell's light with as much noise: it is dark paper × field × the cell's reflectance, and what cells show beyond that is
+added as far as it is more than noise: the share w = 1 − noise² / variance of what is left over, one for each channel
+(empirical Bayes; B. Efron and C. Morris, Journal of the American Statistical Association 68, 1973).
 """
 
 from __future__ import annotations
@@ -92,10 +87,8 @@ class DarkLightEstimate:
     """What dark frames, one after another, have shown of the dark light; each makes a new one.
 
     - `reflectance`: (P, 3) float64 of each patch. `inside`: (P,) bool, whether a patch lies in the frame.
-    - `samples`: of each patch.
     - `left`: (P, 3) float64 counts, sum of what patches showed beyond the prediction.
     - `noise`: (3,) float64 counts², sum of the variances of a patch's mean.
-    - `frames`: how many they are.
     """
 
     reflectance: _Array
@@ -140,7 +133,6 @@ class DarkLightEstimate:
 class DarkSummary:
     """What the dark frames of a session show together.
 
-    - `files`: dark frames read.
     - `light`: (3,) float64 counts above black on bare paper, field divided out: leak and ambient light, the median of
       the frames; NaN without dark frames.
     - `error`: (3,) float64, standard error of `light`.
@@ -168,7 +160,6 @@ class DarkFrameFigures:
     - `black`: (2, 2) float64 counts.
     - `light`, `error`: (3,) float64 counts above black on bare paper, field divided out, and their standard error.
     - `noise`: (3,) float64 counts, standard deviation of a sample.
-    - `origin`: camera, lens and exposure as the raw file states them.
     """
 
     record: FrameRecord

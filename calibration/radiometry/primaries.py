@@ -1,18 +1,15 @@
 """Red, green and blue alone: the flat field of coloured cells, whether the primaries add up, and how the lamp drifts.
 
 A projector's red, green and blue do not fade alike towards the corners. The field of a light that mixes them, as bare
-paper shows it in a channel, is the mean of their fields, weighted by what paper reflects of each into that channel; a
-coloured cell reflects other shares, and its mean is another. The frames of the primaries alone show both: the field of
-each, on paper, and what each cell reflects of it. What a light is mixed of follows from its paper
-(`docs/decisions/0014-fields-of-the-primaries.md`).
-
-Additivity and drift alter no table: each light's ground truth is measured in the frame of its samples.
+paper shows it, is the mean of their fields, weighted by what paper reflects of each; a coloured cell reflects other
+shares, and its mean is another. The frames of the primaries alone show both
+(`docs/decisions/0014-fields-of-the-primaries.md`). Additivity and drift alter no table.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -142,7 +139,8 @@ class Primaries:
             return None
         best = white.argmax(axis=1).tolist()
         red, green, blue = (
-            _for_all_channels(paper.field, int(channel)) for paper, channel in zip(papers, best, strict=True)
+            replace(paper.field, coefficients=(paper.field.coefficients[channel],) * 3)
+            for paper, channel in zip(papers, best, strict=True)
         )
         at_cells = np.array([shape.at(cells_mm)[:, 0] for shape in (red, green, blue)])
         one, two, three = lights
@@ -195,8 +193,3 @@ class Primaries:
             "paper": np.round(self.paper, 4).tolist(),
             "per_light": np.round([self.amounts(light) for light in white], 7).tolist(),
         }
-
-
-def _for_all_channels(field: FlatField, channel: int) -> FlatField:
-    factors = field.coefficients[channel]
-    return FlatField(field.page_mm, (factors, factors, factors))

@@ -82,14 +82,6 @@ class Unmeasured:
     why: str
     remedy: str
 
-    @staticmethod
-    def for_few(patches: int, needed: int) -> Unmeasured:
-        """Return it for a chart of which too few patches can be used."""
-        return Unmeasured(
-            f"{patches} patches of the chart can be used for it and {needed} are needed, whichever lights are planned",
-            f"use a chart of more colours, or {_SERIES}",
-        )
-
 
 NO_PRIMARIES = Unmeasured(
     "no lights of each primary alone show it",
@@ -176,7 +168,8 @@ def superposition(
     """
     patches, needed = int(usable.sum()), max(_LEAST_PATCHES, 2 * known.shape[1])
     if patches < needed:
-        return Superposition.usual(full, Unmeasured.for_few(patches, needed))
+        why = f"{patches} patches of the chart can be used for it and {needed} are needed, whichever lights are planned"
+        return Superposition.usual(full, Unmeasured(why, f"use a chart of more colours, or {_SERIES}"))
     seen, known = np.stack([together, *alone])[:, usable], known[usable]
     hats, size = _hats(seen / full), _AMOUNTS + len(NODES)
     whites = _WHITES if white else ((_LOOSE, _LOOSE, 1.0),)

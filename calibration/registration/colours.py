@@ -148,10 +148,8 @@ def slipped_parts(
 class ColourModel:
     """What camera RGB a printed code gives in one frame: a polynomial, times a smooth light over the page.
 
-    - `degree`: of the polynomial in the three codes.
     - `coefficients`: (terms, 3) float64, counts.
     - `light`: (6, 3) float64, polynomial of second order in page coordinates −1 … 1, mean about 1.
-    - `page_mm`: width and height of the sheet.
     """
 
     degree: int

@@ -360,7 +360,6 @@ class LateralColour:
     """How far out red and blue lie against green.
 
     - `centre_px`: (2,) float64, the frame's middle.
-    - `radius_px`: half the frame's diagonal.
     - `terms_px`: (2, 2) float64, of red and of blue: the linear and the cubic term at the frame's corner. Zeros until
       measured.
     - `covariance_px2`: (4, 4) float64 of `terms_px`, row by row.

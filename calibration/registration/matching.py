@@ -1,14 +1,9 @@
 """The map from print to frame moved until both coincide, and how well each place is known then.
 
-Rules that hold inside:
-
-- The frame is rectified to the print, compared with the print's colours as the camera sees them (a colour model fitted
-  on the frame itself), and a smooth displacement is fitted to what does not coincide.
-- First whole blocks are found where they are, by correlation (`find_blocks`); then all cells move together, by
-  Gauss-Newton steps (`compare_tiles`). Without the first the second locks onto the neighbouring cell.
-- All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres,
-  and the lens's lateral chromatic aberration is measured with the map, which is green's.
-- How well the map fits is said of blocks of cells, and of each place by the noise of what it was measured on.
+The frame is rectified to the print, compared with the print's colours as the camera sees them (a colour model fitted on
+the frame itself), and a smooth displacement is fitted to what does not coincide: first whole blocks are found by
+correlation (`find_blocks`), then all cells move together, by Gauss-Newton steps (`compare_tiles`). Without the first
+the second locks onto the neighbouring cell. All colours are used, each in its own place; the map is green's.
 """
 
 from __future__ import annotations
@@ -306,8 +301,6 @@ class Matcher:
     """Compares a frame with the print, in the print's own raster, and moves the map until they coincide.
 
     - `displacement`: what is added to the lens; zero at first.
-    - `lateral`: where red and blue lie against green.
-    - `colours`: the frame's colour model, fitted again as the map moves.
     """
 
     def __init__(

@@ -1,12 +1,8 @@
 """Where every point of the print lies in a frame: tags or the field's outline first, then the cells themselves.
 
-Rules that hold inside:
-
-- Tags give a homography and Brown's distortion and nothing finer: 35 of them cannot sample a wavy sheet. The local
-  part is measured on the cells (`calibration.registration.matching`).
-- A chart without tags has the outline of its field for that, and is then followed from coarse to fine: a map that has
-  slipped by a cell is looked for, and refused.
-- A registration that cannot be trusted is a `RegistrationError`, never a value.
+Tags give a homography and Brown's distortion and nothing finer: 35 of them cannot sample a wavy sheet. A chart without
+tags has the outline of its field for that, and is then followed from coarse to fine: a map that has slipped by a cell
+is looked for. A registration that cannot be trusted is a `RegistrationError`, never a value.
 
 Places are half-size pixels, pixel centres at integers; millimetres on the print.
 """
@@ -89,15 +85,11 @@ registered well."""
 class Registration:
     """The chart's place in a frame.
 
-    - `framing`: the tags, or the field's outline, as found.
     - `lens`, `displacement`: the two parts of the map of green.
     - `lateral`: where red and blue lie against it.
     - `marks_residual_px`: (N, 2) float64, the tags' corners against the final map; of a chart without tags the field's
       outline, across.
     - `lens_residual_px`: RMS of the same against the lens alone: what the paper's waviness leaves.
-    - `blocks`: fit of the cells.
-    - `place_errors`: how well places are known.
-    - `colours`: the colour model of the frame.
     - `mismatched_cells`: (N,) bool, cells in the chart's order whose colour is not nearly the model's: covered,
       damaged, misprinted.
     - `agreement`: correlation of the cells' colours with the model's, the mean of the channels that carry light.

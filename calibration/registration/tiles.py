@@ -1,12 +1,9 @@
 """A rectified frame compared with the print as drawn, on a raster on the print: block by block, then tile by tile.
 
-`find_blocks` finds blocks of cells where they are, by correlation, up to one and a half cells away from where a map has
-them. Without this first step the fine comparison locks onto the neighbouring cell where the sheet waves: 15 px off for
-a wave of 6 mm, in simulated frames. `compare_tiles` then says how each tile would move the map: one step of Lucas and
-Kanade's method, with gain and offset local and free, as the light and the lens's shading are, and residuals weighted by
-Huber's function (B. D. Lucas and T. Kanade, "An iterative image registration technique", IJCAI 1981).
-
-Pure geometry and sums, without lenses or colours. Elements, millimetres on the print, and half-size pixels.
+`find_blocks` finds blocks of cells where they are, by correlation, up to one and a half cells away. `compare_tiles`
+then says how each tile would move the map: one step of Lucas and Kanade's method, with gain and offset local and free,
+and residuals weighted by Huber's function (B. D. Lucas and T. Kanade, "An iterative image registration technique",
+IJCAI 1981). Elements, millimetres on the print, and half-size pixels.
 """
 
 from __future__ import annotations
@@ -64,7 +61,6 @@ class Raster:
 
     - `low_mm`: (2,) float64, corner of the first element, x then y.
     - `step_mm`: (2,) float64, an element's width and height.
-    - `shape`: rows and columns.
     """
 
     low_mm: _Array

@@ -1,12 +1,7 @@
 """The pictures of the report, each drawn on a Matplotlib figure of its own (`foundation.plots.png_of`).
 
-First the registered chart, the lights, the course of the session; then where samples err and the sensor's noise; then
-what is beyond a limit: the frame with its places circled, and what the field leaves of references.
-
 A frame is drawn at half size, linear camera RGB: one pixel for each 2×2 block, nothing interpolated (the paper's
-"simple subsampling and debayering", section 3.3): red, the mean of both greens, blue, after the black level has been
-subtracted, each phase its own. An odd last row or column is dropped. Pixel (i, j) is the block whose top-left photosite
-is (2i, 2j).
+"simple subsampling and debayering", section 3.3).
 """
 
 from __future__ import annotations
@@ -343,24 +338,23 @@ def draw_course(figure: Any, table: TableMeasurements) -> None:
     (black, shift, blur), (white, consistency, used) = figure.subplots(2, 3)
     count = np.arange(len(frames))
     level = np.array([frame.black.mean() for frame in frames])
-    black.plot(count, level, ".", color=INK, markersize=3)
-    black.set(title="black level", ylabel="counts", xlabel="frame")
+    blurs, moved = [frame.blur_px for frame in frames], [frame.shift.length_px for frame in frames]
+    counts = [frame.paper.references for frame in frames]
+    for axes, values, title, unit in (
+        (black, level, "black level", "counts"),
+        (blur, blurs, "blur σ", "px"),
+        (used, counts, "white references used", ""),
+        (shift, moved, "movement of the chart", "px"),
+    ):
+        axes.plot(count, values, ".", color=INK, markersize=3)
+        axes.set(title=title, ylabel=unit, xlabel="frame")
     middle = float(np.median(level)) if len(level) else 0.0
     black.set_ylim(middle - max(1.0, float(np.ptp(level))), middle + max(1.0, float(np.ptp(level))))
-    blurs = [frame.blur_px for frame in frames]
-    blur.plot(count, blurs, ".", color=INK, markersize=3)
-    blur.set(title="blur σ", ylabel="px", xlabel="frame")
     _ring_largest(blur, blurs, table)
-    counts = [frame.paper.references for frame in frames]
-    used.plot(count, counts, ".", color=INK, markersize=3)
-    used.set(title="white references used", xlabel="frame", ylim=(0, 1.15 * max(counts, default=1)))
+    used.set_ylim(0, 1.15 * max(counts, default=1))
     _ring_largest(used, counts, table, least=True)
-    moved = [frame.shift.length_px for frame in frames]
-    shift.plot(count, moved, ".", color=INK, markersize=3)
     shift.axhline(STILL_PX, color=MARK, linewidth=0.8, linestyle=(0, (4, 3)))
-    shift.set(
-        title="movement of the chart", ylabel="px", xlabel="frame", ylim=(0, max(0.12, 1.1 * max(moved, default=0)))
-    )
+    shift.set_ylim(0, max(0.12, 1.1 * max(moved, default=0)))
     _ring_largest(shift, moved, table)
     at = [number for number, frame in enumerate(frames) if frame.record.kind == "white"]
     whites = np.array([frames[number].paper.white for number in at]).reshape(-1, 3)
@@ -385,27 +379,14 @@ def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], table: TableMea
     if not has_enough_cells(len(table.registration.mismatched_cells)):
         axes.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=axes.transAxes)
         return
-    axes.plot(
-        count,
-        [100 * frame.consistency.scatter for frame in table.frames],
-        ".",
-        color=INK,
-        markersize=3,
-        label="scatter of all cells",
-    )
-    axes.plot(
-        count,
-        [100 * frame.consistency.block for frame in table.frames],
-        "x",
-        color=MARK,
-        markersize=3,
-        label="worst block of cells",
-    )
+    scatter = [100 * frame.consistency.scatter for frame in table.frames]
+    block = [100 * frame.consistency.block for frame in table.frames]
+    axes.plot(count, scatter, ".", color=INK, markersize=3, label="scatter of all cells")
+    axes.plot(count, block, "x", color=MARK, markersize=3, label="worst block of cells")
     axes.legend(frameon=False, fontsize=7, loc="upper right")
     axes.set_ylim(bottom=0, top=max(1.5, 1.3 * axes.get_ylim()[1]))
-    _ring_largest(axes, [100 * frame.consistency.scatter for frame in table.frames], table)
-    if any(frame.consistency.block for frame in table.frames):
-        _ring_largest(axes, [100 * frame.consistency.block for frame in table.frames], table)
+    _ring_largest(axes, scatter, table)
+    _ring_largest(axes, block, table)
 
 
 def draw_worst_cells(figure: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:
@@ -626,14 +607,9 @@ def draw_reference_residuals(figure: Any, chart: Chart, places_mm: _Array, resid
     right.set_ylim(-reach, reach)
 
 
-def half_size(mosaic: Mosaic, black: npt.NDArray[np.float64] | None = None) -> npt.NDArray[np.float32]:
-    """Return a frame as linear RGB.
-
-    `black`: (2, 2) float64 counts of each position of the block; the masked border's mean if not given, or where there
-    is none, what the metadata state. Returns (H // 2, W // 2, 3) float32, counts above black; noise makes some of a
-    dark frame's negative.
-    """
-    black = frame_black(mosaic) if black is None else black
+def half_size(mosaic: Mosaic) -> npt.NDArray[np.float32]:
+    """Return a frame as linear RGB, (H // 2, W // 2, 3) float32 counts above black; an odd last row is dropped."""
+    black = frame_black(mosaic)
     blocks = mosaic.block_planes()
     image = np.empty((*blocks.shape[2:], 3), dtype=np.float32)
     for column, channel in enumerate(CHANNELS):

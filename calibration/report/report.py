@@ -1,12 +1,8 @@
 """The table's report: one page that shows by eye what the figures claim, and the same figures for programs.
 
-`report.json`, whose form is stated in docs/formats.md, holds figures, limits and verdict; `report.html` opens with the
-verdict, what to do, and the pictures that are looked at first: the registered grid over the frame, the lights as
-planned and as the camera saw them (the paper's three figures of chromaticities), where cells err, and the noise. All
-figures follow in groups, each with its pictures, by the names that figures give of them (`Figure.drawing`).
-
-The page, one file to be mailed, is `templates/report.html`; here stands what it shows. Each figure's row comes from the
-figure.
+`report.json`, whose form is stated in docs/formats.md, holds figures, limits and verdict; `report.html`, one file to be
+mailed, opens with the verdict, what to do, and the pictures that are looked at first. All figures follow in groups,
+each with its pictures, by the names that figures give of them (`Figure.drawing`).
 """
 
 from __future__ import annotations
@@ -82,6 +78,7 @@ def report_json(result: BuildResult) -> dict[str, Any]:
     """Return the content of `report.json`: verdict, figures, and every limit with its reason."""
     table, verdict = result.figures, result.verdict
     off_codes_deg, primaries = table.lights.off_codes_deg, table.primaries
+    newest = max((frame.record for frame in table.frames), key=lambda record: record.attempt)
     return {
         "format": REPORT_FORMAT,
         "version": REPORT_VERSION,
@@ -102,7 +99,7 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
         "figures": {name: _rounded(value) for name, value in judged_values(table).items()},
         "causes": _causes(result),
-        **retake_json(retaken_frames(verdict, table), table.registered_frame.record.sha256, _newest_sha256(table)),
+        **retake_json(retaken_frames(verdict, table), table.registered_frame.record.sha256, newest.sha256),
         "limits": [row.figure.limit_json() | {"outcome": row.outcome} for row in verdict.rows],
     }
 
@@ -132,11 +129,6 @@ def _causes(result: BuildResult) -> list[dict[str, Any]]:
         }
         for name, found in findings(result.verdict, result.figures).items()
     ]
-
-
-def _newest_sha256(table: TableMeasurements) -> str:
-    """Return the hash of the measured frame that was taken last."""
-    return max((frame.record for frame in table.frames), key=lambda record: record.attempt).sha256
 
 
 def _chart_places(table: TableMeasurements) -> dict[str, Any]:
@@ -185,15 +177,12 @@ def _codes(codes: CodeAgreement) -> dict[str, Any]:
 
 def _origins(table: TableMeasurements) -> dict[str, Any]:
     """Return which frames' files state another camera, lens or exposure than most."""
-    origins = table.origins
-    named = {
-        "other_camera": origins.other_camera,
-        "other_lens": origins.other_lens,
-        "other_exposure": origins.other_exposure,
-    }
     return {
-        name: [{"file": frame.record.file, "found": frame.found, "expected": frame.expected} for frame in frames]
-        for name, frames in named.items()
+        name: [
+            {"file": frame.record.file, "found": frame.found, "expected": frame.expected}
+            for frame in getattr(table.origins, name)
+        ]
+        for name in ("other_camera", "other_lens", "other_exposure")
     }
 
 
@@ -260,6 +249,12 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
     table = result.figures
     chart, registration = session.chart, table.registration
     frame = half_size(read_raw(session.folder / table.session.registered_file))
+    primaries = "No frames of red, green and blue alone show whether these light the print alike."
+    if table.primaries is not None:
+        primaries = (
+            f"Red, green and blue differ by up to {100 * table.primaries.difference:.1f} % in how they light it; what "
+            "that makes of each cell by its colour is divided out too."
+        )
     return [
         *_first_pictures(result, session, frame, worsts),
         _Picture(
@@ -274,7 +269,7 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
         _Picture(
             "The light on the print",
             "Shape of the light under the frame that was registered, from its white references; it is divided out of "
-            f"samples and ground truth. Contours are 2 % apart. {_primaries_caption(table)}",
+            f"samples and ground truth. Contours are 2 % apart. {primaries}",
             png_of(draw_field, chart, table.registered_frame.paper.field),
             "light",
             "field",
@@ -402,24 +397,8 @@ def _residual_picture(chart: Chart, table: TableMeasurements, picture: npt.NDArr
         "what lies or shines on the print is one place. Right, by the distance from the middle: a bend at its end is "
         "fall-off that the field does not follow."
     )
-    return [
-        _Picture(
-            "What the field leaves",
-            caption,
-            png_of(draw_reference_residuals, chart, places_mm, residual),
-            "truth",
-            "rest",
-        )
-    ]
-
-
-def _primaries_caption(table: TableMeasurements) -> str:
-    if table.primaries is None:
-        return "No frames of red, green and blue alone show whether these light the print alike."
-    return (
-        f"Red, green and blue differ by up to {100 * table.primaries.difference:.1f} % in how they light it; what "
-        "that makes of each cell by its colour is divided out too."
-    )
+    drawn = png_of(draw_reference_residuals, chart, places_mm, residual)
+    return [_Picture("What the field leaves", caption, drawn, "truth", "rest")]
 
 
 def _print_picture(chart: Chart, stains: Stains) -> list[_Picture]:

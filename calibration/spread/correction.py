@@ -75,7 +75,6 @@ class PrintView:
     """
 
     grid: PrintedGrid
-    neighbours: npt.NDArray[np.int32]
     whites: slice
     photosites_px: _Array
     frame_px: tuple[int, int]
@@ -99,7 +98,7 @@ class PrintView:
         low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
         light = UsualLight.of(grid, field.at(grid.points_mm), field.at(np.clip(grid.slots_mm, low, high)))
         beyond = _places_beyond(grid, registration, shape, window)
-        return PrintView(grid, grid.neighbours, whites, photosites_px, shape, light, beyond)
+        return PrintView(grid, whites, photosites_px, shape, light, beyond)
 
     def around(self, registration: Registration, cells: Sites, references: Sites) -> Surroundings:
         """Return the surroundings of the patches of a frame, given where they are sampled."""
@@ -118,7 +117,6 @@ class PrintView:
         return Surroundings(
             grid=self.grid,
             window=cells.window,
-            neighbours=self.neighbours,
             offset_px=np.ascontiguousarray(offset),
             pitch_px=pitch,
             frame_slots=float(np.prod(self.frame_px) / pitch.prod(axis=1).mean()),
@@ -132,10 +130,7 @@ class PrintView:
 class FrameCorrection:
     """The correction of frames that are sampled at the same places.
 
-    - `around`: the patches' surroundings.
-    - `near`: weights of the near kernels.
     - `far`, `veil`: shares of the far kernels (3, F), and of the veil (3,), by channel.
-    - `beyond`: places that show what lies behind the print.
     """
 
     around: Surroundings
@@ -169,7 +164,6 @@ class FrameCorrection:
 class SpreadFrame:
     """A frame that the point spread is measured on.
 
-    - `levels`: what it shows.
     - `field`: (P, 3) float64, its flat field at the patches.
     - `white`: (3,) float64 counts, its bare paper.
     - `usable`: (P,) bool, patches that are in the frame, not clipped and not covered.
@@ -248,11 +242,6 @@ class LensFigures:
         )
 
     @property
-    def assumed(self) -> bool:
-        """Whether what is said of white and cells is of a usual lens, and not of this one."""
-        return not self.measured
-
-    @property
     def uncorrected_in_worst(self) -> float:
         """Share of the worst sample's light from beyond its cell, but for the sharp core's, that is not corrected."""
         return max(self.left_in_worst, 0.0) if self.corrected else self.beyond_cell
@@ -286,17 +275,14 @@ class LensFigures:
         found: dict[str, Any] = {name: float(f"{getattr(self, name):.4g}") for name in shares}
         found |= {
             "white_covariance": [[float(f"{value:.4g}") for value in row] for row in self.white_covariance.tolist()],
-            "assumed": self.assumed,
+            "assumed": not self.measured,
         }
         return {"measured": self.measured, "corrected": self.corrected, "why_not": self.why_not, **found}
 
 
 @dataclass(frozen=True, eq=False)
 class LensCorrection:
-    """The lens of a session: its point spread, what is said of it, and the view by which frames are corrected.
-
-    `view`, `spread`, `figures`: as said.
-    """
+    """The lens of a session: its point spread, what is said of it, and the view by which frames are corrected."""
 
     view: PrintView
     spread: PointSpread
@@ -341,7 +327,10 @@ def measure_spread(
     scales: list[_Array] = []
     of_paper: dict[int, _Array] = {}
     references: list[ReferenceData] = []
-    near = [around.near(_whole(kernel)) for kernel in range(len(NEAR_PX))]
+    # All of a near kernel, the same over the frame, and nothing of the others.
+    whole = np.zeros((len(NEAR_PX), PLACES, 3, len(NEAR_PX)))
+    whole[:, 0] = np.eye(len(NEAR_PX))[:, None]
+    near = [around.near(amounts) for amounts in whole]
     # Of each channel the frame in which it has most light, of all frames that it is the mean of.
     best = np.argmax([frame.white * frame.frames for frame in frames], axis=0)
     for number, frame in enumerate(frames):
@@ -370,13 +359,6 @@ def measure_spread(
     if spread is None:
         return None
     return spread, _figures(spread, data, scales, of_paper, around, bits, least_counts, left_out)
-
-
-def _whole(kernel: int) -> _Array:
-    """Return amounts (9, 3, N): all of a near kernel, the same over the frame, and nothing of the others."""
-    amounts = np.zeros((PLACES, 3, len(NEAR_PX)))
-    amounts[0, :, kernel] = 1
-    return amounts
 
 
 def _references(frame: SpreadFrame, around: Surroundings, channel: int, changes: _Array) -> list[ReferenceData]:

@@ -1,21 +1,18 @@
 """The lens's point spread beside its sharp core, and how much of it there is: regression on the light around each cell.
 
 A share is that of a point's light which the lens spreads over a Gaussian of that σ, rather than where it belongs.
-Gaussians add up to any spread that falls with the distance: exponentials, Moffat's function and power laws are all
-mixtures of them. Light that the lens spreads evenly over the frame is the veil (veiling glare, ISO 9358).
+Gaussians add up to any spread that falls with the distance. Light that the lens spreads evenly over the frame is the
+veil (veiling glare, ISO 9358).
 
 The colours of a chart lie in random order, so that what a cell's neighbours have is unrelated to its own code. A cell's
-own level is predicted from the six codes next to its own, which lie elsewhere on the print, less the curvature that the
-codes beside show; what it differs by from that is regressed on what each kernel would bring to it.
-
-Rules that hold inside:
+own level is predicted from the codes next to its own; what it differs by from that is regressed on what each kernel
+would bring to it.
 
 - Nothing that carries a cell's own noise is among the regressors: own levels are predicted ones there.
 - What the field's fit and the print's unevenness can be wrong by, smooth factors of a cell's level, is fitted along,
-  and held near 0 by what is usual of them. Veil is told from it since it adds the same to dark and bright cells.
-- A far kernel's share is not below 0, and a kernel whose omission costs less than `LEAST_GAIN` is left out. What lies
-  far is not: beside kernels that are proven far ones and the veil have their likeliest shares, which what is usual of
-  lenses holds towards 0, and those of R, G and B towards each other.
+  and held near 0. Veil is told from it since it adds the same to dark and bright cells.
+- A far kernel's share is not below 0, and a kernel whose omission costs less than `LEAST_GAIN` is left out. Beside
+  kernels that are proven far ones and the veil have their likeliest shares, which what is usual of lenses holds.
 
 C cells in the order of colour indices; T unknowns of a channel.
 """
@@ -304,13 +301,11 @@ class PointSpread:
 class SpreadData:
     """A channel of a frame: what cells show, and what kernels would change of it.
 
-    - `channel`: 0, 1 or 2.
     - `level`: (C,) float64, bare paper 1, the field divided out.
     - `changes`: (C, T) float64, change of `level` for a whole share of each unknown of the channel, by the light that
       comes in.
     - `even`: (C,) float64, change of `level` for light that lies evenly over all of the frame.
     - `field`: (C,) float64, the frame's light there, about 1.
-    - `usable`: (C,) bool.
     - `unevenness`: standard deviation of the coefficients of smooth factors.
     - `bend`: standard deviation of what counts of bare paper may lack beside those of dark cells, relative.
     """
@@ -329,7 +324,6 @@ class SpreadData:
 class ReferenceData:
     """A channel of a frame at references of one colour, whose level no model of colours has to predict.
 
-    - `channel`: 0, 1 or 2.
     - `level`: (N,) float64, bare paper 1, the field divided out.
     - `changes`: (N, T) float64, as in `SpreadData`.
     - `field`: (N,) float64, as in `SpreadData`.

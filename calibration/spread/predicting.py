@@ -57,7 +57,6 @@ _Mask = npt.NDArray[np.bool_]
 class LevelModel:
     """What predicts the levels of cells.
 
-    - `bits`: of the chart.
     - `known`: (C,) bool, whether others predict a cell.
     - `freedom`: share of the noise's squares that is left in the residuals.
     - `predicted`: (C,) float64, levels as the codes have them; a cell's own where nothing predicts it.

@@ -3,11 +3,10 @@
 - The print is a grid of slots of one size, as charts of `experiment.chart.layout` are made: every cell and reference
   fills a slot, a tag has 4 × 4 of them and a module is two fifths of one. A patch is a cell (in the order of colour
   indices) or a reference behind them, the white ones before the grey ones.
-- Near kernels are integrated over each slot and each of a window's pixels, where they lie in the frame, each channel's
-  photosites in their own place; tags and margins in fifths of a slot.
-- Far kernels blur the print slot by slot, in which a patch's place within its slot does not matter.
-- Levels are what the frame itself shows: of cells and references their means, of bare paper and black ink the usual
-  ones in the light of the place, of what lies behind the print the mean of places beside it.
+- Near kernels are integrated over each slot and each of a window's pixels, channel by channel; tags and margins in
+  fifths of a slot. Far kernels blur the print slot by slot.
+- Of bare paper and black ink levels are the usual ones in the light of the place, of what lies behind the print the
+  mean of places beside it.
 
 Half-size pixels; P patches as in `PrintedGrid`; counts above black.
 """
@@ -16,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -75,7 +75,7 @@ class PrintedGrid:
     others: npt.NDArray[np.float32]
     slots_mm: _Array
 
-    @property
+    @cached_property
     def neighbours(self) -> _Index:
         """(P, 25) int32, the patches in the 5 × 5 slots around each patch, row by row; −1 where there is none."""
         steps = np.arange(-REACH, REACH + 1)
@@ -186,19 +186,16 @@ class Surroundings:
     """A frame's patches and what lies around them; made by `PrintView.around`.
 
     - `grid`, `window`: the print, and pixels along a patch's window.
-    - `neighbours`: (P, 25) int32, as in `PrintedGrid`.
     - `offset_px`: (P, 3, 2) float64, from each patch's centre to the middle of its window, along the print's axes, by
       channel.
     - `pitch_px`: (P, 2) float64, a slot's width and height.
     - `frame_slots`: how many slots the frame would hold.
     - `places`: (P, 9) float64, the terms of a share over the frame at each patch (`place_terms`).
     - `whites`: places of the white references among the patches.
-    - `light`: the usual light of the session.
     """
 
     grid: PrintedGrid
     window: int
-    neighbours: npt.NDArray[np.int32]
     offset_px: _Array
     pitch_px: _Array
     frame_slots: float
@@ -221,10 +218,10 @@ class Surroundings:
         table = np.array([pitches[0], pitches[1] - pitches[0], first, step])
         grid, local = self.grid, np.ascontiguousarray(np.einsum("np,pck->nck", self.places, amounts))
         kernels.weights_around(
-            grid.row, grid.column, self.neighbours, grid.parts, self.offset_px, self.pitch_px, shares, table, local,
+            grid.row, grid.column, grid.neighbours, grid.parts, self.offset_px, self.pitch_px, shares, table, local,
             weights, others,
         )  # fmt: skip
-        return NearLight(self.neighbours, weights, others, local.sum(axis=2), self.light.patches)
+        return NearLight(grid.neighbours, weights, others, local.sum(axis=2), self.light.patches)
 
     def inks(self, levels: FrameLevels) -> _Array:
         """Return bare paper, black ink, and what lies behind the print, (3, 3) float64 counts where the field is 1."""

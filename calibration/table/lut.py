@@ -1,18 +1,10 @@
-"""The look-up table on disk: what lies in it, and how it is opened for reading.
+"""The look-up table on disk: what lies in it (docs/formats.md), and how it is opened for reading.
 
-A LUT folder holds `samples.npy` (uint16 little-endian, C order, [light, colour, sample, RGB]), `illuminations.csv` (the
-lights and their ground truth), `lut.json` (provenance), `frames.csv` (the frames it was made from), and `SHA256SUMS`.
-The generator reads tables through this file, and nothing behind it (docs/formats.md). It is written by
-`calibration.table.writing`.
-
-Rules that hold inside:
-
-- Every released version of the format stays readable. Keys added since are optional.
-- `SHA256SUMS` has the form of `sha256sum`, so that ``sha256sum -c SHA256SUMS`` checks a table without this software,
-  and ``sha256sum SHA256SUMS`` gives the table's hash: whoever was told it from elsewhere has every byte of the table by
-  it. Tables made before it was written have hashes of ground truth and samples in `lut.json`, or none at all; what they
-  have is held against them.
-- Small files are held against their hashes whenever a table is opened, samples when a light is first used.
+The generator reads tables through this file, and nothing behind it; `calibration.table.writing` writes them. Every
+released version of the format stays readable. `SHA256SUMS` has the form of `sha256sum`, so that a table is checked
+without this software, and its own hash names the table; tables made before it was written have hashes of ground truth
+and samples in `lut.json`, or none at all. Small files are held against their hashes whenever a table is opened, samples
+when a light is first used.
 """
 
 from __future__ import annotations
@@ -147,8 +139,6 @@ class Provenance(Record):
     - `corrections`: what was applied to the counts, with its parameters, in order.
     - `session_sha256`: hash over the frames' hashes (`calibration.table.lut.frames_sha256`).
     - `chart_sha256`: hash of the chart.
-    - `software`: name and version of the program that built the table.
-    - `unfit`: cells unfit for use.
     - `samples_sha256`, `illuminations_sha256`: of the files; None in tables made before they were recorded.
     - `lights_sha256`: of each light's samples as they lie in the file, in the order of lights, so that damage can be
       traced to a light; empty in tables made before they were recorded.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -39,12 +39,14 @@ REFERENCE_COLUMNS: Final = ("light", "name", "r", "g", "b", "r_error", "g_error"
 
 def frames_csv(frames: Sequence[SourceFrame]) -> str:
     """Return the text of `frames.csv`."""
+    rows = ([frame.kind, frame.illumination, frame.file, frame.sha256] for frame in frames)
+    return _csv([FRAME_FIELDS, *rows])
+
+
+def _csv(rows: Iterable[Sequence[object]]) -> str:
+    """Return rows as CSV; None is left empty."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(FRAME_FIELDS)
-    for frame in frames:
-        illumination = "" if frame.illumination is None else frame.illumination
-        writer.writerow([frame.kind, illumination, frame.file, frame.sha256])
+    csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
@@ -145,22 +147,19 @@ class LutWriter:
 
 def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[np.float64]) -> str:
     """Return the text of `illuminations.csv`: the lights with their whites (L, 3), six decimals."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     named = any(light.name is not None for light in illuminations)
-    writer.writerow([*COLUMNS, *WHITE_COLUMNS, *([NAME] if named else [])])
-    for light, values in zip(illuminations, white, strict=True):
-        writer.writerow(
-            [
-                light.index,
-                light.kind,
-                "" if light.cct_k is None else f"{light.cct_k:g}",
-                *light.colour,
-                *(f"{value:.6f}" for value in values),
-                *([light.name or ""] if named else []),
-            ]
-        )
-    return text.getvalue()
+    rows = (
+        [
+            light.index,
+            light.kind,
+            None if light.cct_k is None else f"{light.cct_k:g}",
+            *light.colour,
+            *(f"{value:.6f}" for value in values),
+            *([light.name] if named else []),
+        ]
+        for light, values in zip(illuminations, white, strict=True)
+    )
+    return _csv([[*COLUMNS, *WHITE_COLUMNS, *([NAME] if named else [])], *rows])
 
 
 def references_csv(names: Sequence[str], white: _Array, white_error: _Array, greys: _Array, errors: _Array) -> str:
@@ -169,15 +168,11 @@ def references_csv(names: Sequence[str], white: _Array, white_error: _Array, gre
     `white`, `white_error`: (L, 3), units of the samples. `greys`, `errors`: (L, G, 3), the same units; NaN is left
     empty.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(REFERENCE_COLUMNS)
-
-    def row(light: int, name: str, value: _Array, error: _Array) -> None:
-        writer.writerow([light, name, *("" if np.isnan(v) else f"{v:.6f}" for v in (*value.tolist(), *error.tolist()))])
-
-    for light in range(len(white)):
-        row(light, "white", white[light], white_error[light])
-        for number, name in enumerate(names):
-            row(light, name, greys[light, number], errors[light, number])
-    return text.getvalue()
+    values = np.concatenate([white[:, None], greys], axis=1)
+    off = np.concatenate([white_error[:, None], errors], axis=1)
+    rows = (
+        [light, name, *(None if np.isnan(number) else f"{number:.6f}" for number in (*value.tolist(), *error.tolist()))]
+        for light in range(len(white))
+        for name, value, error in zip(("white", *names), values[light], off[light], strict=True)
+    )
+    return _csv([REFERENCE_COLUMNS, *rows])

@@ -1,20 +1,12 @@
 """A table as others get it: a sharded Zarr array on any store that fsspec reaches, and back to the folder that is used.
 
 Zarr specification version 3 with the codec `sharding_indexed`: one light is a chunk, 32 lights an object, compressed by
-Blosc (Zstandard after bit shuffle), about two thirds of `samples.npy`. The table's other files are attributes, word for
-word, so that a table that was fetched is the one that was published, hash by hash.
+Blosc (Zstandard after bit shuffle). The table's other files are attributes, word for word; `whole` is set last, and
+nothing is overwritten but an array without it.
 
-Rules that hold inside:
-
-- The attributes are completed last: an array without the attribute `whole` was never finished.
-- Nothing is overwritten but such an array.
-- Nothing that a store says of itself is believed before it fits together. The texts say how many lights and colours
-  there are; the array's shape, its chunks and the head of `samples.npy` have to say the same. Sizes are bounded, names
-  are those of a table's files, codecs are the four of published tables: a store may name any that this machine has, and
-  a count that is only claimed would fill the disk.
-- A table that is fetched appears in its folder whole and verified, or not at all.
-
-Needs zarr, the extra `cluster`.
+Nothing that a store says of itself is believed before it fits together: texts, the array's shape, its chunks and the
+head of `samples.npy` have to say the same. Sizes are bounded, names and codecs are those of published tables. A table
+that is fetched appears in its folder whole and verified, or not at all. Needs zarr, the extra `cluster`.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from experiment.lights import Illumination, plan_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, SessionStep
 from sim.camera.film import write_dng
-from sim.world.disturbances import Situation
+from sim.world.disturbances import UNDISTURBED, Situation
 from sim.world.rendering import Print
 from sim.world.sensors import BODIES, Body, Rectangle
 from sim.world.world import Room, World
@@ -56,13 +56,23 @@ class Lab:
         key: int = 1,
         settings: ExposureSettings = SETTINGS,
         paint: Paint | None = None,
+        *,
+        stated: ExposureSettings | None = None,
+        serial: str = "000000000000",
+        lamp: float = 1.0,
+        situation: Situation = UNDISTURBED,
     ) -> bytes:
-        """Return a frame's file; `paint` may alter the whole sensor's counts before it is written."""
-        counts = self.world.expose(colour, settings, key=(key,))
+        """Return a frame's file.
+
+        `paint` may alter the whole sensor's counts before it is written; `stated` is what the file says of the
+        exposure, if not the truth.
+        """
+        counts = self.world.expose(colour, settings, key=(key,), lamp=lamp, situation=situation)
         if paint is not None:
             paint(counts)
         stream = BytesIO()
-        write_dng(stream, counts, self.world.body, settings=settings, taken_at=TAKEN_AT)
+        said = settings if stated is None else stated
+        write_dng(stream, counts, self.world.body, settings=said, taken_at=TAKEN_AT, serial=serial)
         return stream.getvalue()
 
     def mosaic(

@@ -84,32 +84,10 @@ def test_verify_names_the_light_that_has_changed(lut: Path, session: Session, co
     assert "2 faults" in err
 
 
-def test_a_table_without_hashes_cannot_be_verified(command: Command) -> None:
-    code, _, err = command("--verify", VERSION_1)
-    assert code == 2
-    assert "records no hashes" in err
-
-
 def test_match_compares_two_tables(lut: Path, command: Command) -> None:
     code, out, _ = command("--match", lut, lut)
     assert code == 0
     assert "colours and lights correspond" in out
-    code, _, err = command("--match", lut, VERSION_1)
-    assert code == 2
-    assert "3 bits of each channel against 1" in err
-
-
-def test_a_published_table_comes_back_byte_by_byte(lut: Path, command: Command, tmp_path: Path) -> None:
-    code, out, _ = command("--publish", lut, tmp_path / "published")
-    assert code == 0
-    assert f"{len(LIGHTS)} lights" in out
-    code, out, _ = command("--fetch", tmp_path / "published", tmp_path / "fetched")
-    assert code == 0
-    assert "every file is as its own hashes say" in out
-    assert (tmp_path / "fetched" / "samples.npy").read_bytes() == (lut / "samples.npy").read_bytes()
-    code, _, err = command("--fetch", tmp_path / "nothing", tmp_path / "again")
-    assert code == 2
-    assert "holds no table" in err
 
 
 def test_append_says_how_far_the_table_is(session: Session, command: Command, tmp_path: Path) -> None:
@@ -140,6 +118,9 @@ def _refuse(folder: Path, file: str) -> None:
         (["--info", VERSION_1, "--check", "s"], "--check and --info"),
         (["--compare", "a", "b", "--info", "a"], "are two commands"),
         (["--info", VERSION_1, "session"], "--info does not expect session"),
+        (["--window", 3, "--info", VERSION_1], "--info reads one"),
+        (["--window", 4, "session", "lut"], "4 pixels"),
+        (["--verify", VERSION_1], "records no hashes"),
         (["session", "--out", "x"], "--out goes with --compare"),
         (["--compare", "a", "b", "--linearity", "x"], "leave it out of --compare"),
         (["--check", "nowhere", "lut"], "--check writes nothing"),

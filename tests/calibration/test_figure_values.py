@@ -120,6 +120,14 @@ def unlike(frames: tuple[Any, ...]) -> tuple[Any, ...]:
     return (*frames[:4], frame(4, record=SimpleNamespace(kind="white", illumination=None, file="4.dng", sha256="0")))
 
 
+def lens_before(cells: int, **more: bool) -> dict[str, Any]:
+    """Return a lens that leaves 3 in a thousand, and as many cells."""
+    return {
+        "registration": SimpleNamespace(mismatched_cells=np.zeros(cells)),
+        "lens": SimpleNamespace(left=0.003, left_worst=0.02, **more),
+    }
+
+
 TWICE = unlike(table().frames)
 FOREIGN = SimpleNamespace(other_camera=("one",), other_exposure=(), other_lens=(), other_iso=())
 TINTED = (table().frames[0], frame(4, paper=SimpleNamespace(white=np.array([4000.0, 9000, 2200]))))
@@ -191,11 +199,18 @@ AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.arra
         (radiometry.DISTURBED_CELLS, {}, 3),
         (radiometry.DISTURBED_CELLS, {"registration": SimpleNamespace(mismatched_cells=np.zeros(69))}, None),
         (radiometry.REGISTERED_ANEW, {}, 2),
+        (radiometry.WHITE_FRAMES, {}, 2),
+        (radiometry.WHITE_FRAMES, {"frames": TWICE[:1]}, None),
         (radiometry.OTHER_CAMERA, {"origins": FOREIGN}, 1),
         (geometry.TAGS_FOUND, {}, 3 / 4),
         # 17 / 2 less two pixels and three quarters is 2.61 times the blur; and what the lens brings.
         (geometry.BLEED, {}, 0.00449 + 0.01),
         (geometry.BLOCKS_GOOD, {}, 7 / 8),
+        # What a lens leaves is told where cells are enough to tell it.
+        (geometry.CORRECTION_RESIDUAL, lens_before(4096, measured=True, is_left_in=False), 0.003),
+        (geometry.CORRECTION_RESIDUAL, lens_before(4095, measured=True, is_left_in=False), None),
+        (geometry.CORRECTION_RESIDUAL, lens_before(512, measured=True, is_left_in=True), 0.003),
+        (geometry.CORRECTION_RESIDUAL, lens_before(4096, measured=False, is_left_in=True), None),
         (truth.NOISE_MISFIT, {}, 0.2),
         (truth.NOISY_SHARE, {}, 4 / 512),
         (truth.REFERENCES_USED, {}, 0.76),

@@ -28,13 +28,14 @@ from calibration.sampling import (
     table_values,
     unevenness,
 )
+from drivers.raw.rawfile import frame_black
 from tests.calibration.lab import Lab
 
 
 def test_samples_are_pixels_of_the_half_size_picture(lab: Lab, tmp_path: Path) -> None:
     mosaic = lab.mosaic(tmp_path)
-    black = np.array([[2048.25, 2047.5], [2049.0, 2048.0]])
-    picture = half_size(mosaic, black)
+    black = frame_black(mosaic)
+    picture = half_size(mosaic)
     height, width = picture.shape[:2]
     places = np.random.default_rng(1).random((200, 2)) * (width - 1, height - 1)
     sites = sites_at(places, (height, width))
@@ -77,7 +78,7 @@ def test_one_pass_and_two_give_the_same_values(lab: Lab, tmp_path: Path, window:
     mosaic = lab.mosaic(tmp_path)
     black = np.array([[2048.25, 2047.5], [2049.0, 2048.0]])
     random = np.random.default_rng(3)
-    height, width = half_size(mosaic, black).shape[:2]
+    height, width = half_size(mosaic).shape[:2]
     sites = sites_at(random.random((300, 2)) * (width - 1, height - 1), (height, width), window)
     field, dark = random.uniform(0.7, 1.3, (300, 3)), random.uniform(0, 40, (300, 3)).astype(np.float32)
     samples, highest = gather(mosaic, black, sites)
@@ -96,11 +97,14 @@ def patches(level: float, sigma: float, count: int = 3000) -> np.ndarray[tuple[i
     return np.random.default_rng(2).normal(level, sigma, (count, 25, 3))
 
 
+def rim(window: int) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Return which samples of a window lie at its rim."""
+    return np.pad(np.zeros((window - 2, window - 2), dtype=np.bool_), 1, constant_values=True).ravel()
+
+
 def test_a_rim_of_another_colour_is_found() -> None:
     samples = patches(8000, 60)
-    rim = np.ones((5, 5), dtype=bool)
-    rim[1:-1, 1:-1] = False
-    samples[7, rim.ravel(), 1] += 400
+    samples[7, rim(5), 1] += 400
     found = unevenness(samples, np.full((len(samples), 3), 60.0))
     assert np.flatnonzero(found).tolist() == [7]
     assert found[7] == pytest.approx(400 / (8000 + 400 * 16 / 25), rel=0.15)
@@ -108,9 +112,7 @@ def test_a_rim_of_another_colour_is_found() -> None:
 
 def test_less_than_a_percent_is_let_be() -> None:
     samples = patches(8000, 1)
-    rim = np.ones((5, 5), dtype=bool)
-    rim[1:-1, 1:-1] = False
-    samples[:, rim.ravel()] += 70
+    samples[:, rim(5)] += 70
     assert not unevenness(samples, np.full((len(samples), 3), 1.0)).any()
 
 
@@ -118,9 +120,7 @@ def test_less_than_a_percent_is_let_be() -> None:
 def test_a_rim_is_found_in_other_windows(window: int) -> None:
     """Noise of 0.4 %, a rim 8 % brighter: beyond 5 σ even of the single inner pixel of 3×3."""
     samples = np.random.default_rng(6).normal(8000, 30, (3000, window**2, 3))
-    rim = np.ones((window, window), dtype=bool)
-    rim[1:-1, 1:-1] = False
-    samples[7, rim.ravel(), 1] += 640
+    samples[7, rim(window), 1] += 640
     assert np.flatnonzero(unevenness(samples, sample_noise(samples))).tolist() == [7]
 
 
@@ -132,14 +132,6 @@ def test_noise_is_known_as_a_function_of_the_level() -> None:
     ratio = sample_noise(samples) / sigma[:, None]
     assert np.median(ratio) == pytest.approx(1, abs=0.02)
     assert np.abs(ratio[level > 500] - 1).max() < 0.15
-
-
-def test_a_photosite_that_sees_a_third_is_dead() -> None:
-    samples = patches(2000, 30, 50)
-    samples[9, 4, 0] *= 0.3
-    samples[11, 4, 2] *= 0.7
-    assert np.flatnonzero(has_dead_photosite(samples)).tolist() == [9]
-    assert not has_dead_photosite(samples / 10).any()
 
 
 def test_patch_means_are_numpys() -> None:
@@ -208,7 +200,7 @@ def test_noise_at_a_level_is_the_median_of_like_cells_over_that_of_chi_square() 
 def test_means_of_counts_are_those_of_their_samples(lab: Lab, tmp_path: Path) -> None:
     mosaic = lab.mosaic(tmp_path)
     black = np.array([[2048.25, 2047.5], [2049.0, 2048.0]])
-    height, width = half_size(mosaic, black).shape[:2]
+    height, width = half_size(mosaic).shape[:2]
     sites = sites_at(np.random.default_rng(8).random((80, 2)) * (width - 1, height - 1), (height, width), 7)
     samples, _ = gather(mosaic, black, sites)
     assert not sites.inside.all()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,8 @@ from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
-from sim.camera.film import write_dng
 from sim.world.world import UNDISTURBED, Blob, Situation
-from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, renumbered, take
+from tests.calibration.lab import LIGHTS, SETTINGS, Lab, renumbered, take
 
 BRIGHT = renumbered(
     [light for light in LIGHTS if sum(light.colour) == max(light.colour) == 255]
@@ -46,12 +44,12 @@ def frame(
 ) -> bytes:
     """Return a frame's file; its raw file states `settings`, which it was taken with."""
     shown = step.colour if colour is None else colour
-    counts = lab.world.expose(shown, settings, key=(step.number + 1,), situation=situation)
-    if paint is not None:
-        paint(counts, shown)
-    stream = BytesIO()
-    write_dng(stream, counts, lab.world.body, settings=settings, taken_at=TAKEN_AT)
-    return stream.getvalue()
+
+    def onto(counts: Counts) -> None:
+        if paint is not None:
+            paint(counts, shown)
+
+    return lab.dng(shown, step.number + 1, settings, onto, situation=situation)
 
 
 def taken(

@@ -1,4 +1,4 @@
-"""The table of causes, case by case, and at its borders."""
+"""The table of causes, case by case."""
 
 from __future__ import annotations
 
@@ -33,9 +33,7 @@ from calibration.causes.rules import (
     UNKNOWN,
     WRONG_NAME,
     Cause,
-    Condition,
     Evidence,
-    Rule,
     Subject,
     decide,
     evidence_names,
@@ -138,27 +136,6 @@ def test_evidence_decides(subject: Subject, evidence: Evidence, cause: Cause) ->
     assert decide(subject, evidence).cause is cause
 
 
-def example(rule: Rule) -> Evidence:
-    """Return evidence that a rule holds for, as near to its borders as it goes."""
-    return Evidence(**{one.name: one.low if math.isfinite(one.low) else one.high for one in rule.conditions})
-
-
-BORDERS = [(rule, condition) for rule in RULES for condition in rule.conditions]
-
-
-@pytest.mark.parametrize(("rule", "condition"), BORDERS)
-def test_each_condition_counts_at_its_border(rule: Rule, condition: Condition) -> None:
-    held, subject = example(rule), min(rule.about)
-    assert rule.holds(subject, held)
-    assert not rule.holds(subject, replace(held, **{condition.name: math.nan}))
-    for other in set(get_args(Subject)) - rule.about:
-        assert not rule.holds(other, held)
-    for border, away in ((condition.low, -math.inf), (condition.high, math.inf)):
-        if math.isfinite(border):
-            assert rule.holds(subject, replace(held, **{condition.name: border}))
-            assert not rule.holds(subject, replace(held, **{condition.name: math.nextafter(border, away)}))
-
-
 def test_what_is_not_known_decides_nothing() -> None:
     assert not Evidence().known()
     for subject in get_args(Subject):
@@ -166,7 +143,7 @@ def test_what_is_not_known_decides_nothing() -> None:
 
 
 def test_the_table_names_what_there_is() -> None:
-    assert {condition.name for _, condition in BORDERS} <= set(evidence_names())
+    assert {condition.name for rule in RULES for condition in rule.conditions} <= set(evidence_names())
     assert {rule.cause for rule in RULES} | {UNKNOWN} == set(CAUSES)
     assert len({cause.name for cause in CAUSES}) == len(CAUSES)
     for cause in CAUSES[:-1]:

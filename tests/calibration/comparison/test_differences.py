@@ -18,7 +18,6 @@ from calibration.comparison.comparing import (
     GROUPS,
     CellDifferences,
     LightDifferences,
-    LightPairs,
     answers_of,
     colour_groups,
     differing_cells,
@@ -32,7 +31,7 @@ _Array = npt.NDArray[np.float64]
 WHITE = np.array([[9000.0, 8000, 7000], [6000, 250, 4000], [50, 60, 40], [8000, 8000, 200]])
 OTHER = np.array([[9090.0, 8000, 7070], [6060, 400, 4100], [55, 66, 44], [8200, 8100, 900]])
 ERRORS = np.array([[9.0, 4, 7], [3, 1, 2], [0.5, 0.2, 0.1], [8, 6, 1]])
-PAIRS = LightPairs((0, 1, 2, 3), (0, 1, 2, 3), (), ())
+PAIRS = [(light, light) for light in range(4)]
 
 
 def table(folder: Path, white: _Array, errors: _Array, samples: int, drift: _Array | None, unfit: int) -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import json
 import re
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +25,8 @@ from experiment.measures.least_squares import order_of, page_polynomial
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError
-from sim.camera.film import write_dng
 from sim.world.world import Room
-from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
+from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 from tests.calibration.whole import LIMITS, reported, told, whole, words_of, written
 from tests.json_of import json_of
 from tests.pinned import Pinned
@@ -207,10 +205,7 @@ def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Pat
     steps = len(plan_steps(lights, 2))
 
     def frame(step: SessionStep) -> bytes:
-        counts = lab.world.expose(step.colour, SETTINGS, key=(step.number,), lamp=1 - 0.03 * step.number / (steps - 1))
-        stream = BytesIO()
-        write_dng(stream, counts, lab.world.body, settings=SETTINGS, taken_at=TAKEN_AT)
-        return stream.getvalue()
+        return lab.dng(step.colour, step.number, lamp=1 - 0.03 * step.number / (steps - 1))
 
     with take(lab, tmp_path / "session", lights, every=2, frame=frame) as session:
         result = build(session, tmp_path / "lut")

@@ -234,7 +234,7 @@ def test_a_checkpoint_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         assert unfinished.load({"a": "c"}, ["x"]) is None
         assert unfinished.load({"a": "b"}, ["y", "x"]) is None
         back = unfinished.load({"a": "b"}, ["x", "y"])
-        unfinished.discard()
+        unfinished.keep = False
     assert back is not None
     assert (back.identity, back.frames, back.values) == ({"a": "b"}, ["x"], values)
     assert back.arrays["sum"].tobytes() == np.array([0.1, np.inf], np.float32).tobytes()

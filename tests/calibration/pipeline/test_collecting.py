@@ -142,11 +142,6 @@ def test_white_frames_drift_by_less_than_15_per_cent_and_two_degrees(
     assert collecting._drift_is_one([frame(white)])
 
 
-def test_the_lamp_s_gain_at_a_light_is_over_the_first_white_frame() -> None:
-    whites = [frame(at_s=10), frame((110.0, 220, 45), at_s=110)]
-    lights = [frame(at_s=10), frame(at_s=60)]
-    gains = collecting._gains(lights, whites)
-    np.testing.assert_allclose(gains, [[1, 1, 1], [1.05, 1.05, 0.95]], rtol=1e-3)
-    assert (collecting._gains(lights, []) == 1).all()
-    at, white_at = collecting._times_s(lights, whites)
+def test_times_are_since_the_first_white_frame() -> None:
+    at, white_at = collecting._times_s([frame(at_s=10), frame(at_s=60)], [frame(at_s=10), frame(at_s=110)])
     assert (at.tolist(), white_at.tolist()) == ([0, 50], [0, 100])

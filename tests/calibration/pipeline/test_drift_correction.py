@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,7 @@ from calibration.table.verification import find_faults
 from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from foundation.errors import FormatError, QualityError
-from sim.camera.film import write_dng
-from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, figures_alone, hang, take
+from tests.calibration.lab import LIGHTS, Lab, figures_alone, hang, take
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds")]
 
@@ -38,10 +36,7 @@ def session_of(lab: Lab, folder: Path, lamp: Callable[[int], float], every: int 
     """Return a session under a lamp whose light at each step is given."""
 
     def frame(step: SessionStep) -> bytes:
-        counts = lab.world.expose(step.colour, SETTINGS, key=(step.number,), lamp=lamp(step.number))
-        stream = BytesIO()
-        write_dng(stream, counts, lab.world.body, settings=SETTINGS, taken_at=TAKEN_AT)
-        return stream.getvalue()
+        return lab.dng(step.colour, step.number, lamp=lamp(step.number))
 
     return take(lab, folder, LIGHTS, every=every, frame=frame)
 

@@ -6,24 +6,23 @@ import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 
 from calibration.pipeline.build import build
-from calibration.report.report import report_json, summary
+from calibration.report.report import summary
 from calibration.verdict import BuildResult
 from drivers.presenter import WHITE, Colour
 from experiment.lights import Illumination
-from experiment.session.folder import Session
 from experiment.session.records import SessionStep
 from experiment.session.repair import lights_text
 from foundation.errors import QualityError
-from sim.camera.film import write_dng
 from sim.world.sensors import BODIES
 from sim.world.world import Room, World
-from tests.calibration.lab import SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
+from tests.calibration.lab import SETTINGS, Lab, figures_alone, hang, renumbered, take
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_builds")]
 
@@ -55,22 +54,17 @@ def lab() -> Lab:
     return hang(2, "A6")
 
 
-def write_json(result: BuildResult, session: Session, folder: Path) -> None:
-    """Write the report for programs alone: drawing the other takes longer than the build."""
-    (folder / "report.json").write_text(json.dumps(report_json(result)))
-
-
 def built(
     lab: Lab, tmp_path: Path, frame: Frame | None = None, lights: tuple[Illumination, ...] = EIGHT
 ) -> BuildResult:
     with take(lab, tmp_path / "session", lights, frame=frame) as session:
-        return build(session, tmp_path / "lut", report=write_json)
+        return build(session, tmp_path / "lut", report=figures_alone)
 
 
 def refused(lab: Lab, tmp_path: Path, frame: Frame) -> tuple[str, dict[str, object]]:
     """Return why a session makes no table, and what its report says for programs."""
     with take(lab, tmp_path / "session", EIGHT, frame=frame) as session, pytest.raises(QualityError) as error:
-        build(session, tmp_path / "lut", report=write_json)
+        build(session, tmp_path / "lut", report=figures_alone)
     return str(error.value), json.loads((tmp_path / "lut.refused" / "report.json").read_text())
 
 
@@ -86,15 +80,6 @@ def showing(lab: Lab, colours: Mapping[int, Colour]) -> Frame:
         return lab.dng(colour, step.number)
 
     return frame
-
-
-def as_stated(lab: Lab, step: SessionStep, exposed: object, stated: object, world: World | None = None) -> bytes:
-    """Return a frame exposed in one way whose file states another."""
-    counts = (world or lab.world).expose(step.colour, exposed, key=(step.number,))  # pyrefly: ignore[bad-argument-type]
-    stream = BytesIO()
-    body = (world or lab.world).body
-    write_dng(stream, counts, body, settings=stated, taken_at=TAKEN_AT)  # pyrefly: ignore[bad-argument-type]
-    return stream.getvalue()
 
 
 def test_a_session_with_nothing_wrong_has_no_remark(lab: Lab, tmp_path: Path) -> None:
@@ -127,12 +112,10 @@ def test_a_white_frame_that_is_red_is_refused_as_such(lab: Lab, tmp_path: Path) 
 
 def test_two_lights_of_another_camera_are_refused(lab: Lab, tmp_path: Path) -> None:
     body = replace(BODIES["Test"], model="Other", sensitivities="Canon_EOS_200D")
-    other = World(lab.world.sheet, body, lab.world.room)
+    other = Lab(lab.chart, World(lab.world.sheet, body, lab.world.room))
 
     def frame(step: SessionStep) -> bytes:
-        if step.illumination in (WARM, COOL):
-            return as_stated(lab, step, SETTINGS, SETTINGS, other)
-        return lab.dng(step.colour, step.number)
+        return (other if step.illumination in (WARM, COOL) else lab).dng(step.colour, step.number)
 
     said, report = refused(lab, tmp_path, frame)
     assert "Frames of another camera: 2" in said
@@ -144,9 +127,7 @@ def test_another_body_of_the_same_model_is_refused(lab: Lab, tmp_path: Path) -> 
     def frame(step: SessionStep) -> bytes:
         if step.illumination != COOL:
             return lab.dng(step.colour, step.number)
-        counts, stream = lab.world.expose(step.colour, SETTINGS, key=(1,)), BytesIO()
-        write_dng(stream, counts, lab.world.body, settings=SETTINGS, taken_at=TAKEN_AT, serial="42")
-        return stream.getvalue()
+        return lab.dng(step.colour, serial="42")
 
     said, _ = refused(lab, tmp_path, frame)
     # The body is told apart; its number is not told, unless the lab asks for it.
@@ -159,7 +140,7 @@ def test_lights_whose_files_state_another_exposure_are_refused(lab: Lab, tmp_pat
 
     def frame(step: SessionStep) -> bytes:
         off = step.illumination in (WARM, COOL)
-        return as_stated(lab, step, SETTINGS, replace(SETTINGS, iso=200) if off else SETTINGS)
+        return lab.dng(step.colour, step.number, stated=replace(SETTINGS, iso=200) if off else SETTINGS)
 
     said, report = refused(lab, tmp_path, frame)
     assert "Exposure of a frame" in said
@@ -171,16 +152,18 @@ def test_white_frames_at_half_exposure_are_no_brilliant_colour(lab: Lab, tmp_pat
     said, report = refused(
         lab,
         tmp_path,
-        lambda step: as_stated(lab, step, *((HALF, HALF) if step.kind == "white" else (SETTINGS, SETTINGS))),
+        lambda step: lab.dng(step.colour, step.number, HALF if step.kind == "white" else SETTINGS),
     )
     assert "Exposure of a frame" in said
     assert "additivity" not in report["figures"]  # pyrefly: ignore[not-iterable]
 
 
 def test_a_white_frame_at_half_exposure_that_does_not_say_so(lab: Lab, tmp_path: Path) -> None:
-    said, report = refused(
-        lab, tmp_path, lambda step: as_stated(lab, step, HALF if step.kind == "white" else SETTINGS, SETTINGS)
-    )
+    def frame(step: SessionStep) -> bytes:
+        exposed = HALF if step.kind == "white" else SETTINGS
+        return lab.dng(step.colour, step.number, exposed, stated=SETTINGS)
+
+    said, report = refused(lab, tmp_path, frame)
     assert "white" in said
     rows = {limit["name"] for limit in report["limits"] if limit["outcome"] != "accept"}  # pyrefly: ignore[not-iterable]
     assert "additivity" not in rows
@@ -189,7 +172,8 @@ def test_a_white_frame_at_half_exposure_that_does_not_say_so(lab: Lab, tmp_path:
 
 def test_a_light_at_half_exposure_that_does_not_say_so(lab: Lab, tmp_path: Path) -> None:
     def frame(step: SessionStep) -> bytes:
-        return as_stated(lab, step, HALF if step.illumination == WHITE_LIGHT else SETTINGS, SETTINGS)
+        exposed = HALF if step.illumination == WHITE_LIGHT else SETTINGS
+        return lab.dng(step.colour, step.number, exposed, stated=SETTINGS)
 
     said, report = refused(lab, tmp_path, frame)
     assert "light 0 by -50 %" in said
@@ -204,21 +188,19 @@ def test_a_session_without_red_says_what_was_not_measured(lab: Lab, tmp_path: Pa
 
 def test_brilliant_colour_is_called_that(lab: Lab, tmp_path: Path) -> None:
     """A white segment adds three tenths of the least primary: frames of a projector that shows white brighter."""
-    world = lab.world
-
-    def frame(step: SessionStep) -> bytes:
-        colour, least = step.colour, min(step.colour.red, step.colour.green, step.colour.blue)
-        counts = world.expose(colour, SETTINGS, key=(step.number,)).astype("float64")
-        if least:
-            grey = world.expose(Colour(least, least, least), SETTINGS, key=(step.number, 1)).astype("float64")
-            counts = counts + 0.3 * (grey - world.body.black)
-        stream = BytesIO()
-        counts = counts.clip(0, world.body.saturation).round().astype("uint16")
-        write_dng(stream, counts, world.body, settings=SETTINGS, taken_at=TAKEN_AT)
-        return stream.getvalue()
-
     dim = hang(2, "A6", room=Room(waviness_mm=0.5, white_level_share=0.5))
     world = dim.world
+
+    def frame(step: SessionStep) -> bytes:
+        least = min(step.colour.red, step.colour.green, step.colour.blue)
+
+        def add_white(counts: npt.NDArray[np.uint16]) -> None:
+            if least:
+                grey = world.expose(Colour(least, least, least), SETTINGS, key=(step.number, 1)).astype("float64")
+                counts[:] = (counts + 0.3 * (grey - world.body.black)).clip(0, world.body.saturation).round()
+
+        return dim.dng(step.colour, step.number, paint=add_white)
+
     assert remarks(built(dim, tmp_path, frame)) == {"additivity"}
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,8 +13,6 @@ import pytest
 from calibration.cli import main
 from calibration.pipeline.build import build, check
 from calibration.report.report import summary
-from calibration.table.lut import open_lut
-from calibration.table.verification import find_faults
 from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
@@ -177,20 +174,3 @@ def test_a_chart_that_stands_elsewhere_is_refused(session: Session, tmp_path: Pa
     moved = hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
     with pytest.raises(FormatError, match=r"0\.dng: the chart"):
         check(session, linearity=write_series(moved, tmp_path / "series"))
-
-
-@pytest.fixture
-def copied(built: BuildResult, tmp_path: Path) -> Path:
-    """Return a copy of the table, to be changed."""
-    assert built.lut is not None
-    shutil.copytree(built.lut, tmp_path / "lut")
-    return tmp_path / "lut"
-
-
-def test_references_are_under_the_table_s_hashes(copied: Path) -> None:
-    path = copied / "references.csv"
-    assert find_faults(open_lut(copied)) == []
-    path.write_text(path.read_text().replace("white", "wight", 1))
-    assert find_faults(open_lut(copied, check=False)) == ["references.csv is not as it was built"]
-    path.unlink()
-    assert find_faults(open_lut(copied, check=False)) == ["references.csv is gone"]

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.cli import main
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import BuildOptions
 from calibration.report.report import summary as report_summary
@@ -55,18 +54,6 @@ def test_a_window_larger_than_the_cells_is_said(session: Session, built: BuildRe
     assert note.startswith("too large: ")
     plain = next(row.note for row in report_summary(built.figures) if row.name == "Window")
     assert plain.startswith("up to 5×5")
-
-
-def test_the_command_takes_a_window(session: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def run(*arguments: object) -> tuple[int, str]:
-        return main([*map(str, arguments)]), capsys.readouterr().err
-
-    code, said = run("--window", 4, session.folder, tmp_path / "lut")
-    assert code == 2
-    assert "4 pixels" in said
-    code, said = run("--window", 3, "--info", tmp_path / "lut")
-    assert code == 2
-    assert "--info reads one" in said
 
 
 def test_dark_cells_that_the_lens_may_have_left_wrong_are_named_with_its_veil(built: BuildResult) -> None:

@@ -182,13 +182,16 @@ def test_a_published_truth_that_was_edited_is_refused(lut: Lut, tmp_path: Path) 
 @pytest.mark.slow
 def test_a_table_is_the_one_that_was_told_of(lut: Lut, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     url = str(tmp_path / "published")
-    publish(lut, url)
+    assert main(["--publish", str(lut.folder), url]) == 0
+    assert f"{LIGHTS} lights" in capsys.readouterr().out
     assert main(["--info", str(lut.folder)]) == 0
     assert f"Table:           {lut.sha256}" in capsys.readouterr().out
     assert main(["--fetch", url, str(tmp_path / "told"), "--expect", lut.sha256]) == 0
     assert "it is the table expected" in capsys.readouterr().out
     assert main(["--fetch", url, str(tmp_path / "untold")]) == 0
-    assert f"its hash, {lut.sha256}: compare it" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"its hash, {lut.sha256}: compare it" in said
+    assert "every file is as its own hashes say" in said
     edit(tmp_path / "published", retell_everything)
     # All of it fits together: nothing but a hash from elsewhere can tell.
     assert main(["--fetch", url, str(tmp_path / "other")]) == 0
