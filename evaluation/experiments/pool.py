@@ -29,19 +29,13 @@ from evaluation.experiments.transfer.outcome import (
     ForestLine,
     RowRatio,
     TransferFigures,
-    base_ratios_table,
     beside_plot,
-    beside_table,
-    errors_table,
     figures_of,
     forest_plot,
-    intervals_table,
     labelled_results,
     long_table,
-    naive_adapted_table,
-    naive_ratios_table,
-    real_ratios_table,
     shown_ratios,
+    tables_of,
 )
 from evaluation.experiments.transfer.rows import Kind, TransferRow, Way
 from evaluation.metrics import ErrorKind
@@ -425,20 +419,11 @@ def make_tables(pool: Pool, error: ErrorKind, base: str | None = None) -> PoolTa
     single = {
         test: figures_of([_at(row, places) for row in pool.rows], error, base=base) for test, places in members.items()
     }
-    shown = (
-        errors_table(every, name, len(pool.images)),
-        intervals_table(every, name),
-        real_ratios_table(every, name),
-        naive_ratios_table(every, name),
-        base_ratios_table(every, name),
-        beside_table(every, name),
-        naive_adapted_table(every, name),
-        _by_test_set(single, {test: len(places) for test, places in members.items()}),
-    )
+    apart = _by_test_set(single, {test: len(places) for test, places in members.items()})
     listed = [(test, long_table(figures)) for test, figures in single.items()]
     rows: list[tuple[Cell, ...]] = [(test, len(members[test]), *row) for test, table in listed for row in table.rows]
     return PoolTables(
-        tuple(table for table in shown if table is not None),
+        (*tables_of(every, name, len(pool.images)), apart),
         long_table(every),
         Table("All numbers of each test set", ("test", "test_images", *listed[0][1].columns), tuple(rows)),
         every,

@@ -92,7 +92,9 @@ def answer_scenes(
     Methods of this suite are called by several threads at once. Others are called by one thread at a time and get a
     copy of the image, which they may change; with one worker everything runs in the calling thread.
     """
-    runners = [_runner_of(method) for method in methods]
+    runners = [
+        _Runner(method, None if type(method).__module__.startswith("evaluation.") else Lock()) for method in methods
+    ]
     blind = all(isinstance(method, SceneMethod) for method in methods)
     yield from ordered_map(lambda scene: _answer(scene, runners, blind), scenes, workers)
 
@@ -110,10 +112,6 @@ class _Runner:
             return function(*arguments)
         with self.lock:
             return function(*(one.copy() if isinstance(one, np.ndarray) else one for one in arguments))
-
-
-def _runner_of(method: Method | SceneMethod) -> _Runner:
-    return _Runner(method, None if type(method).__module__.startswith("evaluation.") else Lock())
 
 
 def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[SceneAnswer, ...]:

@@ -710,6 +710,7 @@ _CHANNELS: Final = ("red", "green", "blue")
 
 def statistics_to_json(description: DataDescription) -> str:
     """Return the text of a `STATS.json`; the same description gives the same text."""
+    known = figures(description)
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -732,7 +733,7 @@ def statistics_to_json(description: DataDescription) -> str:
                 "of": quantity.value,
                 "summed": quantity.summed,
                 "definition": quantity.definition,
-                "value": figures(description)[quantity.name],
+                "value": known[quantity.name],
             }
             for quantity in QUANTITIES
         ],

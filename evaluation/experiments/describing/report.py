@@ -28,7 +28,7 @@ from evaluation.experiments.describing.description import (
     summed,
 )
 from evaluation.reports.table_output import table_part
-from evaluation.results.tables import Table
+from evaluation.results.tables import Table, finite_or_none
 from foundation import pages
 from foundation.plots import FAINT, GRID, SERIES, legend_label, svg_of
 from generator.statistics import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
@@ -241,7 +241,7 @@ def figures_table(description: DataDescription) -> Table:
         # A spread is of all images: quartiles would be of something else.
         one_each = known.size and quantity.summed != "spread"
         quartiles = np.percentile(known, [25, 75], method="hazen") if one_each else (np.nan, np.nan)
-        numbers = (_known(float(number)) for number in (value[quantity.name], *quartiles))
+        numbers = (finite_or_none(float(number)) for number in (value[quantity.name], *quartiles))
         rows.append((quantity.title, quantity.summed, *numbers, known.size))
     return Table(
         f"{description.name}: figures of {len(description.images)} images",
@@ -287,7 +287,7 @@ def compared_tables(compared: Sequence[FigureCompared], names: tuple[str, str]) 
                 made.verdict,
                 made.one,
                 made.other,
-                *(_known(number) for number in made.change),
+                *map(finite_or_none, made.change),
                 made.distance,
                 made.p,
             )
@@ -369,7 +369,9 @@ def describe_page(one: DataDescription, other: DataDescription | None = None, se
     for made in both:
         parts += [pages.heading(made.name), table_part(figures_table(made)), table_part(sizes_table(made))]
         parts += [pages.paragraph(f"{what}: {told}") for what, told in made.treatment.items()]
-    parts += [pages.heading("Definitions"), table_part(_definitions())]
+    definitions = tuple((quantity.title, quantity.definition) for quantity in QUANTITIES)
+    parts.append(pages.heading("Definitions"))
+    parts.append(table_part(Table("What the figures are", ("Figure", "Definition"), definitions)))
     return pages.page(" beside ".join(made.name for made in both), parts)
 
 
@@ -383,17 +385,5 @@ def sizes_table(description: DataDescription) -> Table:
     return Table(f"{description.name}: sizes, px", ("Size", "Images"), tuple(rows), notes=tuple(notes))
 
 
-def _definitions() -> Table:
-    return Table(
-        "What the figures are",
-        ("Figure", "Definition"),
-        tuple((quantity.title, quantity.definition) for quantity in QUANTITIES),
-    )
-
-
 def _seen_at(description: DataDescription) -> str:
     return f"{description.side} x {description.side} cells at most" if description.side else "full size"
-
-
-def _known(number: float) -> float | None:
-    return number if np.isfinite(number) else None

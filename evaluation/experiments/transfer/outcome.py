@@ -28,7 +28,7 @@ from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import errors_csv
 from evaluation.results.result import Result
-from evaluation.results.tables import Table, table_to_csv
+from evaluation.results.tables import Table, finite_or_none, table_to_csv
 from evaluation.scene import SceneSet
 from foundation import pages
 from foundation.errors import InputError
@@ -398,6 +398,20 @@ def naive_adapted_table(found: TransferFigures, name: str) -> Table | None:
     )
 
 
+def tables_of(found: TransferFigures, name: str, images: int) -> tuple[Table, ...]:
+    """Return all tables of rows on so many images of a test set, in the order in which they are shown."""
+    made = (
+        errors_table(found, name, images),
+        intervals_table(found, name),
+        real_ratios_table(found, name),
+        naive_ratios_table(found, name),
+        base_ratios_table(found, name),
+        beside_table(found, name),
+        naive_adapted_table(found, name),
+    )
+    return tuple(table for table in made if table is not None)
+
+
 def paper_ratios_table() -> Table:
     """Return the paper's ratios, of its table 2.
 
@@ -427,10 +441,12 @@ def long_table(found: TransferFigures) -> Table:
         ratio = to_real.get((row.row.method, row.row.training))
         for place, statistic in enumerate(STATISTICS):
             spread = row.spread[place] if row.spread else None
-            parts = _three(ratio.ratios[place]) if ratio else (None, None, None)
+            parts = map(finite_or_none, ratio.ratios[place]) if ratio else (None, None, None)
             who = (row.row.method, row.row.kind, row.row.data, row.row.images, len(row.row.results))
             beside = row.row.way, row.row.real
-            rows.append((*who, found.error, statistic, *_three(row.statistics[place]), spread, *parts, *beside))
+            rows.append(
+                (*who, found.error, statistic, *map(finite_or_none, row.statistics[place]), spread, *parts, *beside)
+            )
     return Table("All numbers", _LONG, tuple(rows))
 
 
@@ -444,10 +460,6 @@ _LONG: Final = (
 
 def _heads(row: TransferRow) -> tuple[str, str, int | None]:
     return row.method, row.training, row.images or None
-
-
-def _three(figure: BoundedFigure) -> tuple[float | None, ...]:
-    return tuple(number if math.isfinite(number) else None for number in figure)
 
 
 _LINE_INCHES: Final = 0.24
@@ -626,16 +638,7 @@ class TransferOutcome:
 
     def tables(self) -> tuple[Table, ...]:
         """Return the tables in the order in which they are shown."""
-        name = self.test.name
-        made = (
-            errors_table(self.figures, name, len(self.test.scenes)),
-            intervals_table(self.figures, name),
-            real_ratios_table(self.figures, name),
-            naive_ratios_table(self.figures, name),
-            beside_table(self.figures, name),
-            naive_adapted_table(self.figures, name),
-        )
-        return tuple(table for table in made if table is not None)
+        return tables_of(self.figures, self.test.name, len(self.test.scenes))
 
 
 def labelled_results(rows: Sequence[TransferRow]) -> tuple[Result, ...]:
