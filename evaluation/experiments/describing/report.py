@@ -69,26 +69,22 @@ class FigureCompared:
 
 def compare_figures(one: DataDescription, other: DataDescription, seed: int = 0) -> tuple[FigureCompared, ...]:
     """Return every figure that is known of both sets, of at least three images each."""
-    compared: list[FigureCompared] = []
-    for quantity in QUANTITIES:
-        values = [known_values(described, quantity.value) for described in (one, other)]
-        if min(map(len, values)) >= _LEAST:
-            compared.append(_compared(quantity, values[0], values[1], seed))
-    return tuple(compared)
-
-
-def _compared(
-    quantity: Quantity, one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], seed: int
-) -> FigureCompared:
     from scipy.stats import ks_2samp
 
-    values = summed(one, quantity.summed), summed(other, quantity.summed)
-    scale = float(other.std()) if quantity.signed else 1.0
-    change = _change(quantity, one, other, seed)
-    test = ks_2samp(one, other)
-    return FigureCompared(
-        quantity, *values, change, scale, float(test.statistic), float(test.pvalue), _verdict(quantity, change, scale)
-    )
+    compared: list[FigureCompared] = []
+    for quantity in QUANTITIES:
+        first, second = (known_values(described, quantity.value) for described in (one, other))
+        if min(len(first), len(second)) < _LEAST:
+            continue
+        values = summed(first, quantity.summed), summed(second, quantity.summed)
+        scale = float(second.std()) if quantity.signed else 1.0
+        change = _change(quantity, first, second, seed)
+        test = ks_2samp(first, second)
+        distance, p = float(test.statistic), float(test.pvalue)
+        compared.append(
+            FigureCompared(quantity, *values, change, scale, distance, p, _verdict(quantity, change, scale))
+        )
+    return tuple(compared)
 
 
 def _change(

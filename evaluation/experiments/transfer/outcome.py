@@ -659,16 +659,23 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
     every = [scene.name for scene in outcome.crossed.scenes]
     truths = np.stack([scene.truth for scene in outcome.test.scenes])
     with whole_folder(folder, "the results") as partial:
-        write_whole(partial / "results.csv", table_to_csv(long_table(outcome.figures)))
         groups = groups_of(outcome.test.scenes)
         write_whole(partial / "errors.csv", errors_csv(names, truths, labelled_results(outcome.rows), groups))
         for seed, folds in enumerate(outcome.folds):
             write_whole(partial / f"folds_{seed}.csv", folds_to_csv(every, folds))
-        write_whole(partial / "tables.tex", "\n".join(table_to_latex(table) for table in outcome.tables()))
-        write_whole(partial / "report.html", report_page(outcome))
-        if outcome.figures.to_better:
-            write_whole(partial / "beside_real.svg", standalone(beside_plot(outcome.figures)))
-        write_whole(partial / "run.json", json.dumps(_provenance(outcome), indent=2, ensure_ascii=False) + "\n")
+        write_shown(partial, outcome.figures, outcome.tables(), report_page(outcome), _provenance(outcome))
+
+
+def write_shown(
+    folder: Path, found: TransferFigures, tables: Sequence[Table], page: str, about: Mapping[str, Any]
+) -> None:
+    """Write what the folders of a transfer and of a pool have alike, errors aside."""
+    write_whole(folder / "results.csv", table_to_csv(long_table(found)))
+    write_whole(folder / "tables.tex", "\n".join(map(table_to_latex, tables)))
+    write_whole(folder / "report.html", page)
+    if found.to_better:
+        write_whole(folder / "beside_real.svg", standalone(beside_plot(found)))
+    write_whole(folder / "run.json", json.dumps(about, indent=2, ensure_ascii=False) + "\n")
 
 
 def report_page(outcome: TransferOutcome) -> str:
