@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +58,17 @@ class MixedScene(Scene, Protocol):
     def read_truth_map(self) -> npt.NDArray[np.float32]:
         """Return the light of each pixel: (H, W, 3) float32, r + g + b = 1; NaN where it is not known."""
         ...
+
+
+_Made = TypeVar("_Made")
+
+
+def told_of(made: Iterable[_Made], on_scene: Callable[[], None] | None) -> Iterator[_Made]:
+    """Yield what is made of one scene after another; `on_scene` is called when each was taken."""
+    for one in made:
+        yield one
+        if on_scene:
+            on_scene()
 
 
 @dataclass(frozen=True)

@@ -50,18 +50,15 @@ def known_again(scenes: Sequence[Scene], trained: npt.NDArray[np.uint64]) -> tup
     """Return the names of the scenes that are among others, whose identities (N, 2) uint64 are given."""
     images = {int(one) for one in trained[:, 0]}
     names = {int(one) for one in trained[:, 1]}
-    return tuple(
-        scene.name
-        for scene, (own, _) in zip(scenes, identities(scenes).tolist(), strict=True)
-        if own in images or _counterpart(scene) in names
-    )
-
-
-def _counterpart(scene: Scene) -> int:
-    """Return the second identity that a photograph's generated image has, or a generated image's photograph."""
-    if isinstance(scene, GeneratedScene):
-        return _number("real", _stem(scene.entry.source))
-    return _number("generated", _stem(scene.name))
+    found: list[str] = []
+    for scene, (own, _) in zip(scenes, identities(scenes).tolist(), strict=True):
+        if isinstance(scene, GeneratedScene):
+            counterpart = _number("real", _stem(scene.entry.source))
+        else:
+            counterpart = _number("generated", _stem(scene.name))
+        if own in images or counterpart in names:
+            found.append(scene.name)
+    return tuple(found)
 
 
 def source_marks(dataset: Dataset, known: dict[int, Mapping[str, str]]) -> Mapping[str, str]:

@@ -23,7 +23,7 @@ from evaluation.methods.method import Learner, LocalMethod, Method
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod
 from evaluation.metrics import MapError, measure_map
 from evaluation.results.result import Result, SceneAnswer, read_light, results_of
-from evaluation.scene import MixedScene, Scene
+from evaluation.scene import MixedScene, Scene, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import CropError, FormatError, InputError
 
@@ -69,11 +69,7 @@ def evaluate(
     'Gray-world: 0.00 degrees'
     """
     truths = require_truths(scenes, methods)
-    answers: list[tuple[SceneAnswer, ...]] = []
-    for given in answer_scenes(scenes, methods, workers):
-        answers.append(given)
-        if on_scene:
-            on_scene()
+    answers = list(told_of(answer_scenes(scenes, methods, workers), on_scene))
     return results_of([method.name for method in methods], truths, answers)
 
 

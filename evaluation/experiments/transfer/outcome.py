@@ -344,12 +344,13 @@ def beside_table(found: TransferFigures, name: str) -> Table | None:
     """Return the mean errors beside N real images; None if there were none."""
     known = {(row.row.method, row.row.training): row.statistics[0].value for row in found.rows}
     better = {(one.row.method, one.row.training): one for one in found.to_better}
+    of_real = next((one.row.data for one in found.rows if one.row.kind == "real"), "")
     rows: list[tuple[str | float | None, ...]] = []
     for row in (each.row for each in found.rows):
         if row.way not in ("pooled", "adapted") or (row.way == "pooled" and _as(row, "adapted") in better):
             continue
         ratio = better.get(_as(row, "adapted"))
-        alone = known.get((row.method, replace(row, kind="real", data=_data_of_real(found), way="alone").training))
+        alone = known.get((row.method, replace(row, kind="real", data=of_real, way="alone").training))
         listed = (known.get((row.method, row.material)), known.get(_as(row, "pooled")), known.get(_as(row, "adapted")))
         rows.append((row.method, row.material, row.real, alone, *listed, _written(ratio.ratios[0]) if ratio else None))
     if not rows:
@@ -377,10 +378,6 @@ def harm_notes(found: TransferFigures) -> list[str]:
 
 def _as(row: TransferRow, way: Way) -> tuple[str, str]:
     return row.method, replace(row, way=way).training
-
-
-def _data_of_real(found: TransferFigures) -> str:
-    return next((one.row.data for one in found.rows if one.row.kind == "real"), "")
 
 
 def naive_adapted_table(found: TransferFigures, name: str) -> Table | None:
