@@ -421,6 +421,24 @@ def test_a_data_set_without_an_image_is_refused() -> None:
         describe(SceneSet("none", "made", "/none", ()))
 
 
+def test_a_file_holds_all_of_it(tmp_path: Path) -> None:
+    made = describe(random_set("a", 12))
+    text = statistics_to_json(made)
+    path = tmp_path / "s.json"
+    path.write_text(text)
+    back = read_statistics(path)
+    assert back.images == made.images
+    assert back.treatment == made.treatment
+    for name, value in figures(made).items():
+        assert figures(back)[name] == pytest.approx(value, rel=1e-4, nan_ok=True), name
+    np.testing.assert_allclose(back.lights, made.lights, rtol=1e-5)
+    np.testing.assert_allclose(back.chroma, made.chroma, rtol=1e-5)
+    np.testing.assert_allclose(back.luminance, made.luminance, rtol=1e-5)
+    assert back.noise_unit == made.noise_unit
+    assert [len(curve.levels) for curve in back.noise] == [len(curve.levels) for curve in made.noise]
+    assert "NaN" not in text
+
+
 def test_a_light_below_0_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "s.json"
     path.write_text(statistics_to_json(describe(random_set("a", 3))).replace('"lights": [[0.', '"lights": [[-0.'))
