@@ -322,6 +322,17 @@ class PreparedImage:
             yield from differentiated_tiles(self.image, order, sigma, self.scale)
 
 
+def usable(
+    image: Image, saturation: float | None, mask: npt.NDArray[np.bool_] | None, border: int = 0
+) -> npt.NDArray[np.bool_]:
+    """Return (H, W) bool, True where a pixel may be used, for a method that prepares nothing.
+
+    See `PreparedImage.usable`. `image`: (H, W, 3), linear camera RGB. `saturation`, `mask`: as of `Method.estimate`.
+    `border`: px along every edge.
+    """
+    return PreparedImage(image, saturation, mask).usable(border)
+
+
 def estimate(method: Method, prepared: PreparedImage) -> npt.NDArray[np.float64]:
     """Return a method's estimate of a prepared image: (3,) float64 of length 1, or `GREY`.
 

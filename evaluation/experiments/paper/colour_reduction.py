@@ -31,7 +31,7 @@ import numpy.typing as npt
 from evaluation.experiments.running import require_truths
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Method
-from evaluation.methods.prepared import PreparedImage
+from evaluation.methods.prepared import usable
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result, SceneAnswer, read_light, results_of
@@ -145,7 +145,7 @@ def bits_removed(
     def answers_for(scene: Scene) -> list[list[SceneAnswer]]:
         image, mask = scene.read()
         # Clipped pixels are known before the reduction only; they have their say in the operator, as in a camera.
-        left_out = ~PreparedImage(image, scene.saturation, mask).usable()
+        left_out = ~usable(image, scene.saturation, mask)
         versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
         return [[read_light(method.estimate(version, None, left_out)) for method in methods] for version in versions]
 
@@ -215,7 +215,7 @@ def write_codes(
             scene, name = numbered
             image, mask = scene.read()
             found = fitted_codes(image, mask)
-            left_out = ~PreparedImage(image, scene.saturation, mask).usable()
+            left_out = ~usable(image, scene.saturation, mask)
             _write_png(folder / "codes" / name, clear_bits(found.codes, cleared)[..., ::-1])
             if left_out.any():
                 _write_png(folder / "masks" / name, left_out.astype(np.uint8) * np.uint8(255))

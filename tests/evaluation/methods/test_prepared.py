@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.prepared import GREY, PreparedImage, shrink
+from evaluation.methods.prepared import GREY, PreparedImage, shrink, usable
 from evaluation.methods.standard import standard_methods
 from evaluation.methods.wrapped import ResizedMethod
 from evaluation.metrics import recovery_error
@@ -17,7 +17,7 @@ def test_which_pixels_are_used() -> None:
     image[3, 4, 1] = 10
     mask = np.zeros((7, 9), dtype=bool)
     mask[1, 1] = True
-    used = PreparedImage(image, 10, mask).usable(1)
+    used = usable(image, 10, mask, 1)
     expected = np.zeros((7, 9), dtype=bool)
     expected[1:6, 1:8] = True
     expected[2:5, 3:6] = False
