@@ -80,13 +80,14 @@ def compare(
     runs = [read_errors(place) for place in results]
     pairs = _of_one(runs[0], results[0], method, error) if len(runs) == 1 else _of_two(runs, results, method, error)
     comparisons = comparing.compare(pairs, seed, level)
+    records = [_run_json(place) for place in results]
     notes = (
         *comparing.notes_of(comparisons),
         *_unchecked(runs, results),
-        *_ungrouped(runs, results),
-        *_unlike(results),
+        *_ungrouped(runs, results, records),
+        *_unlike(records),
         *_guessed(runs, results),
-        *_indistinct(comparisons, results),
+        *_indistinct(comparisons, records),
     )
     if out is not None:
         comparing.write_comparisons(out, comparisons, notes, level)
@@ -203,49 +204,43 @@ def _unchecked(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]
     ]
 
 
-def _ungrouped(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]) -> list[str]:
+def _ungrouped(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str], records: Sequence[Any]) -> list[str]:
     """Return a sentence for results of generated images that do not say which are of one picture.
 
     Results of before `groups` stood in `run.json` have no column of groups even where images share their pictures.
     """
     if any(method.groups is not None for run in runs for method in run.values()):
         return []
-
-    def silent(place: str) -> bool:
-        try:
-            about = _run_json(place)["data_set"]
-            return about["layout"] == "generated" and "groups" not in about
-        except (KeyError, TypeError):
-            return False
-
     return [
         f"{place} does not say which images are of one picture: where some are, they are not independent, and p and "
         "intervals are too small; run the methods again to have them counted by picture"
-        for place in places
-        if silent(place)
+        for place, record in zip(places, records, strict=True)
+        if _said(record, "data_set", "layout") == "generated" and _said(record, "data_set", "groups") is None
     ]
 
 
-def _unlike(places: Sequence[str]) -> list[str]:
+def _unlike(records: Sequence[Any]) -> list[str]:
     """Return a sentence for each thing that two runs did otherwise to the images: not only the methods then differ."""
-    found = [_record(place) for place in places]
-    if len(found) < 2 or not all(found):
+    done: list[dict[str, str]] = []
+    for record in records:
+        place, treatment = _said(record, "data_set", "place"), _said(record, "treatment")
+        if place is None or not isinstance(treatment, dict):
+            return []
+        done.append({what: str(how) for what, how in {"images": place, **treatment}.items()})
+    if len(done) < 2:
         return []
-    one, other = found
+    one, other = done
     differing = [what for what in one if what in other and one[what] != other[what]]
     return [
         f"the runs differ in their {what}: {one[what]} in the first, {other[what]} in the second" for what in differing
     ]
 
 
-def _record(place: str) -> dict[str, str]:
-    """Return where the images of a results folder came from and what was done to them; nothing if it does not say."""
-    content = _run_json(place)
-    try:
-        treatment = content["treatment"]
-        return {"images": str(content["data_set"]["place"]), **{str(what): str(treatment[what]) for what in treatment}}
-    except (KeyError, TypeError):
-        return {}
+def _said(record: Any, *names: str) -> Any:
+    """Return what a run.json says below names; None where it does not say."""
+    for name in names:
+        record = record.get(name) if isinstance(record, dict) else None
+    return record
 
 
 def _run_json(place: str) -> Any:
@@ -259,10 +254,10 @@ def _run_json(place: str) -> Any:
         return {}
 
 
-def _indistinct(comparisons: Sequence[Comparison], places: Sequence[str]) -> list[str]:
+def _indistinct(comparisons: Sequence[Comparison], records: Sequence[Any]) -> list[str]:
     """Return a sentence for each comparison whose medians differ by less than ground truths may be off by."""
-    stated = [_truth_uncertainty(place) for place in places]
-    known = max((one for one in stated if one is not None), default=None)
+    stated = [_said(record, "data_set", "truth_uncertainty_deg") for record in records]
+    known = max((float(one) for one in stated if isinstance(one, int | float)), default=None)
     if known is None:
         return []
     medians = [
@@ -274,14 +269,6 @@ def _indistinct(comparisons: Sequence[Comparison], places: Sequence[str]) -> lis
         for made, apart in medians
         if abs(apart) < known
     ]
-
-
-def _truth_uncertainty(place: str) -> float | None:
-    """Return what ground truths of a results folder may be off by, degrees; None if it does not say."""
-    try:
-        return float(_run_json(place)["data_set"]["truth_uncertainty_deg"])
-    except (ValueError, KeyError, TypeError):
-        return None
 
 
 def _guessed(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]) -> list[str]:

@@ -11,7 +11,7 @@ from evaluation.commands.options import DataReading, argument, image_steps, thre
 from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
 
 if TYPE_CHECKING:
-    from evaluation.experiments.describing import DataDescription
+    from evaluation.experiments.describing.description import DataDescription
 
 HELP = f"""Describe the images and lights of a data set, and hold them beside another's: how real is what was generated.
 
@@ -92,8 +92,7 @@ def describe(
 
 
 def _described(place: str, reading: DataReading, cells: int, workers: int) -> DataDescription:
-    from evaluation.experiments.describing import describe
-    from evaluation.experiments.describing.description import read_statistics
+    from evaluation.experiments.describing.description import describe, read_statistics
     from foundation.errors import InputError
 
     if reading.layout is None and place.endswith(".json") and Path(place).is_file():

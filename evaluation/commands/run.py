@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from evaluation.commands.options import (
     METHOD_HELP,
@@ -17,10 +17,6 @@ from evaluation.commands.options import (
     thread_option,
 )
 from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
-
-if TYPE_CHECKING:
-    from evaluation.metrics import ErrorKind
-    from evaluation.results.result import Run
 
 HELP = f"""Estimate the light of every image of a data set and sum up the errors.
 
@@ -78,7 +74,9 @@ def run(
 ) -> None:
     """Evaluate methods on a data set."""
     from evaluation.experiments.run_folder import run_methods
+    from evaluation.reports.table_output import print_table, show_notes
     from evaluation.results.result import images_csv, table_csv
+    from evaluation.results.tables import lights_tables, statistics_rows, summary_table
     from foundation.compiled import processor_count
     from foundation.console import orderly_end, progress
     from foundation.files import write_whole
@@ -97,9 +95,14 @@ def run(
     if images is not None:
         write_whole(images, images_csv(found.scenes, made.results))
     if told.asked:
-        _tell(made, told)
+        table = statistics_rows(made.subject, made.results)
+        told.add(data_set=made.subject.name, images=len(made.subject.images))
+        told.add(errors=[dict(zip(table.columns, row, strict=True)) for row in table.rows])
     else:
-        _print(made, error, statistics == "all")
+        print_table(summary_table(made.subject, made.results, error, statistics == "all"))
+        for table in lights_tables(made.subject, made.results, error):
+            print_table(table)
+    show_notes(told, made.notes, made.treatment)
 
 
 def _require_free(csv: Path | None, images: Path | None, out: Path | None) -> None:
@@ -116,27 +119,3 @@ def _require_free(csv: Path | None, images: Path | None, out: Path | None) -> No
         for path in (csv, images):
             if path is not None and Path(os.path.realpath(path)).is_relative_to(os.path.realpath(out)):
                 raise InputError(f"{path} lies in {out}, which --out makes and fills; name a place outside")
-
-
-def _print(made: Run, error: ErrorKind, further: bool) -> None:
-    """Print the tables, what was done to the images, and what else is to be said."""
-    from evaluation.reports.table_output import print_table
-    from evaluation.results.tables import lights_tables, summary_table
-
-    print_table(summary_table(made.subject, made.results, error, further))
-    for table in lights_tables(made.subject, made.results, error):
-        print_table(table)
-    for note in made.notes:
-        print(note)
-    for what, how in made.treatment.items():
-        print(f"{what}: {how}")
-
-
-def _tell(made: Run, told: JsonOutput) -> None:
-    """Add every statistic of every kind of error, and what was done to the images."""
-    from evaluation.results.tables import statistics_rows
-
-    table = statistics_rows(made.subject, made.results)
-    rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
-    told.add(data_set=made.subject.name, images=len(made.subject.images), treatment=dict(made.treatment))
-    told.add(notes=list(made.notes), errors=rows)

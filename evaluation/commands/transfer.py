@@ -151,13 +151,10 @@ def transfer(
     tested = reading.open(test)
     others = None if relit is None else open_scenes(relit)
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared, others)
-    unlike = _sizes(tested, plan, side)
-    plan = replace(plan, notes=(*plan.notes, *([unlike] if unlike else []), *left_out))
     counted, places, partly = _only(only, tested)
-    plan = replace(plan, notes=(*plan.notes, *partly))
     drawn = tuple(choose_folds(tested, folds, seed)[0] for seed in range(seeds))
     wished, too_many = _within(wished, drawn)
-    plan = replace(plan, notes=(*plan.notes, *too_many, *_not_adapted(learners, wished)))
+    notes = [*plan.notes, *_sizes(tested, plan, side), *left_out, *partly, *too_many, *_not_adapted(learners, wished)]
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
     count = count_images(tested.scenes, plan.training, len(drawn), wanted)
@@ -169,9 +166,8 @@ def transfer(
             beside=wished,
             counted=places,
         )
-    plan = replace(plan, notes=(*plan.notes, *_suspicions(counted, rows)))
     figures = figures_of(rows, error, groups=groups_of(counted.scenes))
-    plan = replace(plan, notes=(*plan.notes, *harm_notes(figures)))
+    plan = replace(plan, notes=(*notes, *_suspicions(counted, rows), *harm_notes(figures)))
     settings: dict[str, Any] = {
         "methods": [describe_method(learner) for learner in learners],
         "statistics": [describe_method(method) for method in references],
@@ -259,7 +255,6 @@ def _not_adapted(learners: Sequence[AnyLearner], beside: BesideReal) -> list[str
 
 
 def _references(text: str) -> list[Method]:
-
     return [] if text.strip().lower() == "none" else choose_methods(text.split(","))
 
 
@@ -298,14 +293,14 @@ def _suspicions(test: SceneSet, rows: Sequence[TransferRow]) -> tuple[str, ...]:
     return suspicions([scene.name for scene in test.scenes], np.stack([scene.truth for scene in test.scenes]), results)
 
 
-def _sizes(test: SceneSet, plan: TransferPlan, side: int | None) -> str:
+def _sizes(test: SceneSet, plan: TransferPlan, side: int | None) -> list[str]:
     """Return what the reader is told of the sizes of images; nothing where they are alike."""
     if side is not None:
-        return f"All images were made small to at most {side} px by averaging areas without clipped and masked pixels"
+        return [f"All images were made small to at most {side} px by averaging areas without clipped and masked pixels"]
     sizes = [max(scenes[0].read()[0].shape) for scenes in (test.scenes, plan.training[0].scenes)]
     if max(sizes) <= _ALIKE * min(sizes):
-        return ""
-    return (
+        return []
+    return [
         f"Training images have sides of up to {sizes[1]} px and test images of up to {sizes[0]} px: methods see detail "
         f"and noise in one that the other lacks; --side {min(sizes)} makes them alike"
-    )
+    ]

@@ -9,7 +9,7 @@ another ground truth, is not known again. A run that goes on asks whether the fi
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
@@ -24,6 +24,7 @@ from evaluation.datasets.thumbnails import Thumbnail
 from evaluation.scene import Scene
 from foundation.errors import CropError
 from foundation.files import sha256_of
+from generator.dataset.reader import Dataset
 
 
 def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:
@@ -32,13 +33,12 @@ def identities(scenes: Sequence[Scene]) -> npt.NDArray[np.uint64]:
     The first is of the image: name and light; of a generated one its source picture, whatever the light. The second is
     of the name, by which a generated image and the photograph that it was made from find each other.
     """
-    sources: dict[int, dict[str, str]] = {}
+    known: dict[int, Mapping[str, str]] = {}
     rows: list[tuple[int, int]] = []
     for scene in scenes:
         if isinstance(scene, GeneratedScene):
-            known = sources.setdefault(id(scene.dataset), _sources(scene))
-            source = scene.entry.source
-            rows.append((_number("source", known[source]), _number("generated", _stem(source))))
+            source, marks = scene.entry.source, source_marks(scene.dataset, known)
+            rows.append((_number("source", marks[source]), _number("generated", _stem(source))))
         else:
             total = max(float(scene.truth.sum()), np.finfo(float).tiny)
             light = " ".join(f"{part:.4f}" for part in scene.truth / total)
@@ -50,23 +50,26 @@ def known_again(scenes: Sequence[Scene], trained: npt.NDArray[np.uint64]) -> tup
     """Return the names of the scenes that are among others, whose identities (N, 2) uint64 are given."""
     images = {int(one) for one in trained[:, 0]}
     names = {int(one) for one in trained[:, 1]}
-    return tuple(
-        scene.name
-        for scene, (own, _) in zip(scenes, identities(scenes).tolist(), strict=True)
-        if own in images or _counterpart(scene) in names
-    )
+    found: list[str] = []
+    for scene, (own, _) in zip(scenes, identities(scenes).tolist(), strict=True):
+        if isinstance(scene, GeneratedScene):
+            counterpart = _number("real", _stem(scene.entry.source))
+        else:
+            counterpart = _number("generated", _stem(scene.name))
+        if own in images or counterpart in names:
+            found.append(scene.name)
+    return tuple(found)
 
 
-def _counterpart(scene: Scene) -> int:
-    """Return the second identity that a photograph's generated image has, or a generated image's photograph."""
-    if isinstance(scene, GeneratedScene):
-        return _number("real", _stem(scene.entry.source))
-    return _number("generated", _stem(scene.name))
+def source_marks(dataset: Dataset, known: dict[int, Mapping[str, str]]) -> Mapping[str, str]:
+    """Return by what the source pictures of a generated set are known: the hash of the file, or how it was drawn.
 
-
-def _sources(scene: GeneratedScene) -> dict[str, str]:
-    seed = scene.dataset.description.seed
-    return {record.name: record.sha256 or f"{record.name} of seed {seed}" for record in scene.dataset.sources}
+    `known` keeps those of each set, which many images ask for.
+    """
+    if id(dataset) not in known:
+        seed = dataset.description.seed
+        known[id(dataset)] = {one.name: one.sha256 or f"{one.name} of seed {seed}" for one in dataset.sources}
+    return known[id(dataset)]
 
 
 def _stem(name: str) -> str:

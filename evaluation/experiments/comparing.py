@@ -26,7 +26,7 @@ from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, tables_to_latex
 from evaluation.results.files import MethodErrors
 from evaluation.results.result import csv_text
-from evaluation.results.tables import PAPER_COLUMNS, Table, table_to_csv
+from evaluation.results.tables import PAPER_COLUMNS, Table, finite_or_none, table_to_csv
 from foundation import pages
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted
@@ -375,7 +375,7 @@ def statistics_table(comparison: Comparison, level: float) -> Table:
         f"{one} against {other}: {matched.kind} errors of {matched.cases}, degrees",
         ("Statistic", "First", "Second", "Difference", "from", "to", "Ratio", "ratio from", "ratio to"),
         tuple(
-            (_HEADS[made.statistic], made.one, made.other, *map(_known, (*made.difference, *made.ratio)))
+            (_HEADS[made.statistic], made.one, made.other, *map(finite_or_none, (*made.difference, *made.ratio)))
             for made in comparison.statistics
         ),
         digits=3,
@@ -446,10 +446,6 @@ def _title(comparisons: Sequence[Comparison]) -> str:
     return f"{len(comparisons)} comparisons of {comparisons[0].matched.kind} errors"
 
 
-def _known(number: float) -> float | None:
-    return None if number != number else number
-
-
 def _statistics_csv(comparisons: Sequence[Comparison]) -> str:
     heads = ("difference", "difference_low", "difference_high", "ratio", "ratio_low", "ratio_high")
     rows = tuple(
@@ -458,7 +454,7 @@ def _statistics_csv(comparisons: Sequence[Comparison]) -> str:
             compared.statistic,
             compared.one,
             compared.other,
-            *(_known(number) for number in (*compared.difference, *compared.ratio)),
+            *map(finite_or_none, (*compared.difference, *compared.ratio)),
         )
         for made in comparisons
         for compared in made.statistics

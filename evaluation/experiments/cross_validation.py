@@ -31,7 +31,7 @@ from evaluation.methods.prepared import shrink, unit
 from evaluation.metrics import ErrorKind, Summary, recovery_error, reproduction_error, summarise
 from evaluation.results.result import NO_PIXEL, Result, SceneAnswer, read_light, results_of
 from evaluation.results.tables import PAPER_COLUMNS, STATISTICS_COLUMNS, Cell, Table
-from evaluation.scene import Image, Scene
+from evaluation.scene import Image, Scene, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
@@ -75,12 +75,7 @@ def make_small(
             return SmallScene(scene.name, scene.truth, image, mask, scene.saturation)
         return SmallScene(scene.name, scene.truth, *shrink_image(image, side, scene.saturation, mask), None)
 
-    made: list[SmallScene] = []
-    for scene in ordered_map(small, scenes, workers):
-        made.append(scene)
-        if on_scene:
-            on_scene()
-    return tuple(made)
+    return tuple(told_of(ordered_map(small, scenes, workers), on_scene))
 
 
 def shrink_image(

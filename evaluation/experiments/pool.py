@@ -29,23 +29,18 @@ from evaluation.experiments.transfer.outcome import (
     ForestLine,
     RowRatio,
     TransferFigures,
-    base_ratios_table,
     beside_plot,
-    beside_table,
-    errors_table,
     figures_of,
     forest_plot,
-    intervals_table,
     labelled_results,
     long_table,
-    naive_adapted_table,
-    naive_ratios_table,
-    real_ratios_table,
     shown_ratios,
+    tables_of,
+    write_shown,
 )
 from evaluation.experiments.transfer.rows import Kind, TransferRow, Way
 from evaluation.metrics import ErrorKind
-from evaluation.reports.table_output import table_part, table_to_latex
+from evaluation.reports.table_output import table_part
 from evaluation.results.files import MethodErrors, errors_csv, read_errors
 from evaluation.results.result import Result
 from evaluation.results.tables import Cell, Table, table_to_csv
@@ -53,7 +48,6 @@ from foundation import pages
 from foundation.errors import FormatError, InputError, counted, first_of
 from foundation.files import read_csv, write_whole
 from foundation.folders import whole_folder
-from foundation.plots import standalone
 from foundation.version import software
 
 _KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -90,6 +84,7 @@ def read_transfer(place: Path | str) -> TransferResults:
     errors = read_errors(folder)
     rows: list[TransferRow] = []
     first: MethodErrors | None = None
+    truths: npt.NDArray[np.float64] | None = None
     for row, seeds in _listed(folder / "results.csv"):
         found = [errors.get(name) for name in row.labels(seeds)]
         whole = [one for one in found if one is not None]
@@ -98,16 +93,18 @@ def read_transfer(place: Path | str) -> TransferResults:
                 f"{folder / 'errors.csv'} lacks {first_of(row.labels(seeds))}, which results.csv has; the files of a "
                 "results folder belong together: run the transfer again"
             )
-        first = first or whole[0]
+        results: list[Result] = []
         for one in whole:
+            first = first or one
             if one.images != first.images or one.truths is None or one.estimates is None:
                 raise FormatError(
                     f"{folder / 'errors.csv'}: {one.method} has other images than {first.method}, or lights are "
                     "missing; run the transfer again"
                 )
-        results = tuple(Result(row.method, _lights(one.estimates), one.errors, one.guessed) for one in whole)
-        rows.append(replace(row, results=results))
-    if first is None:
+            truths = one.truths if truths is None else truths
+            results.append(Result(row.method, one.estimates, one.errors, one.guessed))
+        rows.append(replace(row, results=tuple(results)))
+    if first is None or truths is None:
         raise FormatError(f"{folder / 'results.csv'} has no row; run the transfer again")
     try:
         test, error = str(about["test"]["name"]), about["settings"]["error"]
@@ -115,9 +112,7 @@ def read_transfer(place: Path | str) -> TransferResults:
         conditions = _conditions(about["settings"])
     except (AttributeError, KeyError, TypeError) as fault:
         raise FormatError(f"{folder / 'run.json'} does not say the {fault} of the transfer; run it again") from fault
-    return TransferResults(
-        str(place), test, first.images, _lights(first.truths), tuple(rows), error, conditions, generated
-    )
+    return TransferResults(str(place), test, first.images, truths, tuple(rows), error, conditions, generated)
 
 
 def _conditions(settings: Mapping[str, Any]) -> dict[str, str]:
@@ -169,13 +164,6 @@ def _listed(path: Path) -> list[tuple[TransferRow, int]]:
     ]
 
 
-def _lights(given: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64]:
-    """Return lights that were found to be there."""
-    if given is None:
-        raise TypeError("lights are checked before they are taken")
-    return given
-
-
 @dataclass(frozen=True, eq=False)
 class Pool:
     """Several results as one.
@@ -215,8 +203,11 @@ def pool_transfers(parts: Sequence[TransferResults]) -> Pool:
         )
     notes = [f"Left out, since not all of the results have them: {'; '.join(missing)}"] if missing else []
     notes += _differences(parts)
-    labels = _short_names([part.place for part in parts])
-    rows = [_joined([rows[key] for rows in keyed], [part.place for part in parts], single) for key in common]
+    places = [part.place for part in parts]
+    labels = [Path(place).resolve().name for place in places]
+    if len(set(labels)) < len(labels):
+        labels = places
+    rows = [_joined([rows[key] for rows in keyed], places, single) for key in common]
     return Pool(
         images=tuple(f"{label}/{image}" for label, part in zip(labels, parts, strict=True) for image in part.images),
         truths=np.concatenate([part.truths for part in parts]),
@@ -287,12 +278,6 @@ def _require_apart(parts: Sequence[TransferResults]) -> None:
                     f"{image} is a test image of {parts[other].place} and of {part.place}; pool results of different "
                     "images, such as of different cameras, or of parts of one data set (evaluate transfer --only)"
                 )
-
-
-def _short_names(places: Sequence[str]) -> list[str]:
-    """Return the folders' own names, or the paths as they were named where two folders have one name."""
-    names = [Path(place).resolve().name for place in places]
-    return names if len(set(names)) == len(names) else list(places)
 
 
 _MOST_LINES: Final = 90
@@ -401,15 +386,13 @@ class PoolTables:
     """What a pool comes to: tables, and what they were made of.
 
     - `shown`: in the order in which they are shown.
-    - `pooled`: all numbers of the pool for other programs, see `transfer.tables.long_table`.
-    - `single`: the same of each test set by itself, its name and images before them.
+    - `single`: all numbers of each test set by itself, its name and images before them, see `outcome.long_table`.
     - `figures`: what the rows come to over all images.
     - `figures_of_tests`: the same of each test set by itself, by its name.
     - `base`: what the rows are trained on that every other one is held to, as it was asked for; None if none was.
     """
 
     shown: tuple[Table, ...]
-    pooled: Table
     single: Table
     figures: TransferFigures
     figures_of_tests: Mapping[str, TransferFigures]
@@ -423,23 +406,18 @@ def make_tables(pool: Pool, error: ErrorKind, base: str | None = None) -> PoolTa
     every = figures_of(pool.rows, error, base=base)
     members = {test: np.flatnonzero(np.array(pool.tests) == test) for test in tests}
     single = {
-        test: figures_of([_at(row, places) for row in pool.rows], error, base=base) for test, places in members.items()
+        test: figures_of(
+            [replace(row, results=tuple(result.at(places) for result in row.results)) for row in pool.rows],
+            error,
+            base=base,
+        )
+        for test, places in members.items()
     }
-    shown = (
-        errors_table(every, name, len(pool.images)),
-        intervals_table(every, name),
-        real_ratios_table(every, name),
-        naive_ratios_table(every, name),
-        base_ratios_table(every, name),
-        beside_table(every, name),
-        naive_adapted_table(every, name),
-        _by_test_set(single, {test: len(places) for test, places in members.items()}),
-    )
+    apart = _by_test_set(single, {test: len(places) for test, places in members.items()})
     listed = [(test, long_table(figures)) for test, figures in single.items()]
     rows: list[tuple[Cell, ...]] = [(test, len(members[test]), *row) for test, table in listed for row in table.rows]
     return PoolTables(
-        tuple(table for table in shown if table is not None),
-        long_table(every),
+        (*tables_of(every, name, len(pool.images)), apart),
         Table("All numbers of each test set", ("test", "test_images", *listed[0][1].columns), tuple(rows)),
         every,
         single,
@@ -460,19 +438,10 @@ def save_pool(pool: Pool, tables: PoolTables, places: Sequence[str], error: Erro
         "notes": list(pool.notes),
     }
     with whole_folder(folder, "the results") as partial:
-        write_whole(partial / "results.csv", table_to_csv(tables.pooled))
         write_whole(partial / "by_test_set.csv", table_to_csv(tables.single))
         write_whole(partial / "errors.csv", errors_csv(pool.images, pool.truths, labelled_results(pool.rows)))
-        write_whole(partial / "tables.tex", "\n".join(table_to_latex(table) for table in tables.shown))
-        report = pool_page(pool, tables.shown, tables.figures, tables.figures_of_tests, places)
-        write_whole(partial / "report.html", report)
-        if tables.figures.to_better:
-            write_whole(partial / "beside_real.svg", standalone(beside_plot(tables.figures)))
-        write_whole(partial / "run.json", json.dumps(about, indent=2, ensure_ascii=False) + "\n")
-
-
-def _at(row: TransferRow, places: np.ndarray[tuple[int], np.dtype[np.int64]]) -> TransferRow:
-    return replace(row, results=tuple(result.at(places) for result in row.results))
+        page = pool_page(pool, tables.shown, tables.figures, tables.figures_of_tests, places)
+        write_shown(partial, tables.figures, tables.shown, page, about)
 
 
 def _by_test_set(single: dict[str, TransferFigures], images: dict[str, int]) -> Table:

@@ -62,8 +62,11 @@ def read_journal(path: Path, identity: dict[str, Any]) -> list[tuple[SceneAnswer
             path.write_bytes(_line(identity))
             return []
         if not same:
+            differing = " and ".join(
+                name for name in {**head, **identity} if head.get(name) != json.loads(json.dumps(identity.get(name)))
+            )
             raise InputError(
-                f"{path.parent} holds what another run has made so far: its {_difference(head, identity)} differ; go "
+                f"{path.parent} holds what another run has made so far: its {differing} differ; go "
                 "on with that run by its own options, name another place, or remove that folder to begin anew"
             )
         answers: list[tuple[SceneAnswer, ...]] = []
@@ -113,11 +116,6 @@ def _whole_lines(content: bytes) -> tuple[int, list[bytes]]:
     return place, lines
 
 
-def _difference(there: dict[str, Any], here: dict[str, Any]) -> str:
-    """Return the parts in which two identities differ."""
-    return " and ".join(name for name in {**there, **here} if there.get(name) != json.loads(json.dumps(here.get(name))))
-
-
 WHAT = "the results"
 """What the folder holds, for messages."""
 
@@ -142,7 +140,10 @@ def run_methods(
         raise InputError(f"two methods are called {twice[0]!r}; give one another name, or leave one out")
     truths = require_truths(data.scenes, methods)
     # Methods are described before they run: what they keep or import while they do depends on where a run went on.
-    run = _run_of(data, methods)
+    run = describe_run(data, (), [describe_method(method) for method in methods])
+    records = {one.name: one.provenance for one in methods if isinstance(one, StoredMethod) and one.provenance}
+    seen = (_seen_before(name, record, data, run.data_sha256) for name, record in records.items())
+    run = replace(run, notes=tuple(filter(None, seen)))
 
     def finished(answers: Sequence[Sequence[SceneAnswer]]) -> Run:
         results = results_of(names, truths, answers)
@@ -214,18 +215,6 @@ def describe_run(
         software=software(),
         truth_uncertainty_deg=data.truth_uncertainty_deg,
     )
-
-
-def _run_of(data: SceneSet, methods: Sequence[Method | SceneMethod]) -> Run:
-    """Return a run before it has any results."""
-    run = describe_run(data, (), [describe_method(method) for method in methods])
-    notes: list[str] = []
-    for method in methods:
-        if not isinstance(method, StoredMethod) or not method.provenance:
-            continue
-        note = _seen_before(method.name, method.provenance, data, run.data_sha256)
-        notes += [note] if note else []
-    return replace(run, notes=tuple(notes))
 
 
 def _seen_before(name: str, record: TrainingRecord, data: SceneSet, sha256: str) -> str:

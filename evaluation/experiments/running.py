@@ -23,7 +23,7 @@ from evaluation.methods.method import Learner, LocalMethod, Method
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod
 from evaluation.metrics import MapError, measure_map
 from evaluation.results.result import Result, SceneAnswer, read_light, results_of
-from evaluation.scene import MixedScene, Scene
+from evaluation.scene import MixedScene, Scene, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import CropError, FormatError, InputError
 
@@ -69,11 +69,7 @@ def evaluate(
     'Gray-world: 0.00 degrees'
     """
     truths = require_truths(scenes, methods)
-    answers: list[tuple[SceneAnswer, ...]] = []
-    for given in answer_scenes(scenes, methods, workers):
-        answers.append(given)
-        if on_scene:
-            on_scene()
+    answers = list(told_of(answer_scenes(scenes, methods, workers), on_scene))
     return results_of([method.name for method in methods], truths, answers)
 
 
@@ -92,7 +88,9 @@ def answer_scenes(
     Methods of this suite are called by several threads at once. Others are called by one thread at a time and get a
     copy of the image, which they may change; with one worker everything runs in the calling thread.
     """
-    runners = [_runner_of(method) for method in methods]
+    runners = [
+        _Runner(method, None if type(method).__module__.startswith("evaluation.") else Lock()) for method in methods
+    ]
     blind = all(isinstance(method, SceneMethod) for method in methods)
     yield from ordered_map(lambda scene: _answer(scene, runners, blind), scenes, workers)
 
@@ -110,10 +108,6 @@ class _Runner:
             return function(*arguments)
         with self.lock:
             return function(*(one.copy() if isinstance(one, np.ndarray) else one for one in arguments))
-
-
-def _runner_of(method: Method | SceneMethod) -> _Runner:
-    return _Runner(method, None if type(method).__module__.startswith("evaluation.") else Lock())
 
 
 def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[SceneAnswer, ...]:

@@ -68,7 +68,9 @@ def _ways(images: Sequence[str]) -> dict[str, Callable[[_Lights], _Lights]]:
     by_text = np.array(sorted(range(len(images)), key=lambda place: images[place]))
     ways: dict[str, Callable[[_Lights], _Lights]] = {
         "with red and blue exchanged": lambda lights: lights[:, ::-1],
-        "as gains, the reciprocals of lights,": _reciprocal,
+        "as gains, the reciprocals of lights,": lambda lights: (
+            1 / np.maximum(lights, _FLOOR * lights.max(axis=1, keepdims=True))
+        ),
         "given to the image before": lambda lights: np.roll(lights, -1, axis=0),
         "given to the image after": lambda lights: np.roll(lights, 1, axis=0),
     }
@@ -77,10 +79,6 @@ def _ways(images: Sequence[str]) -> dict[str, Callable[[_Lights], _Lights]]:
         ways["in the order of names as text (1, 10, 2)"] = lambda lights: lights[by_text]
         ways["in the order of names as numbers (1, 2, 10)"] = lambda lights: lights[back]
     return ways
-
-
-def _reciprocal(lights: _Lights) -> _Lights:
-    return 1 / np.maximum(lights, _FLOOR * lights.max(axis=1, keepdims=True))
 
 
 def _sentence(how: str, those: Sequence[tuple[str, float, float]], methods: int) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY, unit
-from evaluation.scene import Image, Scene
+from evaluation.scene import Image, Scene, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
@@ -143,11 +143,7 @@ def extract(
         image, mask = scene.read()
         return [learner.features(image, scene.saturation, mask) for learner in learners]
 
-    rows: list[list[Features | None]] = []
-    for row in ordered_map(of_one, scenes, workers):
-        rows.append(row)
-        if on_scene:
-            on_scene()
+    rows = list(told_of(ordered_map(of_one, scenes, workers), on_scene))
     return tuple([row[place] for row in rows] for place in range(len(learners)))
 
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from evaluation.methods.method import Method
 from evaluation.methods.naming import FAMILIES, find_method
 from evaluation.methods.prepared import GREY, estimate_all
-from evaluation.scene import Scene
+from evaluation.scene import Scene, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
@@ -77,12 +77,7 @@ def tune(
         lights = estimate_all(candidates, image, scene.saturation, mask)
         return [np.full(3, np.nan) if light is GREY else light for light in lights]
 
-    found: list[list[npt.NDArray[np.float64]]] = []
-    for lights in ordered_map(estimates, scenes, workers):
-        found.append(lights)
-        if on_scene:
-            on_scene()
-    every = np.array(found)
+    every = np.array(list(told_of(ordered_map(estimates, scenes, workers), on_scene)))
     counted = np.asarray(np.isfinite(every).all(axis=(1, 2)))
     given = every[counted]
     if len(given) < _FEWEST_IMAGES:

@@ -262,7 +262,7 @@ def run_page(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes
         ),
         *_images(run, kind, pictures),
         pages.heading("Methods"),
-        table_part(_methods(run)),
+        table_part(Table("As they were run", ("Method", "Class", "Settings"), tuple(map(_method, run.methods)))),
         pages.note(f"Data set {run.data_sha256[:16]}…, {run.software}"),
     ]
     return pages.page(f"{run.subject.name}: {len(run.results)} method{'s' * (len(run.results) > 1)}", parts)
@@ -311,17 +311,11 @@ def _image(run: Run, number: int, place: int, kind: ErrorKind, pictures: Mapping
     return pages.figure(pictures[number, place], "; ".join(words), f"{image} as recorded, by {result.method}, by truth")
 
 
-def _methods(run: Run) -> Table:
-    rows = tuple(
-        (str(method.get("name", "")), str(method.get("class", "estimates of another program")), _settings_text(method))
-        for method in run.methods
-    )
-    return Table("As they were run", ("Method", "Class", "Settings"), rows)
-
-
-def _settings_text(method: Mapping[str, Any]) -> str:
+def _method(method: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return name, class and settings of a method."""
     settings: Mapping[str, Any] = method.get("settings", method.get("estimates", {}))
-    return ", ".join(f"{name} {_short(value)}" for name, value in settings.items())
+    told = ", ".join(f"{name} {_short(value)}" for name, value in settings.items())
+    return str(method.get("name", "")), str(method.get("class", "estimates of another program")), told
 
 
 def _short(value: Any) -> str:

@@ -185,19 +185,21 @@ def results_of(
 
     `truths`: (N, 3) float64, the true lights of the scenes.
     """
-    return tuple(_result(method, truths, [given[number] for given in answers]) for number, method in enumerate(methods))
-
-
-def _result(method: str, truths: npt.NDArray[np.float64], answers: Sequence[SceneAnswer]) -> Result:
-    estimates = np.array([GREY if answer.light is None else answer.light for answer in answers], dtype=np.float64)
-    return Result(
-        method,
-        estimates,
-        {"recovery": recovery_error(estimates, truths), "reproduction": reproduction_error(estimates, truths)},
-        np.array([answer.light is None for answer in answers]),
-        {number: answer.cause for number, answer in enumerate(answers) if answer.cause},
-        {number: answer.by_pixel for number, answer in enumerate(answers) if answer.by_pixel} or None,
-    )
+    results: list[Result] = []
+    for place, method in enumerate(methods):
+        own = [given[place] for given in answers]
+        estimates = np.array([GREY if answer.light is None else answer.light for answer in own], dtype=np.float64)
+        results.append(
+            Result(
+                method,
+                estimates,
+                {"recovery": recovery_error(estimates, truths), "reproduction": reproduction_error(estimates, truths)},
+                np.array([answer.light is None for answer in own]),
+                {number: answer.cause for number, answer in enumerate(own) if answer.cause},
+                {number: answer.by_pixel for number, answer in enumerate(own) if answer.by_pixel} or None,
+            )
+        )
+    return tuple(results)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ the tables that sum up results: the paper's six columns, every statistic, and er
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -61,6 +62,11 @@ class Table:
             not any(isinstance(cell, str) for cell in column) and any(cell is not None for cell in column)
             for column in columns
         )
+
+
+def finite_or_none(number: float) -> float | None:
+    """Return a number as a cell has it: None where it is not finite."""
+    return number if math.isfinite(number) else None
 
 
 def _text(cell: Cell, digits: int) -> str:

@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.table.lut import Provenance, open_lut
-from calibration.table.writing import LutWriter
-from drivers.presenter import Colour
-from experiment.lights import Illumination
+from calibration.table.lut import open_lut
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.pictures.random_scenes import random_scenes
+from tests.evaluation.tables import CODES, write_lut
 
 LIGHTS = np.array([[2000.0, 3000, 1000], [1500, 3000, 2500]])
 
@@ -28,17 +26,8 @@ def dataset(make_dataset: Callable[[int, int], Path]) -> Path:
 @pytest.fixture
 def made_lut(tmp_path: Path) -> Path:
     """Return a table in which colours reflect as their code, under two lights, no noise."""
-    folder = tmp_path / "lut"
-    folder.mkdir()
-    index = np.arange(512)
-    code = np.stack([index >> 6, index >> 3 & 7, index & 7], axis=-1) / 7
-    writer = LutWriter(folder, 2, 512, 2)
-    for number, light in enumerate(LIGHTS):
-        writer.put(number, np.rint(code * light)[:, None, :].repeat(2, axis=1).astype(np.uint16))
-    known = Provenance(camera="Test", bits=3, white_level=9000, session_sha256="0", chart_sha256="0", software="test")
-    plan = [Illumination(number, "uniform", None, Colour(1, 2, 3)) for number in range(2)]
-    writer.finish(plan, LIGHTS, known)
-    return folder
+    samples = [(CODES / 7 * light)[:, None].repeat(2, axis=1) for light in LIGHTS]
+    return write_lut(tmp_path / "lut", samples, LIGHTS).folder
 
 
 @pytest.fixture

@@ -117,7 +117,12 @@ def open_gehler_shi(place: str, options: DataOptions, listed: Folder | None = No
     truth = choose(options.truth, _TRUTHS, "truth", place) or "recommended"
     path, lights = _read_truth(places, truth, place)
     camera = choose(options.camera, BLACK, "camera", place)
-    found = gather(_with_images(places))
+    # Pictures of a mask or a preview lie in folders without any image of the data set.
+    found = gather(
+        each
+        for each in places
+        if any(name.lower().endswith(".png") and Path(name).stem in _KNOWN for name in each.files)
+    )
     wanted = [name for name in NAMES if camera in (None, camera_of(name))]
     others = set(NAMES).difference(wanted)
     images = {name: file for name, file in found.items() if name not in others}
@@ -176,15 +181,6 @@ def camera_of(name: str) -> str:
     ('1D', '5D')
     """
     return "5D" if name.startswith("IMG_") else "1D"
-
-
-def _with_images(places: list[Folder]) -> list[Folder]:
-    """Return the folders that hold images of the data set, so that pictures of a mask or a preview do not count."""
-    return [place for place in places if any(Path(name).stem in _KNOWN for name in place.files if _is_png(name))]
-
-
-def _is_png(name: str) -> bool:
-    return name.lower().endswith(".png")
 
 
 def _read_truth(places: list[Folder], truth: str, place: str) -> tuple[Path, npt.NDArray[np.float64]]:

@@ -14,7 +14,7 @@ real copy.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from evaluation.datasets.files import Folder, PaintedScene, read_text
@@ -130,14 +130,11 @@ def _folds(folder: Folder, scenes: Sequence[PaintedScene]) -> tuple[int, ...] | 
     for number, path in enumerate(paths):
         for line in read_text(path).split():
             fold_of[_key(line.replace("\\", "/"))] = number
-    return _all_of(fold_of, [_key(scene.name) for scene in scenes])
+    keys = [_key(scene.name) for scene in scenes]
+    return tuple(fold_of[key] for key in keys) if fold_of.keys() >= set(keys) else None
 
 
 def _key(path: str) -> str:
     """Return camera, part and unpadded name of an image's path."""
     parts = path.split("/")[-3:]
     return "/".join([*parts[:-1], _unpadded(parts[-1].rpartition(".")[0])])
-
-
-def _all_of(fold_of: Mapping[str, int], keys: Sequence[str]) -> tuple[int, ...] | None:
-    return tuple(fold_of[key] for key in keys) if all(key in fold_of for key in keys) else None

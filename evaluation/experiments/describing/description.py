@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.experiments.folds import group_of
-from evaluation.scene import Image, MixedScene, Scene, SceneSet
+from evaluation.scene import Image, MixedScene, Scene, SceneSet, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
 from foundation.records import from_plain
@@ -640,7 +640,7 @@ def describe(
     luminance, chroma = np.zeros(len(LUMINANCE_EDGES) - 1), np.zeros((len(CHROMA_EDGES) - 1,) * 2)
     masked = 0.0
     # Images are measured in no other threads than these, and what is kept of one is a few kilobytes.
-    for numbers in ordered_map(partial(measure_scene, side=side), data.scenes, workers):
+    for numbers in told_of(ordered_map(partial(measure_scene, side=side), data.scenes, workers), on_scene):
         sizes[numbers.size] += 1
         values.append(numbers.values)
         lights.append(numbers.lights)
@@ -648,8 +648,6 @@ def describe(
         luminance += numbers.luminance
         chroma += numbers.chroma
         masked += numbers.masked
-        if on_scene:
-            on_scene()
     scaled = all(scene.saturation is not None for scene in data.scenes)
     return DataDescription(
         name=data.name,
@@ -710,6 +708,7 @@ _CHANNELS: Final = ("red", "green", "blue")
 
 def statistics_to_json(description: DataDescription) -> str:
     """Return the text of a `STATS.json`; the same description gives the same text."""
+    known = figures(description)
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -732,7 +731,7 @@ def statistics_to_json(description: DataDescription) -> str:
                 "of": quantity.value,
                 "summed": quantity.summed,
                 "definition": quantity.definition,
-                "value": figures(description)[quantity.name],
+                "value": known[quantity.name],
             }
             for quantity in QUANTITIES
         ],

@@ -28,7 +28,7 @@ from evaluation.experiments.describing.description import (
     summed,
 )
 from evaluation.reports.table_output import table_part
-from evaluation.results.tables import Table
+from evaluation.results.tables import Table, finite_or_none
 from foundation import pages
 from foundation.plots import FAINT, GRID, SERIES, legend_label, svg_of
 from generator.statistics import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
@@ -69,26 +69,22 @@ class FigureCompared:
 
 def compare_figures(one: DataDescription, other: DataDescription, seed: int = 0) -> tuple[FigureCompared, ...]:
     """Return every figure that is known of both sets, of at least three images each."""
-    compared: list[FigureCompared] = []
-    for quantity in QUANTITIES:
-        values = [known_values(described, quantity.value) for described in (one, other)]
-        if min(map(len, values)) >= _LEAST:
-            compared.append(_compared(quantity, values[0], values[1], seed))
-    return tuple(compared)
-
-
-def _compared(
-    quantity: Quantity, one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], seed: int
-) -> FigureCompared:
     from scipy.stats import ks_2samp
 
-    values = summed(one, quantity.summed), summed(other, quantity.summed)
-    scale = float(other.std()) if quantity.signed else 1.0
-    change = _change(quantity, one, other, seed)
-    test = ks_2samp(one, other)
-    return FigureCompared(
-        quantity, *values, change, scale, float(test.statistic), float(test.pvalue), _verdict(quantity, change, scale)
-    )
+    compared: list[FigureCompared] = []
+    for quantity in QUANTITIES:
+        first, second = (known_values(described, quantity.value) for described in (one, other))
+        if min(len(first), len(second)) < _LEAST:
+            continue
+        values = summed(first, quantity.summed), summed(second, quantity.summed)
+        scale = float(second.std()) if quantity.signed else 1.0
+        change = _change(quantity, first, second, seed)
+        test = ks_2samp(first, second)
+        distance, p = float(test.statistic), float(test.pvalue)
+        compared.append(
+            FigureCompared(quantity, *values, change, scale, distance, p, _verdict(quantity, change, scale))
+        )
+    return tuple(compared)
 
 
 def _change(
@@ -241,7 +237,7 @@ def figures_table(description: DataDescription) -> Table:
         # A spread is of all images: quartiles would be of something else.
         one_each = known.size and quantity.summed != "spread"
         quartiles = np.percentile(known, [25, 75], method="hazen") if one_each else (np.nan, np.nan)
-        numbers = (_known(float(number)) for number in (value[quantity.name], *quartiles))
+        numbers = (finite_or_none(float(number)) for number in (value[quantity.name], *quartiles))
         rows.append((quantity.title, quantity.summed, *numbers, known.size))
     return Table(
         f"{description.name}: figures of {len(description.images)} images",
@@ -287,7 +283,7 @@ def compared_tables(compared: Sequence[FigureCompared], names: tuple[str, str]) 
                 made.verdict,
                 made.one,
                 made.other,
-                *(_known(number) for number in made.change),
+                *map(finite_or_none, made.change),
                 made.distance,
                 made.p,
             )
@@ -369,7 +365,9 @@ def describe_page(one: DataDescription, other: DataDescription | None = None, se
     for made in both:
         parts += [pages.heading(made.name), table_part(figures_table(made)), table_part(sizes_table(made))]
         parts += [pages.paragraph(f"{what}: {told}") for what, told in made.treatment.items()]
-    parts += [pages.heading("Definitions"), table_part(_definitions())]
+    definitions = tuple((quantity.title, quantity.definition) for quantity in QUANTITIES)
+    parts.append(pages.heading("Definitions"))
+    parts.append(table_part(Table("What the figures are", ("Figure", "Definition"), definitions)))
     return pages.page(" beside ".join(made.name for made in both), parts)
 
 
@@ -383,17 +381,5 @@ def sizes_table(description: DataDescription) -> Table:
     return Table(f"{description.name}: sizes, px", ("Size", "Images"), tuple(rows), notes=tuple(notes))
 
 
-def _definitions() -> Table:
-    return Table(
-        "What the figures are",
-        ("Figure", "Definition"),
-        tuple((quantity.title, quantity.definition) for quantity in QUANTITIES),
-    )
-
-
 def _seen_at(description: DataDescription) -> str:
     return f"{description.side} x {description.side} cells at most" if description.side else "full size"
-
-
-def _known(number: float) -> float | None:
-    return number if np.isfinite(number) else None

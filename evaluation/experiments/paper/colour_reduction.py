@@ -36,7 +36,7 @@ from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result, SceneAnswer, read_light, results_of
 from evaluation.results.tables import PAPER_COLUMNS, Table
-from evaluation.scene import Image, Scene, SceneSet
+from evaluation.scene import Image, Scene, SceneSet, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
 from foundation.files import is_inside_name, read_inside, reading_error, write_whole
@@ -145,15 +145,11 @@ def bits_removed(
     def answers_for(scene: Scene) -> list[list[SceneAnswer]]:
         image, mask = scene.read()
         # Clipped pixels are known before the reduction only; they have their say in the operator, as in a camera.
-        left_out = ~usable(image, scene.saturation, mask, border=0)
+        left_out = ~usable(image, scene.saturation, mask)
         versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
         return [[read_light(method.estimate(version, None, left_out)) for method in methods] for version in versions]
 
-    answers: list[list[list[SceneAnswer]]] = []
-    for given in ordered_map(answers_for, scenes, workers):
-        answers.append(given)
-        if on_scene:
-            on_scene()
+    answers = list(told_of(ordered_map(answers_for, scenes, workers), on_scene))
     names = [method.name for method in methods]
     raw, *reduced = (
         results_of(names, truths, [given[version] for given in answers]) for version in range(1 + len(bits))
@@ -219,7 +215,7 @@ def write_codes(
             scene, name = numbered
             image, mask = scene.read()
             found = fitted_codes(image, mask)
-            left_out = ~usable(image, scene.saturation, mask, border=0)
+            left_out = ~usable(image, scene.saturation, mask)
             _write_png(folder / "codes" / name, clear_bits(found.codes, cleared)[..., ::-1])
             if left_out.any():
                 _write_png(folder / "masks" / name, left_out.astype(np.uint8) * np.uint8(255))
@@ -228,15 +224,14 @@ def write_codes(
             files = (scene.name, f"codes/{name}", f"masks/{name}" if left_out.any() else "")
             return _row(*files, *(f"{number:.17g}" for number in numbers))
 
-        for row in ordered_map(write, list(zip(data.scenes, names, strict=True)), workers):
-            rows.append(row)
-            if on_scene:
-                on_scene()
+        rows += told_of(ordered_map(write, list(zip(data.scenes, names, strict=True)), workers), on_scene)
         write_whole(folder / TABLE, "\n".join(rows) + "\n")
 
 
 def write_linear(folder: Path, out: Path, workers: int = 1, on_image: Callable[[int, int], None] | None = None) -> int:
     """Write the linear images that a folder of codes stands for into a new folder, and return how many."""
+    import tifffile
+
     coded = list(read_table(folder))
     with whole_folder(out, "the linear images") as made:
         rows = ["image,r,g,b,mask"]
@@ -245,7 +240,9 @@ def write_linear(folder: Path, out: Path, workers: int = 1, on_image: Callable[[
             codes = _read_codes(folder, row.codes)
             linear = row.operator.invert(codes) * row.largest
             name = str(Path(row.codes).with_suffix(".tiff").relative_to("codes"))
-            _write(made / name, _tiff(linear.astype(np.float32)))
+            image = io.BytesIO()
+            tifffile.imwrite(image, linear.astype(np.float32), photometric="rgb", metadata=None)
+            _write(made / name, image.getvalue())
             mask = f"{name.removesuffix('.tiff')}_mask.png" if row.mask else ""
             if mask:
                 _write(made / mask, _read(folder, row.mask))
@@ -326,14 +323,6 @@ def _write_png(path: Path, picture: npt.NDArray[np.uint8]) -> None:
     import cv2
 
     _write(path, cv2.imencode(".png", picture)[1].tobytes())
-
-
-def _tiff(image: npt.NDArray[np.float32]) -> bytes:
-    import tifffile
-
-    stream = io.BytesIO()
-    tifffile.imwrite(stream, image, photometric="rgb", metadata=None)
-    return stream.getvalue()
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -100,12 +100,8 @@ _PLACE: Final = re.compile(rb'(<use [^>]*\bx="[\d.]+?\.\d)\d*(" y="[\d.]+?\.\d)\
 """The place of a dot, of which a tenth of a point is as much as can be seen."""
 
 
-def bits_figure(found: BitsResult, kind: ErrorKind) -> bytes:
-    """Return the paper's figure of bits removal: each method's median against the bits; the raw image's as a line."""
-    return svg_of(_draw_bits, found, kind, inches=(6.4, 3.8))
-
-
 def _draw_bits(figure: Any, found: BitsResult, kind: ErrorKind) -> None:
+    """Draw the paper's figure of bits removal: each method's median against the bits; the raw image's as a line."""
     axes = figure.add_subplot()
     counts = list(found.reduced)
     for place, raw in enumerate(found.raw):
@@ -146,15 +142,8 @@ def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:
     figure.legend(loc="outside lower center", ncols=2)
 
 
-def chromaticities_figure(luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float64]] | None = None) -> bytes:
-    """Return the paper's figures of lights in camera RGB side by side, over the ground truths of data sets.
-
-    `sets`: name of a data set to its ground truths, (N, 3) float64, linear camera RGB of any length.
-    """
-    return svg_of(_draw_chromaticities, luts, sets or {}, inches=(4.6 * len(luts), 4.7))
-
-
 def _draw_chromaticities(figure: Any, luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float64]]) -> None:
+    """Draw the paper's figures of lights in camera RGB side by side, over ground truths (N, 3) of named data sets."""
     reach = max(float(rb_of(lut.white).max()) for lut in luts) * 1.04
     for place, lut in enumerate(luts):
         axes = figure.add_subplot(1, len(luts), place + 1)
@@ -292,7 +281,7 @@ def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperRe
 
 def bits_report(found: BitsResult, kind: ErrorKind, name: str, conditions: Sequence[str]) -> PaperReport:
     """Return the report of bits removal on a data set of that name."""
-    drawn, table = bits_figure(found, kind), bits_table(found, kind, name)
+    drawn, table = svg_of(_draw_bits, found, kind, inches=(6.4, 3.8)), bits_table(found, kind, name)
     caption = "Medians against the bits of each sRGB code that were set to zero; dotted, the linear images as they are."
     files = {"bits.svg": standalone(drawn), **_table_files("bits", table)}
     parts = (*map(pages.paragraph, conditions), pages.figure(drawn, caption), table_part(table))
@@ -316,7 +305,7 @@ def reduction_report(picture: npt.NDArray[np.uint8], name: str) -> PaperReport:
 def chromaticities_report(luts: Sequence[Lut], sets: Sequence[Truths]) -> PaperReport:
     """Return the report of the lights of tables, beside the ground truths of data sets."""
     truths = {found.name: found.lights for found in sets}
-    drawn = chromaticities_figure(luts, truths)
+    drawn = svg_of(_draw_chromaticities, luts, truths, inches=(4.6 * len(luts), 4.7))
     caption = (
         "rb-chromaticities, r = R / (R + G + B) and b = B / (R + G + B) in linear RGB of each table's camera, of the "
         "white under each light of the table; in colour the ground truths of data sets, each in its own camera's RGB."

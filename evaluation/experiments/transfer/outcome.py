@@ -28,7 +28,7 @@ from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import errors_csv
 from evaluation.results.result import Result
-from evaluation.results.tables import Table, table_to_csv
+from evaluation.results.tables import Table, finite_or_none, table_to_csv
 from evaluation.scene import SceneSet
 from foundation import pages
 from foundation.errors import InputError
@@ -344,12 +344,13 @@ def beside_table(found: TransferFigures, name: str) -> Table | None:
     """Return the mean errors beside N real images; None if there were none."""
     known = {(row.row.method, row.row.training): row.statistics[0].value for row in found.rows}
     better = {(one.row.method, one.row.training): one for one in found.to_better}
+    of_real = next((one.row.data for one in found.rows if one.row.kind == "real"), "")
     rows: list[tuple[str | float | None, ...]] = []
     for row in (each.row for each in found.rows):
         if row.way not in ("pooled", "adapted") or (row.way == "pooled" and _as(row, "adapted") in better):
             continue
         ratio = better.get(_as(row, "adapted"))
-        alone = known.get((row.method, replace(row, kind="real", data=_data_of_real(found), way="alone").training))
+        alone = known.get((row.method, replace(row, kind="real", data=of_real, way="alone").training))
         listed = (known.get((row.method, row.material)), known.get(_as(row, "pooled")), known.get(_as(row, "adapted")))
         rows.append((row.method, row.material, row.real, alone, *listed, _written(ratio.ratios[0]) if ratio else None))
     if not rows:
@@ -379,10 +380,6 @@ def _as(row: TransferRow, way: Way) -> tuple[str, str]:
     return row.method, replace(row, way=way).training
 
 
-def _data_of_real(found: TransferFigures) -> str:
-    return next((one.row.data for one in found.rows if one.row.kind == "real"), "")
-
-
 def naive_adapted_table(found: TransferFigures, name: str) -> Table | None:
     """Return adapted generated rows in parts of adapted naive ones; None if there are none."""
     if not found.to_naive_adapted:
@@ -396,6 +393,20 @@ def naive_adapted_table(found: TransferFigures, name: str) -> Table | None:
         rows,
         notes=("Paired by test image. Below 1: beside N real images the table is still worth something.",),
     )
+
+
+def tables_of(found: TransferFigures, name: str, images: int) -> tuple[Table, ...]:
+    """Return all tables of rows on so many images of a test set, in the order in which they are shown."""
+    made = (
+        errors_table(found, name, images),
+        intervals_table(found, name),
+        real_ratios_table(found, name),
+        naive_ratios_table(found, name),
+        base_ratios_table(found, name),
+        beside_table(found, name),
+        naive_adapted_table(found, name),
+    )
+    return tuple(table for table in made if table is not None)
 
 
 def paper_ratios_table() -> Table:
@@ -427,10 +438,12 @@ def long_table(found: TransferFigures) -> Table:
         ratio = to_real.get((row.row.method, row.row.training))
         for place, statistic in enumerate(STATISTICS):
             spread = row.spread[place] if row.spread else None
-            parts = _three(ratio.ratios[place]) if ratio else (None, None, None)
+            parts = map(finite_or_none, ratio.ratios[place]) if ratio else (None, None, None)
             who = (row.row.method, row.row.kind, row.row.data, row.row.images, len(row.row.results))
             beside = row.row.way, row.row.real
-            rows.append((*who, found.error, statistic, *_three(row.statistics[place]), spread, *parts, *beside))
+            rows.append(
+                (*who, found.error, statistic, *map(finite_or_none, row.statistics[place]), spread, *parts, *beside)
+            )
     return Table("All numbers", _LONG, tuple(rows))
 
 
@@ -444,10 +457,6 @@ _LONG: Final = (
 
 def _heads(row: TransferRow) -> tuple[str, str, int | None]:
     return row.method, row.training, row.images or None
-
-
-def _three(figure: BoundedFigure) -> tuple[float | None, ...]:
-    return tuple(number if math.isfinite(number) else None for number in figure)
 
 
 _LINE_INCHES: Final = 0.24
@@ -626,16 +635,7 @@ class TransferOutcome:
 
     def tables(self) -> tuple[Table, ...]:
         """Return the tables in the order in which they are shown."""
-        name = self.test.name
-        made = (
-            errors_table(self.figures, name, len(self.test.scenes)),
-            intervals_table(self.figures, name),
-            real_ratios_table(self.figures, name),
-            naive_ratios_table(self.figures, name),
-            beside_table(self.figures, name),
-            naive_adapted_table(self.figures, name),
-        )
-        return tuple(table for table in made if table is not None)
+        return tables_of(self.figures, self.test.name, len(self.test.scenes))
 
 
 def labelled_results(rows: Sequence[TransferRow]) -> tuple[Result, ...]:
@@ -656,16 +656,23 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
     every = [scene.name for scene in outcome.crossed.scenes]
     truths = np.stack([scene.truth for scene in outcome.test.scenes])
     with whole_folder(folder, "the results") as partial:
-        write_whole(partial / "results.csv", table_to_csv(long_table(outcome.figures)))
         groups = groups_of(outcome.test.scenes)
         write_whole(partial / "errors.csv", errors_csv(names, truths, labelled_results(outcome.rows), groups))
         for seed, folds in enumerate(outcome.folds):
             write_whole(partial / f"folds_{seed}.csv", folds_to_csv(every, folds))
-        write_whole(partial / "tables.tex", "\n".join(table_to_latex(table) for table in outcome.tables()))
-        write_whole(partial / "report.html", report_page(outcome))
-        if outcome.figures.to_better:
-            write_whole(partial / "beside_real.svg", standalone(beside_plot(outcome.figures)))
-        write_whole(partial / "run.json", json.dumps(_provenance(outcome), indent=2, ensure_ascii=False) + "\n")
+        write_shown(partial, outcome.figures, outcome.tables(), report_page(outcome), _provenance(outcome))
+
+
+def write_shown(
+    folder: Path, found: TransferFigures, tables: Sequence[Table], page: str, about: Mapping[str, Any]
+) -> None:
+    """Write what the folders of a transfer and of a pool have alike, errors aside."""
+    write_whole(folder / "results.csv", table_to_csv(long_table(found)))
+    write_whole(folder / "tables.tex", "\n".join(map(table_to_latex, tables)))
+    write_whole(folder / "report.html", page)
+    if found.to_better:
+        write_whole(folder / "beside_real.svg", standalone(beside_plot(found)))
+    write_whole(folder / "run.json", json.dumps(about, indent=2, ensure_ascii=False) + "\n")
 
 
 def report_page(outcome: TransferOutcome) -> str:

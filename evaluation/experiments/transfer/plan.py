@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, Literal
 
@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.generated import GeneratedScene
+from evaluation.datasets.identity import source_marks
 from evaluation.experiments.transfer.rows import TrainingSet
 from evaluation.scene import Scene, SceneSet
 from foundation.colorimetry import decode_srgb
@@ -34,7 +35,7 @@ from foundation.files import file_sha256, sha256_of
 from generator.dataset.reader import Dataset
 from generator.lights.lighting import parse_mixture
 from generator.pictures.random_scenes import RandomScene
-from generator.pictures.sources import PictureFile, Preparation, find_pictures, open_picture
+from generator.pictures.sources import Preparation, find_pictures, open_picture
 from generator.rendering.matrices import ColourMatrix, camera_matrix, choose_matrix
 from generator.variation.variation import Falloff, described_gradient
 
@@ -69,10 +70,11 @@ def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]
             "cross-validation: evaluate cv"
         )
     made = [isinstance(some.scenes[0], GeneratedScene) for some in (training, test)]
-    how = _How(names=not all(made), pixels=not any(made))
-    tests = {key: name for name, keys in _keys(test, how) for key in keys}
+    # Hashes of source pictures are always at hand; names and pixels are asked where one has none.
+    named, seen = not all(made), not any(made)
+    tests = {key: name for name, keys in _keys(test, named, seen) for key in keys}
     shared: list[SharedImage] = []
-    for position, (name, keys) in enumerate(_keys(training, how)):
+    for position, (name, keys) in enumerate(_keys(training, named, seen)):
         found = next(((tests[key], key[0]) for key in keys if key in tests), None)
         if found:
             shared.append(SharedImage(position, name, *found))
@@ -105,44 +107,21 @@ _Key = tuple[str, str]
 """How an image is known, "name" or "content", and by what."""
 
 
-@dataclass(frozen=True)
-class _How:
-    """By what images are compared besides the hashes of source pictures, which are always at hand."""
-
-    names: bool
-    pixels: bool
-
-
-def _keys(scenes: SceneSet, how: _How) -> list[tuple[str, tuple[_Key, ...]]]:
+def _keys(scenes: SceneSet, named: bool, seen: bool) -> list[tuple[str, list[_Key]]]:
     """Return the name of each image, or of its source, and the keys that it is known by."""
-    sources: dict[int, dict[str, _Key]] = {}
-    listed: list[tuple[str, tuple[_Key, ...]]] = []
+    known: dict[int, Mapping[str, str]] = {}
+    listed: list[tuple[str, list[_Key]]] = []
     for scene in scenes.scenes:
-        if not isinstance(scene, GeneratedScene):
-            content = (("content", _pixels(scene)),) if how.pixels else ()
-            listed.append((scene.name, content + _name_key(scene.name, how)))
-            continue
-        known = sources.setdefault(id(scene.dataset), _sources(scene))
-        source = scene.entry.source
-        listed.append((source, (known[source], *_name_key(source, how))))
+        if isinstance(scene, GeneratedScene):
+            name = scene.entry.source
+            keys: list[_Key] = [("content", source_marks(scene.dataset, known)[name])]
+        else:
+            name = scene.name
+            keys = [("content", sha256_of(np.ascontiguousarray(scene.read()[0], np.float32)))] if seen else []
+        if named:
+            keys.append(("name", PurePosixPath(name).stem.lower()))
+        listed.append((name, keys))
     return listed
-
-
-def _name_key(name: str, how: _How) -> tuple[_Key, ...]:
-    return (("name", PurePosixPath(name).stem.lower()),) if how.names else ()
-
-
-def _sources(scene: GeneratedScene) -> dict[str, _Key]:
-    """Return by what the source pictures of a generated set are known: the hash of the file, or how it was drawn."""
-    seed = scene.dataset.description.seed
-    return {
-        record.name: ("content", record.sha256 or f"{record.name} of seed {seed}") for record in scene.dataset.sources
-    }
-
-
-def _pixels(scene: Scene) -> str:
-    image, _ = scene.read()
-    return sha256_of(np.ascontiguousarray(image, dtype=np.float32))
 
 
 def _place(scenes: SceneSet) -> str:
@@ -187,12 +166,30 @@ def find_sources(dataset: Dataset, place: Path | str) -> tuple[Mapping[str, Foun
     tried first, then files of other names. Pictures of random colours need no file.
     """
     preparation = preparation_of(dataset)
+    if "://" in str(place):
+        raise InputError(f"{place} is no folder of this machine; copy the pictures to one")
     # A set of random colours needs no folder, but one that is named must be there.
-    files = _Files({file.name: Path(file.location) for file in _listed(place)})
+    files = {file.name: Path(file.location) for file in find_pictures(place)}
+
+    @cache
+    def hash_of(name: str) -> str:
+        try:
+            return file_sha256(files[name])
+        except OSError as error:
+            told = os.strerror(error.errno or 0)
+            raise InputError(f"cannot read {files[name]}: {told}; name another folder") from error
+
+    @cache
+    def by_hash() -> Mapping[str, Path]:
+        return {hash_of(name): path for name, path in files.items()}
+
     found: dict[str, FoundPicture] = {}
     missing: list[str] = []
     for record in dataset.sources:
-        path = None if record.sha256 is None else files.find(record.name, record.sha256)
+        path = None
+        if record.sha256 is not None:
+            same = record.name in files and hash_of(record.name) == record.sha256
+            path = files[record.name] if same else by_hash().get(record.sha256)
         if path is None and record.sha256 is not None:
             missing.append(record.name)
         else:
@@ -214,38 +211,6 @@ def preparation_of(dataset: Dataset) -> Preparation:
         seed=options.get("lights_of", {}).get("pictures_seed", dataset.description.seed),
         crops=int(options.get("crops", 1)),
     )
-
-
-def _listed(place: Path | str) -> Sequence[PictureFile]:
-    if "://" in str(place):
-        raise InputError(f"{place} is no folder of this machine; copy the pictures to one")
-    return find_pictures(place)
-
-
-class _Files:
-    """Pictures by name and by hash; a hash is taken when it is asked for, once."""
-
-    def __init__(self, paths: Mapping[str, Path]) -> None:
-        self._paths = paths
-        self._hashes: dict[str, str] = {}
-        self._by_hash: dict[str, Path] | None = None
-
-    def find(self, name: str, sha256: str) -> Path | None:
-        """Return the file of that hash, one of that name first; None if there is none."""
-        if name in self._paths and self._hash(name) == sha256:
-            return self._paths[name]
-        if self._by_hash is None:
-            self._by_hash = {self._hash(other): path for other, path in self._paths.items()}
-        return self._by_hash.get(sha256)
-
-    def _hash(self, name: str) -> str:
-        if name not in self._hashes:
-            path = self._paths[name]
-            try:
-                self._hashes[name] = file_sha256(path)
-            except OSError as error:
-                raise InputError(f"cannot read {path}: {os.strerror(error.errno or 0)}; name another folder") from error
-        return self._hashes[name]
 
 
 _LINEAR: Final = decode_srgb(np.arange(256) / 255)
@@ -395,23 +360,15 @@ class RelitScene:
     """A real scene of another camera under a light of a generated image, by von Kries: over its own light, times that.
 
     - `scene`: the real scene.
-    - `light`: (3,) float64, the generated image's ground truth.
+    - `truth`: (3,) float64, the generated image's ground truth, linear camera RGB.
     - `name`: a name of its own, since a scene may be lit several times.
+    - `saturation`: none: what was clipped is masked, since channels were scaled apart.
     """
 
     scene: Scene
-    light: npt.NDArray[np.float64]
+    truth: npt.NDArray[np.float64]
     name: str
-
-    @property
-    def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, linear camera RGB."""
-        return self.light
-
-    @property
-    def saturation(self) -> None:
-        """None: what was clipped is masked, since channels were scaled apart."""
-        return None
+    saturation: None = None
 
     def read(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_] | None]:
         """Return the image (H, W, 3) float32, and its mask (H, W) bool."""
@@ -420,7 +377,7 @@ class RelitScene:
         if self.scene.saturation is not None:
             clipped: npt.NDArray[np.bool_] = np.asarray((image >= self.scene.saturation).any(axis=2))
             mask = clipped if mask is None else mask | clipped
-        return (image * (self.light / self.light.sum() / own)).astype(np.float32), mask
+        return (image * (self.truth / self.truth.sum() / own)).astype(np.float32), mask
 
 
 def relit_scenes(scenes: Sequence[Scene], lights: Sequence[npt.NDArray[np.float64]]) -> tuple[RelitScene, ...]:

@@ -61,19 +61,6 @@ def test_methods_by_their_short_names(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "PCA bright and dark errs less than Shades-of-Gray (p=4) on 9 of 9 images" in chosen
 
 
-def test_files(runs: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "out"
-    assert main(["compare", *runs, "--out", str(out)]) == 0
-    statistics = list(csv.DictReader((out / "statistics.csv").read_text().splitlines()))
-    assert float(statistics[0]["ratio"]) == pytest.approx(1 / 0.7, abs=1e-5)
-    page = (out / "report.html").read_text()
-    assert "B <i>" not in page
-    assert "B &lt;i&gt;" in page
-    capsys.readouterr()
-    assert main(["compare", *runs, "--out", str(out)]) == 2
-    assert str(out) in capsys.readouterr().err
-
-
 def test_a_method_alone_is_not_compared(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", runs[0], "--method", "A"]) == 2
     assert "alone; compare it with a second method" in " ".join(capsys.readouterr().err.split())

@@ -24,18 +24,6 @@ def thumbnails(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_one_set_and_its_file(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stats = dataset.parent / "stats.json"
-    assert main(["describe", str(dataset), "--out", str(stats)]) == 0
-    printed = capsys.readouterr().out
-    assert "made: figures of 16 images" in printed
-    assert "None" not in printed
-    assert main(["describe", str(stats)]) == 0
-    assert capsys.readouterr().out == printed
-    assert main(["describe", str(dataset), "--out", str(stats)]) == 2
-    assert str(stats) in capsys.readouterr().err
-
-
 def test_sets_of_one_name_are_told_apart(thumbnails: str, capsys: pytest.CaptureFixture[str]) -> None:
     stats = Path(thumbnails).parent / "s.json"
     assert main(["describe", thumbnails, "--out", str(stats)]) == 0

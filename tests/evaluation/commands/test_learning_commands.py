@@ -77,32 +77,6 @@ def test_a_model_is_adapted(data: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert "is of kernel-ridge, smart-color-cat was asked for" in " ".join(capsys.readouterr().err.split())
 
 
-def test_a_model_is_tested_on_a_part_of_what_it_was_trained_on(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with np.load(data) as content:
-        half = {name: content[name][::2] for name in content.files}
-    np.savez(tmp_path / "half.npz", **half)
-    model, out = tmp_path / "model.npz", tmp_path / "results"
-    assert main(["train", "smart-color-cat", str(tmp_path / "half.npz"), "--out", str(model)]) == 0
-    assert main(["run", str(data), "--method", str(model), "--out", str(out)]) == 0
-    assert ": 6 of 12 images were trained on, by name and light" in " ".join(capsys.readouterr().out.split())
-    (note,) = json.loads((out / "run.json").read_text())["notes"]
-    assert ": 6 of 12 images were trained on" in note
-
-
-def test_cross_validation_prints_and_writes(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out, folds = tmp_path / "results", tmp_path / "folds.csv"
-    given = ["cv", "smart-color-cat", str(data), "--error", "recovery"]
-    assert main([*given, "--out", str(out), "--save-folds", str(folds)]) == 0
-    printed = capsys.readouterr().out
-    assert folds.read_text() == (out / "folds.csv").read_text()
-    # The same folds from the file give the same table.
-    table = printed[: printed.index("cross-validated")]
-    assert main([*given, "--folds", str(folds)]) == 0
-    assert capsys.readouterr().out.startswith(table)
-
-
 def test_a_class_of_the_users_own(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.py").write_text(
         "import numpy as np\n\n\n"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -48,32 +47,6 @@ def truths(tmp_path: Path) -> Path:
 def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open() as stream:
         return list(csv.DictReader(stream))
-
-
-def test_table1(
-    make_table: TableMaker, thumbnails: Path, truths: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    tables = [str(make_table(f"Canon EOS {name}", noise=0.05).folder) for name in ("6D Mark II", "550D")]
-    out = tmp_path / "out"
-    wish = ("--matrix", "Canon EOS 550D", "--side", "24", "--sizes", "12,24", "--hot", "500", "--out", str(out))
-    given = ("--pictures", str(thumbnails), "--lights-like", f"{truths}#A", "--workers", "2")
-    assert main(["paper", "table1", *tables, *given, *wish]) == 0
-    printed = capsys.readouterr().out
-    assert "9 of photos, developed to sRGB with the colour matrix of Canon EOS 550D" in printed
-    assert printed.count("sensor, A illuminations\n┏") == 4
-    assert "C1 scenes" not in printed
-    assert "C1 illuminations" not in printed
-    assert "its numbers stand beside" in " ".join(printed.split())
-    rows = rows_of(out / "table1.csv")
-    assert len(rows) == 8 * 3 * 2 + 2 * 3
-    paper = [row for row in rows if row["error"] == "paper"]
-    assert len(paper) == 2 * 3
-    assert paper[0]["median"] == "2.15"
-    # What is printed is what the file holds.
-    first = rows[0]
-    assert re.search(rf"White-Patch +│ +{float(first['mean']):.2f} │ +{float(first['median']):.2f} │", printed)
-    assert main(["paper", "table1", *tables, *given, *wish]) == 2
-    assert "already exists; name another place for the report" in capsys.readouterr().err
 
 
 def test_a_matrix_for_photographs_is_refused(
@@ -143,21 +116,6 @@ def test_what_was_computed_is_kept_where_the_reader_of_the_output_left(tmp_path:
     done = subprocess.run(call, cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
     assert (done.returncode, (tmp_path / "out" / "report.html").is_file()) == (0, True), done.stderr
-
-
-def test_chromaticities(
-    make_table: TableMaker, truths: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    tables = [str(make_table(f"Canon EOS {name}").folder) for name in ("6D Mark II", "550D")]
-    out = tmp_path / "out"
-    wish = ("--truths", f"{truths}#A", "--truths", f"{truths}#B", "--out", str(out))
-    assert main(["paper", "chromaticities", *tables, *wish]) == 0
-    assert "Canon EOS 6D Mark II" in capsys.readouterr().out
-    assert len(rows_of(out / "chromaticities.csv")) == 2 * len(LIGHTS)
-    assert [row["Data set"] for row in rows_of(out / "coverage.csv")] == ["A", "B", "A", "B"]
-    assert "black bodies (2)" in (out / "chromaticities.svg").read_text()
-    assert main(["paper", "chromaticities", tables[0]]) == 0
-    assert "--out" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -59,35 +59,6 @@ def made_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 BASIC = ("transfer", "--train", "made", "--test", "real.npz", "--methods", "own.py:Map", "--statistics", "gray-world")
 
 
-def test_tables_and_files(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    wish = ("--naive", "pictures", "--images", "10", "--seeds", "2", "--out", "out", "--error", "recovery")
-    assert main([*BASIC, *wish]) == 0
-    printed = capsys.readouterr().out
-    assert "Training images have sides of up to 24 px and test images of up to 8 px" in printed
-    out = place / "out"
-    assert sorted(path.name for path in out.iterdir()) == [
-        *("errors.csv", "folds_0.csv", "folds_1.csv", "report.html", "results.csv", "run.json", "tables.tex")
-    ]
-    rows = list(csv.DictReader((out / "results.csv").read_text().splitlines()))
-    # Four ways to train the map, two of them for the constant light, and Gray-world; six statistics each.
-    assert len(rows) == (4 + 2 + 1) * 6
-    errors = read_errors(out)
-    assert len(errors) == (4 + 2) * 2 + 1
-    for row in rows:
-        training = {"none": "", "cross-validation": ", real, cross-validated", "generated": ", made: generated"}
-        if row["training"] not in training or row["statistic"] != "worst25":
-            continue
-        name = row["method"] + training[row["training"]]
-        several = [each.errors["recovery"] for full, each in errors.items() if full.split(", seed")[0] == name]
-        assert len(several) == int(row["seeds"])
-        expected = np.mean([summarise(each).worst25 for each in several])
-        assert float(row["degrees"]) == pytest.approx(expected, abs=1e-5)
-        assert float(row["low"]) < expected < float(row["high"])
-    page = (out / "report.html").read_text()
-    assert page.count("<table>") == 5
-    assert "pixels that are zero in every channel" in page
-
-
 def test_nothing_is_called_real_or_generated_that_is_not(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wish = ("--methods", "own.py:Map", "--statistics", "none", "--out", "out")
     assert main(["transfer", "--train", "real.npz", "--test", "made", *wish]) == 0
@@ -121,18 +92,6 @@ def test_the_same_command_gives_the_same_bytes(place: Path, capsys: pytest.Captu
     assert all(table["rows"] for table in found["tables"])
     for path in (place / "one").iterdir():
         assert path.read_bytes() == (place / "two" / path.name).read_bytes(), path.name
-
-
-def test_real_cross_validation_is_that_of_the_command_cv(place: Path) -> None:
-    assert main([*BASIC, "--out", "out"]) == 0
-    assert main(["cv", "own.py:Map", "real.npz", "--out", "cv"]) == 0
-    assert (place / "out" / "folds_0.csv").read_text() == (place / "cv" / "folds.csv").read_text()
-    assert json.loads((place / "out" / "run.json").read_text())["settings"]["folds"] == "3"
-    ours, theirs = read_errors(place / "out"), read_errors(place / "cv")
-    for name in ("Map of the mean", "Constant light"):
-        np.testing.assert_allclose(
-            ours[f"{name}, real, cross-validated"].errors["recovery"], theirs[name].errors["recovery"], atol=2e-6
-        )
 
 
 def test_only_some_images_are_tested(place: Path, capsys: pytest.CaptureFixture[str]) -> None:

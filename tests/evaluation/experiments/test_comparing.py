@@ -35,30 +35,6 @@ def errors(
     )
 
 
-def test_images_are_matched_by_name() -> None:
-    made = match(errors("abcd", [1, 2, 3, 4]), errors("xdcb", [9, 40, 30, 20]), ("one", "other"), "reproduction")
-    assert made.images == ("b", "c", "d")
-    assert made.one.tolist() == [2, 3, 4]
-    assert made.other.tolist() == [20, 30, 40]
-    assert made.missing == (("x",), ("a",))
-    assert missing_images(made) == (
-        "one lacks 1 image of other, left out here: x",
-        "other lacks 1 image of one, left out here: a",
-    )
-    assert match(errors("ab", [1, 2]), errors("ab", [3, 4]), ("", ""), "recovery").one.tolist() == [0.5, 1]
-
-
-def test_truths_must_agree_in_direction() -> None:
-    lights = np.array([[1.0, 2, 1], [2, 2, 1], [1, 1, 1]])
-    match(errors("abc", [1, 2, 3], lights), errors("cba", [1, 2, 3], 7 * lights[::-1]), ("A", "B"), "recovery")
-    turned = lights[::-1].copy()
-    turned[1] += [0.1, 0, 0]
-    with pytest.raises(InputError, match=r"ground truths of b in A and B are 1\.\d\d degrees apart, those of 1 of 3"):
-        match(errors("abc", [1, 2, 3], lights), errors("cba", [1, 2, 3], turned), ("A", "B"), "recovery")
-    with pytest.raises(InputError, match="no image in common, they begin with a and x"):
-        match(errors("ab", [1, 2]), errors("xy", [1, 2]), ("A", "B"), "recovery")
-
-
 def by_enumeration(difference: list[float]) -> float:
     """Return the exact two-sided p of the signed-rank test: the share of all sign patterns as uneven as this one."""
     ranks = np.argsort(np.argsort(np.abs(difference))) + 1

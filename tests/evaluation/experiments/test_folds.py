@@ -12,7 +12,6 @@ import pytest
 
 from evaluation.experiments.folds import (
     choose_folds,
-    draw_folds,
     draw_scene_folds,
     folds_to_csv,
     group_of,
@@ -23,29 +22,6 @@ from evaluation.scene import SceneSet
 from foundation.errors import FormatError, InputError
 
 NAMES = ["a.png", "b.png", "c.png", "d, e.png"]
-
-
-@pytest.mark.parametrize(("count", "folds"), [(2, 2), (10, 3), (259, 3), (11, 11)])
-def test_folds_are_as_even_as_they_can_be(count: int, folds: int) -> None:
-    sizes = np.bincount(draw_folds(count, folds), minlength=folds)
-    assert len(sizes) == folds
-    assert np.ptp(sizes) <= 1
-
-
-def test_neighbours_are_dealt_to_every_pair_of_folds() -> None:
-    # A draw by blocks or by turns would put scenes that were photographed one after another always together, or never.
-    folds = draw_folds(3000, 3)
-    together = (folds[1:] == folds[:-1]).mean()
-    assert 0.28 < together < 0.39
-
-
-def test_groups_stay_together() -> None:
-    rng = np.random.default_rng(0)
-    groups = [f"picture {number}" for number in rng.integers(0, 40, 300)]
-    folds = draw_folds(300, 3, groups=groups)
-    for group in set(groups):
-        assert len({int(fold) for fold, own in zip(folds, groups, strict=True) if own == group}) == 1
-    assert np.ptp(np.bincount(folds)) <= 15
 
 
 def test_folds_are_the_authors_unless_others_are_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

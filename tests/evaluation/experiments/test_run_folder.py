@@ -22,7 +22,6 @@ from evaluation.learning.model_files import StoredMethod, provenance_of
 from evaluation.learning.standard import standard_learners
 from evaluation.methods import GrayEdge
 from evaluation.metrics import MapError, RegionError
-from evaluation.results.files import read_errors
 from evaluation.results.result import SceneAnswer
 from evaluation.scene import Scene, SceneSet
 from foundation.clock import SystemClock
@@ -141,12 +140,6 @@ def undisturbed(whole: Path) -> dict[str, bytes]:
     return content(whole)
 
 
-def test_the_files_of_a_results_folder(undisturbed: dict[str, bytes]) -> None:
-    names = {"run.json", "results.csv", "errors.csv", "table.tex", "report.html", "pixels.csv", "regions.csv"}
-    assert set(undisturbed) == names
-    assert len(undisturbed["errors.csv"].splitlines()) == 1 + COUNT * len(METHODS)
-
-
 @pytest.mark.parametrize(("done", "workers"), [(2, 3), (COUNT, 1)])
 def test_killed_after_any_image_it_ends_the_same(
     tmp_path: Path, undisturbed: dict[str, bytes], done: int, workers: int
@@ -262,18 +255,6 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
 def test_two_methods_of_one_name_are_refused() -> None:
     with pytest.raises(InputError, match="two methods are called 'Gray-world'"):
         run_methods(mixed_set(), [METHODS[0], GrayEdge("Gray-world", 0, 2, 0)])
-
-
-def test_errors_are_read_back(whole: Path) -> None:
-    made = run_methods(mixed_set(), METHODS)
-    found = read_errors(whole)
-    assert list(found) == ["Gray-world", "White-Patch"]
-    for result in made.results:
-        read = found[result.method]
-        assert read.images == made.subject.images
-        np.testing.assert_allclose(read.errors["recovery"], result.errors["recovery"], atol=1e-6)
-        assert read.truths is not None
-        np.testing.assert_allclose(read.truths, made.truths / made.truths.sum(axis=1, keepdims=True), atol=1e-8)
 
 
 class Flat:

@@ -10,7 +10,7 @@ import pytest
 
 from evaluation.experiments.cross_validation import tune_family, tuning_table
 from evaluation.experiments.running import evaluate
-from evaluation.methods.green_stability import family
+from evaluation.methods.green_stability import family, tune
 from evaluation.scene import Image
 from foundation.errors import InputError
 
@@ -102,3 +102,10 @@ def test_a_family_that_is_none() -> None:
         tune_family("gray-world", "shops", BLIND)
     with pytest.raises(InputError, match="'sigma=1@large' is no parameter"):
         tune_family("gray-edge-1@large", "shops", BLIND)
+
+
+def test_too_little_to_tune_with_is_refused() -> None:
+    with pytest.raises(InputError, match="1 sets of parameters on 8 images"):
+        tune(family("gray-edge-1")[:1], BLIND)
+    with pytest.raises(InputError, match="30 sets of parameters on 1 images"):
+        tune(family("gray-edge-1"), BLIND[:1])

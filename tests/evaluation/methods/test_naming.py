@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Learner
 from evaluation.methods.naming import find_method
 from evaluation.methods.standard import standard_methods
@@ -61,19 +60,6 @@ def test_a_value_a_learner_and_a_neighbour_of_the_file(tmp_path: Path) -> None:
 
 def test_a_class_of_a_module() -> None:
     assert find_method("evaluation.methods.pca:BrightDark").name == "PCA bright and dark"
-
-
-@pytest.mark.slow
-def test_parameters_in_a_name() -> None:
-    assert find_method("gray-edge-1:sigma=2.5") == GrayEdge("1st-order Gray-Edge (p=1, σ=2.5)", 1, 1, 2.5)
-    assert find_method("gray-edge-1:sigma=2:p=4") == find_method("gray-edge-1:p=4:sigma=2")
-    assert find_method("shades-of-gray:p=inf").name == "Shades-of-Gray (p=inf)"
-    assert find_method("general-gray-world:p=2@90").name == "General Gray-world (p=2, σ=9) at 90 px"
-    image = np.random.default_rng(1).uniform(0, 1, (20, 30, 3))
-    found = find_method("shades-of-gray:p=6")
-    assert not isinstance(found, Learner)
-    light = (image**6).mean(axis=(0, 1)) ** (1 / 6)
-    np.testing.assert_allclose(found.estimate(image), light / np.linalg.norm(light))
 
 
 def test_what_is_done_around_a_method(tmp_path: Path) -> None:

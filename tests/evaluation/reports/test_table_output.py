@@ -9,7 +9,7 @@ import re
 
 import pytest
 
-from evaluation.reports.table_output import escape_latex, print_table, table_to_latex, tables_to_latex
+from evaluation.reports.table_output import escape_latex, print_table, tables_to_latex
 from evaluation.results.tables import Table
 
 TABLE = Table(
@@ -52,24 +52,6 @@ def test_a_file_gets_the_whole_table_however_narrow_the_terminal(
 
 
 HEADS = ("Algorithm", "Mean", "Best 25%")
-
-
-def rows_of(text: str) -> list[str]:
-    body = text.partition("\\hline")[2].partition("\\end{tabular}")[0]
-    return [line for line in body.splitlines() if line and line != "\\hline"]
-
-
-def test_rows_have_the_columns_of_the_preamble() -> None:
-    table = Table("50 % of A&B_c", HEADS, (("Shades & {p=2} \\ #1", 1.234, None), ("σ = 1°", 2.0, 3.0)), notes=("n_1",))
-    text = table_to_latex(table)
-    found = re.search(r"\\begin\{tabular\}\{\|([lr|]+)\|\}", text)
-    assert found is not None
-    assert found[1].replace("|", "") == "lrr"
-    for row in rows_of(text):
-        assert row.endswith("\\\\")
-        assert len(re.findall(r"(?<!\\)&", row)) == 2
-    assert "1.23 & --" in text
-    assert "\\footnotesize n\\_1" in text
 
 
 def test_a_stack_has_one_preamble_and_every_title() -> None:

@@ -22,25 +22,6 @@ def written(folder: Path, *lines: str, head: str = HEAD) -> Path:
     return path
 
 
-def test_a_folder_and_its_file(tmp_path: Path) -> None:
-    path = written(
-        tmp_path,
-        "b.png,Gray-world,.3,.4,.3,1,2,1,1.5,2.5,0",
-        '"a, 1.png",Gray-world,.3,.4,.3,2,2,1,0.5,0.25,1',
-        "b.png,Mine,.3,.4,.3,1,2,1,3,4,0",
-    )
-    run = read_errors(tmp_path)
-    assert list(run) == ["Gray-world", "Mine"]
-    grey = run["Gray-world"]
-    assert grey.images == ("b.png", "a, 1.png")
-    assert grey.truths is not None
-    assert grey.truths.tolist() == [[1, 2, 1], [2, 2, 1]]
-    assert grey.errors["recovery"].tolist() == [1.5, 0.5]
-    assert grey.errors["reproduction"].tolist() == [2.5, 0.25]
-    assert grey.guessed.tolist() == [False, True]
-    assert read_errors(path)["Mine"].errors["reproduction"].tolist() == [4]
-
-
 def test_columns_in_another_order_and_without_truths(tmp_path: Path) -> None:
     path = written(tmp_path, "7,a.png,Mine,2", head="reproduction,image,method,recovery")
     mine = read_errors(path)["Mine"]

@@ -38,19 +38,6 @@ def subject_of(scenes: tuple[Scene, ...]) -> Subject:
     return Subject("Walls", tuple(scene.name for scene in scenes), mixed)
 
 
-def test_images_under_one_light_need_no_second_table() -> None:
-    scenes = walls(4)
-    results = evaluate(scenes, [White()])
-    table = summary_table(subject_of(scenes), results, "recovery")
-    assert table.title == "Walls: recovery angular error of 4 images, degrees"
-    assert table.rows == (("White", *results[0].summary("recovery").as_tuple()),)
-    assert table.notes == ()
-    assert lights_tables(subject_of(scenes), results, "recovery") == ()
-    further = summary_table(subject_of(scenes), results, "recovery", further=True)
-    summary = results[0].summary("recovery")
-    assert further.rows[0][-3:] == (summary.p95, summary.maximum, 100 * summary.below3)
-
-
 def test_several_lights_are_said_and_told_apart() -> None:
     scenes: tuple[Scene, ...] = (*walls(3), MixedWall("mixed", LIGHTS), MixedWall("other", LIGHTS))
     results = evaluate(scenes, [White()])
@@ -89,16 +76,6 @@ def test_an_image_of_which_nothing_is_judged_is_left_out_and_counted(monkeypatch
     assert row[3] == 1
 
 
-def test_causes_are_named_few_at_a_time() -> None:
-    scenes = walls(6)
-    results = evaluate(scenes, [White(None, (0, 0, 0), (1, 1, 1), None, (1, np.nan, 1))])
-    (note,) = summary_table(subject_of(scenes), results, "recovery").notes
-    assert note == (
-        "White: no light for 4 of 6 images (wall 0.png returned None, wall 1.png returned 0 0 0, wall 3.png returned "
-        "None …); their light was taken to be grey"
-    )
-
-
 TABLE = Table(
     'Cube+, "all"',
     ("Algorithm", "Mean", "Images", "95 %"),
@@ -117,18 +94,12 @@ def test_text_is_rounded_and_csv_is_not() -> None:
     assert rows[1] == ["None known", "", "0", "–"]
 
 
-def test_small_numbers_keep_their_digits_in_csv() -> None:
-    text = table_to_csv(Table("p", ("p",), ((1.23456789e-12,),)))
-    assert float(text.splitlines()[1]) == pytest.approx(1.23456789e-12, rel=1e-8)
-
-
-def test_columns_of_numbers() -> None:
-    assert TABLE.numeric() == (False, True, True, False)
-    assert Table("", ("a", "b"), ((None, 1.0), (None, None))).numeric() == (False, True)
-    assert Table("", ("a",), ()).numeric() == (False,)
-
-
 @pytest.mark.parametrize("rows", [((1.0,),), ((1.0, 2.0), (1.0, 2.0, 3.0))])
 def test_a_row_of_another_length_is_refused(rows: tuple[tuple[float, ...], ...]) -> None:
     with pytest.raises(ValueError, match="cells under 2 heads"):
         Table("t", ("a", "b"), rows)
+
+
+def test_small_numbers_keep_their_digits_in_csv() -> None:
+    text = table_to_csv(Table("p", ("p",), ((1.23456789e-12,),)))
+    assert float(text.splitlines()[1]) == pytest.approx(1.23456789e-12, rel=1e-8)

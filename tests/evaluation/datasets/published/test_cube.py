@@ -72,19 +72,6 @@ def test_a_reduced_copy_is_refused_since_its_cube_would_not_be_masked(copy: Path
         open_scenes(copy).scenes[0].read()
 
 
-@pytest.mark.parametrize("line", ["0.2 0.5", "0.2 0.5 -0.1", "0 0 0"])
-def test_a_line_that_is_no_light_is_named(copy: Path, line: str) -> None:
-    (copy / "cube+_gt.txt").write_text(f"0.1 0.5 0.4\n{line}\n0.3 0.5 0.2\n")
-    with pytest.raises(FormatError, match=r"cube\+_gt\.txt, line 2: .* restore the file"):
-        open_scenes(copy)
-
-
-def test_an_image_of_eight_bits_is_refused(copy: Path) -> None:
-    write_png(copy / "1.PNG", np.zeros((1060, 2060, 3), np.uint8))
-    with pytest.raises(FormatError, match=r"1\.PNG.*8.*RGB.*16"):
-        open_scenes(copy).scenes[0].read()
-
-
 def test_images_in_a_folder_that_is_not_looked_into_are_told_where_they_should_be(copy: Path) -> None:
     (copy / "images").mkdir()
     for path in copy.rglob("*.PNG"):

@@ -226,3 +226,9 @@ def test_variables_are_what_is_expected_of_them() -> None:
     for name in ("numbers", "lights"):
         with pytest.raises(FormatError, match=f"{name} holds .*, expected names"):
             matlab.strings(content, name, path)
+
+
+def test_a_file_is_checked_before_it_is_read(tmp_path: Path) -> None:
+    (tmp_path / "deep.mat").write_bytes(PLAIN[:128] + nested(21))
+    with pytest.raises(FormatError, match="more than 20 deep"):
+        matlab.read_mat(tmp_path / "deep.mat")

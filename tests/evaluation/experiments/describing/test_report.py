@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from evaluation.experiments.describing import DataDescription, describe, figures, report
+from evaluation.experiments.describing import report
 from evaluation.experiments.describing.description import (
     QUANTITIES,
+    DataDescription,
     NoiseCurve,
     NoiseLevel,
+    describe,
+    figures,
     read_statistics,
     statistics_to_json,
 )
@@ -30,7 +33,6 @@ from evaluation.experiments.describing.report import (
     compared_tables,
     seen_notes,
     sentence,
-    sizes_table,
 )
 from generator.likeness.real_data import TITLES
 from tests.evaluation.experiments.describing.scenes import random_set
@@ -212,16 +214,6 @@ def test_noise_in_another_unit_is_not_drawn_beside(monkeypatch: pytest.MonkeyPat
     signal, sigma = curve.get_xydata().T
     np.testing.assert_allclose(sigma**2, 0.03**2 + 0.16 * signal)
     assert report._noise((replace(one, noise=(none,) * 3),)) == []
-
-
-def test_six_sizes_are_listed_and_the_others_counted() -> None:
-    plain = replace(seen("a", 3), mixed=2, masked=0.123)
-    sizes = tuple((width, 10, 9 - width) for width in range(1, 9))
-    for count, last in ((6, ("6 x 10", 3)), (8, ("2 other sizes", 3))):
-        table = sizes_table(replace(plain, sizes=sizes[:count]))
-        assert table.rows[0] == ("1 x 10", 8)
-        assert (len(table.rows), table.rows[-1]) == (min(count, 7), last)
-        assert table.notes == ("2 images under several lights; 12.3% of the pixels are masked.",)
 
 
 def test_what_makes_descriptions_less_comparable_is_said() -> None:

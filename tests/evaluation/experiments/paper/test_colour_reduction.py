@@ -21,13 +21,11 @@ from hypothesis import strategies as st
 from evaluation.cli import main
 from evaluation.datasets import open_scenes
 from evaluation.experiments.paper.colour_reduction import (
-    PANEL,
     bits_methods,
     bits_removed,
     clear_bits,
     read_table,
     reduce_colours,
-    reduction_strip,
     reduction_table,
 )
 from evaluation.experiments.running import evaluate
@@ -226,24 +224,6 @@ def _set(folder: Path, column: str, value: str) -> None:
         table = csv.DictWriter(stream, list(rows[0]))
         table.writeheader()
         table.writerows(rows)
-
-
-def test_each_panel_has_its_bits_cleared() -> None:
-    picture = np.random.default_rng(0).integers(0, 256, (50, 70, 3), dtype=np.uint8)
-    strip = reduction_strip(picture)
-    assert strip.shape == (106, 4 * 76 - 6, 3)
-    for bits in range(8):
-        top, left = bits // 4 * 56, bits % 4 * 76
-        panel = strip[top : top + 50, left : left + 70]
-        np.testing.assert_array_equal(panel, picture // 2**bits * 2**bits)
-    assert (strip[50:56] == 255).all()
-
-
-def test_a_large_picture_is_made_smaller_first() -> None:
-    strip = reduction_strip(np.full((1000, 500, 3), 201, np.uint8), (0, 3))
-    assert strip.shape == (PANEL, 2 * PANEL // 2 + 6, 3)
-    assert (strip[:, : PANEL // 2] == 201).all()
-    assert (strip[:, -PANEL // 2 :] == 200).all()
 
 
 def test_what_is_left() -> None:

@@ -11,12 +11,9 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from calibration.table.lut import Lut, Provenance, open_lut
-from calibration.table.writing import LutWriter
-from drivers.presenter import Colour
+from calibration.table.lut import Lut
 from evaluation.datasets.generated import open_generated
 from evaluation.scene import SceneSet
-from experiment.lights import Illumination
 from foundation.colorimetry import decode_srgb
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
@@ -24,10 +21,10 @@ from generator.lights.lighting import LightChoice, ListedLights
 from generator.pictures.sources import UNPREPARED, Preparation, find_pictures
 from generator.variation.sensor_noise import SensorNoise
 from generator.variation.variation import Variation, parse_gradient
+from tests.evaluation.tables import CODES, write_lut
 
 LIGHTS = np.array([[4000.0, 8000, 3000], [3000, 8000, 6000]])
 """Counts of white under the two lights of the table."""
-WHITE_LEVEL = 9000
 BOTH = ListedLights((0, 1))
 
 
@@ -81,21 +78,10 @@ def save_pictures(folder: Path, names: Sequence[str], seed: int = 0, side: int =
 
 def write_table(folder: Path, matrix: npt.NDArray[np.float64] | None = None, camera: str = "Canon EOS 550D") -> Lut:
     """Write a table whose samples are linear sRGB, through a matrix if there is one, times the light."""
-    folder.mkdir(parents=True)
-    index = np.arange(512)
-    codes = np.stack([index >> 6, index >> 3 & 7, index & 7], axis=-1) * 32
-    linear = decode_srgb(codes / 255)
+    linear = decode_srgb(CODES * 32 / 255)
     if matrix is not None:
         linear = np.maximum(linear @ matrix.T, 0)
-    writer = LutWriter(folder, 2, 512, 2)
-    for number, light in enumerate(LIGHTS):
-        writer.put(number, np.rint(linear * light)[:, None, :].repeat(2, axis=1).astype(np.uint16))
-    known = Provenance(
-        camera=camera, bits=3, white_level=WHITE_LEVEL, session_sha256="0", chart_sha256="0", software="test"
-    )
-    plan = [Illumination(number, "uniform", None, Colour(1, 2, 3)) for number in range(2)]
-    writer.finish(plan, LIGHTS, known)
-    return open_lut(folder)
+    return write_lut(folder, [(linear * light)[:, None].repeat(2, axis=1) for light in LIGHTS], LIGHTS, camera)
 
 
 @pytest.fixture

@@ -122,24 +122,6 @@ def test_a_learner_that_reads_scenes_itself() -> None:
     np.testing.assert_allclose(rows[1].results[0].estimates, np.tile(expected, (120, 1)))
 
 
-@dataclass(frozen=True)
-class Stubborn:
-    """A user's class with a mistake in it."""
-
-    name: str = "Stubborn"
-
-    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Method:
-        raise KeyError("weights")
-
-
-def test_mistakes_of_a_users_class_are_named() -> None:
-    with pytest.raises(InputError, match="Stubborn fails to learn from 80 images: KeyError: 'weights'"):
-        transfer(TEST, [], [Stubborn()], FOLDS, 1)
-    black = (replace(TEST[0], cast=(0.0, 0.0, 0.0)), *TEST[1:])
-    with pytest.raises(InputError, match=r"Mean light fails on 1_000: ZeroDivisionError: black \(test_rows.py"):
-        transfer(black, [], [MeanLearner()], FOLDS, 1)
-
-
 def test_an_image_without_a_usable_pixel_is_guessed() -> None:
     black = (replace(TEST[0], cast=(0.0, 0.0, 0.0)), *TEST[1:])
     for row in transfer(black, [TrainingSet("a", "generated", world(40, seed=2))], [MeanColour()], FOLDS, 40):
