@@ -284,3 +284,16 @@ def percentiles(errors: npt.ArrayLike, levels: tuple[float, ...]) -> npt.NDArray
     """
     # NumPy calls MATLAB's definition after Hazen.
     return np.percentile(np.asarray(errors, dtype=np.float64), levels, method="hazen")
+
+
+__all__ = [
+    "ErrorKind",
+    "MapError",
+    "RegionError",
+    "Summary",
+    "measure_map",
+    "percentiles",
+    "recovery_error",
+    "reproduction_error",
+    "summarise",
+]
