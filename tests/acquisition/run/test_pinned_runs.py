@@ -89,6 +89,7 @@ def test_shutter_times_hold_the_turns_that_they_held(pinned: Pinned) -> None:
     wheels = (24.0, 50.0, 59.94, 60.0, 120.0, 180.0)
     turns = {str(hz): [time for time in ENGRAVED_S if holds_whole_turns(time, 1 / hz)] for hz in wheels}
     odd = [[n, holds_whole_turns(n / 60, 1 / 60)] for n in (0.4, 0.5, 0.994, 0.995, 1.005, 1.0051, 30.14, 30.16, 300.9)]
+    assert not holds_whole_turns(1e-5, 1 / 60), "next to nothing is no turn, however near to a whole number of them"
     said: list[str] = []
     for time, cable in product(
         (0.5, 0.3, 0.01, 1 / 60, 31.0, 0.5026),

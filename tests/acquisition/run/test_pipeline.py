@@ -84,6 +84,17 @@ class TestTime:
         assert lab.projector.power() is Power.COOLING, "a complete session switches the lamp off"
         assert lab.verdicts() == ["accepted"] * 6
 
+    def test_a_session_with_frames_left_leaves_the_lamp_as_its_settings_say(self, folder: Path) -> None:
+        class NotThatLight(ScriptedJudge):
+            def judge(self, file: Path, step: SessionStep) -> Judgement:
+                return refused("somebody passes each time") if step.number == 3 else super().judge(file, step)
+
+        lab = Lab(folder)
+        sequence = PATIENT.sequence.model_copy(update={"lamp_if_unfinished": "on"})
+        left_on = PATIENT.model_copy(update={"sequence": sequence})
+        assert not take_session(lab.session, lab.devices, left_on, NotThatLight()).complete
+        assert lab.projector.power() is Power.ON
+
     def test_no_light_is_exposed_before_it_has_settled(self, folder: Path) -> None:
         lab = Lab(folder, {1: NIGHT, 3: NIGHT})
         shown: list[float] = []
