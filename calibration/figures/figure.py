@@ -1,8 +1,13 @@
 """A judged figure is one object with all that is ever asked of it; judging, reporting and forecasting loop over them.
 
-Limits stand in the figure alone. A value within `accept` is accepted; between `accept` and `refuse` it is remarked on;
-beyond `refuse` there is no table. Where a measurement refuses by itself (`calibration.registration.register`), the
-number is defined there and imported.
+Rules that hold inside:
+
+- A figure has no default for what it may lack: what does not apply is said (`NO_CAUSE`, `ONLY_OF_A_SESSION`). One that
+  lacks a part does not import.
+- Limits stand in the figure alone; the check and the live judge take them from there.
+- A value within `accept` is accepted; between `accept` and `refuse` it is remarked on; beyond `refuse` there is no
+  table. Without `refuse` it is only ever remarked on: what it measures does not make the table wrong.
+- Where a measurement refuses by itself (`calibration.registration.register`), the number is defined there and imported.
 """
 
 from __future__ import annotations
@@ -64,6 +69,7 @@ _LARGE = 1000.0
 class Explanation:
     """How the cause of a figure beyond its limit is found (`calibration.causes`).
 
+    - `about`: what the figure is about, which rules ask for.
     - `gather`: what is known of it, its frames and places, from which value on (the limit accepted).
     - `follows`: names of figures that it moves along with: whose cause it shares where it has none of its own.
     """
@@ -77,6 +83,7 @@ class Explanation:
 class Worst:
     """Where the worst of a figure is, whether or not it is beyond a limit.
 
+    - `what`: what is worst, in few words.
     - `file`: the frame, relative to the session; "" where it is of no frame alone.
     - `light`: the light's number; None where it is of no light alone.
     - `place`: where on the print; None where it has no place.
@@ -99,6 +106,7 @@ class Worst:
 class SummaryRow:
     """What was measured, in words.
 
+    - `name`, `value`: what, and the number with its unit.
     - `note`: what it means, or what is usual; may be "".
     - `brief`: whether it is among the few that a command prints.
     """
@@ -125,6 +133,8 @@ class CheckMeasurements:
     - `cell_px`, `blur_px`: shorter side of the smallest cell, and σ of the median blur, half-size px.
     - `unfit`: share of the cells that would be unfit, by cause: ``outside``, ``clipped``, ``stained``.
     - `unfit_share`: share of those that are one of these.
+    - `stains`: where the print does not have its codes' colours.
+    - `paper`: flat field and white of bare paper.
     - `tint_deg`: largest angle between a printed grey and paper.
     - `leak`: (3,) float64, light while the projector shows black, of white.
     - `brightest_share`, `darkest_counts`: paper under white, of saturation, and under the plan's darkest light, at the
@@ -147,11 +157,23 @@ class CheckMeasurements:
     not_additive: float | None = None
 
 
+NO_PLACE: Final = None
+NO_FRAMES: Final = None
+NO_CAUSE: Final = None
+NOT_DRAWN: Final = None
+NO_LINES: Final[tuple[Line, ...]] = ()
+OF_ITS_CAUSE: Final = None
+ONLY_OF_A_SESSION: Final = None
+"""What a figure has not, said by name: a part that is left out is an error."""
+
+
 @dataclass(frozen=True)
 class Figure:
     """One figure that a table is judged by.
 
     - `name`: as in `report.json`.
+    - `title`: the figure for people.
+    - `group`: of the report's page.
     - `unit`: of the value and both limits; "" for a count or a plain number, "share" for 0 … 1.
     - `sense`: on which side of the limits a value is accepted.
     - `accept`: up to here nothing is remarked.
@@ -161,10 +183,13 @@ class Figure:
     - `remedy`: what to do about it; "" where it depends on what was found.
     - `measure`: the value; None where it could not be measured: from one frame, on a chart without tags or with few
       colours, without dark frames or a series of exposures.
-    - `forecast`: the value from what a check has; None where only a session shows it.
-    - `worst`: where its worst is on the report's page, whatever the verdict.
-    - `where`: frames, lights or place beyond the limit accepted, for a remark; else those of its cause.
-    - `retake`: the frames that are beyond a limit by themselves; it returns None where all of them are.
+    - `forecast`: the value from what a check has, where no check can know it `ONLY_OF_A_SESSION`.
+    - `worst`: where its worst is on the report's page, whatever the verdict; else `NO_PLACE`.
+    - `where`: frames, lights or place beyond the limit accepted, for a remark; else those `OF_ITS_CAUSE`.
+    - `retake`: the frames that are beyond a limit by themselves; else `NO_FRAMES`. None where all of them are.
+    - `cause`: how its cause is found; else it explains itself, `NO_CAUSE`.
+    - `drawing`: the picture that shows it; else `NOT_DRAWN`.
+    - `lines`: its lines in the summary; else `NO_LINES`.
     - `foremost`: whether a refusal speaks of it before others, which may follow from it.
     - `found`: what a refusal or remark adds, and the remedy, where that depends on what was found.
     """
@@ -181,13 +206,13 @@ class Figure:
     source: str
     remedy: str
     measure: Callable[[TableMeasurements], float | None]
-    forecast: Callable[[CheckMeasurements], float | None] | None = None
-    worst: Callable[[TableMeasurements, Chart], Worst | None] | None = None
-    where: Callable[[TableMeasurements, float], str] | None = None
-    retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None = None
-    cause: Explanation | None = None
-    drawing: Drawing | None = None
-    lines: tuple[Line, ...] = ()
+    forecast: Callable[[CheckMeasurements], float | None] | None
+    worst: Callable[[TableMeasurements, Chart], Worst | None] | None
+    where: Callable[[TableMeasurements, float], str] | None
+    retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None
+    cause: Explanation | None
+    drawing: Drawing | None
+    lines: tuple[Line, ...]
     foremost: bool = False
     found: Callable[[TableMeasurements], tuple[str, str] | None] | None = None
 

@@ -10,6 +10,12 @@ from calibration.budget import COVERAGE
 from calibration.causes.gathering import PrintPlace, noisy_evidence, reference_evidence
 from calibration.figures.figure import (
     JUDGEMENT,
+    NO_CAUSE,
+    NO_FRAMES,
+    NO_LINES,
+    NO_PLACE,
+    OF_ITS_CAUSE,
+    ONLY_OF_A_SESSION,
     SIMULATED,
     Explanation,
     Figure,
@@ -22,7 +28,7 @@ from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.framing.field import MIN_SIGNAL
 
 if TYPE_CHECKING:
-    from calibration.measurements import TableMeasurements
+    from calibration.measurements import FrameMeasurements, TableMeasurements
     from experiment.chart.model import Chart
     from experiment.measures.paper import Paper
 
@@ -46,7 +52,8 @@ NOISE_MISFIT = Figure(
     why="there is scatter that light and sensor do not explain: the camera smooths its raw files, or the light "
     "flickers",
     source="EMVA 1288 model; " + SIMULATED + ": 0.05 to 0.15", remedy="switch the camera's noise reduction off",
-    measure=lambda table: float(table.sensor.transfer.misfit.max()),
+    measure=lambda table: float(table.sensor.transfer.misfit.max()), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="noise", lines=(Line(170, _noise_row), Line(200, _at_zero_row)),
 )  # fmt: skip
 
@@ -73,8 +80,8 @@ NOISY_SHARE = Figure(
     "noisy_share", "Cells noisier than their level explains", "noise", "share", "at most", 0.002, 0.1,
     why="they are not of one colour: dirt, a fold, a neighbour's edge", source="a variance 3.5 times the model's",
     remedy="clean the print, focus, and hang it flatter",
-    measure=lambda table: float(table.sensor.transfer.noisy.mean()),
-    worst=_noisiest, cause=Explanation("noisy cells", noisy_evidence),
+    measure=lambda table: float(table.sensor.transfer.noisy.mean()), forecast=ONLY_OF_A_SESSION,
+    worst=_noisiest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("noisy cells", noisy_evidence),
     drawing="cells", lines=(Line(180, _transfer_row),),
 )  # fmt: skip
 
@@ -93,7 +100,9 @@ REFERENCES_USED = Figure(
     "references_used", "White references used, worst frame", "truth", "share", "at least", 0.9, 0.3,
     why="flat field and ground truth rest on few places", source=JUDGEMENT,
     remedy="uncover the print, bring all of it into the picture, expose so that bare paper stays below saturation",
-    measure=_references_used, forecast=lambda check: check.references_used, worst=_fewest_references, drawing="course",
+    measure=_references_used, forecast=lambda check: check.references_used,
+    worst=_fewest_references, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="course", lines=NO_LINES,
 )  # fmt: skip
 
 
@@ -101,9 +110,13 @@ def _spread(paper: Paper) -> float:
     return float(paper.spread[int(np.argmax(paper.white))])
 
 
+def _spread_of(frame: FrameMeasurements) -> float:
+    return _spread(frame.paper)
+
+
 def _most_spread(table: TableMeasurements, chart: Chart) -> Worst | None:
-    worst = max(table.white_frames, key=lambda frame: _spread(frame.paper), default=None)
-    return None if worst is None else Worst(f"{100 * _spread(worst.paper):.2g} %", worst.record.file)
+    worst = max(table.white_frames, key=_spread_of, default=None)
+    return None if worst is None else Worst(f"{100 * _spread_of(worst):.2g} %", worst.record.file)
 
 
 REFERENCE_SPREAD = Figure(
@@ -111,9 +124,10 @@ REFERENCE_SPREAD = Figure(
     why="what is not smooth, or falls off otherwise than lenses do, is left in the samples by the flat field",
     source=SIMULATED + ": 0.3 % of noise and photosites' response",
     remedy="clean or flatten the print, and look for shadows on it",
-    measure=lambda table: max((_spread(frame.paper) for frame in table.white_frames), default=None),
+    measure=lambda table: max(map(_spread_of, table.white_frames), default=None),
     forecast=lambda check: None if check.paper is None else _spread(check.paper),
-    worst=_most_spread, cause=Explanation("references", reference_evidence), drawing="rest",
+    worst=_most_spread, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("references", reference_evidence),
+    drawing="rest", lines=NO_LINES,
 )  # fmt: skip
 
 
@@ -133,7 +147,9 @@ TRUTH_MEDIAN_DEG = Figure(
     "truth_median_deg", "Expanded uncertainty of the ground truth, median light", "truth", "°", "at most", 0.4, 1.0,
     why="a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + ": a quarter of a good method's error; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=lambda table: float(np.median(table.budget.expanded_deg)), drawing="budget", lines=(Line(190, _error_row),),
+    measure=lambda table: float(np.median(table.budget.expanded_deg)), forecast=ONLY_OF_A_SESSION,
+    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="budget", lines=(Line(190, _error_row),),
 )  # fmt: skip
 
 
@@ -149,7 +165,9 @@ TRUTH_WORST_DEG = Figure(
     "truth_worst_deg", "Expanded uncertainty of the ground truth, worst light", "truth", "°", "at most", 0.5, 3.0,
     why="under that light a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=lambda table: float(table.budget.expanded_deg.max()), worst=_least_known, drawing="budget",
+    measure=lambda table: float(table.budget.expanded_deg.max()), forecast=ONLY_OF_A_SESSION,
+    worst=_least_known, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="budget", lines=NO_LINES,
 )  # fmt: skip
 
 
@@ -175,7 +193,8 @@ BRIGHTEST_SHARE = Figure(
     why="the unevenness of the light carries cells into saturation",
     source=JUDGEMENT + ": 0.8 leaves room for 20 % unevenness", remedy="expose less",
     measure=lambda table: float(table.lights.white.max()) / table.sensor.white_level,
-    forecast=lambda check: check.brightest_share, worst=_brightest,
+    forecast=lambda check: check.brightest_share,
+    worst=_brightest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="lights", lines=(Line(150, _saturation_row),),
 )  # fmt: skip
 
@@ -195,5 +214,6 @@ DARKEST_COUNTS = Figure(
     why="25 samples of 300 counts have a mean good to 1 %, a print's dark colours a thirtieth of that",
     source="photon noise at 1.8 electrons a count, 6 counts of read noise", remedy="expose longer",
     measure=lambda table: float(table.lights.white.max(axis=1).min()), forecast=lambda check: check.darkest_counts,
-    worst=_darkest, drawing="lights", lines=(Line(160, _darkest_row),),
+    worst=_darkest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    drawing="lights", lines=(Line(160, _darkest_row),),
 )  # fmt: skip

@@ -3,30 +3,53 @@
 from __future__ import annotations
 
 import re
+from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
-from calibration.figures import geometry, light, radiometry, truth
+from calibration.figures import all_figures, geometry, light, radiometry, truth
 from calibration.figures.all_figures import FIGURES
-from calibration.figures.figure import QUESTIONS, CheckMeasurements
+from calibration.figures.figure import QUESTIONS, CheckMeasurements, Figure
+from calibration.figures.truth import DARKEST_COUNTS
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("foundation", "drivers", "sim", "experiment", "calibration", "acquisition", "benchmarks")
 
 
-def test_a_figure_has_its_parts_and_contradicts_no_other() -> None:
-    names = {figure.name for figure in FIGURES}
-    assert len(names) == len(FIGURES)
-    for figure in FIGURES:
-        assert all((figure.title, figure.why, figure.source)), figure.name
-        assert figure.refuse is None or (figure.refuse > figure.accept) == (figure.sense == "at most"), figure.name
-        assert figure.cause is None or names.issuperset(figure.cause.follows), figure.name
-    places = [line.place for figure in FIGURES for line in figure.lines]
-    assert len(set(places)) == len(places), "two lines at one place of the summary"
+def test_a_figure_that_lacks_a_part_does_not_import() -> None:
+    parts: dict[str, Any] = {part.name: getattr(DARKEST_COUNTS, part.name) for part in fields(Figure) if part.init}
+    assert Figure(**parts) == DARKEST_COUNTS
+    for name in parts.keys() - {"foremost", "found"}:
+        with pytest.raises(TypeError, match=name):
+            Figure(**{key: value for key, value in parts.items() if key != name})
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"why": ""},
+        {"title": ""},
+        {"source": ""},
+        {"refuse": 301.0},
+        {"name": "bleed"},
+        {"lines": light.ADDITIVITY.lines},
+        {"cause": replace(light.ADDITIVITY.cause, follows=("nothing",)) if light.ADDITIVITY.cause else None},
+    ],
+)
+def test_figures_that_contradict_themselves_do_not_import(
+    wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(light, "WRONG", replace(DARKEST_COUNTS, **{"name": "wrong", **wrong}), raising=False)  # pyrefly: ignore[bad-argument-type]
+    with pytest.raises(ValueError, match=r"wrong|names"):
+        all_figures.collected()
 
 
 def test_figures_are_listed_in_the_order_of_their_definitions() -> None:
+    assert all_figures.collected() == FIGURES
     texts = [Path(module.__file__ or "").read_text() for module in (geometry, radiometry, light, truth)]
     assert [figure.name for figure in FIGURES] == re.findall(r' = Figure\(\n    "(\w+)"', "".join(texts))
     assert {figure.group for figure in FIGURES} == QUESTIONS.keys()
@@ -68,3 +91,23 @@ def test_some_figures_are_asked_more_than_others() -> None:
 def test_a_check_that_saw_nothing_forecasts_nothing() -> None:
     nothing = CheckMeasurements()
     assert [figure.name for figure in FIGURES if figure.forecast is not None and figure.forecast(nothing)] == []
+
+
+@pytest.mark.parametrize(
+    ("cells", "measured", "left_in", "told"),
+    [(4096, True, False, True), (4095, True, False, False), (512, True, True, True), (4096, False, True, False)],
+)
+def test_what_a_lens_leaves_is_a_figure_where_cells_are_enough_to_tell_it(
+    cells: int, measured: bool, left_in: bool, told: bool
+) -> None:
+    table: Any = SimpleNamespace(
+        registration=SimpleNamespace(mismatched_cells=np.zeros(cells)),
+        lens=SimpleNamespace(measured=measured, is_left_in=left_in, left=0.003, left_worst=0.02),
+    )
+    assert geometry.CORRECTION_RESIDUAL.measure(table) == (0.003 if told else None)
+
+
+@pytest.mark.parametrize(("frames", "expected"), [(1, None), (2, 1.0), (5, 1.0)])
+def test_white_frames_are_counted_where_there_is_more_than_one_frame(frames: int, expected: float | None) -> None:
+    table: Any = SimpleNamespace(white_frames=("white",), frames=("frame",) * frames)
+    assert radiometry.WHITE_FRAMES.measure(table) == expected
