@@ -356,12 +356,12 @@ def killed_by(
         print(f"{mutation.file}:{mutation.line}: no test runs it", file=sys.stderr)
         return ""
     (folder / "asked").write_text("\n".join(asked), encoding="utf-8")
+    files = dict.fromkeys(test.partition("::")[0] for test in asked)
     known_text = mutation.apply(folder)
     try:
         code, failed = tested(folder, ["@asked"], limit_s)
         if code == pytest.ExitCode.USAGE_ERROR:
             # Cases that are named by what was changed have other names now.
-            files = dict.fromkeys(test.partition("::")[0] for test in asked)
             code, failed = tested(folder, list(files), end_s - time.monotonic())
         if code == "no time":
             print(f"{mutation.file}:{mutation.line}: time was over before all tests were tried", file=sys.stderr)
@@ -369,6 +369,9 @@ def killed_by(
             return ""
     finally:
         (folder / mutation.file).write_text(known_text, encoding="utf-8")
+    if code == pytest.ExitCode.USAGE_ERROR and tested(folder, ["--collect-only", *files], 2 * ENDLESS_S)[0] == 0:
+        # A conftest cannot be imported any more, which pytest calls wrong usage.
+        return "the import of a conftest"
     if not failed or failed in left_out:
         raise RuntimeError(f"pytest ended with {code} and named no test: {mutation}")
     if tested(folder, [failed], 2 * ENDLESS_S)[0] == 0:
