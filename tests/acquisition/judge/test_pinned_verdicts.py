@@ -16,7 +16,7 @@ from acquisition.judge.measure import Frame
 from acquisition.judge.state import Basis, JudgeState, ProjectorModel
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Plane
-from experiment.session.records import Judgement, SessionStep
+from experiment.session.records import Check, Judgement, SessionStep
 from sim.world.disturbances import (
     AmbientStep,
     AnyDisturbance,
@@ -267,6 +267,17 @@ def test_lights_that_are_off_are_named_as_they_were(pinned: Pinned) -> None:
         numbers += [*seen.neutral_light(), *added[0], *added[1], *(light for _, light in ways)]
         found += [reason for reason, _ in dict.fromkeys(ways) if reason]
     pinned("lights that are off", [found, np.array(numbers)])
+
+
+def test_of_two_causes_those_are_named_that_were(pinned: Pinned) -> None:
+    """A value of 0.6 is less blur and movement than what stands for itself, one of 9 is plainly more."""
+    named: dict[str, str] = {}
+    for first, second in itertools.combinations(judge.CAUSES, 2):
+        for value in (0.6, 9.0):
+            found = [Check(name, value, None, 2.0, reason="wrong") for name in (first, second)]
+            left = [check.name for check in judge._named_once(found) if check.reason]
+            named[f"{first} and {second}, {value:g}"] = ", ".join(left)
+    pinned("causes of which one is named", named)
 
 
 @pytest.mark.slow

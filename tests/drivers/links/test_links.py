@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.links.link import PeerLink
+from drivers.links.link import PeerLink, quoted
 from drivers.links.network import LOOPBACK, TcpLink, TcpServer
 from foundation.errors import LinkClosed, LinkTimeout
 from tests.contracts.link import PATIENCE_S, Ends, LinkContract, read_exactly
@@ -135,3 +135,8 @@ def test_a_server_takes_several_connections_and_leaves_no_thread() -> None:
         again.close()
     server.close()
     assert threading.active_count() == before
+
+
+def test_what_a_message_quotes_says_where_it_is_cut_off() -> None:
+    assert quoted(b"%" * 40) == repr("%" * 40)
+    assert quoted(b"%" * 41) == repr("%" * 40) + "…"
