@@ -199,20 +199,22 @@ class Covered:
         """Return the tests that run a mutation's place, or else what is named there; the quickest first."""
         lines = range(mutation.line, mutation.last_line + 1)
         found = self._running(mutation.file, lines)
-        sought = [] if found else [_name_around(mutation.file, mutation.line)]
+        # What runs on import runs in the test that happens to import it first, and is asked of all who use it.
+        runs_once = not found or not _in_function(mutation.file, mutation.line)
+        sought = [_name_around(mutation.file, mutation.line)] if runs_once else []
         for name in sought:
             for file, line in _uses(name):
                 tests = self._running(file, [line])
                 found |= tests
                 around = _name_around(file, line)
-                if not tests and around not in sought:
+                if not (tests and _in_function(file, line)) and around not in sought:
                     sought.append(around)
         near = f"test_{Path(mutation.file).stem}.py::"
         order = sorted(self.seconds, key=lambda test: self.seconds[test] * (0.3 if near in test else 1.0))
         # What a fixture of a whole file runs is counted for the first test that asks for it.
         files = {test.partition("::")[0] for test in found}
         # What is run on import is also reached by those who look through all names of a module.
-        files |= _importers(mutation.file) if sought else set()
+        files |= _importers(mutation.file) if runs_once else set()
         mates = [test for test in order if test.partition("::")[0] in files and test not in found]
         return [*(test for test in order if test in found), *mates]
 
@@ -314,6 +316,13 @@ def _name_around(file: str, line: int) -> str:
         if node.lineno <= line <= (node.end_lineno or node.lineno):
             name = found
     return name
+
+
+@cache
+def _in_function(file: str, line: int) -> bool:
+    """Return whether a line of a file stands in the body of a function."""
+    functions = (node for node in ast.walk(_parsed(file)) if isinstance(node, ast.FunctionDef))
+    return any(node.body[0].lineno <= line <= (node.end_lineno or node.lineno) for node in functions)
 
 
 @cache
