@@ -57,3 +57,12 @@ def test_files_name_their_columns() -> None:
     assert float(first.split(",")[1]) == pytest.approx(budget.expanded_deg[0], rel=1e-3)
     assert budget.cells_csv().splitlines()[0] == ",".join(["colour", *CELL_COLUMNS])
     assert len(budget.cells_csv().splitlines()) == 9
+
+
+def test_the_report_has_the_median_cell_and_the_worst() -> None:
+    cells = np.full((9, 3), 1e-4)
+    cells[4, 1] = 9e-4
+    budget = Budget((Component("noise", "noise", False, "drawn", correlated(), cells),), WHITE)
+    stated = budget.to_json()["cell_share"]
+    assert stated["median"] == pytest.approx([COVERAGE * 1e-2] * 3, rel=1e-3)
+    assert stated["worst"] == pytest.approx([COVERAGE * 1e-2, COVERAGE * 3e-2, COVERAGE * 1e-2], rel=1e-3)
