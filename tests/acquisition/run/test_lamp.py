@@ -12,6 +12,7 @@ from typing import cast
 
 import pytest
 
+from acquisition.run import plan
 from acquisition.run.devices import (
     PAUSE_S,
     POWER_LIMIT_S,
@@ -464,3 +465,10 @@ def test_what_a_slow_projector_reports_is_known_within_a_round() -> None:
     assert [sentence for sentence in said if sentence] == [
         "the projector's picture is muted; release mute on its remote control"
     ]
+
+
+@pytest.mark.parametrize(("power", "said"), [(ON, "its lamp burns"), (Power.STANDBY, "it will be lit")])
+def test_a_plan_says_whether_the_lamp_burns(power: Power, said: str) -> None:
+    sentence, lit = plan._projector_state(SimulatedProjector(SimulatedClock(), power=power))
+    assert said in sentence
+    assert lit is (power is ON)
