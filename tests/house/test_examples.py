@@ -29,4 +29,4 @@ def test_examples(name: str) -> None:
 
 
 def test_there_are_examples() -> None:
-    assert len(MODULES) >= 12
+    assert len(MODULES) >= 14

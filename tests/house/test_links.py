@@ -1,4 +1,4 @@
-"""Links between the repository's pages lead somewhere; `make docs` asks the same, and takes minutes."""
+"""Links between the repository's pages lead to files; `make docs`, which takes minutes, asks for headings, too."""
 
 import re
 from pathlib import Path
