@@ -26,8 +26,23 @@ import numpy.typing as npt
 from llvmlite import ir
 
 from evaluation.scene import Image
-from foundation.compiled import compiled, inlined, intrinsic
-from generator.kernels.vector import ADDRESS, F32, FLOATS, I32, I64, LANES, LINE, broadcast, constant, load, store, void
+from foundation.compiled import compiled, inlined
+from generator.kernels.vector import (
+    ADDRESS,
+    F32,
+    FLOATS,
+    I32,
+    I64,
+    LANES,
+    LINE,
+    Builder,
+    Value,
+    broadcast,
+    constant,
+    load,
+    step,
+    store,
+)
 
 OUTPUTS: Final = 4
 """Vectors that are found at a time: as many sums as a multiplication takes cycles, so that none waits for another."""
@@ -135,166 +150,134 @@ def _write(builder: Any, values: Sequence[Any], target: Any, step: Any) -> None:
         store(builder, value, builder.add(target, builder.mul(step, ir.Constant(I64, at))), 0)
 
 
-def _across(kinds: Sequence[int]) -> Any:
-    """Return what numba wants of an intrinsic that filters `OUTPUTS` pixels of 16 rows by each of some kinds."""
-    count = len(kinds)
-
-    def emit(builder: Any, source: Any, reach: Any, *places: Any) -> None:
-        step = ir.Constant(I64, _PIXEL)
-        found = _emit(builder, source, step, places[:count], reach, kinds)
-        for values, target in zip(found, places[count:], strict=True):
-            _write(builder, values, target, step)
-
-    return void(emit, *[ADDRESS] * (2 + 2 * count))
+def _across(builder: Builder, kinds: Sequence[int], source: Value, reach: Value, places: Sequence[Value]) -> None:
+    """Filter `OUTPUTS` pixels of 16 rows by each of some kinds; `places` are those of the kernels, then the targets."""
+    apart = ir.Constant(I64, _PIXEL)
+    found = _emit(builder, source, apart, places[: len(kinds)], reach, kinds)
+    for values, target in zip(found, places[len(kinds) :], strict=True):
+        _write(builder, values, target, apart)
 
 
-@intrinsic
-def across_even(typing: Any, source: Any, reach: Any, even: Any, target: Any) -> Any:
+@step(*[ADDRESS] * 4)
+def across_even(builder: Builder, source: Value, reach: Value, even: Value, target: Value) -> None:
     """Write four pixels of 16 rows from `source` on, smoothed along x, to `target`."""
-    del typing, source, reach, even, target
-    return _across((EVEN,))
+    _across(builder, (EVEN,), source, reach, (even, target))
 
 
-@intrinsic
-def across_even_odd(typing: Any, source: Any, reach: Any, even: Any, odd: Any, smooth: Any, slope: Any) -> Any:
+@step(*[ADDRESS] * 6)
+def across_even_odd(
+    builder: Builder, source: Value, reach: Value, even: Value, odd: Value, smooth: Value, slope: Value
+) -> None:
     """Write four pixels of 16 rows, smoothed and derived once."""
-    del typing, source, reach, even, odd, smooth, slope
-    return _across((EVEN, ODD))
+    _across(builder, (EVEN, ODD), source, reach, (even, odd, smooth, slope))
 
 
-@intrinsic
+@step(*[ADDRESS] * 8)
 def across_all(
-    typing: Any, source: Any, reach: Any, even: Any, odd: Any, bend: Any, smooth: Any, slope: Any, curve: Any
-) -> Any:
+    builder: Builder,
+    source: Value,
+    reach: Value,
+    even: Value,
+    odd: Value,
+    bend: Value,
+    smooth: Value,
+    slope: Value,
+    curve: Value,
+) -> None:
     """Write four pixels of 16 rows, smoothed, derived once and derived twice."""
-    del typing, source, reach, even, odd, bend, smooth, slope, curve
-    return _across((EVEN, ODD, BEND))
+    _across(builder, (EVEN, ODD, BEND), source, reach, (even, odd, bend, smooth, slope, curve))
 
 
-@intrinsic
+@step(*[ADDRESS] * 9)
 def beside_all(
-    typing: Any,
-    source: Any,
-    reach: Any,
-    even: Any,
-    odd: Any,
-    bend: Any,
-    smooth: Any,
-    slope: Any,
-    curve: Any,
-    column: Any,
-) -> Any:
+    builder: Builder,
+    source: Value,
+    reach: Value,
+    even: Value,
+    odd: Value,
+    bend: Value,
+    smooth: Value,
+    slope: Value,
+    curve: Value,
+    column: Value,
+) -> None:
     """Write 16 interleaved pixels of a row, smoothed, derived once and twice, as vectors `column` bytes apart."""
-    del typing, source, reach, even, odd, bend, smooth, slope, curve, column
-
-    def emit(builder: Any, source: Any, reach: Any, *places: Any) -> None:
-        step = ir.Constant(I64, 3 * _BYTES)
-        found = _emit(builder, source, step, places[:3], reach, (EVEN, ODD, BEND), side_by_side=True)
-        for values, target in zip(found, places[3:-1], strict=True):
-            _write(builder, values, target, places[-1])
-
-    return void(emit, *[ADDRESS] * 9)
+    apart = ir.Constant(I64, 3 * _BYTES)
+    found = _emit(builder, source, apart, (even, odd, bend), reach, (EVEN, ODD, BEND), side_by_side=True)
+    for values, target in zip(found, (smooth, slope, curve), strict=True):
+        _write(builder, values, target, column)
 
 
-@intrinsic
-def down_even(typing: Any, smooth: Any, reach: Any, even: Any, target: Any, pitch: Any) -> Any:
+@step(*[ADDRESS] * 5)
+def down_even(builder: Builder, smooth: Value, reach: Value, even: Value, target: Value, pitch: Value) -> None:
     """Write four rows of 16 numbers, smoothed along y, `pitch` bytes apart."""
-    del typing, smooth, reach, even, target, pitch
-
-    def emit(builder: Any, smooth: Any, reach: Any, even: Any, target: Any, pitch: Any) -> None:
-        (found,) = _emit(builder, smooth, ir.Constant(I64, LINE), (even,), reach, (EVEN,))
-        _write(builder, found, target, pitch)
-
-    return void(emit, *[ADDRESS] * 5)
+    (found,) = _emit(builder, smooth, ir.Constant(I64, LINE), (even,), reach, (EVEN,))
+    _write(builder, found, target, pitch)
 
 
-@intrinsic
+@step(*[ADDRESS] * 7)
 def down_gradient(
-    typing: Any, smooth: Any, slope: Any, reach: Any, even: Any, odd: Any, target: Any, pitch: Any
-) -> Any:
+    builder: Builder, smooth: Value, slope: Value, reach: Value, even: Value, odd: Value, target: Value, pitch: Value
+) -> None:
     """Write the gradient's length from rows smoothed and derived along x."""
-    del typing, smooth, slope, reach, even, odd, target, pitch
-
-    def emit(builder: Any, smooth: Any, slope: Any, reach: Any, even: Any, odd: Any, target: Any, pitch: Any) -> None:
-        step = ir.Constant(I64, LINE)
-        (along_x,) = _emit(builder, slope, step, (even,), reach, (EVEN,))
-        (along_y,) = _emit(builder, smooth, step, (odd,), reach, (ODD,))
-        lengths = [
-            _root(builder, _fused(builder, x, x, builder.fmul(y, y))) for x, y in zip(along_x, along_y, strict=True)
-        ]
-        _write(builder, lengths, target, pitch)
-
-    return void(emit, *[ADDRESS] * 7)
+    apart = ir.Constant(I64, LINE)
+    (along_x,) = _emit(builder, slope, apart, (even,), reach, (EVEN,))
+    (along_y,) = _emit(builder, smooth, apart, (odd,), reach, (ODD,))
+    lengths = [_root(builder, _fused(builder, x, x, builder.fmul(y, y))) for x, y in zip(along_x, along_y, strict=True)]
+    _write(builder, lengths, target, pitch)
 
 
-@intrinsic
+@step(*[ADDRESS] * 9)
 def down_curvature(
-    typing: Any,
-    smooth: Any,
-    slope: Any,
-    curve: Any,
-    reach: Any,
-    even: Any,
-    odd: Any,
-    bend: Any,
-    target: Any,
-    pitch: Any,
-) -> Any:
+    builder: Builder,
+    smooth: Value,
+    slope: Value,
+    curve: Value,
+    reach: Value,
+    even: Value,
+    odd: Value,
+    bend: Value,
+    target: Value,
+    pitch: Value,
+) -> None:
     """Write √(f_xx² + 4 f_xy² + f_yy²) from rows smoothed, derived once, and derived twice along x."""
-    del typing, smooth, slope, curve, reach, even, odd, bend, target, pitch
-
-    def emit(builder: Any, *given: Any) -> None:
-        smooth, slope, curve, reach, even, odd, bend, target, pitch = given
-        step = ir.Constant(I64, LINE)
-        (xx,) = _emit(builder, curve, step, (even,), reach, (EVEN,))
-        (xy,) = _emit(builder, slope, step, (odd,), reach, (ODD,))
-        (yy,) = _emit(builder, smooth, step, (bend,), reach, (BEND,))
-        sizes: list[Any] = []
-        for a, b, c in zip(xx, xy, yy, strict=True):
-            mixed = builder.fadd(b, b)
-            total = _fused(builder, a, a, _fused(builder, mixed, mixed, builder.fmul(c, c)))
-            sizes.append(_root(builder, total))
-        _write(builder, sizes, target, pitch)
-
-    return void(emit, *[ADDRESS] * 9)
+    apart = ir.Constant(I64, LINE)
+    (xx,) = _emit(builder, curve, apart, (even,), reach, (EVEN,))
+    (xy,) = _emit(builder, slope, apart, (odd,), reach, (ODD,))
+    (yy,) = _emit(builder, smooth, apart, (bend,), reach, (BEND,))
+    sizes: list[Value] = []
+    for a, b, c in zip(xx, xy, yy, strict=True):
+        mixed = builder.fadd(b, b)
+        total = _fused(builder, a, a, _fused(builder, mixed, mixed, builder.fmul(c, c)))
+        sizes.append(_root(builder, total))
+    _write(builder, sizes, target, pitch)
 
 
-@intrinsic
-def copy_line(typing: Any, source: Any, target: Any) -> Any:
+@step(ADDRESS, ADDRESS)
+def copy_line(builder: Builder, source: Value, target: Value) -> None:
     """Copy 16 numbers."""
-    del typing, source, target
-
-    def emit(builder: Any, source: Any, target: Any) -> None:
-        store(builder, load(builder, source, 0, FLOATS), target, 0)
-
-    return void(emit, ADDRESS, ADDRESS)
+    store(builder, load(builder, source, 0, FLOATS), target, 0)
 
 
-@intrinsic
-def transpose(typing: Any, source: Any, pitch: Any, target: Any) -> Any:
+@step(*[ADDRESS] * 3)
+def transpose(builder: Builder, source: Value, pitch: Value, target: Value) -> None:
     """Write the 16 x 16 numbers whose rows stand `pitch` bytes apart, transposed, to 16 cache lines at `target`."""
-    del typing, source, pitch, target
-
-    def emit(builder: Any, source: Any, pitch: Any, target: Any) -> None:
-        rows = [
-            load(builder, builder.add(source, builder.mul(pitch, ir.Constant(I64, row))), 0, FLOATS)
-            for row in range(LANES)
-        ]
-        size = LANES // 2
-        while size:
-            # Squares of `size` numbers change places across the diagonal.
-            upper = [lane if not lane & size else LANES + lane - size for lane in range(LANES)]
-            lower = [lane + size if not lane & size else LANES + lane for lane in range(LANES)]
-            for row in range(LANES):
-                if not row & size:
-                    pair = rows[row], rows[row + size]
-                    for at, lanes in ((row, upper), (row + size, lower)):
-                        rows[at] = builder.shuffle_vector(*pair, constant(ir.VectorType(I32, LANES), lanes))
-            size //= 2
-        for row, value in enumerate(rows):
-            store(builder, value, target, LINE * row)
-
-    return void(emit, *[ADDRESS] * 3)
+    rows = [
+        load(builder, builder.add(source, builder.mul(pitch, ir.Constant(I64, row))), 0, FLOATS) for row in range(LANES)
+    ]
+    size = LANES // 2
+    while size:
+        # Squares of `size` numbers change places across the diagonal.
+        upper = [lane if not lane & size else LANES + lane - size for lane in range(LANES)]
+        lower = [lane + size if not lane & size else LANES + lane for lane in range(LANES)]
+        for row in range(LANES):
+            if not row & size:
+                pair = rows[row], rows[row + size]
+                for at, lanes in ((row, upper), (row + size, lower)):
+                    rows[at] = builder.shuffle_vector(*pair, constant(ir.VectorType(I32, LANES), lanes))
+        size //= 2
+    for row, value in enumerate(rows):
+        store(builder, value, target, LINE * row)
 
 
 GROUP: Final = LANES

@@ -18,8 +18,21 @@ import numpy.typing as npt
 from llvmlite import ir
 from numpy import uint32, uint64
 
-from foundation.compiled import compiled, intrinsic
-from generator.kernels.vector import ADDRESS, FLOATS, I32, I64, LINE, broadcast, constant, load, store, void
+from foundation.compiled import compiled
+from generator.kernels.vector import (
+    ADDRESS,
+    FLOATS,
+    I32,
+    I64,
+    LINE,
+    Builder,
+    Value,
+    broadcast,
+    constant,
+    load,
+    step,
+    store,
+)
 
 if TYPE_CHECKING:
     from evaluation.scene import Image
@@ -184,52 +197,46 @@ def _raise(factors: npt.NDArray[np.float64], powers: npt.NDArray[np.float64], le
                 factors[j] *= factors[j]
 
 
-@intrinsic
-def _add_powers(typing: Any, source: Any, blocks: Any, scale: Any, p: Any, bits: Any, sums: Any) -> Any:
+@step(ADDRESS, ADDRESS, "float64", ADDRESS, ADDRESS, ADDRESS)
+def _add_powers(
+    builder: Builder, source: Value, blocks: Value, scale: Value, p: Value, bits: Value, sums: Value
+) -> None:
     """Add to 48 float64 at `sums` the powers `p` of `blocks` times 48 float32 from `source` on, times `scale`.
 
     `p` is whole and of `bits` bits. Factors, powers and sums stay in registers.
     """
-    del typing, source, blocks, scale, p, bits, sums
+    from numba.core import cgutils
 
-    def emit(builder: Any, source: Any, blocks: Any, scale: Any, p: Any, bits: Any, sums: Any) -> None:
-        from numba.core import cgutils
+    one, places = ir.Constant(I64, 1), range(6)
+    halves = [constant(ir.VectorType(I32, 8), range(first, first + 8)) for first in (0, 8)]
 
-        one, places = ir.Constant(I64, 1), range(6)
-        halves = [constant(ir.VectorType(I32, 8), range(first, first + 8)) for first in (0, 8)]
+    def slot_of(value: Any) -> Any:
+        slot = cgutils.alloca_once(builder, _DOUBLES)
+        builder.store(value, slot)
+        return slot
 
-        def slot_of(value: Any) -> Any:
-            from numba.core import cgutils
+    def multiply(slots: list[Any], by: list[Any]) -> None:
+        for slot, other in zip(slots, by, strict=True):
+            builder.store(builder.fmul(builder.load(slot), builder.load(other)), slot)
 
-            slot = cgutils.alloca_once(builder, _DOUBLES)
-            builder.store(value, slot)
-            return slot
-
-        def multiply(slots: list[Any], by: list[Any]) -> None:
-
-            for slot, other in zip(slots, by, strict=True):
-                builder.store(builder.fmul(builder.load(slot), builder.load(other)), slot)
-
-        totals = [slot_of(load(builder, sums, LINE * at, _DOUBLES)) for at in places]
-        factor = broadcast(builder, scale, _DOUBLES)
-        with cgutils.for_range(builder, blocks) as loop:
-            start = builder.add(source, builder.mul(loop.index, ir.Constant(I64, 3 * LINE)))
-            vectors = [load(builder, start, LINE * at, FLOATS) for at in range(3)]
-            parts = [builder.shuffle_vector(vectors[at // 2], vectors[at // 2], halves[at % 2]) for at in places]
-            factors = [slot_of(builder.fmul(builder.fpext(part, _DOUBLES), factor)) for part in parts]
-            powers = [slot_of(ir.Constant(_DOUBLES, [1.0] * 8)) for _ in places]
-            with cgutils.for_range(builder, bits) as bit:
-                wanted = builder.and_(builder.lshr(p, bit.index), one)
-                with builder.if_then(builder.icmp_unsigned("!=", wanted, ir.Constant(I64, 0))):
-                    multiply(powers, factors)
-                with builder.if_then(builder.icmp_unsigned("<", builder.add(bit.index, one), bits)):
-                    multiply(factors, factors)
-            for total, power in zip(totals, powers, strict=True):
-                builder.store(builder.fadd(builder.load(total), builder.load(power)), total)
-        for at, total in enumerate(totals):
-            store(builder, builder.load(total), sums, LINE * at)
-
-    return void(emit, ADDRESS, ADDRESS, "float64", ADDRESS, ADDRESS, ADDRESS)
+    totals = [slot_of(load(builder, sums, LINE * at, _DOUBLES)) for at in places]
+    factor = broadcast(builder, scale, _DOUBLES)
+    with cgutils.for_range(builder, blocks) as loop:
+        start = builder.add(source, builder.mul(loop.index, ir.Constant(I64, 3 * LINE)))
+        vectors = [load(builder, start, LINE * at, FLOATS) for at in range(3)]
+        parts = [builder.shuffle_vector(vectors[at // 2], vectors[at // 2], halves[at % 2]) for at in places]
+        factors = [slot_of(builder.fmul(builder.fpext(part, _DOUBLES), factor)) for part in parts]
+        powers = [slot_of(ir.Constant(_DOUBLES, [1.0] * 8)) for _ in places]
+        with cgutils.for_range(builder, bits) as bit:
+            wanted = builder.and_(builder.lshr(p, bit.index), one)
+            with builder.if_then(builder.icmp_unsigned("!=", wanted, ir.Constant(I64, 0))):
+                multiply(powers, factors)
+            with builder.if_then(builder.icmp_unsigned("<", builder.add(bit.index, one), bits)):
+                multiply(factors, factors)
+        for total, power in zip(totals, powers, strict=True):
+            builder.store(builder.fadd(builder.load(total), builder.load(power)), total)
+    for at, total in enumerate(totals):
+        store(builder, builder.load(total), sums, LINE * at)
 
 
 @compiled

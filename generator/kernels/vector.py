@@ -105,17 +105,6 @@ def signature(returned: str, *kinds: str) -> Any:
     return getattr(named, returned)(*(getattr(named, kind) for kind in kinds))
 
 
-def void(emit: Callable[..., None], *kinds: str) -> Any:
-    """Return what numba wants of an intrinsic that returns nothing."""
-
-    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
-        del signature
-        emit(builder, *arguments)
-        return context.get_dummy_value()
-
-    return signature("void", *kinds), generate
-
-
 def step(*kinds: str, returned: str = "void") -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that makes a step for compiled functions to call of a function that writes it in LLVM's terms.
 
@@ -491,8 +480,6 @@ def mix(
         return totals
 
     def of_all(block: Value, place: Value) -> Sequence[Value]:
-        from numba.core import cgutils
-
         for one in sums:
             builder.store(zero, one)
         with cgutils.for_range(builder, pairs) as loop:
