@@ -597,7 +597,11 @@ def measure_at(
     keep_samples: bool,
     dark: DarkLight | None = None,
 ) -> MeasuredFrame:
-    """Return what a frame shows that is sampled `at` these places, `shift` px from the frame registered before."""
+    """Return what a frame shows that is sampled `at` these places, `shift` px from the frame registered before.
+
+    `reregistered`: whether the chart was registered in this frame, whose blur is then its own. `dark`: as for
+    `measure_frame`. The result's `registered` is `at`.
+    """
     points = baseline.points
     samples, highest = gather(decoded.mosaic, decoded.black, at.references)
     seen = usable_means(samples, highest, at.references, decoded.saturation)

@@ -608,7 +608,10 @@ def draw_reference_residuals(figure: Any, chart: Chart, places_mm: _Array, resid
 
 
 def half_size(mosaic: Mosaic) -> npt.NDArray[np.float32]:
-    """Return a frame as linear RGB, (H // 2, W // 2, 3) float32 counts above black; an odd last row is dropped."""
+    """Return a frame as linear RGB, (H // 2, W // 2, 3) float32 counts above black; noise makes some negative.
+
+    An odd last row or column is dropped.
+    """
     black = frame_black(mosaic)
     blocks = mosaic.block_planes()
     image = np.empty((*blocks.shape[2:], 3), dtype=np.float32)

@@ -2,8 +2,8 @@
 
 docs/formats.md says what lies in a shard: POSIX.1-1988 ustar files whose members are named after the WebDataset
 specification, all with one owner, time and mode, so that equal images make equal files; or Parquet files that Hugging
-Face `datasets` reads, a row an image, which need pyarrow, the extra `parquet`. Images are not decoded by themselves:
-Pillow, with which `datasets` would decode, keeps 8 of a 16-bit image's bits.
+Face `datasets` reads, a row an image, which need pyarrow, the extra `parquet`. There only previews are decoded by
+themselves: Pillow, with which `datasets` would decode, keeps 8 of a 16-bit image's bits.
 """
 
 from __future__ import annotations

@@ -269,7 +269,7 @@ def bits_of(colours: int) -> int:
 
 
 def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
-    """Return the codes (..., 3) int64, red, green, blue, of colour indices (...) int 0 … 8**bits − 1."""
+    """Return the codes (..., 3) int64, 0 … 2**bits − 1, of red, green and blue, of colour indices (...) int."""
     colours = np.asarray(colours, dtype=np.int64)
     mask = (1 << bits) - 1
     return np.stack([colours >> 2 * bits & mask, colours >> bits & mask, colours & mask], axis=-1)

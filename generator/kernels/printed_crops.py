@@ -78,7 +78,7 @@ def draw_printed_crops(
     """Return N crops by colour in `out` (N, 3, height, width) float32, 1 = saturation.
 
     `lights`, `pictures` and `windows` (N, 4: x, y, width, height, inside the picture) are one for each; `scales`
-    (N, 7) float32 as of `planar.scales_of`.
+    (N, 7) float32 as of `planar.scales_of`. An InputError says that `out` is of another shape or type.
     """
     width, height = windows[0, 2:].tolist()
     check_out(out, (len(pictures), 3, height, width), np.float32)

@@ -110,7 +110,10 @@ class LeftOutPicture:
 
 
 def open_scenes(place: str) -> Dataset:
-    """Return the dataset whose scenes and lights are to be taken; an InputError if its images cannot be numbered."""
+    """Return the dataset whose scenes and lights are to be taken.
+
+    An InputError says that its images cannot be numbered, a FormatError that there is none.
+    """
     dataset = open_dataset(place)
     made = dataset.description
     if made.planned % _scenes(dataset):

@@ -172,7 +172,7 @@ def expose(
     and that speed over the table's, 1 or more; `noise` and 1 if not given. Where the factor is larger, the noise is
     that of the factor as ISO speed. `weights`, `end`: (H, W, 2) float32, how much of each pixel's light is that of the
     near and of the far end, and the light of the far end over that of the near one, above 0 up to 1; None for the same
-    light everywhere. `threads`: that share the rows; no count depends on it. `out`: (H, W, 3) uint16 to fill.
+    light everywhere. `out`: (H, W, 3) uint16 to fill.
     """
     target = image if out is None else out
     for array in (image, target):

@@ -87,7 +87,7 @@ class SensorNoise:
 
 
 def measured_noise(lut: Lut) -> SensorNoise:
-    """Return the noise of a table's samples; errors as of `noise_curve`.
+    """Return the noise of a table's samples; an InputError as of `noise_curve`.
 
     Numbers have six digits, so that they are the same wherever a dataset is made.
     """

@@ -84,7 +84,6 @@ def test_every_format_is_the_same_image_in_every_layout(make: Make, form: str) -
 
 READER = """
 import hashlib, json, sys
-from tests.generator.conftest import MakeLut
 # It does without PyTorch, whose import takes longer than all else.
 sys.modules["torch"] = None
 import webdataset

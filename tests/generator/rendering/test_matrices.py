@@ -46,7 +46,7 @@ def test_the_numbers_are_those_of_libraw() -> None:
 
 def test_the_matrix_that_a_second_reading_found() -> None:
     # Found apart, with sRGB's matrix to more digits: rows of the EOS 550D to three decimals.
-    found = camera_matrix("EOS 550D")
+    found = camera_matrix("eos 550d")
     assert found is not None
     expected = [[0.578, 0.344, 0.079], [0.088, 0.674, 0.238], [0.035, 0.217, 0.748]]
     np.testing.assert_allclose(found.rows, expected, atol=0.0011)
