@@ -94,6 +94,7 @@ def test_a_pause_is_no_success_either(
     assert sentence in said.err
 
 
+@pytest.mark.slow
 def test_a_killed_run_has_no_time_left(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     subprocess.run([sys.executable, "-c", ENDED, str(folder)], check=True)
     told = say(folder, capsys, code=3)
@@ -105,6 +106,7 @@ def test_a_killed_run_has_no_time_left(folder: Path, capsys: pytest.CaptureFixtu
     assert (values["state"], values["alive"], values["remaining_s"]) == ("stopped", False, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sentence", "code"),
     [

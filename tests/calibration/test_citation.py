@@ -97,6 +97,7 @@ def test_a_serial_number_that_is_not_told_stands_nowhere(form: str) -> None:
     assert told[0].serial != told[1].serial
 
 
+@pytest.mark.slow
 def test_the_hash_is_the_bodys_alone() -> None:
     assert serial_hash("A", "1") == serial_hash("A", "1")
     assert len({serial_hash("A", "1"), serial_hash("A", "2"), serial_hash("B", "1")}) == 3

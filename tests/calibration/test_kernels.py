@@ -66,6 +66,7 @@ def light_between(low: float, high: float, sigma: float, window: int, offset: fl
     return float(np.mean(shares))
 
 
+@pytest.mark.slow
 def test_a_slot_s_parts_have_the_light_that_lies_between_their_edges() -> None:
     pitches, offsets = np.array([7.0, 11.0]), np.array([-0.6, 0.0, 0.4])
     found = np.empty((2, 3, ACROSS * PARTS))

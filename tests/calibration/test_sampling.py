@@ -32,6 +32,7 @@ from drivers.raw.rawfile import frame_black
 from tests.calibration.lab import Lab
 
 
+@pytest.mark.slow
 def test_samples_are_pixels_of_the_half_size_picture(lab: Lab, tmp_path: Path) -> None:
     mosaic = lab.mosaic(tmp_path)
     black = frame_black(mosaic)
@@ -73,6 +74,7 @@ def test_the_table_rounds_and_clips_at_zero() -> None:
     assert values[1, 0].tolist() == [125, 200, 240]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [3, 5, 7])
 def test_one_pass_and_two_give_the_same_values(lab: Lab, tmp_path: Path, window: int) -> None:
     mosaic = lab.mosaic(tmp_path)

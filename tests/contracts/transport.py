@@ -131,6 +131,7 @@ class TransportContract:
             assert done.response == PtpResponse(ResponseCode.OK, 7 + count, parameters)
             assert done.data == b""
 
+    @pytest.mark.slow
     def test_full_packets_lose_nothing_either_way(self, bench: Bench) -> None:
         for size in EDGES:
             _give(bench, size)
@@ -143,11 +144,13 @@ class TransportContract:
         deadline=None,
         suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.differing_executors],
     )
+    @pytest.mark.slow
     @given(size=st.integers(0, 5000) | st.integers(1, 200).map(lambda packets: 512 * packets - 12))
     def test_any_size_goes_through_either_way(self, bench: Bench, size: int) -> None:
         _give(bench, size)
         _take(bench, size)
 
+    @pytest.mark.slow
     def test_pieces_add_up_to_the_data(self, bench: Bench) -> None:
         pieces: list[bytes] = []
         request = PtpRequest(GIVE, 1, (5_000_000,))
@@ -157,6 +160,7 @@ class TransportContract:
         assert b"".join(pieces) == payload(5_000_000)
         assert len(pieces) > 4, "an object must not lie in memory in full"
 
+    @pytest.mark.slow
     def test_more_data_than_can_be_collected_is_refused(self, bench: Bench) -> None:
         _give(bench, MAX_COLLECTED)
         with pytest.raises(ProtocolError, match="at most"):

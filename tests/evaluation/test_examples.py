@@ -22,6 +22,7 @@ def test_examples(name: str) -> None:
         assert doctest.testmod(import_module(name), optionflags=doctest.ELLIPSIS).failed == 0
 
 
+@pytest.mark.slow
 def test_there_are_examples() -> None:
     found = [test for name in MODULES for test in doctest.DocTestFinder().find(import_module(name)) if test.examples]
     assert len(found) >= 12

@@ -72,6 +72,7 @@ def test_plain_methods_on_parts_of_photographs() -> None:
         assert summarise(errors).as_tuple()[:5] == pytest.approx(expected, abs=0.00501), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ARCHIVES, ids=lambda path: path.stem)
 def test_plain_methods_on_thumbnails(path: Path) -> None:
     with np.load(path) as data:

@@ -222,6 +222,7 @@ def test_a_reader_that_left_is_no_fault(program: str) -> None:
         assert ended(program, pipe.stdin.fileno()) == (0, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lines", [1, 10_000])
 def test_a_full_device_under_stdout_is_5(lines: int) -> None:
     full = Path("/dev/full")
@@ -244,6 +245,7 @@ with progress("files") as told:
 """
 
 
+@pytest.mark.slow
 def test_what_is_printed_beside_a_bar_on_the_terminal_goes_where_standard_output_goes() -> None:
     pty = pytest.importorskip("pty")
     terminal, end = pty.openpty()
@@ -473,6 +475,7 @@ def test_a_terminal_gets_what_it_can_show(encoding: str) -> None:
     assert done.stdout.startswith(b"30 ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closed", ["1", "2"])
 def test_closed_streams_are_no_fault(closed: str) -> None:
     words = ["sh", "-c", f'exec "$0" -c "$1" {closed}>&-', sys.executable, PRINTING]
@@ -481,6 +484,7 @@ def test_closed_streams_are_no_fault(closed: str) -> None:
     assert b"Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_job_is_done_though_the_reader_of_its_output_left(tmp_path: Path, unbuffered: str) -> None:
     """Ending with 0 and half of the work would be believed."""

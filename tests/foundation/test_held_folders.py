@@ -96,6 +96,7 @@ def test_programs_that_ask_for_a_share_are_there_together(tmp_path: Path) -> Non
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("locks")
 def test_who_asks_for_a_share_waits_until_there_is_one(tmp_path: Path) -> None:
     plan, joined = tmp_path / "plan", threading.Event()

@@ -213,6 +213,7 @@ def test_a_head_that_trickles_ends_at_its_deadline() -> None:
                 link.sendall(b"G")
 
 
+@pytest.mark.slow
 def test_a_page_that_asks_now_and_then_keeps_its_connection() -> None:
     with served(head_s=0.05) as server, connect(server) as link:
         assert asked(link) == b"here"
@@ -253,6 +254,7 @@ def crowd(stack: ExitStack, *addresses: str) -> list[tuple[socket.socket, socket
     return made
 
 
+@pytest.mark.slow
 def test_who_gives_way_to_a_new_connection() -> None:
     time = Time()
     connections = Connections(4, time)

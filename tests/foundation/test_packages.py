@@ -19,6 +19,7 @@ def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(program, capture_output=True, text=True, check=False, env=environment, cwd=folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", ["generator", "evaluation", "foundation"])
 def test_a_file_that_hides_a_package_is_named(tmp_path: Path, hidden: str) -> None:
     (tmp_path / f"{hidden}.py").write_text("x = 1\n")

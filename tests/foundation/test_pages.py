@@ -55,6 +55,7 @@ def draw(figure: Any) -> None:
     axes.legend()
 
 
+@pytest.mark.slow
 def test_a_page_holds_all_and_fetches_nothing() -> None:
     text = pages.page(
         "A <b> & 'c'",
@@ -116,6 +117,7 @@ def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
     assert rules["connect-src"] == "'self'"
 
 
+@pytest.mark.slow
 def test_an_svg_takes_the_page_s_colours_and_is_the_same_each_time() -> None:
     svg = svg_of(draw)
     assert svg == svg_of(draw)

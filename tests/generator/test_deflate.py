@@ -147,6 +147,7 @@ def test_distances_count_the_filters_between_rows() -> None:
     np.testing.assert_array_equal(distances_of(image), expected)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 1 << 32), st.integers(1, 40), st.integers(1, 40), st.integers(2, 40))
 def test_what_is_found_is_equal(seed: int, height: int, width: int, colours: int) -> None:
@@ -167,6 +168,7 @@ def test_bands_make_one_stream(monkeypatch: pytest.MonkeyPatch, band: int) -> No
     np.testing.assert_array_equal(imagecodecs.png_decode(data), image)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_files_are_no_larger_than_those_of_opencv(kind: str) -> None:
     image = KINDS[kind](512, 512)

@@ -51,6 +51,7 @@ def test_every_option_stands_on_its_page(name: str) -> None:
                 assert f"\n{word}" in text or f", {word}" in text, word
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("groff") is None, reason="groff is not installed")
 @pytest.mark.parametrize("name", PROJECT["scripts"])
 def test_groff_reads_a_page_without_a_warning(name: str) -> None:

@@ -146,6 +146,7 @@ first: 2.234
 """
 
 
+@pytest.mark.slow
 def test_what_cells_print_is_compared() -> None:
     assert run(checks_of("page.md", CELLS), []) == ([], [])
     for text, instead in (

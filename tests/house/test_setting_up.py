@@ -66,6 +66,7 @@ def test_a_path_beside_the_repository_is_seen() -> None:
     assert astray(ROOT / "docs" / "transfer.md", beside) == beside.split()[:2]
 
 
+@pytest.mark.slow
 def test_a_package_index_shows_no_link_that_leads_nowhere() -> None:
     script = runpy.run_path(str(ROOT / "setup.py"), run_name="setup")
     shown = script["long_description"]((ROOT / "README.md").read_text(encoding="utf-8"))

@@ -62,6 +62,7 @@ def test_nothing_is_written_unless_asked(kept: Pinned, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 
+@pytest.mark.slow
 def test_a_line_that_is_drawn_elsewhere_is_told(kept: Pinned) -> None:
     def figure(y: float, width: float = 1.0) -> Figure:
         made = Figure()

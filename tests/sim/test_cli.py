@@ -39,6 +39,7 @@ def test_is_found_and_announces_itself() -> None:
     assert notice == PjLinkReply("LKUP", "02:00:00:00:00:01", 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"], ["camera", "--model", "Test", "--usbip"]],
@@ -59,6 +60,7 @@ def test_a_taken_udp_port_is_one_line(capsys: pytest.CaptureFixture[str]) -> Non
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -107,6 +109,7 @@ def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
     assert [(entry["idVendor"], entry["idProduct"]) for entry in found] == [(0x04A9, 0x32CA)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -20,6 +20,7 @@ def settings(tmp_path: Path) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 def test_a_table_comes_of_one_command(settings: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "lut"
     given = ["--camera", "Canon_EOS-1Ds_Mark_III", "--lights", "D65,A", "--paper", "matt", "--hot", "5", "--seed", "4"]
@@ -33,6 +34,7 @@ def test_a_table_comes_of_one_command(settings: str, tmp_path: Path, capsys: pyt
     assert computed["room"]["profile"] == "unmanaged"
 
 
+@pytest.mark.slow
 def test_a_table_says_what_it_is_told_of_itself(
     settings: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

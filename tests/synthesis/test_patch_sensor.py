@@ -36,6 +36,7 @@ def test_photosites_differ_by_the_spread_of_the_room() -> None:
     assert response.std() == pytest.approx(0.02, rel=5 * 0.007)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("masked", "photosites"),
     [

@@ -45,6 +45,7 @@ class Broken:
         return fail
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("faulty", FAULTY, ids="+".join)
 def test_every_fault_of_simulated_devices_is_told_at_once(
     folder: Path, monkeypatch: pytest.MonkeyPatch, faulty: tuple[str, ...]

@@ -98,6 +98,7 @@ def test_blur_is_judged_by_what_it_does_to_cells_of_their_size() -> None:
     assert judge_sharpness(BlurMap(PAGE.centres_mm, np.ones(64)), PAGE, 1.0, 10.0).grade == "not checked"
 
 
+@pytest.mark.slow
 def test_the_place_of_clipped_photosites_is_named_and_the_run_s_limit_is_the_fault_s() -> None:
     place = ChartMap(PAGE.page_mm, SQUARE, np.zeros((1, 2)), np.zeros((1, 1, 2)), 1.0)
     rows, columns = AREAS

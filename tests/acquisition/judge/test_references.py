@@ -207,6 +207,7 @@ def begun(gain: npt.ArrayLike = 1.0, greys: int = 6) -> JudgeState:
 LIGHT = SessionStep(20, "light", 0, Colour(255, 197, 126))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gain", "name"),
     [((1, 1, 1), None), ((1.2, 1, 1), "light"), ((1, 1, 0.8), "light"), (1.3, "lamp"), (0.7, "lamp")],

@@ -17,6 +17,8 @@ from foundation.clock import SimulatedClock
 from foundation.errors import QualityError
 from tests.acquisition.run.scripted import SETTINGS, WELL, Lab
 
+pytestmark = pytest.mark.slow
+
 LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 6 * n, 0)) for n in range(40))
 PATIENCE_S = 120.0
 
@@ -75,7 +77,6 @@ def night(tmp_path: Path) -> Night:
     return Night(Lab(tmp_path / "session", lights=LIGHTS, reference_every=10))
 
 
-@pytest.mark.slow
 def test_a_picture_that_stays_one_frame_late_ends_the_run_within_its_patience(night: Night) -> None:
     with pytest.raises(QualityError, match="was ordered"):
         night.run(Seen(night.lab, range(8, 10_000)))
@@ -88,7 +89,6 @@ def test_a_picture_that_stays_one_frame_late_ends_the_run_within_its_patience(ni
     night.require_each_step_once()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("until", [12, 13, 14, 15])
 def test_a_picture_that_was_late_for_a_while_lets_the_run_go_on(night: Night, until: int) -> None:
     assert night.run(Seen(night.lab, range(8, until))).complete
@@ -128,7 +128,6 @@ def test_what_comes_back_after_many_frames_lets_the_run_get_on(night: Night) -> 
     night.require_each_step_once()
 
 
-@pytest.mark.slow
 def test_refused_files_have_a_budget_of_disk(night: Night) -> None:
     class EachSecond(Flapping):
         def judge(self, file: Path, step: SessionStep) -> Judgement:

@@ -102,6 +102,7 @@ def test_a_list_that_is_missing_is_named_itself(tmp_path: Path) -> None:
         import_session(tmp_path / "nowhere.csv", tmp_path / "chart.json", tmp_path / "session")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("verdict", "code"), [("refused: a hand", 4), ("accepted", 0)])
 def test_a_light_without_an_accepted_frame_is_told_by_the_exit_code(
     folder: Path, verdict: str, code: int, capsys: pytest.CaptureFixture[str]

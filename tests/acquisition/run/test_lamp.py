@@ -287,6 +287,7 @@ def test_a_warm_up_ends_though_nothing_so_short_can_be_waited_for() -> None:
     assert room.words == ["warming up"]
 
 
+@pytest.mark.slow
 def test_a_lamp_that_goes_out_while_it_warms_up_gets_all_its_minutes_again() -> None:
     room = Room(Power.STANDBY)
     lit_again = 600.0

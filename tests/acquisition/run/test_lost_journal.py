@@ -27,6 +27,8 @@ from foundation.clock import SimulatedClock
 from foundation.errors import FormatError, StorageError
 from tests.acquisition.run.scripted import SETTINGS, Lab
 
+pytestmark = pytest.mark.slow
+
 LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 30 * n, 0)) for n in range(6))
 
 
@@ -103,7 +105,6 @@ def facts(folder: Path) -> Rows:
         return rows_of(connection)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("happens", "frame"),
     [*zip(MISHAPS, itertools.cycle((2, 7, 12)), strict=False), (deleted, 12), (log_deleted, 12)],
@@ -131,7 +132,6 @@ def test_a_lost_journal_ends_the_run_and_is_made_anew(lab: Lab, happens: Callabl
     lab.session.close()
 
 
-@pytest.mark.slow
 def test_the_ledger_equals_the_journal_after_every_kind_of_end(lab: Lab) -> None:
     lab.camera.script |= {2: b"no raw file", 5: StorageError("lost")}
     with pytest.raises(StorageError, match="lost"):
@@ -231,7 +231,6 @@ def test_a_ledger_of_a_stranger_becomes_no_statement(lab: Lab, line: str) -> Non
         rebuild_journal(lab.session.folder)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("mishap", "after"), [(Path.unlink, 4), (lambda path: os.truncate(path, 9), 12)])  # type: ignore[misc]
 def test_a_frame_that_is_deleted_or_cut_is_taken_again(lab: Lab, mishap: Callable[[Path], object], after: int) -> None:
     folder = lab.session.folder
@@ -253,7 +252,6 @@ def test_a_program_that_writes_the_journal_and_leaves_its_facts_alone_ends_no_ru
     assert facts(folder) == read_ledger(ledger_path(folder))
 
 
-@pytest.mark.slow
 def test_no_command_believes_a_journal_that_the_ledger_contradicts(
     lab: Lab, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -303,7 +301,6 @@ def test_a_complete_session_whose_files_go_is_complete_no_more(
     assert read_session(folder).head(lab.clock.now()).done == len(lab.session.steps) - 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "mishap"),
     [("chart.json", Path.unlink), ("illuminations.csv", lambda path: os.truncate(path, 9))],  # type: ignore[misc]

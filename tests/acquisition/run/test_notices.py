@@ -146,6 +146,7 @@ class TestWebhook:
         assert "Connection refused" in warning
         assert "s3cret" not in warning
 
+    @pytest.mark.slow
     def test_a_server_that_hangs_is_not_waited_for(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(run, "LIMIT_S", 0.1)
         monkeypatch.setattr(run, "ENDING_S", 0.1)
@@ -156,6 +157,7 @@ class TestWebhook:
 
 
 class TestCommand:
+    @pytest.mark.slow
     def test_it_gets_json_and_variables(self, tmp_path: Path) -> None:
         out = tmp_path / "got"
         program = (
@@ -195,6 +197,7 @@ class TestCommand:
                 assert time.monotonic() < until
 
 
+@pytest.mark.slow
 def test_telling_takes_no_time_and_loses_what_nobody_takes() -> None:
     with served(Receiver(hangs=threading.Event())) as receiver:
         told_by = Notices(f"http://127.0.0.1:{receiver.port}/", "night")
@@ -298,6 +301,7 @@ def test_a_run_tells_a_service_manager(tmp_path: Path, monkeypatch: pytest.Monke
     assert got[-1].startswith("STOPPING=1\nSTATUS=complete")
 
 
+@pytest.mark.slow
 def test_who_could_not_be_told_is_noted_while_the_run_goes_on(tmp_path: Path) -> None:
     gone = str(tmp_path / "gone")
     sequence = SETTINGS.sequence.model_copy(update={"notify": f"{gone} s3cret"})
@@ -312,6 +316,7 @@ def test_who_could_not_be_told_is_noted_while_the_run_goes_on(tmp_path: Path) ->
     assert all(gone in doubt and "s3cret" not in doubt for doubt in doubts)
 
 
+@pytest.mark.slow
 def test_a_dead_mans_switch_hears_of_frames_and_pauses_and_of_the_end(tmp_path: Path) -> None:
     heard = tmp_path / "heard"
     program = f"import sys; open({str(heard)!r}, 'a').write(sys.stdin.read() + chr(10))"

@@ -55,6 +55,7 @@ def refused(reason: str, *, voids: bool = False, lasting: bool = False) -> Judge
     return Judgement((Check("light", 9.0, 0.0, 2.0, "°", reason),), measurement=b"bad", voids=voids, lasting=lasting)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("percent", "doubted"), [(0.4, False), (0.6, True)])
 def test_light_in_the_room_is_doubted_once_and_lastingly(folder: Path, percent: float, doubted: bool) -> None:
     class Lit(ScriptedJudge):
@@ -135,6 +136,7 @@ class TestTime:
 
 
 class TestRefusals:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("bad", "reason"),
         [(NIGHT, "is the projector on"), (GLARE, "clipped"), (TURNED, "0.4 instead of 0.5"), (b"garbage", "raw")],
@@ -160,6 +162,7 @@ class TestRefusals:
         assert run(Lab(folder), ScriptedJudge({2: refused("another light")})).complete
         assert len(suspected) == 1
 
+    @pytest.mark.slow
     def test_files_are_looked_for_behind_each_white_frame_and_in_the_end(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -228,6 +231,7 @@ class TestRefusals:
         assert len(lab.taken()) < 40, "lights are not taken again and again meanwhile"
         assert run(lab, ScriptedJudge()).complete
 
+    @pytest.mark.slow
     def test_a_response_frame_voids_what_the_run_has_taken(self, folder: Path) -> None:
         lab = Lab(folder, lights=FOUR, reference_every=2)
         ending = Ending(lambda sentence: None)
@@ -326,6 +330,7 @@ class TestFaults:
         assert [sentence.split(":")[0] for sentence in said] == ["retry", "paused", "resumed", "lamp"]
         assert lab.verdicts() == ["accepted"] * 6
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("place", ["download", "save", "commit", "begin", "fail"])
     def test_a_full_disk_is_waited_for(self, folder: Path, place: str, monkeypatch: pytest.MonkeyPatch) -> None:
         lab = Lab(folder, {3: DeviceError("lost")})
@@ -371,6 +376,7 @@ class TestFaults:
             take_session(lab.session, lab.devices, quick)
         assert raised.value.__notes__ == ["then: fault 2"]
 
+    @pytest.mark.slow
     def test_a_lamp_that_fails_ends_the_run_when_patience_does(self, folder: Path) -> None:
         from drivers.projector import Severity
 

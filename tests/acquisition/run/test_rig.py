@@ -178,6 +178,7 @@ def test_an_unknown_language_is_named_with_the_known_ones() -> None:
         parse_lab(HEAD + '[lab.projector]\ncontrol = "klingon"\n', "LAB.toml")
 
 
+@pytest.mark.slow
 def test_what_cannot_be_asked_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

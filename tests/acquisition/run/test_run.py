@@ -72,6 +72,7 @@ def test_a_session_that_does_not_know_its_projector_is_not_tied(folder: Path) ->
     assert link_runs(lab.session, lab.clock.now()) == ()
 
 
+@pytest.mark.slow
 def test_a_run_that_is_taken_up_shows_the_ties_first(folder: Path) -> None:
     lab = lab_with_response(folder)
     interrupt_after(lab, 5)
@@ -83,6 +84,7 @@ def test_a_run_that_is_taken_up_shows_the_ties_first(folder: Path) -> None:
     assert len(lab.session.steps) == 14
 
 
+@pytest.mark.slow
 def test_ties_that_were_interrupted_are_taken_anew(folder: Path) -> None:
     lab = lab_with_response(folder)
     interrupt_after(lab, 5)

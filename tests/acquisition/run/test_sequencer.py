@@ -16,6 +16,8 @@ from foundation.errors import LinkClosed
 from sim.projectors.projector import SimulatedProjector
 from tests.acquisition.run.scripted import EXPOSE_S, SETTINGS, Beamer, Hurried, Lab, ScriptedCamera
 
+pytestmark = pytest.mark.slow
+
 ONE_AGAIN = ["accepted", "accepted", "refused", "accepted", "accepted", "accepted", "accepted"]
 """The light that is on the screen when something happens is taken again: its frame cannot be trusted."""
 

@@ -120,6 +120,7 @@ def test_a_machine_that_slept_makes_no_step_late() -> None:
     assert not told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("hangs", "cause"), [("expose", "the camera"), ("show", "the screen"), ("judge", "the disk")])
 def test_what_hangs_is_named_while_it_hangs(
     tmp_path: Path, time: Time, hangs: str, cause: str, monkeypatch: pytest.MonkeyPatch

@@ -40,6 +40,7 @@ def test_the_field_is_found_and_its_mean_over_the_cells_is_one() -> None:
     assert paper.white == pytest.approx(level * falloff(CENTRES).mean(axis=0), rel=1e-3)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(st.integers(0, 10_000), st.sampled_from([20.0, 300.0, 9000.0]))
 def test_noise_is_not_taken_for_shape(seed: int, level: float) -> None:
@@ -55,6 +56,7 @@ def test_noise_is_not_taken_for_shape(seed: int, level: float) -> None:
     assert np.sqrt(((paper.field.at(CENTRES) / expected - 1) ** 2).mean()) < 0.002 + 0.25 * noise / level
 
 
+@pytest.mark.slow
 def test_the_error_of_white_holds_that_of_its_field() -> None:
     """Cells where no reference is: by the references' scatter alone errors were 1.5 times as large, and up to 12."""
     random, level = np.random.default_rng(8), np.array([3000.0, 700.0, 5000.0])
@@ -158,6 +160,7 @@ def test_dark_corners_are_within_three_thousandths(corner: float, centre: tuple[
     assert np.sqrt((off**2).mean(axis=0)).max() < 0.0006
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [60.0, 300.0])
 def test_dim_light_has_no_more_noise_than_a_few_terms_bring(level: float) -> None:
     """Without a base: sixth order alone has .67 % at 60 counts and BIC's choice .8 %, of which most was its bias."""

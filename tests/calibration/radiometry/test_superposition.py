@@ -81,6 +81,7 @@ def test_a_full_chart_says_it_more_sharply() -> None:
     assert np.all(full[:-1] < small[:-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lamp", [(1.0, 1.0, 1.0), (1.022, 1.017, 0.968)], ids=["steady", "wheel"])
 @pytest.mark.parametrize("sensor", [compressed, short_of_counts])
 def test_what_a_sensor_does_is_found(sensor: Callable[[_Array], _Array], lamp: tuple[float, float, float]) -> None:

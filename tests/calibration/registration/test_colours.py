@@ -84,6 +84,7 @@ def test_a_part_that_is_off_by_a_third_of_a_cell_has_not_slipped(axis: int) -> N
     assert not places.size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("patches", "finely", "degree"),
     [(59, False, 1), (60, False, 2), (199, False, 2), (200, False, 3), (1999, True, 3), (2000, True, 6),

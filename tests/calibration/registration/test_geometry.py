@@ -127,6 +127,7 @@ def test_its_error_is_what_it_scatters_by_and_grows_where_nothing_is_measured() 
     assert (said >= 0.6 * scattered).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heights", [True, False])
 def test_an_edge_known_across_alone_tells_a_height_along_it_as_well(heights: bool) -> None:
     """A sheet whose left edge stands off: its top edge moves left and up, and only the latter is seen."""

@@ -42,6 +42,7 @@ def moved(image: _Float, dx: float, dy: float) -> _Float:
     return np.asarray(ndimage.shift(image, (dy, dx, 0), order=3, mode="nearest"), dtype=np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.6, 300.0)])
 def test_a_small_movement_is_measured_whatever_gain_and_offset(gain: float, offset: float) -> None:
     image = texture()
@@ -201,6 +202,7 @@ def test_a_block_s_place_is_known_as_well_as_it_scores_and_to_two_hundredths_of_
     np.testing.assert_allclose(information, [share * np.eye(2) / 0.2**2 for share in (0, 0.31**2, 0.8**2)])
 
 
+@pytest.mark.slow
 def test_a_tile_counts_once_however_fine_its_elements() -> None:
     image = texture()
     seen, weight = moved(image, 0.2, 0.1), np.ones(RASTER.shape, dtype=np.float32)

@@ -41,7 +41,7 @@ from drivers.raw.storage import Area
 from experiment.chart.layout import design_chart
 from experiment.measures.stains import Stains
 
-pytestmark = pytest.mark.usefixtures("pinned_pictures")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("pinned_pictures")]
 
 
 def drawn(draw: Callable[..., None], *arguments: Any) -> Any:
@@ -128,7 +128,6 @@ def test_what_cells_of_two_tables_differ_by_is_drawn_in_the_channel_that_differs
     np.testing.assert_allclose(np.asarray(squares.get_array()), 100 * np.array(largest))
 
 
-@pytest.mark.slow
 def test_lights_are_drawn_at_their_chromaticities_in_the_triangle_of_all() -> None:
     codes = np.array([[255.0, 0, 0], [255, 255, 255], [0, 0, 0], [0, 0, 255]])
     white = np.array([[600.0, 300, 100], [200, 500, 300], [0, 0, 0], [100, 300, 600]])
@@ -214,7 +213,6 @@ def test_the_registered_chart_is_drawn_over_its_frame() -> None:
     np.testing.assert_allclose(edge, 1.9 * page)
 
 
-@pytest.mark.slow
 def test_worst_cells_are_drawn_in_the_order_of_their_unevenness() -> None:
     picture = np.random.default_rng(3).normal(500, 1, (400, 500, 3)).astype(np.float32)
     at = 4 * np.asarray(CHART.centres_mm) + 20
@@ -264,7 +262,6 @@ def test_the_field_is_drawn_over_the_page_with_contours_of_two_per_cent() -> Non
     drawn(draw_field, CHART, SimpleNamespace(at=at))
 
 
-@pytest.mark.slow
 def test_errors_of_cells_are_drawn_in_per_cent_and_their_worst_ringed() -> None:
     deviation = np.linspace(-0.04, 0.03, len(CELLS))
     error, alone = np.full((len(CELLS), 3), 1e-6), np.zeros((len(CELLS), 3))

@@ -28,6 +28,7 @@ def places() -> _Array:
     return np.random.default_rng(8).permutation(grid)
 
 
+@pytest.mark.slow
 def test_a_reflection_is_found_where_it_lies() -> None:
     random = np.random.default_rng(2)
     level, cells = levels(), places()
@@ -51,6 +52,7 @@ def test_a_reflection_is_found_where_it_lies() -> None:
     assert np.quantile(found.share[usable], 0.05, axis=0) == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_few_cells_tell_of_no_added_light() -> None:
     usable = np.arange(512) < 199
     few, enough = (

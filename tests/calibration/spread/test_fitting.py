@@ -93,6 +93,7 @@ def test_kernels_that_gain_less_than_chance_and_four_standard_errors_are_left_ou
         assert found.tolist() == sorted(np.concatenate([np.zeros(0, int), *(groups[k] for k in kept)]).tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power", [1.0, 2.0, 3.0, 4.5])
 def test_a_kernel_s_share_of_a_power_law_is_that_of_the_sizes_about_its_own(power: float) -> None:
     scale = np.array(NEAR_PX + FAR_PX)
@@ -265,6 +266,7 @@ def test_shares_are_the_mean_of_what_is_supposed_and_err_by_how_that_differs() -
     np.testing.assert_allclose(covariance, expected, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scatters", [False, True])
 def test_wide_light_is_as_usual_as_lenses_have_it_on_average(scatters: bool) -> None:
     supposed = fitting._supposed_lenses(True)

@@ -24,6 +24,8 @@ from drivers.presenter import Colour
 from experiment.lights import Illumination
 from foundation.errors import FormatError, InputError, StorageError
 
+pytestmark = pytest.mark.slow
+
 LIGHTS = SHARD_LIGHTS + 3
 
 
@@ -49,7 +51,6 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("place", ["{}/published", "memory://bucket/published"])
 def test_there_and_back(lut: Lut, tmp_path: Path, place: str) -> None:
     MemoryFileSystem.store.clear()
@@ -67,7 +68,6 @@ def test_there_and_back(lut: Lut, tmp_path: Path, place: str) -> None:
         fetch(url, tmp_path / "back")
 
 
-@pytest.mark.slow
 def test_one_light_a_chunk_and_32_an_object(lut: Lut, tmp_path: Path) -> None:
     publish(lut, str(tmp_path / "published"))
     described = json.loads((tmp_path / "published" / "zarr.json").read_text())
@@ -86,7 +86,6 @@ def test_one_light_a_chunk_and_32_an_object(lut: Lut, tmp_path: Path) -> None:
     assert len(objects) == 2
 
 
-@pytest.mark.slow
 def test_what_was_never_finished_is_published_anew(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     url = str(tmp_path / "published")
 
@@ -179,7 +178,6 @@ def test_a_published_truth_that_was_edited_is_refused(lut: Lut, tmp_path: Path) 
     assert not (tmp_path / "back").exists()
 
 
-@pytest.mark.slow
 def test_a_table_is_the_one_that_was_told_of(lut: Lut, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     url = str(tmp_path / "published")
     assert main(["--publish", str(lut.folder), url]) == 0
@@ -242,7 +240,6 @@ CLAIMS: list[tuple[Change, str]] = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("change", "fault"), CLAIMS)
 def test_what_a_store_claims_has_to_fit_together(lut: Lut, tmp_path: Path, change: Change, fault: str) -> None:
     publish(lut, str(tmp_path / "published"))
@@ -252,7 +249,6 @@ def test_what_a_store_claims_has_to_fit_together(lut: Lut, tmp_path: Path, chang
     assert [path.name for path in tmp_path.iterdir() if path.name not in ("lut", "published")] == []
 
 
-@pytest.mark.slow
 def test_claimed_lights_do_not_fill_the_disk(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     publish(lut, str(tmp_path / "published"))
 

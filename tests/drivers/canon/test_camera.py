@@ -192,6 +192,7 @@ SPOILS: list[tuple[Callable[[SimulatedEos], None], str]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spoil", "reason"), SPOILS)
 @pytest.mark.parametrize("body", [EOS_550D, EOS_6D_MARK_II], ids=["550D", "6D Mark II"])
 def test_what_would_spoil_a_series_is_refused_with_its_remedy(
@@ -314,6 +315,7 @@ CHANGES: dict[str, Callable[[bytes], bytes]] = {
 PIECES = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lists", [False, True], ids=["lists none", "refuses both"])
 def test_a_body_that_gives_no_parts_gives_whole_frames(lists: bool) -> None:
     lab = Lab(film_bytes=2_500_000, without=() if lists else PIECES)
@@ -329,6 +331,7 @@ def test_a_body_that_gives_no_parts_gives_whole_frames(lists: bool) -> None:
     assert lab.waiting() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [1_500_000, 2_499_990])
 def test_a_whole_frame_that_broke_off_is_completed(after: int) -> None:
     lab = Lab(film_bytes=2_500_000, without=PIECES)
@@ -338,6 +341,7 @@ def test_a_whole_frame_that_broke_off_is_completed(after: int) -> None:
     assert len(lab.film.frames) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["short", "surplus", "nothing"])
 def test_wrong_data_in_a_whole_frame(change: str) -> None:
     lab = Lab(without=PIECES)
@@ -443,6 +447,7 @@ def test_a_cable_pulled_at_any_byte(after: int) -> None:
     assert lab.openings > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("code", [Operation.GET_DEVICE_INFO, Operation.EOS_GET_EVENT])
 def test_wrong_data_once(moody_lab: Lab, code: Operation, change: str) -> None:
@@ -457,6 +462,7 @@ def test_wrong_data_in_a_piece_whose_length_the_body_tells(change: str) -> None:
     goes_on(lab)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["short", "surplus", "nothing"])  # of Canon's operation a decoder must tell garbage
 def test_wrong_data_in_a_piece(moody_lab: Lab, change: str) -> None:
     occasion = Occasion({Operation.EOS_GET_PARTIAL_OBJECT})
@@ -482,6 +488,7 @@ def is_frame(record: Record) -> bool:
     return isinstance(record, TransferRequest)
 
 
+@pytest.mark.slow
 def test_an_announcement_that_is_lost_costs_at_most_one_attempt(moody_lab: Lab, request: pytest.FixtureRequest) -> None:
     seen: list[Record] = []
 
@@ -496,6 +503,7 @@ def test_an_announcement_that_is_lost_costs_at_most_one_attempt(moody_lab: Lab, 
     assert moody_lab.openings == 2
 
 
+@pytest.mark.slow
 def test_announcements_that_are_late_or_doubled(lab: Lab) -> None:
     former: list[Record] = []
 
@@ -521,6 +529,7 @@ def test_an_object_that_is_not_there_is_passed_over(lab: Lab) -> None:
     assert lab.openings == 1
 
 
+@pytest.mark.slow
 def test_an_object_that_is_announced_for_ever_and_never_there(lab: Lab) -> None:
     bogus = TransferRequest(0x77, 0xB103, 600, "IMG_9999.CR2")
     lab.device = Announcing(lab.eos, lambda records: (*records, bogus))
@@ -560,6 +569,7 @@ def test_a_transfer_goes_on_where_it_broke_off() -> None:
     assert lab.openings == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "format", "comes"),
     [
@@ -590,6 +600,7 @@ def test_what_stood_behind_the_place_in_the_file_is_gone(lab: Lab) -> None:
     assert into.getvalue() == lab.film.frames[-1]
 
 
+@pytest.mark.slow
 def test_records_that_nobody_knows_and_a_queue_that_never_ends(lab: Lab) -> None:
     strange = OtherRecord(0xC1FE, b"whatever")
     shutter = Notice(EosEvent.SHUTDOWN_TIMER_UPDATED, 30)
@@ -727,6 +738,7 @@ def test_the_first_cause_is_kept_and_what_came_of_it_told_after(lab: Lab) -> Non
         lab.take(attempts=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["busy", "silent", "gone", "never announced"])
 def test_no_call_is_silent_for_long(kind: str) -> None:
     lab = Lab()
@@ -823,6 +835,7 @@ OPTIONAL = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", [ResponseCode.OPERATION_NOT_SUPPORTED, ResponseCode.EOS_UNKNOWN_COMMAND])
 @pytest.mark.parametrize("code", OPTIONAL, ids=[code.name for code in OPTIONAL])
 def test_an_optional_operation_that_a_body_lists_and_has_not_got(code: Operation, answer: int) -> None:
@@ -952,6 +965,7 @@ def test_a_body_that_tells_its_state_late_is_asked_again(lab: Lab) -> None:
     assert lab.openings == 1
 
 
+@pytest.mark.slow
 def test_a_body_that_sends_no_values_is_told_apart(lab: Lab) -> None:
     lab.device = Announcing(lab.eos, lambda records: ())
     with pytest.raises(DeviceError, match="sends no state"):

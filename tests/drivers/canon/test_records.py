@@ -239,6 +239,7 @@ def test_more_than_the_bound_is_refused_unread() -> None:
         canon.decode_events(bytes(canon.MAX_EVENTS + 1))
 
 
+@pytest.mark.slow
 @given(st.lists(RECORDS, max_size=6).map(tuple))
 def test_any_records_come_back_with_and_without_the_closing_one(records: tuple[Record, ...]) -> None:
     octets = canon.encode_events(records)

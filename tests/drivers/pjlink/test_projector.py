@@ -95,6 +95,7 @@ def camera() -> Generator[tuple[str, int]]:
         yield server.address
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stranger", "name"), [(http_server, "an HTTP server"), (camera, r"a camera \(PTP/IP\)")], ids=["http", "camera"]
 )

@@ -171,6 +171,7 @@ def test_values_outside_the_standard_are_protocol_errors(parse: object, value: s
         parse(value)
 
 
+@pytest.mark.slow
 @given(
     st.builds(
         PjLinkRequest,
@@ -193,6 +194,7 @@ def test_any_bytes_are_a_value_or_a_protocol_error(line: bytes) -> None:
             assert len(str(error)) < 600  # noqa: PT017 – both outcomes are right; only the message is judged
 
 
+@pytest.mark.slow
 @given(st.data())
 def test_any_split_gives_the_same_lines(data: st.DataObject) -> None:
     end = st.sampled_from((b"\r", b"\r\n", b"\n", b"\r\r\n", b"\r\0\0\0"))

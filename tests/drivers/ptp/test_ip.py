@@ -354,6 +354,7 @@ def test_events_split_over_reads_are_joined() -> None:
     assert [event.parameters for event in transport.events()] == [(42,), (42,)]
 
 
+@pytest.mark.slow
 def test_a_flood_of_events_keeps_the_newest() -> None:
     far, transport = connected()
     far.event.write(

@@ -698,6 +698,7 @@ def test_nec_wrong_sum_and_wrong_answer() -> None:
         projector.power()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
 def test_any_split_gives_the_same_answer(name: str, data: st.DataObject) -> None:

@@ -53,6 +53,7 @@ def test_the_ten_lines_of_the_docs(
     assert {row["method"] for row in rows} == {"Brightest percent", "Gray-world"}
 
 
+@pytest.mark.slow
 def test_estimates_of_another_program(thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scenes = open_scenes(thumbnails).scenes
     lines = [f"{scene.name.removesuffix('.png')},1,1,1" for scene in scenes]

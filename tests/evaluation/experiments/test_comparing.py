@@ -72,6 +72,7 @@ def test_equal_errors_keep_their_ranks() -> None:
     assert made.p == pytest.approx(exact, rel=0.25)
 
 
+@pytest.mark.slow
 def test_false_alarms_are_as_rare_as_p_says() -> None:
     random = np.random.default_rng(3)
     probabilities = [signed_rank(*random.gamma(1.5, 2, (2, 60))).p for _ in range(400)]

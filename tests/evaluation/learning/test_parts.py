@@ -22,6 +22,8 @@ from evaluation.metrics import recovery_error
 from foundation.errors import InputError
 from tests.evaluation.learning.made_up_world import MadeUp, lights_on_a_line, world
 
+pytestmark = pytest.mark.slow
+
 RED, GREEN, GREY = (0.8, 0.1, 0.1), (0.1, 0.3, 0.1), (0.2, 0.2, 0.2)
 
 

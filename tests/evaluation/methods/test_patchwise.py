@@ -45,6 +45,7 @@ def test_each_side_gets_its_light(method: LocalMethod) -> None:
     assert one.min() > 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixels", [1, 1000])
 @pytest.mark.parametrize("name", ["grayness-index", "mean-shifted-gray-pixel"])
 def test_gray_pixels_are_those_of_the_whole_whatever_the_strips(

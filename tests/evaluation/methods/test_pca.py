@@ -43,6 +43,7 @@ def by_sorting(pixels: npt.NDArray[np.float64], share: float) -> npt.NDArray[np.
     return np.abs(np.linalg.svd(ends, full_matrices=False)[2][0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extreme", ["bright", "dark", "hidden", "even"])
 def test_pixels_that_were_not_counted_may_be_anything(extreme: str) -> None:
     # Of a large image every 16th pixel of a row, moved on by 5 from row to row, says where the limits may be.

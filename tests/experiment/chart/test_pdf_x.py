@@ -154,6 +154,7 @@ def test_an_independent_reader_finds_no_font_and_the_boxes(pdf: Path) -> None:
     assert len(fonts.splitlines()) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [srgb_output_profile, srgb_display_profile])
 def test_a_profile_is_srgb_to_little_cms(make: Callable[[], bytes]) -> None:
     # Pillow's stubs leave most of its colour management unknown.

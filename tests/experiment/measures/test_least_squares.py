@@ -117,6 +117,7 @@ def test_columns_that_are_equal_are_solved_all_the_same() -> None:
     assert np.abs(residual).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_terms_are_combined_point_by_point() -> None:
     random = np.random.default_rng(2)
     basis, factors = random.random((28, 5000)), random.random((3, 28))

@@ -10,6 +10,8 @@ import pytest
 
 from experiment.measures.stains import Stains, added_light, find_stains, light_of_spot, spots_of
 
+pytestmark = pytest.mark.slow
+
 _Array = npt.NDArray[np.float64]
 SIDE = 16
 
@@ -35,7 +37,6 @@ def test_a_broad_reflection_goes_on_around_the_cells_that_are_listed(added: floa
     assert least < found < added
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("radius", "added", "kept"),
     [(0, 0, 1), (40, 0, 0.9), (40, 0.02, 0.6), (40, 0, 1.1), (9, 0.05, 1), (40, 0.03, 1), (40, 0.1, 1)],

@@ -172,6 +172,7 @@ def test_croissant_names_what_is_there(made: Dataset) -> None:
                 assert source["extract"]["column"] in header.split(",")
 
 
+@pytest.mark.slow
 def test_mlcommons_own_reader_takes_it(made: Dataset) -> None:
     library = pytest.importorskip("mlcroissant", reason="the reader of MLCommons is not installed")
     dataset = library.Dataset(str(place_of(made) / "croissant.json"))

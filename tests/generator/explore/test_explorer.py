@@ -58,6 +58,7 @@ def test_the_command_makes_the_image_that_is_shown(explorer: Explorer, light: st
     assert [made.entries[0].lights[0], len(made.entries)] == [shown["light"], 1]
 
 
+@pytest.mark.slow
 def test_the_command_of_a_picture_that_was_sent_is_run_beside_the_picture(explorer: Explorer, tmp_path: Path) -> None:
     number = explorer.add("/somewhere/-far .png", png(7))
     image = explorer.counts(number, "0", "codes").copy()

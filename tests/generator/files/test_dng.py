@@ -59,6 +59,7 @@ def test_without_the_ground_truth_it_is_not_neutral() -> None:
     assert abs(means[0] / means[1] - 1) > 0.5
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(height=st.integers(22, 41), width=st.integers(22, 41), seed=st.integers(0, 99))
 def test_each_photosite_is_its_own_channel_of_its_pixel(height: int, width: int, seed: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -11,6 +12,7 @@ from generator.kernels.choice import channels_of
 from generator.kernels.unfit import colours_in, nearest_fit_colours, replace_unfit_colours
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(1, 5), st.integers(1, 30), st.integers(1, 30), st.integers(0, 2**32 - 1), st.booleans())
 def test_every_unfit_colour_and_no_other_is_replaced(bits: int, height: int, width: int, seed: int, few: bool) -> None:

@@ -39,6 +39,7 @@ def test_the_whole_picture_is_the_plain_image_in_planes(make_lut: MakeLut, pictu
     np.testing.assert_array_equal(target, got)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_any_window_gain_and_flip_in_a_batch(picture: npt.NDArray[np.uint8], data: st.DataObject) -> None:

@@ -82,6 +82,7 @@ def spelled_out(
     return out
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(st.integers(1, 70), st.integers(1, 9), st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1))
 def test_an_image_is_what_the_rule_says(width: int, height: int, seed: int, image: int) -> None:

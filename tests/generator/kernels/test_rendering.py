@@ -63,6 +63,7 @@ def test_first_choices_of_seed_0_are_fixed_for_ever() -> None:
     assert row == [22, 24, 3, 14, 11, 8, 22, 6, 3, 7, 7, 19]
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(
     st.integers(1, 5),
@@ -97,6 +98,7 @@ def test_bands_threads_memory_order_and_a_given_target_change_nothing(
     np.testing.assert_array_equal(target, whole)
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(st.one_of(st.integers(1, 40), st.integers(480, 1100)), st.integers(1, 4), st.integers(0, 100), st.booleans())
 def test_an_image_too_large_for_the_caches_is_the_same_and_nothing_beside_it_is_written(
@@ -143,6 +145,7 @@ def test_every_sample_is_drawn_equally_often() -> None:
         assert chi_square(drawn[:, place::16], 25) < LIMIT_24
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("down", "right"), [(0, 1), (0, 2), (0, 4), (1, 0), (1, 1), (4, 0), (0, 1024)])
 def test_neighbours_are_independent(down: int, right: int) -> None:
     drawn = choices(5, 0, 1500, 2000).astype(np.int64)

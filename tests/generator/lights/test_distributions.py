@@ -204,6 +204,7 @@ def test_drawn_lights_stay_in_the_gamut_and_keep_the_shape_there() -> None:
     assert likelihood_of_uniform(1 - (1 - 3 * np.clip(barycentric.min(axis=1), 0, 1 / 3)) ** 2) > 1e-5
 
 
+@pytest.mark.slow
 def test_drawn_lights_are_a_function_of_seed_and_position() -> None:
     choice = DrawnLights(GAMUT, Uniform(), 2, seed=4)
     again = pickle.loads(pickle.dumps(DrawnLights(GAMUT, Uniform(), 2, seed=4)))

@@ -81,6 +81,7 @@ def test_just_within_and_just_beyond_the_tolerance_of_one_light() -> None:
         assert (len(GRID.match(turned).mixture.lights) == 1) == (lights == 1)
 
 
+@pytest.mark.slow
 def test_a_light_outside_is_refused_with_how_far_and_what_is_nearest() -> None:
     wanted = rgb_of([0.9, 0.02])
     with pytest.raises(

@@ -12,6 +12,7 @@ def normal(count: int, mean: float, spread: float, seed: int) -> np.ndarray[tupl
     return np.random.default_rng(seed).normal(mean, spread, count)
 
 
+@pytest.mark.slow
 def test_mean_and_spread_are_met_and_weights_are_a_ratio_of_densities() -> None:
     """Between normal distributions the density ratio is the exponential of a parabola, which has these two moments."""
     values = normal(20000, 0.0, 1.0, 1)

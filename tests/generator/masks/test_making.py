@@ -154,6 +154,7 @@ def test_weights_are_whole_parts_that_sum_to_one(
     assert parts.min() >= 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("lights", [2, 3])
 def test_the_same_look_at_every_size(kind: str, lights: int) -> None:
@@ -174,6 +175,7 @@ def test_every_image_and_seed_has_masks_of_its_own(kind: str) -> None:
         assert np.abs(first - other).mean() > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_light_falls_somewhere(kind: str) -> None:
     """Over forty images each of three lights gets its share; over one, none is left out but by chance."""

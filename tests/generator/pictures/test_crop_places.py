@@ -44,6 +44,7 @@ def test_the_first_of_several_is_in_the_centre_where_that_is_said(path: Path) ->
     assert len({(cut.left, cut.top) for cut in cuts}) == 4
 
 
+@pytest.mark.slow
 def test_crops_keep_away_from_each_other() -> None:
     def shared(count: int, together: bool) -> float:
         """Return the mean share of a crop that the second has in common with the first."""

@@ -212,6 +212,7 @@ def test_places_without_pictures_are_named(tmp_path: Path) -> None:
         find_pictures([tmp_path / "nowhere"])
 
 
+@pytest.mark.slow
 def test_random_scenes_are_uniform_and_their_own() -> None:
     first, second = (scene.read().picture for scene in random_scenes(2, 1001, 800, seed=9))
     assert first.shape == (800, 1001, 3)

@@ -68,6 +68,7 @@ def test_items_are_the_same_whoever_makes_them(make_lut: MakeLut) -> None:
     assert np.median(spread) == pytest.approx(4, rel=0.1)
 
 
+@pytest.mark.slow
 def test_black_that_is_taken_out_is_not_lifted_by_noise(make_lut: MakeLut) -> None:
     lut = make_lut(bits=3)
     gallery = gallery_of([np.zeros((60, 60, 3), np.uint8)])
@@ -106,6 +107,7 @@ def assert_noise(patch: Image, mean: float, noise: SensorNoise) -> None:
     assert np.abs(ratio - 1).max() < 4.5 * np.sqrt(2 / count) + 0.2 / expected.min()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.25, 0.5, 0.9])
 def test_less_light_is_as_noisy_as_a_camera_s(factor: float) -> None:
     patch = photographed(2000, NOISE)
@@ -220,6 +222,7 @@ def test_tiles_change_no_count() -> None:
     assert (other != whole).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_deviates_of_pixels_rows_and_channels_are_independent() -> None:
     # A constant count whose noise is all that is added.
     image = np.full((500, 500, 3), 20000, np.uint16)

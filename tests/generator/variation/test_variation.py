@@ -26,6 +26,7 @@ def test_drawn_evenly_in_stops() -> None:
     assert np.abs((drawn + 2) / 3 - np.arange(4000) / 4000).max() < 0.031
 
 
+@pytest.mark.slow
 def test_drawn_normally_in_stops() -> None:
     drawn = stops("normal:mean=-1,sd=.5")
     assert np.mean(drawn) == pytest.approx(-1, abs=0.03)
@@ -34,6 +35,7 @@ def test_drawn_normally_in_stops() -> None:
     assert 0 < max(drawn) <= 0.5
 
 
+@pytest.mark.slow
 def test_quantiles_of_another_data_set() -> None:
     drawn = [np.log2(DrawnExposure((-3.0, -1.0, 0.0)).factor(1, number, 0.0)) for number in range(2000)]
     assert np.mean(np.array(drawn) < -1) == pytest.approx(0.5, abs=0.05)

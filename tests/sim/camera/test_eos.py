@@ -361,6 +361,7 @@ def test_carries_out_all_that_it_lists_and_nothing_else(body: EosModel) -> None:
         assert known == (code in listed), f"0x{code:04x}"
 
 
+@pytest.mark.slow
 @example(Operation.EOS_PC_HDD_CAPACITY, [0xFFFFFFFF, 0xFFFFFFFF], None)
 @example(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, [], PropertySetting(Property.EOS_CAMERA_TIME, b"\xff" * 4).encode())
 @given(

@@ -105,6 +105,7 @@ def test_shoulders_spread_a_share_of_a_squares_light_as_the_profile_says() -> No
         assert (seen[row, column] - black) / (white - black) == pytest.approx(share * wide, rel=0.01, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_shoulders_leave_even_light_and_every_photosites_response_as_they_are() -> None:
     sheet = Print((500, 400), np.empty((0, 4)), np.empty((0, 3), np.uint8))
     plain, wide = (

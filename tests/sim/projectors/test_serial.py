@@ -133,6 +133,7 @@ def test_a_pseudo_terminal_leaves_no_thread_and_no_port(device: SimulatedProject
     assert threading.active_count() == before
 
 
+@pytest.mark.slow
 def test_a_pseudo_terminal_that_nobody_reads_can_be_closed(device: SimulatedProjector) -> None:
     with PseudoTerminal(BenqPeer(device)) as terminal:
         link = SerialLink.open(terminal.path, 115200)
@@ -156,6 +157,7 @@ def test_serves_a_serial_projector_until_interrupted(name: str) -> None:
         projector.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

@@ -46,6 +46,8 @@ from sim.world.sensors import BODIES
 from sim.world.world import OVERSCAN, REFERENCE_EXPOSURE, Blob, Room, Situation, World, moved, moved_back, projected_mm
 from tests.sim.conftest import BARE, PAGE_MM
 
+pytestmark = pytest.mark.slow
+
 RED, GREEN, GREY = Colour(255, 0, 0), Colour(0, 255, 0), Colour(128, 128, 128)
 TEST = BODIES["Test"]
 STRAIGHT = Room(
@@ -367,7 +369,6 @@ def test_what_a_real_screen_does_itself_is_not_pretended() -> None:
     Disturbances((Bump(px=1.0), Person())).require_unshown("--event")
 
 
-@pytest.mark.slow
 def test_a_reflection_adds_a_share_of_papers_light_whatever_is_printed() -> None:
     """In the middle of its spot 5 % of what paper sends, at 1 / e² of that on its rim, on black ink as on paper."""
     quiet = replace(TEST, read_noise_dn=0.01, sensor_noise_e=0.0, electrons_per_dn=1e6)

@@ -90,6 +90,7 @@ def test_the_prepared_form(prepared: Path) -> None:
     assert "resized" in data.treatment["saturation"]
 
 
+@pytest.mark.slow
 def test_levels_of_another_camera_come_from_its_raw_file(copy: Path) -> None:
     (copy / "sony").rename(copy / "galaxy")
     with pytest.raises(InputError, match=r"--black.*--saturation"):

@@ -35,6 +35,8 @@ from foundation.errors import InputError
 from generator.files import Flash, fit_flash
 from tests.evaluation.experiments.describing.scenes import Made
 
+pytestmark = pytest.mark.slow
+
 
 def photo(seed: int, side: int = 40) -> npt.NDArray[np.float64]:
     """Return smooth colours under a light, with a range of brightness as photographs have."""
@@ -96,7 +98,6 @@ def test_a_black_image_stays_black() -> None:
     assert all(not reduced.any() for reduced in reduce_colours(np.zeros((4, 4, 3)), (0, 7)))
 
 
-@pytest.mark.slow
 def test_images_as_they_are_give_what_evaluate_gives() -> None:
     mask = np.zeros((40, 40), np.bool_)
     mask[:, :8] = True
@@ -196,7 +197,6 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damage_is_told(data: SceneSet, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: str) -> None:
     codes, (change, told) = tmp_path / "codes", DAMAGES[damage]

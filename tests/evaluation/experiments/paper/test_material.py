@@ -96,6 +96,7 @@ TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0], [1.5, 3.0, 2.4]])
 PLAIN = DatasetOptions(previews=False, rendering="codes")
 
 
+@pytest.mark.slow
 def test_random_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: Path) -> None:
     lut = make_table("Test", noise=0.05)
     scenes = rendered(lut, SOURCES, lights_at_random(lut, 6, seed=9), seed=9)
@@ -108,6 +109,7 @@ def test_random_lights_are_those_of_the_command(make_table: TableMaker, tmp_path
         assert scene.saturation == 9000
 
 
+@pytest.mark.slow
 def test_near_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: Path) -> None:
     lut = make_table("Test", noise=0.05)
     chosen = lights_like(lut, TRUTHS, 6)

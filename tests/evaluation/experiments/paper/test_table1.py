@@ -83,6 +83,7 @@ def test_a_share_of_all(make_table: TableMaker, share: float) -> None:
         hot_photosites(make_table("Test"), share)
 
 
+@pytest.mark.slow
 def test_noise_of_the_print_s_white(make_table: TableMaker) -> None:
     ((*head, level, r, g, b, high_r, high_g, high_b),) = noise_table([make_table("Test", noise=0.05, samples=400)]).rows
     assert head == ["Test", len(LIGHTS)]
@@ -170,6 +171,7 @@ def test_another_camera_has_no_numbers_of_the_paper(make_table: TableMaker) -> N
     assert {row[5] for row in joint_table(blocks).rows} == {"reproduction", "recovery"}
 
 
+@pytest.mark.slow
 def test_other_pictures_and_lights_have_no_numbers_of_the_paper(make_table: TableMaker) -> None:
     luts = [make_table(SIX_D), make_table(FIVE_FIFTY_D)]
     blocks = table1(settings(luts, PICTURES, TRUTHS, side=16))

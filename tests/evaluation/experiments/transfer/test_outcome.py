@@ -108,6 +108,7 @@ def _row(kind: Kind, *errors: npt.NDArray[np.float64], method: str = "Trees") ->
     return TransferRow(method, kind, "" if kind == "cross-validation" else "made", 9, results)
 
 
+@pytest.mark.slow
 def test_one_seed_is_what_the_bootstrap_gives() -> None:
     rows = [_row("cross-validation", REAL), _row("generated", OTHER), _row("naive", THIRD)]
     found = figures_of(rows, "recovery")
@@ -153,6 +154,7 @@ def test_methods_are_held_to_themselves_only() -> None:
     assert not found.to_naive
 
 
+@pytest.mark.slow
 def test_rows_are_held_to_one_that_is_asked_for_whatever_its_pictures() -> None:
     chosen = replace(_row("generated", OTHER), data="chosen")
     rows = [
@@ -199,6 +201,7 @@ def line(label: str, *ratios: tuple[float, float, float], whole: bool = True) ->
     return ForestLine(label, tuple(BoundedFigure(*ratio) for ratio in ratios), whole=whole)
 
 
+@pytest.mark.slow
 def test_names_stand_as_they_are() -> None:
     svg = forest_plot([ForestLine("Trees <$x_1$>"), line("_mine", (1, 1, 1), (1, 1, 1))], PANELS).decode()
     for text in ("Trees &lt;$x_1$&gt;", "_mine", *PANELS):

@@ -40,6 +40,8 @@ from generator.pictures.sources import Preparation
 from generator.rendering.matrices import ColourMatrix
 from tests.evaluation.experiments.transfer.conftest import BOTH, LIGHTS, Maker, save_pictures, write_table
 
+pytestmark = pytest.mark.slow
+
 MATRIX = np.array([[0.6, 0.3, 0.1], [0.1, 0.7, 0.2], [-0.2, 0.4, 0.8]])
 
 
@@ -230,7 +232,6 @@ def test_another_picture_of_that_name_is_missing(maker: Maker, tmp_path: Path) -
     assert list(found) == ["c.png"]
 
 
-@pytest.mark.slow
 def test_random_colours_are_made_again(maker: Maker) -> None:
     place = maker.folder / "random"
     scenes = random_scenes(2, 7, 5, seed=4)

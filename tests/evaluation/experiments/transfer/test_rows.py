@@ -20,6 +20,8 @@ from evaluation.scene import Image, Scene
 from foundation.errors import InputError
 from tests.evaluation.experiments.transfer.worlds import COOL, MeanColour, world
 
+pytestmark = pytest.mark.slow
+
 LEARNERS = (MeanColour(), ConstantLight())
 TEST = world(120, seed=1)
 FOLDS = tuple(draw_folds(120, 3, seed) for seed in range(2))
