@@ -6,6 +6,7 @@ answered as one that it cannot tell, never as an error: few know all that their 
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol, runtime_checkable
@@ -55,30 +56,39 @@ class ProjectorIdentity:
 class Projector(Protocol):
     """A projector whose control port has been opened."""
 
+    @abstractmethod
     def identity(self) -> ProjectorIdentity:
         """Return maker, model and name."""
 
+    @abstractmethod
     def power(self) -> Power:
         """Return the power state now."""
 
+    @abstractmethod
     def switch_on(self) -> None:
         """Begin to switch on; returns at once, `power` shows when it is done."""
 
+    @abstractmethod
     def switch_off(self) -> None:
         """Begin to switch off; returns at once, `power` shows when it is done."""
 
+    @abstractmethod
     def muted(self) -> bool | None:
         """Return whether the picture is blanked by mute; None where the projector is on and cannot tell."""
 
+    @abstractmethod
     def set_muted(self, muted: bool) -> None:
         """Blank the picture, or show it."""
 
+    @abstractmethod
     def faults(self) -> tuple[Fault, ...]:
         """Return every fault reported now; empty when healthy, and where the projector cannot tell."""
 
+    @abstractmethod
     def lamps(self) -> tuple[Lamp, ...]:
         """Return every lamp; empty for a lampless projector, and for one that does not count hours."""
 
+    @abstractmethod
     def close(self) -> None:
         """Release the control port; a second call does nothing. The power state stays."""
 

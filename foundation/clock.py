@@ -59,7 +59,8 @@ class SteadyClock:
     """A clock whose date goes on as seconds pass, and never back, whatever the machine's clock is set to meanwhile.
 
     White frames are interpolated in time: where that clock is set back during a session, lights would lie between the
-    wrong ones. `clock` tells the date once, which is `not_before` at least, and makes every pause.
+    wrong ones. `clock` tells the date once, which is `not_before` (with a time zone) at least, and makes every pause;
+    `elapsed` returns seconds since any origin, and never goes back.
     """
 
     def __init__(

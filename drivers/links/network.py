@@ -103,13 +103,13 @@ class TcpServer(ClosedAtEnd):
     Use it in a `with` block; leaving it hangs up every connection and joins every thread.
     """
 
-    def __init__(self, handle: Callable[[TcpLink], None], port: int = 0, host: str = LOOPBACK) -> None:
+    def __init__(self, handle: Callable[[TcpLink], None], port: int = 0) -> None:
         self._handle = handle
         try:
-            self._listener = socket.create_server((host, port))
+            self._listener = socket.create_server((LOOPBACK, port))
         except (OSError, OverflowError) as error:
             raise LinkClosed(
-                f"cannot listen at {host}:{port}: {error}; choose another port, 0 picks a free one"
+                f"cannot listen at {LOOPBACK}:{port}: {error}; choose another port, 0 picks a free one"
             ) from error
         self._guard = threading.Lock()
         self._links: set[TcpLink] = set()
@@ -176,9 +176,7 @@ _TIMEOUT_S = 30.0
 """Longest wait for a client to take an answer."""
 
 
-def serve_peer(
-    peer: Callable[[], Peer], port: int = 0, host: str = LOOPBACK, think: Callable[[], None] = lambda: None
-) -> TcpServer:
+def serve_peer(peer: Callable[[], Peer], port: int = 0, think: Callable[[], None] = lambda: None) -> TcpServer:
     """Return a running server that gives each connection a peer, which thinks before it answers; close it."""
 
     def handle(link: TcpLink) -> None:
@@ -193,7 +191,7 @@ def serve_peer(
                 think()
                 link.write(said, _TIMEOUT_S)
 
-    return TcpServer(handle, port, host)
+    return TcpServer(handle, port)
 
 
 ANY_HOST = "0.0.0.0"
@@ -234,7 +232,7 @@ class UdpSocket(ClosedAtEnd):
         """Return the next datagram and who sent it, waiting at most `timeout` seconds."""
         host, port = self.address
         try:
-            self._socket.settimeout(timeout)
+            self._socket.settimeout(max(timeout, 0.0))
             data, (sender, sender_port, *_) = self._socket.recvfrom(MAX_DATAGRAM)
         except (TimeoutError, BlockingIOError) as error:
             raise LinkTimeout(f"no datagram came to {host}:{port} for {timeout:g} s") from error

@@ -575,9 +575,11 @@ class Transport(Protocol):
     """An open cable to a PTP device, seen from the initiator."""
 
     @property
+    @abstractmethod
     def label(self) -> str:
         """What messages call the device: address and name as far as known."""
 
+    @abstractmethod
     def transact(
         self,
         request: PtpRequest,
@@ -593,12 +595,15 @@ class Transport(Protocol):
         the device, seconds.
         """
 
+    @abstractmethod
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come since the last call; never waits."""
 
+    @abstractmethod
     def reset(self) -> None:
         """Bring cable and device back to where a session can be opened; costs a session that is open."""
 
+    @abstractmethod
     def close(self) -> None:
         """Release the device; a second call does nothing."""
 

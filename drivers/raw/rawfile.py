@@ -1017,7 +1017,8 @@ highlights are less."""
 class Plane:
     """One colour of a mosaic: `values` (H // 2, W // 2) float32, counts above black; `offset_px` (x, y).
 
-    The element [i, j] was measured at the half-size place x = j + offset_px[0], y = i + offset_px[1].
+    The element [i, j] was measured at the half-size place x = j + offset_px[0], y = i + offset_px[1]. A half-size
+    pixel is a 2×2 block of photosites; x to the right, y down, centres at whole numbers.
     """
 
     channel: Channel

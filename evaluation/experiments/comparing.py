@@ -26,7 +26,7 @@ from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, tables_to_latex
 from evaluation.results.files import MethodErrors
 from evaluation.results.result import csv_text
-from evaluation.results.tables import PAPER_COLUMNS, Table, finite_or_none, table_to_csv
+from evaluation.results.tables import PAPER_COLUMNS, Table, table_to_csv
 from foundation import pages
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted
@@ -375,7 +375,7 @@ def statistics_table(comparison: Comparison, level: float) -> Table:
         f"{one} against {other}: {matched.kind} errors of {matched.cases}, degrees",
         ("Statistic", "First", "Second", "Difference", "from", "to", "Ratio", "ratio from", "ratio to"),
         tuple(
-            (_HEADS[made.statistic], made.one, made.other, *map(finite_or_none, (*made.difference, *made.ratio)))
+            (_HEADS[made.statistic], made.one, made.other, *map(_known, (*made.difference, *made.ratio)))
             for made in comparison.statistics
         ),
         digits=3,
@@ -440,6 +440,11 @@ def notes_of(comparisons: Sequence[Comparison]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(note for made in comparisons for note in missing_images(made.matched)))
 
 
+def _known(number: float) -> float | None:
+    """Return a number as a cell has it: None for NaN; a ratio's upper end may be infinite."""
+    return None if np.isnan(number) else number
+
+
 def _title(comparisons: Sequence[Comparison]) -> str:
     if len(comparisons) == 1:
         return "{} against {}".format(*comparisons[0].matched.names)
@@ -454,7 +459,7 @@ def _statistics_csv(comparisons: Sequence[Comparison]) -> str:
             compared.statistic,
             compared.one,
             compared.other,
-            *map(finite_or_none, (*compared.difference, *compared.ratio)),
+            *map(_known, (*compared.difference, *compared.ratio)),
         )
         for made in comparisons
         for compared in made.statistics

@@ -1,7 +1,8 @@
 """How a journal's SQLite file is opened, on whatever disk it lies, what it may hold, and what its faults mean.
 
 A reader never writes; a run brings the file up to date and into write-ahead mode. What both trust has been checked: the
-schema holds tables alone, and each row what its column is meant to hold (`experiment.session.journal` gives the rules).
+schema holds tables alone, for views, triggers and generated columns run SQL of others, and each row what its column is
+meant to hold: no text for a number, and no path that leads outside the session.
 
 Sources: sqlite.org/wal.html, sqlite.org/lockingv3.html, sqlite.org/fileformat.html.
 """

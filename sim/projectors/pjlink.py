@@ -316,4 +316,4 @@ def serve_pjlink(
     def think() -> None:
         projector.clock.sleep(answer_s)
 
-    return serve_peer(lambda: PjLinkPeer(projector, password), port, think=think)
+    return serve_peer(lambda: PjLinkPeer(projector, password), port, think)

@@ -6,16 +6,12 @@ The devices are simulated at the ends of real cables; where a display would be n
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import pytest
-
-if sys.platform == "win32":
-    pytest.skip("Windows has no pseudo-terminals", allow_module_level=True)
 
 from acquisition.cli import main
 from drivers.display.fullscreen import Display, choose_display

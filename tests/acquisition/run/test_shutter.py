@@ -11,8 +11,6 @@ from drivers.canon import SHUTTER
 from experiment.config import CameraSettings, ProjectorCable, parse_lab
 from foundation.errors import ConfigurationError
 
-WHEEL = ProjectorCable()
-
 
 def test_a_projector_without_a_wheel_needs_whole_pictures() -> None:
     steady = ProjectorCable(colour_wheel_hz=0, refresh_hz=50)

@@ -19,7 +19,7 @@ from drivers.links.link import MAX_MESSAGE, Link
 from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, ReportsPictureFault, Severity
 from drivers.serial_projectors import LANGUAGES, benq, epson, language, nec, optoma
 from drivers.serial_projectors.benq import BenqProjector
-from drivers.serial_projectors.driver import take_line
+from drivers.serial_projectors.driver import SerialProjector, take_line
 from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
 from drivers.serial_projectors.nec import NecProjector, parse_errors
 from drivers.serial_projectors.optoma import OptomaProjector
@@ -196,6 +196,20 @@ HELLO = (b"\r", b":")
 def epson_script(*turns: tuple[bytes, tuple[bytes, ...] | bytes]) -> tuple[EpsonProjector, Script]:
     script = Script(HELLO, *turns)
     return EpsonProjector(lambda: script, clock=SimulatedClock()), script
+
+
+def test_a_maker_of_whom_half_is_written_cannot_be_made() -> None:
+    class Half(SerialProjector):
+        maker = "Half"
+
+        def switch(self, on: bool) -> None:
+            del on
+
+        def lamp_hours(self) -> tuple[int, ...]:
+            return ()
+
+    with pytest.raises(TypeError, match="muted"):
+        Half(lambda: SerialPeerLink(NecPeer(SimulatedProjector(SimulatedClock()))))  # pyrefly: ignore[bad-instantiation]
 
 
 @pytest.mark.parametrize(

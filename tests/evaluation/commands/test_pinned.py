@@ -100,6 +100,7 @@ SEQUENCES: dict[str, tuple[str, ...]] = {
         "run linear --methods gray-world --workers 1 --json",
         "paper reduction pictures/0.png --out reduction --json",
         "paper chromaticities lut --truths world.npz --out lights --json",
+        "paper chromaticities lut",
     ),
 }
 """Commands that are run one after another."""

@@ -194,3 +194,11 @@ def test_groups_of_one_image_each_change_nothing() -> None:
     grouped = compare([match(replace(mine, groups=tuple("uvwxyz")), others, ("A", "B"), "recovery")])[0]
     assert grouped.test == plain.test
     assert grouped.statistics == plain.statistics
+
+
+def test_a_ratio_s_interval_may_have_no_upper_end() -> None:
+    other = np.array([0.0] * 4 + [1.0] * 5)
+    (comparison,) = compare([match(errors("abcdefghi", other + 2), errors("abcdefghi", other), ("A", "B"), "recovery")])
+    table = statistics_table(comparison, 0.95)
+    row = next(row for row in table.rows if row[0] == "Med.")
+    assert dict(zip(table.columns, row, strict=True))["ratio to"] == np.inf

@@ -89,6 +89,8 @@ def test_statistics_and_intervals(pinned: Pinned) -> None:
             lambda: metrics.summarise([]),
             lambda: metrics.summarise([1, np.nan, np.inf]),
             lambda: bootstrap.ErrorSample.of([]),
+            lambda: bootstrap.ErrorSample.of([1, np.nan]),
+            lambda: bootstrap.ErrorSample.of([1, np.inf]),
             lambda: bootstrap.paired([1, 2], [1]),
             lambda: bootstrap.paired([1, 2], [1, 3], groups=["a"]),
             lambda: bootstrap.paired([1, 2], [1, 3], groups=["a", "a"]),

@@ -36,3 +36,16 @@ def test_what_a_file_imports_from_beside_it_belongs_to_its_method(tmp_path: Path
     assert list(record["imports"]) == ["curve_of_own.py"]
     (tmp_path / "curve_of_own.py").write_text("GAMMA = 3\n")
     assert describe_method(method) != record
+
+
+def test_another_setting_is_another_method() -> None:
+    class Own:
+        name = "Own"
+
+        def __init__(self, strength: float) -> None:
+            self.strength = strength
+
+        def estimate(self, *given: Any) -> tuple[int, int, int]:
+            return 1, 1, 1
+
+    assert describe_method(Own(2)) == describe_method(Own(2)) != describe_method(Own(3))
