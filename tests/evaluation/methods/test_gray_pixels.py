@@ -61,16 +61,23 @@ def test_the_grayness_index_is_that_of_equations_9_and_10() -> None:
 
 @pytest.mark.parametrize(
     ("rates", "cosine"),
-    [((1, 1, 1), 1), ((1, 0, 0), 3**-0.5), ((1, 1, 0), (2 / 3) ** 0.5), ((4, 2, 1), 7 / (3 * 21) ** 0.5)],
+    [
+        ((1, 1, 1), 1),
+        ((1, 1, 1.001), 3.001 / (3 * 3.002001) ** 0.5),
+        ((1, 0, 0), 3**-0.5),
+        ((1, 1, 0), (2 / 3) ** 0.5),
+        ((4, 2, 1), 7 / (3 * 21) ** 0.5),
+    ],
 )
 def test_the_angle_to_grey_by_hand(rates: tuple[float, ...], cosine: float) -> None:
     x = np.linspace(-1, 0, 30)[None, :, None]
     image = np.exp(x * rates).repeat(30, axis=0).astype(np.float32)
     found, missing = angle_to_grey(image)
     assert found[INNER].size
-    np.testing.assert_allclose(found[INNER], np.arccos(cosine), atol=2e-3)
+    np.testing.assert_allclose(found[INNER], np.arccos(cosine), atol=2e-5)
     assert not missing.any()
-    assert angle_to_grey(np.full((9, 9, 3), 0.5, np.float32))[1].all()
+    for flat in (0.5, 0.1, 3 / 7, 1e-3):
+        assert angle_to_grey(np.full((9, 9, 3), (flat, flat / 3, flat / 7), np.float32))[1].all()
 
 
 def test_what_is_dark_or_masked_is_not_chosen() -> None:
