@@ -59,7 +59,7 @@ EVEN, ODD, BEND = 0, 1, 2
 Those of a Gaussian and of its first two derivatives."""
 
 
-def _call(builder: Any, name: str, *arguments: Any) -> Any:
+def _call(builder: Builder, name: str, *arguments: Any) -> Any:
     """Return what an LLVM intrinsic on vectors of 16 float32 gives."""
     whole = f"{name}.v{LANES}f32"
     known = builder.module.globals.get(whole)
@@ -67,19 +67,19 @@ def _call(builder: Any, name: str, *arguments: Any) -> Any:
     return builder.call(function, arguments)
 
 
-def _fused(builder: Any, first: Any, second: Any, third: Any) -> Any:
+def _fused(builder: Builder, first: Any, second: Any, third: Any) -> Any:
     """Return first · second + third, rounded once."""
     return _call(builder, "llvm.fma", first, second, third)
 
 
-def _root(builder: Any, value: Any) -> Any:
+def _root(builder: Builder, value: Any) -> Any:
     return _call(builder, "llvm.sqrt", value)
 
 
 def _emit(
-    builder: Any,
+    builder: Builder,
     source: Any,
-    step: Any,
+    stride: Any,
     weights: Sequence[Any],
     reach: Any,
     kinds: Sequence[int],
@@ -88,15 +88,13 @@ def _emit(
 ) -> list[list[Any]]:
     """Return the filtered vectors at `source` and after for each kind.
 
-    Neighbours lie `step` bytes apart; `weights` are addresses of reach + 1 float32 a kind. Read are `reach` neighbours
-    before the first and after the last vector. The vectors are `OUTPUTS` neighbours, or the three vectors of `CHUNK`
+    Neighbours lie `stride` bytes apart; `weights` are addresses of reach + 1 float32 a kind. Read are `reach`
+    neighbours before the first and after the last vector. The vectors are `OUTPUTS` neighbours, or the three of `CHUNK`
     interleaved pixels side by side, whose neighbours are loaded from wherever they begin.
     """
     from numba.core import cgutils
 
     def slot_of(value: Any) -> Any:
-        from numba.core import cgutils
-
         slot = cgutils.alloca_once(builder, FLOATS)
         builder.store(value, slot)
         return slot
@@ -105,7 +103,7 @@ def _emit(
         return builder.mul(number, ir.Constant(I64, count))
 
     outputs = range(3 if side_by_side else OUTPUTS)
-    apart = ir.Constant(I64, LINE) if side_by_side else step
+    apart = ir.Constant(I64, LINE) if side_by_side else stride
     centre = [load(builder, builder.add(source, times(apart, at)), 0, FLOATS) for at in outputs]
     sums: list[list[Any]] = []
     for kind, table in zip(kinds, weights, strict=True):
@@ -114,10 +112,10 @@ def _emit(
         sums.append([slot_of(builder.fmul(one, first) if kind == EVEN else zero) for one in centre])
     doubled = [builder.fadd(one, one) for one in centre] if BEND in kinds else []
     lows, highs = [slot_of(one) for one in centre], [slot_of(one) for one in centre]
-    last = builder.add(source, times(step, OUTPUTS - 1))
+    last = builder.add(source, times(stride, OUTPUTS - 1))
     with cgutils.for_range(builder, reach) as loop:
         tap = builder.add(loop.index, ir.Constant(I64, 1))
-        offset = builder.mul(tap, step)
+        offset = builder.mul(tap, stride)
         below, above = builder.sub(source, offset), builder.add(last, offset)
         if side_by_side:
             low = [load(builder, below, LINE * at, FLOATS) for at in outputs]
@@ -145,9 +143,9 @@ def _emit(
     return [[builder.load(slot) for slot in slots] for slots in sums]
 
 
-def _write(builder: Any, values: Sequence[Any], target: Any, step: Any) -> None:
+def _write(builder: Builder, values: Sequence[Any], target: Any, stride: Any) -> None:
     for at, value in enumerate(values):
-        store(builder, value, builder.add(target, builder.mul(step, ir.Constant(I64, at))), 0)
+        store(builder, value, builder.add(target, builder.mul(stride, ir.Constant(I64, at))), 0)
 
 
 def _across(builder: Builder, kinds: Sequence[int], source: Value, reach: Value, places: Sequence[Value]) -> None:
