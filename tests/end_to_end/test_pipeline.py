@@ -86,7 +86,7 @@ def test_the_table_has_the_promised_form(lut: Lut, built: Path) -> None:
     assert lut.samples.flags.c_contiguous
     header = (built / "lut" / "illuminations.csv").read_text().splitlines()[0]
     assert header == "index,kind,cct_k,red,green,blue,white_r,white_g,white_b"
-    assert (built / "lut" / "report.html").is_file()
+    assert ", taken in the simulated laboratory" in (built / "lut" / "report.html").read_text(encoding="utf-8")
     assert lut.provenance.bits == 3
 
 

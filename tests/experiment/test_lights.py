@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -218,6 +219,7 @@ def test_figures_of_other_kinds(tmp_path: Path) -> None:
     for name, head in (("a.pdf", b"%PDF"), ("a.SVG", b"<?xml")):
         plot_illuminations(few, tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(head)
+        assert not re.search(rb"CreationDate|dc:date", (tmp_path / name).read_bytes())
     plot_illuminations((), tmp_path / "none.png")
     plot_illuminations((), tmp_path / "again.png")
     assert (tmp_path / "none.png").read_bytes() == (tmp_path / "again.png").read_bytes()

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from acquisition.monitor.view import SessionWatch, place_of, planned_places
+from acquisition.monitor.view import SessionWatch, place_of, planned_places, read_session
 from experiment.session.journal import Journal
 from experiment.session.records import link_steps
 from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
@@ -233,4 +233,6 @@ def test_places_in_the_plane() -> None:
 def test_lights_are_shown_also_without_their_file(run: MadeUpRun) -> None:
     (run.folder / "illuminations.csv").unlink()
     lights = told(SessionWatch(run.folder))["session"]["lights"]
+    # What a complete session lacks is said; one that is still taken needs its plan alone.
+    assert not read_session(run.folder).unreadable
     assert [light[4:] for light in lights] == [list(light.colour) for light in LIGHTS]

@@ -60,6 +60,12 @@ def test_listed_frames_make_a_session(folder: Path) -> None:
         assert [frame.verdict for frame in session.frames()][1] == "refused: a hand"
 
 
+def test_it_is_told_whether_the_list_judged_a_frame_or_its_exposure(folder: Path) -> None:
+    import_rows(folder, [light(0), light(1, verdict="")])
+    with Session.open(folder / "session") as session:
+        assert [one.checks[0].name for one in session.journal.details().values()] == ["list", "exposure"]
+
+
 def test_a_damaged_file_is_refused_whatever_the_list_says_of_it(folder: Path) -> None:
     write_dng(folder / "1.cr2", np.where(np.arange(1024).reshape(32, 32) > 800, 0, 900).astype(np.uint16))
     (folder / "2.cr2").write_bytes(b"II*\0")
