@@ -193,11 +193,12 @@ def design_chart(
         free[row : row + TAG_SLOTS, column : column + TAG_SLOTS] = False
     referenced = spread(free, int(free.sum()) - 8**bits, rng)
     rows, columns = np.nonzero(free & ~referenced)
+    (x0, y0), slot = grid.origin_px, grid.slot_px
     return Chart(
         page_mm=page_mm,
         bits=bits,
         cell_mm=grid.cell_mm,
-        centres_mm=np.array([grid.mm(column + 0.5, row + 0.5) for column, row in zip(columns, rows, strict=True)]),
+        centres_mm=PX_MM * np.array([x0 + (columns + 0.5) * slot, y0 + (rows + 0.5) * slot], dtype=np.float64).T,
         colours=rng.permutation(8**bits).astype(np.int64),
         tags=tuple(_tag(grid, number, *slot) for number, slot in enumerate(grid.tag_slots)),
         references=tuple(_references(grid, referenced, rng)),
@@ -364,13 +365,12 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
     of them allowed.
     """
     rows, columns = allowed.shape
-    row_of, column_of = np.indices(allowed.shape, dtype=np.int64)
-    quarters: npt.NDArray[np.int64] = 2 * (2 * row_of // rows) + 2 * column_of // columns
-    quotas = _quotas([int((allowed & (quarters == quarter)).sum()) for quarter in range(4)], count)
+    halves = [(slice(0, (side + 1) // 2), slice((side + 1) // 2, side)) for side in allowed.shape]
+    quarters = [(down, across) for down in halves[0] for across in halves[1]]
     chosen = np.zeros_like(allowed)
-    members = [np.flatnonzero(allowed & (quarters == quarter)) for quarter in range(4)]
-    for places, quota in zip(members, quotas, strict=True):
-        chosen.flat[rng.choice(places, quota, replace=False)] = True
+    places = [_places(allowed, quarter) for quarter in quarters]
+    for mine, quota in zip(places, _quotas([len(mine) for mine in places], count), strict=True):
+        chosen.flat[rng.choice(mine, quota, replace=False)] = True
     if count == 0:
         return chosen
     # In units of the mean distance between neighbours; found best by the nearest pair and the largest gap on A0.
@@ -378,24 +378,32 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
     down, across = _nearness(rows, sigma), _nearness(columns, sigma)
     # Equals are decided at random, by less than any difference that matters.
     crowd = down @ chosen.astype(np.float64) @ across.T + 1e-6 * rng.random(allowed.shape)
-    flat, picked = crowd.reshape(-1), chosen.reshape(-1)
-    for slot in rng.permutation(np.flatnonzero(chosen)):
-        row, column = divmod(int(slot), columns)
-        crowd -= np.outer(down[:, row], across[:, column])
-        picked[slot] = False
-        places = members[int(quarters[row, column])]
-        open_ = places[~picked[places]]
-        best = int(open_[flat[open_].argmin()])
-        row, column = divmod(best, columns)
-        crowd += np.outer(down[:, row], across[:, column])
-        picked[best] = True
-    return chosen
+    taken = np.where(allowed & ~chosen, 0.0, np.inf)
+    added = np.empty_like(crowd)
+    for row, column in rng.permutation(np.argwhere(chosen)):
+        crowd -= np.multiply(down[:, row, None], across[:, column], out=added)
+        taken[row, column] = 0.0
+        quarter = quarters[2 * int(2 * row // rows) + int(2 * column // columns)]
+        open_ = crowd[quarter] + taken[quarter]
+        row, column = np.add(np.unravel_index(open_.argmin(), open_.shape), [side.start for side in quarter])
+        crowd += np.multiply(down[:, row, None], across[:, column], out=added)
+        taken[row, column] = np.inf
+    return allowed & (taken > 0)
+
+
+def _places(allowed: _Slots, quarter: tuple[slice, slice]) -> npt.NDArray[np.intp]:
+    """Return (n,) int: which slots of a quarter, counted row by row over the whole grid, are allowed."""
+    inside = np.zeros_like(allowed)
+    inside[quarter] = allowed[quarter]
+    return np.flatnonzero(inside)
 
 
 def _nearness(count: int, sigma: float) -> npt.NDArray[np.float64]:
     """Return how near each slot (column) is to each place (row), (count, count) float64, rows of sum 1."""
     places = np.arange(count)
     weights = np.exp(-0.5 * ((places[:, None] - places[None, :]) / sigma) ** 2)
+    # Numbers below the normal ones slow a processor down, and no sum notices these.
+    weights[weights < 1e-40] = 0
     # A place at the edge has neighbours on one side only; without this all would gather at the edges.
     return weights / weights.sum(axis=1, keepdims=True)
 
