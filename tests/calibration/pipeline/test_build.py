@@ -248,6 +248,11 @@ def test_the_report_stands_alone(built: BuildResult) -> None:
 
 def test_the_summary_gives_figures_in_their_units(built: BuildResult) -> None:
     rows = {row.name: row for row in summary(built.figures)}
+    # What the command prints, in this order.
+    assert [name for name, row in rows.items() if row.brief] == [
+        "Tags found", "Residual of cell blocks", "Correlation with the chart", "Movement of the chart",
+        "Drift of white", "Uncertainty of the ground truth", "Cells unfit for use",
+    ]  # fmt: skip
     figures, percent = built.figures, "{:.2f} %".format
     assert rows["Lights"].value == str(len(LIGHTS))
     assert rows["Tags found"].value == "4 of 4"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -241,11 +242,14 @@ def test_cells_that_clip_and_cells_with_hot_samples_are_not_used(make_table: Mak
     assert shown.max() < 5000
 
 
-def test_cells_that_are_not_usable_are_not_seen(make_table: MakeTable) -> None:
+@pytest.mark.parametrize("lights", [{0, 1, 2}, {0}], ids=["in every light", "in the warmest, which has little blue"])
+def test_cells_that_are_not_usable_are_not_seen(make_table: MakeTable, lights: set[int]) -> None:
     """An odd cell under any light that is dark in a channel, and its neighbours do without it."""
+    number = itertools.count()
 
     def spoil(samples: npt.NDArray[np.uint16]) -> None:
-        samples[146, 3] = 9000
+        if next(number) in lights:
+            samples[146, 3] = 9000
 
     spoilt, whole = make_table(change=spoil), make_table(name="whole")
     rendering = ColorimetricRendering(spoilt, MINE)
