@@ -272,6 +272,7 @@ def _provenance(
         black,
         task.body.saturation,
         [one.paper.field for one in kept],
+        saturation_from="settings",
         at_zero=np.array([one.share_at_zero for one in kept]),
     )
     if measurement.primaries is not None:

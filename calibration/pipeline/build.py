@@ -308,7 +308,7 @@ def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWrite
         np.array([frame.black for frame in frames]),
         figures.sensor.saturation_counts,
         [frame.paper.field for frame in frames],
-        measured=figures.sensor.saturation_measured,
+        saturation_from="frames" if figures.sensor.saturation_measured else "raw files",
         gains=lights.gains if figures.white_frames and lights.drift is None else None,
         subtracted=lights.subtracted,
         at_zero=lights.share_at_zero,

@@ -25,6 +25,14 @@ _Array = npt.NDArray[np.float64]
 DIGITS = 6
 """Decimals of the gains, as `lut.json` stores them: samples are divided by the stored number, which undoes it."""
 
+SATURATION_FROM = {
+    "frames": "measured: photosites of this session reached it",
+    "raw files": "the raw files' statement, which may be too high, as no photosite of a cell came near; "
+    "no sample is affected, but white_level may be",
+    "settings": "the settings of the computed camera",
+}
+"""What the saturation of a table may be known from, and how `lut.json` says it."""
+
 LEAST_WHITES = 2
 """White frames that a drift needs: one shows a lamp, and not what becomes of it."""
 
@@ -37,7 +45,7 @@ def corrections(
     saturation_counts: int,
     fields: Sequence[FlatField],
     *,
-    measured: bool = False,
+    saturation_from: str,
     gains: _Array | None = None,
     subtracted: _Array | None = None,
     at_zero: _Array | None = None,
@@ -45,9 +53,9 @@ def corrections(
     """Return what was done to the counts, in order, for `lut.json`.
 
     `black`: (L, 2, 2) float64 counts, black level of each light's frame. `saturation_counts`: raw count of saturation.
-    `gains`: (L, 3) the lamp's drift at each light; None without white frames. `subtracted`: (L, 3) counts, dark light
-    of bare paper that was subtracted; None where none was to be. `at_zero`: (L,) share of each light's samples that are
-    0; None where it was not counted.
+    `saturation_from`: one of `SATURATION_FROM`. `gains`: (L, 3) the lamp's drift at each light; None without white
+    frames. `subtracted`: (L, 3) counts, dark light of bare paper that was subtracted; None where none was to be.
+    `at_zero`: (L,) share of each light's samples that are 0; None where it was not counted.
     """
     done: list[dict[str, Any]] = [
         {
@@ -67,10 +75,7 @@ def corrections(
             "how": f"cells with a count of {CLIPPING_SHARE:g} of it or more are unfit",
             "unit": "raw counts",
             "value": saturation_counts,
-            "from": "measured: photosites of this session reached it"
-            if measured
-            else "the raw files' statement, which may be too high, as no photosite of a cell came near; "
-            "no sample is affected, but white_level may be",
+            "from": SATURATION_FROM[saturation_from],
         },
         {
             "name": "field",

@@ -101,7 +101,8 @@ def test_the_table_says_enough_to_undo_the_field() -> None:
     base = read_paper(9000 * falloff(PLACES)).field
     tilted = falloff(PLACES) * (1 + 0.05 * (2 * PLACES[:, :1] / PAGE[0] - 1))
     field = read_paper(9000 * tilted, base).field
-    record = next(c for c in corrections(PAGE, np.zeros((1, 2, 2)), 13584, [field]) if c["name"] == "field")
+    done = corrections(PAGE, np.zeros((1, 2, 2)), 13584, [field], saturation_from="frames")
+    record = next(one for one in done if one["name"] == "field")
     u, v = (2 * CENTRES / PAGE - 1).T
     for channel in range(3):
         product = np.ones(len(CENTRES))
