@@ -54,7 +54,8 @@ class Pinned:
         path = FOLDER / f"{name}.json"
         now = plain(found)
         if self._renew:
-            path.write_text(written(now) + "\n", encoding="utf-8")
+            known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+            path.write_text(written(renewed(known, now, same, nothing)) + "\n", encoding="utf-8")
         kept = json.loads(path.read_text(encoding="utf-8"))
         moved = list(differences(kept, now, same, nothing))
         more = f"\nand {len(moved) - SHOWN} more" if len(moved) > SHOWN else ""
@@ -97,6 +98,17 @@ def differences(kept: Any, now: Any, same: float, nothing: float, place: str = "
             yield f"{place}: {kept!r:.200} {now!r:.200}"
         case _:
             pass
+
+
+def renewed(kept: Any, now: Any, same: float, nothing: float) -> Any:
+    """Return a plain value with the numbers as they are kept that did not move, so that a difference shows what did."""
+    match kept, now:
+        case dict(), dict():
+            return {key: renewed(kept.get(key), one, same, nothing) for key, one in now.items()}
+        case (list(), list()) if len(kept) == len(now):
+            return [renewed(one, other, same, nothing) for one, other in zip(kept, now, strict=True)]
+        case _:
+            return now if any(differences(kept, now, same, nothing)) else kept
 
 
 def plain(value: Any) -> Any:

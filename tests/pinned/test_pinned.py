@@ -56,6 +56,17 @@ def test_another_form_is_told(kept: Pinned, other: Any) -> None:
         kept("form", other)
 
 
+def test_what_is_renewed_differs_where_it_moved(kept: Pinned, tmp_path: Path) -> None:
+    renew = Pinned(renew=True)
+    before = (tmp_path / "run.json").read_text()
+    renew("run", run(share=0.125 * (1 + 1e-8), by=1e-9))
+    assert (tmp_path / "run.json").read_text() == before
+    renew("run", run(share=0.25, by=1e-9))
+    assert (tmp_path / "run.json").read_text() == before.replace("0.125", "0.25")
+    renew("run", {"name": "bare"})
+    kept("run", {"name": "bare"})
+
+
 def test_nothing_is_written_unless_asked(kept: Pinned, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         kept("other", 1)
