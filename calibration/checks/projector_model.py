@@ -87,6 +87,9 @@ _SCHEDULE = (0.5, 0.2, 0.06, 0.015, 0.0, 0.0, 0.0)
 _STEPS = 4
 """Steps of Gauss and Newton for each of these."""
 
+_STILL = 1e-6
+"""Step, in standard deviations of what is known of any projector, after which no other follows."""
+
 _DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)
 """Damping of a step that is tried in turn, over the curvature."""
 
@@ -240,6 +243,11 @@ def fit_projector(
                 if _misfit(state + by, white - reached, weights) <= before:
                     state, fitted, slopes = state + by, reached, there
                     break
+            else:
+                # It is at the mode but for rounding, and would try the same again.
+                break
+            if np.abs(by).max() < _STILL:
+                break
         if used is not None:
             continue
         covariance = _inverse(_precision(slopes, weights)[0])
@@ -303,7 +311,7 @@ def _model(state: _Array, given: _Codes, scale: float, rest: float) -> tuple[_Ar
     amounts += rest * state[at:]
     for primary in range(3):
         by_state[:, primary, at + primary] = rest
-    slopes = np.einsum("cp,lpk->lck", primaries, by_state)
+    slopes = primaries @ by_state
     each = amounts[:, None, :] * primaries[None]
     slopes[:, :, :9] += np.einsum("lcp,cpk->lck", each, root.reshape(3, 3, 9))
     return each.sum(axis=2), slopes
