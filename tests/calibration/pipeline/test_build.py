@@ -243,6 +243,7 @@ def test_the_report_stands_alone(built: BuildResult) -> None:
     assert f"<th scope='row'>Exposure</th><td>{exposure}</td>" in html.unescape(page)
     # A figure leads to the picture that shows it.
     pictures = set(re.findall(r"<div id='(\w+)'", page))
+    assert {"chart", "lights", "errors", "noise"} < pictures
     assert pictures >= set(re.findall(r"href='#(\w+)'", page)) >= {"residuals", "course", "budget"}
 
 

@@ -70,6 +70,9 @@ def test_what_is_not_read_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixtu
     (tmp_path / "in/a.png").unlink()
     with pytest.raises(InputError, match=r"holds IMG_1\.HEIC and 1 more, which are left out: HEIC is not read"):
         find_pictures([tmp_path / "in"])
+    (tmp_path / "in/deep/IMG_2.heif").unlink()
+    with pytest.raises(InputError, match=r"holds IMG_1\.HEIC, which is left out: HEIC is not read"):
+        find_pictures([tmp_path / "in"])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are bytes, whatever they mean, on Linux only")
