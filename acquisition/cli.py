@@ -116,7 +116,7 @@ def chart(
         typer.Option("--tagged-tiff", help="Write chart-srgb.tif too, tagged as sRGB, to print through a profile."),
     ] = False,
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Make the print: every colour once, AprilTags and achromatic references, at true size.
 
@@ -154,7 +154,7 @@ def chart(
         f"on {width:g} × {height:g} mm, cells of {cell} mm"
     )
     small = small_parts_warning(design)
-    told.add(
+    output.add(
         folder=out,
         colours=design.colour_count,
         tags=len(design.tags),
@@ -186,7 +186,7 @@ def illuminations(
         str, typer.Option(help="Black bodies as FIRST:LAST:STEP in kelvin, or a list K,K,…; empty for none.")
     ] = "2000:10000:200",
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Make the lights: uniformly spread chromaticities and black bodies; 707 by default.
 
@@ -207,7 +207,7 @@ def illuminations(
         raise InputError("no light is left: grid is 0 and there are no black bodies; name some")
     save_illuminations(lights, out)
     plot_illuminations(lights, plot)
-    told.add(file=out, plot=plot, lights=len(lights), kinds=Counter(light.kind for light in lights))
+    output.add(file=out, plot=plot, lights=len(lights), kinds=Counter(light.kind for light in lights))
     print(f"{out}: {len(lights)} lights; plot in {plot}")
 
 
@@ -219,7 +219,7 @@ def devices(
     ] = 10.0,
     identify: Annotated[bool, typer.Option(help="Show on every display its number for ten seconds.")] = False,
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """List what is attached and reachable: cameras, serial ports, displays, projectors on the network.
 
@@ -228,7 +228,7 @@ def devices(
     from acquisition.run.rig.lab import attached_devices, identify_displays
 
     for attached in attached_devices(search):
-        told.append("devices", attached)
+        output.append("devices", attached)
         print(f"{attached.kind}:")
         for name in attached.found:
             print(f"  {name}")
@@ -261,7 +261,7 @@ def check(
         Path | None, typer.Option(help="Where the session will be, for the disk's space; else beside LAB.toml.")
     ] = None,
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Say whether the lab is ready: a verdict on exposure, light, sharpness, print, sensor, supplies; record nothing.
 
@@ -292,8 +292,8 @@ def check(
             linearity=linearity,
             session=session,
         )
-    if told.asked:
-        told.add(**report.values())
+    if output.asked:
+        output.add(**report.values())
     else:
         for line in report.lines():
             print(line)
@@ -327,7 +327,7 @@ def run(
         ),
     ] = False,
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Take the session, or take up one that was interrupted.
 
@@ -340,13 +340,13 @@ def run(
 
     settings = load_lab(lab)
     if dry_run:
-        _print_plan(settings, session, retake, told)
+        _print_plan(settings, session, retake, output)
         return
     with orderly_end() as ending, Terminal() as shown:
         outcome = run_session(
             settings, session, shown.progress, shown.announce, retake, ending, shown.taken, shown.state
         )
-    told.add(session=session, frames=outcome.total, left=outcome.left, refused=outcome.refused, doubts=outcome.doubts)
+    output.add(session=session, frames=outcome.total, left=outcome.left, refused=outcome.refused, doubts=outcome.doubts)
     for doubt in outcome.doubts:
         print(f"doubt: {doubt}")
     if not outcome.complete:
@@ -356,12 +356,12 @@ def run(
     print(f"{session}: complete, {outcome.total} frames; next: build-lut {shlex.quote(str(session))} LUT/")
 
 
-def _print_plan(settings: LabSettings, session: Path, retake: str | None, told: JsonOutput) -> None:
+def _print_plan(settings: LabSettings, session: Path, retake: str | None, output: JsonOutput) -> None:
     from acquisition.run.plan import dry_run, plan_lines
 
     with orderly_end():
         plan = dry_run(settings, session, retake)
-    told.add(
+    output.add(
         session=session,
         frames=plan.work.left,
         frame_s=plan.frame_s.value,
@@ -382,7 +382,7 @@ def _print_plan(settings: LabSettings, session: Path, retake: str | None, told: 
 def status(
     session: Annotated[Path, typer.Argument(help="Session folder.")],
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Show how far a session is, how long it will take, what was measured last, and what was refused.
 
@@ -400,8 +400,8 @@ def status(
     journal_path(session)
     now = datetime.now(UTC)
     view = read_status(session, now)
-    if told.asked:
-        told.add(**status_json(view, now))
+    if output.asked:
+        output.add(**status_json(view, now))
     else:
         print("\n".join(status_lines(view, now)))
     if warning := secrets_warning(session):
@@ -495,7 +495,7 @@ def import_(
     chart: Annotated[Path, typer.Argument(help="chart.json of the print.")],
     session: Annotated[Path, typer.Argument(help="New session folder.")],
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Make a session from raw files taken by other means; every file is copied and judged.
 
@@ -506,7 +506,7 @@ def import_(
 
     with progress("files") as advance:
         imported = import_session(frames, chart, session, advance)
-    told.add(session=session, refused=imported.refused, left=imported.left)
+    output.add(session=session, refused=imported.refused, left=imported.left)
     print(f"{session}: imported; {len(imported.refused)} frames refused")
     for line in imported.refused:
         print(f"  {line}")

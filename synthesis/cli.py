@@ -76,7 +76,7 @@ def table(
         option('"FAMILY, GIVEN"', "Who made the table; several times for several."),
     ] = None,
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Compute a whole table from spectra and the sensor's noise model, without a frame.
 
@@ -97,7 +97,7 @@ def table(
     task = replace(table_task(camera, given, str(settings or "the command line"), spectra), origin=origin)
     with orderly_end(), progress("lights") as shown:
         done = compute_table(task, out, threads or processor_count(), shown)
-    told.add(table=out, lights=done.lights, colours=done.cells, samples=task.window**2, unfit=done.unfit)
+    output.add(table=out, lights=done.lights, colours=done.cells, samples=task.window**2, unfit=done.unfit)
     print(
         f"{out}: computed, {done.lights} lights, {done.cells} colours, {task.window**2} samples each; "
         f"{done.unfit} cells unfit for use"

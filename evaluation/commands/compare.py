@@ -60,7 +60,7 @@ def compare(
     level: Annotated[float, typer.Option(help="Confidence of the intervals.", min=0.5, max=0.999)] = 0.95,
     seed: Annotated[int, typer.Option(help="Of the bootstrap.", min=0)] = 0,
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Compare methods on the same images."""
     from evaluation.experiments import comparing
@@ -91,16 +91,16 @@ def compare(
     )
     if out is not None:
         comparing.write_comparisons(out, comparisons, notes, level)
-    show_notes(told, notes)
+    show_notes(output, notes)
     verdicts = [comparing.verdict(made, level) for made in comparisons]
-    told.add(results=results, error=error, level=level, verdicts=verdicts)
-    show_tables(told, [comparing.tests_table(comparisons)])
+    output.add(results=results, error=error, level=level, verdicts=verdicts)
+    show_tables(output, [comparing.tests_table(comparisons)])
     for verdict in verdicts:
         print(verdict)
-    if images or told.asked or len(comparisons) <= _FEW:
+    if images or output.asked or len(comparisons) <= _FEW:
         for made in comparisons:
-            show_tables(told, [comparing.statistics_table(made, level)])
-            show_tables(told, [comparing.images_table(made, 5)])
+            show_tables(output, [comparing.statistics_table(made, level)])
+            show_tables(output, [comparing.images_table(made, 5)])
     elif out is None:
         print("Statistics and images of each comparison: --images prints them, --out writes them, --method chooses.")
     if out is not None:

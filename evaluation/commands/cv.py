@@ -61,7 +61,7 @@ def cv(
     save_folds: Annotated[Path | None, option("OUT.csv", "Write the folds to this new file.")] = None,
     workers: Annotated[int | None, thread_option(" that read images; no number depends on it")] = None,
     reading: DataReading,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Cross-validate methods on a data set."""
     from evaluation.experiments.cross_validation import cross_validate
@@ -102,9 +102,9 @@ def cv(
             write_run(made, found.scenes, out, error, threads)
         if save_folds is not None:
             write_whole(save_folds, folds_to_csv(made.subject.images, parts))
-    told.add(data_set=found.name, images=count, folds=len(set(parts.tolist())), seed=seed, error=error)
-    show_tables(told, [summary_table(made.subject, results, error, statistics == "all" or told.asked)])
-    show_notes(told, made.notes, made.treatment)
+    output.add(data_set=found.name, images=count, folds=len(set(parts.tolist())), seed=seed, error=error)
+    show_tables(output, [summary_table(made.subject, results, error, statistics == "all" or output.asked)])
+    show_notes(output, made.notes, made.treatment)
 
 
 def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:

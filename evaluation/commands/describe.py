@@ -47,7 +47,7 @@ def describe(
     workers: Annotated[int | None, thread_option()] = None,
     *,
     reading: DataReading,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Describe a data set."""
     from dataclasses import replace
@@ -78,15 +78,15 @@ def describe(
         write_whole(out, statistics_to_json(one))
     if report is not None:
         write_whole(report, reporting.describe_page(one, other, seed))
-    told.add(data_sets=[one.name] if other is None else [one.name, other.name])
+    output.add(data_sets=[one.name] if other is None else [one.name, other.name])
     if other is None:
-        show_tables(told, [reporting.figures_table(one)])
-    show_tables(told, [reporting.lights_table([one] if other is None else [one, other])])
+        show_tables(output, [reporting.figures_table(one)])
+    show_tables(output, [reporting.lights_table([one] if other is None else [one, other])])
     if other is not None:
-        show_notes(told, list(reporting.seen_notes(one, other)))
+        show_notes(output, list(reporting.seen_notes(one, other)))
         compared = compare_figures(one, other, seed)
-        show_tables(told, list(reporting.compared_tables(compared, (one.name, other.name))))
-        told.add(sentences=[sentence(made, (one.name, other.name)) for made in compared])
+        show_tables(output, list(reporting.compared_tables(compared, (one.name, other.name))))
+        output.add(sentences=[sentence(made, (one.name, other.name)) for made in compared])
         for made in compared:
             print(sentence(made, (one.name, other.name)))
 

@@ -100,7 +100,7 @@ def table1(
     out: Out = None,
     workers: Workers = None,
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Run plain methods on eight generated data sets."""
     from evaluation.experiments.paper.material import read_truths
@@ -127,7 +127,7 @@ def table1(
         f"Tables: {'; '.join(map(_says, opened))}.",
         *(() if names == ("C1", "C1") else (_NOT_C1,)),
     )
-    _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out, told)
+    _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out, output)
 
 
 def _says(lut: Lut) -> str:
@@ -172,7 +172,7 @@ def table2(
     workers: Workers = None,
     *,
     reading: DataReading,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Train learned methods on real and on generated images."""
     from evaluation.datasets import open_scenes
@@ -208,7 +208,7 @@ def table2(
         *unseen,
         *(() if is_cube else ("The paper's table is of Cube+, so only its ratios stand beside these.",)),
     )
-    _finish(table2_report(table2_tables(found, error, real.name, is_cube), conditions), conditions, out, told)
+    _finish(table2_report(table2_tables(found, error, real.name, is_cube), conditions), conditions, out, output)
 
 
 _BITS = f"""Influence of colour reduction on methods (section 4.2).
@@ -232,7 +232,7 @@ def bits(
     workers: Workers = None,
     *,
     reading: DataReading,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Run methods on images whose colours were reduced."""
     from evaluation.experiments.paper.colour_reduction import bits_methods, bits_removed
@@ -245,7 +245,7 @@ def bits(
         found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
     first = f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px."
     conditions = (first, _treatment(opened))
-    _finish(bits_report(found, error, opened.name, conditions), conditions, out, told)
+    _finish(bits_report(found, error, opened.name, conditions), conditions, out, output)
 
 
 _FLASH = f"""Tone map linear images to codes of 8 bits by the Flash operator (section 4.2).
@@ -268,7 +268,7 @@ def flash(
     workers: Workers = None,
     *,
     reading: DataReading,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Write tone-mapped codes of linear images."""
     from evaluation.experiments.paper.colour_reduction import write_codes
@@ -278,7 +278,7 @@ def flash(
     opened = reading.open(data)
     with image_steps(len(opened.scenes)) as step:
         write_codes(opened, out, clear, workers or processor_count(), step)
-    told.add(folder=out, data_set=opened.name, images=len(opened.scenes), cleared=clear)
+    output.add(folder=out, data_set=opened.name, images=len(opened.scenes), cleared=clear)
     print(f"{out}: codes of {len(opened.scenes)} images of {opened.name}, {clear} bits of each set to zero")
 
 
@@ -299,7 +299,7 @@ def flash_inverse(
     out: Annotated[Path, option("LINEAR", "New folder of linear images.")],
     workers: Workers = None,
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Write the linear images of codes."""
     from evaluation.experiments.paper.colour_reduction import write_linear
@@ -309,7 +309,7 @@ def flash_inverse(
     _require_free(out)
     with progress("images") as shown:
         count = write_linear(folder, out, workers or processor_count(), shown)
-    told.add(folder=out, images=count)
+    output.add(folder=out, images=count)
     print(f"{out}: {count} linear images; evaluate run {out} estimates their lights")
 
 
@@ -325,14 +325,14 @@ the figure is there only.
 @app.command("reduction", help=_REDUCTION)
 @with_json("evaluate paper reduction")
 def reduction(
-    picture: Annotated[Path, argument("PICTURE", "Any picture file.")], out: Out = None, *, told: JsonOutput
+    picture: Annotated[Path, argument("PICTURE", "Any picture file.")], out: Out = None, *, output: JsonOutput
 ) -> None:
     """Show a picture with its colours reduced."""
     from evaluation.experiments.paper.reporting import reduction_report
     from generator import read_picture
 
     _require_free(out)
-    _finish(reduction_report(read_picture(picture), picture.name), (), out, told)
+    _finish(reduction_report(read_picture(picture), picture.name), (), out, output)
 
 
 _CHROMATICITIES = f"""Chromaticities of tables' lights as their cameras see them (figures of section 3.3).
@@ -356,7 +356,7 @@ def chromaticities(
     ] = None,
     out: Out = None,
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Show the chromaticities of tables' lights."""
     from evaluation.experiments.paper.material import read_truths
@@ -364,7 +364,7 @@ def chromaticities(
 
     _require_free(out)
     report = chromaticities_report(_open(luts), [read_truths(place) for place in truths or ()])
-    _finish(report, (), out, told)
+    _finish(report, (), out, output)
     if out is None:
         print("Name a folder with --out for the figure.")
 
@@ -374,18 +374,18 @@ def _treatment(data: SceneSet) -> str:
     return f"{'; '.join(f'{what}: {how}' for what, how in data.treatment.items())}."
 
 
-def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None, told: JsonOutput) -> None:
+def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None, output: JsonOutput) -> None:
     """Write the folder, if one was named, and print the tables."""
     from evaluation.experiments.paper.reporting import write_report
     from evaluation.reports.table_output import show_notes, show_tables
 
     if out is not None:
         write_report(report, out)
-    show_notes(told, conditions)
+    show_notes(output, conditions)
     for table in report.tables:
-        if not told.asked:
+        if not output.asked:
             print()
-        show_tables(told, [table])
+        show_tables(output, [table])
     if out is not None:
         print(f"\n{out / 'report.html'}")
 

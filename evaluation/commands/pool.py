@@ -37,7 +37,7 @@ def pool(
     ] = None,
     out: Annotated[Path | None, option("FOLDER", "Write the results to this new folder.")] = None,
     *,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Pool the results of several transfers."""
     from evaluation.experiments.pool import make_tables, pool_transfers, read_transfer, save_pool
@@ -56,6 +56,6 @@ def pool(
     tables = make_tables(made, chosen, base)
     if out is not None:
         save_pool(made, tables, [part.place for part in parts], chosen, out)
-    told.add(results=results, error=chosen, base=base)
-    show_tables(told, tables.shown, "")
-    show_notes(told, made.notes)
+    output.add(results=results, error=chosen, base=base)
+    show_tables(output, tables.shown, "")
+    show_notes(output, made.notes)

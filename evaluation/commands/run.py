@@ -70,7 +70,7 @@ def run(
     ] = None,
     *,
     reading: DataReading,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Evaluate methods on a data set."""
     from evaluation.experiments.run_folder import run_methods
@@ -94,15 +94,15 @@ def run(
         write_whole(csv, table_csv(made.results, error))
     if images is not None:
         write_whole(images, images_csv(found.scenes, made.results))
-    if told.asked:
+    if output.asked:
         table = statistics_rows(made.subject, made.results)
-        told.add(data_set=made.subject.name, images=len(made.subject.images))
-        told.add(errors=[dict(zip(table.columns, row, strict=True)) for row in table.rows])
+        output.add(data_set=made.subject.name, images=len(made.subject.images))
+        output.add(errors=[dict(zip(table.columns, row, strict=True)) for row in table.rows])
     else:
         print_table(summary_table(made.subject, made.results, error, statistics == "all"))
         for table in lights_tables(made.subject, made.results, error):
             print_table(table)
-    show_notes(told, made.notes, made.treatment)
+    show_notes(output, made.notes, made.treatment)
 
 
 def _require_free(csv: Path | None, images: Path | None, out: Path | None) -> None:

@@ -50,7 +50,7 @@ def train(
     seed: Annotated[int, option("N", "Of all that is random in the training.", min=0)] = 0,
     workers: Annotated[int | None, thread_option(" that read images; the model does not depend on it")] = None,
     reading: DataReading,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Train a method on a data set."""
     from evaluation.learning import adapting
@@ -97,13 +97,13 @@ def train(
         save_model(out, fitted, record)
     unused = sum(given is None for given in features)
     notes = [f"{unused} of {count} images have no usable pixel and were left out of the training"] if unused else []
-    told.add(model=out, method=learner.name, data_set=found.name, images=count, unused=unused, seed=seed)
+    output.add(model=out, method=learner.name, data_set=found.name, images=count, unused=unused, seed=seed)
     if isinstance(fitted.model, adapting.BlendedModel):
         share = float(fitted.model.share)
-        told.add(adapted_from=adapt, share=share)
+        output.add(adapted_from=adapt, share=share)
         notes.append(f"{adapt} answers with a share of {share:.2f}, what these images teach alone with {1 - share:.2f}")
     print(f"{out}: {learner.name}, {record.sentence()}")
-    show_notes(told, notes, found.treatment)
+    show_notes(output, notes, found.treatment)
 
 
 def _model_to_adapt(adapt: Path, method: str, data: str) -> StoredMethod:

@@ -123,7 +123,7 @@ def transfer(
     workers: Annotated[int | None, thread_option()] = None,
     *,
     reading: DataReading,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Train on generated data, test on real data; options of reading are those of the test set."""
     from dataclasses import asdict, replace
@@ -187,9 +187,9 @@ def transfer(
     outcome = TransferOutcome(counted, tested, plan, rows, figures, drawn, settings)
     if out is not None:
         save_outcome(outcome, out)
-    told.add(test=counted.name, error=error, settings=settings)
-    show_tables(told, list(outcome.tables()), "")
-    show_notes(told, plan.notes)
+    output.add(test=counted.name, error=error, settings=settings)
+    show_tables(output, list(outcome.tables()), "")
+    show_notes(output, plan.notes)
 
 
 def _learners(text: str) -> tuple[list[AnyLearner], list[str]]:
@@ -234,10 +234,10 @@ def _within(beside: BesideReal, folds: Sequence[npt.NDArray[np.int64]]) -> tuple
 
     least = min(len(each) - int(np.bincount(each).max()) for each in folds)
     left_out = [count for count in beside.counts if count is not None and count > least]
-    told = ", ".join(map(str, left_out))
+    asked = ", ".join(map(str, left_out))
     all_of_them = "all are those" if None in beside.counts else "--real all has a row beside those"
     notes = (
-        [f"No rows beside {told} real images: a fold that is tested leaves {least}; {all_of_them}"] if left_out else []
+        [f"No rows beside {asked} real images: a fold that is tested leaves {least}; {all_of_them}"] if left_out else []
     )
     return replace(beside, counts=tuple(count for count in beside.counts if count not in left_out)), notes
 
@@ -270,14 +270,14 @@ def _only(file: Path | None, test: SceneSet) -> tuple[SceneSet, npt.NDArray[np.i
         return test, np.arange(len(test.scenes), dtype=np.int64), ()
     names = read_names(file, [scene.name for scene in test.scenes])
     places = np.array([place for place, scene in enumerate(test.scenes) if scene.name in names], dtype=np.int64)
-    told = (
+    note = (
         f"{len(places)} of the {len(test.scenes)} images of {test.name} count, those of {file.name}; cross-validation "
         "trained on the others of all"
     )
     return (
         replace(test, scenes=tuple(scene for scene in test.scenes if scene.name in names), folds=None),
         places,
-        (told,),
+        (note,),
     )
 
 

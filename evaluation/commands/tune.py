@@ -40,7 +40,7 @@ def tune(
     ] = None,
     workers: Annotated[int | None, thread_option(", one image each; no number depends on it")] = None,
     reading: DataReading,
-    told: JsonOutput,
+    output: JsonOutput,
 ) -> None:
     """Choose a method's parameters on a data set."""
     from evaluation.experiments.cross_validation import settings_of, tune_family, tuning_rows, tuning_table
@@ -59,9 +59,9 @@ def tune(
         tuned = tune_family(family, found.name, found.scenes, errors, threads, step)
     if out is not None:
         write_whole(out, table_to_csv(tuning_rows(tuned)))
-    show_tables(told, [tuning_table(tuned)])
+    show_tables(output, [tuning_table(tuned)])
     best = tuned.settings[0]
-    told.add(data_set=found.name, images=count, family=family, chosen=best.text, spread=best.spread)
+    output.add(data_set=found.name, images=count, family=family, chosen=best.text, spread=best.spread)
     print(f"chosen: {best.text}, whose estimates spread least in green chromaticity ({best.spread:.5f})")
     print(
         "ground truths: not used for the choice"
@@ -69,4 +69,4 @@ def tune(
         + "; on other images the setting is evaluated as --method "
         + best.text
     )
-    show_notes(told, [], found.treatment)
+    show_notes(output, [], found.treatment)

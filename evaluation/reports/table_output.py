@@ -52,25 +52,25 @@ def print_table(table: Table) -> None:
         print(note)
 
 
-def show_tables(told: JsonOutput, tables: Sequence[Table], between: str | None = None) -> None:
+def show_tables(output: JsonOutput, tables: Sequence[Table], between: str | None = None) -> None:
     """Print tables, or add them to `tables` of the JSON object where one is asked for."""
     for table in tables:
-        if told.asked:
+        if output.asked:
             rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
             whole = {"title": table.title, "columns": table.columns, "rows": rows, "notes": table.notes}
-            told.append("tables", whole)
+            output.append("tables", whole)
             continue
         print_table(table)
         if between is not None:
             print(between)
 
 
-def show_notes(told: JsonOutput, notes: Sequence[str], treatment: Mapping[str, str] | None = None) -> None:
+def show_notes(output: JsonOutput, notes: Sequence[str], treatment: Mapping[str, str] | None = None) -> None:
     """Print notes and what was done to the images, or add them to the JSON object where one is asked for."""
-    if told.asked:
-        told.add(notes=list(notes))
+    if output.asked:
+        output.add(notes=list(notes))
         if treatment is not None:
-            told.add(treatment=dict(treatment))
+            output.add(treatment=dict(treatment))
         return
     for note in notes:
         print(note)
