@@ -198,9 +198,9 @@ class Covered:
         found = self._running(mutation.file, lines)
         # What runs on import runs in the test that happens to import it first, and is asked of all who use it.
         runs_once = not found or not _in_function(mutation.file, mutation.line)
-        name = _name_around(mutation.file, mutation.line)
+        around = _name_around(mutation.file, mutation.line)
         # A constant that nobody names is used by those who go through its module.
-        sought = [name if _uses(name) else Path(mutation.file).stem] if runs_once else []
+        sought = [around if _uses(around) else Path(mutation.file).stem] if runs_once else []
         for name in sought:
             for file, line in _uses(name):
                 tests = self._running(file, [line])

@@ -85,7 +85,7 @@ _SCHEDULE = (0.5, 0.2, 0.06, 0.015, 0.0, 0.0, 0.0)
 """Noise added to each white in turn, as a share of it: from that of the priors down to none."""
 
 _STEPS = 4
-"""Steps of Gauss and Newton for each of these."""
+"""Steps of Gauss and Newton for each of these, at most."""
 
 _STILL = 1e-6
 """Step, in standard deviations of what is known of any projector, after which no other follows."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -22,16 +22,18 @@ from experiment.measures.paper import FlatField
 
 _Array = npt.NDArray[np.float64]
 
+SaturationSource = Literal["frames", "raw files", "settings"]
+
 DIGITS = 6
 """Decimals of the gains, as `lut.json` stores them: samples are divided by the stored number, which undoes it."""
 
-SATURATION_FROM = {
+_SATURATION_FROM: dict[SaturationSource, str] = {
     "frames": "measured: photosites of this session reached it",
     "raw files": "the raw files' statement, which may be too high, as no photosite of a cell came near; "
     "no sample is affected, but white_level may be",
     "settings": "the settings of the computed camera",
 }
-"""What the saturation of a table may be known from, and how `lut.json` says it."""
+"""How `lut.json` says what the saturation of a table is known from."""
 
 LEAST_WHITES = 2
 """White frames that a drift needs: one shows a lamp, and not what becomes of it."""
@@ -45,7 +47,7 @@ def corrections(
     saturation_counts: int,
     fields: Sequence[FlatField],
     *,
-    saturation_from: str,
+    saturation_from: SaturationSource,
     gains: _Array | None = None,
     subtracted: _Array | None = None,
     at_zero: _Array | None = None,
@@ -53,7 +55,7 @@ def corrections(
     """Return what was done to the counts, in order, for `lut.json`.
 
     `black`: (L, 2, 2) float64 counts, black level of each light's frame. `saturation_counts`: raw count of saturation.
-    `saturation_from`: one of `SATURATION_FROM`. `gains`: (L, 3) the lamp's drift at each light; None without white
+    `saturation_from`: what says so. `gains`: (L, 3) the lamp's drift at each light; None without white
     frames. `subtracted`: (L, 3) counts, dark light of bare paper that was subtracted; None where none was to be.
     `at_zero`: (L,) share of each light's samples that are 0; None where it was not counted.
     """
@@ -75,7 +77,7 @@ def corrections(
             "how": f"cells with a count of {CLIPPING_SHARE:g} of it or more are unfit",
             "unit": "raw counts",
             "value": saturation_counts,
-            "from": SATURATION_FROM[saturation_from],
+            "from": _SATURATION_FROM[saturation_from],
         },
         {
             "name": "field",

@@ -365,12 +365,17 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
     of them allowed.
     """
     rows, columns = allowed.shape
-    halves = [(slice(0, (side + 1) // 2), slice((side + 1) // 2, side)) for side in allowed.shape]
-    quarters = [(down, across) for down in halves[0] for across in halves[1]]
+    middle_row, middle_column = (rows + 1) // 2, (columns + 1) // 2
+    quarters = [
+        (down, across)
+        for down in (slice(middle_row), slice(middle_row, rows))
+        for across in (slice(middle_column), slice(middle_column, columns))
+    ]
+    number = np.arange(allowed.size).reshape(allowed.shape)
+    members = [number[quarter][allowed[quarter]] for quarter in quarters]
     chosen = np.zeros_like(allowed)
-    places = [_places(allowed, quarter) for quarter in quarters]
-    for mine, quota in zip(places, _quotas([len(mine) for mine in places], count), strict=True):
-        chosen.flat[rng.choice(mine, quota, replace=False)] = True
+    for places, quota in zip(members, _quotas([len(places) for places in members], count), strict=True):
+        chosen.flat[rng.choice(places, quota, replace=False)] = True
     if count == 0:
         return chosen
     # In units of the mean distance between neighbours; found best by the nearest pair and the largest gap on A0.
@@ -378,24 +383,17 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
     down, across = _nearness(rows, sigma), _nearness(columns, sigma)
     # Equals are decided at random, by less than any difference that matters.
     crowd = down @ chosen.astype(np.float64) @ across.T + 1e-6 * rng.random(allowed.shape)
-    taken = np.where(allowed & ~chosen, 0.0, np.inf)
-    added = np.empty_like(crowd)
+    closed, own = np.where(allowed & ~chosen, 0.0, np.inf), np.empty_like(crowd)
     for row, column in rng.permutation(np.argwhere(chosen)):
-        crowd -= np.multiply(down[:, row, None], across[:, column], out=added)
-        taken[row, column] = 0.0
-        quarter = quarters[2 * int(2 * row // rows) + int(2 * column // columns)]
-        open_ = crowd[quarter] + taken[quarter]
-        row, column = np.add(np.unravel_index(open_.argmin(), open_.shape), [side.start for side in quarter])
-        crowd += np.multiply(down[:, row, None], across[:, column], out=added)
-        taken[row, column] = np.inf
-    return allowed & (taken > 0)
-
-
-def _places(allowed: _Slots, quarter: tuple[slice, slice]) -> npt.NDArray[np.intp]:
-    """Return (n,) int: which slots of a quarter, counted row by row over the whole grid, are allowed."""
-    inside = np.zeros_like(allowed)
-    inside[quarter] = allowed[quarter]
-    return np.flatnonzero(inside)
+        crowd -= np.multiply(down[:, row, None], across[:, column], out=own)
+        closed[row, column] = 0.0
+        quarter = quarters[2 * int(row >= middle_row) + int(column >= middle_column)]
+        # Nothing is emptiest where nothing may be.
+        free = crowd[quarter] + closed[quarter]
+        row, column = divmod(int(number[quarter].flat[free.argmin()]), columns)
+        crowd += np.multiply(down[:, row, None], across[:, column], out=own)
+        closed[row, column] = np.inf
+    return allowed & (closed > 0)
 
 
 def _nearness(count: int, sigma: float) -> npt.NDArray[np.float64]:
