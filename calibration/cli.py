@@ -406,6 +406,7 @@ def _make(
 def _check(
     session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None, output: JsonOutput
 ) -> None:
+    from calibration.figures.all_figures import FIGURES
     from calibration.pipeline.build import check
     from calibration.verdict import refusal
 
@@ -413,7 +414,11 @@ def _check(
     _print_result(result, output)
     if result.verdict.refused:
         raise QualityError(f"{session.folder}: {refusal(result.verdict, result.figures)}")
-    print(f"{session.folder}: the chart is found and is the one expected; a table can be built")
+    more = len(FIGURES) - len(result.verdict.rows)
+    print(
+        f"{session.folder}: the chart is found and is the one expected; {more} of {len(FIGURES)} figures are not known "
+        f"of one frame, build-lut {session.folder} LUT judges them"
+    )
 
 
 def _build(

@@ -283,6 +283,11 @@ class TableMeasurements:
     budget: Budget
 
     @property
+    def is_of_one_frame(self) -> bool:
+        """Whether these are a check's, which reads one light or white frame and compares it with no other."""
+        return self.lights.codes is None
+
+    @property
     def primary_lights(self) -> tuple[int, ...]:
         """Lights of red, green and blue alone at their full, by their numbers; () where one is missing."""
         found = {codes: light for light, codes in enumerate(self.session.codes)}

@@ -181,8 +181,8 @@ class Figure:
     - `why`: what goes wrong beyond.
     - `source`: where the numbers come from.
     - `remedy`: what to do about it; "" where it depends on what was found.
-    - `measure`: the value; None where it could not be measured: from one frame, on a chart without tags or with few
-      colours, without dark frames or a series of exposures.
+    - `measure`: the value; None where it could not be measured: on a chart without tags or with few colours, without
+      dark frames or a series of exposures. What takes more than one frame is `of_many_frames`.
     - `forecast`: the value from what a check has, where no check can know it `ONLY_OF_A_SESSION`.
     - `worst`: where its worst is on the report's page, whatever the verdict; else `NO_PLACE`.
     - `where`: frames, lights or place beyond the limit accepted, for a remark; else those `OF_ITS_CAUSE`.
@@ -243,6 +243,13 @@ class Figure:
         """Return its limit as in `report.json`."""
         keys = ("name", "title", "unit", "sense", "accept", "refuse", "why", "source", "remedy")
         return {key: getattr(self, key) for key in keys}
+
+
+def of_many_frames(
+    measure: Callable[[TableMeasurements], float | None],
+) -> Callable[[TableMeasurements], float | None]:
+    """Return the same for what takes all frames: None of a check, which reads one and would find nothing wrong."""
+    return lambda table: None if table.is_of_one_frame else measure(table)
 
 
 def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:

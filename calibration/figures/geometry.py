@@ -23,6 +23,7 @@ from calibration.figures.figure import (
     Line,
     SummaryRow,
     Worst,
+    of_many_frames,
 )
 from calibration.registration.register import (
     MAX_BLOCK_RESIDUAL_PX,
@@ -194,7 +195,7 @@ CORRECTION_RESIDUAL = Figure(
     source=SIMULATED + ": 0.3 to 0.5 % where light falls off towards the corners, and the means twice as good; 1.4 % "
     "in even light or on a chart of 512 colours, which do not show a veil of the usual 1 %",
     remedy=_LESS_VEIL,
-    measure=_left_by_lens, forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(_left_by_lens), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=_veil, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=(Line(70, _lens_row),),
 )  # fmt: skip
@@ -205,7 +206,7 @@ CORRECTION_WORST = Figure(
     source="geometry: by a cell of a twentieth of paper six times the veil's error; 3 % is three standard deviations "
     "of a mean of 300 counts; " + SIMULATED + ": 0.3 to 1.9 % where the mean is accepted",
     remedy=_LESS_VEIL,
-    measure=_left_in_worst_cell, forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(_left_in_worst_cell), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=_veil, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip

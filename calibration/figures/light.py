@@ -35,6 +35,7 @@ from calibration.figures.figure import (
     SummaryRow,
     Worst,
     format_value,
+    of_many_frames,
 )
 from calibration.radiometry.superposition import NODES
 from foundation.colorimetry import angles_deg
@@ -107,7 +108,7 @@ REPEATED_FILES = Figure(
     "repeated_files", "Frames whose file is that of another frame", "light", "", "at most", 0.0, None,
     why="one photograph stands for several: what changed between them, as the lamp's drift, was not seen",
     source="no two exposures have the same bytes", remedy="correct the list of frames that was imported",
-    measure=_repeated, forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(_repeated), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=_repeated_files, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
@@ -281,7 +282,9 @@ LINEARITY = Figure(
 )  # fmt: skip
 
 
-def _linearity_known(table: TableMeasurements) -> float:
+def _linearity_known(table: TableMeasurements) -> float | None:
+    if table.is_of_one_frame and table.sensor.linearity is None:
+        return None
     return float(table.sensor.linearity is not None or table.sensor.superposition.measured)
 
 

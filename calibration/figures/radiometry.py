@@ -38,6 +38,7 @@ from calibration.figures.figure import (
     Line,
     SummaryRow,
     Worst,
+    of_many_frames,
 )
 from experiment.measures.sensor import MAX_BLACK_DRIFT
 from experiment.measures.stains import added_light
@@ -175,7 +176,7 @@ SOFTER_BLEED = Figure(
     source=SIMULATED + ": 0.9 px of blur in one frame of a session with 0.5 px give 0.8 % and cells 1.2 % off, "
     "1.1 px 2 % and cells 4 % off",
     remedy="switch off autofocus and stabilisation, see that nothing shakes the camera",
-    measure=lambda table: table.added_bleed(_softest(table)), forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(lambda table: table.added_bleed(_softest(table))), forecast=ONLY_OF_A_SESSION,
     worst=lambda table, chart: Worst(f"blur σ {_softest(table).blur_px:.2f} px", _softest(table).record.file),
     where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
     cause=Explanation("frame", blur_evidence),
@@ -194,9 +195,9 @@ def _of_alike_frames(value: _FrameValue) -> Callable[[TableMeasurements], float 
 
     def measure(table: TableMeasurements) -> float | None:
         known = has_enough_cells(_cell_count(table))
-        return max((value(table, frame) for frame in table.frames), default=0.0) if known else None
+        return max(value(table, frame) for frame in table.frames) if known else None
 
-    return measure
+    return of_many_frames(measure)
 
 
 FRAME_SCATTER = Figure(
@@ -246,7 +247,7 @@ DISTURBED_CELLS = Figure(
     source=SIMULATED + ": none in healthy rooms; two cells next to each other, five standard deviations off, are one, "
     "unless the dark frames show them to be hot",
     remedy="see that nothing comes between lamp, print and camera",
-    measure=_disturbed, forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(_disturbed), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
     cause=Explanation("few cells", disturbed_evidence, follows=("unlike_block",)),
     drawing="worst", lines=NO_LINES,
@@ -268,7 +269,7 @@ REGISTERED_ANEW = Figure(
     "moved_anew", "Frames registered again", "geometry", "", "at most", 0, None,
     why="the chart or the camera moved between frames; the sampling grid followed", source=JUDGEMENT,
     remedy="fix camera and print, and let nobody walk about",
-    measure=lambda table: float(_registered_anew(table)) if len(table.frames) > 1 else None,
+    measure=of_many_frames(lambda table: float(_registered_anew(table))),
     forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("movement", movement_evidence),
     drawing="course", lines=(Line(120, _movement_row),),
@@ -287,7 +288,7 @@ OTHER_CAMERA = Figure(
     "other_camera", "Frames of another camera", "radiometry", "", "at most", 0, 0.5, foremost=True,
     why="a table is of one camera: another body sees other colours, and another model others yet",
     source="by definition", remedy="take these frames again with the session's camera",
-    measure=lambda table: float(len(table.origins.other_camera)), forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(lambda table: float(len(table.origins.other_camera))), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_camera),
     retake=lambda table, limit: [frame.record for frame in table.origins.other_camera],
     cause=Explanation("camera", camera_evidence),
@@ -298,7 +299,7 @@ OTHER_LENS = Figure(
     "other_lens", "Frames through another lens", "radiometry", "", "at most", 0, None,
     why="lenses tint, blur and shade each in its own way", source="by definition",
     remedy="take these frames again through the session's lens",
-    measure=lambda table: float(len(table.origins.other_lens)), forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(lambda table: float(len(table.origins.other_lens))), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_lens), retake=NO_FRAMES,
     cause=Explanation("camera", camera_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
@@ -315,7 +316,7 @@ OTHER_EXPOSURE = Figure(
     "at most", 0.01, 0.1, foremost=True,
     why="brightness would differ between lights that should be alike, and the noise with the ISO speed",
     source="shutter times are steps of 26 % apart, and are written rounded", remedy=_SAME_EXPOSURE,
-    measure=lambda table: table.origins.exposure_difference, forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(lambda table: table.origins.exposure_difference), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_exposure), retake=_otherwise_exposed,
     cause=Explanation("brightness", light_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
@@ -325,7 +326,7 @@ OTHER_ISO = Figure(
     "other_iso", "Frames of another ISO speed", "radiometry", "", "at most", 0, None,
     why="their noise is another, and so is the count at which they saturate; their exposure is judged apart",
     source="by definition", remedy=_SAME_EXPOSURE,
-    measure=lambda table: float(len(table.origins.other_iso)), forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(lambda table: float(len(table.origins.other_iso))), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_iso), retake=NO_FRAMES,
     cause=Explanation("iso", iso_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
@@ -336,8 +337,7 @@ WHITE_FRAMES = Figure(
     why="nothing says how the lamp drifted, whether the print has stains, or whether cells are of one colour",
     source="by definition; from two on a drift is seen",
     remedy="take white frames along with the lights (sequence.reference_every)",
-    measure=lambda table: float(len(table.white_frames)) if len(table.frames) > 1 else None,
-    forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(lambda table: float(len(table.white_frames))), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
@@ -354,7 +354,7 @@ BLACK_DRIFT_COUNTS = Figure(
     why="the sensor warmed up; each frame's own black is subtracted, but an error of it shows in dark cells of about "
     "30 counts",
     source=JUDGEMENT, remedy="let the camera run for some minutes before the session, and rest between frames",
-    measure=lambda table: table.black_drift, forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(lambda table: table.black_drift), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="course", lines=(Line(140, _black_row),),
 )  # fmt: skip

@@ -22,6 +22,7 @@ from calibration.figures.figure import (
     Line,
     SummaryRow,
     Worst,
+    of_many_frames,
 )
 from calibration.figures.light import percent, percents, worst_light
 from drivers.raw.rawfile import CLIPPING_SHARE
@@ -131,7 +132,9 @@ REFERENCE_SPREAD = Figure(
 )  # fmt: skip
 
 
-def _error_row(table: TableMeasurements) -> SummaryRow:
+def _error_row(table: TableMeasurements) -> SummaryRow | None:
+    if table.is_of_one_frame:
+        return None
     error = table.budget.expanded_deg
     value = f"{np.median(error):.2g}° median, {error.max():.2g}° worst light"
     note = f"k = {COVERAGE:g}; of the worst most is by {table.budget.main_cause(int(np.argmax(error))).title}"
@@ -147,7 +150,7 @@ TRUTH_MEDIAN_DEG = Figure(
     "truth_median_deg", "Expanded uncertainty of the ground truth, median light", "truth", "°", "at most", 0.4, 1.0,
     why="a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + ": a quarter of a good method's error; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=lambda table: float(np.median(table.budget.expanded_deg)), forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(lambda table: float(np.median(table.budget.expanded_deg))), forecast=ONLY_OF_A_SESSION,
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="budget", lines=(Line(190, _error_row),),
 )  # fmt: skip
@@ -165,7 +168,7 @@ TRUTH_WORST_DEG = Figure(
     "truth_worst_deg", "Expanded uncertainty of the ground truth, worst light", "truth", "°", "at most", 0.5, 3.0,
     why="under that light a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=lambda table: float(table.budget.expanded_deg.max()), forecast=ONLY_OF_A_SESSION,
+    measure=of_many_frames(lambda table: float(table.budget.expanded_deg.max())), forecast=ONLY_OF_A_SESSION,
     worst=_least_known, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="budget", lines=NO_LINES,
 )  # fmt: skip
@@ -187,12 +190,18 @@ def _saturation_row(table: TableMeasurements) -> SummaryRow:
     return SummaryRow("Saturation", f"{sensor.white_level} counts above black", note)
 
 
+def _brightest_share(table: TableMeasurements) -> float | None:
+    # Of one frame it is that of white, which a light's own frame does not show.
+    known = table.white_frames or not table.is_of_one_frame
+    return float(table.lights.white.max()) / table.sensor.white_level if known else None
+
+
 BRIGHTEST_SHARE = Figure(
     "brightest_share", "Bare paper under the brightest light, of saturation", "radiometry", "share", "at most", 0.9,
     CLIPPING_SHARE,
     why="the unevenness of the light carries cells into saturation",
     source=JUDGEMENT + ": 0.8 leaves room for 20 % unevenness", remedy="expose less",
-    measure=lambda table: float(table.lights.white.max()) / table.sensor.white_level,
+    measure=_brightest_share,
     forecast=lambda check: check.brightest_share,
     worst=_brightest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="lights", lines=(Line(150, _saturation_row),),
@@ -204,7 +213,9 @@ def _darkest(table: TableMeasurements, chart: Chart) -> Worst | None:
     return worst_light(table, int(np.argmin(paper)), f"{paper.min():.0f} counts") if len(paper) > 1 else None
 
 
-def _darkest_row(table: TableMeasurements) -> SummaryRow:
+def _darkest_row(table: TableMeasurements) -> SummaryRow | None:
+    if table.is_of_one_frame:
+        return None
     darkest = table.lights.white.max(axis=1).min()
     return SummaryRow("Darkest light", f"{darkest:.0f} counts", "its strongest channel on bare paper")
 
@@ -213,7 +224,8 @@ DARKEST_COUNTS = Figure(
     "darkest_counts", "Bare paper under the darkest light", "radiometry", "counts", "at least", 300.0, MIN_SIGNAL,
     why="25 samples of 300 counts have a mean good to 1 %, a print's dark colours a thirtieth of that",
     source="photon noise at 1.8 electrons a count, 6 counts of read noise", remedy="expose longer",
-    measure=lambda table: float(table.lights.white.max(axis=1).min()), forecast=lambda check: check.darkest_counts,
+    measure=of_many_frames(lambda table: float(table.lights.white.max(axis=1).min())),
+    forecast=lambda check: check.darkest_counts,
     worst=_darkest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="lights", lines=(Line(160, _darkest_row),),
 )  # fmt: skip

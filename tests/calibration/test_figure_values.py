@@ -74,6 +74,7 @@ def table(**more: object) -> Any:
         "lights_off_codes": lights_off_codes,
     }  # fmt: skip
     found: dict[str, Any] = {
+        "is_of_one_frame": False,
         "frames": frames,
         "white_frames": [frames[0], frames[4]],
         "white_drift": 0.02,
@@ -200,7 +201,6 @@ AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.arra
         (radiometry.DISTURBED_CELLS, {"registration": SimpleNamespace(mismatched_cells=np.zeros(69))}, None),
         (radiometry.REGISTERED_ANEW, {}, 2),
         (radiometry.WHITE_FRAMES, {}, 2),
-        (radiometry.WHITE_FRAMES, {"frames": TWICE[:1]}, None),
         (radiometry.OTHER_CAMERA, {"origins": FOREIGN}, 1),
         (geometry.TAGS_FOUND, {}, 3 / 4),
         # 17 / 2 less two pixels and three quarters is 2.61 times the blur; and what the lens brings.
@@ -222,6 +222,31 @@ AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.arra
 )
 def test_a_figure_measures(figure: Any, more: dict[str, Any], value: float | None) -> None:
     assert figure.measure(table(**more)) == (None if value is None else pytest.approx(value, rel=1e-3))
+
+
+@pytest.mark.parametrize(
+    "figure",
+    [
+        geometry.CORRECTION_RESIDUAL, geometry.CORRECTION_WORST, light.REPEATED_FILES, light.LINEARITY_KNOWN,
+        radiometry.SOFTER_BLEED, radiometry.FRAME_SCATTER, radiometry.UNLIKE_BLOCK, radiometry.DISTURBED_CELLS,
+        radiometry.REGISTERED_ANEW, radiometry.OTHER_CAMERA, radiometry.OTHER_LENS, radiometry.OTHER_EXPOSURE,
+        radiometry.OTHER_ISO, radiometry.WHITE_FRAMES, radiometry.BLACK_DRIFT_COUNTS, truth.TRUTH_MEDIAN_DEG,
+        truth.TRUTH_WORST_DEG, truth.DARKEST_COUNTS,
+    ],
+    ids=lambda figure: figure.name,
+)  # fmt: skip
+def test_a_check_of_one_frame_does_not_judge_what_takes_more(figure: Any) -> None:
+    known = {**lens_before(4096, measured=True, is_left_in=False), "black_drift": 0.5}
+    known["origins"] = SimpleNamespace(
+        other_camera=(), other_exposure=(), other_lens=(), other_iso=(), exposure_difference=0.0
+    )
+    assert figure.measure(table(**known)) is not None
+    assert figure.measure(table(**known, is_of_one_frame=True)) is None
+
+
+def test_a_check_of_a_light_does_not_say_how_bright_the_brightest_is() -> None:
+    assert truth.BRIGHTEST_SHARE.measure(table(is_of_one_frame=True)) == 0.5
+    assert truth.BRIGHTEST_SHARE.measure(table(is_of_one_frame=True, white_frames=())) is None
 
 
 def test_a_bend_is_what_counts_lack_for_certain_over_paper_s_levels() -> None:

@@ -101,13 +101,8 @@ def test_what_a_lens_leaves_is_a_figure_where_cells_are_enough_to_tell_it(
     cells: int, measured: bool, left_in: bool, told: bool
 ) -> None:
     table: Any = SimpleNamespace(
+        is_of_one_frame=False,
         registration=SimpleNamespace(mismatched_cells=np.zeros(cells)),
         lens=SimpleNamespace(measured=measured, is_left_in=left_in, left=0.003, left_worst=0.02),
     )
     assert geometry.CORRECTION_RESIDUAL.measure(table) == (0.003 if told else None)
-
-
-@pytest.mark.parametrize(("frames", "expected"), [(1, None), (2, 1.0), (5, 1.0)])
-def test_white_frames_are_counted_where_there_is_more_than_one_frame(frames: int, expected: float | None) -> None:
-    table: Any = SimpleNamespace(white_frames=("white",), frames=("frame",) * frames)
-    assert radiometry.WHITE_FRAMES.measure(table) == expected
