@@ -50,10 +50,10 @@ from generator.options import (
 from generator.progress import shown_progress
 
 if TYPE_CHECKING:
-    from generator.dataset.layouts import Description
     from generator.dataset.making import Workers
     from generator.dataset.plan import Plan
     from generator.dataset.reader import Dataset
+    from generator.dataset.records import Description
     from generator.rendering.matrices import ColourMatrix
 
 

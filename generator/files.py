@@ -39,7 +39,7 @@ import math
 import struct
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -53,7 +53,7 @@ from numpy import float32, uint8, uint16, uint32, uint64
 from drivers.raw.rawfile import Matrix, camera_matrix, decode_raw
 from drivers.tiff import CFA, D65, RGB, Tags, TiffTag, ValueType, head, rationals, text
 from foundation.compiled import compiled
-from foundation.errors import FormatError, InputError
+from foundation.errors import CropError, FormatError, InputError
 from generator.deflate import WIDEST, Packer
 
 Image = npt.NDArray[np.uint16]
@@ -425,6 +425,11 @@ def half_size(counts: Image) -> Image:
     return image
 
 
+def _whole(encode: Callable[[Image, ImageMetadata], bytes]) -> Callable[[Image, ImageMetadata], tuple[bytes]]:
+    """Return an encoder in pieces, of which there is one."""
+    return lambda image, metadata: (encode(image, metadata),)
+
+
 def _neutral(metadata: ImageMetadata) -> tuple[float, float, float]:
     """Return the light's white over its largest channel, as AsShotNeutral has it."""
     if not 1 <= metadata.white_level <= 65535:
@@ -438,15 +443,6 @@ def _neutral(metadata: ImageMetadata) -> tuple[float, float, float]:
     return red, green, blue
 
 
-_LIBRARIES: Final[dict[Format, tuple[str, ...]]] = {
-    "png": (),
-    "tiff": (),
-    "exr": ("isal",),
-    "jxl": ("imagecodecs",),
-    "dng": ("rawpy",),
-}
-"""Distributions that encode a format, or for a raw file name its colour matrix."""
-
 _JPEG_QUALITY: Final = 92
 """Of previews, on libjpeg's scale to 100: no blocks are visible."""
 
@@ -458,6 +454,53 @@ _DEFLATE_RATIO: Final = 1032
 """Bytes that deflate makes of one at most (RFC 1951: 258 of two bits)."""
 
 
+@dataclass(frozen=True)
+class FileFormat:
+    """A format of images' files.
+
+    - `pieces`: the file of an image (H, W, 3) uint16 and its light in pieces, whose memory may be used again for the
+      next one.
+    - `decode`: the array in the bytes of a file of that name, (H, W) or (H, W, channels), as it stands there.
+    - `media`: its media type; those of OpenEXR and DNG are not registered with IANA.
+    - `libraries`: distributions that encode it, or for a raw file name its colour matrix: their versions may change the
+      bytes of a file. None if CroP encodes it.
+    - `states_white`: whether it has a place for the white level that readers use; counts of the others may be stretched
+      over 16 bits.
+    - `smallest_side`: least width and height, px.
+    """
+
+    pieces: Callable[[Image, ImageMetadata], Iterable[bytes | memoryview]]
+    decode: Callable[[bytes, str], npt.NDArray[np.generic]]
+    media: str
+    libraries: tuple[str, ...] = ()
+    states_white: bool = False
+    smallest_side: int = 1
+
+
+FILE_FORMATS: Final[Mapping[Format, FileFormat]] = {
+    "png": FileFormat(png_pieces, lambda data, _: decode_png(data), "image/png"),
+    "tiff": FileFormat(_whole(encode_tiff), lambda data, _: decode_tiff(data), "image/tiff"),
+    "exr": FileFormat(
+        _whole(encode_exr), lambda data, _: decode_exr(data), "image/x-exr", libraries=("isal",), states_white=True
+    ),
+    "jxl": FileFormat(
+        lambda image, _: (encode_jxl(image),),
+        lambda data, _: decode_jxl(data),
+        "image/jxl",
+        libraries=("imagecodecs",),
+    ),
+    "dng": FileFormat(
+        _whole(encode_dng),
+        lambda data, name: half_size(decode_raw(data, Path(name)).counts),
+        "image/x-adobe-dng",
+        libraries=("rawpy",),
+        states_white=True,
+        smallest_side=SMALLEST_SIDE,
+    ),
+}
+"""All formats by name."""
+
+
 def suffix_of(form: Format) -> str:
     """Return the suffix of file names of that format, such as ``.png``."""
     return f".{form}"
@@ -467,12 +510,7 @@ def libraries_of(form: Format) -> tuple[str, ...]:
     """Return the distributions whose version may change the bytes of a file of that format; none if CroP encodes it."""
     if form == "jxl":
         imagecodecs()
-    return _LIBRARIES[form]
-
-
-def smallest_side(form: Format) -> int:
-    """Return the least width and height, px, of an image in that format."""
-    return SMALLEST_SIDE if form == "dng" else 1
+    return FILE_FORMATS[form].libraries
 
 
 def encode_image(image: Image, form: Format, metadata: ImageMetadata) -> bytes:
@@ -480,16 +518,7 @@ def encode_image(image: Image, form: Format, metadata: ImageMetadata) -> bytes:
 
     `image`: (H, W, 3) uint16, linear camera RGB.
     """
-    _check(image)
-    if form == "jxl":
-        return encode_jxl(image)
-    encode: dict[str, Callable[[Image, ImageMetadata], bytes]] = {
-        "png": encode_png,
-        "tiff": encode_tiff,
-        "exr": encode_exr,
-        "dng": encode_dng,
-    }
-    return encode[form](image, metadata)
+    return b"".join(map(bytes, encode_pieces(image, form, metadata)))
 
 
 def encode_pieces(image: Image, form: Format, metadata: ImageMetadata) -> Iterable[bytes | memoryview]:
@@ -498,9 +527,7 @@ def encode_pieces(image: Image, form: Format, metadata: ImageMetadata) -> Iterab
     Pieces of a PNG are encoded one after the other, so that a file of any size needs little memory.
     """
     _check(image)
-    if form == "png":
-        return png_pieces(image, metadata)
-    return (encode_image(image, form, metadata),)
+    return FILE_FORMATS[form].pieces(image, metadata)
 
 
 def _check(image: Image) -> None:
@@ -514,12 +541,10 @@ def decode_image(data: bytes, form: Format, what: str) -> Image:
     `data`: the file's bytes. Returns (H, W, 3) uint16, as it was encoded; of `dng` (H // 2, W // 2, 3), the half-size
     linear RGB of its mosaic: red, the mean of both greens, rounded up, and blue of each 2×2 block.
     """
-    if form == "dng":
-        return half_size(decode_raw(data, Path(what)).counts)
     require_plausible(data, what)
     try:
-        image = decode_array(data, form)
-    except InputError:
+        image = FILE_FORMATS[form].decode(data, what)
+    except CropError:
         raise
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -551,17 +576,6 @@ def require_plausible(data: bytes, what: str) -> None:
             left = len(data) - place - 12
             raise FormatError(f"{what}: a part of the PNG claims {size} bytes where {left} are left; make it again")
         place += size + 12
-
-
-def decode_array(data: bytes, form: Format) -> npt.NDArray[np.generic]:
-    """Return the array in a file's bytes, (H, W) or (H, W, channels), uint8, uint16 or float32, as it stands there."""
-    decode: dict[str, Callable[[bytes], npt.NDArray[np.generic]]] = {
-        "png": decode_png,
-        "tiff": decode_tiff,
-        "jxl": decode_jxl,
-        "exr": decode_exr,
-    }
-    return decode[form](data)
 
 
 DARK: Final = 1e-9

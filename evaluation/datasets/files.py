@@ -24,7 +24,7 @@ import numpy.typing as npt
 from evaluation.scene import Image
 from foundation import files
 from foundation.errors import FormatError, InputError, first_of
-from generator.files import decode_array
+from generator.files import decode_png, decode_tiff
 
 IMAGE_ENDINGS = (".png", ".tif", ".tiff", ".npy")
 """Of files that hold linear images of 16 bits or more."""
@@ -453,9 +453,9 @@ def _values(path: str) -> npt.NDArray[Any]:
             return np.asarray(np.load(path, allow_pickle=False))
         data = Path(path).read_bytes()
         if ending == ".png":
-            return decode_array(data, "png")
+            return decode_png(data)
         if ending in (".tif", ".tiff"):
-            return decode_array(data, "tiff")
+            return decode_tiff(data)
     except Exception as error:
         reason = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
         raise FormatError(f"{path} cannot be read: {reason or type(error).__name__}; restore it") from error

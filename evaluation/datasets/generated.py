@@ -12,8 +12,8 @@ from evaluation.datasets.options import choose
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
 from foundation.secret_texts import masked
-from generator.dataset.layouts import SPLITS, Entry
 from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.records import SPLITS, Entry
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from string import Template
 from typing import Any, Final
 
 from calibration.citation import bibtex, origin_lines, table_title
-from generator.dataset.joined import JOINED, JoinedLayout
-from generator.dataset.layouts import CROISSANT, DATASHEET, GROUND_TRUTH, SOURCES, Description, one_line, table_cell
-from generator.files import FULL, suffix_of
+from generator.dataset.layouts import LAYOUTS, FileLayout, JoinedLayout
+from generator.dataset.records import CROISSANT, DATASHEET, GROUND_TRUTH, SOURCES, Description, one_line, table_cell
+from generator.files import FILE_FORMATS, FULL, Format, suffix_of
 
 OPEN: Final = "**TO BE ANSWERED BY THE LAB.**"
 """What stands where only the makers of a dataset know the answer."""
@@ -277,24 +277,27 @@ def _front_matter(description: Description) -> str:
 
 def _configs(description: Description) -> str:
     """Return where the files of each part lie; of plain files the table of ground truths is what rows are read from."""
-    joined = _joined(description)
-    if joined is None or not joined.is_of_the_hub:
+    layout = _layout(description)
+    if not layout.is_of_the_hub:
         files = "  - split: train\n    path: ground_truth.csv\n"
     else:
         files = "".join(
-            f"  - split: {'train' if part == 'data' else part}\n    path: {part}/*.{joined.ending}\n"
-            for part in _parts(description)
+            f"  - split: {'train' if part == 'data' else part}\n    path: {pattern}\n"
+            for part in description.parts
+            for pattern in layout.patterns([part], "")
         )
     return f"configs:\n- config_name: default\n  data_files:\n{files}"
 
 
 def _reading(description: Description) -> str:
     """Return how the images are read without losing bits."""
-    form, joined = option(description, "format"), _joined(description)
-    if joined is not None:
-        return joined.reading
+    layout = _layout(description)
+    if isinstance(layout, JoinedLayout):
+        return layout.reading
+    names = layout.patterns(description.parts, f".{option(description, 'format')}")
+    files = " and ".join(f"`{name.replace('*', 'NNNNNN')}`" for name in names)
     return (
-        f"`images/NNNNNN.{form}` are linear, 16 bits where the format has them; `load_dataset` gives the rows of "
+        f"{files} are linear, 16 bits where the format has them; `load_dataset` gives the rows of "
         "`ground_truth.csv`, whose column `image` names the file. Pillow, and imageio by it, keep 8 of 16 bits of a "
         "PNG: use `cv2.imread(path, cv2.IMREAD_UNCHANGED)` (then BGR) or `generator.open_dataset`."
     )
@@ -340,15 +343,6 @@ _CONTEXT: Final = {
 }
 """The context that the specification recommends, "Appendix 1: JSON-LD context"."""
 
-_MEDIA: Final = {
-    "png": "image/png",
-    "tiff": "image/tiff",
-    "exr": "image/x-exr",
-    "jxl": "image/jxl",
-    "dng": "image/x-adobe-dng",
-}
-"""Media types of the formats of images; those of OpenEXR and DNG are not registered with IANA."""
-
 _TRUTH_COLUMNS: Final = (
     ("image", "sc:Text", "Name of the image, as in the images' files or shards."),
     ("source", "sc:Text", "Name of the picture that it shows."),
@@ -392,22 +386,17 @@ def croissant(description: Description, sums: Mapping[str, str]) -> str:
 
 def _files_of_images(description: Description) -> list[dict[str, Any]]:
     """Return the set of files that holds the images: themselves, or the shards that they lie in."""
-    joined = _joined(description)
-    if joined is None:
-        suffix = suffix_of(option(description, "format"))
-        media = _MEDIA.get(str(option(description, "format")), "application/octet-stream")
-        return [_file_set("image-files", [f"images/*{suffix}"], media)]
-    return [_file_set("shards", [f"{part}/*.{joined.ending}" for part in _parts(description)], joined.media)]
+    layout = _layout(description)
+    form: Format = option(description, "format")
+    patterns = layout.patterns(description.parts, suffix_of(form))
+    if isinstance(layout, JoinedLayout):
+        return [_file_set("shards", patterns, layout.media)]
+    return [_file_set("image-files", patterns, FILE_FORMATS[form].media)]
 
 
-def _joined(description: Description) -> JoinedLayout | None:
-    """Return the layout of a dataset; None where each image is a file of its own."""
-    return JOINED.get(option(description, "layout"))
-
-
-def _parts(description: Description) -> list[str]:
-    """Return the folders in which a dataset's shards lie."""
-    return [part for part, images in description.splits.items() if images] or ["data"]
+def _layout(description: Description) -> FileLayout | JoinedLayout:
+    """Return the layout of a dataset."""
+    return LAYOUTS[option(description, "layout")]
 
 
 def _file_set(name: str, includes: list[str], media: str) -> dict[str, Any]:
@@ -429,11 +418,11 @@ def _ground_truth() -> dict[str, Any]:
 
 def _images(description: Description) -> list[dict[str, Any]]:
     """Return the records of images: their files, or the columns of their shards."""
-    joined = _joined(description)
-    if joined is not None:
+    layout = _layout(description)
+    if isinstance(layout, JoinedLayout):
         fields = [
             _field("images", name, kind, text, {"fileSet": {"@id": "shards"}, "extract": {"column": name}})
-            for name, kind, text in joined.columns
+            for name, kind, text in layout.columns
         ]
         if not fields:
             return []

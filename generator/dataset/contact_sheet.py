@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.files import write_whole
-from generator.dataset.layouts import Entry, Light, Triple
 from generator.dataset.reader import Dataset
+from generator.dataset.records import Entry, Light, Triple
 from generator.lights.lighting import parse_mixture
 
 if TYPE_CHECKING:

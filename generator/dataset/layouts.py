@@ -1,329 +1,32 @@
-"""What a dataset is on disk: its records, the names of its files, and images that are files of their own.
+"""How the images of a dataset lie on disk: each in a file of its own, or those of a shard in one tar or Parquet file.
 
-The records are its description, lights and sources, and the record of each shard. A shard is a range of planned image
-numbers that is made by one task. Its record is written when everything else of it is on the disk: a shard with a record
-is done, one without is not.
-
-Images are files of their own here; those of a shard that lie in one file are `generator.dataset.joined`.
+docs/formats.md says what lies in a shard: POSIX.1-1988 ustar files whose members are named after the WebDataset
+specification, all with one owner, time and mode, so that equal images make equal files; or Parquet files that Hugging
+Face `datasets` reads, a row an image, which need pyarrow, the extra `parquet`. There only previews are decoded by
+themselves: Pillow, with which `datasets` would decode, keeps 8 of a 16-bit image's bits.
 """
 
 from __future__ import annotations
 
+import io
+import json
+import tarfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from types import TracebackType
-from typing import Any, Final, Literal, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, Final, NamedTuple, Protocol, Self, cast
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
-
-from calibration.citation import OriginRecord
+from foundation.errors import CropError, FormatError, InputError
 from foundation.files import HashingWriter
-from foundation.records import Record
-from generator.files import Format
-from generator.stores import Pieces, Store
-
-
-class SparseRecord(Record):
-    """A record of which keys that are None by default are left out while they are, so that files stay as they were."""
-
-    @model_serializer(mode="wrap")
-    def _without_none(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        left_out = {name for name, field in type(self).model_fields.items() if field.default is None}
-        return {key: value for key, value in serialise(self).items() if value is not None or key not in left_out}
-
-
-FORMAT: Final = "crop.dataset"
-VERSION: Final = 2
-"""Version 1 listed the sources in `dataset.json`; they have a table of their own since."""
-STRETCHED_VERSION: Final = 3
-"""Of datasets whose counts are stretched over 16 bits: software that knows nothing of it refuses them, and does not
-take their images for more than six times as bright."""
-
-GROUND_TRUTH: Final = "ground_truth.csv"
-GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")
-UNCERTAINTY_COLUMN: Final = "uncertainty_deg"
-"""Column of `ground_truth.csv` on request: what the light's direction may be off by, expanded (k = 2), degrees."""
-
-IMAGES: Final = "images.csv"
-SOURCES: Final = "sources.csv"
-SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile", "note")
-TRUTHS: Final = "gt.txt"
-SUMS: Final = "SHA256SUMS"
-DATASHEET: Final = "DATASHEET.md"
-CROISSANT: Final = "croissant.json"
-CARD: Final = "README.md"
-
-COMPLETED_BY_HAND: Final = (CARD, DATASHEET, CROISSANT)
-"""Files that a lab completes, so that no hash of them is recorded; nothing of this software reads them."""
-
-Triple = tuple[float, float, float]
-Details = dict[str, int | float | str]
-"""What options did to one image, by column of `images.csv`; all images of a dataset have the same columns."""
-
-Layout = Literal["folder", "webdataset", "parquet"]
-Scale = Literal["table", "full"]
-Split = Literal["train", "validation", "test"]
-SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
-
-
-class ReadingOptions(Record):
-    """What of the options of a dataset its readers need; they refuse values that no dataset is made with."""
-
-    format: Format
-    layout: Layout = "folder"
-    previews: bool
-    shard_images: int = Field(default=256, ge=1, le=1 << 32)
-    scale: Scale = "table"
-
-
-class TableRecord(SparseRecord):
-    """The table a dataset was made from; `sha256` as `calibration.table.lut.Lut.sha256`.
-
-    `computed` is what the table says of itself where nothing was photographed for it
-    (`calibration.table.lut.Provenance.computed`), `lights` how many
-    it has, `origin` with what, when and by whom its frames were taken; None where that was not kept.
-    """
-
-    sha256: str
-    camera: str
-    bits: int = Field(ge=1, le=8)
-    samples: int = Field(ge=1)
-    white_level: int = Field(ge=1, le=65535)
-    software: str
-    computed: dict[str, Any] | None = None
-    lights: int | None = Field(default=None, ge=1)
-    origin: OriginRecord | None = None
-
-
-class Light(SparseRecord):
-    """A light of the table that was used; `codes` as projected, `white` the ground truth in linear camera RGB.
-
-    Lights of a table that was computed under spectra of its own have a `name`, and codes that would show their colour.
-    `uncertainty_deg` is the expanded uncertainty (k = 2) of its direction, where the table states it.
-    """
-
-    illumination: int
-    kind: str
-    cct_k: float | None
-    codes: tuple[int, int, int]
-    white: Triple
-    name: str | None = None
-    uncertainty_deg: float | None = None
-
-    @property
-    def label(self) -> str:
-        """Return what to call it for a reader: its name, its temperature if a black body, else its codes."""
-        if self.name is not None:
-            return self.name
-        return f"{self.cct_k:.0f} K" if self.cct_k is not None else "{} {} {}".format(*self.codes)
-
-    @property
-    def cell(self) -> str:
-        """Return the label for a cell of a table in Markdown, and that it is codes where it is."""
-        return table_cell(self.label if self.name or self.cct_k is not None else f"codes {self.label}")
-
-
-def table_cell(text: str) -> str:
-    """Return a text that stays in its cell of a table in Markdown and is no markup of HTML."""
-    return one_line(text).replace("|", "\\|").replace("<", "&lt;")
-
-
-def one_line(text: str) -> str:
-    """Return a text that no other line of a file follows from: foreign tables name cameras as they like."""
-    return " ".join(text.split())
-
-
-class SourceRecord(Record):
-    """A source picture that was used.
-
-    - `position`: place in the list of sources, from 0; the choice of its lights depends on it.
-    - `name`, `sha256`: its name, and the hash of its file; no hash where it was made and not read.
-    - `profile`: how its colour profile was used, in words; None where it was made and not read.
-    - `width`, `height`: size of its images, px.
-    - `replaced_pixels`: pixels of colours that the table lists as unfit, which took the nearest fit colour.
-    - `split`: the part of the dataset that its images belong to; None where it was not divided.
-    - `note`: what is to be known of it, between semicolons: what it took to read it, or that it is black or tiny; None
-      for nothing.
-    - `weight`: by which it was drawn, 1 that of a picture neither favoured nor disfavoured; None where pictures were
-      not drawn.
-    """
-
-    position: int
-    name: str
-    sha256: str | None
-    profile: str | None = None
-    width: int
-    height: int
-    replaced_pixels: int
-    split: Split | None = None
-    note: str | None = None
-    weight: float | None = None
-
-
-class Skipped(Record):
-    """A source picture that could not be read; its numbers are left free."""
-
-    position: int
-    name: str
-
-
-class LightRow(Record):
-    """A light in an image: its number in the table, or what a mixture is called, and its ground truth of sum 1."""
-
-    illumination: str
-    truth: Triple
-
-
-class ImageRecord(Record):
-    """An image that was made; `truth` is the mean of its lights over its pixels, of sum 1; `details` as `Details`."""
-
-    number: int
-    position: int
-    truth: Triple
-    lights: list[LightRow]
-    details: Details = Field(default_factory=dict[str, int | float | str])
-
-
-class FileSum(Record):
-    """A file of the dataset and its SHA-256."""
-
-    name: str
-    sha256: str
-
-
-class FinishedImage(Record):
-    """An image of a shard that is not done; `files` are all of it, which were written before this was."""
-
-    image: ImageRecord
-    source: SourceRecord
-    files: list[FileSum]
-
-
-class RenderingSummary(Record):
-    """How the images of a dataset were rendered, where that is not by codes with the print's black kept.
-
-    - `outside`, `distance`: means over all pixels of the columns of `images.csv`: the share of colours that the print
-      cannot show, and by how many degrees they are missed. None where images were rendered by codes.
-    - `black_taken`: mean over all images of the share of the print's black that was taken out.
-    """
-
-    outside: float | None = None
-    distance: float | None = None
-    black_taken: float = 0.0
-
-
-class ShardRecord(Record):
-    """What a shard made; images and files in the order of their numbers, sources in that of their positions.
-
-    `lights` are those of the table that were used, alone or mixed.
-    """
-
-    shard: int
-    sources: list[SourceRecord]
-    skipped: list[Skipped]
-    images: list[ImageRecord]
-    files: list[FileSum]
-    lights: list[Light]
-
-
-class Description(SparseRecord):
-    """The content of `dataset.json`.
-
-    - `seed`, `options`: what the dataset is; with the table and the sources, enough to make every byte again.
-    - `planned`, `images`: images planned and made; the numbers of the rest are free.
-    - `sources`, `pixels`, `replaced_pixels`: sources used, their pixels together, and those of them whose colour was
-      replaced.
-    - `splits`: images in each part, where the dataset was divided.
-    - `lights`: the lights of the table that were used, alone or mixed.
-    - `skipped`: sources that could not be read.
-    - `rendering`: how images were rendered; None by codes with the print's black kept.
-    """
-
-    format: Literal["crop.dataset"] = FORMAT
-    version: Literal[2, 3] = VERSION
-    software: str
-    libraries: dict[str, str]
-    table: TableRecord
-    seed: int
-    options: dict[str, Any]
-    planned: int = Field(ge=0, le=1 << 32)
-    images: int = Field(ge=0, le=1 << 32)
-    sources: int = Field(ge=0, le=1 << 32)
-    pixels: int = Field(ge=0)
-    replaced_pixels: int = Field(ge=0)
-    splits: dict[str, int] = Field(default_factory=dict[str, int])
-    lights: list[Light]
-    skipped: list[Skipped]
-    rendering: RenderingSummary | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One image.
-
-    - `image`: its file name; in shards the name it would have as a file.
-    - `source`: its source's name.
-    - `lights`: number in the table, or name of the mixture, of each light in it.
-    - `truths`: ground truth (r, g, b) of sum 1 of each light.
-    - `truth`: mean of its lights over its pixels, of sum 1: the ground truth where there is one light.
-    - `split`: the part of the dataset it belongs to.
-    """
-
-    image: str
-    source: str
-    lights: tuple[str, ...]
-    truths: tuple[Triple, ...]
-    truth: Triple
-    split: Split | None = None
-
-    @property
-    def illumination(self) -> str:
-        """The light's number in the table or its name; of several the first."""
-        return self.lights[0]
-
-
-def image_key(number: int) -> str:
-    """Return the number of an image as file names have it: six digits, more where they are needed."""
-    return f"{number:06d}"
-
-
-def shard_key(shard: int) -> str:
-    """Return the number of a shard as file names have it."""
-    return f"{shard:06d}"
-
-
-_INFIXES: Final = {"images": "", "previews": ".preview", "masks": ".masks", "ground_truth": ".ground_truth"}
-
-
-def member_name(kind: str, key: str, ending: str) -> str:
-    """Return the name of a file of an image where the files of a shard lie in one: ``000123.masks_0.png``."""
-    return f"{key}{_INFIXES[kind]}{ending}"
-
-
-@dataclass(frozen=True)
-class Sample:
-    """An image with all that goes with it, ready to be written.
-
-    - `record`: its number, source and ground truth.
-    - `source`, `split`: its source's name, and the part of the dataset it belongs to.
-    - `width`, `height`: px.
-    - `files`: kind (`images`, `previews`, `masks`, `ground_truth`), what follows the number in the file's name, and the
-      bytes, which can be iterated over once; the image first.
-    - `stored`: files of it that are written already.
-    """
-
-    record: ImageRecord
-    source: str
-    split: Split | None
-    width: int
-    height: int
-    files: tuple[tuple[str, str, Pieces], ...]
-    stored: tuple[FileSum, ...] = ()
-
-    @property
-    def key(self) -> str:
-        """The number as file names have it."""
-        return image_key(self.record.number)
+from generator.dataset.records import FileSum, Sample, part_of, shard_key
+from generator.stores import Store, joined
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
 
 ExitReason = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
@@ -352,15 +55,15 @@ _SYNCED_PIXELS: Final = 1 << 23
 """Pixels of such images, for the same reason where images are large."""
 
 
-class FolderWriter:
-    """Each image in a file of its own: `images/000123.png`, `previews/000123.jpg`.
+class FileWriter:
+    """Each image in a file of its own, named by `FileLayout.place`.
 
     A thread of its own synchronises the files with the disk, a few at a time, while others are made; only the last few
     are waited for.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, store: Store, place: Callable[[str, str, str], str]) -> None:
+        self._store, self._place = store, place
         self._files: list[FileSum] = []
         self._thread = ThreadPoolExecutor(1)
         self._syncing: list[Future[None]] = []
@@ -371,7 +74,7 @@ class FolderWriter:
         """Write the files of a sample; return it without their bytes."""
         sums: list[FileSum] = []
         for kind, ending, data in sample.files:
-            name = f"{kind}/{sample.key}{ending}"
+            name = self._place(kind, part_of(sample.split), f"{sample.key}{ending}")
             with self._store.create(name) as stream:
                 hashed = HashingWriter(stream)
                 for piece in data:
@@ -405,3 +108,409 @@ class FolderWriter:
     def __exit__(self, *error: *ExitReason) -> None:
         """Leave the files where they are: whoever makes the shard again writes the same."""
         self._thread.shutdown(cancel_futures=True)
+
+
+class _Container(Protocol):
+    """A file of a shard in which the files of several images lie, while it is written."""
+
+    def append(self, sample: Sample) -> None:
+        """Write an image and what belongs to it."""
+        ...
+
+    def close(self) -> None:
+        """Write the end of the file."""
+        ...
+
+    def give_up(self) -> None:
+        """Write no end of a file that will not be."""
+        ...
+
+
+class JoinedWriter:
+    """The images of a shard in one file, `data/000003.tar` or `.parquet`, or in one for each part of the dataset.
+
+    `begin` makes such a file of the stream that it is written to.
+    """
+
+    def __init__(self, store: Store, shard: int, ending: str, begin: Callable[[HashingWriter], _Container]) -> None:
+        self._store, self._begin = store, begin
+        self._name = f"{shard_key(shard)}.{ending}"
+        self._stack = ExitStack()
+        self._open: dict[str, tuple[_Container, HashingWriter]] = {}
+
+    def store(self, sample: Sample) -> Sample:
+        """Return the sample with its bytes computed: such a file takes its images one after the other."""
+        return replace(sample, files=tuple((kind, ending, (joined(data),)) for kind, ending, data in sample.files))
+
+    def append(self, sample: Sample) -> None:
+        """Write an image and what belongs to it."""
+        name = f"{part_of(sample.split)}/{self._name}"
+        if name not in self._open:
+            hashed = HashingWriter(self._stack.enter_context(self._store.create(name)))
+            self._open[name] = (self._begin(hashed), hashed)
+        self._open[name][0].append(sample)
+
+    def close(self) -> list[FileSum]:
+        """Finish the files, bring them to the disk and return them."""
+        for container, _ in self._open.values():
+            container.close()
+        self._stack.close()
+        self._store.sync(self._open)
+        return [FileSum(name=name, sha256=self._open[name][1].sha256) for name in sorted(self._open)]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: *ExitReason) -> None:
+        """Leave no half file behind."""
+        for container, _ in self._open.values():
+            container.give_up()
+        self._stack.__exit__(*error)
+
+
+ShardWriter = FileWriter | JoinedWriter
+"""Writes the samples of one shard, in a block; files that are still open appear only if the block ends well.
+`store` is called from the thread that made a sample, `append` in the order of their numbers."""
+
+
+_INFIXES: Final = {"images": "", "previews": ".preview", "masks": ".masks", "ground_truth": ".ground_truth"}
+
+
+def _member_name(kind: str, key: str, ending: str) -> str:
+    """Return the name of a file of an image where the files of a shard lie in one: ``000123.masks_0.png``."""
+    return f"{key}{_INFIXES[kind]}{ending}"
+
+
+class _Tar:
+    """A tar file of images and what belongs to each."""
+
+    def __init__(self, stream: HashingWriter) -> None:
+        self._tar = tarfile.open(fileobj=cast("Any", stream), mode="w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
+
+    def append(self, sample: Sample) -> None:
+        text = json.dumps(metadata_of(sample), ensure_ascii=False) + "\n"
+        for kind, ending, pieces in (*sample.files, ("images", ".json", (text.encode(),))):
+            data = joined(pieces)
+            header = tarfile.TarInfo(_member_name(kind, sample.key, ending))
+            header.size = len(data)
+            header.mode = 0o644
+            self._tar.addfile(header, io.BytesIO(data))
+
+    def close(self) -> None:
+        self._tar.close()
+
+    def give_up(self) -> None:
+        pass
+
+
+def _read_tar(stream: BinaryIO, file: str) -> bytes | None:
+    """Return the bytes of a file in a tar file.
+
+    Only members that are plain files are looked at: a tar file may also hold links and sparse files, and claim sizes
+    that it does not have.
+    """
+    for name, offset, size in _members(stream):
+        if name == file:
+            stream.seek(offset)
+            return stream.read(size)
+    return None
+
+
+def _members(stream: BinaryIO) -> Iterator[tuple[str, int, int]]:
+    """Yield name, offset and size of the plain files of a tar file (POSIX.1-1988, ustar), as they follow each other."""
+    end = stream.seek(0, io.SEEK_END)
+    offset = 0
+    while offset < end:
+        stream.seek(offset)
+        block = stream.read(tarfile.BLOCKSIZE)
+        if not any(block):
+            return
+        header = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
+        offset += tarfile.BLOCKSIZE
+        if not 0 <= header.size <= end - offset:
+            raise tarfile.ReadError(f"{header.name!r} claims {header.size} bytes, {end - offset} are left")
+        if header.type in (tarfile.REGTYPE, tarfile.AREGTYPE):
+            yield header.name, offset, header.size
+        offset += -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+
+
+_GROUP_BYTES: Final = 4 << 20
+"""Bytes from which a group of rows is written: what a reader has to read to get at one image."""
+
+_GROUP_ROWS: Final = 64
+"""Rows of a group at most: small images stay quick to reach too."""
+
+_MOST_THRIFT_BYTES: Final = 64 << 20
+"""Longest text in the description of a shard, of which the longest of ours are a few kilobytes."""
+
+_MOST_THRIFT_ITEMS: Final = 1 << 20
+"""Things that a list in it may hold: ours hold columns and groups, some hundred."""
+
+_MOST_ROWS: Final = 1 << 16
+"""Rows of a group that is read: a thousand times those that are written."""
+
+_COLUMNS: Final = {"images": "image", "previews": "preview", "ground_truth": "ground_truth"}
+
+_FILE = {"decode": False, "_type": "Image"}
+
+_STRING = {"dtype": "string", "_type": "Value"}
+
+_INT = {"dtype": "int64", "_type": "Value"}
+
+_TRUTH = {"feature": {"dtype": "float64", "_type": "Value"}, "length": 3, "_type": "List"}
+
+
+def schema(previews: bool, maps: bool, details: bool) -> pa.Schema:
+    """Return the columns, and in their metadata the features as `datasets` reads them."""
+    import pyarrow as pa
+
+    file = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    truth = pa.list_(pa.float64(), 3)
+    columns: list[tuple[str, pa.DataType, Any]] = [
+        ("image", file, _FILE),
+        ("preview", file, {"_type": "Image"}),
+        ("number", pa.int64(), _INT),
+        ("source", pa.string(), _STRING),
+        ("split", pa.string(), _STRING),
+        ("width", pa.int64(), _INT),
+        ("height", pa.int64(), _INT),
+        ("truth", truth, _TRUTH),
+        (
+            "lights",
+            pa.list_(pa.struct([("illumination", pa.string()), ("truth", truth)])),
+            {"feature": {"illumination": _STRING, "truth": _TRUTH}, "_type": "List"},
+        ),
+        ("details", pa.string(), _STRING),
+        ("masks", pa.list_(file), {"feature": _FILE, "_type": "List"}),
+        ("ground_truth", file, _FILE),
+    ]
+    left_out = {"preview": not previews, "details": not details, "masks": not maps, "ground_truth": not maps}
+    kept = [column for column in columns if not left_out.get(column[0])]
+    features = {name: feature for name, _, feature in kept}
+    info = json.dumps({"info": {"features": features}})
+    return pa.schema([(name, kind) for name, kind, _ in kept]).with_metadata({"huggingface": info})
+
+
+class _Parquet:
+    """A Parquet file with one row an image."""
+
+    def __init__(self, stream: HashingWriter, columns: pa.Schema) -> None:
+        import pyarrow.parquet as pq
+
+        self._schema = columns
+        # Images are compressed already, and the few numbers beside them are not worth a reader's trouble.
+        self._writer: pq.ParquetWriter = pq.ParquetWriter(
+            stream, self._schema, compression="none", use_dictionary=False, write_statistics=["number"]
+        )
+        self._rows: list[dict[str, Any]] = []
+        self._size = 0
+
+    def append(self, sample: Sample) -> None:
+        metadata = metadata_of(sample)
+        row: dict[str, Any] = {"number": metadata.pop("image"), **metadata, "masks": []}
+        if "details" in row:
+            row["details"] = json.dumps(row["details"], ensure_ascii=False)
+        for kind, ending, pieces in sample.files:
+            data = joined(pieces)
+            self._size += len(data)
+            file = {"bytes": data, "path": f"{sample.key}{ending}"}
+            if kind == "masks":
+                row["masks"].append(file)
+            else:
+                row[_COLUMNS[kind]] = file
+        self._rows.append(row)
+        if self._size >= _GROUP_BYTES or len(self._rows) >= _GROUP_ROWS:
+            self._flush()
+
+    def close(self) -> None:
+        self._flush()
+        self._writer.close()
+
+    def give_up(self) -> None:
+        self._writer.is_open = False
+
+    def _flush(self) -> None:
+        import pyarrow as pa
+
+        if self._rows:
+            self._writer.write_table(pa.Table.from_pylist(self._rows, self._schema))
+        self._rows, self._size = [], 0
+
+
+def _cell_of(file: str) -> tuple[str, int | None]:
+    """Return the column that has a file, named as in a tar file, and its place where it is one of several."""
+    kind = file.split(".")[1:-1]
+    if not kind:
+        return "image", None
+    name, several, place = kind[0].partition("masks_")
+    return ("masks", int(place)) if several else (name, None)
+
+
+def _read_parquet(stream: BinaryIO, file: str) -> bytes | None:
+    """Return the bytes of a file, named as in a tar file, in a Parquet file."""
+    import pyarrow.parquet as pq
+
+    number = int(file.partition(".")[0])
+    column, place = _cell_of(file)
+    size = stream.seek(0, 2)
+    table = pq.ParquetFile(
+        stream, thrift_string_size_limit=_MOST_THRIFT_BYTES, thrift_container_size_limit=_MOST_THRIFT_ITEMS
+    )
+    for group in range(table.num_row_groups):
+        # Our writer compresses nothing: a group that claims more than the file has is none of ours.
+        known = table.metadata.row_group(group)
+        if not (0 <= known.num_rows <= _MOST_ROWS and 0 <= known.total_byte_size <= 2 * size + 65536):
+            raise ValueError(f"it claims {known.num_rows} rows of {known.total_byte_size} bytes in a group")
+        numbers = table.read_row_group(group, ["number"]).column("number").to_pylist()
+        if number in numbers:
+            cells = table.read_row_group(group, [column]).column(column).to_pylist()
+            cell = cells[numbers.index(number)]
+            data = (cell if place is None else cell[place])["bytes"]
+            if not isinstance(data, bytes):
+                raise ValueError(f"{file} is no file")
+            return data
+    return None
+
+
+class Beside(NamedTuple):
+    """What a dataset has beside images and their lights: previews, maps of several lights, what options did."""
+
+    previews: bool
+    maps: bool
+    details: bool
+
+
+@dataclass(frozen=True)
+class FileLayout:
+    """A layout in which each image is a file of its own.
+
+    - `place`: name in the dataset of a file of some kind (`images`, `previews`, `masks`, `ground_truth`), of a part of
+      the dataset (`data` where it is not divided), and of its own name, such as ``000123.png``.
+    """
+
+    place: Callable[[str, str, str], str]
+    library: ClassVar[str] = ""
+    is_of_the_hub: ClassVar[bool] = False
+
+    def open_writer(self, store: Store, shard: int, beside: Beside) -> FileWriter:
+        """Return the writer of a shard."""
+        del shard, beside
+        return FileWriter(store, self.place)
+
+    def name_of(self, kind: str, part: str, shard: int, key: str, ending: str) -> str:
+        """Return the name of an image's file in the dataset."""
+        del shard
+        return self.place(kind, part, f"{key}{ending}")
+
+    def get(self, store: Store, name: str) -> bytes:
+        """Return the bytes of a file by its name."""
+        return store.get(name)
+
+    def folder(self, kind: str, parts: Sequence[str]) -> str | None:
+        """Return the folder of all files of a kind; None where they lie in several."""
+        folders = {self.place(kind, part, "").removesuffix("/") for part in parts}
+        return folders.pop() if len(folders) == 1 else None
+
+    def patterns(self, parts: Sequence[str], ending: str) -> list[str]:
+        """Return the patterns of the images' files, which end in `ending`."""
+        return list(dict.fromkeys(self.place("images", part, f"*{ending}") for part in parts))
+
+
+@dataclass(frozen=True)
+class JoinedLayout:
+    """A layout in which the images of a shard lie in one file.
+
+    - `ending`, `media`: of such a file: its name's, and its media type.
+    - `begin`: begins one on a stream.
+    - `read`: returns the bytes of an image's file that lies in one, named as in a tar file (``000123.masks_0.png``);
+      None where it has no such. Whatever else it raises says that the file is damaged.
+    - `library`: by which it is written and read; "" where Python suffices.
+    - `is_of_the_hub`: whether Hugging Face's `load_dataset` finds the images in it; else it finds the table of lights.
+    - `reading`: for the dataset's card, how images are read without losing bits.
+    - `columns`: name, type and description of those that Croissant's loaders find in it.
+    """
+
+    ending: str
+    media: str
+    begin: Callable[[HashingWriter, Beside], _Container]
+    read: Callable[[BinaryIO, str], bytes | None]
+    library: str
+    is_of_the_hub: bool
+    reading: str
+    columns: tuple[tuple[str, str, str], ...]
+
+    def open_writer(self, store: Store, shard: int, beside: Beside) -> JoinedWriter:
+        """Return the writer of a shard."""
+        return JoinedWriter(store, shard, self.ending, lambda stream: self.begin(stream, beside))
+
+    def name_of(self, kind: str, part: str, shard: int, key: str, ending: str) -> str:
+        """Return the name of an image's file: that of its shard in the dataset, and its own in there."""
+        return f"{part}/{shard_key(shard)}.{self.ending}/{_member_name(kind, key, ending)}"
+
+    def get(self, store: Store, name: str) -> bytes:
+        """Return the bytes of a file by its name."""
+        container, _, file = name.rpartition("/")
+        with store.open(container) as stream:
+            try:
+                data = self.read(stream, file)
+            except CropError:
+                raise
+            except Exception as error:
+                # Whatever a foreign file makes of the library: its own errors, and those of values that are missing.
+                reason = " ".join(f"{type(error).__name__}: {error}".split())
+                raise FormatError(f"{store.place}/{container} is damaged: {reason}; make the dataset again") from error
+        if data is None:
+            raise FormatError(f"{store.place}/{container} holds no {file}; make the dataset again")
+        return data
+
+    def patterns(self, parts: Sequence[str], ending: str) -> list[str]:
+        """Return the patterns of the files that images lie in."""
+        del ending
+        return [f"{part}/*.{self.ending}" for part in parts]
+
+
+_HUB_READING: Final = (
+    "`load_dataset` finds the parts. Its decoder, Pillow, keeps 8 of 16 bits: decode the bytes with "
+    "`cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)` (then BGR), with "
+    '`.cast_column("png", Image(decode=False))` before it in WebDataset shards; or read with '
+    "`generator.open_dataset`."
+)
+
+
+LAYOUTS: Final[Mapping[str, FileLayout | JoinedLayout]] = {
+    "folder": FileLayout(place=lambda kind, part, name: f"{kind}/{name}"),
+    "webdataset": JoinedLayout(
+        ending="tar",
+        media="application/x-tar",
+        begin=lambda stream, _: _Tar(stream),
+        read=_read_tar,
+        library="",
+        is_of_the_hub=True,
+        reading=_HUB_READING,
+        # Members of archives that a pattern names cannot be told to loaders; WebDataset's own reader finds them.
+        columns=(),
+    ),
+    "parquet": JoinedLayout(
+        ending="parquet",
+        media="application/x-parquet",
+        begin=lambda stream, beside: _Parquet(stream, schema(*beside)),
+        read=_read_parquet,
+        library="pyarrow",
+        is_of_the_hub=True,
+        reading=_HUB_READING,
+        columns=(
+            ("number", "sc:Integer", "Number of the image."),
+            ("source", "sc:Text", "Name of the picture that it shows."),
+            ("width", "sc:Integer", "Width, px."),
+            ("height", "sc:Integer", "Height, px."),
+        ),
+    ),
+}
+"""All layouts by name."""
+
+
+def require_library(layout: str) -> None:
+    """Refuse a layout whose library is not installed."""
+    library = LAYOUTS[layout].library
+    if library and find_spec(library) is None:
+        raise InputError(f"the layout {layout} needs {library}; install it with: pip install {library}")

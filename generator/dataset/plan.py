@@ -27,9 +27,9 @@ from foundation.errors import InputError
 from foundation.files import file_sha256
 from foundation.secret_texts import masked_values
 from foundation.version import software
-from generator.dataset.joined import library_of, require_library
-from generator.dataset.layouts import SPLITS, Layout, Scale, Split, TableRecord
-from generator.files import FORMATS, Format, libraries_of
+from generator.dataset.layouts import LAYOUTS, require_library
+from generator.dataset.records import SPLITS, Layout, Scale, Split, TableRecord
+from generator.files import FILE_FORMATS, FORMATS, Format, libraries_of
 from generator.pictures.sources import PictureFile
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.black_points import KEEP, BlackPoint
@@ -45,9 +45,6 @@ if TYPE_CHECKING:
 
 SHARD_IMAGES: Final = 256
 """Images of a shard unless said otherwise: all that a kill can cost, for each shard that was being made."""
-
-STRETCHED: Final[tuple[Format, ...]] = ("png", "tiff", "jxl")
-"""Formats without a place for the white level that readers use, whose counts may be stretched over 16 bits."""
 
 RENDERING_VERSION: Final = 4
 """Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options.
@@ -170,10 +167,11 @@ class DatasetOptions:
             raise InputError(f"shards of {self.shard_images} images were asked for, expected 1 or more")
         if self.bits is not None and not 1 <= self.bits <= 8:
             raise InputError(f"{self.bits} bits of each code were to be kept, expected 1 to 8")
-        if self.scale == "full" and self.form not in STRETCHED:
+        if self.scale == "full" and FILE_FORMATS[self.form].states_white:
+            stretched = [form for form, known in FILE_FORMATS.items() if not known.states_white]
             raise InputError(
                 f"counts of {self.form} are not stretched: the file says what white is; use one of "
-                f"{', '.join(STRETCHED)}, or leave the scale as it is"
+                f"{', '.join(stretched)}, or leave the scale as it is"
             )
         if self.split_exact and self.split is None:
             raise InputError("exact parts were asked for without their sizes; give a split such as 0.8,0.1,0.1")
@@ -450,7 +448,7 @@ def versions(form: Format, layout: Layout) -> dict[str, str]:
     Other versions may give other bytes.
     """
     names = {"isal", "numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "scipy", "simplejpeg"}
-    needed = {*libraries_of(form), library_of(layout)} - {""}
+    needed = {*libraries_of(form), LAYOUTS[layout].library} - {""}
     return {name: importlib.metadata.version(name) for name in sorted(names | needed)}
 
 

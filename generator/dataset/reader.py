@@ -25,8 +25,8 @@ from pydantic import ValidationError
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError, counted
 from foundation.files import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object, stream_sha256
-from generator.dataset.joined import JOINED, read_member
-from generator.dataset.layouts import (
+from generator.dataset.layouts import LAYOUTS, require_library
+from generator.dataset.records import (
     COMPLETED_BY_HAND,
     FORMAT,
     GROUND_TRUTH,
@@ -44,8 +44,7 @@ from generator.dataset.layouts import (
     SourceRecord,
     Split,
     Triple,
-    member_name,
-    shard_key,
+    part_of,
 )
 from generator.files import decode_image, from_full_scale
 from generator.lights.lighting import parse_mixture
@@ -275,7 +274,7 @@ class Dataset:
 
         Counts that were stretched over 16 bits are as they were before.
         """
-        name = self._name(entry.image, entry.split, "images")
+        name = self._name(entry, "images", PurePosixPath(entry.image).suffix)
         image = decode_image(self._bytes(name), self._options.format, f"{self.store.place}/{name}")
         if self._options.scale == "full":
             return from_full_scale(image, self.description.table.white_level)
@@ -285,7 +284,7 @@ class Dataset:
         """Return the JPEG file of an image's preview, or None if the dataset has none."""
         if not self._options.previews:
             return None
-        return self._beside(entry, "previews", ".jpg")
+        return self._bytes(self._name(entry, "previews", ".jpg"))
 
     def read_weights(self, entry: Entry) -> npt.NDArray[np.float32]:
         """Return how the lights of an image share its pixels: (H, W, K) float32.
@@ -301,7 +300,7 @@ class Dataset:
 
     @property
     def layout(self) -> str:
-        """Its layout: ``folder``, or a name of `generator.dataset.joined.JOINED`."""
+        """Its layout: ``folder``, or a name of `generator.dataset.layouts.JOINED`."""
         return self._options.layout
 
     @cached_property
@@ -341,33 +340,24 @@ class Dataset:
         """Return the text of a list."""
         return read_bounded(self.store, name, MOST_LIST_BYTES).decode("utf-8", "replace")
 
-    def _name(self, file: str, split: str | None, kind: str) -> str:
-        if self.layout == "folder":
-            return f"{kind}/{file}"
-        number = int(file.partition(".")[0])
-        shard = shard_key(number // self._options.shard_images)
-        return f"{split or 'data'}/{shard}.{JOINED[self.layout].ending}/{file}"
-
     def _map(self, entry: Entry, kind: str, ending: str) -> bytes:
         """Return the file of a map that lies beside an image of several lights."""
         if len(entry.lights) == 1:
             raise InputError(f"one light falls on {entry.image}, so that it has no masks; see its truth")
-        return self._beside(entry, kind, ending)
+        return self._bytes(self._name(entry, kind, ending))
 
-    def _beside(self, entry: Entry, kind: str, ending: str) -> bytes:
-        """Return a file that lies beside an image."""
+    def _name(self, entry: Entry, kind: str, ending: str) -> str:
+        """Return the name of one of an image's files."""
         key = PurePosixPath(entry.image).stem
-        file = f"{key}{ending}" if self.layout == "folder" else member_name(kind, key, ending)
-        return self._bytes(self._name(file, entry.split, kind))
+        shard = _number(entry.image) // self._options.shard_images
+        return LAYOUTS[self.layout].name_of(kind, part_of(entry.split), shard, key, ending)
+
+    def _bytes(self, name: str) -> bytes:
+        require_library(self.layout)
+        return LAYOUTS[self.layout].get(self.store, name)
 
     def _of(self, entry: Entry, what: str) -> str:
         return f"{self.store.place}, the {what} of {entry.image},"
-
-    def _bytes(self, name: str) -> bytes:
-        if self.layout == "folder":
-            return self.store.get(name)
-        container, _, file = name.rpartition("/")
-        return read_member(self.layout, self.store, container, file)
 
 
 def open_dataset(place: Path | str) -> Dataset:

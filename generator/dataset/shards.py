@@ -50,8 +50,9 @@ from foundation.folders import publish_folder, require_free
 from foundation.records import from_json
 from foundation.version import software
 from generator.dataset.cards import card, croissant, datasheet
-from generator.dataset.joined import Beside, ShardWriter, open_writer
-from generator.dataset.layouts import (
+from generator.dataset.layouts import LAYOUTS, Beside, ShardWriter
+from generator.dataset.plan import DatasetOptions, ShardJob, versions
+from generator.dataset.records import (
     CARD,
     COMPLETED_BY_HAND,
     CROISSANT,
@@ -84,7 +85,6 @@ from generator.dataset.layouts import (
     image_key,
     shard_key,
 )
-from generator.dataset.plan import DatasetOptions, ShardJob, versions
 from generator.files import suffix_of
 from generator.lights.lighting import Lighting, Mixture
 from generator.pictures.sources import Cut, Picture, Source, hash_since, keep_bits
@@ -434,7 +434,8 @@ def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
     options = job.options
     lightings = job.choice.lightings_of(job.position * options.crops)
     maps = options.tints or any(lighting.masks is not None for lighting in lightings)
-    return open_writer(options.layout, place.files, job.shard, Beside(options.previews, maps, options.has_details))
+    beside = Beside(options.previews, maps, options.has_details)
+    return LAYOUTS[options.layout].open_writer(place.files, job.shard, beside)
 
 
 @contextmanager
@@ -512,7 +513,7 @@ def _wanted(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
 
 
 def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedImage]) -> _ReadSource:
-    from generator.files import smallest_side
+    from generator.files import FILE_FORMATS
     from generator.kernels.unfit import replace_unfit_colours
 
     known = _known_source(job, job.position + place, finished) if finished else None
@@ -533,7 +534,7 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
         # Mixtures of cells hold fit ones alone.
         fit = [(cut.picture, 0) for cut in whole]
     height, width = scene.picture.shape[:2]
-    least = smallest_side(job.options.form)
+    least = FILE_FORMATS[job.options.form].smallest_side
     if min(height, width) < least:
         raise FormatError(
             f"{source.name} is {width}x{height} px, too small for {job.options.form}, which takes {least}x{least} and "

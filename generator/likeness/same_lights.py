@@ -21,8 +21,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foundation.errors import FormatError, InputError, first_of
-from generator.dataset.layouts import GROUND_TRUTH, Light
+from generator.dataset.layouts import LAYOUTS, FileLayout
 from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.records import GROUND_TRUTH, Light
 from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture
 from generator.masks.making import GivenMaskPlan, find_masks
 from generator.pictures.random_scenes import RandomScene
@@ -239,10 +240,11 @@ def _masks_of(dataset: Dataset) -> GivenMaskPlan | None:
     together = max(len(entry.lights) for entry in dataset.entries)
     if together == 1:
         return None
-    place = dataset.store.place
-    if is_remote(place) or dataset.layout != "folder":
+    place, layout = dataset.store.place, LAYOUTS[dataset.layout]
+    folder = layout.folder("masks", dataset.description.parts) if isinstance(layout, FileLayout) else None
+    if is_remote(place) or folder is None:
         raise InputError(
             f"several lights fall on the images of {place}, whose masks are needed as files of this machine; it has "
             f"the layout {dataset.layout}: copy it here, or make it in the layout folder"
         )
-    return find_masks(local_path(place) / "masks", together)
+    return find_masks(local_path(place) / folder, together)

@@ -36,7 +36,7 @@ from evaluation.datasets.files import Folder, Light, Mask, RawScene, chart_mask,
 from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.errors import FormatError, InputError, first_of
-from generator.files import decode_array
+from generator.files import decode_png
 
 _SONY: Final = (128.0, 4095.0)
 """Black level and saturation of Sony's .tiff files (1_make_mixture_map.py)."""
@@ -350,7 +350,7 @@ def _by_place(folder: Folder) -> dict[str, list[tuple[str, str]]]:
 def _read_mask(path: str, shape: tuple[int, int]) -> Mask:
     """Return (H, W) bool, True where a picture of one channel is 0."""
     try:
-        picture = decode_array(Path(path).read_bytes(), "png")
+        picture = decode_png(Path(path).read_bytes())
     except Exception as error:
         raise FormatError(f"{path} cannot be read: {error}; make it again with 2_preprocess_data.py") from error
     if picture.shape != shape:

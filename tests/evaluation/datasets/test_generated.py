@@ -17,9 +17,9 @@ from evaluation.datasets.options import DataOptions
 from evaluation.experiments.folds import group_of
 from evaluation.scene import MixedScene
 from foundation.errors import InputError
-from generator.dataset.layouts import Layout
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
+from generator.dataset.records import Layout
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks

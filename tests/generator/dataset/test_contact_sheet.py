@@ -11,10 +11,10 @@ import pytest
 
 from generator.dataset.contact_sheet import MAX_COLUMNS, MAX_ROWS, contact_sheet
 from generator.dataset.contact_sheet import _draw as draw
-from generator.dataset.layouts import Entry
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
+from generator.dataset.records import Entry
 from generator.lights.lighting import LightChoice, ListedLights, RandomLights, mixture_of
 from generator.pictures.random_scenes import random_scenes
 from tests.generator.conftest import MakeLut

@@ -15,10 +15,10 @@ from calibration.citation import OriginRecord
 from calibration.table.lut import Lut
 from generator.dataset.cards import card, croissant, datasheet, size_category
 from generator.dataset.contact_sheet import _draw as draw  # before it is painted
-from generator.dataset.layouts import Description, Layout
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset
+from generator.dataset.records import Description, Layout
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import LightChoice, ListedLights, RandomLights, mixture_of
 from generator.masks.making import parse_masks

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, cast, get_args, get_type_hints
 
 import cv2
 import numpy as np
@@ -19,11 +19,12 @@ import numpy.typing as npt
 import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.joined import JOINED
-from generator.dataset.layouts import COMPLETED_BY_HAND, Layout
+from generator.dataset import layouts
+from generator.dataset.layouts import FileLayout, JoinedLayout
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset, file_faults, open_dataset
+from generator.dataset.records import COMPLETED_BY_HAND, Layout
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights
 from generator.masks.making import parse_masks
@@ -39,6 +40,7 @@ Make = Callable[..., Dataset]
 
 SCENES = random_scenes(9, 28, 24, 8)
 LAYOUTS: tuple[Layout, ...] = get_args(Layout)
+JOINED: tuple[Layout, ...] = tuple(name for name in LAYOUTS if isinstance(layouts.LAYOUTS[name], JoinedLayout))
 
 
 @pytest.fixture
@@ -66,7 +68,7 @@ def place_of(made: Dataset) -> Path:
 
 def test_every_layout_is_offered() -> None:
     offered = get_type_hints(ImageOptions)["layout"]
-    assert LAYOUTS == get_args(offered) == ("folder", *JOINED)
+    assert LAYOUTS == get_args(offered) == tuple(layouts.LAYOUTS)
 
 
 @pytest.mark.parametrize("form", ["png", "tiff", "exr", "jxl", "dng"])
@@ -80,6 +82,31 @@ def test_every_format_is_the_same_image_in_every_layout(make: Make, form: str) -
         for other in others:
             np.testing.assert_array_equal(other.read_image(entry), image)
             assert other.read_preview(entry) == folder.read_preview(entry) != None  # noqa: E711
+
+
+@pytest.mark.parametrize("split", [None, (0.6, 0.0, 0.4)])
+def test_another_layout_of_files_is_one_entry(make: Make, monkeypatch: pytest.MonkeyPatch, split: Any) -> None:
+    lights = SimultaneousLights(ListedLights((2, 0)), 2, parse_masks("half-plane", 2, 5))
+    usual = make("folder", lights, split=split)
+    images = [(usual.read_image(one), usual.read_weights(one), usual.read_preview(one)) for one in usual.entries]
+    entry = FileLayout(place=lambda kind, part, name: f"{part}/{kind}/{name}")
+    monkeypatch.setitem(cast("dict[str, Any]", layouts.LAYOUTS), "folder", entry)
+    other = make("folder", lights, split=split)
+    parts = {"train", "test"} if split else {"data"}
+    assert {path.parts[-3] for path in place_of(other).rglob("*.png")} == parts
+    assert list(file_faults(place_of(other))) == []
+    for one, (image, weights, preview) in zip(other.entries, images, strict=True):
+        np.testing.assert_array_equal(other.read_image(one), image)
+        np.testing.assert_array_equal(other.read_weights(one), weights)
+        assert other.read_preview(one) == preview
+    (files,) = [
+        found for found in json.loads((place_of(other) / "croissant.json").read_text())["distribution"]
+        if found["@id"] == "image-files"
+    ]  # fmt: skip
+    assert sum(len(list(place_of(other).glob(pattern))) for pattern in files["includes"]) == len(other.entries)
+    card = (place_of(other) / "README.md").read_text()
+    assert all(f"`{part}/images/NNNNNN.png`" in card for part in parts)
+    assert (entry.folder("masks", ["train", "test"]), entry.folder("masks", ["test"])) == (None, "test/masks")
 
 
 READER = """
@@ -181,7 +208,7 @@ def test_a_shard_that_cannot_be_ended_is_given_up_quietly(
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("layout", [name for name, joined in JOINED.items() if joined.is_of_the_hub])
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if layouts.LAYOUTS[name].is_of_the_hub])
 def test_hugging_face_finds_the_parts_by_the_card(
     make: Make, hugging_face: Any, tmp_path: Path, layout: Layout
 ) -> None:
@@ -329,7 +356,7 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
     def find_spec(name: str) -> None:
         del name
 
-    monkeypatch.setattr("generator.dataset.joined.find_spec", find_spec)
+    monkeypatch.setattr("generator.dataset.layouts.find_spec", find_spec)
     with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install pyarrow"):
         make("parquet")
 

@@ -21,10 +21,10 @@ from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.registry import register_implementation
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.layouts import Layout
 from generator.dataset.making import finish_dataset, generate_dataset, make_dataset, make_share, workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import file_faults, open_dataset
+from generator.dataset.records import Layout
 from generator.dataset.shards import make_elsewhere
 from generator.lights.lighting import ListedLights
 from generator.pictures.random_scenes import random_scenes

@@ -20,10 +20,10 @@ from foundation.errors import FormatError, InputError
 from foundation.folders import FolderLock, held_folder
 from generator.dataset import layouts as plain_files
 from generator.dataset import shards
-from generator.dataset.layouts import FinishedImage, Layout, ShardRecord
 from generator.dataset.making import Workers, finish_dataset, generate_dataset, make_dataset, make_share, workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.records import FinishedImage, Layout, ShardRecord
 from generator.dataset.shards import SILENT, Callbacks, Workplace
 from generator.lights.choices import SimultaneousLights
 from generator.lights.lighting import ListedLights, RandomLights

@@ -189,7 +189,7 @@ def test_what_cannot_be_encoded(pinned: Pinned) -> None:
     found.append(said(next, files.png_pieces(empty(1, (1 << 28) + 1), METADATA)))
     found += [said(encode_exr, empty(1, width), METADATA) for width in (11184811, 1 << 28)]
     found.append(said(encode_tiff, empty(1 << 15, 1 << 15), METADATA))
-    found += [said(files.suffix_of, "png"), [files.smallest_side(form) for form in files.FORMATS]]
+    found += [said(files.suffix_of, "png"), [known.smallest_side for known in files.FILE_FORMATS.values()]]
     found += [said(fit_flash, np.ones((1, 1, 3)), *given) for given in ((0.0,), (5.0, 0.0), (1e-9, 1e-9))]
     found += [said(files.encode_preview, np.broadcast_to(np.zeros(3, np.uint8), (1, 65501, 3)))]
     pinned("what cannot be encoded", found)
