@@ -16,17 +16,15 @@ from drivers.links.link import Link, Peer, PeerLink
 from drivers.pjlink import PjLinkProjector, PjLinkRequest
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power, Severity
-from drivers.serial_projectors import benq, epson, nec, optoma
-from drivers.serial_projectors.benq import BenqProjector
-from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
-from drivers.serial_projectors.nec import NecProjector
+from drivers.serial_projectors import LANGUAGES, benq, epson, nec, optoma
+from drivers.serial_projectors.epson import EpsonOnNetwork
 from drivers.serial_projectors.optoma import OptomaProjector
 from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError
 from sim.projectors.jvc import JvcPeer
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import ProjectorTraits, Screen, SimulatedProjector
-from sim.projectors.serial import BenqPeer, EpsonPeer, NecPeer, OptomaPeer
+from sim.projectors.serial import PEERS, EpsonPeer, OptomaPeer
 from tests.drivers.display.test_lightcrafter import Table
 from tests.pinned import Pinned
 
@@ -50,12 +48,13 @@ class Overheard:
         self._link.close()
 
 
+TRAITS = {"epson": ProjectorTraits(warm_up_s=20.0, lamp_hours=4321.5), "nec": ProjectorTraits(lamp_hours=77.9)}
 MAKERS: dict[str, tuple[Callable[..., Any], Callable[[SimulatedProjector], Peer], ProjectorTraits]] = {
-    "BenQ": (BenqProjector, BenqPeer, ProjectorTraits()),
-    "Epson": (EpsonProjector, EpsonPeer, ProjectorTraits(warm_up_s=20.0, lamp_hours=4321.5)),
+    **{
+        language.maker: (language.projector, PEERS[name], TRAITS.get(name, ProjectorTraits()))
+        for name, language in LANGUAGES.items()
+    },
     "Epson on a network": (EpsonOnNetwork, partial(EpsonPeer, network=True), ProjectorTraits(cool_down_s=5.0)),
-    "NEC": (NecProjector, NecPeer, ProjectorTraits(lamp_hours=77.9)),
-    "Optoma": (OptomaProjector, OptomaPeer, ProjectorTraits()),
     "Optoma that is silent of its mute": (OptomaProjector, partial(OptomaPeer, answers_mute=False), ProjectorTraits()),
     "PJLink": (PjLinkProjector, PjLinkPeer, ProjectorTraits()),
     "PJLink of class 1": (PjLinkProjector, PjLinkPeer, ProjectorTraits(pjlink_class=1, filter_hours=None)),
