@@ -64,6 +64,11 @@ np.testing.assert_allclose = _of_something(np.testing.assert_allclose)
 np.testing.assert_array_equal = _of_something(np.testing.assert_array_equal)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put first the tests that wait for programs: lint runs beside them, and nobody waits for them at the end."""
+    items.sort(key=lambda item: item.path.name != "test_rehearsal.py")
+
+
 def pytest_collection_finish() -> None:
     """Collect garbage from here on, but for what has come by now."""
     gc.freeze()

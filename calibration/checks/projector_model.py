@@ -69,6 +69,7 @@ _SUBSETS: tuple[tuple[int, ...], ...] = ((0, 1), (0, 2), (1, 2), (0, 1, 2))
 """Primaries that overlap: each pair, and all three."""
 
 _TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if primary in subset]
+"""Three of each primary."""
 
 
 _REST, _REST_UNKNOWN = 5e-4, 0.02
@@ -141,20 +142,27 @@ def _primary_root() -> _Array:
 
 @dataclass(frozen=True, eq=False)
 class _Codes:
-    """Codes of lights, with what of the bases they use: computed once."""
+    """Codes of L lights, with what of the bases they use: computed once.
 
-    codes: npt.NDArray[np.int64]
-    least: npt.NDArray[np.int64]
+    Of each primary alone, and of each of its three overlaps, whose code is the least of the primaries that take part:
+
+    - `lit`: (L, 3, 4) bool, whether the code is above 0.
+    - `power`: (L, 3, 4) float64, logarithm of the light by the mean tone curve.
+    - `curves`: (L, 3, 4, N) float64, what the numbers of a curve add to it.
+    - `overlaps`: (L, 3, 3, K) float64, what the numbers of an overlap add to its amount.
+    """
+
+    lit: npt.NDArray[np.bool_]
+    power: _Array
     curves: _Array
-    least_curves: _Array
-    least_overlaps: _Array
+    overlaps: _Array
 
     @staticmethod
     def of(codes: npt.NDArray[np.integer]) -> _Codes:
         whole = np.asarray(codes, dtype=np.int64)
-        least = np.stack([whole[:, subset].min(axis=1) for _, subset in _TERMS], axis=-1)
-        curve, overlap = _curve_basis(), _overlap_basis()
-        return _Codes(whole, least, curve[whole], curve[least], overlap[least])
+        least = np.stack([whole[:, subset].min(axis=1) for _, subset in _TERMS], axis=-1).reshape(-1, 3, 3)
+        each = np.concatenate([whole[:, :, None], least], axis=2)
+        return _Codes(each > 0, _POWER * _x(each), _curve_basis()[each], _overlap_basis()[least])
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,37 +288,28 @@ def _misfit(state: _Array, residual: _Array, weights: _Array) -> float:
 
 def _model(state: _Array, given: _Codes, scale: float, rest: float) -> tuple[_Array, _Array]:
     """Return the whites (L, 3) that a state gives, and their slopes (L, 3, K)."""
-    count, nodes = len(given.codes), len(_OVERLAP_NODES)
+    count, nodes = len(given.lit), len(_OVERLAP_NODES)
     root = _primary_root()
     prior = np.log(_SEEN * _CHANNELS[:, None] * scale)
     primaries = np.exp(np.clip(prior + (root @ state[:9]).reshape(3, 3), -40, 40))
     parts = state[9 : 9 + _CURVES].reshape(4, _N)
     curves = np.sqrt(1 - _OWN**2) * parts[0] + _OWN * parts[1:]
-    overlaps = state[9 + _CURVES : 9 + _CURVES + _OVERLAPS].reshape(len(_TERMS), nodes)
-    amounts, by_state = np.zeros((count, 3)), np.zeros((count, 3, len(state)))
-
-    def curve(primary: int, codes: npt.NDArray[np.int64], basis: _Array) -> _Array:
-        return np.where(codes > 0, np.exp(np.clip(_POWER * _x(codes) + basis @ curves[primary], -30, 3)), 0.0)
-
-    def add(primary: int, part: _Array, basis: _Array) -> None:
-        """Add light `part` (L,) of a primary, and what it changes by with that primary's curve."""
-        amounts[:, primary] += part
-        slope = part[:, None] * basis
-        by_state[:, primary, 9 : 9 + _N] += np.sqrt(1 - _OWN**2) * slope
-        own = 9 + _N * (1 + primary)
-        by_state[:, primary, own : own + _N] += _OWN * slope
-
+    overlaps = state[9 + _CURVES : 9 + _CURVES + _OVERLAPS].reshape(3, 3, nodes)
+    bent = np.einsum("lpjn,pn->lpj", given.curves, curves)
+    light = np.where(given.lit, np.exp(np.clip(given.power + bent, -30, 3)), 0.0)
+    part = light.copy()
+    part[:, :, 1:] *= np.einsum("lpjm,pjm->lpj", given.overlaps, overlaps)
+    by_curve = np.einsum("lpj,lpjn->lpn", part, given.curves)
+    by_overlap = (light[:, :, 1:, None] * given.overlaps).reshape(count, 3, -1)
+    by_state = np.zeros((count, 3, len(state)))
+    by_state[:, :, 9 : 9 + _N] = np.sqrt(1 - _OWN**2) * by_curve
+    rests = 9 + _CURVES + _OVERLAPS
     for primary in range(3):
-        add(primary, curve(primary, given.codes[:, primary], given.curves[:, primary]), given.curves[:, primary])
-    for term, (primary, _) in enumerate(_TERMS):
-        light = curve(primary, given.least[:, term], given.least_curves[:, term])
-        add(primary, (given.least_overlaps[:, term] @ overlaps[term]) * light, given.least_curves[:, term])
-        at = 9 + _CURVES + nodes * term
-        by_state[:, primary, at : at + nodes] += light[:, None] * given.least_overlaps[:, term]
-    at = 9 + _CURVES + _OVERLAPS
-    amounts += rest * state[at:]
-    for primary in range(3):
-        by_state[:, primary, at + primary] = rest
+        own, shared = 9 + _N * (1 + primary), 9 + _CURVES + 3 * nodes * primary
+        by_state[:, primary, own : own + _N] = _OWN * by_curve[:, primary]
+        by_state[:, primary, shared : shared + 3 * nodes] = by_overlap[:, primary]
+        by_state[:, primary, rests + primary] = rest
+    amounts = part.sum(axis=2) + rest * state[rests:]
     slopes = primaries @ by_state
     each = amounts[:, None, :] * primaries[None]
     slopes[:, :, :9] += np.einsum("lcp,cpk->lck", each, root.reshape(3, 3, 9))

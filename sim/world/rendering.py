@@ -487,13 +487,14 @@ def light(
                     _shares(x_lines, u, u_sigma, i, i1, u_share)
                     _shares(y_lines, v, v_sigma, j, j1, v_share)
                     red, green, blue = np.float32(0), np.float32(0), np.float32(0)
-                    for b in range(j, j1 + 1):
-                        for a in range(i, i1 + 1):
-                            share = np.float32(u_share[a] * v_share[b])
-                            label = labels[b, a]
-                            red += share * signals[label, channel, 0]
-                            green += share * signals[label, channel, 1]
-                            blue += share * signals[label, channel, 2]
+                    for b in range(np.uintp(j), np.uintp(j1 + 1)):
+                        of_row = v_share[b]
+                        for a in range(np.uintp(i), np.uintp(i1 + 1)):
+                            share = np.float32(u_share[a] * of_row)
+                            at = np.uintp(labels[b, a])
+                            red += share * signals[at, channel, 0]
+                            green += share * signals[at, channel, 1]
+                            blue += share * signals[at, channel, 2]
                 off_x, off_y = x - vignetting[0], y - vignetting[1]
                 passed = 1 / (1 + vignetting[2] * (off_x * off_x + off_y * off_y))
                 passed *= passed * response[row, x]
