@@ -143,6 +143,6 @@ def test_a_lamp_that_fails_is_refused_alike_by_each_run_and_followed_when_it_rec
 def test_a_light_that_is_none_is_said_before_anything_moves(tmp_path: Path) -> None:
     make_lab(tmp_path)
     save_illuminations([Illumination(0, "uniform", None, BLACK)], tmp_path / "illuminations.csv")
-    with pytest.raises(InputError, match=r"light 0 has the codes 0, 0, 0: no frame .* take it out"):
+    with pytest.raises(InputError, match=r"light 0 .*0, 0, 0.*take it out"):
         run_session(load_lab(tmp_path / "LAB.toml"), tmp_path / "another", lambda done, total: None)
     assert not (tmp_path / "another").exists()

@@ -261,7 +261,7 @@ class TestWholeFolder:
         write_whole(tmp_path / "file", "precious")
         (tmp_path / "link").symlink_to(tmp_path / "nowhere")
         for name in ("full", "file", "link"):
-            with pytest.raises(InputError, match=f"{name} already exists; .*the table"):  # noqa: SIM117
+            with pytest.raises(InputError, match=f"{name} already exists"):  # noqa: SIM117
                 with whole_folder(tmp_path / name, "the table"):
                     pytest.fail("the block must not begin")
         assert (tmp_path / "full" / "mine").read_text() == "precious"

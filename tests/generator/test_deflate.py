@@ -178,10 +178,10 @@ def test_files_are_no_larger_than_those_of_opencv(kind: str) -> None:
 
 def test_images_that_no_png_holds_are_refused() -> None:
     wide = np.broadcast_to(np.zeros(1, np.uint16), (1, (1 << 28) + 1, 3))
-    with pytest.raises(InputError, match="268435457x1 px is too large for PNG"):
+    with pytest.raises(InputError, match=r"268435457x1 px.*PNG"):
         encode_png(wide, METADATA)
     tall = np.broadcast_to(np.zeros(1, np.uint16), (1 << 31, 1, 3))
-    with pytest.raises(InputError, match="1x2147483648 px is too large for PNG"):
+    with pytest.raises(InputError, match=r"1x2147483648 px.*PNG"):
         encode_png(tall, METADATA)
 
 

@@ -131,7 +131,7 @@ def test_overexposed_cells_are_unfit_and_overexposed_paper_is_refused(tmp_path: 
     assert all(cell.cause.startswith("clipped: ") for cell in lut.provenance.unfit)
     assert {cell.colour for cell in lut.provenance.unfit} < set(range(512))
     pinned("overexposed cells of a computed table", [lut.provenance.unfit[::9], lut.white])
-    with pytest.raises(QualityError, match=r"the frame of white: bare paper is clipped in .* expose less"):
+    with pytest.raises(QualityError, match=r"frame of white.*expose less"):
         compute_table(task_of(white_level_share=1.6), tmp_path / "over", threads=2)
     assert not (tmp_path / "over").exists()
 
@@ -146,7 +146,7 @@ def test_a_taken_place_and_a_small_disk_are_refused_first(tmp_path: Path, monkey
     with pytest.raises(InputError, match="already exists"):
         compute_table(task_of(), tmp_path / "taken", threads=1)
     monkeypatch.setattr("shutil.disk_usage", small_disk)
-    with pytest.raises(StorageError, match=r"takes 0\.02 GB, the disk has 0\.00 GB left"):
+    with pytest.raises(StorageError, match=r"0\.02 GB, the disk has 0\.00 GB"):
         compute_table(task_of(), tmp_path / "new", threads=1)
     assert not (tmp_path / "new").exists()
 

@@ -226,7 +226,7 @@ class TestRefusals:
                 return refused("white is 21 % weaker", voids=True) if step.number in (4, 8) else seen
 
         lab = Lab(folder, lights=FOUR, reference_every=2)
-        with pytest.raises(QualityError, match="white is 21 % weaker"):
+        with pytest.raises(QualityError, match="21 % weaker"):
             run(lab, NoWhite())
         assert len(lab.taken()) < 40, "lights are not taken again and again meanwhile"
         assert run(lab, ScriptedJudge()).complete
@@ -318,7 +318,7 @@ class TestFaults:
             raise DeviceError("the card cannot be read")
 
         lab.camera.download = never  # type: ignore[method-assign]
-        with pytest.raises(DeviceError, match="the card cannot be read"):
+        with pytest.raises(DeviceError, match="the card"):
             run(lab)
         assert lab.clock.monotonic() < 2 * PATIENT.sequence.patience_s
 

@@ -472,7 +472,7 @@ class TestDryRun:
 def test_the_first_fault_is_raised_and_the_others_named() -> None:
     faults: tuple[CropError, ...] = (DeviceFault("the lamp is broken"), StorageError("the disk is full"))
     plan = replace(planned(), faults=faults)
-    with pytest.raises(DeviceFault, match="the lamp is broken; moreover, the disk is full"):
+    with pytest.raises(DeviceFault, match=r"lamp is broken.*disk is full"):
         plan.require()
     replace(planned(), faults=()).require()
 

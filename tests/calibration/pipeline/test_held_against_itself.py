@@ -215,6 +215,6 @@ def test_two_lights_are_held_against_each_other(lab: Lab, tmp_path: Path) -> Non
     (tmp_path / "wrong").mkdir()
     with (
         take(lab, tmp_path / "wrong" / "session", pair, frame=frame) as session,
-        pytest.raises(QualityError, match="exchanged names: light 0 and light 1"),
+        pytest.raises(QualityError, match="light 0 and light 1"),
     ):
         build(session, tmp_path / "wrong" / "lut")

@@ -80,7 +80,7 @@ def test_a_shadow_on_one_frame_costs_that_frame(
     folder, out = tmp_path / "session", tmp_path / "lut"
     with (
         doctored(lab, folder, kind, number, shadow) as session,
-        pytest.raises(QualityError, match=rf"take 1 frame again: {COMMAND}.*report"),
+        pytest.raises(QualityError, match=rf"1 frame again: {COMMAND}.*report"),
     ):
         build(session, out, report=write_report if kind == "light" else figures_alone)
     says = json.loads((tmp_path / "lut.refused" / "report.json").read_text())

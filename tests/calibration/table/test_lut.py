@@ -34,7 +34,7 @@ def test_a_ground_truth_that_was_not_measured_is_refused(wrong: object, tmp_path
     row = first.split(",")
     row[header.split(",").index("white_g")] = str(wrong)
     path.write_text("\n".join([header, ",".join(row), *others, ""]))
-    with pytest.raises(FormatError, match=f"not between 0 and {MOST_WHITE}"):
+    with pytest.raises(FormatError, match=f"between 0 and {MOST_WHITE}"):
         open_lut(path.parent)
 
 
@@ -84,7 +84,7 @@ def test_samples_that_have_changed_are_not_used(tmp_path: Path) -> None:
     changed = open_lut(lut.folder)
     for light in (0, 1, 3):
         assert changed.light_samples(light).shape == (8, 25, 3)
-    with pytest.raises(FormatError, match=r"samples\.npy: .* light 2 .*build-lut --verify"):
+    with pytest.raises(FormatError, match=r"samples\.npy.*light 2.*--verify"):
         changed.light_samples(2)
 
 
@@ -103,7 +103,7 @@ def test_samples_of_another_form_are_not_mapped(
     shape: tuple[int, ...], kind: str, order: Literal["C", "F"], tmp_path: Path
 ) -> None:
     np.save(tmp_path / "samples.npy", np.zeros(shape, kind, order=order))
-    with pytest.raises(FormatError, match=r"expected uint16 \(2, 8, samples, 3\) of 1 to 1024 samples"):
+    with pytest.raises(FormatError, match=r"uint16 \(2, 8, samples, 3\) of 1 to 1024"):
         map_samples(tmp_path / "samples.npy", 2, 1)
     most = np.arange(2 * 8 * 1024 * 3, dtype="<u2").reshape(2, 8, 1024, 3)
     np.save(tmp_path / "most.npy", most)

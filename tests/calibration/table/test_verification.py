@@ -84,7 +84,7 @@ def test_tables_that_do_not_correspond_are_refused(tmp_path: Path) -> None:
         require_match(one, write(tmp_path / "chart", chart="ef" * 32))
     with pytest.raises(FormatError, match=f"{len(LIGHTS)} lights against 3"):
         require_match(one, write(tmp_path / "fewer", lights=3))
-    with pytest.raises(FormatError, match="1 bits of each channel against 3"):
+    with pytest.raises(FormatError, match=r"1 bits.*against 3"):
         require_match(one, _with(write(tmp_path / "bits"), tmp_path, bits=3))
     shutil.copytree(one.folder, tmp_path / "codes")
     path = tmp_path / "codes" / "illuminations.csv"
@@ -98,7 +98,7 @@ def test_the_report_is_listed_and_may_be_left_out(tmp_path: Path) -> None:
     lut = write(tmp_path / "lut", report="<html>accept</html>")
     assert "report.html" in (lut.folder / "SHA256SUMS").read_text()
     flip("report.html", 7)(lut.folder)
-    with pytest.raises(FormatError, match=r"report\.html is not as it was built"):
+    with pytest.raises(FormatError, match=r"report\.html.*built"):
         open_lut(lut.folder)
     lose("report.html")(lut.folder)
     assert open_lut(lut.folder).sha256 == lut.sha256

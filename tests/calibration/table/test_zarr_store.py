@@ -269,7 +269,7 @@ def test_a_published_folder_of_no_plain_files_is_refused(lut: Lut, tmp_path: Pat
         os.mkfifo(shard)
     else:
         shard.symlink_to(lut.folder / "samples.npy")
-    with pytest.raises(FormatError, match=f"is a {kind}, a regular file expected"):
+    with pytest.raises(FormatError, match=f"{kind}, a regular file"):
         fetch(str(tmp_path / "published"), tmp_path / "back")
 
 

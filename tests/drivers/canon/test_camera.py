@@ -1017,7 +1017,7 @@ def test_a_body_that_is_busy_for_a_while_is_waited_for_on_the_same_connection(la
 
 def test_a_body_that_is_never_ready_is_refused_without_a_new_connection(lab: Lab) -> None:
     lab.device = Slow(lab, 1000)
-    with pytest.raises(DeviceRefused, match=r"DEVICE_BUSY .* it has been so for 30 s"):
+    with pytest.raises(DeviceRefused, match=r"DEVICE_BUSY .*for 30 s"):
         lab.camera.configure(SETTINGS)
     assert lab.openings == 1
     assert lab.clock.monotonic() < 45
@@ -1083,7 +1083,7 @@ def test_a_recorded_body_without_a_lens_has_no_aperture(aperture: float | None, 
 
 
 def test_a_lens_with_contacts_is_not_left_to_stand_as_it_does(lab: Lab) -> None:
-    with pytest.raises(DeviceRefused, match=r"the lens has apertures, .* among them: name one as f-number"):
+    with pytest.raises(DeviceRefused, match=r"f-number"):
         lab.camera.configure(replace(SETTINGS, aperture=None))
 
 

@@ -280,7 +280,7 @@ def test_what_no_body_could_say_is_our_own_mistake() -> None:
 
 
 def test_a_name_must_fit() -> None:
-    with pytest.raises(ValueError, match="no name of at most 16"):
+    with pytest.raises(ValueError, match="at most 16"):
         ObjectEntry(1, 1, 0xB103, 0, "A_NAME_TOO_LONG.CR2").encode()
     with pytest.raises(ValueError, match="look alike"):
         ObjectEntry(1, 1, 0xB103, 0, "A.CR2", time=None, name_width=20).encode()
@@ -307,7 +307,7 @@ def test_values() -> None:
     assert canon.number_of(b"\x87\x02\0\x80") == 0x80000287
     assert canon.text_value("Lab") == b"Lab\0"
     assert canon.text_of(b"EF-S15-85mm\0\0\0") == "EF-S15-85mm"
-    with pytest.raises(ProtocolError, match="needs 4 bytes, but only 1"):
+    with pytest.raises(ProtocolError, match=r"4 bytes.*only 1"):
         canon.number_of(b"\0")
     with pytest.raises(ValueError, match="NUL"):
         canon.text_value("a\0")
@@ -403,7 +403,7 @@ def test_apertures_as_people_write_them() -> None:
 def test_what_is_between_is_not_guessed() -> None:
     with pytest.raises(InputError, match=r"^aperture 7\.5 is not offered; near it: 6\.3, 7\.1, 8, 9$"):
         APERTURE.code(7.5, APERTURES_60D)
-    with pytest.raises(InputError, match=r"aperture 2\.8 is not offered; near it: 3\.5, 4, 4\.5, 5"):
+    with pytest.raises(InputError, match=r"2\.8.*3\.5, 4, 4\.5, 5"):
         APERTURE.code(2.8, APERTURES_60D)
     with pytest.raises(InputError, match="the list is empty"):
         SHUTTER.code("1/60", [])
@@ -419,9 +419,9 @@ def test_bulb_and_auto_are_no_values() -> None:
     assert SHUTTER.code("bulb", [0x0C, 0x10]) == 0x0C
     assert ISO.code("Auto") == 0
     assert SHUTTER.label(0x0C) == "bulb"
-    with pytest.raises(ProtocolError, match="the camera reports shutter time bulb"):
+    with pytest.raises(ProtocolError, match="shutter time bulb"):
         SHUTTER.value(0x0C)
-    with pytest.raises(ProtocolError, match="turn its mode dial to M"):
+    with pytest.raises(ProtocolError, match="mode dial"):
         APERTURE.value(0)
     with pytest.raises(InputError, match="is not offered"):
         SHUTTER.code("bulb", [0x10])

@@ -100,7 +100,7 @@ def test_a_window_in_front_is_noticed(screen: FullScreen) -> None:
             r"at \+0\+0, 0 Hz, within 100×50 px at \+\d+\+\d+; in front of it lies “You have mail”.*, 100×50 px at ",
         ):
             screen.show(Colour(9, 9, 9))
-        with pytest.raises(DeviceError, match="in front of it lies “You have mail”"):
+        with pytest.raises(DeviceError, match="“You have mail”"):
             screen.verify(Colour(9, 9, 9))
     finally:
         glfw.destroy_window(notification)
@@ -113,7 +113,7 @@ def test_a_pop_up_after_the_colour_came_is_noticed_and_named(screen: FullScreen,
     screen.show(colour)
     screen.verify(colour)
     with messaging(virtual, "Low battery"):
-        with pytest.raises(DeviceError, match=r"in front of it lies “Low battery” \(Xmessage\), "):
+        with pytest.raises(DeviceError, match=r"“Low battery” \(Xmessage\)"):
             screen.verify(colour)
         picture = virtual.picture()
         assert np.count_nonzero(picture != 0xFF8800) > 100
@@ -173,9 +173,7 @@ def test_a_picture_that_changed_in_one_corner_is_noticed(screen: FullScreen, vir
 
 def test_a_picture_of_another_colour_is_noticed_and_nobody_is_blamed(screen: FullScreen) -> None:
     screen.show(Colour(10, 20, 30))
-    with pytest.raises(
-        DeviceError, match=r"\(10, 20, 30\) in place of \(10, 20, 31\) in 230400 of .*; look for a window"
-    ):
+    with pytest.raises(DeviceError, match=r"\(10, 20, 30\).*\(10, 20, 31\) in 230400.*window"):
         screen.verify(Colour(10, 20, 31))
 
 
@@ -288,7 +286,7 @@ def test_a_window_moved_away_is_noticed_and_put_back(screen: FullScreen, virtual
     import glfw
 
     glfw.set_window_monitor(glfw.get_current_context(), cast("Any", None), 10, 10, 300, 200, 0)
-    with pytest.raises(DeviceError, match="no longer fills display 1: screen 640×360"):
+    with pytest.raises(DeviceError, match="display 1: screen 640×360"):
         screen.verify(BLACK)
     screen.show(WHITE)
     assert plain(virtual.picture()) == WHITE
@@ -302,7 +300,7 @@ def test_a_display_that_power_saving_keeps_dark_is_noticed(screen: FullScreen, m
     assert asked == [False]
     monkeypatch.setattr(fullscreen, "is_dark", lambda display: True)  # pyrefly: ignore[implicit-any-lambda]
     for use in (screen.show, screen.verify):
-        with pytest.raises(DeviceError, match=r"power saving keeps display 1: screen 640×360 .* dark"):
+        with pytest.raises(DeviceError, match=r"power saving.*640×360.*dark"):
             use(WHITE)
 
 
@@ -532,7 +530,7 @@ def test_the_screen_saver_is_held_off_where_that_can_be_asked_for(virtual: Virtu
 
 def test_what_is_not_on_the_screen_cannot_be_read(virtual: VirtualScreen) -> None:
     screen = XScreen()
-    with pytest.raises(DeviceError, match=r"no 100×100 pixels at \+600\+0 any more"):
+    with pytest.raises(DeviceError, match=r"100×100.*\+600\+0 any more"):
         screen.read(600, 0, 100, 100)
     assert screen.read(0, 0, 100, 100).shape == (100, 100)
     screen.close()
@@ -542,7 +540,7 @@ def test_what_is_not_on_the_screen_cannot_be_read(virtual: VirtualScreen) -> Non
 @pytest.mark.parametrize("display", [":4711", ""])
 def test_no_desktop_says_so(monkeypatch: pytest.MonkeyPatch, display: str) -> None:
     monkeypatch.setenv("DISPLAY", display)
-    with pytest.raises(DeviceError, match=r"no desktop to show a picture on \(DISPLAY") as told:
+    with pytest.raises(DeviceError, match=r"desktop.*\(DISPLAY") as told:
         FullScreen()
     assert "b'" not in str(told.value)
     with pytest.raises(DeviceError, match="no desktop"):

@@ -162,9 +162,7 @@ def test_what_would_spoil_a_series_is_refused(
 
 
 def test_everything_that_is_wrong_is_told_at_once() -> None:
-    with pytest.raises(
-        DeviceRefused, match=r"raw format cannot.*; iso 100 cannot.*; aperture or f-number 8.*shutterspeed"
-    ):
+    with pytest.raises(DeviceRefused, match=r"iso 100.*f-number 8.*shutterspeed"):
         plan(lambda name: None, SETTINGS)
 
 
@@ -181,7 +179,7 @@ def test_a_lens_without_contacts_is_used_as_one() -> None:
         assert "f-number" not in plan(bare, replace(SETTINGS, aperture=None))
         with pytest.raises(DeviceRefused, match=r'aperture 8 cannot be set.*aperture = "none"'):
             plan(bare, SETTINGS)
-    with pytest.raises(DeviceRefused, match=r"it stands at f/5\.6: name one as f-number"):
+    with pytest.raises(DeviceRefused, match=r"f/5\.6.*f-number"):
         plan(NIKON_Z7.get, replace(SETTINGS, aperture=None))
 
 
@@ -241,7 +239,7 @@ def test_a_dial_that_turns_step_by_step_is_waited_for(monkeypatch: pytest.Monkey
 
 def test_a_setting_that_the_body_does_not_take_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = Fake(monkeypatch, "Nikon Z 7", stubborn=frozenset({"imagequality"}))
-    with pytest.raises(DeviceRefused, match=r"imagequality was set to NEF \(Raw\), and the camera reports NEF\+Fine"):
+    with pytest.raises(DeviceRefused, match=r"NEF \(Raw\).*NEF\+Fine"):
         fake.camera.configure(SETTINGS)
 
 
@@ -256,7 +254,7 @@ def test_what_stands_right_is_not_set_again(fake: Fake) -> None:
 def test_a_picture_in_place_of_a_raw_file_is_refused(monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
     fake = Fake(monkeypatch, "Sony A7 IV", suffix=suffix)
     fake.camera.configure(SETTINGS)
-    with pytest.raises(DeviceRefused, match=r"capt0000\..* no raw file, though it was asked for one"):
+    with pytest.raises(DeviceRefused, match=r"capt0000\..*no raw file"):
         fake.camera.expose()
     assert fake.body.files == {}, "it does not stay in the camera's memory"
     with pytest.raises(DeviceError, match="no exposed frame"):
@@ -285,7 +283,7 @@ def test_a_busy_body_is_asked_for_its_file_again(fake: Fake) -> None:
     assert [into.getvalue()] == fake.film.frames
     fake.camera.expose()
     fake.body.fails.extend([-110] * 5)
-    with pytest.raises(DeviceError, match="retaken when it is idle"):
+    with pytest.raises(DeviceError, match="is idle"):
         fake.camera.download(io.BytesIO())
 
 

@@ -65,7 +65,7 @@ class TestSerialLink(LinkContract):
         far.write(b"last words", PATIENCE_S)
         assert read_exactly(near, 10) == b"last words"
         far.close()
-        with pytest.raises(LinkClosed, match="plug its cable in again"):
+        with pytest.raises(LinkClosed, match="cable in again"):
             near.read(1, PATIENCE_S)
 
 
@@ -99,7 +99,7 @@ def test_a_port_that_is_not_there_lists_those_that_are(monkeypatch: pytest.Monke
         return [ListPortInfo("/dev/ttyUSB1"), ListPortInfo("/dev/ttyACM0")]
 
     monkeypatch.setattr(list_ports, "comports", two_ports)
-    with pytest.raises(LinkClosed, match="no serial port /dev/ttyUSB7; found: /dev/ttyACM0, /dev/ttyUSB1"):
+    with pytest.raises(LinkClosed, match=r"/dev/ttyUSB7.*/dev/ttyACM0, /dev/ttyUSB1"):
         SerialLink.open("/dev/ttyUSB7", 9600)
     monkeypatch.setattr(list_ports, "comports", list[ListPortInfo])
     with pytest.raises(LinkClosed, match="found: none at all"):
@@ -129,14 +129,14 @@ def test_a_port_that_cannot_be_opened_names_the_remedy(
 
 def test_one_port_one_program(far: FarEnd) -> None:
     link = SerialLink.open(far.path, 9600)
-    with pytest.raises(DeviceRefused, match="in use by another program"):
+    with pytest.raises(DeviceRefused, match="another program"):
         SerialLink.open(far.path, 9600)
     link.close()
     SerialLink.open(far.path, 9600).close()
 
 
 def test_no_serial_port_at_all(tmp_path: object) -> None:
-    with pytest.raises(DeviceError, match="check that it is a serial port"):
+    with pytest.raises(DeviceError, match="serial port"):
         SerialLink.open("/dev/null", 9600)
 
 

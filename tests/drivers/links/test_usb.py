@@ -67,7 +67,7 @@ def test_opens_by_any_mark() -> None:
 def test_says_what_is_there_when_the_camera_is_not() -> None:
     with pytest.raises(LinkClosed, match="none at all"):
         open_usb(backend=SimulatedBus())
-    with pytest.raises(LinkClosed, match=r"serial number 9 .* serial number 1\b.*switch the camera on"):
+    with pytest.raises(LinkClosed, match=r"serial number 9 .*serial number 1\b"):
         open_usb(serial="9", backend=bus_with(camera("1")))
 
 

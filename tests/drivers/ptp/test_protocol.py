@@ -286,7 +286,7 @@ def test_what_is_declined_for_the_moment_is_asked_again_under_a_new_number(code:
 
 def test_patience_ends_by_the_clock() -> None:
     session, _, clock = opened(ResponseCode.OK, *[0x2019] * 1000)
-    with pytest.raises(OperationDeclined, match="wait until it is idle") as caught:
+    with pytest.raises(OperationDeclined, match="is idle") as caught:
         session.call(Operation.EOS_KEEP_DEVICE_ON)
     assert caught.value.code == 0x2019
     assert clock.monotonic() == pytest.approx(PASSING_LIMIT_S)
@@ -301,7 +301,7 @@ def test_no_patience_asks_once() -> None:
 
 def test_every_other_answer_is_told_by_its_name_at_once() -> None:
     session, cable, _ = opened(ResponseCode.OK, 0x200F)
-    with pytest.raises(DeviceRefused, match=r"the scripted camera answers ACCESS_DENIED \(0x200f\)"):
+    with pytest.raises(DeviceRefused, match=r"scripted.*ACCESS_DENIED \(0x200f\)"):
         session.call(Operation.EOS_KEEP_DEVICE_ON)
     assert len(cable.asked) == 2
 

@@ -84,9 +84,9 @@ def test_what_learns_is_no_method_and_what_does_not_is_no_learner(tmp_path: Path
         choose_methods([f"{file}:Learns"])
     with pytest.raises(InputError, match="Estimates has no fit"):
         choose_learners([f"{file}:Estimates"])
-    with pytest.raises(InputError, match="gray-world has nothing to learn; expected regression-trees"):
+    with pytest.raises(InputError, match=r"gray-world .*regression-trees"):
         choose_learners(["gray-world"])
-    with pytest.raises(InputError, match="'magic' is no method that learns"):
+    with pytest.raises(InputError, match="'magic'"):
         choose_learners(["magic"])
 
 
@@ -199,5 +199,5 @@ def test_two_groups_with_an_option_of_one_name_are_a_mistake() -> None:
 
 
 def test_levels_that_are_none_are_refused() -> None:
-    with pytest.raises(InputError, match=r"saturation 100 is not above the black level 128"):
+    with pytest.raises(InputError, match=r"saturation 100.*128"):
         _ = DataReading(black=128, saturation=100).options

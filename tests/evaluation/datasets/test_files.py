@@ -95,7 +95,7 @@ def test_a_chart_far_outside_of_its_image_is_refused(x: float) -> None:
     corners = np.array([[1.0, 1], [15.9, 2], [5, -15.9], [0, 5]])
     assert chart_mask((5, 8), corners, "a.png").any()
     corners[2, 0] = x
-    with pytest.raises(FormatError, match=r"chart of a\.png .* of an image of 8 × 5"):
+    with pytest.raises(FormatError, match=r"chart of a\.png .*8 × 5"):
         chart_mask((5, 8), corners, "a.png")
 
 
@@ -151,5 +151,5 @@ def test_a_table_that_is_none_is_named(tmp_path: Path, text: bytes, why: str) ->
     (tmp_path / "gt.csv").write_bytes(text)
     with pytest.raises(FormatError, match=f"gt.csv.*{why}"):
         assert not list(read_rows(tmp_path / "gt.csv", ["a", "b"]))
-    with pytest.raises(FormatError, match="No such file or directory; restore it"):
+    with pytest.raises(FormatError, match="restore it"):
         next(read_rows(tmp_path / "none.csv", ["a"]))

@@ -113,18 +113,18 @@ def test_a_layout_named_for_something_else_says_what_is_missing(layout: str, tmp
 
 def test_a_folder_that_looks_like_none_is_told_what_was_looked_for(tmp_path: Path) -> None:
     (tmp_path / "1.png").write_bytes(b"")
-    with pytest.raises(FormatError, match=r"pictures \(1\.png\) without ground truths") as told:
+    with pytest.raises(FormatError, match=r"\(1\.png\) without") as told:
         open_scenes(tmp_path)
     assert len(str(told.value)) < 400
     (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(FormatError, match="is no dataset of a layout that is known") as told:
+    with pytest.raises(FormatError, match="no dataset of a layout") as told:
         open_scenes(tmp_path)
     for name, layout in LAYOUTS.items():
         assert f"{layout.signs} ({name})" in str(told.value)
 
 
 def test_what_is_not_there_or_no_folder_is_told(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="nowhere is no dataset: it does not exist"):
+    with pytest.raises(FormatError, match="nowhere is no dataset"):
         open_scenes(tmp_path / "nowhere")
     (tmp_path / "set.zip").write_bytes(b"PK")
     with pytest.raises(FormatError, match=r"set\.zip"):
@@ -138,9 +138,9 @@ def test_a_file_for_a_layout_of_folders_is_told(layout: str, place_of: Place, tm
         FormatError, match=rf"\.npz is a file, expected a folder of .*\({re.escape(layout)}\); name that"
     ):
         open_scenes(archive, layout)
-    with pytest.raises(FormatError, match=r"nowhere is not there, expected a folder of"):
+    with pytest.raises(FormatError, match=r"nowhere is not there"):
         open_scenes(tmp_path / "nowhere", layout)
-    with pytest.raises(FormatError, match=r"is a folder, expected a file of thumbnails"):
+    with pytest.raises(FormatError, match=r"file of thumbnails"):
         open_scenes(tmp_path, "thumbnails")
 
 
@@ -149,7 +149,7 @@ def test_a_results_folder_is_told_from_a_data_set(tmp_path: Path) -> None:
     (tmp_path / "errors.csv").write_text("image,method,r,g,b\na,grey,1,1,1\na,white,1,1,1\n")
     (tmp_path / "run.json").write_text("{}")
     for place in (tmp_path, tmp_path / "errors.csv"):
-        with pytest.raises(FormatError, match="is a results folder of evaluate, expected a data set; name the data"):
+        with pytest.raises(FormatError, match="results folder"):
             open_scenes(place)
 
 
@@ -163,7 +163,7 @@ def test_what_looks_like_two_must_be_named(place_of: Place, tmp_path: Path) -> N
 
 
 def test_an_option_without_a_meaning_is_refused(place_of: Place, dataset: Path) -> None:
-    with pytest.raises(InputError, match=r"--camera has no meaning for .*Cube\+.*it has one for nus8, gehler-shi"):
+    with pytest.raises(InputError, match=r"--camera.*Cube\+.*nus8, gehler-shi"):
         open_scenes(place_of("cube-plus"), options=DataOptions(camera="SonyA57"))
     with pytest.raises(InputError, match="--black"):
         open_scenes(dataset, options=DataOptions(black=3))

@@ -77,7 +77,7 @@ def judged(folder: Path, black: float | None = None) -> str:
 def test_a_black_level_above_all_pixels_is_refused(tmp_path: Path) -> None:
     folder = three_images(tmp_path / "own", 0)
     assert judged(folder, 3999).startswith("3999, as the user gave it")
-    with pytest.raises(InputError, match=r"60000 is above every pixel of all 3 images.* 4000 .*png"):
+    with pytest.raises(InputError, match=r"60000 is above.*3 images.*4000"):
         judged(folder, 60000)
 
 
@@ -94,7 +94,7 @@ def test_a_black_level_that_may_be_missing_is_told(tmp_path: Path) -> None:
 
 def test_a_table_between_semicolons_is_told_by_its_columns(copy: Path) -> None:
     (copy / "gt.csv").write_text("image;r;g;b\na;1;2;1\n")
-    with pytest.raises(FormatError, match=r"gt\.csv lacks the columns image,r,g,b \(found: image;r;g;b\)"):
+    with pytest.raises(FormatError, match=r"gt\.csv.*image,r,g,b \(found: image;r;g;b\)"):
         open_scenes(copy)
 
 
@@ -150,7 +150,7 @@ def test_an_image_of_eight_bits_and_a_mask_of_another_size(copy: Path) -> None:
     write_png(copy / "small.png", image_of(4, 4))
     write_table(copy, "eight,1,1,1,", "small,1,1,1,a_mask.png", head="image,r,g,b,mask")
     eight, small = open_scenes(copy, options=DataOptions(partial=True)).scenes
-    with pytest.raises(FormatError, match="has 8 bits a channel"):
+    with pytest.raises(FormatError, match="8 bits a channel"):
         eight.read()
     with pytest.raises(FormatError, match=r"a_mask\.png.*10.*8.*4.*4"):
         small.read()
@@ -228,5 +228,5 @@ def test_names_without_ending_of_files_that_are_refused_say_why(tmp_path: Path, 
     for name in "ab":
         (tmp_path / f"{name}.{ending}").write_bytes(b"")
     write_table(tmp_path, "a,1,1,1", "b,1,1,1")
-    with pytest.raises(FormatError, match=rf"gt\.csv, line 2: of a there is only .*{why}"):
+    with pytest.raises(FormatError, match=rf"gt\.csv, line 2.*{why}"):
         open_scenes(tmp_path)

@@ -148,10 +148,10 @@ def test_what_cannot_be_validated_is_refused() -> None:
         cross_validate(SCENES, [], FOLDS)
     with pytest.raises(InputError, match="1 methods in 1 folds"):
         cross_validate(SCENES, [Memory()], np.zeros(24, np.int64))
-    with pytest.raises(InputError, match="images of scene 0 are in the folds"):
+    with pytest.raises(InputError, match="scene 0 are in the folds"):
         cross_validate([SCENES[0], *SCENES[:1], *SCENES[2:]], [Memory()], np.arange(24) % 2)
     dark = replace(SCENES[7], truth=np.array([0.0, 1, 1]))
-    with pytest.raises(InputError, match="the ground truth of scene 7 is 0 1 1"):
+    with pytest.raises(InputError, match="scene 7 is 0 1 1"):
         cross_validate([*SCENES[:7], dark, *SCENES[8:]], [Memory()], FOLDS)
 
 

@@ -80,14 +80,14 @@ def test_a_bad_file_of_folds_is_refused(tmp_path: Path, text: str, why: str) -> 
 
 
 def test_a_missing_file_of_folds_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"from .*none\.csv: No such file or directory; expected CSV"):
+    with pytest.raises(FormatError, match=r"none\.csv.*expected CSV"):
         read_folds(tmp_path / "none.csv", NAMES)
 
 
 def test_folds_that_leak_are_refused() -> None:
     scenes: Any = [SimpleNamespace(name=f"{number}.png", group=f"picture {number // 2}") for number in range(4)]
     require_apart(scenes, np.array([0, 0, 1, 1]))
-    with pytest.raises(InputError, match="images of picture 1 are in the folds 0 and 1"):
+    with pytest.raises(InputError, match=r"picture 1 .*folds 0 and 1"):
         require_apart(scenes, np.array([0, 0, 0, 1]))
     named: Any = [SimpleNamespace(name="same.png"), SimpleNamespace(name="same.png")]
     assert group_of(named[0]) == "same.png"

@@ -86,7 +86,7 @@ def test_seeds_stay_apart() -> None:
     for seed in range(2):
         expected = np.concatenate([one[seed], two[seed]])
         np.testing.assert_array_equal(pool.rows[0].results[seed].errors["recovery"], expected)
-    with pytest.raises(InputError, match="Trees has different numbers of seeds: 2 in a, 1 in b"):
+    with pytest.raises(InputError, match=r"Trees .*2 in a, 1 in b"):
         pool_transfers([part("a", row("generated", *one)), part("b", row("generated", two[0]), first=50)])
 
 
@@ -111,15 +111,15 @@ def test_several_training_sets_are_matched_by_their_names() -> None:
         "Left out, since not all of the results have them: Trees, generated, codes; Trees, generated, veil",
     )
     strange = part("c", row("generated", errors(9), data="x"), row("generated", errors(9), data="y"), first=40)
-    with pytest.raises(InputError, match="a and the others have no row in common"):
+    with pytest.raises(InputError, match="no row in common"):
         pool_transfers([first, strange])
 
 
 def test_an_image_that_would_count_twice_is_refused() -> None:
     rows = row("cross-validation", errors(9))
-    with pytest.raises(InputError, match=r"8\.png is a test image of a and of b"):
+    with pytest.raises(InputError, match=r"8\.png .*of a and of b"):
         pool_transfers([part("a", rows), part("b", rows, first=8)])
-    with pytest.raises(InputError, match=r"0\.png is a test image of a and of a"):
+    with pytest.raises(InputError, match=r"0\.png .*of a and of a"):
         pool_transfers([part("a", rows), part("a", rows)])
     with pytest.raises(InputError, match="no results to pool"):
         pool_transfers([])
@@ -256,7 +256,7 @@ def test_damage_is_named(folder: Path, file: str, before: str, after: str, messa
 
 
 def test_what_is_not_there_is_named(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"cannot read .*run.json: No such file.*name a folder"):
+    with pytest.raises(InputError, match=r"run\.json.*name a folder"):
         read_transfer(tmp_path / "nothing")
     (folder / "results.csv").unlink()
     with pytest.raises(InputError, match=r"cannot read .*results.csv"):

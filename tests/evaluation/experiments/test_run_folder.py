@@ -91,7 +91,7 @@ def test_another_run_is_refused_and_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "journal"
     whole = written(path)
     other = json.loads(json.dumps(IDENTITY)) | {"software": "x 2", "treatment": {}}
-    with pytest.raises(InputError, match="what another run has made so far: its software and treatment differ"):
+    with pytest.raises(InputError, match="software and treatment differ"):
         read_journal(path, other)
     assert path.read_bytes() == whole
 
@@ -218,7 +218,7 @@ def test_what_another_run_has_made_is_not_taken(
 ) -> None:
     folder = tmp_path / "out"
     before = _stopped(folder)
-    with pytest.raises(InputError, match=rf"\.out\.partial holds what another run has made so far: its {what} differ"):
+    with pytest.raises(InputError, match=rf"\.out\.partial.*{what} differ"):
         run_methods(data(), methods, folder)
     assert next(partial_path(folder).iterdir()).read_bytes() == before
 
@@ -228,7 +228,7 @@ def test_changed_pixels_are_noticed(tmp_path: Path) -> None:
     before = _stopped(folder)
     scenes: list[Any] = list(mixed_set().scenes)
     scenes[0] = Wall(scenes[0].name, scenes[0].truth, seed=99)
-    with pytest.raises(InputError, match=r"answers otherwise for wall 0\.png than when the run was stopped"):
+    with pytest.raises(InputError, match=r"answers otherwise for wall 0\.png"):
         run_methods(as_set(tuple(scenes)), METHODS, folder)
     assert next(partial_path(folder).iterdir()).read_bytes() == before
 
@@ -247,13 +247,13 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").touch()
     log: list[str] = []
-    with pytest.raises(InputError, match="already exists; name another place for the results"):
+    with pytest.raises(InputError, match="already exists"):
         run_methods(as_set(walls(2, log)), METHODS, tmp_path / "out")
     assert not log
 
 
 def test_two_methods_of_one_name_are_refused() -> None:
-    with pytest.raises(InputError, match="two methods are called 'Gray-world'"):
+    with pytest.raises(InputError, match="'Gray-world'"):
         run_methods(mixed_set(), [METHODS[0], GrayEdge("Gray-world", 0, 2, 0)])
 
 

@@ -80,7 +80,7 @@ def test_the_line_of_the_user_s_file_is_named(tmp_path: Path) -> None:
         "    def estimate(self, image, saturation=None, mask=None):\n        return np.linalg.inv(np.zeros((3, 3)))\n"
     )
     method = find_method(f"{file}:Own")
-    with pytest.raises(InputError, match=r"Own fails on wall 0\.png: LinAlgError: Singular matrix \(own\.py, line 7\)"):
+    with pytest.raises(InputError, match=r"Own fails on wall 0\.png: LinAlgError: .*\(own\.py, line 7\)"):
         evaluate(walls(1), [method])  # pyrefly: ignore[bad-argument-type]
 
 
@@ -102,7 +102,7 @@ def test_nothing_to_evaluate_is_said() -> None:
 @pytest.mark.parametrize("light", [(0, 0, 0), (np.nan, 1, 1), (np.inf, 1, 1), (1, 1, -1)])
 def test_a_scene_without_a_light_is_named_before_the_work(light: tuple[float, ...]) -> None:
     read: list[str] = []
-    with pytest.raises(InputError, match=r"the ground truth of dark\.png is .*, expected red, green and blue"):
+    with pytest.raises(InputError, match=r"dark\.png.*blue"):
         evaluate([*walls(1, read), Wall("dark.png", np.array(light))], [GRAY_WORLD])
     assert not read
 
@@ -220,7 +220,7 @@ def test_a_map_that_is_none_ends_the_run(
     monkeypatch: pytest.MonkeyPatch, change: Callable[[Any], Any], message: str
 ) -> None:
     method = altered(monkeypatch, change)
-    with pytest.raises(InputError, match=f"Half right fails on mixed: estimate_map returned {message}"):
+    with pytest.raises(InputError, match=f"fails on mixed: .*{message}"):
         evaluate([MixedWall("mixed", LIGHTS)], [method])
 
 
@@ -244,7 +244,7 @@ def test_a_map_of_another_size_is_named(monkeypatch: pytest.MonkeyPatch) -> None
         return whole
 
     monkeypatch.setattr(MixedWall, "read_truth_map", large)
-    with pytest.raises(FormatError, match=r"mixed is 16x12 px, its map of lights 16x12, its shares 4x3"):
+    with pytest.raises(FormatError, match=r"mixed is 16x12.*16x12.*4x3"):
         evaluate([InMemoryMixed("mixed", LIGHTS)], [HalfRight()])
 
 

@@ -93,12 +93,12 @@ def test_images_without_a_light_are_left_out_and_told() -> None:
     tuned = tune_family("shades-of-gray", "shops", scenes)
     assert tuned.settings == tune_family("shades-of-gray", "shops", BLIND).settings
     assert tuning_table(tuned).notes == ("1 of 9 images give no light with some setting and do not count for any.",)
-    with pytest.raises(InputError, match="only 1 of 2 images give a light"):
+    with pytest.raises(InputError, match="1 of 2 images"):
         tune_family("shades-of-gray", "shops", scenes[-2:])
 
 
 def test_a_family_that_is_none() -> None:
-    with pytest.raises(InputError, match="'gray-world' is no family of methods to tune; the families are shades"):
+    with pytest.raises(InputError, match="'gray-world' is no family"):
         tune_family("gray-world", "shops", BLIND)
     with pytest.raises(InputError, match="'sigma=1@large' is no parameter"):
         tune_family("gray-edge-1@large", "shops", BLIND)

@@ -116,7 +116,7 @@ def test_lights_that_span_more_than_the_torus_get_wider_bins() -> None:
     assert again.estimate(scenes[50].image) == pytest.approx(method.estimate(scenes[50].image))
     with pytest.raises(ValueError, match="bins of"):
         LEARNER.restore({**arrays, "grid": np.array([0.5, 0.1])})
-    with pytest.raises(InputError, match=r"span 3\.\d\d natural logarithms .* tells 3"):
+    with pytest.raises(InputError, match=r"3\.\d\d natural.*tells 3"):
         LEARNER.fit(relit(60, np.exp(np.stack([logs * 1.5, -logs], axis=1))))
 
 

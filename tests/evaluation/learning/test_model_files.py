@@ -109,7 +109,7 @@ def test_foreign_files_are_refused(tmp_path: Path, kind: str) -> None:
             np.savez(path, images=np.ones((1, 2, 2, 3)), gt=np.ones((1, 3)), names=np.array(["a"]))
         case _:
             pass
-    with pytest.raises(FormatError, match=r"model\.npz is no whole model file: .*; name a file that evaluate train"):
+    with pytest.raises(FormatError, match=r"model\.npz.*evaluate train"):
         load_model(path)
 
 

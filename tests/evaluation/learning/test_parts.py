@@ -193,7 +193,7 @@ def test_counts_of_the_largest_working_size_are_not_cut(learner: type[KernelRidg
     own: dict[str, Any] = {"brightness": 0.0} if learner is KernelRidge else {}
     counts: Any = learner(working_size=255, **own).features(image)
     assert counts.max() == 255 * 255
-    with pytest.raises(ValueError, match="a working size of 256 px; expected 1 to 255"):
+    with pytest.raises(ValueError, match=r"256 px.*1 to 255"):
         learner(working_size=256)
 
 
@@ -205,7 +205,7 @@ def test_what_is_not_installed_is_named_with_its_remedy(
     learner: FeatureLearner, module: str, package: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=f"needs {module}, which is not installed: pip install {package}"):
+    with pytest.raises(InputError, match=f"{module}.*pip install {package}"):
         learner.fit(world(3))
 
 

@@ -58,9 +58,9 @@ def test_faults_are_named(tmp_path: Path, line: str, says: str) -> None:
 
 
 def test_other_files(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="has the columns image, method; expected recovery, reproduction too"):
+    with pytest.raises(FormatError, match=r"image, method.*recovery, reproduction"):
         read_errors(written(tmp_path, head="image,method").rename(tmp_path / "x.csv"))
-    with pytest.raises(InputError, match=r"cannot read .*errors.csv.*name a results folder"):
+    with pytest.raises(InputError, match=r"errors.csv.*results folder"):
         read_errors(tmp_path)
     (tmp_path / "errors.csv").write_bytes(b"\xff\xfe\x80")
     with pytest.raises(FormatError, match="UTF-8 was expected"):
@@ -102,7 +102,7 @@ def test_what_is_no_light_is_kept_as_it_is(tmp_path: Path) -> None:
 
 
 def test_a_name_without_extension_that_two_images_have_is_neither(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"2 images of the data set are missing .* no image of the data set \(one\)"):
+    with pytest.raises(InputError, match=r"2 images .*missing.*\(one\)"):
         read_estimates(given(tmp_path, "one,1,1,1\n"), ["one.png", "one.tiff"])
 
 
@@ -123,5 +123,5 @@ def test_what_is_no_table_is_refused(tmp_path: Path, text: str, message: str) ->
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"cannot read .*none\.csv: No such file"):
+    with pytest.raises(InputError, match=r"none\.csv: No such"):
         read_estimates(tmp_path / "none.csv", IMAGES)

@@ -284,7 +284,7 @@ def test_corners_by_hand_are_192_raw_pixels_apart(side: int, is_taken: bool) -> 
     if is_taken:
         assert field.parse_corners(texts)[0] == (49.75, 49.75)
     else:
-        with pytest.raises(InputError, match=f"too close together: {side} pixels, at least 192"):
+        with pytest.raises(InputError, match=f"{side} pixels.*192"):
             field.parse_corners(texts)
 
 

@@ -312,7 +312,7 @@ def test_damaged_shards_are_named(make: Make, layout: Layout) -> None:
     with pytest.raises(FormatError, match=rf"{file.name} (is damaged|holds no 000012)"):
         made.read_image(entry)
     file.unlink()
-    with pytest.raises(FormatError, match=rf"cannot read .*{file.name}: No such file"):
+    with pytest.raises(FormatError, match=rf"{file.name}: No such"):
         made.read_image(entry)
 
 
@@ -337,7 +337,7 @@ def test_an_image_is_a_number_with_an_ending_and_no_path(make: Make, layout: Lay
     text = table.read_text()
     for name in ("000000../outside/canary.png", "../000000.png", "٠٠٠٠٠٠.png", "0.0/0.png"):
         table.write_text(text.replace("000000.png", name), encoding="utf-8")
-        with pytest.raises(FormatError, match="is not in the order of the images"):
+        with pytest.raises(FormatError, match="order of the images"):
             open_dataset(table.parent)
     table.write_text(text.replace("000000.png", "000000"), encoding="utf-8")
     assert open_dataset(table.parent).entries[0].image == "000000"
@@ -348,7 +348,7 @@ def test_a_number_comes_once_and_has_few_digits(make: Make) -> None:
     text = table.read_text()
     for name in ("0.png", "000000.tiff", "1" * 11 + ".png", "1" * 5000 + ".png"):
         table.write_text(text.replace("\n000001.png,", f"\n{name},"))
-        with pytest.raises(FormatError, match="is not in the order of the images"):
+        with pytest.raises(FormatError, match="order of the images"):
             open_dataset(table.parent)
 
 
@@ -357,7 +357,7 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
         del name
 
     monkeypatch.setattr("generator.dataset.layouts.find_spec", find_spec)
-    with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install pyarrow"):
+    with pytest.raises(InputError, match=r"pip install pyarrow"):
         make("parquet")
 
 

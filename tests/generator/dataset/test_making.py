@@ -154,12 +154,12 @@ def test_images_come_of_samples_as_they_were_measured(make_lut: MakeLut, picture
     sources = find_pictures([pictures])
     by_codes = DatasetOptions(rendering="codes")
     generate_dataset(lut, tmp_path / "sound", sources, [0, 1], options=by_codes)
-    with pytest.raises(FormatError, match="samples of light 3 are not those that were measured"):
+    with pytest.raises(FormatError, match="samples of light 3"):
         generate_dataset(lut, tmp_path / "out", sources, [0, 3], options=by_codes)
-    with pytest.raises(FormatError, match="samples of light 3 are not those that were measured"):
+    with pytest.raises(FormatError, match="samples of light 3"):
         generate_dataset(lut, tmp_path / "mixed", sources, ListedLights((mixture_of({0: 1, 3: 1}),)), options=by_codes)
     # By colour the map of the print may rest on any light.
-    with pytest.raises(FormatError, match="samples of light 3 are not those that were measured"):
+    with pytest.raises(FormatError, match="samples of light 3"):
         generate_dataset(lut, tmp_path / "by-colour", sources, [3])
 
 
@@ -185,10 +185,10 @@ def test_nothing_is_left_of_a_dataset_that_cannot_be(make_lut: MakeLut, pictures
     before, threads = contents(tmp_path), threading.active_count()
     with pytest.raises(InputError, match="there is no light 9"):
         generate_dataset(lut, tmp_path / "out", sources, [0, 9], workers=2)
-    with pytest.raises(FormatError, match="none of the 1 pictures can be used"):
+    with pytest.raises(FormatError, match="none of the 1 pictures"):
         generate_dataset(lut, tmp_path / "out", find_pictures([pictures / "broken.jpg"]), [0])
     unlike: Any = (1, 2)
-    with pytest.raises(InputError, match="the split 1,2 is to be three shares from 0 that sum to 1"):
+    with pytest.raises(InputError, match=r"split 1,2 .*sum to 1"):
         generate_dataset(lut, tmp_path / "out", sources, [0], options=DatasetOptions(split=unlike))
     with pytest.raises(InputError, match="'bmp'"):
         DatasetOptions(form=cast("Any", "bmp"))
@@ -201,9 +201,9 @@ def test_a_taken_folder_and_empty_lists_are_refused(make_lut: MakeLut, pictures:
     lut = make_lut()
     with pytest.raises(InputError, match="already exists"):
         generate_dataset(lut, pictures, find_pictures([pictures]), [0])
-    with pytest.raises(InputError, match="0 pictures under 1 lights make no image"):
+    with pytest.raises(InputError, match="0 pictures under 1 lights"):
         generate_dataset(lut, tmp_path / "out", [], [0])
-    with pytest.raises(InputError, match="under 0 lights make no image"):
+    with pytest.raises(InputError, match="0 lights make no"):
         generate_dataset(lut, tmp_path / "out", find_pictures([pictures]), [])
-    with pytest.raises(InputError, match="0 workers were asked for"):
+    with pytest.raises(InputError, match="0 workers"):
         generate_dataset(lut, tmp_path / "out", find_pictures([pictures]), [0], workers=0)

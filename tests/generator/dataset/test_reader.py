@@ -45,7 +45,7 @@ def test_a_damaged_dataset_is_named(small: Path, tmp_path: Path) -> None:
     table = small / "ground_truth.csv"
     text = table.read_text()
     table.write_text("\n".join(text.splitlines()[:-1]))
-    with pytest.raises(FormatError, match="has rows of 1 images, expected the 2 of"):
+    with pytest.raises(FormatError, match=r"rows of 1 .*the 2 of"):
         open_dataset(small)
     table.write_text(text.replace(",1,", ",one,"))
     with pytest.raises(FormatError, match=r"ground_truth\.csv.*2"):

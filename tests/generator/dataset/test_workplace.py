@@ -341,9 +341,7 @@ def test_another_plan_in_the_same_place_is_refused(make_lut: MakeLut, tmp_path: 
     lut, out = make_lut(), tmp_path / "out"
     with pytest.raises(StopIt):
         make(lut, out, on_image=interrupt_after(4))
-    with pytest.raises(
-        InputError, match=r"begun with another plan \(seed 3, now 4\); finish it as it was begun, remove"
-    ):
+    with pytest.raises(InputError, match=r"\(seed 3, now 4\).*remove"):
         make(lut, out, seed=4)
     with pytest.raises(InputError, match=r"options previews false, now true"):
         make(lut, out, previews=True)
@@ -360,7 +358,7 @@ def test_one_program_makes_a_dataset_at_a_time(make_lut: MakeLut, tmp_path: Path
     plan = Plan(lut, SCENES, ListedLights((0,)), 0, DatasetOptions())
     with (
         workplace(out, plan.identity()),
-        pytest.raises(InputError, match="is being made by another program; wait for it"),
+        pytest.raises(InputError, match="another program"),
     ):
         generate_dataset(lut, out, SCENES, [0])
 
@@ -376,9 +374,9 @@ def test_shares_make_the_whole(make_lut: MakeLut, tmp_path: Path) -> None:
     make_dataset(plan_of(lut), tmp_path / "whole")
     assert make_share(plan_of(lut), out, (1, 3), Workers(count=2)) == (2, 6)
     assert make_share(plan_of(lut), out, (0, 3)) == (4, 6)
-    with pytest.raises(InputError, match=r"2 of 6 shards of .* are not made yet: 2, 5; run their shares"):
+    with pytest.raises(InputError, match=r"2 of 6 shards .*: 2, 5"):
         finish_dataset(out)
-    with pytest.raises(InputError, match="share 3 of 3 was asked for, expected 0 to 2"):
+    with pytest.raises(InputError, match=r"share 3 of 3.*0 to 2"):
         make_share(plan_of(lut), out, (3, 3))
     assert make_share(plan_of(lut), out, (2, 3)) == (6, 6)
     assert make_share(plan_of(lut), out, (2, 3)) == (6, 6), "made again, nothing changes"
@@ -389,7 +387,7 @@ def test_shares_make_the_whole(make_lut: MakeLut, tmp_path: Path) -> None:
     before = contents(out)
     assert finish_dataset(out).description.images == plan_of(lut).total, "finished before: it is there"
     assert contents(out) == before
-    with pytest.raises(InputError, match="no dataset is being made at"):
+    with pytest.raises(InputError, match="being made at"):
         finish_dataset(tmp_path / "elsewhere")
 
 
@@ -397,7 +395,7 @@ def test_shares_are_made_beside_each_other(make_lut: MakeLut, tmp_path: Path) ->
     lut = make_lut()
     with workplace(tmp_path / "out", plan_of(lut).identity(), alone=False):
         assert make_share(plan_of(lut), tmp_path / "out", (0, 1)) == (6, 6)
-        with pytest.raises(InputError, match="is being made by another program"):
+        with pytest.raises(InputError, match="another program"):
             finish_dataset(tmp_path / "out")
 
 
@@ -413,7 +411,7 @@ def test_a_share_that_waited_for_the_whole_is_refused(
         return held_folder(*arguments, **named)
 
     monkeypatch.setattr("generator.dataset.making.held_folder", finished_meanwhile)
-    with pytest.raises(InputError, match="already exists; name another place"):
+    with pytest.raises(InputError, match="already exists"):
         make_share(plan_of(lut), out, (0, 2))
     assert not (tmp_path / ".out.partial").exists()
 

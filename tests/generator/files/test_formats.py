@@ -230,7 +230,7 @@ def test_a_png_may_claim_what_deflate_can_make_of_its_bytes() -> None:
 
 def test_a_file_of_eight_bits_is_refused() -> None:
     data = cv2.imencode(".png", np.zeros((4, 5, 3), np.uint8))[1].tobytes()
-    with pytest.raises(FormatError, match=r"a\.png holds uint8 \(4, 5, 3\), expected uint16"):
+    with pytest.raises(FormatError, match=r"a\.png holds uint8 \(4, 5, 3\).*uint16"):
         decode_image(data, "png", "a.png")
 
 

@@ -205,11 +205,11 @@ def test_a_picture_of_another_type_is_refused_before_anything_is_drawn(make_lut:
 def test_a_light_that_is_not_there_is_named(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
     lut = make_lut()
     for light in (-1, 4):
-        with pytest.raises(InputError, match=rf"there is no light {light}; the table .* has lights 0 to 3"):
+        with pytest.raises(InputError, match=rf"light {light}.*0 to 3"):
             render(lut, picture, light)
     wrong: list[Any] = [1.5, None]
     for light in wrong:
-        with pytest.raises(InputError, match=rf"light {light!r} is no light"):
+        with pytest.raises(InputError, match=rf"{light!r}"):
             render(lut, picture, light)
     np.testing.assert_array_equal(render(lut, picture, np.arange(4)[2]), render(lut, picture, 2))
 
@@ -226,7 +226,7 @@ def test_wrong_shapes_and_numbers_are_named(picture: npt.NDArray[np.uint8]) -> N
         draw_samples(samples, picture, out=np.zeros((1, 1, 3), np.uint16))
     locked = np.zeros(picture.shape, np.uint16)
     locked.flags.writeable = False
-    with pytest.raises(InputError, match="the target may not be written to"):
+    with pytest.raises(InputError, match="target may not"):
         draw_samples(samples, picture, out=locked)
     with pytest.raises(InputError, match="the image number is"):
         draw_samples(samples, picture, image=1 << 32)
@@ -262,7 +262,7 @@ def test_a_mosaic_has_each_site_s_own_channel(make_lut: MakeLut, picture: npt.ND
             for top in range(0, 37, 5)
         ]
         np.testing.assert_array_equal(np.concatenate(bands), mosaic)
-    with pytest.raises(InputError, match="'XTRANS' is no Bayer pattern; expected RGGB"):
+    with pytest.raises(InputError, match=r"'XTRANS'.*RGGB"):
         draw_mosaic(samples, picture, pattern="XTRANS")
 
 

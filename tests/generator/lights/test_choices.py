@@ -38,9 +38,9 @@ def test_lights_of_a_table_may_have_names(make_lut: MakeLut) -> None:
     lut = replace(lut, illuminations=tuple(named))
     assert parse_light(" FL2 ", lut) == plain(1)
     assert parse_light("2", lut) == plain(2)
-    with pytest.raises(InputError, match=r"'fl2' is no light; did you mean 'FL2'\?"):
+    with pytest.raises(InputError, match=r"'fl2'.*'FL2'\?"):
         parse_light("fl2", lut)
-    with pytest.raises(InputError, match="or a name: A, FL2, D65"):
+    with pytest.raises(InputError, match="name: A, FL2, D65"):
         parse_light("xyzzy", lut)
 
 

@@ -66,7 +66,7 @@ def test_channel_gains_move_the_density_and_change_nothing_else() -> None:
     "lights", [[[1, 1, 1]], [[1, 1, 1], [1, 1, 2]], [[1, 1, 1], [1, 1, 2], [1, 1, 3]], [[0.3, 0.4, 0.3]] * 5]
 )
 def test_lights_without_breadth_have_no_density(lights: list[list[float]]) -> None:
-    with pytest.raises(FormatError, match=r"do not lie on a line; take them as they are with --match s\.json"):
+    with pytest.raises(FormatError, match=r"on a line.*--match s\.json"):
         LogKernels.of(np.array(lights, dtype=float), "s.json")
 
 
@@ -179,7 +179,7 @@ def test_a_fit_follows_the_data() -> None:
 
 @pytest.mark.parametrize("truths", [[[1, 2, 3]], [[1, 2, 1], [2, 2, 2]], [[1, 1, 1], [1, 2, 1], [1, 3, 1], [1, 4, 1]]])
 def test_what_has_no_density_is_refused(truths: list[list[float]]) -> None:
-    with pytest.raises(FormatError, match=r"no distribution fits the \d ground truths of gt\.csv"):
+    with pytest.raises(FormatError, match=r"\d ground truths of gt\.csv"):
         Fitted.of(np.array(truths, dtype=np.float64), "gt.csv")
 
 

@@ -84,9 +84,7 @@ def test_just_within_and_just_beyond_the_tolerance_of_one_light() -> None:
 @pytest.mark.slow
 def test_a_light_outside_is_refused_with_how_far_and_what_is_nearest() -> None:
     wanted = rgb_of([0.9, 0.02])
-    with pytest.raises(
-        OutsideGamutError, match=r"r=0\.9000, b=0\.0200 lies .*° outside .* nearest it can is r="
-    ) as info:
+    with pytest.raises(OutsideGamutError, match=r"r=0\.9000, b=0\.0200.*° outside.*r=") as info:
         GRID.match(wanted)
     nearest = GRID.match(wanted, outside="nearest")
     # By brute force: no mixture of any two lights is nearer.
@@ -113,7 +111,7 @@ def test_what_is_contained_is_matched_and_what_is_not_is_refused(r: float, b: fl
 
 @pytest.mark.parametrize("wanted", [[0.0, 0, 0], [1, -1, 1], [1, 2], [np.nan, 1, 1], [[1, 2, 3]]])
 def test_what_is_no_light_is_refused(wanted: list[float]) -> None:
-    with pytest.raises(InputError, match="is no light: expected three numbers from 0"):
+    with pytest.raises(InputError, match="three numbers from 0"):
         GRID.match(wanted)
 
 
@@ -160,7 +158,7 @@ def test_black_bodies_are_joined_by_mired(make_lut: MakeLut) -> None:
 def test_a_temperature_beyond_the_tables_is_refused(make_lut: MakeLut) -> None:
     lut = make_lut(lights=5)
     for cct_k in (3000.9, 3003.1):
-        with pytest.raises(InputError, match=r"outside the black bodies .* 3001 to 3003 K"):
+        with pytest.raises(InputError, match=r"outside.*3001 to 3003"):
             black_body(lut, cct_k)
     with pytest.raises(InputError, match="has no black bodies"):
         black_body(make_lut(lights=1, name="none"), 3001)

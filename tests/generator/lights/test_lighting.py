@@ -74,7 +74,7 @@ def test_the_ground_truth_is_the_mixture_of_ground_truths(make_lut: MakeLut) -> 
 def test_a_light_that_the_table_lacks_is_named(make_lut: MakeLut) -> None:
     lut = make_lut(lights=4)
     for of in (Mixture((0, 4), (0.5, 0.5)).white, Mixture((0, 4), (0.5, 0.5)).samples):
-        with pytest.raises(InputError, match=r"there is no light 4; the table .* has lights 0 to 3"):
+        with pytest.raises(InputError, match=r"light 4.*0 to 3"):
             of(lut)
 
 

@@ -56,7 +56,7 @@ def test_names_with_other_suffixes_and_several_lights(make_lut: MakeLut, tmp_pat
         ["0", "1"],
     ]
     # Two pictures of one name in two folders do not share a light by chance.
-    with pytest.raises(InputError, match="2 of 2 pictures have no light"):
+    with pytest.raises(InputError, match="2 of 2 pictures"):
         named_lights(Gamut.of(lut), load_named_truths(path), ["one/s8.png", "other/s8.png"])
 
 

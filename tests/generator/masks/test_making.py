@@ -99,7 +99,7 @@ def test_sets_follow_one_another_by_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize("data", [b"", b"no picture"])
 def test_a_file_that_is_no_picture_is_named(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "bad.png").write_bytes(data)
-    with pytest.raises(FormatError, match=r"bad\.png is no picture that can be read"):
+    with pytest.raises(FormatError, match=r"bad\.png is no picture"):
         find_masks(tmp_path, 2)
 
 

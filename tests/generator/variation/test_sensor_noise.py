@@ -105,7 +105,7 @@ def test_a_photographed_table_says_its_speed() -> None:
     object.__setattr__(lut.provenance, "origin", OriginRecord(iso=400))
     assert known_of_table(lut) == (400.0, 2.5)
     assert parse_iso("1600", *known_of_table(lut)).ratio == 4
-    with pytest.raises(InputError, match="says that the table is of ISO 100, and the table says 400"):
+    with pytest.raises(InputError, match=r"ISO 100.*400"):
         parse_iso("1600/100", *known_of_table(lut))
     object.__setattr__(lut.provenance, "origin", OriginRecord())
     assert known_of_table(lut) == (None, 2.5)
@@ -123,7 +123,7 @@ def test_a_computed_table_says_its_speed() -> None:
         "table": 200.0,
         "sensor_electrons": 3.0,
     }
-    with pytest.raises(InputError, match="says that the table is of ISO 100, and the table says 200; write 1600"):
+    with pytest.raises(InputError, match=r"ISO 100.*200.*1600"):
         parse_iso("1600/100", *known_of_table(lut))
     with pytest.raises(InputError, match="below the ISO 200"):
         parse_iso("100", *known_of_table(lut))

@@ -98,7 +98,7 @@ def test_the_shape_is_not_that_of_masks_of_the_same_seed() -> None:
 def test_a_folder_of_masks_is_no_gradient(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "masks").mkdir()
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="'masks' is no kind of masks; name one of half-plane, soft-edge"):
+    with pytest.raises(InputError, match=r"'masks'.*half-plane"):
         parse_gradient("masks:stops=1")
 
 

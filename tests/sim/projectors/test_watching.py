@@ -244,7 +244,7 @@ def test_a_screen_is_named(text: str, place: ScreenPlace) -> None:
 
 @pytest.mark.parametrize("text", ["", "1", ":", "640x360", ":1,640x360", ":1;640x360+0+0", "HDMI-1"])
 def test_what_names_no_screen_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match="is no screen; expected DISPLAY"):
+    with pytest.raises(InputError, match="DISPLAY"):
         ScreenPlace.parse(text)
 
 

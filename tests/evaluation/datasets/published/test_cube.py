@@ -48,7 +48,7 @@ def test_cube_is_told_from_cube_plus(copy: Path) -> None:
 
 def test_missing_images(copy: Path) -> None:
     (copy / "2.PNG").unlink()
-    with pytest.raises(FormatError, match=r"lacks 1 of the 3 images of cube\+_gt.txt \(2\); .* --partial"):
+    with pytest.raises(FormatError, match=r"lacks 1.*3 images of cube\+_gt.txt \(2\).*--partial"):
         open_scenes(copy)
     data = open_scenes(copy, options=DataOptions(partial=True))
     assert [scene.name for scene in data.scenes] == ["1.PNG", "3.PNG"]
@@ -58,7 +58,7 @@ def test_missing_images(copy: Path) -> None:
 
 def test_superfluous_images(copy: Path) -> None:
     write_png(copy / "4.png", image_of(4, 4))
-    with pytest.raises(FormatError, match=r"has 1 images that cube\+_gt.txt does not know \(4\)"):
+    with pytest.raises(FormatError, match=r"1 images.*cube\+_gt.txt.*know \(4\)"):
         open_scenes(copy)
     (copy / "4.png").unlink()
     write_png(copy / "PNG" / "1.PNG", image_of(4, 4))
@@ -129,7 +129,7 @@ def test_a_white_level_below_black_is_refused(whole: Path) -> None:
 
 def test_another_size_is_refused(whole: Path) -> None:
     write_png(whole / "PNG" / "00_0001.png", image_of(432, 648))
-    with pytest.raises(FormatError, match=r"is 648 × 432, expected 2592 × 1728"):
+    with pytest.raises(FormatError, match=r"648 × 432, expected 2592 × 1728"):
         open_scenes(whole).scenes[0].read()
 
 

@@ -82,14 +82,14 @@ def test_lines_of_text_that_have_no_bytes_are_refused() -> None:
     plain = written(False, {"none": np.array([""])})
     at = plain.index(struct.pack("<IIii", 5, 8, 0, 0))
     check_mat5(plain[: at + 8] + struct.pack("<ii", 1000, 0) + plain[at + 16 :])
-    with pytest.raises(ValueError, match="1001 lines of text in 0 bytes"):
+    with pytest.raises(ValueError, match="1001 lines"):
         check_mat5(plain[: at + 8] + struct.pack("<ii", 1001, 0) + plain[at + 16 :])
 
 
 def test_values_that_are_not_as_many_as_the_dimensions_are_refused() -> None:
     plain = written(False, {"gt": np.array([[0.25, 0.5, 0.75]])})
     at = plain.index(struct.pack("<ii", 1, 3))
-    with pytest.raises(ValueError, match="24 bytes of values, expected 4 of 8 bytes"):
+    with pytest.raises(ValueError, match=r"24 bytes.*4 of 8"):
         check_mat5(plain[:at] + struct.pack("<ii", 1, 4) + plain[at + 8 :])
 
 
@@ -194,7 +194,7 @@ def test_tags_flags_and_dimensions_are_whole() -> None:
     assert "does not hold one array" in refused(element(15, zlib.compress(nested(0) + nested(0))))
     with pytest.raises(ValueError, match="it has 127 bytes"):
         check_mat5(PLAIN[:127])
-    with pytest.raises(ValueError, match="the order of bytes is b'XX'"):
+    with pytest.raises(ValueError, match=r"order.*b'XX'"):
         check_mat5(PLAIN[:126] + b"XX")
 
 
@@ -219,12 +219,12 @@ def test_variables_are_what_is_expected_of_them() -> None:
     for name in ("flat", "minus", "words", "none"):
         with pytest.raises(FormatError, match=rf"gt\.mat.*{name}"):
             matlab.scalar(content, name, path)
-    with pytest.raises(FormatError, match="has it, expected none among them"):
+    with pytest.raises(FormatError, match="none among"):
         matlab.scalar({"__header__": b"", "it": 1}, "none", path)
     assert matlab.strings(content, "names", path) == ["a.png", "b"]
     assert matlab.strings(content, "none", path) is None
     for name in ("numbers", "lights"):
-        with pytest.raises(FormatError, match=f"{name} holds .*, expected names"):
+        with pytest.raises(FormatError, match=f"{name} holds"):
             matlab.strings(content, name, path)
 
 

@@ -173,7 +173,7 @@ def test_boxes_that_have_half_of_both_in_common_are_of_one_chart(copy: Path) -> 
     folder = write_masks(copy, "1,2,9,2", "1,1,0.4,7")
     assert "edges at most 5 px apart" in open_scenes(copy / "SonyA57").treatment["mask"]
     (folder / "SonyA57_0001_mask.txt").write_text("1,1,9,3")
-    with pytest.raises(FormatError, match="expected the same chart in both"):
+    with pytest.raises(FormatError, match="same chart"):
         open_scenes(copy / "SonyA57")
 
 
@@ -196,7 +196,7 @@ def test_a_chart_goes_over_the_edge_by_two_pixels_at_most(first: int, last: int,
             seen = scene.mask(np.zeros((8, 8, 3), np.uint16))
             np.testing.assert_array_equal(seen.T if across else seen, np.repeat(inside[:, None], 8, axis=1))
         else:
-            with pytest.raises(FormatError, match=r"a\.png is 8 × 8, but its chart is in"):
+            with pytest.raises(FormatError, match=r"a\.png is 8 × 8"):
                 scene.mask(np.zeros((8, 8, 3), np.uint16))
 
 

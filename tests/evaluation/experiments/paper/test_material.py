@@ -156,7 +156,7 @@ def test_rows_of_one_camera(tmp_path: Path) -> None:
     assert one.lights.tolist() == [[1, 2, 3], [7, 8, 9]]
     assert one.images == ("A/1.png", "A/2.png")
     assert everything.images == ("A/1.png", "B/1.png", "A/2.png")
-    with pytest.raises(InputError, match=r"no row of .* begins with 'C'; the first begins with 'A/1.png'"):
+    with pytest.raises(InputError, match=r"'C'.*'A/1.png'"):
         read_truths(f"{path}#C")
 
 

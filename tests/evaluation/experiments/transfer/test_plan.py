@@ -194,7 +194,7 @@ def test_a_gradient_that_is_described_as_none_is_named(maker: Maker) -> None:
         described.write_text(json.dumps(record))
         (made, *_) = _generated(open_generated(maker.folder / "made").scenes)
         (naive,) = _counterparts([made], maker.pictures)
-        with pytest.raises(FormatError, match=r"describes its variation as .*; make it again"):
+        with pytest.raises(FormatError, match=r"describes its variation"):
             naive.read()
 
 
@@ -249,7 +249,7 @@ def test_what_cannot_be_found_is_said(maker: Maker) -> None:
         find_sources(dataset, "s3://bucket/pictures")
     found, _ = find_sources(dataset, maker.pictures)
     save_pictures(maker.pictures, ["a.png"], side=32)
-    with pytest.raises(FormatError, match="32x32 px where images of it are 24x24"):
+    with pytest.raises(FormatError, match=r"32x32 px.*24x24"):
         found["a.png"].codes()
 
 
@@ -274,7 +274,7 @@ def test_a_source_that_is_a_test_image_is_found_by_name(maker: Maker) -> None:
         (2, "b.png", "B.PNG", "name"),
         (3, "b.png", "B.PNG", "name"),
     ]
-    with pytest.raises(InputError, match=r"2 of 6 images of made are also in the test set, by name: b\.png.*--shared"):
+    with pytest.raises(InputError, match=r"2 of 6 images of made.*b\.png.*--shared"):
         plan_transfer(test, [made])
     without = plan_transfer(test, [made], shared="leave-out")
     assert [scene.name for scene in without.training[0].scenes] == [
@@ -313,7 +313,7 @@ def test_copies_are_kept_only_where_that_is_allowed() -> None:
     said = "2 of 2 images of real are also in photos, by content: 1, 2"
     assert trainable_images(one, other, "keep", "photos") == (one.scenes, said)
     assert trainable_images(one, other, "leave-out", "photos", copies=False) == ((), said)
-    with pytest.raises(InputError, match=f"{said}.*must be unseen: --shared leave-out"):
+    with pytest.raises(InputError, match=f"{said}.*--shared leave-out"):
         trainable_images(one, other, "keep", "photos", copies=False)
     # What shows the same scene by its name is no copy.
     named = _real("3", "5", place="named.npz", seed=1)
@@ -340,7 +340,7 @@ def test_naive_counterparts_are_of_the_same_images(maker: Maker, tmp_path: Path)
     assert "Canon EOS 550D, ColorMatrix2" in plan.notes[1]
     shutil.rmtree(some)
     save_pictures(some, ["b.png"], seed=8)
-    with pytest.raises(InputError, match="none of the 3 pictures of made"):
+    with pytest.raises(InputError, match="3 pictures of made"):
         plan_transfer(_real("x"), [made], pictures=some)
 
 
@@ -380,13 +380,13 @@ def test_parts_that_are_set_apart_stay_apart(maker: Maker, tmp_path: Path) -> No
 
 def test_what_cannot_be_planned_is_said(maker: Maker) -> None:
     made = maker.make()
-    with pytest.raises(InputError, match="no data set to train on"):
+    with pytest.raises(InputError, match="no data set"):
         plan_transfer(_real("x"), [])
-    with pytest.raises(InputError, match="two training sets are called made"):
+    with pytest.raises(InputError, match="called made"):
         plan_transfer(_real("x"), [made, made])
-    with pytest.raises(InputError, match="--naive is for sets made by generate"):
+    with pytest.raises(InputError, match=r"--naive.*generate"):
         plan_transfer(_real("x"), [_real("y", place="y.npz", seed=1)], maker.pictures)
-    with pytest.raises(InputError, match="made has no image left"):
+    with pytest.raises(InputError, match="no image left"):
         plan_transfer(_real("a", "b", "c"), [made], shared="leave-out")
 
 
