@@ -15,7 +15,8 @@ from string import Template
 from typing import Any, Final
 
 from calibration.citation import bibtex, origin_lines, table_title
-from generator.dataset.layouts import LAYOUTS, FileLayout, JoinedLayout
+from generator.dataset.joined import JoinedLayout
+from generator.dataset.layouts import LAYOUTS, FileLayout
 from generator.dataset.records import CROISSANT, DATASHEET, GROUND_TRUTH, SOURCES, Description, one_line, table_cell
 from generator.files import FILE_FORMATS, FULL, Format, suffix_of
 

@@ -10,6 +10,7 @@ Images are files of their own here; those of a shard that lie in one file are `g
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import TracebackType
 from typing import Any, Final, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
@@ -323,3 +324,7 @@ class Sample:
     def key(self) -> str:
         """The number as file names have it."""
         return image_key(self.record.number)
+
+
+ExitReason = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
+"""Arguments of `__exit__`: the type, value and traceback of what ended the block, or None."""

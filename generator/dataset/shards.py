@@ -50,7 +50,8 @@ from foundation.folders import publish_folder, require_free
 from foundation.records import from_json
 from foundation.version import software
 from generator.dataset.cards import card, croissant, datasheet
-from generator.dataset.layouts import LAYOUTS, Beside, ShardWriter
+from generator.dataset.joined import Beside
+from generator.dataset.layouts import LAYOUTS, ShardWriter
 from generator.dataset.plan import DatasetOptions, ShardJob, versions
 from generator.dataset.records import (
     CARD,

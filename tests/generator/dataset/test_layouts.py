@@ -20,7 +20,8 @@ import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
 from generator.dataset import layouts
-from generator.dataset.layouts import FileLayout, JoinedLayout
+from generator.dataset.joined import JoinedLayout
+from generator.dataset.layouts import FileLayout
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import Dataset, file_faults, open_dataset
