@@ -28,7 +28,7 @@ from foundation.console import (
     option,
     shows_progress,
 )
-from foundation.errors import FormatError, InputError, QualityError
+from foundation.errors import FormatError, InputError, QualityError, counted
 from foundation.secret_texts import masked, printable
 
 if TYPE_CHECKING:
@@ -406,7 +406,6 @@ def _make(
 def _check(
     session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None, output: JsonOutput
 ) -> None:
-    from calibration.figures.all_figures import FIGURES
     from calibration.pipeline.build import check
     from calibration.verdict import refusal
 
@@ -414,10 +413,10 @@ def _check(
     _print_result(result, output)
     if result.verdict.refused:
         raise QualityError(f"{session.folder}: {refusal(result.verdict, result.figures)}")
-    more = len(FIGURES) - len(result.verdict.rows)
+    judged = counted(len(result.verdict.rows), "figure")
     print(
-        f"{session.folder}: the chart is found and is the one expected; {more} of {len(FIGURES)} figures are not known "
-        f"of one frame, build-lut {session.folder} LUT judges them"
+        f"{session.folder}: the chart is found and is the one expected; this frame tells {judged}, the others take all "
+        f"frames: build-lut {session.folder} LUT"
     )
 
 

@@ -284,7 +284,7 @@ class TableMeasurements:
 
     @property
     def is_of_one_frame(self) -> bool:
-        """Whether these are a check's, which reads one light or white frame and compares it with no other."""
+        """Whether these are a check's, which reads one light or white frame, and one dark frame."""
         return self.lights.codes is None
 
     @property

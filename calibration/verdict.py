@@ -107,8 +107,8 @@ class ProbableCause:
 
 
 def judged_values(table: TableMeasurements) -> dict[str, float]:
-    """Return the values that are judged, by the names of their figures; without those that could not be measured."""
-    values = ((figure.name, figure.measure(table)) for figure in FIGURES)
+    """Return the values that are judged, by the names of their figures; without those that are not known."""
+    values = ((figure.name, figure.judged_value(table)) for figure in FIGURES)
     return {name: value for name, value in values if value is not None}
 
 

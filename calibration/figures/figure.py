@@ -182,8 +182,11 @@ class Figure:
     - `source`: where the numbers come from.
     - `remedy`: what to do about it; "" where it depends on what was found.
     - `measure`: the value; None where it could not be measured: on a chart without tags or with few colours, without
-      dark frames or a series of exposures. What takes more than one frame is `of_many_frames`.
+      dark frames or a series of exposures.
     - `forecast`: the value from what a check has, where no check can know it `ONLY_OF_A_SESSION`.
+    - `of_one_frame`: what `build-lut --check` can say of it, which reads one light or white frame and a dark one: it is
+      `known`; or `bounded`, since more frames can only make it worse, so that it is told where it is beyond its limit
+      already; or `unknown`.
     - `worst`: where its worst is on the report's page, whatever the verdict; else `NO_PLACE`.
     - `where`: frames, lights or place beyond the limit accepted, for a remark; else those `OF_ITS_CAUSE`.
     - `retake`: the frames that are beyond a limit by themselves; else `NO_FRAMES`. None where all of them are.
@@ -207,6 +210,7 @@ class Figure:
     remedy: str
     measure: Callable[[TableMeasurements], float | None]
     forecast: Callable[[CheckMeasurements], float | None] | None
+    of_one_frame: Literal["known", "bounded", "unknown"]
     worst: Callable[[TableMeasurements, Chart], Worst | None] | None
     where: Callable[[TableMeasurements, float], str] | None
     retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None
@@ -222,6 +226,13 @@ class Figure:
         if self.refuse is not None and not sign * value <= sign * self.refuse:
             return "refuse"
         return "accept" if sign * value <= sign * self.accept else "accept with remarks"
+
+    def judged_value(self, table: TableMeasurements) -> float | None:
+        """Return the value that is judged; None where it was not measured, or other frames may change its outcome."""
+        value = self.measure(table)
+        if value is None or not table.is_of_one_frame or self.of_one_frame == "known":
+            return value
+        return value if self.of_one_frame == "bounded" and self.outcome(value) != "accept" else None
 
     @property
     def ranges(self) -> tuple[Range, Range]:
@@ -243,13 +254,6 @@ class Figure:
         """Return its limit as in `report.json`."""
         keys = ("name", "title", "unit", "sense", "accept", "refuse", "why", "source", "remedy")
         return {key: getattr(self, key) for key in keys}
-
-
-def of_many_frames(
-    measure: Callable[[TableMeasurements], float | None],
-) -> Callable[[TableMeasurements], float | None]:
-    """Return the same for what takes all frames: None of a check, which reads one and would find nothing wrong."""
-    return lambda table: None if table.is_of_one_frame else measure(table)
 
 
 def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:

@@ -23,7 +23,6 @@ from calibration.figures.figure import (
     Line,
     SummaryRow,
     Worst,
-    of_many_frames,
 )
 from calibration.registration.register import (
     MAX_BLOCK_RESIDUAL_PX,
@@ -82,6 +81,7 @@ TAGS_FOUND = Figure(
     why="where a tag is missing, the place of the cells around it rests on the cells alone", source=JUDGEMENT,
     remedy="bring all of the chart into the picture, and uncover it",
     measure=_tags_found, forecast=lambda check: check.tags_found,
+    of_one_frame="known",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("chart", chart_evidence),
     drawing="chart", lines=(Line(30, _tags_row),),
 )  # fmt: skip
@@ -98,7 +98,7 @@ CELL_PX = Figure(
     source="geometry: half of 5 px, 0.5 px rounding, 0.25 px registration; 8.6 px bleeds 1.3 % at a blur of 0.7 px",
     remedy="bring the camera nearer or take a longer lens",
     measure=lambda table: table.registration.cell_px, forecast=lambda check: check.cell_px,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="known", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="chart", lines=(Line(40, _cell_row),),
 )  # fmt: skip
 
@@ -140,7 +140,7 @@ BLEED = Figure(
     remedy="focus on the print, stop down to f/8, bring the camera nearer, or take a smaller window "
     "(build-lut --window)",
     measure=_bleed, forecast=_bleed_in_check,
-    worst=_smallest_cell, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="known", worst=_smallest_cell, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="chart",
     lines=(
         Line(50, _window_row),
@@ -195,8 +195,8 @@ CORRECTION_RESIDUAL = Figure(
     source=SIMULATED + ": 0.3 to 0.5 % where light falls off towards the corners, and the means twice as good; 1.4 % "
     "in even light or on a chart of 512 colours, which do not show a veil of the usual 1 %",
     remedy=_LESS_VEIL,
-    measure=of_many_frames(_left_by_lens), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=_veil, retake=NO_FRAMES, cause=NO_CAUSE,
+    measure=_left_by_lens, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown", worst=NO_PLACE, where=_veil, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=(Line(70, _lens_row),),
 )  # fmt: skip
 
@@ -206,8 +206,8 @@ CORRECTION_WORST = Figure(
     source="geometry: by a cell of a twentieth of paper six times the veil's error; 3 % is three standard deviations "
     "of a mean of 300 counts; " + SIMULATED + ": 0.3 to 1.9 % where the mean is accepted",
     remedy=_LESS_VEIL,
-    measure=of_many_frames(_left_in_worst_cell), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=_veil, retake=NO_FRAMES, cause=NO_CAUSE,
+    measure=_left_in_worst_cell, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown", worst=NO_PLACE, where=_veil, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
@@ -234,7 +234,7 @@ TAG_RESIDUAL_PX = Figure(
     why="the place of a sheet that waves more rests on its cells alone",
     source=SIMULATED + ": 6 mm of waves and 10 mm of curl give 2.3", remedy=_FLATTEN,
     measure=lambda table: table.registration.lens_residual_px, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="known", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="residuals", lines=(Line(90, _plane_row),),
 )  # fmt: skip
 
@@ -244,7 +244,7 @@ TAG_FINAL_PX = Figure(
     source=SIMULATED + ": 0.05 to 0.2, the detector's own error 0.09",
     remedy="check that chart.json is that of the print, and that the print is one flat sheet",
     measure=lambda table: table.registration.marks_rms_px / table.registration.clearance, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="known", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="residuals", lines=(Line(80, _final_row),),
 )  # fmt: skip
 
@@ -270,7 +270,7 @@ BLOCK_RESIDUAL_PX = Figure(
     why="cells are sampled beside their centres; the limits are for cells of 10 px and rise with their size",
     source=SIMULATED + ": 0.01 to 0.06", remedy=_FLATTEN,
     measure=lambda table: table.registration.block_rms_px / table.registration.clearance, forecast=ONLY_OF_A_SESSION,
-    worst=_worst_block, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="known", worst=_worst_block, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="residuals", lines=(Line(100, _blocks_row),),
 )  # fmt: skip
 
@@ -279,6 +279,7 @@ BLOCKS_GOOD = Figure(
     why="part of the print is covered, damaged, or another print", source=JUDGEMENT,
     remedy="uncover the print, or print it anew",
     measure=lambda table: float(table.registration.blocks.good.mean()), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="known",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("chart", chart_evidence),
     drawing="residuals", lines=NO_LINES,
 )  # fmt: skip
@@ -295,6 +296,7 @@ AGREEMENT = Figure(
     source=SIMULATED + ": 0.99 and more; another order of the cells has about 0",
     remedy="name the chart.json of this print, and print without colour management",
     measure=lambda table: table.registration.agreement, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="known",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("chart", chart_evidence),
     drawing="chart", lines=(Line(110, _agreement_row),),
 )  # fmt: skip

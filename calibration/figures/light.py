@@ -35,7 +35,6 @@ from calibration.figures.figure import (
     SummaryRow,
     Worst,
     format_value,
-    of_many_frames,
 )
 from calibration.radiometry.superposition import NODES
 from foundation.colorimetry import angles_deg
@@ -108,8 +107,8 @@ REPEATED_FILES = Figure(
     "repeated_files", "Frames whose file is that of another frame", "light", "", "at most", 0.0, None,
     why="one photograph stands for several: what changed between them, as the lamp's drift, was not seen",
     source="no two exposures have the same bytes", remedy="correct the list of frames that was imported",
-    measure=of_many_frames(_repeated), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=_repeated_files, retake=NO_FRAMES, cause=NO_CAUSE,
+    measure=_repeated, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded", worst=NO_PLACE, where=_repeated_files, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
@@ -129,6 +128,7 @@ WHITE_DRIFT = Figure(
     why="lights taken at other times differ in brightness; each has its own ground truth, so its colour is right",
     source=JUDGEMENT + "; 1 % between whites is usual for a warm lamp", remedy=_WARM_UP,
     measure=_white_drift, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("drift", drift_evidence),
     drawing="course", lines=(Line(130, _drift_row),),
 )  # fmt: skip
@@ -148,7 +148,7 @@ DRIFT_LEFT = Figure(
     remedy="build the table without --correct-drift, let the lamp warm up, or take white frames more often "
     "(sequence.reference_every)",
     measure=_drift_left, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="unknown", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
 
@@ -163,14 +163,21 @@ WHITE_DRIFT_DEG = Figure(
     why="the lamp's spectrum changes, not its brightness alone",
     source=JUDGEMENT + ": a tenth of a good method's error", remedy=_WARM_UP,
     measure=_white_drift_deg, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("drift", drift_evidence),
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
 
 
+def _shows_white(table: TableMeasurements) -> bool:
+    """Return whether white is among what was read: a check may have read the frame of a light, of any colour."""
+    return bool(table.white_frames) or not table.is_of_one_frame
+
+
 def _leak(table: TableMeasurements) -> float | None:
     share = table.dark_share
-    return share if np.isfinite(share) and table.lights.subtracted is None else None
+    measured = np.isfinite(share) and table.lights.subtracted is None
+    return share if measured and _shows_white(table) else None
 
 
 def _dark_row(table: TableMeasurements) -> SummaryRow | None:
@@ -190,6 +197,7 @@ LEAK_SHARE = Figure(
     source=JUDGEMENT + "; a contrast of 1 : 1500 leaks 0.07 %",
     remedy="darken the room, cover lamps and displays, or have it subtracted (build-lut --subtract-dark)",
     measure=_leak, forecast=lambda check: None if check.leak is None else float(np.abs(check.leak).max()),
+    of_one_frame="known",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("dark", dark_evidence),
     drawing=NOT_DRAWN, lines=(Line(210, _dark_row),),
 )  # fmt: skip
@@ -202,6 +210,7 @@ DARK_DRIFT = Figure(
     remedy="darken the room, and keep daylight out",
     measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None,
     forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("dark", dark_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
@@ -234,6 +243,7 @@ STRAY_SHARE = Figure(
     remedy="darken the room, see that no door, lamp or display changes during the session, switch power saving and "
     "dynamic contrast off, and take the frames again",
     measure=_stray, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("stray", stray_evidence),
     drawing=NOT_DRAWN, lines=(Line(250, _stray_row),),
 )  # fmt: skip
@@ -277,14 +287,12 @@ LINEARITY = Figure(
     remedy="expose less, switch the camera's highlight priority and noise reduction off; a series of exposures of the "
     "chart, given with --linearity, shows where counts bend",
     measure=_linearity, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="known", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=(Line(185, _linearity_row),),
 )  # fmt: skip
 
 
-def _linearity_known(table: TableMeasurements) -> float | None:
-    if table.is_of_one_frame and table.sensor.linearity is None:
-        return None
+def _linearity_known(table: TableMeasurements) -> float:
     return float(table.sensor.linearity is not None or table.sensor.superposition.measured)
 
 
@@ -301,7 +309,7 @@ LINEARITY_KNOWN = Figure(
     remedy="plan red, green and blue each alone (acquire illuminations does) for a chart of 512 colours or more, or "
     "give a series of exposures of the chart with --linearity",
     found=_linearity_lacks, measure=_linearity_known, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="unknown", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
@@ -335,7 +343,7 @@ TOO_DARK = Figure(
     remedy="build the table without --subtract-dark; a lamp or a display was on while the dark frames were taken, or "
     "the projector closes an iris for black: take the dark frames as the lights are taken",
     measure=_too_dark, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="unknown", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
 
@@ -371,6 +379,7 @@ ADDITIVITY = Figure(
     source=JUDGEMENT + "; the drift of the lamp is taken out first",
     remedy="switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
     measure=_beyond_sum(-1), forecast=lambda check: check.not_additive,
+    of_one_frame="unknown",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("sum", _sum_evidence),
     drawing=NOT_DRAWN, lines=(Line(260, _sum_row),),
 )  # fmt: skip
@@ -382,6 +391,7 @@ WHITE_DEFICIT = Figure(
     source=JUDGEMENT + "; a lamp that flickers by 1 % gives 2 %",
     remedy="look at the exposures of these frames, and switch dynamic contrast and power saving off",
     measure=_beyond_sum(1), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("brightness", light_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
@@ -448,6 +458,7 @@ OFF_CODES_DEG = Figure(
     remedy="correct the list of frames that was imported, let the picture settle for longer (sequence.settle_s), or "
     "expose whole turns of the colour wheel",
     measure=_off_codes, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown",
     worst=_furthest_off, where=_off_lights, retake=_frames_off_codes, cause=Explanation("names", name_evidence),
     drawing="lights", lines=(Line(220, _codes_row),),
 )  # fmt: skip
@@ -489,7 +500,7 @@ OFF_BRIGHTNESS = Figure(
     source=JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
     remedy="keep one exposure for the session, and take the frames again",
     measure=_of_codes(lambda codes: float(codes.off_brightness.max())), forecast=ONLY_OF_A_SESSION,
-    worst=_brightest_off, where=_brightness_text, retake=_frames_off_brightness,
+    of_one_frame="unknown", worst=_brightest_off, where=_brightness_text, retake=_frames_off_brightness,
     cause=Explanation("brightness", brightness_evidence, follows=("off_codes_deg", "exchanged_lights")),
     drawing=NOT_DRAWN, lines=NO_LINES,
 )  # fmt: skip
@@ -501,6 +512,7 @@ EXCHANGED_LIGHTS = Figure(
     source=SIMULATED + ": none in random healthy rooms, all pairs further apart than the figure below in the others",
     remedy="correct the list of frames that was imported, or take both again",
     measure=_of_codes(lambda codes: float(len(codes.exchanges))), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown",
     worst=NO_PLACE, where=_exchanges, retake=NO_FRAMES, cause=Explanation("names", name_evidence),
     drawing="lights", lines=NO_LINES,
 )  # fmt: skip
@@ -511,7 +523,7 @@ CODE_MISFIT = Figure(
     source=SIMULATED + ": 1 is what random healthy rooms stay below; of more than 24 lights each is judged by itself",
     remedy="look whether frames and lights belong together, and whether the lamp was steady",
     measure=_of_codes(lambda codes: codes.misfit), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="unknown", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="lights", lines=NO_LINES,
 )  # fmt: skip
 
@@ -521,7 +533,7 @@ EXCHANGE_DEG = Figure(
     source=SIMULATED + ": 0.3 with 707 lights, 0 with eight that lie far apart",
     remedy="take white and the primaries along with the lights, and expose longer",
     measure=_of_codes(lambda codes: codes.exchange_deg), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="unknown", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="lights", lines=NO_LINES,
 )  # fmt: skip
 
@@ -546,7 +558,7 @@ CHECKED_SHARE = Figure(
     source="the angle from which a wrong name is refused, beyond what codes predict of so few lights",
     remedy="take white, red, green and blue along with the lights, and expose longer",
     measure=_of_codes(lambda codes: float(codes.held.mean())), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=_checked_text, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="unknown", worst=NO_PLACE, where=_checked_text, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=(Line(230, _checked_row),),
 )  # fmt: skip
 
@@ -582,6 +594,7 @@ WHITE_FRAME_DEG = Figure(
     source=SIMULATED + ": 0 in random healthy rooms",
     remedy="correct the list of frames that was imported, or take the white frame again",
     measure=_white_frames(lambda white: white.off_deg), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown",
     worst=NO_PLACE, where=lambda table, accepted: first_of([one.file for one in _beyond_deg(table, accepted)]),
     retake=_beyond_deg, cause=Explanation("names", name_evidence),
     drawing="course", lines=NO_LINES,
@@ -594,6 +607,7 @@ WHITE_FRAME_BRIGHTNESS = Figure(
     source=JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
     remedy="keep one exposure for the session, and take the white frame again",
     measure=_white_frames(lambda white: white.off_brightness), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown",
     worst=NO_PLACE, where=lambda table, accepted: first_of([one.file for one in _beyond_brightness(table, accepted)]),
     retake=_beyond_brightness, cause=Explanation("brightness", light_evidence),
     drawing="course", lines=NO_LINES,
@@ -620,14 +634,14 @@ PRIMARIES_LACKING = Figure(
     source="where the primaries' fields differ by 10 %, coloured cells at corners are off by some tenths of a per cent",
     remedy="take red, green and blue, each alone, along with the lights",
     measure=_primaries_lacking, forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="unknown", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="field", lines=(Line(240, _fields_row),),
 )  # fmt: skip
 
 
 def _tint(table: TableMeasurements) -> float | None:
     tint = table.greys.tints_deg(table.lights.white)
-    return float(np.nanmax(tint)) if tint.size and np.isfinite(tint).any() else None
+    return float(np.nanmax(tint)) if tint.size and np.isfinite(tint).any() and _shows_white(table) else None
 
 
 def _tint_row(table: TableMeasurements) -> SummaryRow | None:
@@ -650,6 +664,6 @@ GREY_TINT_DEG = Figure(
     remedy="generate by colour, as it does unless told otherwise, which takes the print as it is measured; or have the "
     "chart printed through the printer's profile (docs/printing.md)",
     measure=_tint, forecast=lambda check: check.tint_deg,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="known", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=(Line(270, _tint_row),),
 )  # fmt: skip

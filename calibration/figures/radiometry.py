@@ -38,7 +38,6 @@ from calibration.figures.figure import (
     Line,
     SummaryRow,
     Worst,
-    of_many_frames,
 )
 from experiment.measures.sensor import MAX_BLACK_DRIFT
 from experiment.measures.stains import added_light
@@ -99,7 +98,7 @@ UNFIT_SHARE = Figure(
     "unfit_share", "Cells unfit for use", "radiometry", "share", "at most", 0.005, 0.1,
     why="colours without samples are missing from every picture", source=JUDGEMENT, remedy="", found=_most_unfit,
     measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1), forecast=_unfit_in_check,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
+    of_one_frame="bounded", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
     cause=Explanation("unfit cells", unfit_evidence, follows=("unlike_block",)),
     drawing="print", lines=(Line(290, _unfit_row),),
 )  # fmt: skip
@@ -127,6 +126,7 @@ DOUBTFUL_SHARE = Figure(
     remedy="clean the print, hang it flatter, and look for shadows on it",
     measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.known else None,
     forecast=_doubtful_in_check,
+    of_one_frame="known",
     worst=_most_deviating, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("spot", spot_evidence),
     drawing="print", lines=NO_LINES,
 )  # fmt: skip
@@ -145,6 +145,7 @@ ADDED_LIGHT = Figure(
     remedy="turn print or projector until nothing is mirrored on it, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
     forecast=_added_in_check,
+    of_one_frame="known",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("spot", spot_evidence),
     drawing="print", lines=NO_LINES,
 )  # fmt: skip
@@ -176,7 +177,8 @@ SOFTER_BLEED = Figure(
     source=SIMULATED + ": 0.9 px of blur in one frame of a session with 0.5 px give 0.8 % and cells 1.2 % off, "
     "1.1 px 2 % and cells 4 % off",
     remedy="switch off autofocus and stabilisation, see that nothing shakes the camera",
-    measure=of_many_frames(lambda table: table.added_bleed(_softest(table))), forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: table.added_bleed(_softest(table)), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded",
     worst=lambda table, chart: Worst(f"blur σ {_softest(table).blur_px:.2f} px", _softest(table).record.file),
     where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
     cause=Explanation("frame", blur_evidence),
@@ -197,7 +199,7 @@ def _of_alike_frames(value: _FrameValue) -> Callable[[TableMeasurements], float 
         known = has_enough_cells(_cell_count(table))
         return max(value(table, frame) for frame in table.frames) if known else None
 
-    return of_many_frames(measure)
+    return measure
 
 
 FRAME_SCATTER = Figure(
@@ -207,7 +209,7 @@ FRAME_SCATTER = Figure(
     source=SIMULATED + ": to 0.8 % beyond noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
     remedy="see that nothing changes during the session",
     measure=_of_alike_frames(lambda table, frame: frame.consistency.scatter), forecast=ONLY_OF_A_SESSION,
-    worst=_most_scattered,
+    of_one_frame="bounded", worst=_most_scattered,
     where=lambda table, accepted: f"in {max(table.frames, key=lambda one: one.consistency.scatter).record.file}",
     retake=_frames_beyond(lambda table, frame: frame.consistency.scatter),
     cause=Explanation("frame", scatter_evidence, follows=("unlike_block", "disturbed_cells")),
@@ -227,6 +229,7 @@ UNLIKE_BLOCK = Figure(
     why="something lay, or shone, on the print in that frame or in the one compared with, and its samples contain it",
     source=SIMULATED + ": to 0.4 % beyond noise", remedy="see that nobody comes between lamp, print and camera",
     measure=_of_alike_frames(lambda table, frame: frame.consistency.block), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded",
     worst=_worst_block, where=OF_ITS_CAUSE, retake=_frames_beyond(lambda table, frame: frame.consistency.block),
     cause=Explanation("block", block_evidence),
     drawing="course", lines=NO_LINES,
@@ -247,8 +250,8 @@ DISTURBED_CELLS = Figure(
     source=SIMULATED + ": none in healthy rooms; two cells next to each other, five standard deviations off, are one, "
     "unless the dark frames show them to be hot",
     remedy="see that nothing comes between lamp, print and camera",
-    measure=of_many_frames(_disturbed), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
+    measure=_disturbed, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
     cause=Explanation("few cells", disturbed_evidence, follows=("unlike_block",)),
     drawing="worst", lines=NO_LINES,
 )  # fmt: skip
@@ -269,8 +272,9 @@ REGISTERED_ANEW = Figure(
     "moved_anew", "Frames registered again", "geometry", "", "at most", 0, None,
     why="the chart or the camera moved between frames; the sampling grid followed", source=JUDGEMENT,
     remedy="fix camera and print, and let nobody walk about",
-    measure=of_many_frames(lambda table: float(_registered_anew(table))),
+    measure=lambda table: float(_registered_anew(table)),
     forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("movement", movement_evidence),
     drawing="course", lines=(Line(120, _movement_row),),
 )  # fmt: skip
@@ -288,8 +292,8 @@ OTHER_CAMERA = Figure(
     "other_camera", "Frames of another camera", "radiometry", "", "at most", 0, 0.5, foremost=True,
     why="a table is of one camera: another body sees other colours, and another model others yet",
     source="by definition", remedy="take these frames again with the session's camera",
-    measure=of_many_frames(lambda table: float(len(table.origins.other_camera))), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_camera),
+    measure=lambda table: float(len(table.origins.other_camera)), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded", worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_camera),
     retake=lambda table, limit: [frame.record for frame in table.origins.other_camera],
     cause=Explanation("camera", camera_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
@@ -299,7 +303,8 @@ OTHER_LENS = Figure(
     "other_lens", "Frames through another lens", "radiometry", "", "at most", 0, None,
     why="lenses tint, blur and shade each in its own way", source="by definition",
     remedy="take these frames again through the session's lens",
-    measure=of_many_frames(lambda table: float(len(table.origins.other_lens))), forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: float(len(table.origins.other_lens)), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded",
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_lens), retake=NO_FRAMES,
     cause=Explanation("camera", camera_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
@@ -316,7 +321,8 @@ OTHER_EXPOSURE = Figure(
     "at most", 0.01, 0.1, foremost=True,
     why="brightness would differ between lights that should be alike, and the noise with the ISO speed",
     source="shutter times are steps of 26 % apart, and are written rounded", remedy=_SAME_EXPOSURE,
-    measure=of_many_frames(lambda table: table.origins.exposure_difference), forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: table.origins.exposure_difference, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded",
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_exposure), retake=_otherwise_exposed,
     cause=Explanation("brightness", light_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
@@ -326,7 +332,8 @@ OTHER_ISO = Figure(
     "other_iso", "Frames of another ISO speed", "radiometry", "", "at most", 0, None,
     why="their noise is another, and so is the count at which they saturate; their exposure is judged apart",
     source="by definition", remedy=_SAME_EXPOSURE,
-    measure=of_many_frames(lambda table: float(len(table.origins.other_iso))), forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: float(len(table.origins.other_iso)), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded",
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_iso), retake=NO_FRAMES,
     cause=Explanation("iso", iso_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
@@ -337,8 +344,8 @@ WHITE_FRAMES = Figure(
     why="nothing says how the lamp drifted, whether the print has stains, or whether cells are of one colour",
     source="by definition; from two on a drift is seen",
     remedy="take white frames along with the lights (sequence.reference_every)",
-    measure=of_many_frames(lambda table: float(len(table.white_frames))), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    measure=lambda table: float(len(table.white_frames)), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
 
@@ -354,7 +361,7 @@ BLACK_DRIFT_COUNTS = Figure(
     why="the sensor warmed up; each frame's own black is subtracted, but an error of it shows in dark cells of about "
     "30 counts",
     source=JUDGEMENT, remedy="let the camera run for some minutes before the session, and rest between frames",
-    measure=of_many_frames(lambda table: table.black_drift), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    measure=lambda table: table.black_drift, forecast=ONLY_OF_A_SESSION,
+    of_one_frame="bounded", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="course", lines=(Line(140, _black_row),),
 )  # fmt: skip

@@ -22,7 +22,6 @@ from calibration.figures.figure import (
     Line,
     SummaryRow,
     Worst,
-    of_many_frames,
 )
 from calibration.figures.light import percent, percents, worst_light
 from drivers.raw.rawfile import CLIPPING_SHARE
@@ -54,7 +53,7 @@ NOISE_MISFIT = Figure(
     "flickers",
     source="EMVA 1288 model; " + SIMULATED + ": 0.05 to 0.15", remedy="switch the camera's noise reduction off",
     measure=lambda table: float(table.sensor.transfer.misfit.max()), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="known", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="noise", lines=(Line(170, _noise_row), Line(200, _at_zero_row)),
 )  # fmt: skip
 
@@ -82,6 +81,7 @@ NOISY_SHARE = Figure(
     why="they are not of one colour: dirt, a fold, a neighbour's edge", source="a variance 3.5 times the model's",
     remedy="clean the print, focus, and hang it flatter",
     measure=lambda table: float(table.sensor.transfer.noisy.mean()), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="known",
     worst=_noisiest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("noisy cells", noisy_evidence),
     drawing="cells", lines=(Line(180, _transfer_row),),
 )  # fmt: skip
@@ -102,7 +102,7 @@ REFERENCES_USED = Figure(
     why="flat field and ground truth rest on few places", source=JUDGEMENT,
     remedy="uncover the print, bring all of it into the picture, expose so that bare paper stays below saturation",
     measure=_references_used, forecast=lambda check: check.references_used,
-    worst=_fewest_references, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="bounded", worst=_fewest_references, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
 
@@ -127,6 +127,7 @@ REFERENCE_SPREAD = Figure(
     remedy="clean or flatten the print, and look for shadows on it",
     measure=lambda table: max(map(_spread_of, table.white_frames), default=None),
     forecast=lambda check: None if check.paper is None else _spread(check.paper),
+    of_one_frame="bounded",
     worst=_most_spread, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("references", reference_evidence),
     drawing="rest", lines=NO_LINES,
 )  # fmt: skip
@@ -150,8 +151,8 @@ TRUTH_MEDIAN_DEG = Figure(
     "truth_median_deg", "Expanded uncertainty of the ground truth, median light", "truth", "°", "at most", 0.4, 1.0,
     why="a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + ": a quarter of a good method's error; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=of_many_frames(lambda table: float(np.median(table.budget.expanded_deg))), forecast=ONLY_OF_A_SESSION,
-    worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    measure=lambda table: float(np.median(table.budget.expanded_deg)), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="budget", lines=(Line(190, _error_row),),
 )  # fmt: skip
 
@@ -168,8 +169,8 @@ TRUTH_WORST_DEG = Figure(
     "truth_worst_deg", "Expanded uncertainty of the ground truth, worst light", "truth", "°", "at most", 0.5, 3.0,
     why="under that light a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=of_many_frames(lambda table: float(table.budget.expanded_deg.max())), forecast=ONLY_OF_A_SESSION,
-    worst=_least_known, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    measure=lambda table: float(table.budget.expanded_deg.max()), forecast=ONLY_OF_A_SESSION,
+    of_one_frame="unknown", worst=_least_known, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="budget", lines=NO_LINES,
 )  # fmt: skip
 
@@ -190,20 +191,14 @@ def _saturation_row(table: TableMeasurements) -> SummaryRow:
     return SummaryRow("Saturation", f"{sensor.white_level} counts above black", note)
 
 
-def _brightest_share(table: TableMeasurements) -> float | None:
-    # Of one frame it is that of white, which a light's own frame does not show.
-    known = table.white_frames or not table.is_of_one_frame
-    return float(table.lights.white.max()) / table.sensor.white_level if known else None
-
-
 BRIGHTEST_SHARE = Figure(
     "brightest_share", "Bare paper under the brightest light, of saturation", "radiometry", "share", "at most", 0.9,
     CLIPPING_SHARE,
     why="the unevenness of the light carries cells into saturation",
     source=JUDGEMENT + ": 0.8 leaves room for 20 % unevenness", remedy="expose less",
-    measure=_brightest_share,
+    measure=lambda table: float(table.lights.white.max()) / table.sensor.white_level,
     forecast=lambda check: check.brightest_share,
-    worst=_brightest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="bounded", worst=_brightest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="lights", lines=(Line(150, _saturation_row),),
 )  # fmt: skip
 
@@ -224,8 +219,8 @@ DARKEST_COUNTS = Figure(
     "darkest_counts", "Bare paper under the darkest light", "radiometry", "counts", "at least", 300.0, MIN_SIGNAL,
     why="25 samples of 300 counts have a mean good to 1 %, a print's dark colours a thirtieth of that",
     source="photon noise at 1.8 electrons a count, 6 counts of read noise", remedy="expose longer",
-    measure=of_many_frames(lambda table: float(table.lights.white.max(axis=1).min())),
+    measure=lambda table: float(table.lights.white.max(axis=1).min()),
     forecast=lambda check: check.darkest_counts,
-    worst=_darkest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    of_one_frame="bounded", worst=_darkest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="lights", lines=(Line(160, _darkest_row),),
 )  # fmt: skip

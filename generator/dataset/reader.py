@@ -300,7 +300,7 @@ class Dataset:
 
     @property
     def layout(self) -> str:
-        """Its layout: ``folder``, or a name of `generator.dataset.layouts.JOINED`."""
+        """Its layout, a name of `generator.dataset.layouts.LAYOUTS`."""
         return self._options.layout
 
     @cached_property

@@ -1,10 +1,8 @@
-"""What a dataset is on disk: its records, the names of its files, and images that are files of their own.
+"""What a dataset is on disk: its description, lights and sources, the record of each shard, and the names of its files.
 
-The records are its description, lights and sources, and the record of each shard. A shard is a range of planned image
-numbers that is made by one task. Its record is written when everything else of it is on the disk: a shard with a record
-is done, one without is not.
-
-Images are files of their own here; those of a shard that lie in one file are `generator.dataset.layouts`.
+A shard is a range of planned image numbers that is made by one task. Its record is written when everything else of it
+is on the disk: a shard with a record is done, one without is not. How its images lie there is another matter
+(`generator.dataset.layouts`).
 """
 
 from __future__ import annotations

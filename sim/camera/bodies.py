@@ -176,7 +176,7 @@ def focus_points(found: Iterable[int]) -> bytes:
     return struct.pack("<IH", length, length - 4) + body
 
 
-_FILE_FORMATS = (
+_IMAGE_FORMATS = (
     ObjectFormat.ASSOCIATION,
     ObjectFormat.SCRIPT,
     ObjectFormat.DPOF,
@@ -198,7 +198,7 @@ def _device_info(model: str, version: str, manufacturer: str, extension_version:
         events=tuple(EVENTS),
         properties=tuple(STANDARD_PROPERTIES),
         capture_formats=(ObjectFormat.EXIF_JPEG,),
-        image_formats=_FILE_FORMATS,
+        image_formats=_IMAGE_FORMATS,
         manufacturer=manufacturer,
         model=model,
         device_version=version,

@@ -224,29 +224,54 @@ def test_a_figure_measures(figure: Any, more: dict[str, Any], value: float | Non
     assert figure.measure(table(**more)) == (None if value is None else pytest.approx(value, rel=1e-3))
 
 
+def of_one_frame(**more: object) -> Any:
+    """Return what a check has, whose frame shows nothing wrong."""
+    origins = SimpleNamespace(other_camera=(), other_exposure=(), other_lens=(), other_iso=(), exposure_difference=0.0)
+    paper = SimpleNamespace(white=np.array([4000.0, 9000, 2000]), references=100, spread=np.full(3, 0.001))
+    calm = SimpleNamespace(scatter=0.0, block=0.0, disturbed=())
+    one = frame(0, paper=paper, consistency=calm)
+    usual = {"frames": (one,), "white_frames": (one,), "white": WHITE[1:2], "origins": origins, "black_drift": 0.1}
+    return table(is_of_one_frame=True, **{**usual, **more})
+
+
 @pytest.mark.parametrize(
-    "figure",
+    ("figure", "beyond"),
     [
-        geometry.CORRECTION_RESIDUAL, geometry.CORRECTION_WORST, light.REPEATED_FILES, light.LINEARITY_KNOWN,
-        radiometry.SOFTER_BLEED, radiometry.FRAME_SCATTER, radiometry.UNLIKE_BLOCK, radiometry.DISTURBED_CELLS,
-        radiometry.REGISTERED_ANEW, radiometry.OTHER_CAMERA, radiometry.OTHER_LENS, radiometry.OTHER_EXPOSURE,
-        radiometry.OTHER_ISO, radiometry.WHITE_FRAMES, radiometry.BLACK_DRIFT_COUNTS, truth.TRUTH_MEDIAN_DEG,
-        truth.TRUTH_WORST_DEG, truth.DARKEST_COUNTS,
+        (radiometry.OTHER_CAMERA, {"origins": FOREIGN}),
+        (radiometry.UNFIT_SHARE, {"cells": SimpleNamespace(unfit=(1, 2, 3, 4))}),
+        (radiometry.BLACK_DRIFT_COUNTS, {"black_drift": 20.0}),
+        (truth.DARKEST_COUNTS, {"white": np.array([[60.0, 243, 30]])}),
+        (truth.BRIGHTEST_SHARE, {"white": np.array([[60.0, 9900, 30]])}),
+        (truth.REFERENCES_USED, {"session": SimpleNamespace(white_references=200)}),
     ],
-    ids=lambda figure: figure.name,
-)  # fmt: skip
-def test_a_check_of_one_frame_does_not_judge_what_takes_more(figure: Any) -> None:
-    known = {**lens_before(4096, measured=True, is_left_in=False), "black_drift": 0.5}
-    known["origins"] = SimpleNamespace(
-        other_camera=(), other_exposure=(), other_lens=(), other_iso=(), exposure_difference=0.0
-    )
-    assert figure.measure(table(**known)) is not None
-    assert figure.measure(table(**known, is_of_one_frame=True)) is None
+)
+def test_a_check_tells_what_more_frames_cannot_make_good_and_accepts_nothing_that_they_may_spoil(
+    figure: Any, beyond: dict[str, Any]
+) -> None:
+    fine, bad = of_one_frame(), of_one_frame(**beyond)
+    assert figure.outcome(figure.measure(fine)) == "accept"
+    assert figure.outcome(figure.measure(bad)) != "accept"
+    assert (figure.judged_value(fine), figure.judged_value(bad)) == (None, figure.measure(bad))
+    fine.is_of_one_frame = False
+    assert figure.judged_value(fine) == figure.measure(fine)
 
 
-def test_a_check_of_a_light_does_not_say_how_bright_the_brightest_is() -> None:
-    assert truth.BRIGHTEST_SHARE.measure(table(is_of_one_frame=True)) == 0.5
-    assert truth.BRIGHTEST_SHARE.measure(table(is_of_one_frame=True, white_frames=())) is None
+def test_a_check_does_not_judge_what_all_frames_tell() -> None:
+    found = of_one_frame(**lens_before(4096, measured=True, is_left_in=False))
+    for figure in (geometry.CORRECTION_RESIDUAL, light.LINEARITY_KNOWN, radiometry.WHITE_FRAMES, truth.TRUTH_WORST_DEG):
+        assert figure.measure(found) is not None
+        assert figure.judged_value(found) is None
+
+
+def test_leak_and_tint_are_held_against_white_alone() -> None:
+    def tints_deg(white: object) -> Any:
+        return np.array([2.0])
+
+    greys = SimpleNamespace(tints_deg=tints_deg)
+    for figure in (light.LEAK_SHARE, light.GREY_TINT_DEG):
+        assert figure.judged_value(of_one_frame(greys=greys)) is not None
+        assert figure.judged_value(of_one_frame(greys=greys, white_frames=())) is None
+        assert figure.judged_value(table(greys=greys, white_frames=())) is not None
 
 
 def test_a_bend_is_what_counts_lack_for_certain_over_paper_s_levels() -> None:
