@@ -20,7 +20,8 @@ _FIGURES_HEAD = """# Figures
 
 What `build-lut` judges a table by. Within what is *accepted* nothing is said; beyond it a figure is remarked on, and
 beyond what is *refused* there is no table. `acquire check` forecasts some of them before a session, by the same limits.
-The names are those of `report.json`.
+`build-lut --check` reads one frame, and judges those that this tells; what more frames can only make worse it judges
+where it is *beyond* already. The names are those of `report.json`.
 
 *Written by `python -m calibration.reference` from `calibration/figures`.*
 """
@@ -45,13 +46,18 @@ _LEAST = 1e-9
 """What stands in the table for "more than none"."""
 
 
+_TOLD = {"known": "yes", "bounded": "beyond", "unknown": "–"}
+
+
 def figures_page() -> str:
     """Return the page of the figures, Markdown."""
     parts = [_FIGURES_HEAD]
     for group, question in QUESTIONS.items():
         parts.append(f"## {group.capitalize()}\n\n{question}\n")
-        parts.append("| figure | accepted | refused beyond | in a check | what goes wrong beyond | what helps |")
-        parts += ["|---|---|---|---|---|---|", *(_limits(one) for one in FIGURES if one.group == group), ""]
+        parts.append(
+            "| figure | accepted | refused beyond | in a check | of one frame | what goes wrong beyond | what helps |"
+        )
+        parts += ["|---|---|---|---|---|---|---|", *(_limits(one) for one in FIGURES if one.group == group), ""]
     return "\n".join(parts)
 
 
@@ -59,7 +65,9 @@ def _limits(one: Figure) -> str:
     refused = "–" if one.refuse is None else one.text(one.refuse)
     known = "–" if one.forecast is None else "yes"
     helps = one.remedy or "what most of them are decides"
-    return f"| {one.title} (`{one.name}`) | {one.expected} | {refused} | {known} | {one.why} ({one.source}) | {helps} |"
+    told = _TOLD[one.of_one_frame]
+    limits = f"{one.expected} | {refused} | {known} | {told}"
+    return f"| {one.title} (`{one.name}`) | {limits} | {one.why} ({one.source}) | {helps} |"
 
 
 def causes_page() -> str:
