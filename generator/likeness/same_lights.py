@@ -243,8 +243,9 @@ def _masks_of(dataset: Dataset) -> GivenMaskPlan | None:
     place, layout = dataset.store.place, LAYOUTS[dataset.layout]
     folder = layout.folder("masks", dataset.description.parts) if isinstance(layout, FileLayout) else None
     if is_remote(place) or folder is None:
+        remedy = "make it in the layout folder" if folder is None else "copy it here"
         raise InputError(
-            f"several lights fall on the images of {place}, whose masks are needed as files of this machine; it has "
-            f"the layout {dataset.layout}: copy it here, or make it in the layout folder"
+            f"several lights fall on the images of {place}, whose masks are needed in a folder of this machine, "
+            f"and it has the layout {dataset.layout}; {remedy}"
         )
     return find_masks(local_path(place) / folder, together)

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from generator.cli import main
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import exact_parts, sizes_of
 from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.records import Layout
 from generator.files import FULL, from_full_scale, to_full_scale
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import find_pictures
@@ -70,7 +71,7 @@ class TestFullScale:
         np.testing.assert_array_equal(from_full_scale(stretched, white), counts)
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("layout", ["folder", "webdataset", "parquet"])
+    @pytest.mark.parametrize("layout", get_args(Layout))
     def test_our_readers_read_what_was_stretched_as_it_was(self, lut: Lut, layout: str) -> None:
         if layout == "parquet":
             pytest.importorskip("pyarrow")

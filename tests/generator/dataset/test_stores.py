@@ -203,7 +203,7 @@ STRIDE = 3
 """Of the writes to a store every third is one at which it fails."""
 
 
-@pytest.mark.parametrize("layout", ["folder", "webdataset"])
+@pytest.mark.parametrize("layout", get_args(Layout))
 def test_a_store_that_fails_at_any_write_is_gone_on_with(make_lut: MakeLut, tmp_path: Path, layout: str) -> None:
     lut = make_lut()
     make(lut, tmp_path / "out", layout=layout, previews=False)

@@ -63,7 +63,7 @@ def interrupt_after(images: int) -> Callable[[], None]:
     return on_image
 
 
-@pytest.mark.parametrize(("layout", "workers"), [("folder", 1), ("folder", 3), ("webdataset", 1), ("parquet", 3)])
+@pytest.mark.parametrize(("layout", "workers"), [("folder", 3), *((layout, 1) for layout in get_args(Layout))])
 def test_going_on_gives_the_same_bytes(make_lut: MakeLut, tmp_path: Path, layout: str, workers: int) -> None:
     lut = make_lut()
     make(lut, tmp_path / "whole", layout=layout)

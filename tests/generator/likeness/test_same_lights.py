@@ -80,6 +80,15 @@ def test_masks_are_those_of_the_first(lab: Path) -> None:
         assert first.read_weights(here).tolist() == second.read_weights(there).tolist()
 
 
+def test_masks_that_lie_in_shards_are_refused(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    del lab
+    wish = ("--sources", "pictures", "--no-preview")
+    several = ("--random", "1", "--lights-per-image", "2", "--layout", "webdataset")
+    assert main(("one", "first", *wish, *several)) == 0
+    assert main(("two", "second", *wish, "--lights-of", "first")) == 2
+    assert "layout webdataset; make it in the layout folder" in capsys.readouterr().err
+
+
 def test_what_is_refused(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wish = ("--sources", "pictures", "--no-preview")
     assert main(("one", "first", *wish, "--illuminations", "all")) == 0
