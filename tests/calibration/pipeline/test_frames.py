@@ -91,6 +91,17 @@ def test_damaged_settings_are_told_where_a_table_is_made(
     assert "neither its origin" in caplog.text
 
 
+@pytest.mark.parametrize(("rig", "iso"), [("lab", 200), ("simulated", 200), ("replay", None)])
+def test_the_exposure_of_settings_is_stated_where_they_set_the_camera(
+    taken: Callable[[Sequence[float]], Session], rig: str, iso: int | None
+) -> None:
+    with taken([float(number) for number in range(len(STEPS))]) as session:
+        (session.folder / "session.toml").write_text(f'rig = "{rig}"\n[camera]\niso = 200\n')
+        stated = stated_origin(session)
+    assert stated.rig == rig
+    assert (None if stated.camera is None else stated.camera.iso) == iso
+
+
 def test_patches_that_are_cut_off_or_clipped_have_no_mean() -> None:
     samples = np.arange(4 * 25 * 3, dtype=np.float32).reshape(4, 25, 3)
     sites = sites_at(np.array([[10.0, 10], [1, 10], [20, 20], [20, 10]]), (40, 40))
