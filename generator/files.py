@@ -122,11 +122,6 @@ _GREY: Final = 0
 _RGB: Final = 2
 
 
-def encode_png(image: Image, metadata: ImageMetadata) -> bytes:
-    """Return the file of `image` (H, W, 3) uint16."""
-    return b"".join(map(bytes, png_pieces(image, metadata)))
-
-
 def png_pieces(image: Image, metadata: ImageMetadata) -> Iterator[bytes | memoryview]:
     """Yield the file of `image` (H, W, 3) uint16 piece by piece; the memory of each is used again for the next."""
     height, width, _ = image.shape

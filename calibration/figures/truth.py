@@ -133,9 +133,7 @@ REFERENCE_SPREAD = Figure(
 )  # fmt: skip
 
 
-def _error_row(table: TableMeasurements) -> SummaryRow | None:
-    if table.is_of_one_frame:
-        return None
+def _error_row(table: TableMeasurements) -> SummaryRow:
     error = table.budget.expanded_deg
     value = f"{np.median(error):.2g}° median, {error.max():.2g}° worst light"
     note = f"k = {COVERAGE:g}; of the worst most is by {table.budget.main_cause(int(np.argmax(error))).title}"
@@ -208,9 +206,7 @@ def _darkest(table: TableMeasurements, chart: Chart) -> Worst | None:
     return worst_light(table, int(np.argmin(paper)), f"{paper.min():.0f} counts") if len(paper) > 1 else None
 
 
-def _darkest_row(table: TableMeasurements) -> SummaryRow | None:
-    if table.is_of_one_frame:
-        return None
+def _darkest_row(table: TableMeasurements) -> SummaryRow:
     darkest = table.lights.white.max(axis=1).min()
     return SummaryRow("Darkest light", f"{darkest:.0f} counts", "its strongest channel on bare paper")
 

@@ -489,9 +489,13 @@ def page(
 
 
 def summary(table: TableMeasurements, group: Group | None = None) -> list[SummaryRow]:
-    """Return the lines that say how good a table is, in their order: of all figures, or of a group's."""
+    """Return the lines that say how good a table is, in their order: of all figures, or of a group's.
+
+    Of one frame, those of figures that it tells.
+    """
     session = table.session
-    lines = (line for one in FIGURES if group in (None, one.group) for line in one.lines)
+    told = [one for one in FIGURES if not table.is_of_one_frame or one.of_one_frame != "unknown"]
+    lines = (line for one in told if group in (None, one.group) for line in one.lines)
     found = (line.row(table) for line in sorted(lines, key=lambda line: line.place))
     rows = [row for row in found if row is not None]
     if group not in (None, "geometry"):

@@ -295,7 +295,7 @@ def _reading(description: Description) -> str:
     layout = _layout(description)
     if isinstance(layout, JoinedLayout):
         return layout.reading
-    names = layout.patterns(description.parts, f".{option(description, 'format')}")
+    names = layout.patterns(description.parts, suffix_of(option(description, "format")))
     files = " and ".join(f"`{name.replace('*', 'NNNNNN')}`" for name in names)
     return (
         f"{files} are linear, 16 bits where the format has them; `load_dataset` gives the rows of "

@@ -14,16 +14,21 @@ import tarfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple, Protocol, Self, cast
 
 from foundation.errors import CropError, FormatError
 from foundation.files import HashingWriter
-from generator.dataset.records import ExitReason, FileSum, Sample, part_of, shard_key
+from generator.dataset.records import FileSum, Sample, part_of, shard_key
 from generator.stores import Store, joined
 
 if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
+
+
+ExitReason = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
+"""Arguments of `__exit__`: the type, value and traceback of what ended the block, or None."""
 
 
 def metadata_of(sample: Sample) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from typing import ClassVar, Final, Self
 
 from foundation.errors import InputError
 from foundation.files import HashingWriter
-from generator.dataset.joined import JOINED, Beside, JoinedLayout, JoinedWriter
-from generator.dataset.records import ExitReason, FileSum, Sample, part_of
+from generator.dataset.joined import JOINED, Beside, ExitReason, JoinedLayout, JoinedWriter
+from generator.dataset.records import FileSum, Sample, part_of
 from generator.stores import Store
 
 _SYNCED_IMAGES: Final = 32

@@ -8,7 +8,6 @@ is on the disk: a shard with a record is done, one without is not. How its image
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Final, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
@@ -322,7 +321,3 @@ class Sample:
     def key(self) -> str:
         """The number as file names have it."""
         return image_key(self.record.number)
-
-
-ExitReason = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
-"""Arguments of `__exit__`: the type, value and traceback of what ended the block, or None."""

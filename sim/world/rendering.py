@@ -487,6 +487,7 @@ def light(
                     _shares(x_lines, u, u_sigma, i, i1, u_share)
                     _shares(y_lines, v, v_sigma, j, j1, v_share)
                     red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+                    # Unsigned, for whether a signed index counts from the end is asked at each of hundreds of shares.
                     for b in range(np.uintp(j), np.uintp(j1 + 1)):
                         of_row = v_share[b]
                         for a in range(np.uintp(i), np.uintp(i1 + 1)):

@@ -20,7 +20,7 @@ from isal import isal_zlib
 from foundation.errors import InputError
 from generator import files
 from generator.deflate import LONGEST, Packer, code_lengths, codes_of, find_repeats
-from generator.files import ImageMetadata, encode_png
+from generator.files import ImageMetadata, encode_image
 
 METADATA = ImageMetadata(12000, (1.0, 1.0, 1.0), "Benchmark")
 
@@ -163,7 +163,7 @@ def test_what_is_found_is_equal(seed: int, height: int, width: int, colours: int
 def test_bands_make_one_stream(monkeypatch: pytest.MonkeyPatch, band: int) -> None:
     monkeypatch.setattr(files, "BAND", band)
     image = drawn(37, 400, 60)
-    data = encode_png(image, METADATA)
+    data = encode_image(image, "png", METADATA)
     assert data.count(b"IDAT") == -(-37 // max(1, band // 400))
     np.testing.assert_array_equal(imagecodecs.png_decode(data), image)
 
@@ -173,16 +173,16 @@ def test_bands_make_one_stream(monkeypatch: pytest.MonkeyPatch, band: int) -> No
 def test_files_are_no_larger_than_those_of_opencv(kind: str) -> None:
     image = KINDS[kind](512, 512)
     usual = cv2.imencode(".png", image[..., ::-1])[1]
-    assert len(encode_png(image, METADATA)) <= len(usual)
+    assert len(encode_image(image, "png", METADATA)) <= len(usual)
 
 
 def test_images_that_no_png_holds_are_refused() -> None:
     wide = np.broadcast_to(np.zeros(1, np.uint16), (1, (1 << 28) + 1, 3))
     with pytest.raises(InputError, match=r"268435457x1 px.*PNG"):
-        encode_png(wide, METADATA)
+        encode_image(wide, "png", METADATA)
     tall = np.broadcast_to(np.zeros(1, np.uint16), (1 << 31, 1, 3))
     with pytest.raises(InputError, match=r"1x2147483648 px.*PNG"):
-        encode_png(tall, METADATA)
+        encode_image(tall, "png", METADATA)
 
 
 frequencies = st.lists(st.integers(0, 1 << 40) | st.just(0), min_size=1, max_size=286)

@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 from hypothesis import given
@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 
 from drivers.links.link import MAX_MESSAGE, Link
 from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, ReportsPictureFault, Severity
-from drivers.serial_projectors import LANGUAGES, language, nec
+from drivers.serial_projectors import LANGUAGES, benq, epson, language, nec, optoma
 from drivers.serial_projectors.benq import BenqProjector
-from drivers.serial_projectors.driver import SerialProjector
+from drivers.serial_projectors.driver import SerialProjector, take_line
 from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
 from drivers.serial_projectors.nec import NecProjector, parse_errors
 from drivers.serial_projectors.optoma import OptomaProjector
@@ -733,6 +733,30 @@ def test_half_an_answer_is_no_answer(name: str, data: st.DataObject) -> None:
     script = Script(*((said, b":") for said in expected.before), (expected.question, (half,) if half else ()))
     with pytest.raises(LinkTimeout, match="within 5 s"):
         LANGUAGES[name].projector(lambda: script).power()
+
+
+TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
+    benq.reply_parser(b"\r*pow=?#\r"),
+    epson.take_reply,
+    epson.take_welcome,
+    nec.take_reply,
+    optoma.take_message,
+]
+COMMAND_TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
+    take_line,
+    nec.take_command,
+    optoma.take_command,
+]
+
+
+@given(data=st.binary(max_size=80))
+def test_whatever_comes_is_taken_waited_for_or_refused(data: bytes) -> None:
+    for take in TAKERS + COMMAND_TAKERS:
+        try:
+            taken = take(data)
+        except ProtocolError:
+            continue
+        assert taken is None or 1 <= taken[1] <= len(data)
 
 
 @pytest.mark.parametrize("name", NAMES)

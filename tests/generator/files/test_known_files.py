@@ -24,7 +24,6 @@ from generator.files import (
     encode_exr,
     encode_image,
     encode_map,
-    encode_png,
     encode_tiff,
     fit_flash,
     flash,
@@ -74,7 +73,11 @@ def test_files_of_images(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> Non
     found: dict[str, Any] = {}
     for name, numbers in images():
         image = numbers.astype(np.uint16)
-        found[name] = [encode_png(image, METADATA), encode_tiff(image, METADATA), encode_exr(image, METADATA)[:340]]
+        found[name] = [
+            encode_image(image, "png", METADATA),
+            encode_tiff(image, METADATA),
+            encode_exr(image, METADATA)[:340],
+        ]
         # Maps are packed by a library, whose versions may differ: that they come to less is known.
         found[name].append(len(encode_map(image[..., 1])) < 100 + image.nbytes)
         if min(image.shape[:2]) >= 22:
@@ -82,7 +85,7 @@ def test_files_of_images(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> Non
         # In bands of some rows, the last of them shorter.
         with monkeypatch.context() as changed:
             changed.setattr(files, "BAND", 7 * image.shape[1] + 3)
-            found[name].append(encode_png(image, OF_A_BODY))
+            found[name].append(encode_image(image, "png", OF_A_BODY))
     pinned("bytes of images' files", found)
 
 
@@ -180,7 +183,10 @@ def test_what_cannot_be_encoded(pinned: Pinned) -> None:
         found.append(made if isinstance(made, str) else "made")
     images = (image[:21], image[:, :21], image[:, :0], image[..., :2], image.astype(np.int16), image[0])
     found += [str(said(encode_image, one, form, METADATA))[:90] for one in images for form in ("png", "dng")]
-    found += [said(decode_image, encode_png(image, METADATA)[:60], form, "it")[:40] for form in ("png", "tiff", "exr")]
+    found += [
+        said(decode_image, encode_image(image, "png", METADATA)[:60], form, "it")[:40]
+        for form in ("png", "tiff", "exr")
+    ]
 
     def empty(height: int, width: int) -> npt.NDArray[np.uint16]:
         """Return an image without memory of its own, wider or higher than a format holds."""
