@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from unittest.mock import patch
 
 from acquisition.cli import main as acquire
@@ -128,7 +128,7 @@ class _Presenter(SimulatedPresenter):
 class _Eos(SimulatedEos):
     """A body that says nothing, has no space left, or an empty battery, while the lab says so."""
 
-    lab: TroubledLab
+    lab: ClassVar[TroubledLab]
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         if self.lab.camera_hangs:

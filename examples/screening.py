@@ -171,17 +171,17 @@ class Training:
     def __init__(self, lever: str, pictures: Floats, seen: Print, real: Real, others: Sequence[Real]) -> None:
         self.rendering, _, self.choice = lever.partition("-")
         self.seen, self.real, self.others = seen, real, others
-        rng = np.random.default_rng(0)
+        rng, made = np.random.default_rng(0), []
         if self.rendering == "naive":
             matrix = seen.matrix if self.choice == "matrix" else np.eye(3)
             linear = [np.maximum(LINEAR[picture] @ matrix.T, 0) for picture in pictures]
-            self.images: Floats = np.array([_halved(image) for image in linear]).astype(np.float16)
+            made = [_halved(image) for image in linear]
         elif self.rendering != "relit":
             dithered = self.rendering != "codes"
             responses = seen.node_responses(dithered)
-            self.images = np.array(
-                [_halved(responses[nodes_of(picture, rng, dithered)]) for picture in pictures]
-            ).astype(np.float16)
+            made = [_halved(responses[nodes_of(picture, rng, dithered)]) for picture in pictures]
+        # Images are relit anew each time.
+        self.images: Floats = np.array(made).astype(np.float16)
 
     def make(self, lights: Floats, other: Floats, rng: np.random.Generator) -> tuple[list[Floats], Floats]:
         """Return an image for each light (N, 3), and its truth; `other` holds the places of the half that was seen."""

@@ -175,7 +175,7 @@ class _Reply:
     def __bool__(self) -> bool:
         return bool(self.address)
 
-    def bytes(self, offset: int, size: int) -> bytes:
+    def read(self, offset: int, size: int) -> bytes:
         """Return `size` bytes of it at `offset`."""
         return ctypes.string_at(self.address + offset, size)
 
@@ -226,7 +226,7 @@ class XScreen:
         with self._ask("get_geometry", self._root) as reply:
             if not reply:
                 raise DeviceError(f"the X server is gone: somebody logged out, or it crashed; log in, {RUN_AGAIN}")
-            width, height = struct.unpack("=HH", reply.bytes(16, 4))
+            width, height = struct.unpack("=HH", reply.read(16, 4))
         return width, height
 
     def read(self, x: int, y: int, width: int, height: int) -> npt.NDArray[np.uint32]:
@@ -239,7 +239,7 @@ class XScreen:
                     "check the display's cable and the desktop's display settings"
                 )
             size: int = self._xcb.xcb_get_image_data_length(reply.address)
-            depth = reply.bytes(1, 1)[0]
+            depth = reply.read(1, 1)[0]
             if depth not in (24, 32) or size != 4 * width * height:
                 raise DeviceError(f"the X screen has a depth of {depth} bits; set 24, so that codes arrive as they are")
             raw = (ctypes.c_uint8 * size).from_address(self._xcb.xcb_get_image_data(reply.address))
@@ -251,7 +251,7 @@ class XScreen:
     def has_extension(self, name: str) -> bool:
         """Return whether the server has the extension `name`."""
         with self._ask("query_extension", len(name), name.encode("ascii")) as reply:
-            return bool(reply) and reply.bytes(8, 1) != b"\0"
+            return bool(reply) and reply.read(8, 1) != b"\0"
 
     def has_root_property(self, name: str) -> bool:
         """Return whether the root window has a property `name` that is not empty."""
@@ -337,7 +337,7 @@ class XScreen:
                 return 0, []
             count: int = self._xcb.xcb_query_tree_children_length(reply.address)
             children = ctypes.string_at(self._xcb.xcb_query_tree_children(reply.address), _FOUR * count)
-            (parent,) = struct.unpack("=I", reply.bytes(12, 4))
+            (parent,) = struct.unpack("=I", reply.read(12, 4))
             return parent, list(struct.unpack(f"={count}I", children))
 
     def _place(self, window: int) -> tuple[int, int, int, int] | None:
@@ -345,13 +345,13 @@ class XScreen:
         with self._ask("get_window_attributes", window) as reply:
             if not reply:
                 return None
-            (kind,) = struct.unpack("=H", reply.bytes(12, 2))
-            if kind == INPUT_ONLY or reply.bytes(26, 1)[0] != VIEWABLE:
+            (kind,) = struct.unpack("=H", reply.read(12, 2))
+            if kind == INPUT_ONLY or reply.read(26, 1)[0] != VIEWABLE:
                 return None
         with self._ask("get_geometry", window) as reply:
             if not reply:
                 return None
-            x, y, width, height, border = struct.unpack("=hhHHH", reply.bytes(12, 10))
+            x, y, width, height, border = struct.unpack("=hhHHH", reply.read(12, 10))
             return x, y, width + 2 * border, height + 2 * border
 
     def _text(self, window: int, name: str) -> str:
@@ -361,7 +361,7 @@ class XScreen:
     def _property(self, window: int, name: str) -> bytes:
         """Return the first `MAX_TEXT` bytes of a window's property, none where it has not got it."""
         with self._ask("intern_atom", 1, len(name), name.encode("ascii")) as reply:
-            (atom,) = struct.unpack("=I", reply.bytes(8, 4)) if reply else (0,)
+            (atom,) = struct.unpack("=I", reply.read(8, 4)) if reply else (0,)
         if not atom:
             return b""
         with self._ask("get_property", 0, window, atom, _ANY_TYPE, 0, MAX_TEXT // _FOUR) as reply:

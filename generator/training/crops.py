@@ -75,7 +75,7 @@ class Recycled:
         memory = self._memory(size)
         # Views refer to `values`, since what is below it is no array; so it lives as long as the last of them.
         values = np.frombuffer(memory, dtype=np.float32)
-        weakref.finalize(values, self._free.append, memory).atexit = False  # pyrefly: ignore[missing-attribute]
+        weakref.finalize(values, self._free.append, memory).atexit = False
         return values.reshape(shape)
 
     def _memory(self, size: int) -> mmap.mmap:

@@ -12,7 +12,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import pytest
 
@@ -72,8 +72,8 @@ def bodies() -> Generator[Bodies]:
     command = [sys.executable, "-m", "tests.drivers.gphoto2_server"]
     folder = Path(__file__).parents[3]
     # Lines are looked for with nothing kept back: a film reads the same pipe.
-    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "bufsize": 0}
-    with subprocess.Popen(command, cwd=folder, **pipes) as process:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, cwd=folder, stdin=pipe, stdout=pipe, bufsize=0) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         yield Bodies(process.stdin, process.stdout)

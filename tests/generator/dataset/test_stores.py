@@ -11,7 +11,7 @@ from collections.abc import Generator, Iterator
 from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, get_args
 
 import cv2
 import fsspec
@@ -143,7 +143,7 @@ class FailingFileSystem(MemoryFileSystem):
 
     protocol = "failing"
     store: dict[str, Any] = {}  # noqa: RUF012  as the class above has it
-    fails_at: int | None = None
+    fails_at: ClassVar[int | None] = None
     writes = 0
 
     def _count(self) -> None:
