@@ -362,8 +362,8 @@ def _places_px(
     result: BuildResult, figures: FrameMeasurements, world: World, change: FrameChange, cells_mm: _Array
 ) -> _Array:
     """Return (C, 2) float64: where cells were sampled in a frame, nearly, if the chart was found anew in it."""
-    registration, moved_anew = result.figures.registration, any(frame.reregistered for frame in result.figures.frames)
-    if not moved_anew or change.situation == UNDISTURBED:
+    registration, anew = result.figures.registration, any(frame.reregistered for frame in result.figures.frames)
+    if not anew or change.situation == UNDISTURBED:
         still = math.hypot(figures.shift.dx, figures.shift.dy) <= STILL_PX
         return (registration if still else registration.shifted(figures.shift.dx, figures.shift.dy)).to_pixels(cells_mm)
     found = registration.to_pixels(cells_mm) - world.project(cells_mm)

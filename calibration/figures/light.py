@@ -385,7 +385,7 @@ ADDITIVITY = Figure(
 )  # fmt: skip
 
 WHITE_DEFICIT = Figure(
-    "white_short", "White short of the sum of the primaries", "light", "share", "at most", 0.05, 0.3,
+    "white_deficit", "White short of the sum of the primaries", "light", "share", "at most", 0.05, 0.3,
     why="no wheel takes light away: a frame of white or of a primary was exposed otherwise, or the projector holds "
     "full white back",
     source=JUDGEMENT + "; a lamp that flickers by 1 % gives 2 %",
@@ -394,6 +394,7 @@ WHITE_DEFICIT = Figure(
     of_one_frame="unknown",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("brightness", light_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
+    former_name="white_short",
 )  # fmt: skip
 
 
@@ -552,14 +553,15 @@ def _checked_row(table: TableMeasurements) -> SummaryRow | None:
     return SummaryRow("Lights held against their codes", value, note)
 
 
-CHECKED_SHARE = Figure(
-    "held_share", "Lights that could be held against their codes", "light", "share", "at least", 0.9, None,
+CROSS_CHECKED_SHARE = Figure(
+    "cross_checked_share", "Lights that could be held against their codes", "light", "share", "at least", 0.9, None,
     why="of the others nothing says that they bear their own names",
     source="the angle from which a wrong name is refused, beyond what codes predict of so few lights",
     remedy="take white, red, green and blue along with the lights, and expose longer",
     measure=_of_codes(lambda codes: float(codes.held.mean())), forecast=ONLY_OF_A_SESSION,
     of_one_frame="unknown", worst=NO_PLACE, where=_checked_text, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=(Line(230, _checked_row),),
+    former_name="held_share",
 )  # fmt: skip
 
 _WhiteValues = Callable[["CodeAgreement"], "npt.NDArray[np.float64]"]

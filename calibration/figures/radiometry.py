@@ -99,7 +99,7 @@ UNFIT_SHARE = Figure(
     why="colours without samples are missing from every picture", source=JUDGEMENT, remedy="", found=_most_unfit,
     measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1), forecast=_unfit_in_check,
     of_one_frame="bounded", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
-    cause=Explanation("unfit cells", unfit_evidence, follows=("unlike_block",)),
+    cause=Explanation("unfit cells", unfit_evidence, follows=("block_deviation",)),
     drawing="print", lines=(Line(290, _unfit_row),),
 )  # fmt: skip
 
@@ -170,8 +170,8 @@ def _softest_text(table: TableMeasurements, accepted: float) -> str:
     return f"in {_softest(table).record.file}, whose blur is σ = {_softest(table).blur_px:.2f} px"
 
 
-SOFTER_BLEED = Figure(
-    "softer_bleed", "Light of neighbouring cells added in the most blurred frame", "geometry", "share", "at most",
+FRAME_BLUR = Figure(
+    "frame_blur", "Light of neighbouring cells added in the most blurred frame", "geometry", "share", "at most",
     0.003, 0.012,
     why="a frame is out of focus, or was shaken; only white frames are checked cell by cell for such light",
     source=SIMULATED + ": 0.9 px of blur in one frame of a session with 0.5 px give 0.8 % and cells 1.2 % off, "
@@ -183,6 +183,7 @@ SOFTER_BLEED = Figure(
     where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
     cause=Explanation("frame", blur_evidence),
     drawing="course", lines=NO_LINES,
+    former_name="softer_bleed",
 )  # fmt: skip
 
 
@@ -203,7 +204,7 @@ def _of_alike_frames(value: _FrameValue) -> Callable[[TableMeasurements], float 
 
 
 FRAME_SCATTER = Figure(
-    "unlike_scatter", "Scatter of cells about their codes' colours, worst frame", "radiometry", "share", "at most",
+    "frame_scatter", "Scatter of cells about their codes' colours, worst frame", "radiometry", "share", "at most",
     0.012, 0.03,
     why="the frame's samples are not of their cells' colours",
     source=SIMULATED + ": to 0.8 % beyond noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
@@ -212,8 +213,9 @@ FRAME_SCATTER = Figure(
     of_one_frame="bounded", worst=_most_scattered,
     where=lambda table, accepted: f"in {max(table.frames, key=lambda one: one.consistency.scatter).record.file}",
     retake=_frames_beyond(lambda table, frame: frame.consistency.scatter),
-    cause=Explanation("frame", scatter_evidence, follows=("unlike_block", "disturbed_cells")),
+    cause=Explanation("frame", scatter_evidence, follows=("block_deviation", "disturbed_cells")),
     drawing="course", lines=NO_LINES,
+    former_name="unlike_scatter",
 )  # fmt: skip
 
 
@@ -224,8 +226,9 @@ def _worst_block(table: TableMeasurements, chart: Chart) -> Worst | None:
     return Worst(f"{100 * seen.block:.2g} %", file, place=place) if seen.block > 0 else None
 
 
-UNLIKE_BLOCK = Figure(
-    "unlike_block", "Deviation of the worst block of cells, worst frame", "radiometry", "share", "at most", 0.01, 0.03,
+BLOCK_DEVIATION = Figure(
+    "block_deviation", "Deviation of the worst block of cells, worst frame", "radiometry", "share", "at most",
+    0.01, 0.03,
     why="something lay, or shone, on the print in that frame or in the one compared with, and its samples contain it",
     source=SIMULATED + ": to 0.4 % beyond noise", remedy="see that nobody comes between lamp, print and camera",
     measure=_of_alike_frames(lambda table, frame: frame.consistency.block), forecast=ONLY_OF_A_SESSION,
@@ -233,6 +236,7 @@ UNLIKE_BLOCK = Figure(
     worst=_worst_block, where=OF_ITS_CAUSE, retake=_frames_beyond(lambda table, frame: frame.consistency.block),
     cause=Explanation("block", block_evidence),
     drawing="course", lines=NO_LINES,
+    former_name="unlike_block",
 )  # fmt: skip
 
 
@@ -252,7 +256,7 @@ DISTURBED_CELLS = Figure(
     remedy="see that nothing comes between lamp, print and camera",
     measure=_disturbed, forecast=ONLY_OF_A_SESSION,
     of_one_frame="bounded", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
-    cause=Explanation("few cells", disturbed_evidence, follows=("unlike_block",)),
+    cause=Explanation("few cells", disturbed_evidence, follows=("block_deviation",)),
     drawing="worst", lines=NO_LINES,
 )  # fmt: skip
 
@@ -268,8 +272,8 @@ def _movement_row(table: TableMeasurements) -> SummaryRow | None:
     return SummaryRow("Movement of the chart", moved, note, brief=True)
 
 
-REGISTERED_ANEW = Figure(
-    "moved_anew", "Frames registered again", "geometry", "", "at most", 0, None,
+REREGISTERED_FRAMES = Figure(
+    "reregistered_frames", "Frames registered again", "geometry", "", "at most", 0, None,
     why="the chart or the camera moved between frames; the sampling grid followed", source=JUDGEMENT,
     remedy="fix camera and print, and let nobody walk about",
     measure=lambda table: float(_registered_anew(table)),
@@ -277,6 +281,7 @@ REGISTERED_ANEW = Figure(
     of_one_frame="bounded",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("movement", movement_evidence),
     drawing="course", lines=(Line(120, _movement_row),),
+    former_name="moved_anew",
 )  # fmt: skip
 
 

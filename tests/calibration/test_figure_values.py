@@ -182,7 +182,7 @@ AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.arra
         (light.OFF_BRIGHTNESS, {}, 0.4),
         (light.OFF_BRIGHTNESS, {"codes": None}, None),
         (light.EXCHANGED_LIGHTS, {"codes": codes(exchanges=pairs(2))}, 2),
-        (light.CHECKED_SHARE, {}, 2 / 3),
+        (light.CROSS_CHECKED_SHARE, {}, 2 / 3),
         (light.WHITE_FRAME_DEG, {}, None),
         (light.WHITE_FRAME_DEG, {"as_whites": AS_WHITES}, 4),
         (light.WHITE_FRAME_BRIGHTNESS, {"as_whites": AS_WHITES}, 0.2),
@@ -191,15 +191,15 @@ AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.arra
         (light.PRIMARIES_LACKING, {"session": SimpleNamespace(codes=((9, 9, 9), (0, 0, 0)))}, 0),
         (light.PRIMARIES_LACKING, {"codes": None}, None),
         (radiometry.UNFIT_SHARE, {"cells": SimpleNamespace(unfit=(1, 2, 3, 4))}, 4 / 512),
-        (radiometry.SOFTER_BLEED, {}, 0.1),
+        (radiometry.FRAME_BLUR, {}, 0.1),
         (radiometry.FRAME_SCATTER, {}, 0.01),
-        (radiometry.UNLIKE_BLOCK, {}, 0.02),
-        (radiometry.UNLIKE_BLOCK, {"registration": SimpleNamespace(mismatched_cells=np.zeros(69))}, None),
-        (radiometry.UNLIKE_BLOCK, {"registration": SimpleNamespace(mismatched_cells=np.zeros(70))}, 0.02),
+        (radiometry.BLOCK_DEVIATION, {}, 0.02),
+        (radiometry.BLOCK_DEVIATION, {"registration": SimpleNamespace(mismatched_cells=np.zeros(69))}, None),
+        (radiometry.BLOCK_DEVIATION, {"registration": SimpleNamespace(mismatched_cells=np.zeros(70))}, 0.02),
         # Cells of lights' frames, each once.
         (radiometry.DISTURBED_CELLS, {}, 3),
         (radiometry.DISTURBED_CELLS, {"registration": SimpleNamespace(mismatched_cells=np.zeros(69))}, None),
-        (radiometry.REGISTERED_ANEW, {}, 2),
+        (radiometry.REREGISTERED_FRAMES, {}, 2),
         (radiometry.WHITE_FRAMES, {}, 2),
         (radiometry.OTHER_CAMERA, {"origins": FOREIGN}, 1),
         (geometry.TAGS_FOUND, {}, 3 / 4),
@@ -305,12 +305,12 @@ def test_a_bend_is_what_counts_lack_for_certain_over_paper_s_levels() -> None:
         (light.OFF_BRIGHTNESS, 0.1, ["1", "3"]),
         (light.WHITE_FRAME_DEG, 1.0, ["4"]),
         (light.WHITE_FRAME_BRIGHTNESS, 0.1, ["0"]),
-        (radiometry.SOFTER_BLEED, 0.05, ["3"]),
+        (radiometry.FRAME_BLUR, 0.05, ["3"]),
         (radiometry.FRAME_SCATTER, 0.01, []),
         (radiometry.FRAME_SCATTER, 0.009, ["2"]),
-        (radiometry.UNLIKE_BLOCK, 0.01, ["1"]),
+        (radiometry.BLOCK_DEVIATION, 0.01, ["1"]),
         # Where every frame is beyond, it is none of single ones.
-        (radiometry.UNLIKE_BLOCK, -1.0, None),
+        (radiometry.BLOCK_DEVIATION, -1.0, None),
         (radiometry.OTHER_EXPOSURE, 0.1, ["1", "2"]),
         (radiometry.OTHER_EXPOSURE, 0.01, ["1", "2", "3"]),
     ],
@@ -338,9 +338,9 @@ def test_a_figure_names_its_worst() -> None:
     assert worst(light.OFF_CODES_DEG, made).light == 2
     assert worst(light.OFF_BRIGHTNESS, made).file == "3.dng"
     assert worst(light.OFF_BRIGHTNESS, table(codes=codes(off_brightness=np.zeros(3)))) is None
-    assert worst(radiometry.SOFTER_BLEED, made).file == "3.dng"
+    assert worst(radiometry.FRAME_BLUR, made).file == "3.dng"
     assert worst(radiometry.FRAME_SCATTER, made).file == "2.dng"
-    assert worst(radiometry.UNLIKE_BLOCK, made).place == PrintPlace("1.dng", 3.0, 4.0, 9.0)
+    assert worst(radiometry.BLOCK_DEVIATION, made).place == PrintPlace("1.dng", 3.0, 4.0, 9.0)
     assert worst(truth.REFERENCES_USED, made).file == "4.dng"
     assert worst(truth.REFERENCE_SPREAD, made).file == "4.dng"
     assert (
@@ -358,7 +358,7 @@ def test_a_figure_names_its_worst() -> None:
     assert "more" not in where(light.EXCHANGED_LIGHTS, table(codes=codes(exchanges=pairs(4))), 0.0)
     assert where(light.OFF_BRIGHTNESS, made, 0.1) == "light 2 by -50 %, light 0 by +25 %"
     assert where(light.REPEATED_FILES, table(frames=TWICE), 0.0) == "4.dng is 0.dng"
-    assert where(light.CHECKED_SHARE, made, 0.0) == "2 of 3"
+    assert where(light.CROSS_CHECKED_SHARE, made, 0.0) == "2 of 3"
 
 
 def test_a_check_forecasts_bleed_of_a_cell_and_a_blur_that_it_saw() -> None:

@@ -23,7 +23,7 @@ PACKAGES = ("foundation", "drivers", "sim", "experiment", "calibration", "acquis
 def test_a_figure_that_lacks_a_part_does_not_import() -> None:
     parts: dict[str, Any] = {part.name: getattr(DARKEST_COUNTS, part.name) for part in fields(Figure) if part.init}
     assert Figure(**parts) == DARKEST_COUNTS
-    for name in parts.keys() - {"foremost", "found"}:
+    for name in parts.keys() - {"foremost", "found", "former_name"}:
         with pytest.raises(TypeError, match=name):
             Figure(**{key: value for key, value in parts.items() if key != name})
 
@@ -36,6 +36,9 @@ def test_a_figure_that_lacks_a_part_does_not_import() -> None:
         {"source": ""},
         {"refuse": 301.0},
         {"name": "bleed"},
+        {"name": "held_share"},
+        {"former_name": "bleed"},
+        {"former_name": "held_share"},
         {"lines": light.ADDITIVITY.lines},
         {"cause": replace(light.ADDITIVITY.cause, follows=("nothing",)) if light.ADDITIVITY.cause else None},
     ],
@@ -44,7 +47,7 @@ def test_figures_that_contradict_themselves_do_not_import(
     wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(light, "WRONG", replace(DARKEST_COUNTS, **{"name": "wrong", **wrong}), raising=False)  # pyrefly: ignore[bad-argument-type]
-    with pytest.raises(ValueError, match=r"wrong|names"):
+    with pytest.raises(ValueError, match=r"wrong|one of the names"):
         all_figures.collected()
 
 
@@ -74,15 +77,15 @@ def test_some_figures_are_asked_more_than_others() -> None:
     first = {figure.name for figure in FIGURES if figure.foremost}
     assert first >= {"other_camera", "other_exposure", "off_codes_deg", "white_frame_deg"}
     assert {figure.name for figure in FIGURES if figure.retake is not None} >= first | {
-        "softer_bleed", "unlike_scatter", "unlike_block", "off_brightness", "white_frame_brightness",
+        "frame_blur", "frame_scatter", "block_deviation", "off_brightness", "white_frame_brightness",
     }  # fmt: skip
     explained = {figure.name: figure.cause.follows for figure in FIGURES if figure.cause is not None}
     assert (
         explained.items()
         >= {
-            "unfit_share": ("unlike_block",),
-            "unlike_scatter": ("unlike_block", "disturbed_cells"),
-            "disturbed_cells": ("unlike_block",),
+            "unfit_share": ("block_deviation",),
+            "frame_scatter": ("block_deviation", "disturbed_cells"),
+            "disturbed_cells": ("block_deviation",),
             "off_brightness": ("off_codes_deg", "exchanged_lights"),
         }.items()
     )

@@ -20,5 +20,5 @@ def test_a_page_is_written_from_the_code(name: str, page: Callable[[], str]) -> 
 
 
 def test_they_explain_all_figures_and_all_evidence() -> None:
-    assert all(f"(`{figure.name}`)" in figures_page() for figure in FIGURES)
+    assert all(f"(`{figure.name}`" in figures_page() for figure in FIGURES)
     assert all(f"| `{name}` | " in causes_page() for name in evidence_names())

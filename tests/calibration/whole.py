@@ -24,7 +24,7 @@ from tests.pinned.drawn import drawn
 LIMITS: dict[str, float] = {"same": 1e-3, "nothing": 1e-6}
 """What numbers of whole builds may differ by: they come from fits upon fits, and another BLAS moves some by 3e-4."""
 
-UNSURE = ("scatter", "unlike_scatter", "noise", "noise_misfit", "transfer")
+UNSURE = ("scatter", "frame_scatter", "noise", "noise_misfit", "transfer")
 """What is a small difference of large numbers, or hangs on which cells are left out: 2 % by another processor."""
 
 MOST_UNFIT = 3

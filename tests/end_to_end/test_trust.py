@@ -165,7 +165,7 @@ def test_a_faint_shadow_is_remarked_on(lab: Lab, tmp_path: Path) -> None:
     """6 % less light on a hand's breadth is no reason to refuse a table, but to look at it."""
     with session_of(lab, tmp_path, shaded(lab, 0.94)) as session:
         result = build(session, tmp_path / "lut")
-    assert "unlike_block" in {row.figure.name for row in result.verdict.remarks}
+    assert "block_deviation" in {row.figure.name for row in result.verdict.remarks}
 
 
 def test_a_lamp_that_flickers_is_reported_and_harms_no_colour(lab: Lab, tmp_path: Path) -> None:

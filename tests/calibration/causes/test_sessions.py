@@ -62,7 +62,7 @@ def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tm
     assert causes(found) == {OBJECT_IN_FRAME}
     assert [frame.file for frame in retaken_frames(result.verdict, result.figures)] == [f"frames/{file}.dng"]
     # Cells under a hand in the first frame do not look like the chart's and are not compared; references tell of it.
-    finding = found["reference_spread" if which == "white 0" else "unlike_block"]
+    finding = found["reference_spread" if which == "white 0" else "block_deviation"]
     page = np.array(lab.chart.page_mm)
     (place,) = finding.places
     assert place.file == f"frames/{file}.dng"
@@ -143,7 +143,7 @@ def test_one_hot_photosite_in_a_dark_cell_needs_no_word(lab: Lab, tmp_path: Path
     result, found = measured(taken(lab, tmp_path / "session", paint=heat), tmp_path)
     assert [cell.colour for cell in result.figures.cells.unfit] == [dark]
     assert result.figures.cells.unfit[0].cause.startswith("hot")
-    assert "unlike_block" not in found
+    assert "block_deviation" not in found
     assert not causes(found)
 
 
@@ -160,14 +160,14 @@ def test_a_frame_out_of_focus_is_called_that(lab: Lab, tmp_path: Path) -> None:
 
     _, found = measured(taken(lab, tmp_path / "session", one, situation=Situation(defocus_px=0.9)), tmp_path)
     assert causes(found) == {DEFOCUS}
-    assert found["softer_bleed"].decision.cause is DEFOCUS
+    assert found["frame_blur"].decision.cause is DEFOCUS
 
 
 def test_dark_corners_are_no_dirt(tmp_path: Path) -> None:
     """Corners at 42 to 52 % of the centre's light: the field follows them, and nothing is to be said."""
     lab = hang(room=Room(waviness_mm=0.5, vignetting=0.45, projector_falloff=0.25))
     _, found = measured(taken(lab, tmp_path / "session"), tmp_path)
-    assert not {"reference_spread", "doubtful_share", "unlike_block"} & found.keys()
+    assert not {"reference_spread", "doubtful_share", "block_deviation"} & found.keys()
     assert not causes(found)
 
 

@@ -64,19 +64,19 @@ def sheet() -> Sheet:
 @pytest.mark.parametrize("level", [1.0, 0.3])
 def test_another_light_is_no_other_print(sheet: Sheet, level: float) -> None:
     like = sheet.compared(level * sheet.other)
-    assert like.scatter < LIMITS["unlike_scatter"].accept
-    assert like.block < 0.5 * LIMITS["unlike_block"].accept
+    assert like.scatter < LIMITS["frame_scatter"].accept
+    assert like.block < 0.5 * LIMITS["block_deviation"].accept
 
 
 def test_another_order_of_the_colours_is(sheet: Sheet) -> None:
     like = sheet.compared(sheet.random.permutation(sheet.other))
-    assert like.scatter > 10 * (LIMITS["unlike_scatter"].refuse or np.inf)
+    assert like.scatter > 10 * (LIMITS["frame_scatter"].refuse or np.inf)
 
 
 def test_a_neighbour_s_light_is_scatter(sheet: Sheet) -> None:
     """4 % of a cell's light from another, as a lens out of focus gives."""
     like = sheet.compared(0.96 * sheet.other + 0.04 * sheet.random.permutation(sheet.other))
-    assert like.scatter > 1.5 * LIMITS["unlike_scatter"].accept
+    assert like.scatter > 1.5 * LIMITS["frame_scatter"].accept
 
 
 @pytest.mark.parametrize("left", [0.0, 0.3, 0.9])
@@ -84,7 +84,7 @@ def test_a_shadow_is_found_where_it_lies(sheet: Sheet, left: float) -> None:
     middle = np.array([260.0, 90.0])
     under = np.abs(sheet.places - middle).max(axis=1) < 45
     like = sheet.compared(sheet.other * np.where(under, left, 1.0)[:, None])
-    assert like.block > (LIMITS["unlike_block"].refuse or np.inf)
+    assert like.block > (LIMITS["block_deviation"].refuse or np.inf)
     assert np.abs(np.array(like.at_mm) - middle).max() < 45
 
 
@@ -98,7 +98,7 @@ def test_a_shadow_that_covers_a_part_of_each_block_is_found(
     column, row = (sheet.places / 5.0).T
     under = (np.abs(column - place[0] - 1) < cells / 2) & (np.abs(row - place[1] - 1) < cells / 2)
     like = sheet.compared(sheet.other * np.where(under, left, 1.0)[:, None])
-    limit = LIMITS["unlike_block"]
+    limit = LIMITS["block_deviation"]
     assert like.block > ((limit.refuse or np.inf) if left == 0.05 else 0.5 * limit.accept)
 
 
@@ -109,7 +109,7 @@ def test_it_is_told_whether_light_was_added_or_taken(sheet: Sheet, added: float,
     under = np.linalg.norm(sheet.places - (200, 130), axis=1) < 45
     top = np.percentile(sheet.other, 99, axis=0)
     like = sheet.compared(np.where(under[:, None], added * top + kept * sheet.other, sheet.other))
-    assert like.block > LIMITS["unlike_block"].accept
+    assert like.block > LIMITS["block_deviation"].accept
     # Blocks at its rim are half under it.
     assert like.added == pytest.approx(added, abs=0.01 + 0.3 * added)
     assert like.kept == pytest.approx(kept, abs=0.3 * abs(1 - kept) + 0.02)
@@ -131,7 +131,7 @@ def test_one_hot_photosite_is_no_hand(excess: float) -> None:
     dark = np.argsort(seen[:, 0])[sheet.random.integers(300, 600, 3)]
     seen[dark, 0] += excess
     like = sheet.compared(seen)
-    assert like.block < 0.5 * LIMITS["unlike_block"].accept
+    assert like.block < 0.5 * LIMITS["block_deviation"].accept
 
 
 @pytest.mark.parametrize("percentile", [50.0, 60.0, 65.0])
@@ -144,7 +144,7 @@ def test_one_hot_photosite_among_dark_cells_is_no_hand(percentile: float) -> Non
     lone = np.flatnonzero(bright & (seen[:, 2] < 90) & (bright[around].sum(axis=1) <= 2))
     seen[sheet.random.choice(lone, 3, replace=False), 2] += 160
     like = sheet.compared(seen)
-    assert like.block < 0.5 * LIMITS["unlike_block"].accept
+    assert like.block < 0.5 * LIMITS["block_deviation"].accept
 
 
 @pytest.mark.parametrize("left", [0.05, 0.8])
@@ -208,7 +208,7 @@ def test_a_dim_channel_of_few_bright_cells_does_not_scatter() -> None:
     check = ConsistencyCheck(sheet.rgb, sheet.places, *sheet.seen(sheet.white), np.ones(len(sheet.rgb), dtype=np.bool_))
     in_order = np.sort(sheet.other[::4], axis=0)
     dim = 60 * sheet.other / in_order[[-4000, -4000, -160], [0, 1, 2]]
-    assert max(check.compare(*sheet.seen(dim)).scatter for _ in range(30)) < 0.5 * LIMITS["unlike_scatter"].accept
+    assert max(check.compare(*sheet.seen(dim)).scatter for _ in range(30)) < 0.5 * LIMITS["frame_scatter"].accept
     # Of as few cells another print is one.
     assert check.compare(*sheet.seen(sheet.random.permutation(dim))).scatter > 0.3
 
@@ -223,7 +223,7 @@ def test_a_channel_whose_bright_cells_lie_apart_says_nothing_of_a_place() -> Non
     seen[:, 2] = np.where(apart, 90.0 * sheet.white[:, 2] / sheet.white[apart, 2].mean(), 45.0)
     under = np.linalg.norm(sheet.places - (200, 130), axis=1) < 45
     like = sheet.compared(seen * np.where(under, 0.7, 1.0)[:, None])
-    assert like.block > LIMITS["unlike_block"].accept
+    assert like.block > LIMITS["block_deviation"].accept
     assert like.kept == pytest.approx(0.7, abs=0.05)
 
 
@@ -257,7 +257,7 @@ def test_what_is_found_is_restored_from_a_checkpoint(sheet: Sheet) -> None:
 def test_cells_that_were_covered_from_the_start_do_not_count(sheet: Sheet) -> None:
     under = np.abs(sheet.places - [260.0, 90.0]).max(axis=1) < 45
     like = sheet.compared(sheet.other * np.where(under, 0.2, 1.0)[:, None], usable=~under)
-    assert like.block < 0.5 * LIMITS["unlike_block"].accept
+    assert like.block < 0.5 * LIMITS["block_deviation"].accept
 
 
 def test_too_few_cells_say_nothing() -> None:

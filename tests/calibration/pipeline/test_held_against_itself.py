@@ -39,8 +39,8 @@ CODES = (
 WHITE_LIGHT, RED, BLUE, WARM, COOL = 0, 1, 3, 4, 5
 EIGHT = tuple(Illumination(index, "uniform", None, colour) for index, colour in enumerate(CODES))
 ABOUT_NAMES = {
-    "off_codes_deg", "off_brightness", "exchanged_lights", "exchange_deg", "held_share", "white_frame_deg",
-    "white_frame_brightness", "white_short", "additivity", "other_camera", "other_lens", "other_exposure",
+    "off_codes_deg", "off_brightness", "exchanged_lights", "exchange_deg", "cross_checked_share", "white_frame_deg",
+    "white_frame_brightness", "white_deficit", "additivity", "other_camera", "other_lens", "other_exposure",
     "primaries_lacking",
 }  # fmt: skip
 HALF = replace(SETTINGS, shutter_s=SETTINGS.shutter_s / 2)
@@ -167,7 +167,7 @@ def test_a_white_frame_at_half_exposure_that_does_not_say_so(lab: Lab, tmp_path:
     assert "white" in said
     rows = {limit["name"] for limit in report["limits"] if limit["outcome"] != "accept"}  # pyrefly: ignore[not-iterable]
     assert "additivity" not in rows
-    assert rows & {"white_frame_brightness", "white_short"}
+    assert rows & {"white_frame_brightness", "white_deficit"}
 
 
 def test_a_light_at_half_exposure_that_does_not_say_so(lab: Lab, tmp_path: Path) -> None:
@@ -206,7 +206,7 @@ def test_brilliant_colour_is_called_that(lab: Lab, tmp_path: Path) -> None:
 
 def test_two_lights_are_held_against_each_other(lab: Lab, tmp_path: Path) -> None:
     pair = renumbered([EIGHT[WARM], EIGHT[COOL]])
-    assert remarks(built(lab, tmp_path / "right", lights=pair)) <= {"held_share"}
+    assert remarks(built(lab, tmp_path / "right", lights=pair)) <= {"cross_checked_share"}
 
     def frame(step: SessionStep) -> bytes:
         shown = {0: CODES[COOL], 1: CODES[WARM]}.get(step.illumination if step.illumination is not None else -1)

@@ -77,9 +77,9 @@ def test_a_bump_is_followed_and_reported(plain: Lab, tmp_path: Path, by: tuple[f
     if anew:
         assert "1 frames registered again" in (tmp_path / "lut" / "report.html").read_text()
     remarks = [row.figure.name for row in result.verdict.remarks]
-    assert ("moved_anew" in remarks) == bool(anew)
+    assert ("reregistered_frames" in remarks) == bool(anew)
     if anew:
-        found = findings(result.verdict, result.figures)["moved_anew"]
+        found = findings(result.verdict, result.figures)["reregistered_frames"]
         assert found.decision.cause is BUMP
         assert [frame.illumination for frame in found.frames] == anew
 

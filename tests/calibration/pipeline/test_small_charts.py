@@ -34,7 +34,7 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
     assert {row.figure.name for row in result.verdict.remarks} == {"linearity_known"}
     assert not result.verdict.refused
     assert not result.figures.cells.unfit
-    assert judged_values(result.figures).keys().isdisjoint({"unlike_scatter", "unlike_block", "doubtful_share"})
+    assert judged_values(result.figures).keys().isdisjoint({"frame_scatter", "block_deviation", "doubtful_share"})
     # What is not judged is not shown as clean.
     if bits == 1:
         report = (tmp_path / "report.html").read_text()

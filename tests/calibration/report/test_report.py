@@ -42,7 +42,7 @@ def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path, monkeypat
 
     monkeypatch.setattr("calibration.report.report.png_of", blank)
     out = tmp_path / "lut"
-    limits = [limit for limit in FIGURES if limit.name == "unlike_block"]
+    limits = [limit for limit in FIGURES if limit.name == "block_deviation"]
     with (
         taken(lab, tmp_path / "session", nth_white(1), situation=HAND) as session,
         pytest.raises(Exception, match=r"frames/0004_white\.dng.*a hand.*--retake bad"),
