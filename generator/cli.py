@@ -66,8 +66,8 @@ _STORE_READERS: Final = 16
 _HELP = f"""Make a dataset of raw linear images with exact ground truth.
 
 Reads the table LUT (made by build-lut) and the source pictures. Writes the dataset OUT, a folder or a URL of a store
-that fsspec knows, which appears when it is complete: images/ (linear camera RGB), previews/, ground_truth.csv, gt.txt,
-sources.csv, dataset.json and SHA256SUMS.
+that fsspec knows, which appears when it is complete: images/ (linear camera RGB; other files by --layout),
+previews/, ground_truth.csv, gt.txt, sources.csv, dataset.json and SHA256SUMS.
 
 Each picture is printed, lit and photographed by the table: a pixel becomes what the camera sees of its colour under the
 light, interpolated between cells, plus the deviation of one of the samples that it took; with --rendering codes, one of

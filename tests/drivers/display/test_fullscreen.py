@@ -513,6 +513,21 @@ def test_a_colour_profile_of_the_display_is_reported(outputs: str) -> None:
         assert "colour profile is set for DUMMY1" in warning
 
 
+def test_a_compositor_under_the_x_server_is_reported(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Xwayland says what it is by an extension of its own (xwayland-extension, version 23.1)."""
+    asked: list[str] = []
+
+    def has(_: XScreen, name: str) -> bool:
+        asked.append(name)
+        return name == "XWAYLAND"
+
+    assert not [warning for warning in screen.warnings() if "Wayland" in warning]
+    monkeypatch.setattr(XScreen, "has_extension", has)
+    (warning,) = [warning for warning in screen.warnings() if "Wayland" in warning]
+    assert "Xorg" in warning
+    assert "XWAYLAND" in asked
+
+
 def ramps(presenter: FullScreen) -> list[str]:
     return [warning for warning in presenter.warnings() if "gamma" in warning]
 
