@@ -17,6 +17,7 @@ Half-size pixels, pixel centres at integers, x right, y down; millimetres on the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -340,8 +341,12 @@ def _cubic_weights(t: _Array) -> _Array:
     return np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3], axis=-1) / 6
 
 
+@lru_cache(maxsize=4)
 def _differences(rows: int, columns: int) -> sparse.csr_array:
-    """Return all second differences (D, K) on a grid of coefficients: yy, then xx, then √2 times xy."""
+    """Return all second differences (D, K) on a grid of coefficients: yy, then xx, then √2 times xy; not to be written.
+
+    A registration asks for those of one grid dozens of times.
+    """
 
     def difference(n: int, order: int) -> sparse.csr_array:
         matrix = sparse.eye_array(n, format="csr")

@@ -197,11 +197,12 @@ class Margins:
 
     def put_somewhere(self, side: Side, boxes: Boxes, start: int) -> bool:
         """Put boxes (N, 4) int64 px at the first free place along a margin from u = `start` on, within the field."""
-        extent = int(boxes[:, 2].max())
-        return any(
-            self.put(side, boxes + np.array([u, 0, u, 0]))
-            for u in range(max(0, start), self.length(side) - extent + 1, _SEARCH_PX)
-        )
+        places = np.arange(max(0, start), self.length(side) - int(boxes[:, 2].max()) + 1, _SEARCH_PX)
+        # Mostly the first is free.
+        if len(places) and self.put(side, boxes + np.array([places[0], 0, places[0], 0])):
+            return True
+        taken = self._taken_at(self._on_sheet(side, boxes), 0 if side in {"top", "bottom"} else 1, places)
+        return any(self.put(side, boxes + np.array([u, 0, u, 0])) for u in places[~taken].tolist())
 
     def crop_marks(self) -> None:
         """Mark the sheet's corners by two strokes each, along the edges where it is to be cut."""
@@ -268,6 +269,21 @@ class Margins:
             case "right":
                 placed = (right + v0, top + u0, right + v1, top + u1)
         return np.stack(placed, axis=1)
+
+    def _taken_at(self, boxes: Boxes, axis: Literal[0, 1], shifts: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """Return whether something is in the way of boxes (N, 4) px of the sheet, shifted along an axis: (M,) of (M,).
+
+        All shifts at once: two boxes that overlap across the axis keep an open interval of shifts from each other.
+        """
+        others, across = np.concatenate(self._taken), 1 - axis
+        low, high = boxes[:, None, across] - _AIR_PX, boxes[:, None, across + 2] + _AIR_PX
+        others = others[(low.min() < others[:, across + 2]) & (others[:, across] < high.max())]
+        one, other = np.nonzero((low < others[:, across + 2]) & (others[:, across] < high))
+        first = others[other, axis] - boxes[one, axis + 2] - _AIR_PX
+        last = others[other, axis + 2] - boxes[one, axis] + _AIR_PX
+        begun = np.bincount(np.searchsorted(shifts, first, "right"), minlength=len(shifts) + 1)
+        ended = np.bincount(np.searchsorted(shifts, last, "left"), minlength=len(shifts) + 1)
+        return np.cumsum(begun - ended)[: len(shifts)] > 0
 
     def _put(self, boxes: Boxes, clear: bool) -> bool:
         hull = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])

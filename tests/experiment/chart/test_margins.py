@@ -148,6 +148,29 @@ def test_a_margin_runs_along_the_field_and_outwards(side: Side, expected: list[l
     assert near == [False, True]
 
 
+# Multiples of 4, so that things often lie just as far apart as they must.
+@settings(max_examples=100)
+@given(
+    st.sampled_from(("bottom", "top", "left", "right")),
+    st.lists(st.tuples(*[st.integers(0, 650).map(lambda n: 4 * n)] * 2, *[st.integers(1, 75)] * 2), max_size=30),
+    st.integers(-3, 350).map(lambda n: 4 * n),
+)
+def test_the_place_found_is_the_first_of_those_where_there_is_room(
+    side: Side, there: list[tuple[int, int, int, int]], start: int
+) -> None:
+    boxes = [(x, y, x + 4 * width, y + 4 * height) for x, y, width, height in there]
+    taken = np.array(boxes, dtype=np.int64).reshape(-1, 4)
+    mark = np.array([[0, 40, 200, 90], [0, 40, 20, 160], [300, 60, 310, 70]])
+    found = Margins(FIELD, (3000, 2600), taken)
+    length = found.length(side)
+    expected = Margins(FIELD, (3000, 2600), taken)
+    places = range(max(0, start), length - 310 + 1, 24)
+    assert found.put_somewhere(side, mark, start) == any(
+        expected.put(side, mark + np.array([u, 0, u, 0])) for u in places
+    )
+    assert found.boxes.tolist() == expected.boxes.tolist()
+
+
 def test_a_long_ruler_has_a_number_at_every_hundred_millimetres() -> None:
     # 300 mm are 7086.6 px.
     assert [number_every_mm(length) for length in (100, 7086, 7087, 30000)] == [10, 10, 100, 100]
