@@ -53,6 +53,7 @@ def test_the_matrix_is_that_of_the_standard(science: Any) -> None:
 def test_black_bodies_are_those_of_colour_science(science: Any, cct_k: float) -> None:
     theirs = science.sd_blackbody(cct_k, science.SpectralShape(360, 780, 1))
     assert planck(WAVELENGTHS, cct_k) == pytest.approx(theirs.values, rel=1e-12)
+    assert planck(WAVELENGTHS.astype(np.float32), cct_k) == pytest.approx(theirs.values, rel=1e-12)
 
 
 @pytest.mark.slow

@@ -57,6 +57,8 @@ def test_a_good_room_has_nothing_to_remark_on_and_names_what_is_not_known_yet(ch
     assert {"white_drift", "off_codes_deg", "agreement"} <= set(report.not_known)
     assert "not known before the session: " in report.lines()[-1]
     assert ", white drift, " in report.lines()[-1]
+    # What is to be taken stands before the devices that take it.
+    assert [line.split()[0] for line in report.devices] == ["lights", "camera", "projector"]
     table = plain(report.values())["table"]
     assert table["outcome"] == "accept"
     assert table["figures"]["cell_px"] > 8.6
