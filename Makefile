@@ -66,7 +66,7 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	$(BIN)/pyrefly check --threads $(THREADS) --progress-bar no
+	$(BIN)/pyrefly check --threads $(THREADS) --progress-bar no --min-severity error
 
 # The site: tutorial, how-to, reference from the docstrings, explanation; a warning is an error. Needs no network.
 docs: $(READY)

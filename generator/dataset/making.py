@@ -250,7 +250,7 @@ def _client(address: str, workers: int) -> Generator[distributed.Client]:
     if address:
         try:
             client = Client(address, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, TimeoutError) as error:
+        except OSError as error:
             raise InputError(
                 f"no Dask scheduler answers at {address.removeprefix('tcp://')}: {error}; start one with "
                 "dask scheduler, or give its address"

@@ -241,7 +241,7 @@ class Fitted:
         try:
             covariance = np.atleast_2d(np.asarray(gaussian_kde(rb.T).covariance, dtype=np.float64))
             root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-        except (ValueError, np.linalg.LinAlgError) as error:
+        except ValueError as error:
             raise FormatError(
                 f"no distribution fits the {len(rb)} ground truths of {file or 'the list'}: expected three or more "
                 "that do not lie on a line"
