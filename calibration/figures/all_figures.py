@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from calibration.figures import geometry, light, radiometry, truth
 from calibration.figures.figure import Figure
 
@@ -11,7 +13,7 @@ def collected() -> tuple[Figure, ...]:
     modules = (geometry, radiometry, light, truth)
     found = tuple(value for module in modules for value in vars(module).values() if isinstance(value, Figure))
     names = {figure.name for figure in found}
-    every = [*(figure.name for figure in found), *(figure.former_name for figure in found if figure.former_name)]
+    times = Counter(name for figure in found for name in (figure.name, figure.former_name) if name)
     for figure in found:
         if not (figure.title and figure.why and figure.source):
             raise ValueError(f"{figure.name}: a figure has a title, and limits with their reason and source")
@@ -19,8 +21,8 @@ def collected() -> tuple[Figure, ...]:
             raise ValueError(f"{figure.name}: refused at {figure.refuse}, accepted {figure.sense} {figure.accept}")
         if figure.cause is not None and not names.issuperset(figure.cause.follows):
             raise ValueError(f"{figure.name}: it follows {figure.cause.follows}, which are not all figures")
-    if len(set(every)) < len(every):
-        raise ValueError(f"two figures have, or had, one of the names {', '.join(sorted(every))}")
+    if twice := sorted(name for name, count in times.items() if count > 1):
+        raise ValueError(f"two figures have, or had, one of the names {', '.join(twice)}")
     at: dict[int, str] = {}
     for figure in found:
         for line in figure.lines:

@@ -261,14 +261,14 @@ DISTURBED_CELLS = Figure(
 )  # fmt: skip
 
 
-def _registered_anew(table: TableMeasurements) -> int:
+def _reregistered(table: TableMeasurements) -> int:
     return sum(frame.reregistered for frame in table.frames)
 
 
 def _movement_row(table: TableMeasurements) -> SummaryRow | None:
     if len(table.frames) < 2:
         return None
-    moved, note = f"{table.largest_shift_px:.3f} px at most", f"{_registered_anew(table)} frames registered again"
+    moved, note = f"{table.largest_shift_px:.3f} px at most", f"{_reregistered(table)} frames registered again"
     return SummaryRow("Movement of the chart", moved, note, brief=True)
 
 
@@ -276,7 +276,7 @@ REREGISTERED_FRAMES = Figure(
     "reregistered_frames", "Frames registered again", "geometry", "", "at most", 0, None,
     why="the chart or the camera moved between frames; the sampling grid followed", source=JUDGEMENT,
     remedy="fix camera and print, and let nobody walk about",
-    measure=lambda table: float(_registered_anew(table)),
+    measure=lambda table: float(_reregistered(table)),
     forecast=ONLY_OF_A_SESSION,
     of_one_frame="bounded",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("movement", movement_evidence),

@@ -201,7 +201,7 @@ class Margins:
         # Mostly the first is free.
         if len(places) and self.put(side, boxes + np.array([places[0], 0, places[0], 0])):
             return True
-        taken = self._taken_at(self._on_sheet(side, boxes), 0 if side in {"top", "bottom"} else 1, places)
+        taken = self._taken_at(side, boxes, places)
         return any(self.put(side, boxes + np.array([u, 0, u, 0])) for u in places[~taken].tolist())
 
     def crop_marks(self) -> None:
@@ -270,12 +270,13 @@ class Margins:
                 placed = (right + v0, top + u0, right + v1, top + u1)
         return np.stack(placed, axis=1)
 
-    def _taken_at(self, boxes: Boxes, axis: Literal[0, 1], shifts: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """Return whether something is in the way of boxes (N, 4) px of the sheet, shifted along an axis: (M,) of (M,).
+    def _taken_at(self, side: Side, boxes: Boxes, shifts: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """Return whether something is in the way of boxes (N, 4) px, (u, v), shifted along a margin: (M,) of (M,) px.
 
-        All shifts at once: two boxes that overlap across the axis keep an open interval of shifts from each other.
+        All shifts at once: two boxes that overlap across the margin keep an open interval of shifts from each other.
         """
-        others, across = np.concatenate(self._taken), 1 - axis
+        axis, across = (0, 1) if side in {"top", "bottom"} else (1, 0)
+        boxes, others = self._on_sheet(side, boxes), np.concatenate(self._taken)
         low, high = boxes[:, None, across] - _AIR_PX, boxes[:, None, across + 2] + _AIR_PX
         others = others[(low.min() < others[:, across + 2]) & (others[:, across] < high.max())]
         one, other = np.nonzero((low < others[:, across + 2]) & (others[:, across] < high))

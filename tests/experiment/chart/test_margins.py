@@ -162,9 +162,8 @@ def test_the_place_found_is_the_first_of_those_where_there_is_room(
     taken = np.array(boxes, dtype=np.int64).reshape(-1, 4)
     mark = np.array([[0, 40, 200, 90], [0, 40, 20, 160], [300, 60, 310, 70]])
     found = Margins(FIELD, (3000, 2600), taken)
-    length = found.length(side)
     expected = Margins(FIELD, (3000, 2600), taken)
-    places = range(max(0, start), length - 310 + 1, 24)
+    places = range(max(0, start), found.length(side) - 310 + 1, 24)
     assert found.put_somewhere(side, mark, start) == any(
         expected.put(side, mark + np.array([u, 0, u, 0])) for u in places
     )
