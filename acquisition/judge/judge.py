@@ -333,14 +333,10 @@ def _independence(one: Measured, other: Measured) -> float | None:
     """Return the noise of two frames' difference over that of independent ones; None where noise is too small."""
     if one.samples.shape != other.samples.shape or len(one.samples) == 0:
         return None
-    a, b = one.samples.astype(np.float64), other.samples.astype(np.float64)
-    ours, theirs = a[:, 0] - a[:, 1], b[:, 0] - b[:, 1]
-    # By the differences of the two greens of a block, from which colour and light drop out.
-    spread = [float(np.clip(np.abs(d - np.median(d)), 0, 4 * np.median(np.abs(d)) + 3).std()) for d in (ours, theirs)]
-    if min(spread) < limits.LEAST_NOISE:
+    ours, theirs = one.green_noise, other.green_noise
+    if min(ours.spread, theirs.spread) < limits.LEAST_NOISE:
         return None
-    ours, theirs = (np.clip(d - np.median(d), -(q := 4 * float(np.median(np.abs(d))) + 3), q) for d in (ours, theirs))
-    correlation = float((ours * theirs).mean() / (ours.std() * theirs.std()))
+    correlation = float((ours.pattern * theirs.pattern).mean() / (ours.deviation * theirs.deviation))
     return float(np.sqrt(max(1 - max(correlation, 0.0) ** 2, 0.0)))
 
 

@@ -152,6 +152,30 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
+class GreenNoise:
+    """The noise of blocks as the difference of their two greens, from which colour and light drop out.
+
+    - `pattern`: (M,) float64 counts, about 0, without outliers.
+    - `deviation`: its standard deviation, counts.
+    - `spread`: standard deviation of its size, counts.
+    """
+
+    pattern: _Array
+    deviation: float
+    spread: float
+
+    @classmethod
+    def of(cls, samples: npt.NDArray[np.uint16]) -> GreenNoise:
+        """Return the noise of counts (M, 2) of both greens of blocks."""
+        one, other = samples.astype(np.float64).T
+        difference = one - other
+        most = 4 * float(np.median(np.abs(difference))) + 3
+        centred = difference - np.median(difference)
+        pattern = np.clip(centred, -most, most)
+        return cls(pattern, float(pattern.std()), float(np.minimum(np.abs(centred), most).std()))
+
+
+@dataclass(frozen=True, eq=False)
 class Measured:
     """A frame as it was measured.
 
@@ -187,6 +211,11 @@ class Measured:
     def level(self) -> _Array:
         """(3,) float64, mean of all tiles, counts above black."""
         return np.asarray(self.tiles.mean(axis=0))
+
+    @cached_property
+    def green_noise(self) -> GreenNoise:
+        """The noise of the sampled blocks, of which there are some; each of the next frames is held against it."""
+        return GreenNoise.of(self.samples)
 
 
 def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import combinations_with_replacement
 
 import numpy as np
 import numpy.typing as npt
@@ -328,10 +329,16 @@ class Displacement:
         basis = self.basis(points_mm)
         ways = self._ways(points_mm)
         weighted = [np.einsum("nij,nj->ni", information, way) for way in ways]
-        blocks = [[basis.T @ sparse.diags_array((way * of).sum(axis=1)) @ basis for of in weighted] for way in ways]
+        groups = range(len(ways))
+        # Each is its own transpose, and that of one group and another is that of the other and the one.
+        upper = {
+            (one, other): basis.T @ sparse.diags_array((ways[one] * weighted[other]).sum(axis=1)) @ basis
+            for one, other in combinations_with_replacement(groups, 2)
+        }
         bending = _differences(*self.coefficients.shape[:2])
         for number, roughness in enumerate(self._roughnesses(roughness_px)):
-            blocks[number][number] += bending.T @ bending / roughness**2 + sparse.identity(bending.shape[1]) * _RIDGE
+            upper[number, number] += bending.T @ bending / roughness**2 + sparse.identity(bending.shape[1]) * _RIDGE
+        blocks = [[upper[min(one, other), max(one, other)] for other in groups] for one in groups]
         return sparse.csc_array(sparse.block_array(blocks))
 
 
