@@ -70,9 +70,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage from here on, but for what has come by now."""
+    """Collect garbage from here on, but for what has come by now; seldom, as what stays is looked through each time."""
     gc.freeze()
+    gc.set_threshold(5_000, 20, 100)
     gc.enable()
+
+
+def pytest_sessionfinish() -> None:
+    """Leave little to pytest, which collects garbage five times at the end, lest an error in it go unseen."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -143,7 +150,7 @@ def kept_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def undrawn() -> Iterator[None]:
-    """Leave the pictures of build-lut's reports blank, where a module's tests look at none."""
+    """Leave the pictures of reports and results blank, where a module's tests look at none."""
     from tests.calibration.lab import blank_pictures
 
     with blank_pictures():
