@@ -669,12 +669,12 @@ class _Inks:
 
     def matching(self, lab: _Array) -> _Array:
         """Return the ink codes (N, 3), 0 … 1, that look most like CIELAB (N, 3)."""
+        from scipy.spatial import cKDTree
+
         axis = np.linspace(0, 1, 9)
         grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         seen = _lab(self.xyz(grid))
-        share = np.concatenate(
-            [grid[((part[:, None] - seen) ** 2).sum(axis=2).argmin(axis=1)] for part in np.array_split(lab, 32)]
-        )
+        share = grid[cKDTree(seen).query(lab)[1]]
         chroma = np.hypot(lab[:, 1], lab[:, 2])
         along = np.where(chroma[:, None] > 1e-6, lab[:, 1:] / np.maximum(chroma, 1e-6)[:, None], [1.0, 0.0])
         turn = np.zeros((len(lab), 3, 3))
