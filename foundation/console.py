@@ -134,9 +134,15 @@ def _patient(stream: Any) -> TextIOWrapper:
 
 def loaded() -> None:
     """Say that the modules of a command that `loads` are there: from here on garbage is looked for, if new."""
-    if not gc.isenabled() and not gc.get_freeze_count():
-        gc.freeze()
+    if not gc.isenabled():
+        _set_apart()
     gc.enable()
+
+
+@functools.cache
+def _set_apart() -> None:
+    """Set what is there apart from what is looked through for garbage: once a process, so that garbage is not kept."""
+    gc.freeze()
 
 
 def _outcome(command: Callable[[], object], keeps: bool) -> int:
@@ -440,6 +446,15 @@ class _StyledTyper(typer.Typer):
         """Register a command."""
         named: dict[str, Any] = {"cls": StyledCommand, **more}
         return super().command(name, **named)
+
+    @functools.cached_property
+    def _whole(self) -> Any:
+        """The command with all below it, made once: a process that calls it again would make all their options anew."""
+        return typer.main.get_command(self)
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        """Run the command."""
+        return self._whole(*arguments, **named)
 
 
 def new_app(help_text: str | None = None, **more: Any) -> typer.Typer:

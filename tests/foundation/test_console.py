@@ -21,7 +21,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation import errors
+from foundation import console, errors
 from foundation.console import (
     EXIT_CODES,
     Ending,
@@ -385,6 +385,15 @@ def test_garbage_is_looked_for_when_modules_are_loaded_and_after_every_end() -> 
         assert not gc.isenabled(), "whoever has it off keeps it off"
     finally:
         gc.enable()
+
+
+def test_what_is_there_is_set_apart_once_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[int] = []
+    monkeypatch.setattr(gc, "freeze", lambda: done.append(1))
+    console._set_apart.cache_clear()
+    for _ in range(3):
+        assert run(loaded, loads=True) == 0
+    assert done == [1]
 
 
 COMMANDS = ("acquisition", "calibration", "generator", "evaluation", "synthesis")
