@@ -181,13 +181,15 @@ def _bands(
     width, height = size
     edges = np.rint(drawn.rectangles_mm * pixels_per_mm).astype(np.int64)
     edges = np.clip(edges, 0, [width, height, width, height])
-    cuts = np.unique(np.concatenate([edges[:, 1], edges[:, 3], [0, height]])).tolist()
-    for top, bottom in pairwise(cuts):
-        row = np.full((width, 3), PAPER_WHITE, dtype=np.uint8)
-        inside = (edges[:, 1] <= top) & (edges[:, 3] > top)
-        for (left, _, right, _), rgb in zip(edges[inside].tolist(), drawn.rgb[inside], strict=True):
-            row[left:right] = rgb
-        yield top, bottom, row
+    across, down = (np.unique(np.append(edges[:, axis::2], [0, end])) for axis, end in enumerate(size))
+    left, right = np.searchsorted(across, edges[:, 0::2]).T.tolist()
+    top, bottom = np.searchsorted(down, edges[:, 1::2]).T.tolist()
+    # Between two neighbouring edges everything looks alike, so that each rectangle is painted once.
+    parts = np.full((len(down) - 1, len(across) - 1, 3), PAPER_WHITE, dtype=np.uint8)
+    for k, rgb in enumerate(drawn.rgb):
+        parts[top[k] : bottom[k], left[k] : right[k]] = rgb
+    for (first, end), row in zip(pairwise(down.tolist()), parts, strict=True):
+        yield first, end, np.repeat(row, np.diff(across), axis=0)
 
 
 def _packed_strips(bands: Iterator[tuple[int, int, npt.NDArray[np.uint8]]], height: int) -> Iterator[bytes]:
@@ -283,6 +285,7 @@ def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, more: byt
 def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     """Return a small picture of the sheet, (height, width_px, 3) uint8 RGB, each pixel the mean of what it covers."""
     import cv2
+    from scipy import sparse
 
     if width_px < 1:
         raise InputError(f"a preview of {width_px} pixels has no width; give 1 or more")
@@ -299,8 +302,10 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     band_tops, band_bottoms = np.array([[top, bottom] for top, bottom, _ in bands]).T
     tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
     shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)
-    weights = np.maximum(shared, 0) / _SUPERSAMPLING
-    return np.rint(np.tensordot(weights, means, axes=1)).astype(np.uint8)
+    # A row lies over few bands.
+    weights = sparse.csr_array(np.maximum(shared, 0) / _SUPERSAMPLING)
+    picture = np.asarray(weights @ means.reshape(len(bands), -1), dtype=np.float64)
+    return np.rint(picture).reshape(height_px, width_px, 3).astype(np.uint8)
 
 
 def save_preview(chart: Chart, path: Path, width_px: int = 2400) -> None:
