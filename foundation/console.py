@@ -447,15 +447,6 @@ class _StyledTyper(typer.Typer):
         named: dict[str, Any] = {"cls": StyledCommand, **more}
         return super().command(name, **named)
 
-    @functools.cached_property
-    def _whole(self) -> Any:
-        """The command with all below it, made once: a process that calls it again would make all their options anew."""
-        return typer.main.get_command(self)
-
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Run the command."""
-        return self._whole(*arguments, **named)
-
 
 def new_app(help_text: str | None = None, **more: Any) -> typer.Typer:
     """Return an app in the style of all commands.

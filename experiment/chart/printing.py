@@ -33,6 +33,9 @@ POINTS_PER_MM = 72 / MM_PER_INCH
 _STRIP_ROWS = 64
 """Rows of a strip of the TIFF: 5 MB of an A0 sheet at 600 dpi, little to hold and long enough to compress."""
 
+_BANDS = 64
+"""Bands of like rows that are painted at a time: the picture is never held, however many edges a sheet has."""
+
 _SUPERSAMPLING = 8
 """Pixels along each side of a preview's pixel: edges are then good to 1/8 of it."""
 
@@ -182,14 +185,15 @@ def _bands(
     edges = np.rint(drawn.rectangles_mm * pixels_per_mm).astype(np.int64)
     edges = np.clip(edges, 0, [width, height, width, height])
     across, down = (np.unique(np.append(edges[:, axis::2], [0, end])) for axis, end in enumerate(size))
-    left, right = np.searchsorted(across, edges[:, 0::2]).T.tolist()
-    top, bottom = np.searchsorted(down, edges[:, 1::2]).T.tolist()
-    # Between two neighbouring edges everything looks alike, so that each rectangle is painted once.
-    parts = np.full((len(down) - 1, len(across) - 1, 3), PAPER_WHITE, dtype=np.uint8)
-    for k, rgb in enumerate(drawn.rgb):
-        parts[top[k] : bottom[k], left[k] : right[k]] = rgb
-    for (first, end), row in zip(pairwise(down.tolist()), parts, strict=True):
-        yield first, end, np.repeat(row, np.diff(across), axis=0)
+    (left, right), (top, bottom) = np.searchsorted(across, edges[:, 0::2]).T, np.searchsorted(down, edges[:, 1::2]).T
+    # Between two neighbouring edges everything looks alike, so that a rectangle is painted once for many rows.
+    for first in range(0, len(down) - 1, _BANDS):
+        edges_down = down[first : first + _BANDS + 1].tolist()
+        parts = np.full((len(edges_down) - 1, len(across) - 1, 3), PAPER_WHITE, dtype=np.uint8)
+        for k in np.flatnonzero((top < first + len(parts)) & (bottom > first)).tolist():
+            parts[max(top[k] - first, 0) : bottom[k] - first, left[k] : right[k]] = drawn.rgb[k]
+        for (begin, end), row in zip(pairwise(edges_down), parts, strict=True):
+            yield begin, end, np.repeat(row, np.diff(across), axis=0)
 
 
 def _packed_strips(bands: Iterator[tuple[int, int, npt.NDArray[np.uint8]]], height: int) -> Iterator[bytes]:

@@ -20,12 +20,25 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import tifffile
+from hypothesis import given
+from hypothesis import strategies as st
 from pyapriltags import Detector
 
+from experiment.chart import printing
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.margins import text_boxes
 from experiment.chart.model import Chart, Tag
-from experiment.chart.printing import drawing, field_px, label, preview, save_pdf, save_preview, save_tiff, tag_modules
+from experiment.chart.printing import (
+    Drawing,
+    drawing,
+    field_px,
+    label,
+    preview,
+    save_pdf,
+    save_preview,
+    save_tiff,
+    tag_modules,
+)
 from experiment.chart.proof import LOOK_FOR, proof_drawing, save_proof
 from foundation.errors import InputError, StorageError
 
@@ -264,6 +277,18 @@ def test_an_independent_library_reads_all_tags_of_the_paper_s_chart(a0: Chart) -
     assert sorted(found) == list(range(35))
     for tag in a0.tags:
         np.testing.assert_allclose(found[tag.id], tag.corners_mm * 1600 / 1189, atol=0.15)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 150))
+def test_a_picture_is_its_rectangles_one_upon_another(seed: int, count: int) -> None:
+    random = np.random.default_rng(seed)
+    corners = np.sort(random.uniform(-5, 60, (count, 2, 2)), axis=1)
+    drawn = Drawing((50.0, 40.0), corners.reshape(count, 4), random.integers(0, 256, (count, 3), dtype=np.uint8))
+    expected = np.full((160, 200, 3), 255, dtype=np.uint8)
+    for (left, top, right, bottom), rgb in zip(np.rint(4 * corners).astype(int).reshape(-1, 4), drawn.rgb, strict=True):
+        expected[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = rgb
+    bands = printing._bands(drawn, 4.0, (200, 160))
+    np.testing.assert_array_equal(np.concatenate([[row] * (end - first) for first, end, row in bands]), expected)
 
 
 def test_a_preview_is_the_mean_of_what_it_covers(a7: Chart, tmp_path: Path) -> None:
