@@ -76,12 +76,6 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
-def pytest_sessionfinish() -> None:
-    """Leave little to pytest, which collects garbage five times at the end, lest an error in it go unseen."""
-    gc.collect()
-    gc.freeze()
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
     """Print arrays as NumPy does by itself: the package colour sets its own way for all of a process."""
@@ -150,7 +144,7 @@ def kept_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def undrawn() -> Iterator[None]:
-    """Leave the pictures of reports and results blank, where a module's tests look at none."""
+    """Leave the pictures of build-lut's reports blank, where a module's tests look at none."""
     from tests.calibration.lab import blank_pictures
 
     with blank_pictures():
