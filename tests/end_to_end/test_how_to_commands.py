@@ -8,7 +8,7 @@ rehearsal.md have a test of their own, those of the tutorial are run by `make de
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -20,7 +20,7 @@ import pytest
 from croplab import COMMANDS
 from tests.house.test_documented_commands import FOUND
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn", "unplotted")]
 
 HOW_TO = "docs/how-to/"
 ELSEWHERE = {"rehearsal.md"}
@@ -132,6 +132,19 @@ def run(*words: object) -> int:
     """Run a command as the shell would and return its exit code."""
     name, *arguments = map(str, words)
     return int(import_module(COMMANDS[name]).main(arguments))
+
+
+@pytest.fixture(scope="module")
+def unplotted() -> Iterator[None]:
+    """Leave the plots of results blank: the commands' own tests draw them."""
+
+    def blank(draw: Callable[..., None], *arguments: object, inches: tuple[float, float]) -> bytes:
+        return b"<svg></svg>"
+
+    with pytest.MonkeyPatch.context() as patched:
+        for page in ("reports.run_page", "experiments.comparing", "experiments.describing.report"):
+            patched.setattr(f"evaluation.{page}.svg_of", blank)
+        yield
 
 
 @pytest.fixture(scope="module")
