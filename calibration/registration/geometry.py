@@ -336,8 +336,9 @@ class Displacement:
             for one, other in combinations_with_replacement(groups, 2)
         }
         bending = _differences(*self.coefficients.shape[:2])
+        stiffness, ridge = bending.T @ bending, sparse.identity(bending.shape[1]) * _RIDGE
         for number, roughness in enumerate(self._roughnesses(roughness_px)):
-            upper[number, number] += bending.T @ bending / roughness**2 + sparse.identity(bending.shape[1]) * _RIDGE
+            upper[number, number] += stiffness / roughness**2 + ridge
         blocks = [[upper[min(one, other), max(one, other)] for other in groups] for one in groups]
         return sparse.csc_array(sparse.block_array(blocks))
 
