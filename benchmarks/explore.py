@@ -71,9 +71,7 @@ def _ask(address: str, **query: object) -> tuple[float, bytes]:
 
 def _drawn(base: str, ways: npt.NDArray[np.float64]) -> list[float]:
     """Return how long each of some chromaticities (N, 2) takes to be drawn on the page, ms."""
-    # Processes of the browser may write to its profile when it has ended.
-    scratch = tempfile.TemporaryDirectory(prefix="crop-", ignore_cleanup_errors=True)
-    with scratch as profile, browser_tab(Path(profile)) as tab:
+    with browser_tab() as tab:
         tab.open(base)
         tab.wait_for("document.readyState === 'complete' && panels.length === 2 && panels.every((one) => one.drawn)")
         # Lights that are not in the program's caches yet: a little beside those before.

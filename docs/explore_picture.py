@@ -40,7 +40,7 @@ def main() -> None:
         save_photographs(Path("photographs"))
         sources = find_pictures("photographs/coffee.png", Preparation(max_side=1000))
         explorer = Explorer("lut", open_lut(Path("lut")), sources)
-        with ExploreServer(explorer, "127.0.0.1", 0) as server, browser_tab(Path("profile")) as tab:
+        with ExploreServer(explorer, "127.0.0.1", 0) as server, browser_tab() as tab:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             tab.call("Emulation.setScrollbarsHidden", hidden=True)
             tab.open(f"http://127.0.0.1:{server.port}/", width=WINDOW[0], height=WINDOW[1])

@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import subprocess
+import tempfile
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -174,7 +175,7 @@ class Tab:
 
 
 @contextmanager
-def browser_tab(profile: Path) -> Generator[Tab]:
+def browser_tab() -> Generator[Tab]:
     """Run a browser with a profile of its own, and yield a tab of it."""
     assert CHROMIUM is not None
     to_browser, ours_out = os.pipe()
@@ -186,9 +187,11 @@ def browser_tab(profile: Path) -> Generator[Tab]:
         os.dup2(read_end, 3)
         os.dup2(write_end, 4)
 
+    # Its other processes may write to the profile when it has ended.
+    scratch = tempfile.TemporaryDirectory(prefix="crop-", ignore_cleanup_errors=True)
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe", "--mute-audio"]
     process = subprocess.Popen(
-        [CHROMIUM, *flags, f"--user-data-dir={profile}", "about:blank"],
+        [CHROMIUM, *flags, f"--user-data-dir={scratch.name}", "about:blank"],
         preexec_fn=place_pipes,
         close_fds=False,
         stdout=subprocess.DEVNULL,
@@ -203,3 +206,4 @@ def browser_tab(profile: Path) -> Generator[Tab]:
         process.wait(30)
         os.close(ours_out)
         os.close(ours_in)
+        scratch.cleanup()

@@ -39,8 +39,8 @@ DRAWN = "panels.length === 2 && panels.every((panel) => panel.drawn === `${state
 
 
 @pytest.fixture(scope="module")
-def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    with browser_tab(tmp_path_factory.mktemp("profile")) as opened:
+def tab() -> Iterator[Tab]:
+    with browser_tab() as opened:
         yield opened
 
 
