@@ -7,7 +7,8 @@ and file a PNG takes some megabytes, however large.
 **PNG** (ISO/IEC 15948). Chunks are written here around `generator.deflate`; one of data holds a band of rows. Values
 are the image's own: no gAMA, cICP or iCCP chunk, since camera RGB is no display's and some readers would convert, and
 no sBIT, since values lie at the lower end of the 16 bits. Maps are smooth: of differences to the row above ISA-L makes
-as few bytes as OpenCV's writer does, in a fifth of its time; its bytes depend on its version and may on the processor.
+as few bytes as OpenCV's writer does, in a fifth of its time; its bytes depend on its version and may on the processor,
+but on nothing else if it is used as `docs/decisions/0051-first-bytes-apart.md` says.
 
 **TIFF** 6.0 as every reader can read it: one uncompressed strip. The zstd codec is missing from widespread readers,
 and deflate, at the speed of their TIFF writers, costs more time than it saves room.
@@ -115,6 +116,8 @@ _ZLIB: Final = bytes([0x78, 0x01])
 """Deflate, a window of 32 KiB, packed fast (RFC 1950, 2.2)."""
 _LEVEL: Final = 1
 """Level of ISA-L's compression, of 0 to 3, for maps and for what OpenEXR's prediction leaves: both are smooth."""
+_APART: Final = 8
+"""Bytes that are packed before all others; of more than 16 ISA-L would use the loop that is wrong at its start."""
 _UP: Final = 2
 """The filter type Up (clause 9.2)."""
 # Colour types (clause 11.2.2).
@@ -137,7 +140,7 @@ def png_pieces(image: Image, metadata: ImageMetadata) -> Iterator[bytes | memory
     for top in range(0, height, rows):
         last = top + rows >= height
         data, plain = _packer().pack(np.ascontiguousarray(image[top : top + rows]), last=last)
-        checksum = int(isal_zlib.adler32(plain.data, checksum))  # pyrefly: ignore[missing-attribute]  # its stub leaves the function out
+        checksum = isal_zlib.adler32(plain.data, checksum)
         yield from _chunk(b"IDAT", b"" if top else _ZLIB, data.data, struct.pack(">I", checksum) if last else b"")
     yield from _chunk(b"IEND")
 
@@ -158,8 +161,15 @@ def encode_map(values: Image) -> bytes:
     rows[0, 1:] = plain[0]
     np.subtract(plain[1:], plain[:-1], out=rows[1:, 1:])
     head = _head(width, height, _GREY if values.ndim == 2 else _RGB)
-    packed = isal_zlib.compress(rows.data, _LEVEL)
-    return b"".join([head, *_chunk(b"IDAT", packed), *_chunk(b"IEND")])
+    return b"".join([head, *_chunk(b"IDAT", _packed(rows)), *_chunk(b"IEND")])
+
+
+def _packed(data: npt.NDArray[np.uint8]) -> bytes:
+    """Return contiguous `data` as zlib data, RFC 1950, the same bytes in every process."""
+    packer, plain = isal_zlib.compressobj(_LEVEL), data.reshape(-1).data
+    # Given all at once, ISA-L takes what lies in a register for its hash of the third to the sixth byte.
+    first = packer.compress(plain[:_APART]) + packer.flush(isal_zlib.Z_SYNC_FLUSH)
+    return b"".join([first, packer.compress(plain[_APART:]), packer.flush()])
 
 
 def _head(width: int, height: int, colour: int) -> bytes:
@@ -269,7 +279,7 @@ def _scan_lines(image: Image, y: int) -> bytes:
     # Bytes of even and of odd places are parted, then differences taken: so noise and exponents stand apart.
     apart = np.concatenate([raw[0::2], raw[1::2]])
     apart[1:] = apart[1:] - apart[:-1] + np.uint8(128)
-    data = isal_zlib.compress(apart.data, _LEVEL)
+    data = _packed(apart)
     # Data that do not become smaller are stored without reordering.
     body = data if len(data) < raw.nbytes else raw.tobytes()
     return struct.pack("<ii", y, len(body)) + body

@@ -7,6 +7,8 @@ import json
 import struct
 import sys
 import zlib
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -29,7 +31,9 @@ from generator.files import (
     decode_image,
     decode_png,
     decode_tiff,
+    encode_exr,
     encode_image,
+    encode_map,
     encode_preview,
     libraries_of,
     require_plausible,
@@ -113,6 +117,29 @@ def chunks_of(data: bytes) -> list[tuple[bytes, bytes]]:
         chunks.append((body[:4], body[4:]))
         at += 12 + size
     return chunks
+
+
+def repeating_maps(count: int) -> list[Image16]:
+    """Return maps whose rows are the same bytes once the row above is subtracted, other bytes in each map."""
+    first = np.random.default_rng(0).integers(0, 256, (count, 1, 8), np.uint8)
+    rows = np.arange(1, 13, dtype=np.uint8)[:, None] * first
+    return list(rows.view(">u2").astype(np.uint16))
+
+
+def exr_of(values: Image16) -> bytes:
+    return encode_exr(np.stack([values] * 3, axis=-1), METADATA)
+
+
+@pytest.mark.parametrize("encoded", [encode_map, exr_of])
+def test_what_isal_packs_is_the_same_bytes_in_every_thread(encoded: Callable[[Image16], bytes]) -> None:
+    """What a thread leaves in a register chose matches: one map of 400, and another in every process."""
+    maps = repeating_maps(4000)
+
+    def packed() -> list[bytes]:
+        return [encoded(values) for values in maps]
+
+    with ThreadPoolExecutor(1) as other:
+        assert other.submit(packed).result() == packed()
 
 
 def test_png_is_sixteen_bit_rgb_and_tells_its_shot() -> None:
