@@ -27,6 +27,7 @@ import os
 import stat
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from io import BufferedRandom
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeGuard, cast
@@ -329,6 +330,7 @@ _LOOKED_AT: Final = 4096
 _COPY_REMEDY: Final = "ask who made the folder for a copy without it, or copy it with its links resolved (cp -rL)"
 
 
+@lru_cache(8192)
 def is_inside_name(name: str) -> bool:
     """Return whether a name that stands in a file leads to a place below its folder, without looking at the disk.
 
