@@ -988,7 +988,9 @@ def _tile_size(shape: tuple[int, ...]) -> tuple[int, int]:
 def _tiles(extreme: np.ufunc, counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
     """Return the largest or least count of each tile; what is left at the edges belongs to the last."""
     height, width = _tile_size(counts.shape)
-    bands = extreme.reduceat(counts, range(0, counts.shape[0] - height + 1, height), axis=0)
+    # `reduceat` across rows takes 45 times as long.
+    parts = np.split(counts, range(height, counts.shape[0] - height + 1, height))
+    bands = np.stack([extreme.reduce(part, axis=0) for part in parts])
     return extreme.reduceat(bands, range(0, counts.shape[1] - width + 1, width), axis=1)
 
 
