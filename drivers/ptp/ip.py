@@ -272,19 +272,6 @@ def encode_data(transaction: int, data: bytes | memoryview, *, last: bool) -> by
     return b"".join((encode_integer(length, 4), encode_integer(kind, 4), encode_integer(transaction, 4), data))
 
 
-def decode(data: bytes) -> Packet:
-    """Return the packet that `data` is, from its first byte to its last."""
-    cursor = Cursor(data, "a PTP/IP packet")
-    length, kind = cursor.u32("length"), cursor.u32("type")
-    if length != len(data):
-        raise cursor.fault("length", f"{len(data)}, the bytes there are", length, at=0)
-    _checked(kind, length)
-    packet = _PACKETS[kind].read(cursor)
-    if cursor.left:
-        raise cursor.fault("the end", "no more bytes", f"followed by {cursor.left} bytes", at=cursor.at)
-    return packet
-
-
 class PacketCutter:
     """Cuts a channel's stream into packets, however it was split in transit. One for each channel."""
 
@@ -321,12 +308,12 @@ class PacketCutter:
             return self._next_data(packets)
         if self._left < HEADER_LENGTH:
             return False
-        if self._waiting[self._at : self._at + 5].upper() in _OF_HTTP:
+        length, kind = _HEADER.unpack_from(self._waiting, self._at)
+        if kind not in _PACKETS and self._waiting[self._at : self._at + 5].upper() in _OF_HTTP:
             raise ProtocolError(
                 "an HTTP server answers, no camera; give the camera's address, and as port "
                 f"{PORT} unless its menu says another"
             )
-        length, kind = _HEADER.unpack_from(self._waiting, self._at)
         _checked(kind, length)
         if kind in _DATA_TYPES:
             if self._left < _DATA_HEADER.size:
@@ -337,9 +324,8 @@ class PacketCutter:
             return True
         if self._left < length:
             return False
-        packet = decode(self._waiting[self._at : self._at + length])
+        packets.append(_decode(kind, self._waiting[self._at : self._at + length]))
         self._at += length
-        packets.append(packet)
         return self._left > 0
 
     def _next_data(self, packets: list[Packet]) -> bool:
@@ -357,6 +343,16 @@ class PacketCutter:
 
 _OF_HTTP: Final = (b"HTTP/", b"<!DOC", b"<HTML")
 """How what a server of pages says begins; as packets these would be of a gigabyte."""
+
+
+def _decode(kind: int, data: bytes) -> Packet:
+    """Return the packet of a type whose bytes, its header included, are `data`."""
+    cursor = Cursor(data, "a PTP/IP packet")
+    cursor.at = HEADER_LENGTH
+    packet = _PACKETS[kind].read(cursor)
+    if cursor.left:
+        raise cursor.fault("the end", "no more bytes", f"followed by {cursor.left} bytes", at=cursor.at)
+    return packet
 
 
 def _checked(kind: int, length: int) -> None:

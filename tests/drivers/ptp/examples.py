@@ -126,7 +126,6 @@ READERS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
     ("number", canon.number_of, bytes(4)),
     ("device status", container.DeviceStatus.decode, bytes.fromhex("0800 0120 81000000")),
     ("cancel", container.decode_cancel, bytes.fromhex("0140 05000000")),
-    *((f"packet {number}", ptpip.decode, packet) for number, packet in enumerate(IP_PACKETS, 1)),
 )
 """What reads bytes whose end is known: a name, the function, bytes that it reads to their last."""
 

@@ -30,7 +30,7 @@ from sim.buses.usb import (
 from sim.buses.usbip import UsbIpService
 from sim.projectors.lightcrafter import Controller, LightCrafterUsb
 from sim.projectors.projector import Screen
-from tests.drivers.ptp.examples import READERS, STREAMS
+from tests.drivers.ptp.examples import IP_PACKETS, READERS, STREAMS
 from tests.pinned import Pinned
 from tests.sim.camera.test_eos import host_of
 
@@ -223,7 +223,7 @@ def test_codes_and_bytes_of_ptp_are_what_they_were(pinned: Pinned) -> None:
         for size in (0, 1, 2, 14, 15)
         for compression in (2, 3, 4, 8)
     ]
-    packets = [str(ptpip.PacketCutter().feed(data)) for name, _, data in READERS if name.startswith("packet")]
+    packets = [str(ptpip.PacketCutter().feed(packet)) for packet in IP_PACKETS]
     containers = [
         container.encode_data_header(0x1001, 7, size).hex() for size in (0, 500, 0xFFFFFFF3, 0xFFFFFFF4, 1 << 40)
     ]
