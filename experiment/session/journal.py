@@ -243,7 +243,8 @@ class Journal:
     def steps(self) -> tuple[SessionStep, ...]:
         """Return the plan, in taking order."""
         rows = self._rows("SELECT step, kind, illumination, red, green, blue FROM plan ORDER BY step")
-        return tuple(_step(row[0], self._kind(row[1]), *row[2:]) for row in rows)
+        self._require_known_kinds(row[1] for row in rows)
+        return tuple([_step(*row) for row in rows])
 
     def add_steps(self, steps: Sequence[SessionStep]) -> None:
         """Put steps at the end of the plan; their numbers must be free."""
@@ -346,7 +347,8 @@ class Journal:
             "SELECT id, step, kind, illumination, file, started_at, ended_at, taken_at, verdict, reason"
             " FROM attempts ORDER BY id"
         )
-        return [_attempt(*row[:2], self._kind(row[2]), *row[3:]) for row in rows]
+        self._require_known_kinds(row[2] for row in rows)
+        return [_attempt(*row) for row in rows]
 
     def events(self) -> list[SessionEvent]:
         """Return every event, oldest first."""
@@ -425,23 +427,23 @@ class Journal:
             "SELECT step, kind, illumination, file, sha256, taken_at, exposure_s, verdict, reason, id FROM attempts"
             " WHERE sha256 IS NOT NULL ORDER BY step, id"
         )
+        self._require_known_kinds(row[1] for row in rows)
         newest = {step: attempt for step, *_, verdict, _, attempt in rows if verdict == ACCEPTED}
         return [
             FrameRecord(
-                *(self._kind(kind), light, file, sha256, datetime.fromisoformat(taken_at), exposure_s),
+                *(kind, light, file, sha256, datetime.fromisoformat(taken_at), exposure_s),
                 _verdict_text(verdict, reason, newest.get(step, attempt) == attempt),
                 attempt,
             )
             for step, kind, light, file, sha256, taken_at, exposure_s, verdict, reason, attempt in rows
         ]
 
-    def _kind(self, kind: str) -> FrameKind:
-        if kind not in KINDS:
+    def _require_known_kinds(self, kinds: Iterable[str]) -> None:
+        if unknown := sorted({*kinds} - {*KINDS}):
             raise FormatError(
-                f"{self.path} holds a frame of the kind {kind!r}, this software knows {', '.join(KINDS)}; use the "
-                "software that took the session"
+                f"{self.path} holds a frame of the kind {unknown[0]!r}, this software knows {', '.join(KINDS)}; use "
+                "the software that took the session"
             )
-        return kind
 
     def _newer_rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
         """Return rows of a table that journals of version 1 do not have."""
