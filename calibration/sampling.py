@@ -75,32 +75,9 @@ def patch_means(values: npt.NDArray[np.uint16]) -> npt.NDArray[np.float64]:
 
 
 @inlined
-def _sampled(sensor: Any, corner: Any, step: Any, places: Any, window: Any, black: Any, samples: Any) -> Any:
-    """Fill a patch's samples (window², 3) float32 and return the highest of its counts, int32."""
-    red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
-    highest, number = np.int32(0), uint64(0)
-    for row in range(window):
-        # Unsigned places spare the test for one before the array's beginning.
-        at = uint64(corner + row * step)
-        for _ in range(window):
-            r, b = np.int32(sensor[at + red]), np.int32(sensor[at + blue])
-            g, h = np.int32(sensor[at + green]), np.int32(sensor[at + other])
-            at += uint64(2)
-            samples[number, 0] = np.float32(r) - black[0]
-            samples[number, 1] = np.float32(g + h) * np.float32(0.5) - black[1]
-            samples[number, 2] = np.float32(b) - black[2]
-            highest = max(highest, max(max(r, b), max(g, h)))
-            number += uint64(1)
-    return highest
-
-
-@inlined
-def _tabulated(samples: Any, dark: Any, field: Any, values: Any) -> None:
-    """Fill a patch's values (S, 3) uint16 from its samples (S, 3) float32, less `dark` (3,), over `field` (3,)."""
-    for number in range(len(samples)):
-        for channel in range(3):
-            level = np.rint((samples[number, channel] - dark[channel]) / field[channel])
-            values[number, channel] = np.uint16(min(max(level, np.float32(0)), np.float32(65535)))
+def _rounded(above: Any, field: Any) -> Any:
+    """Return a sample as the table holds it, uint16."""
+    return np.uint16(min(max(np.rint(above / field), np.float32(0)), np.float32(65535)))
 
 
 @compiled
@@ -123,19 +100,37 @@ def _sample(
     whether a patch lies on the sensor. `places`: (4,) photosites from a block's top-left one to its red, its two greens
     and its blue. `black`: (3,) float32 counts, of red, green and blue.
     """
+    red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
     for patch in order:
+        highest, number = np.int32(0), uint64(0)
+        of_patch = samples[patch]
         if not inside[patch]:
-            samples[patch] = 0
+            of_patch[:] = 0
             peak[patch] = 0
             continue
-        peak[patch] = _sampled(sensor, corner[patch], step, places, window, black, samples[patch])
+        for row in range(window):
+            # Unsigned places spare the test for one before the array's beginning.
+            at = uint64(corner[patch] + row * step)
+            for _ in range(window):
+                r, b = np.int32(sensor[at + red]), np.int32(sensor[at + blue])
+                g, h = np.int32(sensor[at + green]), np.int32(sensor[at + other])
+                at += uint64(2)
+                of_patch[number, 0] = np.float32(r) - black[0]
+                of_patch[number, 1] = np.float32(g + h) * np.float32(0.5) - black[1]
+                of_patch[number, 2] = np.float32(b) - black[2]
+                highest = max(highest, max(max(r, b), max(g, h)))
+                number += uint64(1)
+        peak[patch] = highest
 
 
 @compiled
 def _tabulate(samples: _Float, dark: _Float, field: _Float, values: _Count) -> None:
     """Fill values (N, S, 3) uint16 from samples (N, S, 3) float32, less `dark` (N, 3), over `field` (N, 3)."""
     for patch in range(samples.shape[0]):
-        _tabulated(samples[patch], dark[patch], field[patch], values[patch])
+        for number in range(samples.shape[1]):
+            for channel in range(3):
+                above = samples[patch, number, channel] - dark[patch, channel]
+                values[patch, number, channel] = _rounded(above, field[patch, channel])
 
 
 @compiled
@@ -153,19 +148,32 @@ def _sample_to_table(
     values: _Count,
     peak: _Count,
 ) -> None:
-    """Do `_sample` and `_tabulate` patch by patch, without the samples (N, window², 3) between them.
+    """Do `_sample` and `_tabulate` in one pass, without the samples (N, window², 3) between them.
 
     `values` (N, window², 3) uint16 and `peak` (N,) uint16 are filled; `dark` and `field` are (N, 3) float32, the rest
     as for `_sample`.
     """
-    samples = np.empty(values.shape[1:], np.float32)
+    red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
     for patch in order:
+        highest, number = np.int32(0), uint64(0)
+        of_patch = values[patch]
         if not inside[patch]:
-            values[patch] = 0
+            of_patch[:] = 0
             peak[patch] = 0
             continue
-        peak[patch] = _sampled(sensor, corner[patch], step, places, window, black, samples)
-        _tabulated(samples, dark[patch], field[patch], values[patch])
+        for row in range(window):
+            at = uint64(corner[patch] + row * step)
+            for _ in range(window):
+                r, b = np.int32(sensor[at + red]), np.int32(sensor[at + blue])
+                g, h = np.int32(sensor[at + green]), np.int32(sensor[at + other])
+                at += uint64(2)
+                of_patch[number, 0] = _rounded(np.float32(r) - black[0] - dark[patch, 0], field[patch, 0])
+                above = np.float32(g + h) * np.float32(0.5) - black[1] - dark[patch, 1]
+                of_patch[number, 1] = _rounded(above, field[patch, 1])
+                of_patch[number, 2] = _rounded(np.float32(b) - black[2] - dark[patch, 2], field[patch, 2])
+                highest = max(highest, max(max(r, b), max(g, h)))
+                number += uint64(1)
+        peak[patch] = highest
 
 
 @compiled
