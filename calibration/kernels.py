@@ -145,14 +145,45 @@ def light_around(
 def blur_rows(image: _Float, taps: _Float, out: _Float) -> None:
     """Fill out (R, N) with an image (R, N) blurred down its rows by odd `taps`; its border is repeated."""
     rows, reach = image.shape[0], len(taps) // 2
+    padded = np.zeros(len(taps) + 3, dtype=np.float32)
+    padded[: len(taps)] = taps
     for row in range(rows):
         out[row] = 0
-        for tap in range(len(taps)):
-            source = min(max(row + tap - reach, 0), rows - 1)
-            weight = taps[tap]
-            line, sums = image[source], out[row]
+        sums = out[row]
+        # Four rows at once, added in their order: each sum is fetched and put back a fourth as often.
+        for tap in range(0, len(taps), 4):
+            first = row + tap - reach
+            one, two = image[min(max(first, 0), rows - 1)], image[min(max(first + 1, 0), rows - 1)]
+            three, four = image[min(max(first + 2, 0), rows - 1)], image[min(max(first + 3, 0), rows - 1)]
+            a, b, c, d = padded[tap], padded[tap + 1], padded[tap + 2], padded[tap + 3]
             for place in range(image.shape[1]):
-                sums[place] += weight * line[place]
+                sums[place] = (((sums[place] + a * one[place]) + b * two[place]) + c * three[place]) + d * four[place]
+
+
+@compiled
+def print_slots(shares: _Float, light: _Array, inks: _Array, image: _Float) -> None:
+    """Fill image (N, 3) with slots whose `shares` (N, 3 kinds) show `inks` (3 kinds, 3) in the `light` (N, 3) there.
+
+    The last kind, what lies behind the print, has light of its own.
+    """
+    for slot in range(len(shares)):
+        for channel in range(3):
+            seen = shares[slot, 0] * (light[slot, channel] * inks[0, channel])
+            seen += shares[slot, 1] * (light[slot, channel] * inks[1, channel])
+            seen += shares[slot, 2] * inks[2, channel]
+            image[slot, channel] = np.float32(seen)
+
+
+@compiled
+def add_far(image: _Float, row: _Place, column: _Place, share: _Array, levels: _Array, added: _Array) -> None:
+    """Add to added (N, 3) what patches get of an image (R, K, 3), at their `row` and `column`, for their levels (N, 3).
+
+    `share`: (3,) of the light of each channel.
+    """
+    for n in range(len(row)):
+        for channel in range(3):
+            far = np.float64(image[row[n], column[n], channel])
+            added[n, channel] += share[channel] * (far - levels[n, channel])
 
 
 @compiled

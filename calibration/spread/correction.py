@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration import kernels
 from calibration.registration.register import Registration
 from calibration.sampling import Sites, sites_at
 from calibration.spread.fitting import (
@@ -151,10 +152,11 @@ class FrameCorrection:
         around, inks = self.around, self.around.inks(levels)
         added = self.near.at(levels, inks) - self.near.total * levels.patches
         if self.far.any():
-            image = around.image(levels, inks)
-            for share, scale in zip(self.far.T, FAR_PX, strict=True):
+            image, grid = around.image(levels, inks), around.grid
+            for share, scale in zip(np.ascontiguousarray(self.far.T), FAR_PX, strict=True):
                 if share.any():
-                    added += share * (around.far(image, scale) - levels.patches)
+                    blurred = around.blurred(image, scale)
+                    kernels.add_far(blurred, grid.column, grid.row, share, levels.patches, added)
         if self.veil.any():
             added += self.veil * (around.mean(levels, inks) - levels.patches)
         return added

@@ -76,6 +76,11 @@ class PrintedGrid:
     slots_mm: _Array
 
     @cached_property
+    def plain_slots(self) -> float:
+        """How many slots bare paper and black ink would fill."""
+        return float(self.others[..., :2].sum())
+
+    @cached_property
     def neighbours(self) -> _Index:
         """(P, 25) int32, the patches in the 5 × 5 slots around each patch, row by row; −1 where there is none."""
         steps = np.arange(-REACH, REACH + 1)
@@ -235,22 +240,20 @@ class Surroundings:
         `inks` (3, 3) are those of `inks`.
         """
         sheet = levels.patches.sum(axis=0) + (self.light.elsewhere * inks[:2]).sum(axis=0)
-        slots = len(levels.patches) + float(self.grid.others[..., :2].sum())
+        slots = len(levels.patches) + self.grid.plain_slots
         beside = max(self.frame_slots - slots, 0.0)
         return (sheet + beside * inks[2]) / (slots + beside)
 
     def image(self, levels: FrameLevels, inks: _Array) -> _Float:
         """Return the print slot by slot, (R, K, 3) float32 counts; `inks` (3, 3) are those of `inks`."""
-        shares, light = self.grid.others.reshape(-1, 3), self.light.slots
-        seen = shares[:, :1] * (light * inks[0]) + shares[:, 1:2] * (light * inks[1])
-        seen += shares[:, 2:] * inks[2]
-        image = seen.reshape(*self.grid.source.shape, 3).astype(np.float32)
+        image = np.empty((*self.grid.source.shape, 3), dtype=np.float32)
+        kernels.print_slots(self.grid.others.reshape(-1, 3), self.light.slots, inks, image.reshape(-1, 3))
         image[self.grid.row, self.grid.column] = levels.patches
         return image
 
-    def far(self, image: _Float, scale_px: float) -> _Array:
-        """Return what a far kernel brings to the patches, (P, 3) float64 counts, their own slots' light included."""
-        width, height = self.pitch_px.mean(axis=0)
+    def blurred(self, image: _Float, scale_px: float) -> _Float:
+        """Return what a far kernel makes of the print, (K, R, 3) float32 counts: columns first."""
+        width, height = self._mean_pitch_px
         # Columns and channels in one, so that the compiled loop runs along them.
         rows = image.reshape(image.shape[0], -1)
         down = np.empty_like(rows)
@@ -259,12 +262,20 @@ class Surroundings:
         columns = turned.reshape(turned.shape[0], -1)
         across = np.empty_like(columns)
         kernels.blur_rows(columns, far_taps(scale_px / width), across)
-        across = across.reshape(turned.shape)
-        return across[self.grid.column, self.grid.row].astype(np.float64)
+        return across.reshape(turned.shape)
+
+    def far(self, image: _Float, scale_px: float) -> _Array:
+        """Return what a far kernel brings to the patches, (P, 3) float64 counts, their own slots' light included."""
+        return self.blurred(image, scale_px)[self.grid.column, self.grid.row].astype(np.float64)
+
+    @cached_property
+    def _mean_pitch_px(self) -> tuple[float, float]:
+        width, height = self.pitch_px.mean(axis=0).tolist()
+        return width, height
 
     def own_share(self, scale_px: float) -> float:
         """Return the share of a far kernel's light at a patch that comes from its own slot."""
-        width, height = self.pitch_px.mean(axis=0)
+        width, height = self._mean_pitch_px
         taps = far_taps(scale_px / width), far_taps(scale_px / height)
         return float(taps[0][len(taps[0]) // 2] * taps[1][len(taps[1]) // 2])
 

@@ -13,10 +13,12 @@ from scipy import integrate, ndimage, stats
 from calibration.kernels import (
     ACROSS,
     PARTS,
+    add_far,
     blur_rows,
     clipped_to_neighbours,
     light_around,
     moments,
+    print_slots,
     weights_around,
     window_shares,
 )
@@ -48,13 +50,33 @@ def test_moments_are_exact_for_any_counts() -> None:
     np.testing.assert_allclose(variances, values.astype(np.float64).var(axis=1, ddof=1), rtol=1e-9)
 
 
-def test_a_column_is_blurred_by_its_taps_with_its_border_repeated() -> None:
+@pytest.mark.parametrize("count", [1, 7, 9])
+def test_a_column_is_blurred_by_its_taps_with_its_border_repeated(count: int) -> None:
     random = np.random.default_rng(3)
-    image, taps = random.random((23, 5)).astype(np.float32), random.random(7).astype(np.float32)
+    image, taps = random.random((23, 5)).astype(np.float32), random.random(count).astype(np.float32)
     found = np.empty_like(image)
     blur_rows(image, taps, found)
     expected = ndimage.correlate1d(image.astype(np.float64), taps.astype(np.float64), axis=0, mode="nearest")
     np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_slots_show_their_inks_in_the_light_of_the_place() -> None:
+    random = np.random.default_rng(4)
+    shares, light, inks = random.random((40, 3)).astype(np.float32), random.random((40, 3)), random.random((3, 3))
+    image = np.empty((40, 3), dtype=np.float32)
+    print_slots(shares, light, inks, image)
+    lit = np.stack([light * inks[0], light * inks[1], np.broadcast_to(inks[2], light.shape)], axis=1)
+    np.testing.assert_allclose(image, np.einsum("nk,nkc->nc", shares, lit), rtol=1e-6)
+
+
+def test_patches_get_the_far_light_of_their_slot_for_their_own() -> None:
+    random = np.random.default_rng(5)
+    image, levels, added = random.random((6, 5, 3)).astype(np.float32), random.random((8, 3)), random.random((8, 3))
+    row, column = random.integers(0, 6, 8), random.integers(0, 5, 8)
+    share = np.array([0.1, 0.0, -0.2])
+    expected = added + share * (image[row, column] - levels)
+    add_far(image, row, column, share, levels, added)
+    np.testing.assert_allclose(added, expected, rtol=1e-12)
 
 
 def light_between(low: float, high: float, sigma: float, window: int, offset: float) -> float:
