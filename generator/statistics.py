@@ -11,6 +11,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -62,7 +63,9 @@ def cell_means(image: npt.NDArray[np.generic], light: npt.ArrayLike, side: int =
     """
     rows, columns = (cell_borders(size, side) for size in image.shape[:2])
     # In float64, in which sums of 16-bit counts are exact up to 2⁵³.
-    sums = np.add.reduceat(np.add.reduceat(image, rows[:-1], axis=0, dtype=np.float64), columns[:-1], axis=1)
+    # By bands: `reduceat` across the rows of a whole image takes twelve times as long.
+    bands = [image[top:bottom].sum(axis=0, dtype=np.float64) for top, bottom in pairwise(rows)]
+    sums = np.add.reduceat(np.stack(bands), columns[:-1], axis=1)
     even = np.asarray(light, dtype=np.float64)
     return sums / (np.diff(rows)[:, None] * np.diff(columns))[..., None] / (even / even.mean())
 
