@@ -206,16 +206,17 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
     path = folder / JOURNAL_FILE
     opened = Journal.open(path) if before else open_journal(folder)
     with closing(opened) as journal, journal.one_moment():
-        steps, rows, events = journal.steps(), journal.attempts(), journal.events()
+        steps, verdicts, events = journal.steps(), journal.verdicts(), journal.events()
         accepted = journal.accepted_files()
         known = {view.id: view for view in before.attempts} if before else {}
         changed = [
-            row
-            for row in rows
-            if (old := known.get(row.id)) is None or (old.verdict, old.started_at) != (row.verdict, row.started_at)
+            number
+            for number, started_at, verdict in verdicts
+            if (old := known.get(number)) is None or (old.verdict, old.started_at) != (verdict, started_at)
         ]
-        details, nothing = journal.details([row.id for row in changed]), AttemptDetails()
-        known |= {row.id: AttemptView(**vars(row), **vars(details.get(row.id, nothing))) for row in changed}
+        rows = journal.attempts(changed)
+        details, nothing = journal.details(changed), AttemptDetails()
+        known |= {row.id: AttemptView(**vars(row), **vars(details.get(row.id, nothing))) for row in rows}
         records, heartbeat = journal.records(), journal.heartbeat()
     starts = [event.at for event in events if event.what == RUN_STARTS]
     is_complete = {step.number for step in steps} <= {frame.step for frame in accepted}
@@ -225,7 +226,7 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
         steps,
         before.lights if before and before.steps == steps else _lights_of(folder),
         records,
-        with_seconds([known[row.id] for row in rows], starts),
+        with_seconds([known[number] for number, *_ in verdicts], starts),
         tuple(events),
         heartbeat,
         SessionPlace.of(path),

@@ -341,14 +341,21 @@ class Journal:
         rows = self._newer_rows("SELECT state FROM heartbeat")
         return rows[0][0] if rows else None
 
-    def attempts(self) -> list[Attempt]:
-        """Return every attempt, oldest first."""
+    def attempts(self, numbers: Sequence[int] | None = None) -> list[Attempt]:
+        """Return attempts, those of these numbers or all, oldest first."""
+        among, values = ("", ()) if numbers is None else (f"WHERE id {_AMONG}", (json.dumps(list(numbers)),))
         rows = self._rows(
             "SELECT id, step, kind, illumination, file, started_at, ended_at, taken_at, verdict, reason"
-            " FROM attempts ORDER BY id"
+            f" FROM attempts {among} ORDER BY id",
+            values,
         )
         self._require_known_kinds(row[2] for row in rows)
         return [_attempt(*row) for row in rows]
+
+    def verdicts(self) -> list[tuple[int, datetime, str | None]]:
+        """Return of every attempt, oldest first, number, start and verdict: what a whole night is looked through by."""
+        rows = self._rows("SELECT id, started_at, verdict FROM attempts ORDER BY id")
+        return [(number, datetime.fromisoformat(at), verdict) for number, at, verdict in rows]
 
     def events(self) -> list[SessionEvent]:
         """Return every event, oldest first."""
@@ -596,7 +603,6 @@ def _step(number: int, kind: FrameKind, illumination: int | None, *codes: int) -
     return SessionStep(number, kind, illumination, Colour(*codes))
 
 
-@lru_cache(_ROWS_KEPT)
 def _attempt(
     number: int,
     step: int,
