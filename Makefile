@@ -58,7 +58,7 @@ test: $(READY)
 suite: $(READY)
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
-# What most mistakes are caught by: every test function that takes no longer than a quarter of a second.
+# What most mistakes are caught by: every test function that takes no longer than a tenth of a second.
 quick: $(READY)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"
 

@@ -28,7 +28,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.rooms import Case, PhotographedChart, photographed
-from calibration.registration.register import Registration, register
+from calibration.registration.register import MAX_PLACE_ERROR_PX, Registration, register
 from drivers.raw.rawfile import CHANNELS
 from experiment.chart.layout import design_chart, paper_chart
 from foundation.errors import CropError
@@ -64,7 +64,7 @@ def listed(shot: PhotographedChart, registration: Registration) -> np.ndarray[An
     centres, blocks = shot.chart.centres_mm, registration.blocks
     nearest = np.asarray(cKDTree(blocks.centres_mm).query(centres)[1])
     covered = registration.mismatched_cells | ~blocks.good[nearest]
-    return covered | registration.uncertain(centres)
+    return covered | (registration.expanded_px(centres) > MAX_PLACE_ERROR_PX)
 
 
 def tried(name: str, body: str, seed: int) -> dict[str, Any]:

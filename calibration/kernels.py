@@ -1,8 +1,8 @@
 """Inner loops of calibration, compiled: the lens's spread, cells among neighbours, moments.
 
 Without licence to reorder sums: a table's bytes depend on neither processor nor thread. What the numbers mean stands
-where the kernels are called. Nothing of ours but the compiler is imported: whatever is, its change has all of them
-compiled again.
+where the kernels are called. Of this software only the compiler is imported: a change of what is imported has all
+kernels compiled again.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ _Array = npt.NDArray[np.float64]
 _Float = npt.NDArray[np.float32]
 _Count = npt.NDArray[np.uint16]
 _Place = npt.NDArray[np.int64]
-_Mask = npt.NDArray[np.bool_]
 _Slot = npt.NDArray[np.int32]
 
 PARTS = 5
@@ -143,7 +142,7 @@ def light_around(
 
 @compiled
 def blur_rows(image: _Float, taps: _Float, out: _Float) -> None:
-    """Fill out (R, N) with an image (R, N) blurred down its rows by odd `taps`; its border is repeated."""
+    """Fill out (R, N) with a finite image (R, N) blurred down its rows by odd `taps`; its border is repeated."""
     rows, reach = image.shape[0], len(taps) // 2
     padded = np.zeros(len(taps) + 3, dtype=np.float32)
     padded[: len(taps)] = taps

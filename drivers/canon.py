@@ -10,8 +10,8 @@ came, in `OtherRecord`, and one that contradicts itself raises `ProtocolError`.
 Then a body's state and its connection (`EosBody`):
 
 - Every step is one that the recorded conversations have, or one that libgphoto2 takes. Nothing is sent or taken for
-  settable that the body does not list, and what it lists and does not know all the same is done without where it can
-  be.
+  settable that the body does not list. Where it lists an operation and does not know it all the same, the camera does
+  without if it can.
 - What a body claims costs little: counts and sizes are checked before they are believed, and what it reports is
   held up to limits that no real body comes near.
 - A body keeps a frame in its memory until TransferComplete, and refuses the next when that memory is full. So every
@@ -734,7 +734,6 @@ class EosState:
     - `lists`, `formats`: what a property can be set to now.
     - `functions`: the custom functions: number to first value.
     - `busy`: whether the body reported that it is exposing or writing.
-    - `shutting_down`: whether it reported that it will soon switch itself off.
     - `waiting`: by handle, in the order of their announcement.
     """
 
@@ -743,7 +742,6 @@ class EosState:
     formats: dict[int, tuple[ImageFormat, ...]] = field(default_factory=dict[int, tuple[ImageFormat, ...]])
     functions: dict[int, int] = field(default_factory=dict[int, int])
     busy: bool = False
-    shutting_down: bool = False
     waiting: dict[int, WaitingObject] = field(default_factory=dict[int, WaitingObject])
 
     def take(self, records: Iterable[Record]) -> None:
@@ -771,8 +769,6 @@ class EosState:
                     self.waiting.pop(handle, None)
                 case Notice(EosEvent.CAMERA_STATUS_CHANGED, status):
                     self.busy = status == CameraStatus.BUSY
-                case Notice(EosEvent.WILL_SOON_SHUT_DOWN):
-                    self.shutting_down = True
 
     def number(self, code: int) -> int | None:
         """Return the value of a property that is a number, None where it was not reported."""

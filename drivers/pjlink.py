@@ -281,10 +281,10 @@ def is_class_1_input(code: str) -> bool:
     return re.fullmatch("[1-5][1-9]", code) is not None
 
 
-def parse_input(value: str, command: str = "INPT") -> str:
+def parse_input(value: str) -> str:
     """Return an input's code, its letter a capital."""
     if not re.fullmatch("[1-6][1-9A-Z]", value.upper()):
-        raise _unexpected(command, value, "a digit 1 to 6 and one of 1 to 9 or A to Z")
+        raise _unexpected("INPT", value, "a digit 1 to 6 and one of 1 to 9 or A to Z")
     return value.upper()
 
 

@@ -6,7 +6,6 @@ added has a default. Arrays are lists in the file, numbers that are not finite a
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Collection, Iterable, Mapping
 from functools import cache
@@ -64,11 +63,6 @@ def to_plain(record: Any, kind: Any = None) -> Any:
     `kind` is its type, where it is not that of the object alone (`tuple[Frame, ...]`).
     """
     return _adapter(kind or cast("Any", type(record))).dump_python(record, mode="json")
-
-
-def to_json(record: Any, kind: Any = None) -> str:
-    """Return a record as the text of a JSON file, two spaces a level and a newline at the end."""
-    return json.dumps(to_plain(record, kind), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def from_plain(kind: type[T], value: Any, about: object, remedy: str) -> T:

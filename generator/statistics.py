@@ -64,8 +64,10 @@ def cell_means(image: npt.NDArray[np.generic], light: npt.ArrayLike, side: int =
     rows, columns = (cell_borders(size, side) for size in image.shape[:2])
     # In float64, in which sums of 16-bit counts are exact up to 2⁵³.
     # By bands: `reduceat` across the rows of a whole image takes twelve times as long.
-    bands = [image[top:bottom].sum(axis=0, dtype=np.float64) for top, bottom in pairwise(rows)]
-    sums = np.add.reduceat(np.stack(bands), columns[:-1], axis=1)
+    bands = np.empty((len(rows) - 1, *image.shape[1:]))
+    for band, (top, bottom) in zip(bands, pairwise(rows), strict=True):
+        image[top:bottom].sum(axis=0, dtype=np.float64, out=band)
+    sums = np.add.reduceat(bands, columns[:-1], axis=1)
     even = np.asarray(light, dtype=np.float64)
     return sums / (np.diff(rows)[:, None] * np.diff(columns))[..., None] / (even / even.mean())
 

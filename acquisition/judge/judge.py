@@ -343,6 +343,7 @@ def _independence(one: Measured, other: Measured) -> float | None:
 def _judge_exposure(
     state: JudgeState, measured: Measured, step: SessionStep, settings: LabSettings
 ) -> tuple[Check, Check]:
+    """Return what is said of a frame's clipped photosites and of its brightest counts."""
     exposure = Exposure(measured.clipped, measured.brightest_dn, measured.range_dn)
     # Where white is known, a dark frame is held against it.
     free = step.kind == "dark" and state.white is not None

@@ -300,8 +300,8 @@ def head_of(
             state, sentence = "silent", f"its process {pid} was stopped by a signal; kill -CONT {pid} lets it go on"
         elif _is_full(view, free_bytes) and (state, _cause(sentence)) != ("paused", "the disk"):
             state, sentence = "late", "the disk is full; free space, and the run goes on by itself"
-    judged = [one for one in attempts if one.verdict is not None][-RECENT:]
-    remaining = time_left([TimedAttempt(one.seconds, one.verdict in (ACCEPTED, VOIDED)) for one in judged], left)
+    judged = (one for one in attempts if one.verdict is not None)
+    remaining = time_left((TimedAttempt(one.seconds, one.verdict in (ACCEPTED, VOIDED)) for one in judged), left)
     near = (
         heartbeat is not None
         and bool(attempts)

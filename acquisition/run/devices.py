@@ -17,7 +17,8 @@ The disk is waited for as camera, presenter and projector are. Rules that hold i
 - A projector that reports a fault, shows no picture or does not answer is unhealthy: the run pauses. One that was out
   of reach for as long as a lamp takes to light may have lost its power meanwhile.
 - It is lit by the program once, before the first frame: whoever switched it off later may have had a reason. With
-  `sequence.relight` it is lit again where it is in standby, once a pause: a lamp that does not light is not worn out.
+  `sequence.relight` it is lit again where it is in standby, only once a pause, so that tries do not wear out a lamp
+  that does not light.
 - Whatever ends the run, the screen goes black, and the lamp's fate is decided and said:
 
 ====================  =====================================  =========================================

@@ -70,8 +70,8 @@ from foundation.errors import CropError, DeviceError, QualityError, StorageError
 from foundation.files import write_whole
 
 AHEAD = 1
-"""Frames whose verdict is not known when the next is exposed: that of the one before has an exposure and a download to
-come in, several times what judging takes; more would only be lost where one is refused."""
+"""Frames whose verdict is not known when the next is exposed. A frame is judged while the next is exposed and
+downloaded, which takes several times as long; with more frames ahead, more would be lost where one is refused."""
 
 DOWNLOADS = 2
 """Tries at fetching a frame before it is exposed again: a driver has renewed its connection several times by then."""
@@ -286,7 +286,7 @@ class Pipeline:
             self._pause_for(_CAMERA, error)
             return None
         timings = {"show": light.show_s, "settle": settling_s, "expose": clock.monotonic() - begun}
-        checks = (*self._screen_check(step), *self._gap_check(step))
+        checks = (*self._screen_check(step), *self._gap_check())
         return Exposed(step, number, stem, clock.now(), checks, timings, changed)
 
     def _note_gap(self) -> float:
@@ -304,7 +304,7 @@ class Pipeline:
             self._job.retry.report("gap", sentence)
         return gap_s
 
-    def _gap_check(self, step: SessionStep) -> tuple[Check, ...]:
+    def _gap_check(self) -> tuple[Check, ...]:
         """Refuse a frame during which the program stood still: nobody knows what the screen showed meanwhile."""
         if not (gap_s := self._note_gap()):
             return ()
@@ -580,8 +580,9 @@ class Verdicts:
 class LastingCause:
     """What would refuse every frame: waited for, and tried again at growing intervals until it is seen to be over.
 
-    A picture that is always late shows the right light where a frame follows itself: that it is over is shown by a
-    light that another one was shown before, or by all frames that were to tell, of which one is such a frame.
+    A picture that is always late shows the right light where a frame is taken twice in a row. So that it is over is
+    shown by a light that follows another one, or by all frames that were taken to find out, of which one follows
+    another light.
 
     - `last_before`: the newest attempt from before the run, or from before its last pause for something lasting.
     """

@@ -1,7 +1,7 @@
 """From LAB.toml to a session on disk: creates it or takes it up, opens the rig, and takes every frame that is open.
 
-First who is told of a run: the terminal, a command, a URL, systemd, a dead man's switch; nothing waits for them.
-docs/how-to/night-run.md says what they get.
+The first part tells others of a run: the terminal, a command, a URL, systemd, a dead man's switch. No frame waits for
+them; docs/how-to/night-run.md says what they get.
 
 Rules that hold inside for a session that is taken up:
 
@@ -95,7 +95,7 @@ QUEUED: Final = 100
 class Notices:
     """Tells a target what happens; close it at the end, which waits for what was told, for `LIMIT_S` at most.
 
-    `target`: A URL or a command line; empty: nobody is told.
+    `target`: a URL or a command line; empty: nobody is told.
     """
 
     def __init__(self, target: str, session: str, warn: Callable[[str], object] = lambda sentence: None) -> None:

@@ -60,7 +60,6 @@ _SAME = 0.03
 """Logarithm of two exposures' ratio up to which they are one: shutter speeds differ by a quarter, and are rounded."""
 
 _Array = npt.NDArray[np.float64]
-_Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

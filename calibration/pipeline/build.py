@@ -109,7 +109,13 @@ def build(
     linearity: Path | None = None,
     judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
-    """Build the table of a session."""
+    """Build the table of a session, whole or not at all, and return it with its figures.
+
+    `out`: the table's folder, which must not be there. `progress`: told frames done, frames in all, and what is done.
+    `report`: writes a report into the folder before it gets its name. `linearity`: a measurement of the sensor to
+    correct by. `judged_by`: the figures of the verdict. Raises FormatError where frames, or the linearity, cannot make
+    a table, InputError where the folder may not be written.
+    """
     selected = select_frames(session)
     if selected.lights_without:
         raise FormatError(

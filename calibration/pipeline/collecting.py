@@ -81,7 +81,7 @@ def budget_of(table: TableMeasurements) -> Budget:
     return Budget(
         (
             _noise(table, white, cells),
-            _lens(table, white, cells),
+            _lens(table, white),
             _darkness(table, white, cells),
             _linearity(table, white, cells),
             _added_light(table, white, cells),
@@ -119,7 +119,7 @@ def _noise(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
     )  # fmt: skip
 
 
-def _lens(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
+def _lens(table: TableMeasurements, white: _Array) -> Component:
     lens = table.lens
     source = "what the light about each cell says of the lens, and cannot say" if lens.measured else lens.why_not
     return Component(

@@ -57,10 +57,7 @@ from calibration.sampling import (
     unevenness,
 )
 from calibration.spread.added_light import MOST_ADDED, AddedLight, added_light
-from calibration.spread.correction import (
-    FrameCorrection,
-    LensCorrection,
-)
+from calibration.spread.correction import FrameCorrection, LensCorrection
 from calibration.spread.surroundings import FrameLevels
 from calibration.table.lut import Unfit
 from drivers.raw.rawfile import (

@@ -133,10 +133,6 @@ class Registration:
         errors = 2 if self.framing.field is None else 3
         return errors * self.uncertainty_px(points_mm) / self.clearance
 
-    def uncertain(self, points_mm: npt.ArrayLike) -> _Mask:
-        """Return which points (N,) bool are known too badly to be sampled."""
-        return np.asarray(self.expanded_px(points_mm) > MAX_PLACE_ERROR_PX)
-
     @property
     def places_known_px(self) -> tuple[float, float]:
         """Standard error of places, px: the median over the field, and the largest of the outermost cells but 1 %."""

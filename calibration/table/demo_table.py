@@ -24,14 +24,11 @@ BITS: Final = 4
 """Bits kept of each channel: 4096 colours, 5 MB."""
 
 
-def table_folder(given: Path, cache: Path | None = None) -> Path:
-    """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there.
-
-    `cache`: where the table is kept; None for `foundation.folders.cache_folder`.
-    """
+def table_folder(given: Path) -> Path:
+    """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there."""
     if str(given) != DEMO:
         return given
-    cache = cache or cache_folder()
+    cache = cache_folder()
     if cache is None:
         raise InputError(
             f"{DEMO} needs a place to keep its table, and there is no home folder; set XDG_CACHE_HOME, or make one "

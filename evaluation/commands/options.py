@@ -267,7 +267,7 @@ def _method(text: str) -> Method:
 def _learner(text: str) -> Learner:
     from evaluation.learning.standard import standard_learners
     from evaluation.methods.standard import standard_methods
-    from foundation.errors import InputError
+    from foundation.errors import InputError, nearest_names
 
     known = standard_learners()
     if text in known:
@@ -276,7 +276,8 @@ def _learner(text: str) -> Learner:
     if text in standard_methods() or text.endswith(".npz"):
         raise InputError(f"{text} has nothing to learn; {expected}")
     if ":" not in text:
-        raise InputError(f"{text!r} is no method that learns; {expected}")
+        near = nearest_names(text, known)
+        raise InputError(f"{text!r} is no method that learns; {f'{near} ' if near else ''}{expected}")
     found = _found(text)
     if not callable(getattr(found, "fit", None)):
         raise InputError(f"{text} has no fit(scenes, seed); evaluate run takes methods that need not learn")

@@ -54,7 +54,7 @@ def resamples(
 ) -> Iterator[npt.NDArray[np.int64]]:
     """Give the counts (B, N) int64 of images in resamples, some resamples at a time; each row has sum N.
 
-    `groups`: (N,) int64, the group of each image from 0; as many groups as there are are then drawn, each with all its
+    `groups`: (N,) int64, the group of each image from 0; then groups are drawn, as many as there are, each with all its
     images, and rows have the sum N only where groups are of one size. None: each image is one of its own.
     """
     if count < 1:

@@ -51,7 +51,7 @@ def tune(
     on_scene: Callable[[], None] | None = None,
     workers: int = 1,
 ) -> Tuned:
-    """Return the candidate whose estimates spread least in green chromaticity; ground truths are not looked at.
+    """Find the candidate whose estimates spread least in green chromaticity; ground truths are not looked at.
 
     Examples
     --------

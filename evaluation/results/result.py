@@ -228,7 +228,7 @@ class Run:
     - `data_sha256`: of the images' names and ground truths; see `learning.model_files.scenes_sha256`.
     - `truths`: (N, 3) float64, camera RGB of any length.
     - `results`: one a method.
-    - `methods`: A JSON object each; see `method_records.describe_method`.
+    - `methods`: a JSON object each; see `method_records.describe_method`.
     - `settings`: what else the results depend on, such as a seed: JSON.
     - `folds`: (N,) int64, the fold of each image, where the methods were cross-validated; else None.
     - `notes`: sentences that belong beside the results.

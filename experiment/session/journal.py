@@ -354,8 +354,9 @@ class Journal:
 
     def verdicts(self) -> list[tuple[int, datetime, str | None]]:
         """Return of every attempt, oldest first, number, start and verdict: what a whole night is looked through by."""
-        rows = self._rows("SELECT id, started_at, verdict FROM attempts ORDER BY id")
-        return [(number, datetime.fromisoformat(at), verdict) for number, at, verdict in rows]
+        rows = self._rows("SELECT id, started_at, verdict, kind FROM attempts ORDER BY id")
+        self._require_known_kinds(row[3] for row in rows)
+        return [(number, datetime.fromisoformat(at), verdict) for number, at, verdict, _ in rows]
 
     def events(self) -> list[SessionEvent]:
         """Return every event, oldest first."""

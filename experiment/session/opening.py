@@ -151,7 +151,7 @@ def create_file(path: Path) -> sqlite3.Connection:
     """Return a connection to a new journal with its tables and nothing in them."""
     try:
         connection = connect(path, "rwc")
-        _execute_all(connection, _VERSION_1 + _VERSION_2, JOURNAL_VERSION)
+        _execute_all(connection, _VERSION_1 + _VERSION_2)
     except sqlite3.DatabaseError as error:
         raise StorageError(f"cannot write {path}: {error}; free space or choose another disk") from error
     return connection
@@ -188,7 +188,7 @@ def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
         if not _on_network(path):
             connection = _in_write_ahead(path, connection, retry)
         if version < JOURNAL_VERSION:
-            retry.run(lambda: _execute_all(connection, _VERSION_2, JOURNAL_VERSION))
+            retry.run(lambda: _execute_all(connection, _VERSION_2))
     except OSError as error:
         connection.close()
         raise storage_error(path, error) from error
@@ -334,13 +334,13 @@ def beside(path: Path, suffix: str) -> Path:
     return path.with_name(path.name + suffix)
 
 
-def _execute_all(connection: sqlite3.Connection, statements: str, version: int) -> None:
-    """Execute statements and set the version, all or nothing."""
+def _execute_all(connection: sqlite3.Connection, statements: str) -> None:
+    """Execute statements and set the newest version, all or nothing."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         for statement in statements.split(";"):
             connection.execute(statement)
-        connection.execute(f"PRAGMA user_version = {version}")
+        connection.execute(f"PRAGMA user_version = {JOURNAL_VERSION}")
         connection.execute("COMMIT")
     except BaseException:
         if connection.in_transaction:

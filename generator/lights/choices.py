@@ -132,8 +132,8 @@ class SimultaneousLights:
     def __post_init__(self) -> None:
         if self.together < 2 or self.choice.lights_each % self.together:
             raise InputError(
-                f"{self.choice.lights_each} lights for each picture cannot be shared out {self.together} to an image; "
-                "expected 2 or more to an image, and a whole number of images"
+                f"lights for each picture: {self.choice.lights_each}, lights in an image: {self.together}; expected 2 "
+                "or more in an image, and a multiple of these for each picture: repeat --light, or give --random"
             )
 
     @property

@@ -125,11 +125,11 @@ def test_the_tutorial_counts_the_frames_that_are_taken(tmp_path: Path) -> None:
     steps = planned_steps(load_lab(tmp_path / "LAB.toml"), lights)
     kinds = Counter(step.kind for step in steps)
     assert f"these are {len(lights)}." in text
-    said = re.search(r"There are (\d+) frames: (\d+) of the projector's\s+primaries", text)
+    said = re.search(r"There are (\d+) frames: a white and a dark\s+one, (\d+) of the projector's primaries", text)
     assert said is not None
     assert (int(said[1]), int(said[2])) == (len(steps), kinds["response"])
     assert (kinds["white"], kinds["dark"]) == (2, 2)
-    assert f"made of the last {len(steps) - kinds['response']}." in text
+    assert f"made of all but the {kinds['response']}." in text
     assert f"complete, {len(steps)} frames;" in text
     assert f"frames  {len(steps)} of {len(steps)}" in text
     assert f"lights  {len(lights)} of {len(lights)}" in text

@@ -75,6 +75,23 @@ def test_the_brightest_place_of_each_part_is_paper() -> None:
     assert found.tolist() == [list(place) for number, place in enumerate(places) if number % 3]
 
 
+def test_paper_that_does_not_change_is_as_bright_in_the_frame_that_its_places_were_chosen_in() -> None:
+    """As of the brightest of the noise it would be 1.2 % brighter there."""
+    random = np.random.default_rng(4)
+    scene = np.full((400, 600), 200.0)
+    middles = [(x, y) for y in range(20, 380, 20) for x in range(20, 580, 20)]
+    for x, y in middles:
+        # Light falls off by a quarter, as it does over a frame.
+        scene[y - 5 : y + 6, x - 5 : x + 6] = 1000 * (1 - 0.25 * np.hypot(x - 300, y - 200) / 360)
+    first, later = (np.asarray(scene + random.normal(0, 15, scene.shape), dtype=np.float32) for _ in range(2))
+    found = measure._paper(first, np.array(middles, dtype=np.float64))
+    x, y = found.T
+    assert len(found) == len(middles)
+    assert np.abs(found - middles).max() <= 2
+    levels = [np.mean([frame[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)]) for frame in (first, later)]
+    assert levels[0] == pytest.approx(levels[1], rel=1.5e-3)
+
+
 def test_texture_is_many_edges_and_no_single_bright_photosite() -> None:
     values = np.zeros((480, 640), dtype=np.float32)
     x, y = 90, 100

@@ -5,6 +5,7 @@ A healthy frame passes half of either limit; noise alone would need five standar
 
 from __future__ import annotations
 
+import json
 from functools import cache
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency, has_enough_cells
 from calibration.figures.all_figures import FIGURES
-from foundation.records import from_json, to_json
+from foundation.records import from_json, to_plain
 
 pytestmark = pytest.mark.slow
 
@@ -250,7 +251,7 @@ def test_hot_photosites_side_by_side_are_nothing_that_lies_there(beside: int) ->
 
 def test_what_is_found_is_restored_from_a_checkpoint(sheet: Sheet) -> None:
     like = sheet.compared(sheet.other * np.where(sheet.places[:, :1] < 60, 0.9, 1.0))
-    stored = to_json(like)
+    stored = json.dumps(to_plain(like))
     assert from_json(FrameConsistency, stored, "a checkpoint", "begin anew") == like
 
 

@@ -14,7 +14,7 @@ import pytest
 from calibration.registration import register as registering
 from calibration.registration.geometry import Lens
 from calibration.registration.matching import Blocks, PlaceErrors
-from calibration.registration.register import Registration
+from calibration.registration.register import MAX_PLACE_ERROR_PX, Registration
 from calibration.registration.tiles import Raster
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.framing.field import SIDE_POINTS, FoundField, field_mm
@@ -94,7 +94,7 @@ def test_places_may_be_off_by_two_errors_or_three_of_a_chart_without_tags() -> N
         for error, is_uncertain in ((0.49 / errors, False), (0.51 / errors, True)):
             found = registration(error=error, has_tags=has_tags)
             np.testing.assert_allclose(found.expanded_px(points), errors * error)
-            assert found.uncertain(points).tolist() == [is_uncertain] * 2
+            assert (found.expanded_px(points) > MAX_PLACE_ERROR_PX).tolist() == [is_uncertain] * 2
     assert registration().clearance == 1
     assert registration(cell_px=13.5).clearance == pytest.approx(2)
     found = registration()

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import rooms
 from calibration.registration import register as registering
-from calibration.registration.register import CLEARANCE_PX, Registration, register
+from calibration.registration.register import CLEARANCE_PX, MAX_PLACE_ERROR_PX, Registration, register
 from calibration.sampling import SAMPLE_REACH_PX
 from drivers.presenter import Colour
 from drivers.raw.rawfile import Mosaic, read_raw
@@ -81,7 +81,7 @@ def test_the_estimate_of_its_own_error_is_honest(lab: Lab, white: Mosaic, regist
     # Of a whole chart it is 99 %; here most cells are at the rim.
     assert np.percentile(error / said, 98) < 3
     assert said.max() < 3 * max(error.max(), 0.1)
-    assert not registered.uncertain(centres).any()
+    assert not (registered.expanded_px(centres) > MAX_PLACE_ERROR_PX).any()
 
 
 def test_what_agrees_too_little_is_refused(lab: Lab, white: Mosaic, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,4 +205,4 @@ def test_places_matter_less_in_large_cells(lab: Lab, registered: Registration, c
     assert large.clearance == pytest.approx(clearance)
     np.testing.assert_allclose(large.uncertainty_px(lab.chart.centres_mm), 1)
     # Two pixels, of half a pixel for each clearance of a cell of 10 px.
-    assert (large.uncertain(lab.chart.centres_mm) == uncertain).all()
+    assert ((large.expanded_px(lab.chart.centres_mm) > MAX_PLACE_ERROR_PX) == uncertain).all()

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from calibration.figures.radiometry import UNFIT_SHARE
-from calibration.registration.register import Registration, register
+from calibration.registration.register import MAX_PLACE_ERROR_PX, Registration, register
 from drivers.presenter import Colour
 from drivers.raw.rawfile import CHANNELS, Mosaic
 from experiment.chart.layout import paper_chart
@@ -73,7 +73,7 @@ def test_cells_that_the_map_does_not_follow_are_known_to_be_uncertain(tmp_path: 
     registration = register(mosaic, SMALL)
     error = np.linalg.norm(registration.to_pixels(SMALL.centres_mm) - lab.truth_px(SMALL.centres_mm, mosaic), axis=1)
     assert error.max() > 0.5, "a room in which it matters"
-    uncertain = registration.uncertain(SMALL.centres_mm)
+    uncertain = registration.expanded_px(SMALL.centres_mm) > MAX_PLACE_ERROR_PX
     assert uncertain[error > 0.5].all()
     assert uncertain.mean() > (UNFIT_SHARE.refuse or 1)
 
@@ -87,11 +87,11 @@ def test_a_curl_is_not_taken_for_distortion(tmp_path: Path) -> None:
     error = np.linalg.norm(registration.to_pixels(SMALL.centres_mm) - lab.truth_px(SMALL.centres_mm, mosaic), axis=1)
     assert np.sqrt((error**2).mean()) < 0.12
     assert error.max() < 0.3
-    assert not registration.uncertain(SMALL.centres_mm).any()
+    assert not (registration.expanded_px(SMALL.centres_mm) > MAX_PLACE_ERROR_PX).any()
 
 
 def test_a_flat_sheet_has_no_uncertain_cell(plain: Lab, white: Mosaic, registered: Registration) -> None:
-    assert not registered.uncertain(SMALL.centres_mm).any()
+    assert not (registered.expanded_px(SMALL.centres_mm) > MAX_PLACE_ERROR_PX).any()
     error = np.linalg.norm(registered.to_pixels(SMALL.centres_mm) - plain.truth_px(SMALL.centres_mm, white), axis=1)
     assert (error < 3 * registered.uncertainty_px(SMALL.centres_mm)).all()
 

@@ -139,6 +139,7 @@ def test_only_some_images_are_tested(place: Path, capsys: pytest.CaptureFixture[
     [
         (("--test", "made"), "made is both training and test"),
         (("--methods", "magic"), "'magic' is no method that learns; expected regression-trees"),
+        (("--methods", "kernel-rdge"), "did you mean 'kernel-ridge'? expected regression-trees"),
         (("--statistics", "magic"), "'magic'"),
         (("--images", "13"), "13 training images of 12 were asked for"),
         (("--folds", "31"), "31 folds of 30 images"),

@@ -66,6 +66,17 @@ def test_times_that_a_reader_could_not_compare_are_refused(journal: sqlite3.Conn
         require_time(journal, text)
 
 
+@pytest.mark.parametrize("text", ["0" * 63 + "g", "ab\x00zz", "0" * 65, "A" * 64])
+def test_hashes_that_are_none_are_refused(journal: sqlite3.Connection, text: str) -> None:
+    journal.execute(
+        "INSERT INTO attempts (step, kind, file, started_at, taken_at, exposure_s, size, sha256, verdict) VALUES"
+        " (0, 'white', 'frames/a.cr2', ?, ?, 0.5, 1, ?, 'accepted')",
+        (*[time_text(datetime(2026, 1, 1, tzinfo=UTC))] * 2, text),
+    )
+    with pytest.raises(FormatError, match="1 rows of attempts"):
+        require_sound_rows(Path("journal.sqlite"), journal, JOURNAL_VERSION)
+
+
 LIGHTS = (Illumination(0, "uniform", None, Colour(255, 0, 0)),)
 STEPS = plan_steps(LIGHTS, 2)
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)

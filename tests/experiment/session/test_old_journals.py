@@ -16,6 +16,7 @@ from drivers.presenter import Colour
 from experiment.chart.layout import design_chart
 from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session
+from experiment.session.journal import Journal
 from experiment.session.records import Judgement
 from foundation.errors import FormatError
 
@@ -140,3 +141,12 @@ def test_a_kind_of_frame_that_is_not_known_is_named(folder: Path) -> None:
         journal.execute("UPDATE plan SET kind = 'flat' WHERE step = 1")
     with pytest.raises(FormatError, match=r"'flat'.*light, white, dark, resp"):
         Session.open(folder)
+
+
+def test_a_kind_of_attempt_that_is_not_known_is_named_however_the_attempts_are_read(folder: Path) -> None:
+    with closing(sqlite3.connect(folder / "journal.sqlite")) as file, file:
+        file.execute("UPDATE attempts SET kind = 'flat' WHERE id = 1")
+    with closing(Journal.open(folder / "journal.sqlite")) as journal:
+        for read in (journal.attempts, journal.verdicts, journal.frames):
+            with pytest.raises(FormatError, match=r"'flat'.*light, white, dark, resp"):
+                read()
