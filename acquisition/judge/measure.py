@@ -401,9 +401,10 @@ class Anchor:
         blocks = mosaic.block_planes()
         x, y = self.paper.T
         around = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-        level = np.full(3, np.nan)
-        quarter = len(x) // 4
-        for number, channel in enumerate(CHANNELS if len(x) else ()):
+        if not len(x):
+            return np.full(3, np.nan)
+        level, quarter = np.empty(3), len(x) // 4
+        for number, channel in enumerate(CHANNELS):
             seen = [
                 np.mean([blocks[place][y + dy, x + dx] for dy, dx in around], axis=0) - black[place]
                 for place in phases[channel]

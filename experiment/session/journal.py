@@ -82,9 +82,6 @@ from foundation.files import (
 JOURNAL_FILE = "journal.sqlite"
 """Name of the journal in a session's folder."""
 
-_AMONG = "IN (SELECT value FROM json_each(?))"
-"""Condition on numbers that are given as a JSON list, however many there are."""
-
 PATIENCE_S = 600.0
 """How long a write waits for another program's unless the caller says otherwise: as long as a run waits for a device by
 default (`sequence.patience_s`)."""
@@ -343,10 +340,10 @@ class Journal:
 
     def attempts(self, numbers: Sequence[int] | None = None) -> list[Attempt]:
         """Return attempts, those of these numbers or all, oldest first."""
-        among, values = ("", ()) if numbers is None else (f"WHERE id {_AMONG}", (json.dumps(list(numbers)),))
+        among, values = _among("id", numbers)
         rows = self._rows(
             "SELECT id, step, kind, illumination, file, started_at, ended_at, taken_at, verdict, reason"
-            f" FROM attempts {among} ORDER BY id",
+            f" FROM attempts WHERE {among} ORDER BY id",
             values,
         )
         self._require_known_kinds(row[2] for row in rows)
@@ -368,25 +365,23 @@ class Journal:
 
         Those of which nothing is kept, as in journals of version 1, are not there.
         """
-        among, numbers = "", tuple[str, ...]()
-        if attempts is not None:
-            among, numbers = f"AND attempt {_AMONG}", (json.dumps(list(attempts)),)
+        among, numbers = _among("attempt", attempts)
         seen: dict[int, tuple[float, float, float]] = {
             attempt: (red, green, blue)
             for attempt, red, green, blue in self._newer_rows(
-                f"SELECT attempt, red, green, blue FROM measurements WHERE red IS NOT NULL {among}", numbers
+                f"SELECT attempt, red, green, blue FROM measurements WHERE red IS NOT NULL AND {among}", numbers
             )
         }
         checks: dict[int, list[Check]] = {}
         for attempt, *check in self._newer_rows(
             "SELECT attempt, name, value, low, high, unit, reason FROM checks"
-            f" WHERE TRUE {among} ORDER BY attempt, position",
+            f" WHERE {among} ORDER BY attempt, position",
             numbers,
         ):
             checks.setdefault(attempt, []).append(Check(*check))
         timings: dict[int, dict[str, float]] = {}
         for attempt, name, seconds in self._newer_rows(
-            f"SELECT attempt, name, seconds FROM timings WHERE TRUE {among} ORDER BY rowid", numbers
+            f"SELECT attempt, name, seconds FROM timings WHERE {among} ORDER BY rowid", numbers
         ):
             timings.setdefault(attempt, {})[name] = seconds
         return {
@@ -439,7 +434,12 @@ class Journal:
         newest = {step: attempt for step, *_, verdict, _, attempt in rows if verdict == ACCEPTED}
         return [
             FrameRecord(
-                *(kind, light, file, sha256, datetime.fromisoformat(taken_at), exposure_s),
+                kind,
+                light,
+                file,
+                sha256,
+                datetime.fromisoformat(taken_at),
+                exposure_s,
                 _verdict_text(verdict, reason, newest.get(step, attempt) == attempt),
                 attempt,
             )
@@ -597,6 +597,13 @@ _ROWS_KEPT: Final = 8192
 """Rows of each kind that are kept as values: whoever watches a session reads its 800 frames again after each."""
 
 _accepted_file: Final = lru_cache(_ROWS_KEPT)(AcceptedFile)
+
+
+def _among(column: str, numbers: Sequence[int] | None) -> tuple[str, tuple[str, ...]]:
+    """Return the condition that a column is one of some numbers, however many there are, and its value; None: any."""
+    if numbers is None:
+        return "TRUE", ()
+    return f"{column} IN (SELECT value FROM json_each(?))", (json.dumps(list(numbers)),)
 
 
 @lru_cache(_ROWS_KEPT)
