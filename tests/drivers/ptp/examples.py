@@ -132,6 +132,7 @@ READERS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
 STREAMS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
     ("USB stream", read_usb, USB_STREAM),
     ("PTP/IP stream", read_ip, b"".join(IP_PACKETS)),
+    *((f"packet {number}", read_ip, packet) for number, packet in enumerate(IP_PACKETS, 1)),
 )
 """What reads streams: cut short they wait for more instead of raising."""
 
