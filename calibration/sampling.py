@@ -148,7 +148,9 @@ def _sample_to_table(
     values: _Count,
     peak: _Count,
 ) -> None:
-    """Do `_sample` and `_tabulate` in one pass, without the samples (N, window², 3) between them.
+    """Do `_sample` and `_tabulate` in one loop, without the samples (N, window², 3) between them.
+
+    The loop is that of `_sample` once more: two shared steps, with a patch's samples between, take twice as long.
 
     `values` (N, window², 3) uint16 and `peak` (N,) uint16 are filled; `dark` and `field` are (N, 3) float32, the rest
     as for `_sample`.
