@@ -227,7 +227,8 @@ def chosen_images(result: Result, kind: ErrorKind) -> tuple[tuple[int, ...], tup
     """
     errors = result.errors[kind]
     worst = tuple(int(number) for number in np.argsort(-errors, kind="stable")[:WORST])
-    nearest = np.argsort(np.abs(errors - np.median(errors)), kind="stable")
+    # Of an even number of images the two in the middle are equally far, and rounding must not choose between them.
+    nearest = np.argsort(np.round(np.abs(errors - np.median(errors)), 9), kind="stable")
     return worst, tuple([int(number) for number in nearest if int(number) not in worst][:MIDDLE])
 
 

@@ -143,6 +143,8 @@ def test_worst_and_median_images_are_chosen() -> None:
     assert worst == (2, 5, 0)
     assert middle == (6, 3)  # The median is 4; 5 is shown already.
     assert chosen_images(result_of([1.0]), "recovery") == ((0,), ())
+    # The median is 0.4, from which 0.7 is less far in binary numbers.
+    assert chosen_images(result_of([0.1, 0.7, 5, 6, 7, 0, 0, 0]), "recovery")[1] == (0, 1)
 
 
 @pytest.mark.slow
