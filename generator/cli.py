@@ -289,7 +289,7 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers, output: Json
 
 def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bool = False) -> None:
     made = dataset.description
-    lights = len({light for entry in dataset.entries for light in entry.lights})
+    lights = len(dataset.light_labels)
     # A picture that was drawn several times is a source each time; one that was made and not read has no hash.
     different = len({source.sha256 or source.name for source in dataset.sources})
     noted = [source for source in dataset.sources if source.note]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -79,8 +79,6 @@ def open_generated(place: Path | str, subset: str | None = None) -> SceneSet:
             "dataset by pictures, and evaluate cv keeps the images of a picture in one fold without that"
         )
     part = choose(subset, parts, "subset", masked(str(place)))
-    if part is not None:
-        dataset = replace(dataset, entries=tuple(entry for entry in dataset.entries if entry.split == part))
     table = dataset.description.table
     white = table.white_level
     # Whoever reads results must see that no camera took a photograph of these colours.
@@ -100,6 +98,7 @@ def open_generated(place: Path | str, subset: str | None = None) -> SceneSet:
         scenes=tuple(
             (GeneratedScene if len(entry.lights) == 1 else GeneratedMixedScene)(dataset, entry)
             for entry in dataset.entries
+            if part is None or entry.split == part
         ),
         treatment={
             **computed,

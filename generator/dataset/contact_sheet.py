@@ -85,7 +85,7 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     alone = made.images == made.sources
     grid = _flow(dataset.entries, max_rows, max_columns) if alone else _rows(dataset.entries, max_rows, max_columns)
     pictures = [[_load(dataset, entry) for entry in line] for line in grid]
-    lights = len({light for entry in dataset.entries for light in entry.lights})
+    lights = len(dataset.light_labels)
     table_lights = {light.illumination: light for light in dataset.description.lights}
     named = {str(number): light.label for number, light in table_lights.items()}
     shared = all([entry.lights for entry in line] == [entry.lights for entry in grid[0]] for line in grid)

@@ -348,15 +348,15 @@ def make_dataset(plan: Plan, out: Path | str, workers: Workers | None = None, ca
     One thread makes it if `workers` is None.
     """
     identity = plan.identity()
-    if not finished(out, identity):
-        with workplace(out, identity) as place:
-            _make(plan, place, range(plan.shards), workers or Workers(), callbacks)
-            try:
-                assemble(place, identity)
-            except NothingMadeError:
-                place.discard()
-                raise
-    return open_dataset(out)
+    if finished(out, identity):
+        return open_dataset(out)
+    with workplace(out, identity) as place:
+        _make(plan, place, range(plan.shards), workers or Workers(), callbacks)
+        try:
+            return assemble(place, identity)
+        except NothingMadeError:
+            place.discard()
+            raise
 
 
 def begun_rendering(out: Path | str) -> Rendering | None:
@@ -437,16 +437,16 @@ def finish_dataset(out: Path | str) -> Dataset:
     if holds_dataset(out):
         return open_dataset(out)
     identity = stored_identity(out)
-    if not finished(out, identity):
-        with workplace(out, identity) as place:
-            missing = sorted(set(range(identity["shards"])) - place.done())
-            if missing:
-                raise InputError(
-                    f"{len(missing)} of {identity['shards']} shards of {out} are not made yet: {first_of(missing)}; "
-                    "run their shares, or the command without a share, which makes all that is missing"
-                )
-            assemble(place, identity)
-    return open_dataset(out)
+    if finished(out, identity):
+        return open_dataset(out)
+    with workplace(out, identity) as place:
+        missing = sorted(set(range(identity["shards"])) - place.done())
+        if missing:
+            raise InputError(
+                f"{len(missing)} of {identity['shards']} shards of {out} are not made yet: {first_of(missing)}; "
+                "run their shares, or the command without a share, which makes all that is missing"
+            )
+        return assemble(place, identity)
 
 
 def _make(plan: Plan, place: Workplace, wanted: range, workers: Workers, callbacks: Callbacks) -> None:

@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from itertools import groupby
 from pathlib import Path, PurePosixPath
@@ -254,16 +254,16 @@ MOST_LIST_BYTES: Final = 4 << 30
 
 @dataclass(frozen=True)
 class Dataset:
-    """A dataset on disk or in a store; images are read where they are used.
+    """A dataset on disk or in a store; lists and images are read where they are used.
 
     - `store`: where its files are.
     - `description`: the content of `dataset.json`.
-    - `entries`: its images in the order of their numbers.
+    - `made_under`: `light_labels`, where the dataset was made just now; None to find them in its lists.
     """
 
     store: Store
     description: Description
-    entries: tuple[Entry, ...]
+    made_under: frozenset[str] | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         """Return one line: a dataset has an entry for each of its images."""
@@ -297,6 +297,18 @@ class Dataset:
     def read_ground_truth_map(self, entry: Entry) -> npt.NDArray[np.float32]:
         """Return the ground truth of every pixel of an image: (H, W, 3) float32, r + g + b = 1."""
         return decode_ground_truth(self._map(entry, "ground_truth", ".png"), self._of(entry, "ground truth"))
+
+    @cached_property
+    def entries(self) -> tuple[Entry, ...]:
+        """Its images in the order of their numbers."""
+        return tuple(read_entries(self.store, self.description))
+
+    @cached_property
+    def light_labels(self) -> frozenset[str]:
+        """Every light on its images once: number in the table, or name of the mixture; see `Entry.lights`."""
+        if self.made_under is not None:
+            return self.made_under
+        return frozenset(label for entry in self.entries for label in entry.lights)
 
     @property
     def layout(self) -> str:
@@ -387,8 +399,10 @@ def open_dataset(place: Path | str) -> Dataset:
     store = open_store(place)
     if not store.has(DESCRIPTION):
         raise FormatError(f"{place} is no dataset: it has no {DESCRIPTION}; make one with generate")
-    description = load_description(store)
-    return Dataset(store, description, tuple(read_entries(store, description)))
+    dataset = Dataset(store, load_description(store))
+    # Lists that disagree are told now, not in the middle of what is done with the images.
+    _ = dataset.entries
+    return dataset
 
 
 def load_description(store: Store) -> Description:

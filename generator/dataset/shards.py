@@ -53,6 +53,7 @@ from generator.dataset.cards import card, croissant, datasheet
 from generator.dataset.joined import Beside
 from generator.dataset.layouts import LAYOUTS, ShardWriter
 from generator.dataset.plan import DatasetOptions, ShardJob, versions
+from generator.dataset.reader import Dataset, load_description
 from generator.dataset.records import (
     CARD,
     COMPLETED_BY_HAND,
@@ -89,7 +90,7 @@ from generator.dataset.records import (
 from generator.files import suffix_of
 from generator.lights.lighting import Lighting, Mixture
 from generator.pictures.sources import Cut, Picture, Source, hash_since, keep_bits
-from generator.stores import DESCRIPTION, LocalStore, Pieces, Store
+from generator.stores import DESCRIPTION, LocalStore, Pieces, Store, open_store
 from generator.variation.variation import Varied
 
 if TYPE_CHECKING:
@@ -671,14 +672,15 @@ class _ListedFile:
         return f"{self.sha256}  {self.name}\n"
 
 
-def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
-    """Write what a dataset has beside its images, and give the dataset its name."""
+def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
+    """Write what a dataset has beside its images, give the dataset its name, and return it; its lists are not read."""
     options = identity["options"]
     suffix = suffix_of(options["format"])
     counts: Counter[str] = Counter()
     splits: Counter[str] = Counter()
     skipped: list[Skipped] = []
     used: dict[int, Light] = {}
+    labels: set[str] = set()
     details: _ListedFile | None = None
     rendered = _RenderingSums()
     with ExitStack() as stack:
@@ -708,6 +710,7 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
                 name = f"{image_key(image.number)}{suffix}"
                 table.write(_image_rows(name, source.name, image, used if stated else None))
                 truths.write("{:.9f} {:.9f} {:.9f}\n".format(*image.truth))
+                labels.update(light.illumination for light in image.lights)
                 if image.details:
                     rendered.add(image.details, source.width * source.height)
                     if details is None:
@@ -760,6 +763,8 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
     place.files.put(DESCRIPTION, text)
     place.files.sync([DESCRIPTION])
     place.publish()
+    store = open_store(place.out)
+    return Dataset(store, load_description(store), frozenset(labels))
 
 
 def _records(place: Workplace, shards: int) -> Iterator[tuple[ShardRecord, list[SourceRecord], list[Skipped]]]:
