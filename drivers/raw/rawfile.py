@@ -26,6 +26,7 @@ import struct
 import sys
 import threading
 from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -368,10 +369,27 @@ def decode_raw(data: bytes | memoryview, path: Path, *, known_whole: bool = Fals
     """
     if not data:
         raise _unreadable(path, "it is empty")
-    contents = _examined(path, data, known_whole)
+    contents = _examined(path, data)
     plain = _plain_mosaic(path, data, contents)
     if plain is not None:
         return plain
+    with ThreadPoolExecutor(1, "LibRaw") as beside:
+        # LibRaw decodes without the interpreter's lock, so that both together take no longer than one.
+        mosaic = beside.submit(_by_libraw, path, data, contents)
+        fault = None if known_whole else _lossless_fault(data, contents)
+    if fault is not None:
+        raise _unreadable(path, fault)
+    return mosaic.result()
+
+
+def _lossless_fault(data: bytes | memoryview, contents: _Contents) -> str | None:
+    """Return why a lossless JPEG in which frames are stored is damaged; None where none is."""
+    parts = {part for frame in contents.frames if frame.lossless for part in frame.extents}
+    faults = (lossless_fault(data[offset : offset + size]) for offset, size in parts)
+    return next((fault for fault in faults if fault is not None), None)
+
+
+def _by_libraw(path: Path, data: bytes | memoryview, contents: _Contents) -> Mosaic:
     import rawpy
 
     with _libraw_silenced():
@@ -697,7 +715,7 @@ class _Contents:
     frames: Sequence[Stored]
 
 
-def _examined(path: Path, data: bytes | memoryview, known_whole: bool) -> _Contents:
+def _examined(path: Path, data: bytes | memoryview) -> _Contents:
     """Return what a file says of itself; refuse one that cannot hold the frame that it claims."""
     try:
         cr3 = read_cr3(data) if bytes(data[4:12]) == b"ftypcrx " else None
@@ -709,10 +727,6 @@ def _examined(path: Path, data: bytes | memoryview, known_whole: bool) -> _Conte
         raise _unsupported(path, str(error)) from error
     except NotBayer as error:
         raise _not_bayer(path, str(error)) from error
-    for offset, size in () if known_whole else {part for frame in frames if frame.lossless for part in frame.extents}:
-        fault = lossless_fault(data[offset : offset + size])
-        if fault is not None:
-            raise _unreadable(path, fault)
     return _Contents(directories, cr3, frames)
 
 
