@@ -283,19 +283,6 @@ class ObjectEntry:
         )
 
 
-def decode_object_entries(data: bytes) -> tuple[ObjectEntry, ...]:
-    """Return the objects that GetObjectInfoEx (0x9109) answers."""
-    cursor = Cursor(data, "GetObjectInfoEx", MAX_DATASET)
-    count = cursor.u32("the count of objects")
-    entries: list[ObjectEntry] = []
-    # A record takes at least four bytes, so that the bytes left bound the loop whatever the count says.
-    for number in range(count):
-        length = cursor.u32("the length of a record")
-        body = cursor.take(max(length - 4, 0), f"record {number} of {count}")
-        entries.append(ObjectEntry.read(Cursor(body, f"GetObjectInfoEx, record {number}")))
-    return tuple(entries)
-
-
 def encode_object_entries(entries: Iterable[ObjectEntry]) -> bytes:
     """Return the answer to GetObjectInfoEx."""
     bodies = [entry.encode() for entry in entries]

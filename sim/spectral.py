@@ -614,17 +614,6 @@ def ink_codes(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
     return codes
 
 
-def intended_lab(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
-    """Return (N, 3) float64: CIELAB under D50, relative to paper, that the managed profile wants of codes (N, 3)."""
-    return _lab(_wanted(np.asarray(rgb, dtype=np.float64) / 255, _black(on)))
-
-
-def relative_lab(reflectance: NDArray[np.float64], on: PaperName = "poster") -> NDArray[np.float64]:
-    """Return (N, 3) float64: CIELAB of the CIE 1931 observer under D50 of reflectances (N, 81), relative to paper."""
-    observer = _observer()
-    return _lab(reflectance @ observer / (paper(on).white @ observer))
-
-
 @cache
 def _observer() -> _Array:
     """Return (81, 3): CIE 1931 colour-matching functions times D50."""

@@ -227,30 +227,6 @@ _LEVEL: Final = 0.95
 """Confidence of an interval: the usual one."""
 
 
-def intervals(
-    errors: npt.ArrayLike, seed: int = 0, count: int = _COUNT, level: float = _LEVEL
-) -> dict[Statistic, tuple[float, float]]:
-    """Return the confidence interval of every statistic of errors, from the same resamples.
-
-    `errors`: (N,) float, N ≥ 1, finite: degrees, or any other number an image.
-
-    Examples
-    --------
-    >>> errors = [1.2, 0.4, 3.1, 2.2, 0.9, 1.7, 5.0, 2.8]
-    >>> low, high = intervals(errors)["mean"]
-    >>> low < sum(errors) / 8 < high
-    True
-    """
-    sample = ErrorSample.of(errors)
-    replicates = np.concatenate([sample.statistics(drawn) for drawn in resamples(len(sample.order), seed, count)])
-    left_out = sample.without_each()
-    estimate = sample.estimate()
-    return {
-        name: bca(estimate[place], replicates[:, place], [left_out[:, place]], level)
-        for place, name in enumerate(STATISTICS)
-    }
-
-
 @dataclass(frozen=True)
 class Compared:
     """A statistic of one set of errors against that of another.

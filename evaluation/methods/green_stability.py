@@ -11,13 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
 from evaluation.methods.method import Method
-from evaluation.methods.naming import FAMILIES, find_method
+from evaluation.methods.naming import FAMILIES
 from evaluation.methods.prepared import GREY, estimate_all
 from evaluation.scene import Scene, told_of
 from foundation.compiled import ordered_map
@@ -66,7 +65,8 @@ def tune(
     ...     def read(self):
     ...         return self.image, None
     >>> walls = [Wall([2, 1, 1]), Wall([1, 1, 2]), Wall([1.5, 1, 1.5])]
-    >>> tune(family("shades-of-gray"), walls).best.name
+    >>> from evaluation.methods.naming import find_method
+    >>> tune([find_method(text) for text in family_names("shades-of-gray")], walls).best.name
     'Shades-of-Gray (p=1)'
     """
     if len(candidates) < 2 or len(scenes) < _FEWEST_IMAGES:
@@ -105,14 +105,3 @@ def family_names(name: str) -> tuple[str, ...]:
     if name == "shades-of-gray":
         return tuple(f"{name}:p={p}" for p in range(1, 16))
     return tuple(f"{name}:p={p}:sigma={sigma}" for sigma in (1, 2, 4, 6, 9) for p in (1, 2, 4, 6, 9, 13))
-
-
-def family(name: str) -> tuple[Method, ...]:
-    """Return the candidates of a family, each with its parameters in its name.
-
-    Examples
-    --------
-    >>> [len(family(name)) for name in FAMILIES]
-    [15, 30, 30, 30]
-    """
-    return tuple(cast("Method", find_method(text)) for text in family_names(name))

@@ -13,7 +13,15 @@ from hypothesis import strategies as st
 from drivers import canon
 from drivers.ptp import ip as ptpip
 from drivers.ptp import usb as container
-from drivers.ptp.protocol import DeviceInfo, ObjectInfo, StorageInfo, decode_u32_array, decode_value
+from drivers.ptp.protocol import (
+    MAX_DATASET,
+    Cursor,
+    DeviceInfo,
+    ObjectInfo,
+    StorageInfo,
+    decode_u32_array,
+    decode_value,
+)
 
 # ISO 15740, 5.5.1: version 1.00, vendor 0xb "ab", two operations, one event, no properties, one capture format,
 # two image formats, "C", "EOS", "1", "2".
@@ -109,6 +117,16 @@ def read_ip(data: bytes) -> object:
     return ptpip.PacketCutter().feed(data)
 
 
+def decode_object_entries(data: bytes) -> tuple[canon.ObjectEntry, ...]:
+    """Return the objects that GetObjectInfoEx (0x9109) answers, for which the driver never asks."""
+    cursor = Cursor(data, "GetObjectInfoEx", MAX_DATASET)
+    bodies = [
+        cursor.take(max(cursor.u32("the length of a record") - 4, 0), "a record")
+        for _ in range(cursor.u32("the count of objects"))
+    ]
+    return tuple(canon.ObjectEntry.read(Cursor(body, "a record")) for body in bodies)
+
+
 READERS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
     ("DeviceInfo", DeviceInfo.decode, DEVICE_INFO),
     ("ObjectInfo", ObjectInfo.decode, OBJECT_INFO),
@@ -119,7 +137,7 @@ READERS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
     ("GetEvent, shot", canon.decode_events, EOS_400D_SHOT[12:]),
     ("GetEvent, transfer", canon.decode_events, TRANSFER_REQUEST),
     ("GetEvent, state", canon.decode_events, STATE),
-    ("GetObjectInfoEx", canon.decode_object_entries, OBJECT_ENTRIES),
+    ("GetObjectInfoEx", decode_object_entries, OBJECT_ENTRIES),
     ("DeviceInfoEx", canon.DeviceInfoEx.decode, DEVICE_INFO_EX),
     ("setting", canon.PropertySetting.decode, SETTING),
     ("image format", canon.ImageFormat.decode, RAW_FORMAT),

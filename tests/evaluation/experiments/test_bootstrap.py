@@ -12,12 +12,12 @@ from evaluation.experiments.bootstrap import (
     Compared,
     ErrorSample,
     independent,
-    intervals,
     numbered,
     paired,
     resamples,
 )
 from evaluation.metrics import summarise
+from tests.evaluation.experiments.one_sample import intervals
 
 pytestmark = pytest.mark.slow
 

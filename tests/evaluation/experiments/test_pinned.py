@@ -25,6 +25,7 @@ from evaluation.results.result import Result, images_csv, indistinct, read_light
 from evaluation.results.tables import Table, lights_tables, statistics_rows, summary_table
 from foundation.errors import CropError
 from tests.evaluation.experiments.describing.scenes import Made, MadeMixture, made_set, random_set
+from tests.evaluation.experiments.one_sample import intervals
 from tests.evaluation.made_up import MixedWall, as_set, walls
 from tests.evaluation.shown import lines, numbers, printed, recorded_figures, table, words
 from tests.pinned import Pinned
@@ -77,7 +78,7 @@ def test_statistics_and_intervals(pinned: Pinned) -> None:
             "groups left out": numbers(sample.without_each(bootstrap.numbered(groups)).ravel().tolist())
             if len(values) > 2
             else None,
-            "intervals": bootstrap.intervals(given, seed=3, count=50),
+            "intervals": intervals(given, seed=3, count=50),
             "paired": figures_in(bootstrap.paired(given, other, seed=1, count=60, level=0.8)),
             "paired by groups": figures_in(bootstrap.paired(given, other, count=40, groups=groups)),
             "independent": figures_in(bootstrap.independent(given, [*other, 3.0], seed=2, count=30)),
@@ -94,8 +95,8 @@ def test_statistics_and_intervals(pinned: Pinned) -> None:
             lambda: bootstrap.paired([1, 2], [1]),
             lambda: bootstrap.paired([1, 2], [1, 3], groups=["a"]),
             lambda: bootstrap.paired([1, 2], [1, 3], groups=["a", "a"]),
-            lambda: bootstrap.intervals([1, 2], count=0),
-            lambda: bootstrap.intervals([1, 2, 4], count=1),
+            lambda: intervals([1, 2], count=0),
+            lambda: intervals([1, 2, 4], count=1),
             *(lambda level=level: bootstrap.bca(1, np.ones(3), [], level) for level in (0.0, 1.0, 0.5)),
         )
     ]

@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.cross_validation import tune_family, tuning_table
+from evaluation.experiments.cross_validation import settings_of, tune_family, tuning_table
 from evaluation.experiments.running import evaluate
-from evaluation.methods.green_stability import family, tune
+from evaluation.methods.green_stability import tune
+from evaluation.methods.method import Method
 from evaluation.scene import Image
 from foundation.errors import InputError
 
@@ -73,10 +74,14 @@ def test_wrong_ground_truths_change_the_errors_and_not_the_choice() -> None:
     assert good.settings[0].errors.median < bad.settings[0].errors.median - 20
 
 
+def methods_of(family: str) -> list[Method]:
+    return [method for _, method in settings_of(family)]
+
+
 def test_errors_are_those_of_a_run() -> None:
     scenes = [Shop(scene.number, tuple(scene.light.tolist())) for scene in BLIND]
     tuned = tune_family("shades-of-gray", "shops", scenes, "reproduction", workers=2)
-    runs = {result.method: result.summary("reproduction") for result in evaluate(scenes, family("shades-of-gray"))}
+    runs = {result.method: result.summary("reproduction") for result in evaluate(scenes, methods_of("shades-of-gray"))}
     for one in tuned.settings:
         assert one.errors is not None
         np.testing.assert_allclose(one.errors.as_tuple(), runs[one.name].as_tuple(), rtol=1e-9)
@@ -106,6 +111,6 @@ def test_a_family_that_is_none() -> None:
 
 def test_too_little_to_tune_with_is_refused() -> None:
     with pytest.raises(InputError, match="1 sets of parameters on 8 images"):
-        tune(family("gray-edge-1")[:1], BLIND)
+        tune(methods_of("gray-edge-1")[:1], BLIND)
     with pytest.raises(InputError, match="30 sets of parameters on 1 images"):
-        tune(family("gray-edge-1"), BLIND[:1])
+        tune(methods_of("gray-edge-1"), BLIND[:1])

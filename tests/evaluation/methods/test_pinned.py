@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from evaluation.experiments.cross_validation import settings_of
 from evaluation.methods import gray_pixels, naming, pixel_loops, prepared
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.gray_pixels import GraynessIndex, LocalGraynessIndex, MeanShiftedGrayPixel, largest_cluster
-from evaluation.methods.green_stability import family, tune
+from evaluation.methods.green_stability import tune
 from evaluation.methods.method import LocalMethod, Method
 from evaluation.methods.pca import BrightDark
 from evaluation.methods.prepared import PreparedImage
@@ -236,7 +237,8 @@ def test_tuning_and_names(pinned: Pinned) -> None:
             return images[int(self.name)].astype(np.float32), None
 
     given = [Tiles(scene.name, scene.truth) for scene in scenes]
-    found = {name: vars(tune(family(name), given)) for name in ("shades-of-gray", "gray-edge-1")}
+    families = {name: [method for _, method in settings_of(name)] for name in ("shades-of-gray", "gray-edge-1")}
+    found = {name: vars(tune(methods, given)) for name, methods in families.items()}
     for one in found.values():
         one["best"], one["candidates"] = one["best"].name, [method.name for method in one["candidates"]]
     pinned("tuning by green stability", found, same=1e-5)

@@ -31,7 +31,6 @@ from drivers.canon import (
     Record,
     TransferRequest,
     decode_events,
-    decode_object_entries,
     number_of,
     number_value,
     text_value,
@@ -65,6 +64,7 @@ from sim.buses.usb import MemoryTransport
 from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, EOS_BODIES, TEST_BODY, EosModel
 from sim.camera.eos import CARD, DCIM, FOLDER, SimulatedEos
 from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, conversations, read_description, transcript
+from tests.drivers.ptp.examples import decode_object_entries
 
 REAL = {"the transcript": transcript} | {name: make for name, make in conversations().items() if name == "EOS 60D"}
 """Conversations of the real EOS 60D: without the bytes that it sent, and whole where the recording is found."""

@@ -20,6 +20,7 @@ from sim.world.sensors import BODIES, FACTS, Body, Rectangle, find_body
 from sim.world.world import REFERENCE_EXPOSURE, UNDISTURBED, Blob, Glare, Patch, Room, Situation, World, moved
 from tests.pinned import Pinned
 from tests.sim.conftest import PAGE_MM, patches
+from tests.sim.world.lab import relative_lab
 
 TINY = replace(
     BODIES["Test"], sensor=(131, 187), visible=Rectangle(11, 16, 117, 166), masked=(Rectangle(0, 0, 131, 14),)
@@ -164,7 +165,7 @@ def test_inks_are_what_they_were(name: spectral.PaperName, pinned: Pinned) -> No
     found = {
         "coverage": spectral.ink_coverage(rgb, name),
         "reflectance": spectral.print_reflectance(rgb, name),
-        "lab": spectral.relative_lab(spectral.print_reflectance(rgb, name), name),
+        "lab": relative_lab(spectral.print_reflectance(rgb, name), name),
         "paper": paper(name),
         "overprints": paper(name).overprints(),
         "intended": spectral._lab(spectral._wanted(rgb / 255, 0.02)),

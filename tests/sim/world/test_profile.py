@@ -16,12 +16,11 @@ from sim.spectral import (
     PaperName,
     ProfileName,
     ink_codes,
-    intended_lab,
     paper,
     print_reflectance,
     printed_reflectance,
-    relative_lab,
 )
+from tests.sim.world.lab import intended_lab, relative_lab
 
 pytestmark = pytest.mark.slow
 

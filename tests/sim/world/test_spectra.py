@@ -24,10 +24,10 @@ from sim.spectral import (
     paper_white,
     print_reflectance,
     projector_primaries,
-    relative_lab,
     sensitivities,
 )
 from tests.data_files import available
+from tests.sim.world.lab import relative_lab
 
 CAMERAS = ("Canon_EOS_600D", "Canon_EOS_200D")
 LAMPS: tuple[LampSpectrum, ...] = ("uhp", "led")

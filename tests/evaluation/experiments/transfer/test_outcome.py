@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.bootstrap import STATISTICS, intervals, paired
+from evaluation.experiments.bootstrap import STATISTICS, paired
 from evaluation.experiments.transfer.outcome import (
     BoundedFigure,
     ForestLine,
@@ -29,6 +29,7 @@ from evaluation.experiments.transfer.rows import Kind, TransferRow, Way
 from evaluation.metrics import summarise
 from evaluation.results.result import Result
 from foundation.errors import InputError
+from tests.evaluation.experiments.one_sample import intervals
 
 ERRORS = np.arange(1.0, 41.0)
 

@@ -1,0 +1,20 @@
+"""CIELAB of prints, and what the managed profile of a paper wants it to be."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim import spectral
+from sim.spectral import PaperName
+
+
+def intended_lab(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
+    """Return (N, 3) float64: CIELAB under D50, relative to paper, that the managed profile wants of codes (N, 3)."""
+    return spectral._lab(spectral._wanted(np.asarray(rgb, dtype=np.float64) / 255, spectral._black(on)))
+
+
+def relative_lab(reflectance: NDArray[np.float64], on: PaperName = "poster") -> NDArray[np.float64]:
+    """Return (N, 3) float64: CIELAB of the CIE 1931 observer under D50 of reflectances (N, 81), relative to paper."""
+    observer = spectral._observer()
+    return spectral._lab(reflectance @ observer / (spectral.paper(on).white @ observer))
