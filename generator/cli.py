@@ -318,7 +318,8 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
         print(parts if made.splits.get("validation") else f"{parts}: two shares are those of train and test")
     if made.skipped:
         tried = made.sources + len(made.skipped)
-        print(f"{len(made.skipped)} of {tried} pictures were left out; dataset.json lists them")
+        was = "was" if len(made.skipped) == 1 else "were"
+        print(f"{len(made.skipped)} of {tried} pictures {was} left out; dataset.json lists them")
     if noted:
         example = printable(f"{noted[0].name}: {noted[0].note}")
         has = "has a note" if len(noted) == 1 else "have notes"

@@ -617,7 +617,9 @@ def _differences(stored: Any, wanted: Any, name: str = "") -> Generator[str]:
     if isinstance(stored, dict) and isinstance(wanted, dict):
         one, other = cast("dict[str, Any]", stored), cast("dict[str, Any]", wanted)
         for key in dict.fromkeys([*one, *other]):
-            yield from _differences(one.get(key), other.get(key), f"{name} {key}".strip())
+            # "lights", not "options lights lights".
+            inner = name if key in ("options", name.rpartition(" ")[2]) else f"{name} {key}".strip()
+            yield from _differences(one.get(key), other.get(key), inner)
     elif stored != wanted:
         yield f"{name} {_short(stored)}, now {_short(wanted)}"
 

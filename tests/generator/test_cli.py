@@ -85,7 +85,7 @@ def test_a_dataset_with_its_contact_sheet(generate: Generate, capsys: pytest.Cap
     assert generate("lut", "out", *wish, "--max-side", "30") == 0
     printed = capsys.readouterr()
     assert "out: 6 images of 2 pictures under 3 lights" in printed.out
-    assert "1 of 3 pictures were left out" in printed.out
+    assert "1 of 3 pictures was left out" in printed.out
     assert "lists as unfit; they took the nearest fit colour" in printed.out
     assert "left out bad.png" in printed.err
     assert "6/6" in printed.err

@@ -343,7 +343,7 @@ def test_another_plan_in_the_same_place_is_refused(make_lut: MakeLut, tmp_path: 
         make(lut, out, on_image=interrupt_after(4))
     with pytest.raises(InputError, match=r"\(seed 3, now 4\).*remove"):
         make(lut, out, seed=4)
-    with pytest.raises(InputError, match=r"options previews false, now true"):
+    with pytest.raises(InputError, match=r"previews false, now true"):
         make(lut, out, previews=True)
     with pytest.raises(InputError, match=r"8.*6.*4.*3.*4.*3.*sha256"):
         make(lut, out, 3)
