@@ -197,7 +197,7 @@ class Covered:
         lines = range(mutation.line, mutation.last_line + 1)
         found = self._running(mutation.file, lines)
         # What runs on import runs in the test that happens to import it first, and is asked of all who use it.
-        runs_once = not found or not _in_function(mutation.file, mutation.line)
+        runs_once = not found or _function_around(mutation.file, mutation.line) is None
         around = _name_around(mutation.file, mutation.line)
         # A constant that nobody names is used by those who go through its module.
         sought = [around if _uses(around) else Path(mutation.file).stem] if runs_once else []
@@ -205,9 +205,14 @@ class Covered:
             for file, line in _uses(name):
                 tests = self._running(file, [line])
                 found |= tests
-                around = _name_around(file, line)
-                if not (tests and _in_function(file, line)) and around not in sought:
-                    sought.append(around)
+                name_of_use = _function_around(file, line)
+                if not tests or name_of_use is None:
+                    name_of_use = _name_around(file, line)
+                elif all(_function_around(*use) for use in _uses(name_of_use)):
+                    continue
+                # A function that is called on import is looked for by the name of what it made, too.
+                if name_of_use not in sought:
+                    sought.append(name_of_use)
         near = f"test_{Path(mutation.file).stem}.py::"
         order = sorted(self.seconds, key=lambda test: self.seconds[test] * (0.3 if near in test else 1.0))
         # What a fixture of a whole file runs is counted for the first test that asks for it.
@@ -318,10 +323,11 @@ def _name_around(file: str, line: int) -> str:
 
 
 @cache
-def _in_function(file: str, line: int) -> bool:
-    """Return whether a line of a file stands in the body of a function."""
+def _function_around(file: str, line: int) -> str | None:
+    """Return the innermost function in whose body a line of a file stands."""
     functions = (node for node in ast.walk(_parsed(file)) if isinstance(node, ast.FunctionDef))
-    return any(node.body[0].lineno <= line <= (node.end_lineno or node.lineno) for node in functions)
+    around = [node.name for node in functions if node.body[0].lineno <= line <= (node.end_lineno or node.lineno)]
+    return around[-1] if around else None
 
 
 @cache

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -91,6 +92,23 @@ def test_workers_change_no_number() -> None:
     assert tune_family("general-gray-world", "shops", BLIND, workers=3) == tune_family(
         "general-gray-world", "shops", BLIND
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Pair(Shop):
+    """One of two shops that are read at the same time, or not at all."""
+
+    both: threading.Barrier = field(kw_only=True)
+
+    def read(self) -> tuple[Image, None]:
+        self.both.wait()
+        return super().read()
+
+
+def test_as_many_images_are_read_at_once_as_there_are_workers() -> None:
+    both = threading.Barrier(2, timeout=30)
+    scenes = [Pair(number, both=both) for number in range(4)]
+    assert tune_family("shades-of-gray", "shops", scenes, workers=2).counted == 4
 
 
 def test_images_without_a_light_are_left_out_and_told() -> None:

@@ -38,6 +38,12 @@ def test_estimates_are_there_where_all_are(tmp_path: Path, second: str, whole: b
     assert (None if mine.estimates is None else mine.estimates.tolist()) == ([[3, 4, 5], [1, 2, 3]] if whole else None)
 
 
+@pytest.mark.parametrize("guessed", [("", "0", "no", "False", "FALSE"), ("1", "yes", "True", "TRUE")])
+def test_whether_a_light_was_guessed_is_read_as_programs_write_it(tmp_path: Path, guessed: tuple[str, ...]) -> None:
+    lines = (f"{place},Mine,1,1,1,1,1,1,1,2,{word}" for place, word in enumerate(guessed))
+    assert read_errors(written(tmp_path, *lines))["Mine"].guessed.tolist() == ["yes" in guessed] * len(guessed)
+
+
 @pytest.mark.parametrize(
     ("line", "says"),
     [

@@ -7,6 +7,7 @@ Forest plots: every ratio where it belongs, what is not known nowhere, and a wid
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -82,6 +83,14 @@ def test_beside_real_images_a_row_is_held_to_the_better_of_what_it_was_made_of()
     drawn = beside_plot(found).decode()
     for label in ("real alone", "made: generated, adapted", "made: generated, pooled", "real images"):
         assert f">{label}<" in drawn
+    others = [replace(row, method=f"Forest {number}") for number in range(3) for row in rows]
+    assert width_of(beside_plot(figures_of([*rows, *others], "recovery")).decode()) > 2 * width_of(drawn)
+
+
+def width_of(svg: str) -> float:
+    found = re.search(r'viewBox="0 0 ([0-9.]+) ', svg)
+    assert found is not None
+    return float(found[1])
 
 
 def test_what_a_number_hides_is_noted() -> None:
