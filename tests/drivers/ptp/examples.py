@@ -120,11 +120,14 @@ def read_ip(data: bytes) -> object:
 def decode_object_entries(data: bytes) -> tuple[canon.ObjectEntry, ...]:
     """Return the objects that GetObjectInfoEx (0x9109) answers, for which the driver never asks."""
     cursor = Cursor(data, "GetObjectInfoEx", MAX_DATASET)
-    bodies = [
-        cursor.take(max(cursor.u32("the length of a record") - 4, 0), "a record")
-        for _ in range(cursor.u32("the count of objects"))
-    ]
-    return tuple(canon.ObjectEntry.read(Cursor(body, "a record")) for body in bodies)
+    count = cursor.u32("the count of objects")
+    entries: list[canon.ObjectEntry] = []
+    # A record takes at least four bytes, so that the bytes left bound the loop whatever the count says.
+    for number in range(count):
+        length = cursor.u32("the length of a record")
+        body = cursor.take(max(length - 4, 0), f"record {number} of {count}")
+        entries.append(canon.ObjectEntry.read(Cursor(body, f"GetObjectInfoEx, record {number}")))
+    return tuple(entries)
 
 
 READERS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
