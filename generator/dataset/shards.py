@@ -89,6 +89,7 @@ from generator.dataset.records import (
 )
 from generator.files import suffix_of
 from generator.lights.lighting import Lighting, Mixture
+from generator.masks.maps import encode_maps, mean_weights
 from generator.pictures.sources import Cut, Picture, Source, hash_since, keep_bits
 from generator.stores import DESCRIPTION, LocalStore, Pieces, Store, open_store
 from generator.variation.variation import Varied
@@ -264,8 +265,6 @@ def _image_light(
 
     `weights`: (H, W, K) float32, of each of K lights in each pixel; None of one light.
     """
-    from generator.masks.maps import encode_maps, mean_weights
-
     labels = [mixture.label for mixture in lighting.mixtures]
     whites = lighting.whites(lut)
     intensity = None
