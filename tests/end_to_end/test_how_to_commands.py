@@ -73,13 +73,6 @@ PAGES = {
         | {"runs/a": "results", "runs/b": "results"},
         written={"Gray-world=Mine": "Gray-world=White-Patch"},
     ),
-    "describing.md": Page(
-        {"generated": "dataset", "real": "dataset", "LUT": "computed", "LUT1": "computed", "LUT2": "computed"}
-        | {"pictures": "pictures", "lights.csv": "gt.txt"},
-        written={"~/data/Cube+": "real", "~/data/mine": "real"},
-        fresh={"generate LUT ": "generated"},
-        skipped={"generate 5DSR": _REAL, "evaluate describe out": _REAL},
-    ),
     "evaluate.md": Page(
         {"DATA": "dataset", "brightest.py": "brightest.py", "c5.csv": "estimates.csv", "out/fc4.csv": "estimates.csv"},
         fresh={"evaluate": "RESULTS"},

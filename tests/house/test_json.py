@@ -152,7 +152,6 @@ CALLS: dict[str, tuple[str, dict[str, Any]]] = {
     "evaluate cv": ("constant-light MADE/set --folds 2", {"folds": 2, "images": 12}),
     "evaluate train": ("constant-light MADE/set --out OUT/model.npz", {"images": 12, "unused": 0}),
     "evaluate tune": ("shades-of-gray MADE/set", {"images": 12, "family": "shades-of-gray"}),
-    "evaluate describe": ("MADE/set", {"data_sets": ["set"]}),
     "evaluate paper bits": ("MADE/set --sigma 1", {}),
     "evaluate paper flash": ("MADE/set --out OUT/codes --clear 2", {"images": 12, "cleared": 2}),
     "evaluate paper reduction": ("MADE/pictures/0.png", {}),
