@@ -30,7 +30,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from foundation.errors import CropError, DeviceError, FormatError, InputError, first_of
+from foundation.errors import CropError, DeviceError, FormatError, InputError
 from foundation.files import partial_path, storage_error
 from foundation.folders import clear_folder, held_folder, require_free
 from generator.dataset.plan import DatasetOptions, Plan
@@ -420,7 +420,7 @@ def make_share(
     workers: Workers | None = None,
     callbacks: Callbacks = SILENT,
 ) -> tuple[int, int]:
-    """Make one of several shares of a dataset, beside other programs that make theirs; then call `finish_dataset`.
+    """Make one of several shares of a dataset, beside other programs that make theirs; then call `make_dataset`.
 
     `share`: (i, n): the shards whose number leaves i when divided by n, i from 0.
     """
@@ -430,23 +430,6 @@ def make_share(
     with workplace(out, plan.identity(), alone=False) as place:
         _make(plan, place, range(index, plan.shards, count), workers or Workers(), callbacks)
         return len(place.done()), plan.shards
-
-
-def finish_dataset(out: Path | str) -> Dataset:
-    """Make a dataset of its shards when every share is done; a dataset that is complete stays as it is."""
-    if holds_dataset(out):
-        return open_dataset(out)
-    identity = stored_identity(out)
-    if finished(out, identity):
-        return open_dataset(out)
-    with workplace(out, identity) as place:
-        missing = sorted(set(range(identity["shards"])) - place.done())
-        if missing:
-            raise InputError(
-                f"{len(missing)} of {identity['shards']} shards of {out} are not made yet: {first_of(missing)}; "
-                "run their shares, or the command without a share, which makes all that is missing"
-            )
-        return assemble(place, identity)
 
 
 def _make(plan: Plan, place: Workplace, wanted: range, workers: Workers, callbacks: Callbacks) -> None:

@@ -29,10 +29,6 @@ class SparseRecord(Record):
 
 FORMAT: Final = "crop.dataset"
 VERSION: Final = 2
-"""Version 1 listed the sources in `dataset.json`; they have a table of their own since."""
-STRETCHED_VERSION: Final = 3
-"""Of datasets whose counts are stretched over 16 bits: software that knows nothing of it refuses them, and does not
-take their images for more than six times as bright."""
 
 GROUND_TRUTH: Final = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")
@@ -56,7 +52,6 @@ Details = dict[str, int | float | str]
 """What options did to one image, by column of `images.csv`; all images of a dataset have the same columns."""
 
 Layout = Literal["folder", "webdataset", "parquet"]
-Scale = Literal["table", "full"]
 Split = Literal["train", "validation", "test"]
 SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
 
@@ -65,10 +60,9 @@ class ReadingOptions(Record):
     """What of the options of a dataset its readers need; they refuse values that no dataset is made with."""
 
     format: Format
-    layout: Layout = "folder"
+    layout: Layout
     previews: bool
-    shard_images: int = Field(default=256, ge=1, le=1 << 32)
-    scale: Scale = "table"
+    shard_images: int = Field(ge=1, le=1 << 32)
 
 
 class TableRecord(SparseRecord):
@@ -139,8 +133,6 @@ class SourceRecord(Record):
     - `split`: the part of the dataset that its images belong to; None where it was not divided.
     - `note`: what is to be known of it, between semicolons: what it took to read it, or that it is black or tiny; None
       for nothing.
-    - `weight`: by which it was drawn, 1 that of a picture neither favoured nor disfavoured; None where pictures were
-      not drawn.
     """
 
     position: int
@@ -152,7 +144,6 @@ class SourceRecord(Record):
     replaced_pixels: int
     split: Split | None = None
     note: str | None = None
-    weight: float | None = None
 
 
 class Skipped(Record):
@@ -235,7 +226,7 @@ class Description(SparseRecord):
     """
 
     format: Literal["crop.dataset"] = FORMAT
-    version: Literal[2, 3] = VERSION
+    version: Literal[2] = VERSION
     software: str
     libraries: dict[str, str]
     table: TableRecord

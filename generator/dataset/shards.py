@@ -65,11 +65,9 @@ from generator.dataset.records import (
     SOURCE_COLUMNS,
     SOURCES,
     SPLITS,
-    STRETCHED_VERSION,
     SUMS,
     TRUTHS,
     UNCERTAINTY_COLUMN,
-    VERSION,
     Description,
     Details,
     FinishedImage,
@@ -90,7 +88,7 @@ from generator.dataset.records import (
 from generator.files import suffix_of
 from generator.lights.lighting import Lighting, Mixture
 from generator.masks.maps import encode_maps, mean_weights
-from generator.pictures.sources import Cut, Picture, Source, hash_since, keep_bits
+from generator.pictures.sources import Cut, Picture, Source, hash_since
 from generator.stores import DESCRIPTION, LocalStore, Pieces, Store, open_store
 from generator.variation.variation import Varied
 
@@ -153,6 +151,41 @@ def light_of(lut: Lut, light: int) -> Light:
     )
 
 
+@dataclass(frozen=True)
+class ShownColours:
+    """How well a print shows the colours of a picture; columns of `images.csv`.
+
+    - `cells`: first 16 digits of the SHA-256 of the map of the print.
+    - `outside`: share of the pixels that the print cannot show, 0 … 1.
+    - `distance`: mean angle by which colours are missed, degrees.
+    """
+
+    cells: str
+    outside: float
+    distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class RawImage:
+    """The raw image of a print.
+
+    - `counts`: (H, W, 3) uint16, linear camera RGB. One light: memory that the thread's next call overwrites.
+    - `weights`: (H, W, K) float32, the share of each of several lights in each pixel; None with one light.
+    - `black_taken`: share of the print's black that was taken out, 0 … 1; None if the black is kept.
+    - `shown`: how the print shows the colours; None if it was rendered by codes.
+    """
+
+    counts: npt.NDArray[np.uint16]
+    weights: npt.NDArray[np.float32] | None
+    black_taken: float | None = None
+    shown: ShownColours | None = None
+
+    def details(self) -> Details:
+        """Return the columns of `images.csv`."""
+        shown: Details = {} if self.shown is None else dict(vars(self.shown))
+        return shown if self.black_taken is None else shown | {"black_taken": self.black_taken}
+
+
 def photograph(
     lut: Lut,
     picture: Picture,
@@ -161,14 +194,10 @@ def photograph(
     seed: int,
     number: int,
     white_level: int,
-    black_taken: float | None = None,
-) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None, Details]:
+) -> RawImage:
     """Return the raw image of a picture's print.
 
     `picture`: (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
-    `black_taken`: share of the print's black that is taken out, 0 … 1; None for what the options say. Returns (H, W, 3)
-    uint16, linear camera RGB; of several lights the weights (H, W, K) float32 of each in each pixel, else None; and
-    what is recorded of the rendering.
     """
     from generator.kernels.mixing import mix_samples
     from generator.kernels.printing import nearest_nodes
@@ -178,37 +207,29 @@ def photograph(
     for mixture in lighting.mixtures:
         for light in mixture.lights:
             lut.require_unchanged(light)
-    details: Details = {}
-    share = 0.0
-    if black_taken is not None or options.black_point.kind != "keep":
-        share = options.black_point.share(seed, number) if black_taken is None else black_taken
-        details["black_taken"] = share
+    share = None if options.black_point.kind == "keep" else options.black_point.share(seed, number)
     weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
     if options.rendering == "colorimetric":
         rendering = rendering_of(lut, options)
         outside, distance = rendering.map.missed(nearest_nodes(picture))
-        seen: Details = {
-            "cells": rendering.map.sha256[:16],
-            "outside": round(outside, 6),
-            "distance": round(distance, 6),
-        }
-        image = rendering.draw(
+        counts = rendering.draw(
             picture,
             lighting.mixtures,
-            share,
+            share or 0.0,
             weights,
             most=lut.provenance.white_level if weights is None else white_level,
             seed=seed,
             image=number,
             out=_reused(picture.shape),
         )
-        return image, weights, seen | details
-    tables = [_samples(lut, mixture, picture, share, seed) for mixture in lighting.mixtures]
+        shown = ShownColours(rendering.map.sha256[:16], round(outside, 6), round(distance, 6))
+        return RawImage(counts, weights, share, shown)
+    tables = [_samples(lut, mixture, picture, share or 0.0, seed) for mixture in lighting.mixtures]
     if weights is None:
-        out = _reused(picture.shape)
-        return draw_samples(tables[0], picture, seed=seed, image=number, out=out), None, details
-    image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
-    return image, weights, details
+        counts = draw_samples(tables[0], picture, seed=seed, image=number, out=_reused(picture.shape))
+    else:
+        counts = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
+    return RawImage(counts, weights, share)
 
 
 def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int) -> npt.NDArray[np.uint16]:
@@ -338,7 +359,6 @@ class _ReadSource:
 
     cuts: tuple[Cut, ...]
     record: SourceRecord
-    black_taken: float | None
 
 
 class ShardCancelled(Exception):
@@ -519,7 +539,7 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
 
     known = _known_source(job, job.position + place, finished) if finished else None
     if known is not None:
-        return _ReadSource((), known, None)
+        return _ReadSource((), known)
     source: Source = job.sources[place]
     scene = source.read()
     whole = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
@@ -528,7 +548,6 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
             f"{source.name} has {max(1, len(whole))} crops, expected {job.options.crops}; give the preparation of "
             "pictures and the options of the dataset the same number, and leave random scenes out"
         )
-    whole = tuple(replace(cut, picture=keep_bits(cut.picture, job.options.bits)) for cut in whole)
     if job.options.rendering == "codes":
         fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in whole]
     else:
@@ -554,12 +573,11 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
         width=width,
         height=height,
         replaced_pixels=sum(replaced for _, replaced in fit),
-        split=job.parts[place] if job.parts else split_of(job.options.split, job.seed, scene.sha256, source.name),
+        split=split_of(job.options.split, job.seed, scene.sha256, source.name),
         note="; ".join(notes) or None,
-        weight=scene.weight,
     )
     cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
-    return _ReadSource(cuts, record, scene.black_taken)
+    return _ReadSource(cuts, record)
 
 
 def _known_source(job: ShardJob, position: int, finished: Mapping[int, FinishedImage]) -> SourceRecord | None:
@@ -582,36 +600,32 @@ def _photographed(
     crop: int,
     lighting: Lighting,
 ) -> Sample:
-    from generator.files import FULL, ImageMetadata, encode_pieces, encode_preview, preview_of, suffix_of, to_full_scale
+    from generator.files import FULL, ImageMetadata, encode_pieces, encode_preview, preview_of, suffix_of
 
     options, cut = job.options, source.cuts[crop]
     height, width = cut.picture.shape[:2]
     white_level = lut.provenance.white_level
     # What exceeds saturation may be below it once it is exposed anew, and is cut then.
     most = white_level if options.variation is None else FULL
-    taken = source.black_taken
-    image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
+    raw = photograph(lut, cut.picture, lighting, options, job.seed, number, most)
     varied = Varied()
     if options.variation is not None:
-        varied = options.variation.apply(image, white_level, job.seed, number)
-    light = _image_light(lut, lighting, weights, varied, options.tints)
-    stored, level = (image, white_level) if options.scale == "table" else (to_full_scale(image, white_level), FULL)
-    metadata = ImageMetadata(level, light.truth, lut.provenance.camera)
+        varied = options.variation.apply(raw.counts, white_level, job.seed, number)
+    light = _image_light(lut, lighting, raw.weights, varied, options.tints)
+    metadata = ImageMetadata(white_level, light.truth, lut.provenance.camera)
     files: list[tuple[str, str, Pieces]] = [
-        ("images", suffix_of(options.form), encode_pieces(stored, options.form, metadata)),
+        ("images", suffix_of(options.form), encode_pieces(raw.counts, options.form, metadata)),
         *((kind, ending, (data,)) for kind, ending, data in light.maps),
     ]
     if options.previews:
-        files.append(("previews", ".jpg", (encode_preview(preview_of(image, white_level)),)))
+        files.append(("previews", ".jpg", (encode_preview(preview_of(raw.counts, white_level)),)))
     details: Details = {"crop": crop, "left": cut.left, "top": cut.top} if options.crops > 1 else {}
-    if source.record.weight is not None:
-        details["weight"] = source.record.weight
     record = ImageRecord(
         number=number,
         position=source.record.position,
         truth=light.truth,
         lights=light.rows,
-        details=details | rendered | varied.details,
+        details=details | raw.details() | varied.details,
     )
     sample = writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
     if sample.stored:
@@ -728,7 +742,6 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
                 "left out, each with its reason; name others, or ask for a smaller crop if they are too small"
             )
         description = Description(
-            version=STRETCHED_VERSION if options.get("scale") == "full" else VERSION,
             software=software(),
             libraries=identity["libraries"],
             table=TableRecord.model_validate(identity["table"]),

@@ -20,7 +20,7 @@ from foundation.errors import FormatError, InputError
 from foundation.folders import FolderLock, held_folder
 from generator.dataset import layouts as plain_files
 from generator.dataset import shards
-from generator.dataset.making import Workers, finish_dataset, generate_dataset, make_dataset, make_share, workplace
+from generator.dataset.making import Workers, generate_dataset, make_dataset, make_share, workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, open_dataset
 from generator.dataset.records import FinishedImage, Layout, ShardRecord
@@ -374,21 +374,14 @@ def test_shares_make_the_whole(make_lut: MakeLut, tmp_path: Path) -> None:
     make_dataset(plan_of(lut), tmp_path / "whole")
     assert make_share(plan_of(lut), out, (1, 3), Workers(count=2)) == (2, 6)
     assert make_share(plan_of(lut), out, (0, 3)) == (4, 6)
-    with pytest.raises(InputError, match=r"2 of 6 shards .*: 2, 5"):
-        finish_dataset(out)
     with pytest.raises(InputError, match=r"share 3 of 3.*0 to 2"):
         make_share(plan_of(lut), out, (3, 3))
     assert make_share(plan_of(lut), out, (2, 3)) == (6, 6)
     assert make_share(plan_of(lut), out, (2, 3)) == (6, 6), "made again, nothing changes"
     assert not out.exists()
-    finish_dataset(out)
+    make_dataset(plan_of(lut), out)
     assert contents(out) == contents(tmp_path / "whole")
     assert not list(tmp_path.glob(".out*"))
-    before = contents(out)
-    assert finish_dataset(out).description.images == plan_of(lut).total, "finished before: it is there"
-    assert contents(out) == before
-    with pytest.raises(InputError, match="being made at"):
-        finish_dataset(tmp_path / "elsewhere")
 
 
 def test_shares_are_made_beside_each_other(make_lut: MakeLut, tmp_path: Path) -> None:
@@ -396,7 +389,7 @@ def test_shares_are_made_beside_each_other(make_lut: MakeLut, tmp_path: Path) ->
     with workplace(tmp_path / "out", plan_of(lut).identity(), alone=False):
         assert make_share(plan_of(lut), tmp_path / "out", (0, 1)) == (6, 6)
         with pytest.raises(InputError, match="another program"):
-            finish_dataset(tmp_path / "out")
+            make_dataset(plan_of(lut), tmp_path / "out")
 
 
 def test_a_share_that_waited_for_the_whole_is_refused(
@@ -423,10 +416,10 @@ def test_a_damaged_record_and_a_changed_source_are_reported(make_lut: MakeLut, t
     text = record.read_text()
     record.write_text(text[:-9])
     with pytest.raises(FormatError, match=r"000001\.\w+\.json: damaged: .*; remove it and run the same command again"):
-        finish_dataset(out)
+        make_dataset(plan_of(lut), out)
     record.write_text(text.replace('"width":24', '"width":25'))
     with pytest.raises(FormatError, match="random-000000"):
-        finish_dataset(out)
+        make_dataset(plan_of(lut), out)
     record.unlink()
     make_dataset(plan_of(lut), out)
     make_dataset(plan_of(lut), tmp_path / "whole")
