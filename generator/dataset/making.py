@@ -36,11 +36,8 @@ from foundation.folders import clear_folder, held_folder, require_free
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, load_description, open_dataset
 from generator.dataset.shards import (
-    DONE,
-    IMAGE_NOTES,
     NOTES,
     PLAN,
-    RECORDS,
     SILENT,
     Callbacks,
     NothingMadeError,
@@ -510,8 +507,7 @@ def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Ge
             yield place
         except BaseException as error:
             # An InputError asks for another command, which could not go on with images of this one.
-            useful = DONE if isinstance(error, InputError) else (DONE, IMAGE_NOTES)
-            if alone and folder.is_dir() and not any(name.endswith(useful) for name in notes.names(RECORDS)):
+            if alone and folder.is_dir() and not place.has_finished(isinstance(error, InputError)):
                 shutil.rmtree(folder, ignore_errors=True)
             raise
 
@@ -545,7 +541,7 @@ def _remote(out: str, identity: PlanIdentity) -> Generator[Workplace]:
         yield place
     except BaseException:
         with contextlib.suppress(Exception):
-            if not begun and not any(notes.names(RECORDS)):
+            if not begun and not place.has_finished():
                 files.remove("")
         raise
 

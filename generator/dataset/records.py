@@ -178,11 +178,11 @@ class FileSum(Record):
 
 
 class FinishedImage(Record):
-    """An image of a shard that is not done; `files` are all of it, which were written before this was."""
+    """An image of a shard that is not done; its `files` are those of its piece."""
 
     image: ImageRecord
     source: SourceRecord
-    files: list[FileSum]
+    files: list[FileSum] = Field(default_factory=list[FileSum], exclude=True)
 
 
 class RenderingSummary(Record):
@@ -201,14 +201,14 @@ class RenderingSummary(Record):
 class ShardRecord(Record):
     """What a shard made; images and files in the order of their numbers, sources in that of their positions.
 
-    `lights` are those of the table that were used, alone or mixed.
+    `lights` are those of the table that were used, alone or mixed; `files` are those of the shard's piece.
     """
 
     shard: int
     sources: list[SourceRecord]
     skipped: list[Skipped]
     images: list[ImageRecord]
-    files: list[FileSum]
+    files: list[FileSum] = Field(default_factory=list[FileSum], exclude=True)
     lights: list[Light]
 
 

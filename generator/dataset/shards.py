@@ -2,21 +2,19 @@
 
 Pictures are read, photographed and written. Where that happens (`Workplace`), work that was interrupted is continued,
 and the dataset appears whole. On a disk everything happens in the hidden folder `.OUT.partial`: `dataset-ID/`, with the
-plan's identifier, fills with files, and `plan/` has the plan, the records of the shards that are done, and of those
-that are not a line for each image whose files are written. At the end `dataset-ID/` gets its name by one rename, then
-the rest is removed. An object store has no rename: the files are written where they stay, plan and records below
-`OUT/.plan/`, and `dataset.json`, written last, makes a dataset of them.
+plan's identifier, fills with files, and `plan/` has the plan and a record file of finished pieces for each shard
+(`foundation.pieces`). At the end `dataset-ID/` gets its name by one rename, then the rest is removed. An object store
+has no rename: the files are written where they stay, plan and records below `OUT/.plan/`, and `dataset.json`, written
+last, makes a dataset of them.
 
 Rules that hold inside:
 
 - A shard's bytes depend on its job alone: not on the workers, on other shards, or on how often it is made.
-- Its record is written last, when all else has been synchronised with the disk: a shard with a record is whole. The
+- A shard is one piece, written when all else has been synchronised with the disk: a shard with its piece is whole. The
   program may be killed at any instruction, and any number of programs may make the same shard at once.
-- Of a shard without a record, an image counts whose files are there with the hashes that were noted when they were
-  written, and whose source is as it was. The bytes of the others do not depend on it.
+- Until then each image is a piece, and counts if its files are there with their hashes and its source is as it was. The
+  bytes of the others do not depend on it. An object store cannot add to a file, so that it has no such pieces.
 - At most about three pictures are in memory for each worker.
-- The lines of images are not synchronised with the disk and may be cut: each bears its own hash and those of its files,
-  and what does not agree with them is made again. An object store cannot add to a file, and has no such lines.
 
 An image under one light has that light's ground truth, however its intensity falls off. Where it falls off with a tint
 (`generator.variation.variation`) the light stands in the records twice, as it is at the near and at the far end, and
@@ -25,7 +23,6 @@ masks and maps say how much of either reaches a pixel.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import hashlib
 import io
@@ -39,14 +36,16 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import CropError, FormatError, InputError
-from foundation.files import HashingWriter, sha256_of, stream_sha256
+from foundation.compiled import ordered_map
+from foundation.errors import FormatError, InputError
+from foundation.files import HashingWriter
 from foundation.folders import publish_folder, require_free
+from foundation.pieces import Piece, pieces_of
 from foundation.records import from_json
 from foundation.version import software
 from generator.dataset.cards import card, croissant, datasheet
@@ -70,6 +69,7 @@ from generator.dataset.records import (
     UNCERTAINTY_COLUMN,
     Description,
     Details,
+    FileSum,
     FinishedImage,
     ImageRecord,
     Light,
@@ -101,9 +101,10 @@ PLAN: Final = "plan.json"
 RECORDS: Final = "shards"
 NOTES: Final = ".plan"
 """Names among a place's notes: of the plan, of the folder of shards' records, and in a store of the notes' folder."""
-DONE: Final = ".json"
-IMAGE_NOTES: Final = ".images"
-"""Ends of the names of a shard's record, and of the lines of its finished images."""
+_WHOLE: Final = "shard"
+"""Name of the piece that is a shard; those of images are their numbers."""
+_READERS: Final = 16
+"""Record files that are read at a time: a store is waited for most of the time."""
 
 PlanIdentity = Mapping[str, Any]
 
@@ -440,9 +441,8 @@ def make_shard(
 
 def _finished_images(job: ShardJob, place: Workplace, pool: ThreadPoolExecutor) -> dict[int, FinishedImage]:
     """Return by number the images of a shard that whoever was at it before has finished."""
-    noted = place.noted(job.shard)
-    whole = pool.map(place.is_whole, noted)
-    return {image.image.number: image for image, is_whole in zip(noted, whole, strict=True) if is_whole}
+    found = pool.map(place.image_of, place.pieces(job.shard).values())
+    return {image.image.number: image for image in found if image is not None}
 
 
 def _taken_up(image: FinishedImage) -> Sample:
@@ -863,61 +863,47 @@ class Workplace:
 
     def done(self) -> set[int]:
         """Return the shards that are done."""
-        ending = f".{self.plan_id}{DONE}"
+        ending = f".{self.plan_id}"
         found = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
-        return {int(name.removesuffix(ending)) for name in found if name.endswith(ending)}
+        shards = [int(name.removesuffix(ending)) for name in found if name.endswith(ending)]
+        whole = ordered_map(self.has, shards, _READERS)
+        return {shard for shard, is_done in zip(shards, whole, strict=True) if is_done}
 
     def has(self, shard: int) -> bool:
         """Return whether a shard is done."""
-        return self.notes.has(self._record_name(shard))
+        return _WHOLE in self.pieces(shard)
 
     def load(self, shard: int) -> ShardRecord:
         """Return the record of a shard that is done."""
-        name = self._record_name(shard)
-        remedy = "remove it and run the same command again, which makes it anew"
-        return from_json(ShardRecord, self.notes.get(name), f"{self.notes.place}/{name}", remedy)
+        whole = self.pieces(shard).get(_WHOLE)
+        if whole is None:
+            raise FormatError(f"{self.notes.place}/{self._record_name(shard)} is damaged; run the same command again")
+        return _record_in(whole, ShardRecord)
 
     def commit(self, record: ShardRecord) -> None:
         """Bring the record of a shard to the disk whose files are there: from here on it is done."""
         name = self._record_name(record.shard)
-        self.notes.put(name, record.model_dump_json().encode())
+        self.notes.put(name, self._piece(_WHOLE, record).to_line())
         self.notes.sync([name])
-        if isinstance(self.notes, LocalStore):
-            # Whoever makes the shard at the same time may have it open, and no later reader asks for it.
-            with contextlib.suppress(OSError):
-                (self.notes.root / self._images_name(record.shard)).unlink(missing_ok=True)
 
     def note(self, shard: int, image: FinishedImage) -> None:
         """Note that all files of an image of a shard are written; any thread may do so."""
         if isinstance(self.notes, LocalStore):
-            line = image.model_dump_json().encode()
-            # It begins anew behind a line that was cut.
-            self.notes.append(self._images_name(shard), b"\n%s %s\n" % (sha256_of(line).encode(), line))
+            self.notes.append(self._record_name(shard), self._piece(str(image.image.number), image).to_line())
 
-    def noted(self, shard: int) -> list[FinishedImage]:
-        """Return what was noted of the images of a shard, but for what cannot be read; see `is_whole`."""
-        name = self._images_name(shard)
-        if not isinstance(self.notes, LocalStore) or not self.notes.has(name):
-            return []
-        found: list[FinishedImage] = []
-        # Whoever makes the shard at the same time may be done, and have removed them.
-        with contextlib.suppress(FormatError):
-            for noted in self.notes.get(name).splitlines():
-                sha256, _, line = noted.partition(b" ")
-                if sha256 == sha256_of(line).encode():
-                    found.append(from_json(FinishedImage, line, f"{self.notes.place}/{name}", "remove it"))
-        return found
+    def pieces(self, shard: int) -> dict[str, Piece]:
+        """Return the finished pieces of a shard by their names."""
+        name = self._record_name(shard)
+        return pieces_of(self.notes.get(name), self.plan_id) if self.notes.has(name) else {}
 
-    def is_whole(self, image: FinishedImage) -> bool:
-        """Return whether all files of an image are there as they were written."""
-        try:
-            for file in image.files:
-                with self.files.open(file.name) as stream:
-                    if stream_sha256(stream) != file.sha256:
-                        return False
-        except (CropError, OSError):
-            return False
-        return True
+    def image_of(self, piece: Piece) -> FinishedImage | None:
+        """Return the image that a piece is; None if a file of it is not as it was written."""
+        return _record_in(piece, FinishedImage) if piece.is_whole(self.files.open) else None
+
+    def has_finished(self, shard: bool = False) -> bool:
+        """Return whether an image is finished, or a `shard`, of this plan or of another one."""
+        names = self.notes.names(RECORDS)
+        return any(not shard or _WHOLE in pieces_of(self.notes.get(name)) for name in names)
 
     def discard(self) -> None:
         """Remove the records of the shards that are done, since to continue would end the same."""
@@ -932,11 +918,23 @@ class Workplace:
             publish_folder(self.files.root, out, "the dataset")
         remove_notes(self.notes)
 
-    def _record_name(self, shard: int) -> str:
-        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}{DONE}"
+    def _piece(self, name: str, record: ShardRecord | FinishedImage) -> Piece:
+        return Piece(name, self.plan_id, {file.name: file.sha256 for file in record.files}, record.model_dump_json())
 
-    def _images_name(self, shard: int) -> str:
-        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}{IMAGE_NOTES}"
+    def _record_name(self, shard: int) -> str:
+        # A worker of a plan that was removed may still be alive: it writes under another name.
+        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}"
+
+
+_Finished = TypeVar("_Finished", ShardRecord, FinishedImage)
+
+
+def _record_in(piece: Piece, kind: type[_Finished]) -> _Finished:
+    """Return what a piece's line says of it, with its files."""
+    files = [FileSum(name=name, sha256=sha256) for name, sha256 in piece.files.items()]
+    return from_json(kind, piece.values, f"the piece {piece.name}", "make the dataset again").model_copy(
+        update={"files": files}
+    )
 
 
 def remove_notes(notes: Store) -> None:
