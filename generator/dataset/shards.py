@@ -48,7 +48,7 @@ from foundation.folders import publish_folder, require_free
 from foundation.pieces import Piece, pieces_of
 from foundation.records import from_json
 from foundation.version import software
-from generator.dataset.cards import card, croissant, datasheet
+from generator.dataset.cards import card, datasheet
 from generator.dataset.joined import Beside
 from generator.dataset.layouts import LAYOUTS, ShardWriter
 from generator.dataset.plan import DatasetOptions, ShardJob, versions
@@ -56,7 +56,6 @@ from generator.dataset.reader import Dataset, load_description
 from generator.dataset.records import (
     CARD,
     COMPLETED_BY_HAND,
-    CROISSANT,
     DATASHEET,
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,
@@ -764,9 +763,8 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
         for file in written:
             sums.write(file.sum.encode())
         sums.write(f"{hashlib.sha256(text).hexdigest()}  {DESCRIPTION}\n".encode())
-        known = {file.name: file.sha256 for file in written}
         # Its makers complete them, so that no hash of them is recorded.
-        texts = {CARD: card(description), DATASHEET: datasheet(description), CROISSANT: croissant(description, known)}
+        texts = {CARD: card(description), DATASHEET: datasheet(description)}
         for name, card_text in texts.items():
             place.files.put(name, card_text.encode())
     names = [file.name for file in written]

@@ -13,7 +13,7 @@ import pytest
 
 from calibration.citation import OriginRecord
 from calibration.table.lut import Lut
-from generator.dataset.cards import card, croissant, datasheet, size_category
+from generator.dataset.cards import card, datasheet, size_category
 from generator.dataset.contact_sheet import _draw as draw  # before it is painted
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
@@ -87,8 +87,7 @@ def test_texts_beside_datasets(lut: Lut, tmp_path: Path, pinned: Pinned) -> None
         for number, changes in enumerate(tables[: 6 if name == "plain" else 2]):
             table = described.table.model_copy(update=changes)
             changed: Description = described.model_copy(update={"table": table, "software": "croplab X"})
-            sums = dict.fromkeys(dataset.store.names(), "0" * 64)
-            texts = [card(changed), datasheet(changed), croissant(changed, sums)]
+            texts = [card(changed), datasheet(changed)]
             found[f"{name} {number}"] = [
                 text.splitlines() if name == "plain" and number < 1 else text.encode() for text in texts
             ]
