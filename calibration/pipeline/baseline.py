@@ -56,7 +56,7 @@ from calibration.spread.surroundings import FrameLevels, photosite_offsets_px, p
 from calibration.table.lut import Lut, SourceFrame
 from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.chart.model import Chart
-from experiment.config import CameraSettings, CitationSettings
+from experiment.config import CameraSettings, CitationSettings, checked
 from experiment.framing.pictures import STILL_PX
 from experiment.measures.least_squares import code_polynomial, code_powers, least_squares, page_polynomial
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, FlatField, PaperReader
@@ -427,7 +427,8 @@ def stated_origin(session: Session) -> StatedOrigin:
     try:
         document: dict[str, Any] = tomllib.loads(session.settings_text())
         rig: Rig | None = next((known for known in get_args(Rig) if known == document.get("rig")), None)
-        citation = CitationSettings.model_validate(document.get("citation", {}))
+        where = f"{session.folder / 'session.toml'}: citation"
+        citation = checked(CitationSettings, document.get("citation", {}), where)
         set_by = CameraSettings.model_validate(document["camera"]) if rig in _SETTING_RIGS else None
     except (CropError, ValidationError, ValueError, KeyError, RecursionError) as error:
         if isinstance(error, CropError | tomllib.TOMLDecodeError):

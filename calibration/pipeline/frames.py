@@ -73,7 +73,6 @@ from drivers.raw.rawfile import (
 )
 from drivers.raw.storage import Area
 from experiment.chart.model import Chart, Reference
-from experiment.config import CitationSettings
 from experiment.framing.field import Corners
 from experiment.framing.pictures import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between
 from experiment.measures.paper import Paper, PaperReader
@@ -109,8 +108,6 @@ class BuildOptions:
       end.
     - `lens_correction`: whether what the lens spreads beside its sharp core is subtracted from samples and ground
       truth, where the print proves that it does.
-    - `citation`: what the lab states of the table's origin; None for what the session's settings state. No sample
-      depends on it.
     """
 
     window: int = WINDOW
@@ -118,7 +115,6 @@ class BuildOptions:
     corners: Corners | None = None
     correct_drift: bool = False
     lens_correction: bool = True
-    citation: CitationSettings | None = None
 
     def __post_init__(self) -> None:
         if self.window not in WINDOWS:
