@@ -309,7 +309,7 @@ def _verify_table(folder: Path, session: Path | None, output: JsonOutput) -> Non
     with _progress_bar("reading the samples") as progress:
         faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
     if session is not None:
-        from calibration.pipeline.baseline import frame_faults
+        from calibration.pipeline.frames import frame_faults
         from experiment.session.folder import Session
 
         with Session.open(session) as opened, _progress_bar("reading the frames") as progress:
@@ -391,7 +391,7 @@ def _make(
     if lut is None and not check:
         raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
     from calibration.citation import with_changes
-    from calibration.pipeline.baseline import stated_origin
+    from calibration.pipeline.frames import stated_origin
     from experiment.session.folder import Session
 
     with Session.open(session) as opened:

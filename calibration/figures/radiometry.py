@@ -64,7 +64,7 @@ _UNFIT_REMEDIES = {
     "lit": "turn print or projector until no lamp, window or bright wall is mirrored on the print",
     "uneven": "focus on the print and keep the camera still",
 }
-"""What helps against each cause of unfit cells (`calibration.pipeline.frames`)."""
+"""What helps against each cause of unfit cells (`calibration.pipeline.collecting`)."""
 
 _SAME_EXPOSURE = "keep one exposure and ISO speed for the session, and take these frames again"
 
