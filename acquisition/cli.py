@@ -15,10 +15,6 @@ from foundation import console
 from foundation.console import (
     EXIT_CODES,
     JsonOutput,
-    Quiet,
-    Verbose,
-    Version,
-    common_first,
     new_app,
     option,
     orderly_end,
@@ -52,12 +48,7 @@ class Rig(Enum):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `acquire` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
-    return console.run(lambda: app(args=common_first(argv), prog_name="acquire"))
-
-
-@app.callback()
-def acquire(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
-    """Take what all commands take."""
+    return console.run(lambda: app(args=argv, prog_name="acquire"))
 
 
 @app.command(epilog=EXIT_CODES)
@@ -101,15 +92,10 @@ def chart(
         str | None,
         typer.Option(help="Paper, landscape: A0 … A8, or WIDTHxHEIGHT in mm; else the smallest that fits."),
     ] = None,
-    cell_mm: Annotated[
-        float | None,
-        typer.Option(help="Side of a cell, mm, to the nearest 0.21; else 5.29, or the largest that fits on the page."),
-    ] = None,
     arrangement: Annotated[
         Arrangement,
         typer.Option(help="tagged: random order, tags and references; paper: the paper's 256 × 128 grid without tags."),
     ] = Arrangement.TAGGED,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the colours.")] = 1,
     tiff: Annotated[bool, typer.Option(help="Write the 600-dpi TIFF.")] = True,
     tagged_tiff: Annotated[
         bool,
@@ -131,12 +117,7 @@ def chart(
     from experiment.framing.finding import small_parts_warning
     from foundation.folders import whole_folder
 
-    if arrangement is Arrangement.PAPER:
-        if cell_mm is not None:
-            raise InputError("the paper's arrangement fills its page; leave --cell-mm out, or choose another --page")
-        design = paper_chart(_page(page), bits)
-    else:
-        design = design_chart(bits, _page(page), seed, cell_mm)
+    design = paper_chart(_page(page), bits) if arrangement is Arrangement.PAPER else design_chart(bits, _page(page))
     with whole_folder(out, "the chart") as folder:
         save_preview(design, folder / "preview.png")
         save_pdf(design, folder / "chart.pdf")
@@ -214,9 +195,6 @@ def illuminations(
 @app.command(epilog=EXIT_CODES)
 @with_json("acquire devices")
 def devices(
-    search: Annotated[
-        float, typer.Option(min=0, help="Seconds to wait for PJLink projectors to answer; 0 does not ask.")
-    ] = 10.0,
     identify: Annotated[bool, typer.Option(help="Show on every display its number for ten seconds.")] = False,
     *,
     output: JsonOutput,
@@ -227,7 +205,7 @@ def devices(
     """
     from acquisition.run.rig.lab import attached_devices, identify_displays
 
-    for attached in attached_devices(search):
+    for attached in attached_devices():
         output.append("devices", attached)
         print(f"{attached.kind}:")
         for name in attached.found:
@@ -246,7 +224,6 @@ def check(
         Path | None,
         typer.Option(help="Save as PNG the frame with what was found on it, maps of light, blur and print, verdicts."),
     ] = None,
-    identify: Annotated[bool, typer.Option(help="First show on every display its number for ten seconds.")] = False,
     corners: Annotated[
         tuple[str, str, str, str] | None,
         option(
@@ -257,9 +234,6 @@ def check(
     linearity: Annotated[
         bool, typer.Option("--linearity", help="Take a series of exposures too: linearity, electrons a count, noise.")
     ] = False,
-    session: Annotated[
-        Path | None, typer.Option(help="Where the session will be, for the disk's space; else beside LAB.toml.")
-    ] = None,
     *,
     output: JsonOutput,
 ) -> None:
@@ -279,10 +253,6 @@ def check(
         from experiment.framing.field import parse_corners
 
         given = parse_corners(corners)
-    if identify:
-        from acquisition.run.rig.lab import identify_displays
-
-        identify_displays(10.0)
     with orderly_end():
         report = check_lab(
             settings,
@@ -290,7 +260,6 @@ def check(
             picture=picture,
             corners=given,
             linearity=linearity,
-            session=session,
         )
     if output.asked:
         output.add(**report.values())

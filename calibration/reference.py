@@ -20,7 +20,7 @@ _FIGURES_HEAD = """# Figures
 
 What `build-lut` judges a table by. Within what is *accepted* nothing is said; beyond it a figure is remarked on, and
 beyond what is *refused* there is no table. `acquire check` forecasts some of them before a session, by the same limits.
-`build-lut --check` reads one frame, and judges those that this tells; what more frames can only make worse it judges
+`build-lut check` reads one frame, and judges those that this tells; what more frames can only make worse it judges
 where it is *beyond* already. The names are those of `report.json`; some had others in the reports of earlier software.
 
 *Written by `python -m calibration.reference` from `calibration/figures`.*

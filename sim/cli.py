@@ -13,7 +13,7 @@ import typer
 
 from drivers.serial_projectors import LANGUAGES, language
 from foundation import console
-from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app, option
+from foundation.console import EXIT_CODES, new_app, option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,12 +32,7 @@ app = new_app(
 
 def main(argv: Sequence[str] | None = None, read_chart: Callable[[Path], Print] | None = None) -> int:
     """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
-    return console.run(lambda: app(args=common_first(argv), prog_name="sim", obj=read_chart))
-
-
-@app.callback()
-def _devices(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
-    """Serve simulated devices on loopback connections, until interrupted."""
+    return console.run(lambda: app(args=argv, prog_name="sim", obj=read_chart))
 
 
 @app.command()

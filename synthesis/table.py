@@ -162,7 +162,7 @@ class TableTask:
       that the simulated projector shows.
     - `window`: half-size pixels along a window's side.
     - `record`: what the provenance says under `computed`.
-    - `origin`: note, licence and authors, as whoever computes the table gives them; None where nothing is given.
+    - `origin`: title, authors, licence, note and address of the table; None if the settings have none.
     """
 
     chart: Chart

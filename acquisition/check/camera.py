@@ -460,7 +460,7 @@ def judge_disk(folder: Path, frames: int, frame_bytes: int) -> Finding:
         free / max(needed, 1),
         f"{bytes_text(free)} free at {folder}, {bytes_text(needed, up=True)} needed for {frames} frames of "
         f"{bytes_text(frame_bytes)} (as one that was taken here), some of them taken again",
-        "free space, or put the session on another disk (--session FOLDER tells where it will be)",
+        "free space, or put the session on another disk (acquire run --dry-run checks the disk of a session's folder)",
         {"free_bytes": free, "needed_bytes": needed, "frames": frames, "frame_bytes": frame_bytes},
     )
 

@@ -91,13 +91,11 @@ def check_lab(
     picture: Path | None = None,
     corners: Corners | None = None,
     linearity: bool = False,
-    session: Path | None = None,
 ) -> CheckReport:
     """Check the rig that the settings name; record nothing.
 
     `picture`: where to draw what was found, PNG. `corners`: of the field of a chart without tags, as given by hand,
     half-size px. `linearity`: whether to take a series of exposures that shows the sensor's linearity and noise.
-    `session`: where the session is to lie, for the disk's free space; the settings' folder if not given.
     """
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
@@ -120,7 +118,7 @@ def check_lab(
         *_sensor_findings(seen, camera.timings, figures, chart, linearity),
         *screen,
         *(Finding("settings", "remark", doubt) for doubt in settings_doubts(settings)),
-        judge_disk(session or Path(settings.file).parent, frames, seen.first.size),
+        judge_disk(Path(settings.file).parent, frames, seen.first.size),
         *supplies,
     ]
     if seen.used_s != seen.first.shutter_s:

@@ -184,7 +184,7 @@ class Figure:
     - `measure`: the value; None where it could not be measured: on a chart without tags or with few colours, without
       dark frames or a series of exposures.
     - `forecast`: the value from what a check has, where no check can know it `ONLY_OF_A_SESSION`.
-    - `of_one_frame`: what `build-lut --check` can say of it, which reads one light or white frame and a dark one: it is
+    - `of_one_frame`: what `build-lut check` can say of it, which reads one light or white frame and a dark one: it is
       `known`; or `bounded`, since more frames can only make it worse, so that it is told where it is beyond its limit
       already; or `unknown`.
     - `worst`: where its worst is on the report's page, whatever the verdict; else `NO_PLACE`.

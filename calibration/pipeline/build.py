@@ -441,8 +441,8 @@ def _identity(session: Session, selected: SelectedFrames, options: BuildOptions)
         "software": software(),
         "method": METHOD,
         "stored": stored_names(),
-        # The drift is taken out of the finished samples, and no sample depends on the citation.
-        "options": to_plain(replace(options, correct_drift=False, citation=None)),
+        # The drift is taken out of the finished samples.
+        "options": to_plain(replace(options, correct_drift=False)),
         "chart": session.chart.sha256,
         "lights": hashlib.sha256(repr(session.illuminations).encode()).hexdigest(),
         "registered": selected.registered.sha256,

@@ -18,7 +18,7 @@ from calibration.radiometry.primaries import pure_lights
 from calibration.sampling import WINDOW, WINDOWS
 from calibration.spread.predicting import VARYING_BITS
 from calibration.table.lut import Lut, SourceFrame
-from experiment.config import CameraSettings, CitationSettings
+from experiment.config import CameraSettings, CitationSettings, checked
 from experiment.framing.field import Corners
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
@@ -43,8 +43,6 @@ class BuildOptions:
       end.
     - `lens_correction`: whether what the lens spreads beside its sharp core is subtracted from samples and ground
       truth, where the print proves that it does.
-    - `citation`: what the lab states of the table's origin; None for what the session's settings state. No sample
-      depends on it.
     """
 
     window: int = WINDOW
@@ -52,7 +50,6 @@ class BuildOptions:
     corners: Corners | None = None
     correct_drift: bool = False
     lens_correction: bool = True
-    citation: CitationSettings | None = None
 
     def __post_init__(self) -> None:
         if self.window not in WINDOWS:
@@ -190,7 +187,8 @@ def stated_origin(session: Session) -> StatedOrigin:
     try:
         document: dict[str, Any] = tomllib.loads(session.settings_text())
         rig: Rig | None = next((known for known in get_args(Rig) if known == document.get("rig")), None)
-        citation = CitationSettings.model_validate(document.get("citation", {}))
+        where = f"{session.folder / 'session.toml'}: citation"
+        citation = checked(CitationSettings, document.get("citation", {}), where)
         set_by = CameraSettings.model_validate(document["camera"]) if rig in _SETTING_RIGS else None
     except (CropError, ValidationError, ValueError, KeyError, RecursionError) as error:
         if isinstance(error, CropError | tomllib.TOMLDecodeError):

@@ -340,9 +340,6 @@ def _figures(
     """Return all figures; `even` is the frame that shows how even cells are."""
     session, baseline, saturation = done.session, done.baseline, done.saturation
     stated = stated_origin(session)
-    if baseline.options.citation is not None:
-        # What was given for the build stands in place of the session's settings.
-        stated = replace(stated, citation=baseline.options.citation)
     origins = [one.origin for one in done.figures]
     published = with_published_serials(origins, stated.citation.camera_serial)
     stains, dark = done.stains(_field_at_cells(baseline, even)), done.dark_summary()

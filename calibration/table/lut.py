@@ -428,7 +428,7 @@ class Lut:
         if light_sha256(self.samples[light]) != known[light]:
             raise FormatError(
                 f"{self.folder / SAMPLES}: the samples of light {light} are not those that were measured; see what "
-                f"else has changed with build-lut --verify {self.folder}, then copy the table again or build it anew"
+                f"else has changed with build-lut verify {self.folder}, then copy the table again or build it anew"
             )
         self._unchanged.add(light)
 

@@ -250,7 +250,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
     """
     zarr = _zarr()
     if expect is not None and not HASH.fullmatch(expect):
-        raise InputError(f"{expect!r} is no hash of a table; give the 64 digits that build-lut --info prints as Table")
+        raise InputError(f"{expect!r} is no hash of a table; give the 64 digits that build-lut info prints as Table")
     require_free(folder, "the table")
     described = described_at(url)
     attributes = attributes_of(described)

@@ -40,7 +40,7 @@ def test_two_days_differ_in_brightness_alone(
     folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "report"
-    assert main(["--compare", *map(str, folders), "--json", "--out", str(out)]) == 0
+    assert main(["compare", *map(str, folders), "--json", "--out", str(out)]) == 0
     document = json.loads(capsys.readouterr().out)
     assert [each["same_within_noise"] for each in document["answers"]] == [True, False, True]
     assert document["gains"] == pytest.approx([0.69 / 0.7] * 3, abs=2.5e-3)
@@ -64,5 +64,5 @@ def test_a_table_is_compared_with_a_session(
 ) -> None:
     with Session.open(folders[0]) as session:
         build(session, tmp_path / "lut")
-    assert main(["--compare", str(tmp_path / "lut"), str(folders[0])]) == 0
+    assert main(["compare", str(tmp_path / "lut"), str(folders[0])]) == 0
     assert "warning: both tables" in capsys.readouterr().out

@@ -429,8 +429,8 @@ def test_the_command_builds_and_reports(session: Session, tmp_path: Path, capsys
 
 
 def test_the_command_checks(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--check", str(session.folder)]) == 0
+    assert main(["check", str(session.folder)]) == 0
     assert "the others take all frames" in capsys.readouterr().out
-    found = json_of(main, ["--check", session.folder], capsys)
-    assert (found["command"], found["format"]) == ("build-lut", "crop.report")
+    found = json_of(main, ["check", session.folder], capsys)
+    assert (found["command"], found["format"]) == ("build-lut check", "crop.report")
     assert found["figures"]

@@ -139,7 +139,7 @@ def test_the_command_says_what_it_did(
     monkeypatch.setattr("calibration.report.report.write_report", figures_alone)
     assert main([str(drifting), str(tmp_path / "lut"), "--correct-drift"]) == 0
     capsys.readouterr()
-    assert main(["--info", str(tmp_path / "lut")]) == 0
+    assert main(["info", str(tmp_path / "lut")]) == 0
     said = capsys.readouterr().out
     assert "drift" in said
     assert "drift (recorded" not in said
