@@ -183,7 +183,7 @@ def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> Fra
 
 
 def stated_origin(session: Session) -> StatedOrigin:
-    """Return what a session states; what older software did not write, or is damaged, is not known."""
+    """Return what a session states; what is lacking or damaged is not known."""
     try:
         document: dict[str, Any] = tomllib.loads(session.settings_text())
         rig: Rig | None = next((known for known in get_args(Rig) if known == document.get("rig")), None)
