@@ -228,7 +228,7 @@ def verify(
 
     Reads LUT and SESSION; writes nothing. Ends with 2 where anything has changed.
     """
-    from calibration.pipeline.baseline import frame_faults
+    from calibration.pipeline.frames import frame_faults
     from calibration.table.lut import open_lut
     from calibration.table.verification import find_faults
     from experiment.session.folder import Session
@@ -366,14 +366,11 @@ def fetch(
 
 def _vouched(lut: Lut, expect: str | None) -> str:
     """Return in words what is known of a table that was fetched."""
-    if not lut.provenance.lights_sha256:
-        return "it has no hashes, so that nobody can say whether it is as it was built"
-    covered = "every file is" if lut.provenance.has_sums else "ground truth and samples are (it is an older table)"
     if expect is not None:
-        return f"it is the table expected, and {covered} as it was built"
+        return "it is the table expected, and every file is as it was built"
     return (
-        f"{covered} as its own hashes say; that it is the table you mean shows its hash, {lut.sha256}: compare it with "
-        "the one you were told, or give that with --expect"
+        f"every file is as its own hashes say; that it is the table you mean shows its hash, {lut.sha256}: compare it "
+        "with the one you were told, or give that with --expect"
     )
 
 

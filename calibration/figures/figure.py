@@ -2,8 +2,6 @@
 
 Rules that hold inside:
 
-- A figure has no default for what it may lack: what does not apply is said (`NO_CAUSE`, `ONLY_OF_A_SESSION`). One that
-  lacks a part does not import.
 - Limits stand in the figure alone; the check and the live judge take them from there.
 - A value within `accept` is accepted; between `accept` and `refuse` it is remarked on; beyond `refuse` there is no
   table. Without `refuse` it is only ever remarked on: what it measures does not make the table wrong.
@@ -157,16 +155,6 @@ class CheckMeasurements:
     not_additive: float | None = None
 
 
-NO_PLACE: Final = None
-NO_FRAMES: Final = None
-NO_CAUSE: Final = None
-NOT_DRAWN: Final = None
-NO_LINES: Final[tuple[Line, ...]] = ()
-OF_ITS_CAUSE: Final = None
-ONLY_OF_A_SESSION: Final = None
-"""What a figure has not, said by name: a part that is left out is an error."""
-
-
 @dataclass(frozen=True)
 class Figure:
     """One figure that a table is judged by.
@@ -183,19 +171,19 @@ class Figure:
     - `remedy`: what to do about it; "" where it depends on what was found.
     - `measure`: the value; None where it could not be measured: on a chart without tags or with few colours, without
       dark frames or a series of exposures.
-    - `forecast`: the value from what a check has, where no check can know it `ONLY_OF_A_SESSION`.
+    - `forecast`: the value from what a check has, None if no check can know it.
     - `of_one_frame`: what `build-lut check` can say of it, which reads one light or white frame and a dark one: it is
       `known`; or `bounded`, since more frames can only make it worse, so that it is told where it is beyond its limit
       already; or `unknown`.
-    - `worst`: where its worst is on the report's page, whatever the verdict; else `NO_PLACE`.
-    - `where`: frames, lights or place beyond the limit accepted, for a remark; else those `OF_ITS_CAUSE`.
-    - `retake`: the frames that are beyond a limit by themselves; else `NO_FRAMES`. None where all of them are.
-    - `cause`: how its cause is found; else it explains itself, `NO_CAUSE`.
-    - `drawing`: the picture that shows it; else `NOT_DRAWN`.
-    - `lines`: its lines in the summary; else `NO_LINES`.
+    - `worst`: where its worst is on the report's page, whatever the verdict; None if it has no place.
+    - `where`: frames, lights or place beyond the limit accepted, for a remark; None for those of its cause.
+    - `retake`: the frames that are beyond a limit by themselves, None if all of them are; None for a figure that is not
+      of single frames.
+    - `cause`: how its cause is found; None if it explains itself.
+    - `drawing`: the picture that shows it; None if none does.
+    - `lines`: its lines in the summary.
     - `foremost`: whether a refusal speaks of it before others, which may follow from it.
     - `found`: what a refusal or remark adds, and the remedy, where that depends on what was found.
-    - `former_name`: its name in the reports of earlier software; "" where it is the same.
     """
 
     name: str
@@ -210,17 +198,16 @@ class Figure:
     source: str
     remedy: str
     measure: Callable[[TableMeasurements], float | None]
-    forecast: Callable[[CheckMeasurements], float | None] | None
-    of_one_frame: Literal["known", "bounded", "unknown"]
-    worst: Callable[[TableMeasurements, Chart], Worst | None] | None
-    where: Callable[[TableMeasurements, float], str] | None
-    retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None
-    cause: Explanation | None
-    drawing: Drawing | None
-    lines: tuple[Line, ...]
+    forecast: Callable[[CheckMeasurements], float | None] | None = None
+    of_one_frame: Literal["known", "bounded", "unknown"] = "unknown"
+    worst: Callable[[TableMeasurements, Chart], Worst | None] | None = None
+    where: Callable[[TableMeasurements, float], str] | None = None
+    retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None = None
+    cause: Explanation | None = None
+    drawing: Drawing | None = None
+    lines: tuple[Line, ...] = ()
     foremost: bool = False
     found: Callable[[TableMeasurements], tuple[str, str] | None] | None = None
-    former_name: str = ""
 
     def outcome(self, value: float) -> Outcome:
         """Return what a value does to a table; one that is not a number is as bad as can be."""

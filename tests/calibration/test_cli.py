@@ -18,7 +18,6 @@ from tests.json_of import json_of
 
 pytestmark = pytest.mark.slow
 
-VERSION_1 = Path(__file__).parent / "table" / "table_v1"
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -46,14 +45,6 @@ def test_info_tells_what_the_table_is(lut: Path, command: Command) -> None:
     assert f"{len(LIGHTS)}: {len(LIGHTS) - 3} uniform, 3 black bodies 2500 to 6500 K" in out
     assert "512 (3 bits a channel), 25 samples each" in out
     assert "black, half size, saturation, field, rounding" in out
-
-
-def test_info_tells_of_a_table_of_version_1(command: Command) -> None:
-    code, out, _ = command("info", VERSION_1)
-    assert code == 0
-    assert "1 of 8, 1 covered" in out
-    assert "no hash recorded" in out
-    assert "not listed" in out
 
 
 def test_a_check_tells_nothing_that_one_frame_cannot(session: Session, command: Command) -> None:
@@ -139,10 +130,9 @@ def test_a_table_and_its_entry_are_one_object(lut: Path, capsys: pytest.CaptureF
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--info", VERSION_1], "--info is a command, not an option: build-lut info"),
+        (["--info", "lut"], "--info is a command, not an option: build-lut info"),
         (["-v", "--check", "session"], "build-lut check"),
         (["--window", 4, "session", "lut"], "4 pixels"),
-        (["verify", VERSION_1], "records no hashes"),
         (["nowhere", "lut"], "nowhere is no session"),
         (["info", "nowhere"], "nowhere is no table"),
         (["compare", "a", "b"], "a is no table"),
