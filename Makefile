@@ -42,7 +42,7 @@ demo: $(DEMO_READY)
 	$(BIN)/acquire run $(DEMO)/LAB.toml $(DEMO)/session
 	$(BIN)/build-lut $(DEMO)/session $(DEMO)/lut
 	$(BIN)/python examples/photographs.py $(DEMO)/photographs
-	$(BIN)/generate $(DEMO)/lut $(DEMO)/dataset --sources $(DEMO)/photographs --illuminations 0-11 --contact-sheet $(DEMO)/contact_sheet.png
+	$(BIN)/generate $(DEMO)/lut $(DEMO)/dataset --sources $(DEMO)/photographs --light 0-11 --contact-sheet $(DEMO)/contact_sheet.png
 	$(BIN)/evaluate $(DEMO)/dataset
 	$(BIN)/evaluate cv kernel-ridge $(DEMO)/dataset
 	$(BIN)/evaluate train kernel-ridge $(DEMO)/dataset --out $(DEMO)/model.npz

@@ -55,7 +55,6 @@ MEASURED = (
     "docs/measured.md",
     "docs/paper.md",
     "docs/transfer.md",
-    "docs/how-to/describing.md",
     "docs/how-to/rendering.md",
     "docs/how-to/table-without-a-lab.md",
     "docs/how-to/transfer.md",

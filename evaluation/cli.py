@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 
 from evaluation.commands import compare as compare_command
 from evaluation.commands import cv as cv_command
-from evaluation.commands import describe as describe_command
 from evaluation.commands import paper as paper_command
-from evaluation.commands import pool as pool_command
 from evaluation.commands import run as run_command
 from evaluation.commands import train as train_command
 from evaluation.commands import transfer as transfer_command
@@ -35,9 +33,7 @@ app.add_typer(paper_command.app, name="paper", help=paper_command.HELP)
 app.command("compare", help=compare_command.HELP)(compare_command.compare)
 app.command("train", help=train_command.HELP)(train_command.train)
 app.command("cv", help=cv_command.HELP)(cv_command.cv)
-app.command("describe", help=describe_command.HELP)(describe_command.describe)
 app.command("transfer", help=transfer_command.HELP)(transfer_command.transfer)
-app.command("pool", help=pool_command.HELP)(pool_command.pool)
 app.command("tune", help=tune_command.HELP)(tune_command.tune)
 
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from calibration.table.lut import open_lut
 from foundation.colorimetry import angles_deg
 from generator.kernels.printing import NODES, SIDE, nearest_nodes
-from generator.lights.choices import parse_lights
+from generator.lights.choices import light_numbers
 from generator.lights.lighting import plain
 from generator.pictures.sources import open_picture
 from generator.rendering.colorimetric import ColorimetricRendering, source_colours
@@ -69,13 +69,13 @@ def main() -> int:
     """Print the table; return 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("lut", type=Path)
-    parser.add_argument("--lights", default="", help="numbers, as in generate --illuminations")
+    parser.add_argument("--lights", default="", help="numbers, as in generate --light")
     parser.add_argument("--every", type=int, default=50, help="or each so-maniest light, from the last")
     parser.add_argument("--picture", type=Path, nargs="*", default=[])
     given = parser.parse_args()
     lut = open_lut(given.lut)
     total = len(lut.white)
-    lights = parse_lights(given.lights, total).lights if given.lights else range(total - 1, -1, -given.every)
+    lights = light_numbers(given.lights, total) if given.lights else range(total - 1, -1, -given.every)
     shares = np.full(NODES, 1 / NODES)
     if given.picture:
         counts = [nearest_nodes(open_picture(path).picture) for path in given.picture]

@@ -1,11 +1,10 @@
 """Divide an archive of thumbnails at random: the lights of one part to generate under, the rest to test on.
 
 `python examples/halves.py nus_canon_600d_64x64.npz [FOLDER] [--names PART] [--parts N]` writes for each half H, 0 and
-1, into the folder (the working folder by default): `half_H.npz`, the images, for `evaluate describe` and `generate
---like`; `lights_H.csv` (r,g,b a line, of sum 1) for `generate --match`; and `images_H.csv` (column image) for `evaluate
-transfer --only`. A set that was made by half 0 is tested on the images of half 1 and the reverse, so that every image
-is tested once and no test light was looked at. `all.npz` holds both halves; with `--names` only images whose names
-contain PART.
+1, into the folder (the working folder by default): `half_H.npz`, the images; `lights_H.csv` (r,g,b a line, of sum 1)
+for `generate --match`; and `images_H.csv` (column image) for `evaluate transfer --only`. A set that was made by half 0
+is tested on the images of half 1 and the reverse, so that every image is tested once and no test light was looked at.
+`all.npz` holds both halves; with `--names` only images whose names contain PART.
 
 Of N parts, `others_P.npz` and `others_P.csv` are images and lights of all but part P, whose images `images_P.csv`
 names; `folds.csv` (image,fold) is for `evaluate transfer --folds`: real images beside a set are then drawn of those

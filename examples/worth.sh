@@ -10,8 +10,7 @@
 # SEEDS     of learners, training images and folds, by default 5.
 #
 # LEVERS (environment) chooses some of the renderings below, by default all. Naive rows are made for each of them, of the same
-# pictures under the same lights; NAIVE=no leaves them out, which are half of the work. DRAW=900 draws so many pictures
-# for the sets that are drawn to be like the real ones, by default as many as there are. LEARNERS names the methods; most
+# pictures under the same lights; NAIVE=no leaves them out, which are half of the work. LEARNERS names the methods; most
 # of the time is log-chroma's. REAL=0,20,100,400,all also trains beside so many real images of the other parts, in the
 # ways that BESIDE names (adapted; pooled doubles the time).
 set -euo pipefail
@@ -39,24 +38,19 @@ for camera in 600d 1ds 5dsr; do
     [ -e "$half/$camera.npz" ] || mv "$half/all.npz" "$half/$camera.npz"
     once "tables/$camera" sim table --camera "${sensitivities[$camera]}" "tables/$camera"
     for ((test = 0; test < parts[$camera]; test++)); do
-        stats=$half/stats_$test.json
-        once "$stats" evaluate describe "$half/others_$test.npz" --out "$stats"
         colorimetric=(--rendering colorimetric --matrix "${matrix[$camera]}")
-        like=(--like "$stats" --like-in pictures ${DRAW:+--draw "$DRAW"})
         sets=()
-        for lever in ${LEVERS:-codes colorimetric compensate random random-like like}; do
+        for lever in ${LEVERS:-codes colorimetric compensate random}; do
             case $lever in
                 codes) options=(--rendering codes) ;;
                 colorimetric) options=("${colorimetric[@]}") ;;
                 compensate) options=("${colorimetric[@]}" --black-point compensate) ;;
                 random) options=("${colorimetric[@]}" --black-point random) ;;
-                random-like) options=("${colorimetric[@]}" --black-point random "${like[@]}") ;;
-                like) options=("${colorimetric[@]}" --black-point like "${like[@]}") ;;
                 *) echo "no lever $lever" >&2; exit 2 ;;
             esac
             set=sets/$camera$test/$lever
             once "$set" generate "tables/$camera" "$set" --sources "$pictures" --max-side 160 --no-preview \
-                --match "$half/others_$test.csv" --outside nearest --seed 1 "${options[@]}"
+                --match "$half/others_$test.csv" --seed 1 "${options[@]}"
             sets+=(--train "$set")
         done
         naive=(--naive "$pictures" --matrix "${matrix[$camera]}")
@@ -68,4 +62,3 @@ for camera in 600d 1ds 5dsr; do
             ${REAL:+--real "$REAL" --beside "${BESIDE:-adapted}"} --out "results/$camera$test"
     done
 done
-once pool evaluate pool results/* --error recovery --out pool

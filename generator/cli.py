@@ -31,7 +31,6 @@ from generator.options import (
     CommonOptions,
     ImageOptions,
     LightOptions,
-    LikenessOptions,
     PictureOptions,
     Places,
     RenderingOptions,
@@ -89,30 +88,22 @@ def generate(
     places: Places,
     pictures: PictureOptions,
     light: LightOptions,
-    likeness: LikenessOptions,
     rendering: RenderingOptions,
     variation: VariationOptions,
     images: ImageOptions,
     work: WorkOptions,
     common: CommonOptions,
 ) -> None:
-    """Make a dataset, or one share of it; or finish or verify one that is there."""
-    _require_alone({"--verify": work.verify, "--finish": work.finish}, places.lut)
+    """Make a dataset, or one share of it; or verify one that is there."""
+    if work.verify is not None and places.lut is not None:
+        raise InputError(f"--verify does not expect {places.lut}; leave it out")
     sheet = images.contact_sheet
     if sheet is not None:
-        _check_sheet(sheet, work.verify or work.finish or places.out, work.shard, again=work.verify is None)
+        _check_sheet(sheet, work.verify or places.out, work.shard, again=work.verify is None)
     with json_output("generate", common.as_json) as output:
         if work.verify is not None:
             loaded()
             _draw_sheet(_verify(work.verify, work.workers, output), work.verify, sheet)
-        elif work.finish is not None:
-            from generator.dataset.making import finish_dataset, holds_dataset
-
-            loaded()
-            was_there = holds_dataset(work.finish)
-            dataset = finish_dataset(work.finish)
-            _print_summary(dataset, work.finish, output, was_there)
-            _draw_sheet(dataset, work.finish, sheet)
         else:
             if places.lut is None or places.out is None:
                 raise InputError(_missing_place(places.lut))
@@ -125,7 +116,7 @@ def generate(
 
             loaded()
             workers = work.makers()
-            plan = _plan(places.lut, places.out, pictures, light, likeness, rendering, variation, images, work)
+            plan = _plan(places.lut, places.out, pictures, light, rendering, variation, images, work)
             there = made_before(plan, places.out)
             if there is not None:
                 _print_summary(there, places.out, output, was_there=True)
@@ -149,9 +140,6 @@ def explore(
             show_default=False,
         ),
     ] = None,
-    max_side: Annotated[
-        int, typer.Option(metavar="PX", help="Make larger pictures this small.", min=16, max=4000)
-    ] = 1000,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8708,
     host: Annotated[
         str,
@@ -167,13 +155,13 @@ def explore(
     dropped onto the page stays in memory. With --host the address holds a token, new at each start.
     """
     from calibration.table.lut import open_lut
-    from generator.explore.explorer import Explorer, ExploreServer, sample_folder
+    from generator.explore.explorer import MAX_SIDE, Explorer, ExploreServer, sample_folder
     from generator.pictures.sources import Preparation, find_pictures
 
     loaded()
     table = open_lut(table_folder(lut))
-    found = find_pictures(sources or [str(sample_folder())], Preparation(max_side=max_side))
-    with ExploreServer(Explorer(str(lut), table, found, max_side), host, port) as server:
+    found = find_pictures(sources or [str(sample_folder())], Preparation(max_side=MAX_SIDE))
+    with ExploreServer(Explorer(str(lut), table, found), host, port) as server:
         server.serve(str(lut), "can look at the table and the pictures, and send pictures of their own")
 
 
@@ -193,21 +181,11 @@ def _missing_place(given: Path | None) -> str:
     return f"{what} missing; write generate {lut} {out} --sources DIR{help_for}"
 
 
-def _require_alone(commands: dict[str, str | None], more: Path | None) -> None:
-    """Refuse a second command beside one that needs its place only, and a table or place that it would ignore."""
-    given = [name for name, place in commands.items() if place is not None]
-    if len(given) > 1:
-        raise InputError(f"{' and '.join(given)} are two commands; give one of them")
-    if given and more is not None:
-        raise InputError(f"{given[0]} does not expect {more}; leave it out")
-
-
 def _plan(
     lut: Path,
     out: str,
     pictures: PictureOptions,
     light: LightOptions,
-    likeness: LikenessOptions,
     rendering: RenderingOptions,
     variation: VariationOptions,
     images: ImageOptions,
@@ -216,18 +194,16 @@ def _plan(
     """Return the plan of a dataset whose place is free, or holds a dataset, which may be the one planned."""
     from calibration.table.lut import open_lut
     from generator.dataset.making import begun_rendering, holds_dataset, require_free_place
-    from generator.dataset.plan import DatasetOptions, Plan
+    from generator.dataset.plan import Plan
 
     if not holds_dataset(out):
         require_free_place(out)
     table = open_lut(table_folder(lut))
     begun = None if rendering.rendering else begun_rendering(out)
-    rendered = rendering.of(DatasetOptions(bits=images.bits), table, begun)
-    chosen = choose(table, likeness, pictures, light, variation, rendered, images.seed, processor_count())
+    chosen = choose(table, pictures, light, images.seed)
     for line in chosen.lines:
         print(line)
-    varied = variation.variation(table, chosen.exposure)
-    options = images.dataset_options(work.shard_images, chosen.reading, varied, chosen.crops, chosen.weighted)
+    options = images.dataset_options(work.shard_images, chosen.reading, variation.variation(table), chosen.crops)
     plan = Plan(table, chosen.sources, chosen.choice, images.seed, rendering.of(options, table, begun))
     if plan.options.matrix is not None:
         print(matrix_sentence(plan.options.matrix, table.provenance.camera, chosen=rendering.matrix is not None))
@@ -251,7 +227,7 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers, output: Json
     with orderly_end(), shown_progress(sum(map(plan.images_of, shards))) as callbacks:
         done, every = make_share(plan, out, share, workers, callbacks)
     output.add(dataset=masked(out), shard=shard, shards_done=done, shards=every)
-    finish = f"make a dataset of them with generate --finish {out}"
+    finish = "run the same command without --shard to make a dataset of them"
     left = finish if done == every else "others are still to be made"
     print(masked(f"{done} of {every} shards of {out} are done; {left}"))
 
@@ -357,7 +333,7 @@ def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None, again:
 
     if shard is not None:
         raise InputError(
-            "one share of a dataset has no contact sheet; ask for it with --finish OUT --contact-sheet PATH"
+            "one share of a dataset has no contact sheet; ask for it when all shares are done, without --shard"
         )
     if out and not is_remote(out) and contact_sheet.absolute().is_relative_to(local_path(out).absolute()):
         raise InputError(

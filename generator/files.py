@@ -88,24 +88,6 @@ FULL: Final = 65535
 """Largest number of 16 bits, which saturation becomes."""
 
 
-def to_full_scale(image: Image, white_level: int) -> Image:
-    """Return counts (...) uint16 stretched so that saturation is 65535; what is above the white level is cut at it.
-
-    A raw image of 0 … 11 536 looks nearly black to a program that takes the largest number of a type for white. With
-    white level w a count v becomes ⌊65535 v / w⌉, which grows by more than 1 from count to count, so that no two become
-    the same, and ⌊w s / 65535⌉ is v again: nothing is lost.
-    """
-    white = np.uint32(white_level)
-    counts = np.minimum(image, np.uint16(white_level)).astype(np.uint32)
-    return ((counts * np.uint32(FULL) + white // np.uint32(2)) // white).astype(np.uint16)
-
-
-def from_full_scale(image: Image, white_level: int) -> Image:
-    """Return the counts (...) uint16 that `to_full_scale` stretched."""
-    stretched = image.astype(np.uint32) * np.uint32(white_level)
-    return ((stretched + np.uint32(FULL // 2)) // np.uint32(FULL)).astype(np.uint16)
-
-
 SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 """The first bytes of every PNG file (clause 5.2)."""
 TALLEST: Final = (1 << 31) - 1
@@ -469,8 +451,6 @@ class FileFormat:
     - `media`: its media type; those of OpenEXR and DNG are not registered with IANA.
     - `libraries`: distributions that encode it, or for a raw file name its colour matrix: their versions may change the
       bytes of a file. None if CroP encodes it.
-    - `states_white`: whether it has a place for the white level that readers use; counts of the others may be stretched
-      over 16 bits.
     - `smallest_side`: least width and height, px.
     """
 
@@ -478,16 +458,13 @@ class FileFormat:
     decode: Callable[[bytes, str], npt.NDArray[np.generic]]
     media: str
     libraries: tuple[str, ...] = ()
-    states_white: bool = False
     smallest_side: int = 1
 
 
 FILE_FORMATS: Final[Mapping[Format, FileFormat]] = {
     "png": FileFormat(png_pieces, lambda data, _: decode_png(data), "image/png"),
     "tiff": FileFormat(_whole(encode_tiff), lambda data, _: decode_tiff(data), "image/tiff"),
-    "exr": FileFormat(
-        _whole(encode_exr), lambda data, _: decode_exr(data), "image/x-exr", libraries=("isal",), states_white=True
-    ),
+    "exr": FileFormat(_whole(encode_exr), lambda data, _: decode_exr(data), "image/x-exr", libraries=("isal",)),
     "jxl": FileFormat(
         lambda image, _: (encode_jxl(image),),
         lambda data, _: decode_jxl(data),
@@ -499,7 +476,6 @@ FILE_FORMATS: Final[Mapping[Format, FileFormat]] = {
         lambda data, name: half_size(decode_raw(data, Path(name)).counts),
         "image/x-adobe-dng",
         libraries=("rawpy",),
-        states_white=True,
         smallest_side=SMALLEST_SIDE,
     ),
 }

@@ -1,37 +1,32 @@
-"""The options of the command `generate`: a frozen dataclass for each panel of its help, and what they come to.
+"""The options of the command `generate`: a frozen dataclass for each panel of its help, and the values they give.
 
-The last of them make a dataset like a real one, or like another camera's. Libraries that take long to load are imported
-when a group makes something of its options.
+Libraries that take long to load are imported when a group makes something of its options.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from foundation.compiled import processor_count
-from foundation.console import AsJson, option, progress
+from foundation.console import AsJson, option
 from foundation.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from calibration.table.lut import Lut
     from generator.dataset.making import Workers
     from generator.dataset.plan import DatasetOptions
+    from generator.dataset.records import Description
     from generator.lights.lighting import LightChoice
-    from generator.likeness.real_data import BlackShares, DrawnPictures
     from generator.pictures.sources import Preparation, Source
     from generator.rendering import Rendering
-    from generator.statistics import RealStatistics
-    from generator.variation.variation import ExposureChoice, Variation
+    from generator.variation.variation import Variation
 
 
 _source_option = partial(option, panel="Source pictures")
@@ -68,61 +63,64 @@ class PictureOptions:
             "knows; may be repeated.",
         ),
     ] = None
-    random_scenes: Annotated[int, _source_option("N", "Add N pictures of uniformly random colours.", min=0)] = 0
-    size: Annotated[str, _source_option("WxH", "Size of the random pictures, px.")] = "512x512"
+    random_scenes: Annotated[
+        str | None,
+        _source_option("N", "Add N pictures of uniformly random colours, 512x512 px; of another size as N:WxH."),
+    ] = None
     max_side: Annotated[int | None, _source_option("PX", "Make larger pictures this small first.", min=1)] = None
-    crop: Annotated[str | None, _source_option("WxH", "Cut pictures to this size; smaller ones are left out.")] = None
-    cover: Annotated[
-        bool,
-        _source_option(None, "Make pictures as small as still covers the crop before they are cut.", "--cover"),
-    ] = False
-    crop_at: Annotated[
-        Literal["centre", "random"] | None,
+    crop: Annotated[
+        str | None,
         _source_option(
-            None,
-            "Where to cut; random is chosen by the seed. Of several crops the first. \\[default: centre; random with "
-            "--crops]",
+            "WxH",
+            "Cut pictures to this size; smaller ones are left out. WxH,cover first makes pictures as small as still "
+            "covers the crop. One crop is cut from the centre, or with WxH,random from a place that the seed chooses.",
         ),
     ] = None
     crops: Annotated[
         int,
-        _source_option(
-            "N",
-            "Cut N different crops of each picture, the first where --crop-at says, the others at random places far "
-            "from it and from each other.",
-            min=1,
-        ),
+        _source_option("N", "Cut N different crops of each picture, at random places far from each other.", min=1),
     ] = 1
-    profiles: Annotated[
-        Literal["honour", "ignore"],
-        _source_option(
-            None, "Convert pictures with another colour profile to sRGB, or take their codes as they stand."
-        ),
-    ] = "honour"
 
     def preparation(self, seed: int) -> Preparation:
-        """Return what is done to each picture; an InputError says which option cannot be used."""
+        """Return what is done to each picture; an InputError names the option that cannot be used."""
         from generator.pictures.sources import Preparation
 
-        crop = None if self.crop is None else _size(self.crop, "--crop")
-        return Preparation(self.max_side, crop, self.cover, self.crop_at, self.profiles, seed, self.crops)
+        if self.crop is None:
+            return Preparation(self.max_side, seed=seed, crops=self.crops)
+        size, *words = self.crop.split(",")
+        unknown = [word for word in words if word not in ("cover", "random")]
+        if unknown:
+            raise InputError(f"--crop {self.crop} has {unknown[0]!r}, expected cover or random behind the size")
+        return Preparation(
+            self.max_side,
+            _size(size, "--crop"),
+            cover="cover" in words,
+            crop_at="random" if "random" in words else None,
+            seed=seed,
+            crops=self.crops,
+        )
 
-    def find(self, seed: int) -> tuple[Source, ...]:
+    def find(self, preparation: Preparation) -> tuple[Source, ...]:
         """Return the sources: pictures that are found, then random ones."""
         from generator.pictures.random_scenes import random_scenes
         from generator.pictures.sources import find_pictures
 
-        preparation = self.preparation(seed)
         places = self.sources or []
         if not places and (preparation.crop or preparation.max_side):
             raise InputError(
-                "--crop, --crops and --max-side are for pictures, and --sources names none; random ones have --size"
+                "--crop, --crops and --max-side are for pictures, and --sources names none; random ones have a size, "
+                "as in --random-scenes 8:256x256"
             )
         found: tuple[Source, ...] = find_pictures(places, preparation)
-        if self.random_scenes and self.crops > 1:
-            raise InputError("--crops is for pictures; leave --random-scenes out, or make a dataset of them alone")
-        if self.random_scenes:
-            found += random_scenes(self.random_scenes, *_size(self.size, "--size"), seed)
+        if self.random_scenes is not None:
+            if preparation.crops > 1:
+                raise InputError("--crops is for pictures; leave --random-scenes out, or make a dataset of them alone")
+            number, _, size = self.random_scenes.partition(":")
+            if not re.fullmatch(r"[1-9]\d{0,8}", number, re.ASCII):
+                raise InputError(
+                    f"--random-scenes is {self.random_scenes!r}, expected a number such as 8, or 8:256x256"
+                )
+            found += random_scenes(int(number), *_size(size or "512x512", "--random-scenes"), preparation.seed)
         if not found:
             raise InputError("there is no source picture; name some with --sources or ask for --random-scenes")
         return found
@@ -132,15 +130,13 @@ class PictureOptions:
 class LightOptions:
     """Which lights fall on which picture, and where."""
 
-    illuminations: Annotated[str | None, _light_option("LIST", "These lights for every picture: 0,5,12-20 or all.")] = (
-        None
-    )
     light: Annotated[
         list[str] | None,
         _light_option(
             "LIGHT",
-            "A light for every picture, mixed of the table's: 12, 12:0.25+40:0.75, 5600K, a name such as D65 where "
-            "the table's lights have names, or a chromaticity r=.3,b=.25; may be repeated.",
+            "A light for every picture: numbers of the table's, 0,5,12-20 or all; a mixture of them, 12:0.25+40:0.75; "
+            "5600K; a name such as D65 where the table's lights have names; or a chromaticity r=.3,b=.25. May be "
+            "repeated.",
         ),
     ] = None
     random: Annotated[
@@ -168,21 +164,23 @@ class LightOptions:
         ),
     ] = None
     match: Annotated[
-        Path | None, _light_option("GT.csv", "The same with a mixture of lights that matches the ground truth.")
-    ] = None
-    lights_by_name: Annotated[
         Path | None,
         _light_option(
-            "FILE.csv",
-            "For each picture the light that this file gives for its name (columns source or name, and r,g,b), matched "
-            "by a mixture; several rows of a name are several images.",
+            "GT.csv",
+            "The same with a mixture of lights that matches the ground truth; where the table cannot make it, with the "
+            "nearest that it can.",
         ),
     ] = None
-    outside: Annotated[
-        Literal["refuse", "nearest"], _light_option(None, "What to do about lights that the table cannot make.")
-    ] = "refuse"
     lights_per_image: Annotated[
         int | None, _light_option("K", "Let K lights fall on each image. \\[default: 1; 2 with --masks]")
+    ] = None
+    lights_of: Annotated[
+        str | None,
+        _light_option(
+            "DATASET",
+            "Make the scenes of this dataset under the same lights for another camera, whose table LUT has the same "
+            "lights; --sources names the same pictures, which are prepared in the same way.",
+        ),
     ] = None
     masks: Annotated[
         str | None,
@@ -194,8 +192,8 @@ class LightOptions:
         ),
     ] = None
 
-    def choose(self, lut: Lut, seed: int, names: Sequence[str] = (), crops: int = 1) -> LightChoice:
-        """Return the choice of lights for pictures of these names; an InputError says which option cannot be used."""
+    def choose(self, lut: Lut, seed: int) -> LightChoice:
+        """Return the choice of lights; an InputError names the option that cannot be used."""
         from generator.lights.choices import SimultaneousLights
         from generator.masks.making import parse_masks
 
@@ -207,25 +205,22 @@ class LightOptions:
                 f"--masks {self.masks} says where several lights fall, but each image has one; ask for more with "
                 "--lights-per-image"
             )
-        choice = self._lights(lut, seed, together, names, crops)
+        choice = self._lights(lut, seed, together)
         if together == 1:
             return choice
         return SimultaneousLights(choice, together, parse_masks(self.masks or "smooth", together, seed))
 
-    def _lights(self, lut: Lut, seed: int, together: int, names: Sequence[str], crops: int) -> LightChoice:
+    def _lights(self, lut: Lut, seed: int, together: int) -> LightChoice:
         """Return the choice of lights with as many for each picture as its images have together."""
         from generator.lights import choices
         from generator.lights.distributions import load_ground_truths, parse_distribution
         from generator.lights.gamut import Gamut
-        from generator.lights.lighting import ListedLights, RandomLights
-        from generator.lights.named_lights import load_named_truths, named_lights
+        from generator.lights.lighting import RandomLights
 
         ways = {
-            "--illuminations": self.illuminations is not None,
             "--light": bool(self.light),
             "--nearest": self.nearest is not None,
             "--match": self.match is not None,
-            "--lights-by-name": self.lights_by_name is not None,
             "--distribution": self.distribution is not None,
             "--random": self.random is not None and self.distribution is None,
         }
@@ -235,19 +230,12 @@ class LightOptions:
                 f"{' and '.join(given)} were both given; give one of them (only --random may go with --distribution)"
             )
         count = together * (1 if self.random is None else self.random)
-        if self.illuminations is not None:
-            return choices.parse_lights(self.illuminations, len(lut.white))
         if self.light:
-            gamut = Gamut.of(lut)
-            return ListedLights(tuple(choices.parse_light(text, lut, gamut, self.outside) for text in self.light))
+            return choices.parse_lights(self.light, lut)
         if self.nearest is not None:
             return choices.nearest_lights(lut, load_ground_truths(self.nearest), self.nearest.name, together)
         if self.match is not None:
-            truths = load_ground_truths(self.match)
-            return choices.matched_lights(Gamut.of(lut), truths, self.match.name, together, self.outside)
-        if self.lights_by_name is not None:
-            truths_by_name, file = load_named_truths(self.lights_by_name), self.lights_by_name.name
-            return named_lights(Gamut.of(lut), truths_by_name, names, file, self.outside, crops)
+            return choices.matched_lights(Gamut.of(lut), load_ground_truths(self.match), self.match.name, together)
         if self.distribution is not None:
             return choices.DrawnLights(Gamut.of(lut), parse_distribution(self.distribution), count, seed)
         return RandomLights(count, len(lut.white), seed)
@@ -282,33 +270,6 @@ class ImageOptions:
             "a hash of each picture, so that parts have these sizes on average.",
         ),
     ] = None
-    exact_split: Annotated[
-        bool,
-        _image_option(
-            None,
-            "With --split, parts of exactly these sizes, such as 700,200,100 of 1000 pictures; copies of a "
-            "picture stay in one part.",
-            "--exact-split",
-        ),
-    ] = False
-    bits: Annotated[
-        int | None,
-        _image_option(
-            "N",
-            "Keep N bits of each code of the pictures and set the others to zero before they are printed. "
-            "\\[default: those of the table]",
-            min=1,
-            max=8,
-        ),
-    ] = None
-    scale: Annotated[
-        Literal["table", "full"],
-        _image_option(
-            None,
-            "Store the camera's counts, which most programs show nearly black; or stretch them over 16 bits, which our "
-            "readers undo (PNG, TIFF and JPEG XL).",
-        ),
-    ] = "table"
     preview: Annotated[bool, _image_option(None, "Write tone-mapped previews.")] = True
     uncertainty: Annotated[
         bool,
@@ -324,14 +285,9 @@ class ImageOptions:
     ] = None
 
     def dataset_options(
-        self,
-        shard_images: int,
-        reading: Mapping[str, Any],
-        variation: Variation | None,
-        crops: int,
-        weighted: bool = False,
+        self, shard_images: int, reading: Mapping[str, Any], variation: Variation | None, crops: int
     ) -> DatasetOptions:
-        """Return what the dataset is to be; an InputError says which option cannot be used."""
+        """Return the options of the dataset; an InputError names the option that cannot be used."""
         from generator.dataset.plan import DatasetOptions, parse_split
 
         return DatasetOptions(
@@ -339,15 +295,11 @@ class ImageOptions:
             layout=self.layout,
             previews=self.preview,
             split=None if self.split is None else parse_split(self.split),
-            split_exact=self.exact_split,
-            bits=self.bits,
-            scale=self.scale,
             uncertainty=self.uncertainty,
             shard_images=shard_images,
             variation=variation,
             crops=crops,
             reading=reading,
-            weighted=weighted,
         )
 
 
@@ -376,9 +328,8 @@ class RenderingOptions:
         str,
         _image_option(
             "WHAT",
-            "The print's own black: keep it, compensate for it (take it out), take out a random share of it of each "
-            "image, random or random:MAX, or, with --like, of each picture the share that makes shadows like the real "
-            "ones, like. The ground truth stays.",
+            "The print's own black: keep it, compensate for it (take it out), or take out a random share of it of each "
+            "image, random or random:MAX. The ground truth stays.",
         ),
     ] = "keep"
 
@@ -429,12 +380,12 @@ class VariationOptions:
         ),
     ] = None
 
-    def variation(self, lut: Lut, like: ExposureChoice | None = None) -> Variation | None:
-        """Return the variation of images of a table, exposed like a data set unless an option says how, or None."""
+    def variation(self, lut: Lut) -> Variation | None:
+        """Return the variation of images of a table, or None."""
         from generator.variation.iso_speed import known_of_table, parse_iso
         from generator.variation.variation import parse_exposure, parse_gradient, varied_by
 
-        exposure = like if self.exposure is None else parse_exposure(self.exposure)
+        exposure = None if self.exposure is None else parse_exposure(self.exposure)
         gradient = None if self.gradient is None else parse_gradient(self.gradient)
         iso = None if self.iso is None else parse_iso(self.iso, *known_of_table(lut))
         if exposure is None and gradient is None and iso is None:
@@ -462,13 +413,10 @@ class WorkOptions:
     ] = 256
     shard: Annotated[
         str | None,
-        _work_option("I/N", "Make share I of N only, I from 0, beside other programs that make theirs; then --finish."),
-    ] = None
-    finish: Annotated[
-        str | None,
         _work_option(
-            "OUT",
-            "Make the dataset OUT of its shards when all shares are done; no other argument is needed.",
+            "I/N",
+            "Make share I of N only, I from 0, beside other programs that make theirs; then run the command without "
+            "it.",
         ),
     ] = None
     verify: Annotated[
@@ -500,314 +448,78 @@ def _size(text: str, name: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-_likeness_option = partial(option, panel="Likeness")
-
-PARTS: Final = ("lights", "pictures", "exposure", "size")
-"""What of a real data set can be followed."""
-
-
-@dataclass(frozen=True)
-class LikenessOptions:
-    """What the dataset is to be like."""
-
-    like: Annotated[
-        Path | None,
-        _likeness_option(
-            "STATS.json",
-            "Make the dataset like the real one that evaluate describe --out wrote this of: lights drawn from a "
-            "density of its lights, pictures drawn by weights that bring luminance, chroma and grey-world offsets to "
-            "its own, exposures drawn from its exposures, and images cut to its most frequent size. Prints how far "
-            "that went.",
-        ),
-    ] = None
-    like_in: Annotated[
-        str | None,
-        _likeness_option(
-            "LIST",
-            "In which of lights,pictures,exposure,size. \\[default: in all that no other option says]",
-        ),
-    ] = None
-    draw: Annotated[
-        int | None,
-        _likeness_option("N", "Draw N pictures, some several times. \\[default: as many as are found]", min=1),
-    ] = None
-    lights_of: Annotated[
-        str | None,
-        _likeness_option(
-            "DATASET",
-            "Make the scenes of this dataset under the same lights for another camera, whose table LUT has the same "
-            "lights; --sources names the same pictures, which are prepared in the same way.",
-        ),
-    ] = None
-
-
 @dataclass(frozen=True)
 class Chosen:
-    """Sources and lights of a dataset, and what is recorded and printed of how they were chosen.
+    """Sources and lights of a dataset.
 
     - `sources`, `choice`: the sources and the lights.
     - `reading`: how sources were read, as plain values.
-    - `lines`: lines to print.
+    - `lines`: lines to print about the choice.
     - `crops`: crops of each picture.
-    - `weighted`: whether sources were drawn by weights.
-    - `exposure`: how images are exposed; None as the table.
     """
 
     sources: tuple[Source, ...]
     choice: LightChoice
     reading: Mapping[str, Any]
-    lines: tuple[str, ...] = ()
-    crops: int = 1
-    weighted: bool = False
-    exposure: ExposureChoice | None = None
+    lines: tuple[str, ...]
+    crops: int
 
 
-def choose(
-    lut: Lut,
-    likeness: LikenessOptions,
-    pictures: PictureOptions,
-    light: LightOptions,
-    variation: VariationOptions,
-    rendered: DatasetOptions,
-    seed: int,
-    workers: int,
-) -> Chosen:
+def choose(lut: Lut, pictures: PictureOptions, light: LightOptions, seed: int) -> Chosen:
     """Return the sources and lights that the options ask for."""
-    parts = [] if likeness.like is None else _parts(likeness, pictures, light, variation)
-    if rendered.black_point.kind == "like" and "pictures" not in parts:
-        raise InputError(
-            "--black-point like draws pictures with the shadows of real images; give --like STATS.json, with pictures "
-            "in --like-in if that is given, or another black point"
-        )
-    if likeness.lights_of is not None:
-        if likeness.like is not None:
-            raise InputError("--like and --lights-of were both given; the second takes pictures and lights as they are")
-        _refuse_more(likeness)
-        return _same_scenes(lut, likeness.lights_of, pictures, light)
-    if likeness.like is None:
-        _refuse_more(likeness)
-        sources = pictures.find(seed)
-        choice = light.choose(lut, seed, [source.name for source in sources], pictures.crops)
-        return Chosen(sources, choice, pictures.preparation(seed).describe(), crops=pictures.crops)
-    return _like(lut, likeness, likeness.like, parts, pictures, light, rendered, seed, workers)
+    from generator.lights.choices import light_notes
 
-
-def _refuse_more(likeness: LikenessOptions) -> None:
-    """Refuse what says more of `--like`, which is not given."""
-    for name, given in (("--like-in", likeness.like_in), ("--draw", likeness.draw)):
-        if given is not None:
-            raise InputError(f"{name} {given} says what --like is to do; give --like STATS.json, or leave it out")
-
-
-def _like(
-    lut: Lut,
-    likeness: LikenessOptions,
-    path: Path,
-    parts: list[str],
-    pictures: PictureOptions,
-    light: LightOptions,
-    rendered: DatasetOptions,
-    seed: int,
-    workers: int,
-) -> Chosen:
-    from generator.likeness.real_data import (
-        cautions,
-        drawn_sources,
-        exposure_sentence,
-        light_caution,
-        like_exposure,
-        like_size,
-        remedies,
-    )
-    from generator.statistics import read_statistics
-
-    target = read_statistics(path)
-    record: dict[str, Any] = {
-        "file": target.file,
-        "sha256": target.sha256,
-        "data": target.name,
-        "images": target.images,
-        "in": parts,
-    }
-    lines = cautions(target)
-    if "size" in parts:
-        size = like_size(target, pictures.find(seed))
-        if size is None:
-            lines.append(f"size: {target.name} is of thumbnails, whose size is not followed; pictures keep theirs")
-        else:
-            pictures = replace(pictures, crop=f"{size.width}x{size.height}", cover=True)
-            record["size"] = size.describe()
-            lines.append(size.sentence())
-    if "lights" in parts:
-        light = replace(light, distribution=str(path))
-        record["lights"], sentence = _lights_within(lut, target)
-        lines.append(sentence)
-    exposure = None
-    if "exposure" in parts:
-        exposure = like_exposure(target)
-        if exposure is None and likeness.like_in is not None:
-            raise InputError(
-                f"{target.file} knows no exposure, since the saturation of {target.name} was not known; describe it "
-                "with --saturation, or leave exposure out of --like-in"
-            )
-        lines.append(exposure_sentence(target))
-    sources = pictures.find(seed)
-    if "pictures" in parts:
-        drawn = _drawn(lut, target, sources, rendered, likeness.draw, seed, workers)
-        sources = drawn_sources(sources, drawn)
-        record["pictures"] = drawn.describe()
-        lines += [*drawn.sentences(), *remedies(drawn, rendered), light_caution(lut, target)]
-    choice = light.choose(lut, seed, [source.name for source in sources], pictures.crops)
-    reading = {**pictures.preparation(seed).describe(), "like": record}
-    return Chosen(sources, choice, reading, tuple(lines), pictures.crops, "pictures" in parts, exposure)
-
-
-def _parts(
-    likeness: LikenessOptions, pictures: PictureOptions, light: LightOptions, variation: VariationOptions
-) -> list[str]:
-    """Return in what the dataset is to be like the real one."""
-    said = {
-        "lights": [
-            name
-            for name, given in (
-                ("--illuminations", light.illuminations),
-                ("--light", light.light),
-                ("--distribution", light.distribution),
-                ("--nearest", light.nearest),
-                ("--match", light.match),
-                ("--lights-by-name", light.lights_by_name),
-            )
-            if given
-        ],
-        "pictures": [],
-        "exposure": [] if variation.exposure is None else ["--exposure"],
-        "size": [name for name, given in (("--crop", pictures.crop), ("--max-side", pictures.max_side)) if given],
-    }
-    if likeness.like_in is None:
-        parts = [part for part in PARTS if not said[part]]
-    else:
-        parts = list(dict.fromkeys(part.strip() for part in likeness.like_in.split(",")))
-        for part in parts:
-            if part not in PARTS:
-                raise InputError(f"--like-in has {part!r}, expected some of {','.join(PARTS)}")
-            if said[part]:
-                raise InputError(f"{' and '.join(said[part])} says the {part}, and so does --like; leave one out")
-    if likeness.draw is not None and "pictures" not in parts:
-        raise InputError(f"--draw {likeness.draw} is for pictures, in which --like-in does not follow the real data")
-    return parts
-
-
-def _lights_within(lut: Lut, target: RealStatistics) -> tuple[dict[str, Any], str]:
-    """Return how many of the target's lights a table can make, as a record and a sentence."""
-    from generator.lights.gamut import TOLERANCE_DEG, Gamut
-
-    gamut = Gamut.of(lut)
-    # A light of the very table lies at its edge, and beyond by what a file rounds.
-    beyond = target.lights[~gamut.contains(target.lights)]
-    outside = sum(gamut.match(light, "nearest").angle > TOLERANCE_DEG for light in beyond) / len(target.lights)
-    sentence = (
-        f"lights: {outside:.1%} of the {len(target.lights)} of {target.name} lie outside what {lut.folder} can make"
-    )
-    if outside:
-        sentence += "; others are drawn for them"
-    return {"count": len(target.lights), "outside": float(f"{outside:.6g}")}, sentence
-
-
-def _drawn(
-    lut: Lut,
-    target: RealStatistics,
-    sources: tuple[Source, ...],
-    rendered: DatasetOptions,
-    count: int | None,
-    seed: int,
-    workers: int,
-) -> DrawnPictures:
-    """Return which pictures are drawn by what they look like under the light nearest to the target's."""
-    from generator.likeness.real_data import draw_pictures, measure_pictures, reference_light
-    from generator.rendering.black_points import KEEP
-
-    reference = reference_light(lut, target.lights)
-    black = None
-    if rendered.black_point.kind == "like":
-        black = _black_under(lut, reference, rendered)
-        rendered = replace(rendered, black_point=KEEP)
-    photograph = partial(_photograph, lut, reference, rendered, seed)
-    with progress("pictures") as shown:
-        measured = measure_pictures(sources, photograph, lut.white[reference], target.cells, workers, shown, black)
-    return draw_pictures(measured, target, count, seed)
-
-
-def _black_under(lut: Lut, light: int, rendered: DatasetOptions) -> BlackShares:
-    """Return the print's black under a light of the table; a QualityError where it is as bright as half of white."""
-    from generator.dataset.shards import rendering_of
-    from generator.lights.lighting import plain
-    from generator.likeness.real_data import BlackShares
-    from generator.rendering.black_points import veil_of
-
-    grey = None
-    if rendered.rendering == "colorimetric":
-        grey = rendering_of(lut, rendered).black(plain(light))
-    red, green, blue = veil_of(lut, plain(light), 1.0, grey).taken.tolist()
-    return BlackShares((red, green, blue))
-
-
-def _photograph(
-    lut: Lut, light: int, rendered: DatasetOptions, seed: int, picture: npt.NDArray[np.uint8], number: int
-) -> npt.NDArray[np.uint16]:
-    """Return the raw image of a picture as the dataset renders it, under one of the table's lights."""
-    from generator.dataset.shards import photograph
-    from generator.kernels.unfit import replace_unfit_colours
-    from generator.lights.lighting import Lighting, plain
-    from generator.pictures.sources import keep_bits
-
-    picture = keep_bits(picture, rendered.bits)
-    if rendered.rendering == "codes":
-        picture, _ = replace_unfit_colours(picture, lut.provenance)
-    white_level = lut.provenance.white_level
-    return photograph(lut, picture, Lighting((plain(light),)), rendered, seed, number, white_level)[0]
+    if light.lights_of is not None:
+        return _same_scenes(lut, light.lights_of, pictures, light)
+    preparation = pictures.preparation(seed)
+    sources = pictures.find(preparation)
+    choice = light.choose(lut, seed)
+    return Chosen(sources, choice, preparation.describe(), light_notes(choice), preparation.crops)
 
 
 def _same_scenes(lut: Lut, place: str, pictures: PictureOptions, light: LightOptions) -> Chosen:
     """Return the scenes of another dataset, under its lights."""
-    from generator.likeness.same_lights import lights_of, open_scenes, scenes_of
+    from generator.dataset.reader import open_dataset
+    from generator.dataset.same_lights import lights_of, scenes_of
 
-    if light != LightOptions():
-        raise InputError(f"--lights-of {place} says the lights, and so does another option; leave one out")
-    dataset = open_scenes(place)
-    prepared = _prepared_as(pictures, dataset.description.options, place)
-    seed = dataset.description.seed
-    found = prepared.find(seed) if prepared.sources else ()
+    if replace(light, lights_of=None) != LightOptions():
+        raise InputError(f"--lights-of {place} gives the lights, and so does another option; leave one out")
+    dataset = open_dataset(place)
+    preparation = _prepared_as(pictures, dataset.description, place)
+    found = pictures.find(preparation) if pictures.sources else ()
     sources = scenes_of(dataset, found)
-    reading = {**prepared.preparation(seed).describe(), "lights_of": {"pictures_seed": seed}}
-    lines = [
-        f"{place} was made with {name.replace('_', ' ')}; here it is what the options say"
+    reading = {**preparation.describe(), "lights_of": {"pictures_seed": preparation.seed}}
+    lines = tuple(
+        f"{place} was made with {name.replace('_', ' ')}; here the options decide"
         for name in ("variation", "rendering", "black_point")
         if name in dataset.description.options
-    ]
-    return Chosen(sources, lights_of(dataset, lut), reading, tuple(lines), prepared.crops)
+    )
+    return Chosen(sources, lights_of(dataset, lut), reading, lines, preparation.crops)
 
 
-def _prepared_as(pictures: PictureOptions, made: Mapping[str, Any], place: str) -> PictureOptions:
-    """Return the options of pictures as a dataset was made with; an InputError if others are given."""
+def _prepared_as(pictures: PictureOptions, made: Description, place: str) -> Preparation:
+    """Return the preparation of a dataset's pictures; an InputError if the options give another one."""
+    from generator.pictures.sources import Preparation
+
     if pictures.random_scenes:
         raise InputError(
-            f"--lights-of {place} says the pictures; leave --random-scenes out, those of it are made again"
+            f"--lights-of {place} gives the pictures; leave --random-scenes out, those of it are made again"
         )
-    crop = made.get("crop")
-    wanted: dict[str, Any] = {
-        "max_side": made.get("max_side"),
-        "crop": None if crop is None else "{}x{}".format(*crop),
-        "cover": bool(made.get("cover", False)),
-        "crop_at": made.get("crop_at"),
-        "profiles": made.get("profiles", "honour"),
-        "crops": int(made.get("crops", 1)),
-    }
-    plain = PictureOptions()
-    for name, value in wanted.items():
-        given = getattr(pictures, name)
-        if given not in (value, getattr(plain, name)):
-            raise InputError(
-                f"--{name.replace('_', '-')} is {given}, where {place} was made with {value}; leave it out, pictures "
-                "are prepared as there"
-            )
-    return replace(pictures, **wanted)
+    options = made.options
+    crop = options.get("crop")
+    prepared = Preparation(
+        max_side=options.get("max_side"),
+        crop=None if crop is None else (crop[0], crop[1]),
+        cover=bool(options.get("cover", False)),
+        crop_at=options.get("crop_at"),
+        profiles=options.get("profiles", "honour"),
+        seed=made.seed,
+        crops=int(options.get("crops", 1)),
+    )
+    given = pictures.preparation(made.seed)
+    if given.describe() not in (prepared.describe(), Preparation().describe()):
+        raise InputError(
+            f"--max-side, --crop and --crops prepare pictures in another way than those of {place}; leave them out, "
+            "pictures are prepared as there"
+        )
+    return prepared

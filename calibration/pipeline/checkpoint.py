@@ -1,4 +1,9 @@
-"""A table that is being made: its hidden folder, and the checkpoint from which a build that was killed goes on."""
+"""A table that is being made: its hidden folder, and the checkpoint from which a build that was killed goes on.
+
+The checkpoint is a finished piece (`foundation.pieces`) in the file `RECORD`. Its arrays lie beside that file, in one
+that is named after the number of frames taken in: it is written before the record names it, and the one before is
+removed after that.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,6 @@ import contextlib
 import io
 import json
 import shutil
-import zipfile
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,14 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.table.lut import SAMPLES
-from foundation.files import partial_path, storage_error, sync_folder, write_whole
+from foundation.files import partial_path, sha256_of, storage_error, sync_folder, write_whole
 from foundation.folders import held_folder, publish_folder, require_free
+from foundation.pieces import Piece, pieces_of
 
-CHECKPOINT = "checkpoint.npz"
-"""Name of the checkpoint in the hidden folder."""
-
-_TEXT = "text"
-"""Name of the array that holds all that is no array, as JSON."""
+RECORD = "checkpoint"
+"""Name of the record file in the hidden folder, and the beginning of the names of files of arrays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,35 +60,53 @@ class UnfinishedTable:
 
         A build goes on from a checkpoint of the same identity that took in the first of its `frames`.
         """
-        if not (self.folder / SAMPLES).is_file():
+        record = self.folder / RECORD
+        if not record.is_file() or not (self.folder / SAMPLES).is_file():
             return None
-        try:
-            with np.load(self.folder / CHECKPOINT, allow_pickle=False) as stored:
-                arrays: dict[str, npt.NDArray[Any]] = {name: stored[name] for name in stored.files}
-            text = json.loads(arrays.pop(_TEXT).tobytes())
-            found = Checkpoint(text["identity"], text["frames"], text["values"], arrays)
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
-            return None
-        began = bool(found.frames) and found.frames == frames[: len(found.frames)]
-        return found if began and found.identity == identity else None
+        for name, piece in pieces_of(record.read_bytes()).items():
+            begun = frames[: int(name)]
+            same = begun and piece.inputs == _hash_of(identity, begun)
+            if same and piece.is_whole(lambda file: (self.folder / file).open("rb")):
+                with np.load(self.folder / _arrays_of(begun), allow_pickle=False) as stored:
+                    arrays: dict[str, npt.NDArray[Any]] = {key: stored[key] for key in stored.files}
+                return Checkpoint(identity, begun, json.loads(piece.values), arrays)
+        return None
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Replace the checkpoint."""
-        content = {"identity": checkpoint.identity, "frames": checkpoint.frames, "values": checkpoint.values}
-        text = np.frombuffer(json.dumps(content).encode(), dtype=np.uint8)
         stream = io.BytesIO()
-        np.savez(stream, allow_pickle=False, **{**checkpoint.arrays, _TEXT: text})
-        write_whole(self.folder / CHECKPOINT, stream.getvalue())
+        np.savez(stream, allow_pickle=False, **checkpoint.arrays)
+        arrays, data = _arrays_of(checkpoint.frames), stream.getvalue()
+        write_whole(self.folder / arrays, data)
+        inputs = _hash_of(checkpoint.identity, checkpoint.frames)
+        files = {arrays: sha256_of(data)}
+        piece = Piece(str(len(checkpoint.frames)), inputs, files, json.dumps(checkpoint.values))
+        write_whole(self.folder / RECORD, piece.to_line())
+        self._remove(kept={RECORD, arrays})
 
     def publish(self) -> None:
         """Give the table its final name."""
         require_free(self.out, "the table")
         try:
-            (self.folder / CHECKPOINT).unlink(missing_ok=True)
+            self._remove()
             sync_folder(self.folder)
         except OSError as error:
             raise storage_error(self.out, error) from error
         publish_folder(self.folder, self.out, "the table")
+
+    def _remove(self, kept: set[str] | None = None) -> None:
+        """Remove the files of checkpoints, but for those whose names are kept."""
+        for path in self.folder.glob(f"{RECORD}*"):
+            if path.name not in (kept or ()):
+                path.unlink()
+
+
+def _arrays_of(frames: list[str]) -> str:
+    return f"{RECORD}.{len(frames)}.npz"
+
+
+def _hash_of(identity: dict[str, Any], frames: list[str]) -> str:
+    return sha256_of(json.dumps([identity, frames], sort_keys=True).encode())
 
 
 @contextmanager
@@ -100,6 +120,6 @@ def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
         try:
             yield unfinished
         finally:
-            if folder.is_dir() and not (unfinished.keep and (folder / CHECKPOINT).is_file()):
+            if folder.is_dir() and not (unfinished.keep and (folder / RECORD).is_file()):
                 with contextlib.suppress(OSError):
                     shutil.rmtree(folder)

@@ -83,11 +83,6 @@ def open_generated(place: Path | str, subset: str | None = None) -> SceneSet:
     white = table.white_level
     # Whoever reads results must see that no camera took a photograph of these colours.
     computed = {} if table.computed is None else {"table": "computed from spectra and a model of the sensor"}
-    made = dataset.description.options
-    if "bits" in made:
-        computed["bits"] = f"the pictures' codes were reduced to {made['bits']} bits a channel before they were printed"
-    if made.get("scale") == "full":
-        computed["scale"] = "counts were stretched over 16 bits in the files, which is undone"
     stated = [light.uncertainty_deg for light in dataset.description.lights]
     known = max((one for one in stated if one is not None), default=None) if None not in stated else None
     within = "" if known is None else f"; its direction is known to {known:.2g} degrees at worst (k = 2)"

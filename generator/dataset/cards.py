@@ -65,31 +65,19 @@ def summary_of(description: Description) -> str:
     return (
         f"{counted_images(description)} of linear camera RGB as the raw sensor of the {one_line(table.camera)} would "
         "give them, each with the exact colour of its light. Black is 0, saturation "
-        f"{stored_white(description)}; nothing is white balanced. {kind_of(description)}"
+        f"{table.white_level}; nothing is white balanced. {kind_of(description)}"
     )
-
-
-def stored_white(description: Description) -> int:
-    """Return the number that saturation has in the files."""
-    return FULL if option(description, "scale") == "full" else description.table.white_level
 
 
 def brightness_note(description: Description) -> str:
     """Return why a reader that knows nothing of raw images shows them as it does, and what to do about it."""
-    white = stored_white(description)
+    white = description.table.white_level
     if option(description, "format") == "dng":
         return "Images are raw files: open them with a raw developer."
-    if option(description, "scale") == "full":
-        counts = description.table.white_level
-        return (
-            f"Counts of 0 to {counts} are stretched over 16 bits: the camera's count is round(v * {counts} / {FULL}). "
-            "Images are linear, so that they still look darker than photographs: for display divide by the ground "
-            "truth and apply the sRGB curve."
-        )
     return (
         f"A reader that takes {FULL} for white, as WebDataset's decoders, imageio and image viewers do, shows them "
-        f"nearly black: {white} is white here. Divide by {white} after decoding all 16 bits, or make the dataset with "
-        "generate --scale full. Previews show what they look like."
+        f"nearly black: {white} is white here. Divide by {white} after decoding all 16 bits. Previews show "
+        "what they look like."
     )
 
 
@@ -138,11 +126,8 @@ def noise_of(description: Description) -> str:
         gain, read, early = (float(body[name]) for name in ("electrons_per_dn", "read_noise_dn", "sensor_noise_e"))
     except (KeyError, TypeError, ValueError):
         return f"The table does not state gain and read noise. {green}"
-    stretched = f"; a count is {FULL / table.white_level:.4g} of the files' units" * (
-        option(description, "scale") == "full"
-    )
     return (
-        f"In the model of the sensor a count is {gain * 100 / iso:.4g} electrons at its ISO {iso:g}{stretched}; "
+        f"In the model of the sensor a count is {gain * 100 / iso:.4g} electrons at its ISO {iso:g}; "
         f"at ISO 100 it is {gain:.4g}, and the read noise of a photosite {read:.4g} counts, of which {early:.4g} "
         f"electrons arise before the amplifier. {green}"
     )
@@ -213,7 +198,7 @@ def datasheet(description: Description) -> str:
         "table_software": table.software,
         "truth": truth_of(description),
         "uncertainty": uncertainty_of(description),
-        "white_level": stored_white(description),
+        "white_level": table.white_level,
     }
     # The makers of the dataset are asked for whether or not those of the table are known.
     return template.substitute(answers, count=template.template.count("${open}") + 1)

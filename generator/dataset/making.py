@@ -30,17 +30,14 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from foundation.errors import CropError, DeviceError, FormatError, InputError, first_of
+from foundation.errors import CropError, DeviceError, FormatError, InputError
 from foundation.files import partial_path, storage_error
 from foundation.folders import clear_folder, held_folder, require_free
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, load_description, open_dataset
 from generator.dataset.shards import (
-    DONE,
-    IMAGE_NOTES,
     NOTES,
     PLAN,
-    RECORDS,
     SILENT,
     Callbacks,
     NothingMadeError,
@@ -420,7 +417,7 @@ def make_share(
     workers: Workers | None = None,
     callbacks: Callbacks = SILENT,
 ) -> tuple[int, int]:
-    """Make one of several shares of a dataset, beside other programs that make theirs; then call `finish_dataset`.
+    """Make one of several shares of a dataset, beside other programs that make theirs; then call `make_dataset`.
 
     `share`: (i, n): the shards whose number leaves i when divided by n, i from 0.
     """
@@ -430,23 +427,6 @@ def make_share(
     with workplace(out, plan.identity(), alone=False) as place:
         _make(plan, place, range(index, plan.shards, count), workers or Workers(), callbacks)
         return len(place.done()), plan.shards
-
-
-def finish_dataset(out: Path | str) -> Dataset:
-    """Make a dataset of its shards when every share is done; a dataset that is complete stays as it is."""
-    if holds_dataset(out):
-        return open_dataset(out)
-    identity = stored_identity(out)
-    if finished(out, identity):
-        return open_dataset(out)
-    with workplace(out, identity) as place:
-        missing = sorted(set(range(identity["shards"])) - place.done())
-        if missing:
-            raise InputError(
-                f"{len(missing)} of {identity['shards']} shards of {out} are not made yet: {first_of(missing)}; "
-                "run their shares, or the command without a share, which makes all that is missing"
-            )
-        return assemble(place, identity)
 
 
 def _make(plan: Plan, place: Workplace, wanted: range, workers: Workers, callbacks: Callbacks) -> None:
@@ -527,8 +507,7 @@ def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Ge
             yield place
         except BaseException as error:
             # An InputError asks for another command, which could not go on with images of this one.
-            useful = DONE if isinstance(error, InputError) else (DONE, IMAGE_NOTES)
-            if alone and folder.is_dir() and not any(name.endswith(useful) for name in notes.names(RECORDS)):
+            if alone and folder.is_dir() and not place.has_finished(isinstance(error, InputError)):
                 shutil.rmtree(folder, ignore_errors=True)
             raise
 
@@ -562,7 +541,7 @@ def _remote(out: str, identity: PlanIdentity) -> Generator[Workplace]:
         yield place
     except BaseException:
         with contextlib.suppress(Exception):
-            if not begun and not any(notes.names(RECORDS)):
+            if not begun and not place.has_finished():
                 files.remove("")
         raise
 

@@ -6,9 +6,7 @@ several are asked for) under the k-th light of scene `position · crops + c`, wh
 read. Shard i holds the numbers from i · n up to (i + 1) · n, n the images of a shard. So any worker can make any shard
 at any time, and a shard made twice is the same twice.
 
-Each source falls into a part by its own hash. Where parts are to have exactly the sizes asked for, all sources are
-ranked together by a hash of the seed and their name, and cut by their number: pictures of one name, and copies of one
-file, whatever their names, stay together; of files, only those of one length are read to find copies.
+Each source falls into a part of the split by its own hash.
 """
 
 from __future__ import annotations
@@ -16,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -24,17 +21,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, get_args
 
 from foundation.errors import InputError
-from foundation.files import file_sha256
 from foundation.secret_texts import masked_values
 from foundation.version import software
 from generator.dataset.layouts import LAYOUTS, require_library
-from generator.dataset.records import SPLITS, Layout, Scale, Split, TableRecord
-from generator.files import FILE_FORMATS, FORMATS, Format, libraries_of
-from generator.pictures.sources import PictureFile
+from generator.dataset.records import SPLITS, Layout, TableRecord
+from generator.files import FORMATS, Format, libraries_of
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.black_points import KEEP, BlackPoint
 from generator.rendering.matrices import ColourMatrix, matrix_for
-from generator.stores import is_remote
 from generator.variation.variation import Variation
 
 if TYPE_CHECKING:
@@ -75,8 +69,6 @@ class DatasetOptions:
         Crops of each picture, 1 or more; of more than one the sources must have as many.
     reading
         How sources were read, as plain values; recorded only.
-    weighted
-        Whether sources were drawn by weights, which are recorded of each image.
     rendering
         ``"colorimetric"``: the print shows the camera the picture's colours; ``"codes"``: codes of a picture are those
         of the print, the paper's way.
@@ -84,13 +76,6 @@ class DatasetOptions:
         Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
     black_point
         What becomes of the print's black.
-    bits
-        Bits kept of each code of the pictures, the others set to zero before they are printed; None keeps those that
-        the table tells apart.
-    scale
-        ``"table"`` stores counts as they are; ``"full"`` stretches them over 16 bits, see `generator.files`.
-    split_exact
-        Whether parts have exactly the sizes of `split`, and not on average.
     uncertainty
         Whether `ground_truth.csv` has what each light's direction may be off by, as the table states it.
 
@@ -116,19 +101,15 @@ class DatasetOptions:
     variation: Variation | None = None
     crops: int = 1
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    weighted: bool = False
     rendering: Rendering = DEFAULT
     matrix: ColourMatrix | None = None
     black_point: BlackPoint = KEEP
-    bits: int | None = None
-    scale: Scale = "table"
-    split_exact: bool = False
     uncertainty: bool = False
 
     @property
     def has_details(self) -> bool:
         """Whether options do something to each image that is recorded of it: `images.csv` lists it then."""
-        return self.variation is not None or self.crops > 1 or self.weighted or self.is_rendered
+        return self.variation is not None or self.crops > 1 or self.is_rendered
 
     @cached_property
     def tints(self) -> bool:
@@ -157,7 +138,6 @@ class DatasetOptions:
             ("format", self.form, FORMATS),
             ("layout", self.layout, get_args(Layout)),
             ("rendering", self.rendering, get_args(Rendering)),
-            ("scale", self.scale, get_args(Scale)),
         ):
             if value not in known:
                 raise InputError(f"{value!r} is no {what} of a dataset; use one of {', '.join(known)}")
@@ -165,16 +145,6 @@ class DatasetOptions:
             raise InputError("a colour matrix is for colorimetric rendering; choose that, or leave the matrix out")
         if self.shard_images < 1:
             raise InputError(f"shards of {self.shard_images} images were asked for, expected 1 or more")
-        if self.bits is not None and not 1 <= self.bits <= 8:
-            raise InputError(f"{self.bits} bits of each code were to be kept, expected 1 to 8")
-        if self.scale == "full" and FILE_FORMATS[self.form].states_white:
-            stretched = [form for form, known in FILE_FORMATS.items() if not known.states_white]
-            raise InputError(
-                f"counts of {self.form} are not stretched: the file says what white is; use one of "
-                f"{', '.join(stretched)}, or leave the scale as it is"
-            )
-        if self.split_exact and self.split is None:
-            raise InputError("exact parts were asked for without their sizes; give a split such as 0.8,0.1,0.1")
         if self.crops < 1:
             raise InputError(f"{self.crops} crops of each picture were asked for, expected 1 or more")
         split = self.split
@@ -210,68 +180,6 @@ def parse_split(text: str) -> tuple[float, float, float]:
     return parts[0] / total, parts[1] / total, parts[2] / total
 
 
-def exact_parts(sources: Sequence[Source], shares: tuple[float, float, float], seed: int) -> tuple[Split, ...]:
-    """Return the part of each source; parts have the sizes of `sizes_of`."""
-    wanted: dict[Split, int] = dict(zip(SPLITS, sizes_of(len(sources), shares), strict=True))
-    groups: dict[str, list[int]] = defaultdict(list)
-    copies = _copies(sources)
-    for place, source in enumerate(sources):
-        groups[copies.get(place, f"name {source.name}")].append(place)
-    ranked = sorted(groups, key=lambda key: hashlib.sha256(f"split {seed} {key}".encode()).digest())
-    parts: dict[int, Split] = {}
-    # Copies first, while there is room; a stable sort keeps the order of the hashes among groups of one size.
-    for key in sorted(ranked, key=lambda key: -len(groups[key])):
-        group = groups[key]
-        part: Split | None = next((name for name in SPLITS if wanted[name] >= len(group)), None)
-        if part is None:
-            raise InputError(
-                f"{len(group)} copies of {sources[group[0]].name} stay in one part, and none of the parts of exactly "
-                f"{','.join(map(str, sizes_of(len(sources), shares)))} has room for them; leave copies out, or ask for "
-                "other sizes"
-            )
-        wanted[part] -= len(group)
-        parts.update((place, part) for place in group)
-    return tuple(parts[place] for place in range(len(sources)))
-
-
-def sizes_of(count: int, shares: tuple[float, float, float]) -> tuple[int, int, int]:
-    """Return how many of `count` sources each part has: shares rounded by largest remainders."""
-    # Shares are quotients: a product that should be whole may be off by its last bits.
-    exact = [round(share * count, 6) for share in shares]
-    sizes = [int(size) for size in exact]
-    by_remainder = sorted(range(3), key=lambda part: (sizes[part] - exact[part], part))
-    for part in by_remainder[: count - sum(sizes)]:
-        sizes[part] += 1
-    return sizes[0], sizes[1], sizes[2]
-
-
-def _copies(sources: Sequence[Source]) -> dict[int, str]:
-    """Return by place what tells the content of files that may be copies of others: those that are as long."""
-    by_length: dict[int, list[int]] = defaultdict(list)
-    for place, source in enumerate(map(_file_of, sources)):
-        if isinstance(source, PictureFile) and not is_remote(source.location):
-            try:
-                by_length[Path(source.location).stat().st_size].append(place)
-            except OSError:
-                # It is left out, and named, where it is to be read.
-                continue
-    found: dict[int, str] = {}
-    for places in by_length.values():
-        for place in places if len(places) > 1 else ():
-            source = _file_of(sources[place])
-            if isinstance(source, PictureFile):
-                try:
-                    found[place] = f"file {file_sha256(Path(source.location))}"
-                except OSError:
-                    continue
-    return found
-
-
-def _file_of(source: Source) -> Source:
-    """Return what a source with a weight, or one that must be as it was, is of."""
-    return getattr(source, "source", source)
-
-
 @dataclass(frozen=True)
 class ShardJob:
     """Everything that a worker on any machine needs to make one shard.
@@ -282,7 +190,6 @@ class ShardJob:
     - `sources`: the sources that its images show.
     - `choice`, `seed`, `options`: those of the plan.
     - `versions`: versions of the libraries that the bytes depend on; a worker must have the same.
-    - `parts`: the part of each of `sources`, where they were decided together; empty where each is by itself.
     """
 
     table: Path
@@ -296,7 +203,6 @@ class ShardJob:
     seed: int
     options: DatasetOptions
     versions: dict[str, str]
-    parts: tuple[Split, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,21 +230,7 @@ class Plan:
                 "a gradient with a colour and several lights an image were both asked for, but masks tell either; "
                 "leave out colour, or ask for one light"
             )
-        kept = self.options.bits
-        if self.options.rendering == "codes" and kept is not None and kept > self.lut.provenance.bits:
-            raise InputError(
-                f"{kept} bits of each code were to be kept, where the table has {self.lut.provenance.bits}; ask for "
-                "fewer"
-            )
         require_library(self.options.layout)
-
-    @cached_property
-    def parts(self) -> tuple[Split, ...]:
-        """The part of each source, where parts have exact sizes; empty otherwise."""
-        if not self.options.split_exact or self.options.split is None:
-            return ()
-
-        return exact_parts(self.sources, self.options.split, self.seed)
 
     @property
     def total(self) -> int:
@@ -377,13 +269,10 @@ class Plan:
             seed=self.seed,
             options=self.options,
             versions=versions(self.options.form, self.options.layout),
-            parts=tuple(self.parts[place] for place in places) if self.parts else (),
         )
 
     def identity(self) -> dict[str, Any]:
         """Return plain values that two plans share exactly if they make the same bytes."""
-        # Copies of a file are told by its content, which is not in the list of sources.
-        parts = {"parts": hashlib.sha256(" ".join(self.parts).encode()).hexdigest()} if self.parts else {}
         return {
             "format": "crop.plan",
             "version": 1,
@@ -396,7 +285,6 @@ class Plan:
             "lights_each": self.choice.lights_each,
             "shards": self.shards,
             "sources": {"count": len(self.sources), "sha256": sources_sha256(self.sources)},
-            **parts,
         }
 
     def recorded_options(self) -> dict[str, Any]:
@@ -417,12 +305,6 @@ class Plan:
             recorded["variation"] = options.variation.describe()
         if options.crops > 1:
             recorded["crops"] = options.crops
-        if options.bits is not None:
-            recorded["bits"] = options.bits
-        if options.scale != "table":
-            recorded["scale"] = options.scale
-        if options.split_exact:
-            recorded["split_exact"] = True
         if options.uncertainty:
             recorded["uncertainty"] = True
         # A data set is published: addresses in it have no secrets.

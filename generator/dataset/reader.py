@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from itertools import groupby
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +34,6 @@ from generator.dataset.records import (
     IMAGES,
     SOURCES,
     SPLITS,
-    STRETCHED_VERSION,
     SUMS,
     TRUTHS,
     VERSION,
@@ -46,7 +45,7 @@ from generator.dataset.records import (
     Triple,
     part_of,
 )
-from generator.files import decode_image, from_full_scale
+from generator.files import decode_image
 from generator.lights.lighting import parse_mixture
 from generator.masks.maps import decode_ground_truth, decode_weights
 from generator.stores import DESCRIPTION, Store, open_store, read_bounded
@@ -197,7 +196,7 @@ def file_faults(
 ) -> Iterator[str]:
     """Yield each file of a dataset that is missing, changed or unknown, in words; reads every byte of it.
 
-    Card, datasheet and Croissant metadata are completed by hand and not looked at, unless older software listed them.
+    Card, datasheet and Croissant metadata are completed by hand and not looked at.
     """
     store = open_store(place)
     sums = f"{store.place}/{SUMS}"
@@ -270,15 +269,9 @@ class Dataset:
         return f"Dataset({self.store.place!r}, {counted(self.description.images, 'image')}, layout {self.layout})"
 
     def read_image(self, entry: Entry) -> npt.NDArray[np.uint16]:
-        """Return the image (H, W, 3) uint16, linear camera RGB, `description.table.white_level` = saturation.
-
-        Counts that were stretched over 16 bits are as they were before.
-        """
+        """Return the image (H, W, 3) uint16, linear camera RGB, `description.table.white_level` = saturation."""
         name = self._name(entry, "images", PurePosixPath(entry.image).suffix)
-        image = decode_image(self._bytes(name), self._options.format, f"{self.store.place}/{name}")
-        if self._options.scale == "full":
-            return from_full_scale(image, self.description.table.white_level)
-        return image
+        return decode_image(self._bytes(name), self._options.format, f"{self.store.place}/{name}")
 
     def read_preview(self, entry: Entry) -> bytes | None:
         """Return the JPEG file of an image's preview, or None if the dataset has none."""
@@ -322,12 +315,8 @@ class Dataset:
     @cached_property
     def sources(self) -> tuple[SourceRecord, ...]:
         """The sources that were used, in their order."""
-        rows: Iterable[dict[str, Any]]
         try:
-            if self.store.has(SOURCES):
-                rows = csv.DictReader(io.StringIO(self._list(SOURCES)))
-            else:
-                rows = _content(self.store)["sources"]  # Version 1 had them there.
+            rows = csv.DictReader(io.StringIO(self._list(SOURCES)))
             return tuple(
                 SourceRecord.model_validate({key: None if value == "" else value for key, value in row.items()})
                 for row in rows
@@ -409,33 +398,15 @@ def load_description(store: Store) -> Description:
     """Return the content of a dataset's `dataset.json`; a FormatError says why it cannot be used."""
     name = f"{store.place}/{DESCRIPTION}"
     try:
-        content = _content(store)
-        if content["version"] == 1:
-            content = _upgraded(content)
+        content = parse_json_object(read_bounded(store, DESCRIPTION, MOST_JSON_BYTES), name)
         description = Description.model_validate(content)
         ReadingOptions.model_validate(description.options)
     except ValidationError as error:
         first = error.errors()[0]
         raise FormatError(
             f"{name} is no dataset's description: {'.'.join(map(str, first['loc']))}: {first['msg']}; this software "
-            f"reads {FORMAT} of versions 1 to {STRETCHED_VERSION}"
+            f"reads {FORMAT} of version {VERSION}"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise FormatError(f"{name} is damaged ({type(error).__name__}: {error}); make the dataset again") from error
     return description
-
-
-def _content(store: Store) -> dict[str, Any]:
-    """Return the object of `dataset.json` as it stands there."""
-    return parse_json_object(read_bounded(store, DESCRIPTION, MOST_JSON_BYTES), f"{store.place}/{DESCRIPTION}")
-
-
-def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
-    """Return a description of version 1, which listed the sources themselves, as one of version 2."""
-    sources = content["sources"]
-    counts = {
-        "sources": len(sources),
-        "pixels": sum(source["width"] * source["height"] for source in sources),
-        "replaced_pixels": sum(source["replaced_pixels"] for source in sources),
-    }
-    return content | counts | {"version": VERSION, "planned": content["images"]}

@@ -29,10 +29,6 @@ class SparseRecord(Record):
 
 FORMAT: Final = "crop.dataset"
 VERSION: Final = 2
-"""Version 1 listed the sources in `dataset.json`; they have a table of their own since."""
-STRETCHED_VERSION: Final = 3
-"""Of datasets whose counts are stretched over 16 bits: software that knows nothing of it refuses them, and does not
-take their images for more than six times as bright."""
 
 GROUND_TRUTH: Final = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")
@@ -56,7 +52,6 @@ Details = dict[str, int | float | str]
 """What options did to one image, by column of `images.csv`; all images of a dataset have the same columns."""
 
 Layout = Literal["folder", "webdataset", "parquet"]
-Scale = Literal["table", "full"]
 Split = Literal["train", "validation", "test"]
 SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
 
@@ -65,10 +60,9 @@ class ReadingOptions(Record):
     """What of the options of a dataset its readers need; they refuse values that no dataset is made with."""
 
     format: Format
-    layout: Layout = "folder"
+    layout: Layout
     previews: bool
-    shard_images: int = Field(default=256, ge=1, le=1 << 32)
-    scale: Scale = "table"
+    shard_images: int = Field(ge=1, le=1 << 32)
 
 
 class TableRecord(SparseRecord):
@@ -139,8 +133,6 @@ class SourceRecord(Record):
     - `split`: the part of the dataset that its images belong to; None where it was not divided.
     - `note`: what is to be known of it, between semicolons: what it took to read it, or that it is black or tiny; None
       for nothing.
-    - `weight`: by which it was drawn, 1 that of a picture neither favoured nor disfavoured; None where pictures were
-      not drawn.
     """
 
     position: int
@@ -152,7 +144,6 @@ class SourceRecord(Record):
     replaced_pixels: int
     split: Split | None = None
     note: str | None = None
-    weight: float | None = None
 
 
 class Skipped(Record):
@@ -187,11 +178,11 @@ class FileSum(Record):
 
 
 class FinishedImage(Record):
-    """An image of a shard that is not done; `files` are all of it, which were written before this was."""
+    """An image of a shard that is not done; its `files` are those of its piece."""
 
     image: ImageRecord
     source: SourceRecord
-    files: list[FileSum]
+    files: list[FileSum] = Field(default_factory=list[FileSum], exclude=True)
 
 
 class RenderingSummary(Record):
@@ -210,14 +201,14 @@ class RenderingSummary(Record):
 class ShardRecord(Record):
     """What a shard made; images and files in the order of their numbers, sources in that of their positions.
 
-    `lights` are those of the table that were used, alone or mixed.
+    `lights` are those of the table that were used, alone or mixed; `files` are those of the shard's piece.
     """
 
     shard: int
     sources: list[SourceRecord]
     skipped: list[Skipped]
     images: list[ImageRecord]
-    files: list[FileSum]
+    files: list[FileSum] = Field(default_factory=list[FileSum], exclude=True)
     lights: list[Light]
 
 
@@ -235,7 +226,7 @@ class Description(SparseRecord):
     """
 
     format: Literal["crop.dataset"] = FORMAT
-    version: Literal[2, 3] = VERSION
+    version: Literal[2] = VERSION
     software: str
     libraries: dict[str, str]
     table: TableRecord

@@ -2,21 +2,19 @@
 
 Pictures are read, photographed and written. Where that happens (`Workplace`), work that was interrupted is continued,
 and the dataset appears whole. On a disk everything happens in the hidden folder `.OUT.partial`: `dataset-ID/`, with the
-plan's identifier, fills with files, and `plan/` has the plan, the records of the shards that are done, and of those
-that are not a line for each image whose files are written. At the end `dataset-ID/` gets its name by one rename, then
-the rest is removed. An object store has no rename: the files are written where they stay, plan and records below
-`OUT/.plan/`, and `dataset.json`, written last, makes a dataset of them.
+plan's identifier, fills with files, and `plan/` has the plan and a record file of finished pieces for each shard
+(`foundation.pieces`). At the end `dataset-ID/` gets its name by one rename, then the rest is removed. An object store
+has no rename: the files are written where they stay, plan and records below `OUT/.plan/`, and `dataset.json`, written
+last, makes a dataset of them.
 
 Rules that hold inside:
 
 - A shard's bytes depend on its job alone: not on the workers, on other shards, or on how often it is made.
-- Its record is written last, when all else has been synchronised with the disk: a shard with a record is whole. The
+- A shard is one piece, written when all else has been synchronised with the disk: a shard with its piece is whole. The
   program may be killed at any instruction, and any number of programs may make the same shard at once.
-- Of a shard without a record, an image counts whose files are there with the hashes that were noted when they were
-  written, and whose source is as it was. The bytes of the others do not depend on it.
+- Until then each image is a piece, and counts if its files are there with their hashes and its source is as it was. The
+  bytes of the others do not depend on it. An object store cannot add to a file, so that it has no such pieces.
 - At most about three pictures are in memory for each worker.
-- The lines of images are not synchronised with the disk and may be cut: each bears its own hash and those of its files,
-  and what does not agree with them is made again. An object store cannot add to a file, and has no such lines.
 
 An image under one light has that light's ground truth, however its intensity falls off. Where it falls off with a tint
 (`generator.variation.variation`) the light stands in the records twice, as it is at the near and at the far end, and
@@ -25,7 +23,6 @@ masks and maps say how much of either reaches a pixel.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import hashlib
 import io
@@ -39,14 +36,16 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import CropError, FormatError, InputError
-from foundation.files import HashingWriter, sha256_of, stream_sha256
+from foundation.compiled import ordered_map
+from foundation.errors import FormatError, InputError
+from foundation.files import HashingWriter
 from foundation.folders import publish_folder, require_free
+from foundation.pieces import Piece, pieces_of
 from foundation.records import from_json
 from foundation.version import software
 from generator.dataset.cards import card, croissant, datasheet
@@ -65,13 +64,12 @@ from generator.dataset.records import (
     SOURCE_COLUMNS,
     SOURCES,
     SPLITS,
-    STRETCHED_VERSION,
     SUMS,
     TRUTHS,
     UNCERTAINTY_COLUMN,
-    VERSION,
     Description,
     Details,
+    FileSum,
     FinishedImage,
     ImageRecord,
     Light,
@@ -90,7 +88,7 @@ from generator.dataset.records import (
 from generator.files import suffix_of
 from generator.lights.lighting import Lighting, Mixture
 from generator.masks.maps import encode_maps, mean_weights
-from generator.pictures.sources import Cut, Picture, Source, hash_since, keep_bits
+from generator.pictures.sources import Cut, Picture, Source, hash_since
 from generator.stores import DESCRIPTION, LocalStore, Pieces, Store, open_store
 from generator.variation.variation import Varied
 
@@ -103,9 +101,10 @@ PLAN: Final = "plan.json"
 RECORDS: Final = "shards"
 NOTES: Final = ".plan"
 """Names among a place's notes: of the plan, of the folder of shards' records, and in a store of the notes' folder."""
-DONE: Final = ".json"
-IMAGE_NOTES: Final = ".images"
-"""Ends of the names of a shard's record, and of the lines of its finished images."""
+_WHOLE: Final = "shard"
+"""Name of the piece that is a shard; those of images are their numbers."""
+_READERS: Final = 16
+"""Record files that are read at a time: a store is waited for most of the time."""
 
 PlanIdentity = Mapping[str, Any]
 
@@ -153,6 +152,41 @@ def light_of(lut: Lut, light: int) -> Light:
     )
 
 
+@dataclass(frozen=True)
+class ShownColours:
+    """How well a print shows the colours of a picture; columns of `images.csv`.
+
+    - `cells`: first 16 digits of the SHA-256 of the map of the print.
+    - `outside`: share of the pixels that the print cannot show, 0 … 1.
+    - `distance`: mean angle by which colours are missed, degrees.
+    """
+
+    cells: str
+    outside: float
+    distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class RawImage:
+    """The raw image of a print.
+
+    - `counts`: (H, W, 3) uint16, linear camera RGB. One light: memory that the thread's next call overwrites.
+    - `weights`: (H, W, K) float32, the share of each of several lights in each pixel; None with one light.
+    - `black_taken`: share of the print's black that was taken out, 0 … 1; None if the black is kept.
+    - `shown`: how the print shows the colours; None if it was rendered by codes.
+    """
+
+    counts: npt.NDArray[np.uint16]
+    weights: npt.NDArray[np.float32] | None
+    black_taken: float | None = None
+    shown: ShownColours | None = None
+
+    def details(self) -> Details:
+        """Return the columns of `images.csv`."""
+        shown: Details = {} if self.shown is None else dict(vars(self.shown))
+        return shown if self.black_taken is None else shown | {"black_taken": self.black_taken}
+
+
 def photograph(
     lut: Lut,
     picture: Picture,
@@ -161,14 +195,10 @@ def photograph(
     seed: int,
     number: int,
     white_level: int,
-    black_taken: float | None = None,
-) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None, Details]:
+) -> RawImage:
     """Return the raw image of a picture's print.
 
     `picture`: (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
-    `black_taken`: share of the print's black that is taken out, 0 … 1; None for what the options say. Returns (H, W, 3)
-    uint16, linear camera RGB; of several lights the weights (H, W, K) float32 of each in each pixel, else None; and
-    what is recorded of the rendering.
     """
     from generator.kernels.mixing import mix_samples
     from generator.kernels.printing import nearest_nodes
@@ -178,37 +208,29 @@ def photograph(
     for mixture in lighting.mixtures:
         for light in mixture.lights:
             lut.require_unchanged(light)
-    details: Details = {}
-    share = 0.0
-    if black_taken is not None or options.black_point.kind != "keep":
-        share = options.black_point.share(seed, number) if black_taken is None else black_taken
-        details["black_taken"] = share
+    share = None if options.black_point.kind == "keep" else options.black_point.share(seed, number)
     weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
     if options.rendering == "colorimetric":
         rendering = rendering_of(lut, options)
         outside, distance = rendering.map.missed(nearest_nodes(picture))
-        seen: Details = {
-            "cells": rendering.map.sha256[:16],
-            "outside": round(outside, 6),
-            "distance": round(distance, 6),
-        }
-        image = rendering.draw(
+        counts = rendering.draw(
             picture,
             lighting.mixtures,
-            share,
+            share or 0.0,
             weights,
             most=lut.provenance.white_level if weights is None else white_level,
             seed=seed,
             image=number,
             out=_reused(picture.shape),
         )
-        return image, weights, seen | details
-    tables = [_samples(lut, mixture, picture, share, seed) for mixture in lighting.mixtures]
+        shown = ShownColours(rendering.map.sha256[:16], round(outside, 6), round(distance, 6))
+        return RawImage(counts, weights, share, shown)
+    tables = [_samples(lut, mixture, picture, share or 0.0, seed) for mixture in lighting.mixtures]
     if weights is None:
-        out = _reused(picture.shape)
-        return draw_samples(tables[0], picture, seed=seed, image=number, out=out), None, details
-    image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
-    return image, weights, details
+        counts = draw_samples(tables[0], picture, seed=seed, image=number, out=_reused(picture.shape))
+    else:
+        counts = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
+    return RawImage(counts, weights, share)
 
 
 def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int) -> npt.NDArray[np.uint16]:
@@ -338,7 +360,6 @@ class _ReadSource:
 
     cuts: tuple[Cut, ...]
     record: SourceRecord
-    black_taken: float | None
 
 
 class ShardCancelled(Exception):
@@ -420,9 +441,8 @@ def make_shard(
 
 def _finished_images(job: ShardJob, place: Workplace, pool: ThreadPoolExecutor) -> dict[int, FinishedImage]:
     """Return by number the images of a shard that whoever was at it before has finished."""
-    noted = place.noted(job.shard)
-    whole = pool.map(place.is_whole, noted)
-    return {image.image.number: image for image, is_whole in zip(noted, whole, strict=True) if is_whole}
+    found = pool.map(place.image_of, place.pieces(job.shard).values())
+    return {image.image.number: image for image in found if image is not None}
 
 
 def _taken_up(image: FinishedImage) -> Sample:
@@ -519,7 +539,7 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
 
     known = _known_source(job, job.position + place, finished) if finished else None
     if known is not None:
-        return _ReadSource((), known, None)
+        return _ReadSource((), known)
     source: Source = job.sources[place]
     scene = source.read()
     whole = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
@@ -528,7 +548,6 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
             f"{source.name} has {max(1, len(whole))} crops, expected {job.options.crops}; give the preparation of "
             "pictures and the options of the dataset the same number, and leave random scenes out"
         )
-    whole = tuple(replace(cut, picture=keep_bits(cut.picture, job.options.bits)) for cut in whole)
     if job.options.rendering == "codes":
         fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in whole]
     else:
@@ -554,12 +573,11 @@ def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedIm
         width=width,
         height=height,
         replaced_pixels=sum(replaced for _, replaced in fit),
-        split=job.parts[place] if job.parts else split_of(job.options.split, job.seed, scene.sha256, source.name),
+        split=split_of(job.options.split, job.seed, scene.sha256, source.name),
         note="; ".join(notes) or None,
-        weight=scene.weight,
     )
     cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
-    return _ReadSource(cuts, record, scene.black_taken)
+    return _ReadSource(cuts, record)
 
 
 def _known_source(job: ShardJob, position: int, finished: Mapping[int, FinishedImage]) -> SourceRecord | None:
@@ -582,36 +600,32 @@ def _photographed(
     crop: int,
     lighting: Lighting,
 ) -> Sample:
-    from generator.files import FULL, ImageMetadata, encode_pieces, encode_preview, preview_of, suffix_of, to_full_scale
+    from generator.files import FULL, ImageMetadata, encode_pieces, encode_preview, preview_of, suffix_of
 
     options, cut = job.options, source.cuts[crop]
     height, width = cut.picture.shape[:2]
     white_level = lut.provenance.white_level
     # What exceeds saturation may be below it once it is exposed anew, and is cut then.
     most = white_level if options.variation is None else FULL
-    taken = source.black_taken
-    image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most, taken)
+    raw = photograph(lut, cut.picture, lighting, options, job.seed, number, most)
     varied = Varied()
     if options.variation is not None:
-        varied = options.variation.apply(image, white_level, job.seed, number)
-    light = _image_light(lut, lighting, weights, varied, options.tints)
-    stored, level = (image, white_level) if options.scale == "table" else (to_full_scale(image, white_level), FULL)
-    metadata = ImageMetadata(level, light.truth, lut.provenance.camera)
+        varied = options.variation.apply(raw.counts, white_level, job.seed, number)
+    light = _image_light(lut, lighting, raw.weights, varied, options.tints)
+    metadata = ImageMetadata(white_level, light.truth, lut.provenance.camera)
     files: list[tuple[str, str, Pieces]] = [
-        ("images", suffix_of(options.form), encode_pieces(stored, options.form, metadata)),
+        ("images", suffix_of(options.form), encode_pieces(raw.counts, options.form, metadata)),
         *((kind, ending, (data,)) for kind, ending, data in light.maps),
     ]
     if options.previews:
-        files.append(("previews", ".jpg", (encode_preview(preview_of(image, white_level)),)))
+        files.append(("previews", ".jpg", (encode_preview(preview_of(raw.counts, white_level)),)))
     details: Details = {"crop": crop, "left": cut.left, "top": cut.top} if options.crops > 1 else {}
-    if source.record.weight is not None:
-        details["weight"] = source.record.weight
     record = ImageRecord(
         number=number,
         position=source.record.position,
         truth=light.truth,
         lights=light.rows,
-        details=details | rendered | varied.details,
+        details=details | raw.details() | varied.details,
     )
     sample = writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
     if sample.stored:
@@ -728,7 +742,6 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
                 "left out, each with its reason; name others, or ask for a smaller crop if they are too small"
             )
         description = Description(
-            version=STRETCHED_VERSION if options.get("scale") == "full" else VERSION,
             software=software(),
             libraries=identity["libraries"],
             table=TableRecord.model_validate(identity["table"]),
@@ -850,61 +863,47 @@ class Workplace:
 
     def done(self) -> set[int]:
         """Return the shards that are done."""
-        ending = f".{self.plan_id}{DONE}"
+        ending = f".{self.plan_id}"
         found = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
-        return {int(name.removesuffix(ending)) for name in found if name.endswith(ending)}
+        shards = [int(name.removesuffix(ending)) for name in found if name.endswith(ending)]
+        whole = ordered_map(self.has, shards, _READERS)
+        return {shard for shard, is_done in zip(shards, whole, strict=True) if is_done}
 
     def has(self, shard: int) -> bool:
         """Return whether a shard is done."""
-        return self.notes.has(self._record_name(shard))
+        return _WHOLE in self.pieces(shard)
 
     def load(self, shard: int) -> ShardRecord:
         """Return the record of a shard that is done."""
-        name = self._record_name(shard)
-        remedy = "remove it and run the same command again, which makes it anew"
-        return from_json(ShardRecord, self.notes.get(name), f"{self.notes.place}/{name}", remedy)
+        whole = self.pieces(shard).get(_WHOLE)
+        if whole is None:
+            raise FormatError(f"{self.notes.place}/{self._record_name(shard)} is damaged; run the same command again")
+        return _record_in(whole, ShardRecord)
 
     def commit(self, record: ShardRecord) -> None:
         """Bring the record of a shard to the disk whose files are there: from here on it is done."""
         name = self._record_name(record.shard)
-        self.notes.put(name, record.model_dump_json().encode())
+        self.notes.put(name, self._piece(_WHOLE, record).to_line())
         self.notes.sync([name])
-        if isinstance(self.notes, LocalStore):
-            # Whoever makes the shard at the same time may have it open, and no later reader asks for it.
-            with contextlib.suppress(OSError):
-                (self.notes.root / self._images_name(record.shard)).unlink(missing_ok=True)
 
     def note(self, shard: int, image: FinishedImage) -> None:
         """Note that all files of an image of a shard are written; any thread may do so."""
         if isinstance(self.notes, LocalStore):
-            line = image.model_dump_json().encode()
-            # It begins anew behind a line that was cut.
-            self.notes.append(self._images_name(shard), b"\n%s %s\n" % (sha256_of(line).encode(), line))
+            self.notes.append(self._record_name(shard), self._piece(str(image.image.number), image).to_line())
 
-    def noted(self, shard: int) -> list[FinishedImage]:
-        """Return what was noted of the images of a shard, but for what cannot be read; see `is_whole`."""
-        name = self._images_name(shard)
-        if not isinstance(self.notes, LocalStore) or not self.notes.has(name):
-            return []
-        found: list[FinishedImage] = []
-        # Whoever makes the shard at the same time may be done, and have removed them.
-        with contextlib.suppress(FormatError):
-            for noted in self.notes.get(name).splitlines():
-                sha256, _, line = noted.partition(b" ")
-                if sha256 == sha256_of(line).encode():
-                    found.append(from_json(FinishedImage, line, f"{self.notes.place}/{name}", "remove it"))
-        return found
+    def pieces(self, shard: int) -> dict[str, Piece]:
+        """Return the finished pieces of a shard by their names."""
+        name = self._record_name(shard)
+        return pieces_of(self.notes.get(name), self.plan_id) if self.notes.has(name) else {}
 
-    def is_whole(self, image: FinishedImage) -> bool:
-        """Return whether all files of an image are there as they were written."""
-        try:
-            for file in image.files:
-                with self.files.open(file.name) as stream:
-                    if stream_sha256(stream) != file.sha256:
-                        return False
-        except (CropError, OSError):
-            return False
-        return True
+    def image_of(self, piece: Piece) -> FinishedImage | None:
+        """Return the image that a piece is; None if a file of it is not as it was written."""
+        return _record_in(piece, FinishedImage) if piece.is_whole(self.files.open) else None
+
+    def has_finished(self, shard: bool = False) -> bool:
+        """Return whether an image is finished, or a `shard`, of this plan or of another one."""
+        names = self.notes.names(RECORDS)
+        return any(not shard or _WHOLE in pieces_of(self.notes.get(name)) for name in names)
 
     def discard(self) -> None:
         """Remove the records of the shards that are done, since to continue would end the same."""
@@ -919,11 +918,23 @@ class Workplace:
             publish_folder(self.files.root, out, "the dataset")
         remove_notes(self.notes)
 
-    def _record_name(self, shard: int) -> str:
-        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}{DONE}"
+    def _piece(self, name: str, record: ShardRecord | FinishedImage) -> Piece:
+        return Piece(name, self.plan_id, {file.name: file.sha256 for file in record.files}, record.model_dump_json())
 
-    def _images_name(self, shard: int) -> str:
-        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}{IMAGE_NOTES}"
+    def _record_name(self, shard: int) -> str:
+        # A worker of a plan that was removed may still be alive: it writes under another name.
+        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}"
+
+
+_Finished = TypeVar("_Finished", ShardRecord, FinishedImage)
+
+
+def _record_in(piece: Piece, kind: type[_Finished]) -> _Finished:
+    """Return what a piece's line says of it, with its files."""
+    files = [FileSum(name=name, sha256=sha256) for name, sha256 in piece.files.items()]
+    return from_json(kind, piece.values, f"the piece {piece.name}", "make the dataset again").model_copy(
+        update={"files": files}
+    )
 
 
 def remove_notes(notes: Store) -> None:

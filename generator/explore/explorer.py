@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 
 MAX_SIDE: Final = 1000
-"""Longest side of a picture on the page unless said otherwise, px: what a window shows, and made in milliseconds."""
+"""Longest side of a picture on the page, px: what a window shows, and made in milliseconds."""
 
 MOST_DROPPED: Final = 8
 """Pictures sent by pages that are kept, the newest; and decoded pictures that are at hand."""
@@ -236,8 +236,7 @@ class Explorer:
             picture = replace_unfit_colours(picture, lut.provenance)[0]
         matrix = self._matrix if rendering == "colorimetric" else None
         options = DatasetOptions(rendering=rendering, matrix=matrix)
-        made = photograph(lut, picture, Lighting((mixture,)), options, 0, image, lut.provenance.white_level)
-        return made[0]
+        return photograph(lut, picture, Lighting((mixture,)), options, 0, image, lut.provenance.white_level).counts
 
 
 def _as_place(name: str) -> str:

@@ -21,7 +21,7 @@ from foundation.errors import InputError, first_of, kind_of, nearest_names
 from generator import philox
 from generator.kernels.rendering import known_light
 from generator.lights.distributions import Distribution
-from generator.lights.gamut import Gamut, Match, OutsideGamut, OutsideGamutError, black_body, rgb_of
+from generator.lights.gamut import TOLERANCE_DEG, Gamut, Match, OutsideGamut, black_body, rgb_of
 from generator.lights.lighting import LightChoice, Lighting, ListedLights, Mixture, parse_mixture, plain
 from generator.masks.making import MaskPlan
 from generator.named_numbers import parse_numbers
@@ -162,10 +162,23 @@ class SimultaneousLights:
         }
 
 
-def parse_lights(text: str, total: int) -> ListedLights:
+def parse_lights(texts: Iterable[str], lut: Lut) -> ListedLights:
+    """Return the lights of several texts: each is a list as `light_numbers` reads it, or one light of `parse_light`."""
+    gamut, lights = Gamut.of(lut), list[int | Mixture]()
+    for text in texts:
+        is_number = re.fullmatch(r"\s*\d+\s*", text, re.ASCII)
+        if not is_number and re.fullmatch(r"[\d\s,-]+|\s*all\s*", text, re.ASCII | re.IGNORECASE):
+            lights += light_numbers(text, len(lut.white))
+        else:
+            mixture = parse_light(text, lut, gamut)
+            lights.append(mixture.lights[0] if is_number else mixture)
+    return ListedLights(tuple(lights))
+
+
+def light_numbers(text: str, total: int) -> tuple[int, ...]:
     """Return the lights of a list such as `0,5,12-20`, or `all`; each once, in the order written."""
     if text.strip().lower() == "all":
-        return ListedLights(tuple(range(total)))
+        return tuple(range(total))
     lights: dict[int, None] = {}
     for entry in text.split(","):
         match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", entry, re.ASCII)
@@ -178,7 +191,7 @@ def parse_lights(text: str, total: int) -> ListedLights:
         if last < first:
             raise InputError(f"{entry.strip()!r} runs backwards; write {last}-{first}")
         lights.update(dict.fromkeys(range(first, last + 1)))
-    return ListedLights(tuple(lights))
+    return tuple(lights)
 
 
 _LEAST_K: Final = 1000
@@ -273,28 +286,25 @@ def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", ea
     return SequentialLights("nearest", tuple(matches), file, each)
 
 
-def matched_lights(
-    gamut: Gamut,
-    truths: npt.NDArray[np.float64],
-    file: str = "",
-    each: int = 1,
-    outside: OutsideGamut = "refuse",
-) -> SequentialLights:
-    """Return for each ground truth the mixture of the table's lights that has it; see `gamut.Gamut.match`.
+def matched_lights(gamut: Gamut, truths: npt.NDArray[np.float64], file: str = "", each: int = 1) -> SequentialLights:
+    """Return for each ground truth the mixture of the table's lights that has it, or the nearest that there is.
 
-    `truths`: (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
+    `truths`: (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length. See `gamut.Gamut.match`.
     """
-    matches: list[Match] = []
-    outside_gamut: list[tuple[int, OutsideGamutError]] = []
-    for number, truth in enumerate(truths):
-        try:
-            matches.append(gamut.match(truth, outside))
-        except OutsideGamutError as error:
-            outside_gamut.append((number, error))
-    if outside_gamut:
-        number, worst = max(outside_gamut, key=lambda item: item[1].angle)
-        raise InputError(
-            f"{len(outside_gamut)} of {len(truths)} ground truths{f' of {file}' if file else ''} cannot be made; "
-            f"the farthest is number {number + 1}: {worst}"
-        ) from worst
-    return SequentialLights("match", tuple(matches), file, each)
+    return SequentialLights("match", tuple(gamut.match(truth, "nearest") for truth in truths), file, each)
+
+
+def light_notes(choice: LightChoice) -> tuple[str, ...]:
+    """Return a sentence about the ground truths that the table cannot make; none if it makes all."""
+    if isinstance(choice, SimultaneousLights):
+        return light_notes(choice.choice)
+    if not isinstance(choice, SequentialLights) or choice.method != "match":
+        return ()
+    angles = [match.angle for match in choice.matches]
+    outside = sum(angle > TOLERANCE_DEG for angle in angles)
+    if not outside:
+        return ()
+    return (
+        f"{outside} of the {len(angles)} lights of {choice.file} lie outside what the table can make, up to "
+        f"{max(angles):.2f} degrees; the nearest that it can make are taken, and are the ground truth",
+    )

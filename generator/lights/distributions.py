@@ -2,10 +2,6 @@
 
 A distribution turns random words into chromaticities; the caller draws again what falls outside the gamut, so
 that every distribution is cut to the gamut and keeps its shape within.
-
-The lights of a real data set are read from files of text, or from its statistics; those are a density in the plane of
-ln(R/G) and ln(B/G), where a light's distance to another does not depend on the gains of the camera's channels, and
-kernels of one size fit daylight and lamps alike.
 """
 
 from __future__ import annotations
@@ -26,87 +22,8 @@ from foundation.files import read_text
 from generator.lights.gamut import rb_of
 from generator.named_numbers import is_number, parse_numbers
 from generator.philox import Words, standard_normal
-from generator.statistics import log_chroma, read_lights
-
-_OF_SCOTT: Final = 0.5
-"""Share of Scott's factor n^(−1/6), which is for one normal cloud: real lights lie in clusters. Measured on four real
-sets (NUS 600D and 1Ds Mark III, INTEL-TAU 5DSR prints and field): with a half the likelihood of left-out fifths is
-highest, or within .1 of it, and the energy distance to the lights is .001 to .008 instead of .007 to .016; with a
-quarter the likelihood falls apart on two of them."""
 
 _Array = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class LogKernels:
-    """A kernel density estimate of lights in the plane of ln(R/G) and ln(B/G), of the lights' own covariance.
-
-    Kernels are Gaussians with the lights' covariance times f², f half of Scott's factor n^(−1/6) (D. W. Scott,
-    Multivariate Density Estimation, 1992). What is drawn is brought nearer to the mean by 1/√(1 + f²), so that the mean
-    and the covariance of the density are those of the lights (B. W. Silverman, G. A. Young, "The bootstrap: to smooth
-    or not to smooth?", Biometrika 74 (1987) 469-479).
-
-    - `places`: (N, 2) float64, the lights' ln(R/G) and ln(B/G).
-    - `root`: (2, 2) float64, lower triangular, times its transpose the kernel's covariance.
-    - `factor`: f.
-    - `file`, `sha256`: name of the file of the lights, and the hash of those read from it.
-    """
-
-    places: _Array
-    root: _Array
-    factor: float
-    file: str
-    sha256: str
-
-    @classmethod
-    def of(cls, lights: _Array, file: str = "") -> LogKernels:
-        """Return the density of lights (N, 3) float64 above 0, linear RGB of the table's camera, of any length."""
-        places = log_chroma(lights)
-        factor = _OF_SCOTT * len(places) ** (-1 / 6)
-        try:
-            if len(places) < 3:
-                raise np.linalg.LinAlgError
-            root = np.linalg.cholesky(np.cov(places.T, bias=True)) * factor
-            if not root.diagonal().min() > 1e-6 * factor * max(1e-6, root.diagonal().max() / factor):
-                raise np.linalg.LinAlgError
-        except np.linalg.LinAlgError as error:
-            raise FormatError(
-                f"no density fits the {len(places)} lights of {file or 'the list'}: expected three or more that do not "
-                f"lie on a line; take them as they are with --match {file or 'FILE'}"
-            ) from error
-        digest = hashlib.sha256(np.ascontiguousarray(lights, dtype="<f8").tobytes()).hexdigest()
-        return cls(places, root, factor, file, digest)
-
-    def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
-        """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
-        mean = self.places.mean(axis=0)
-        drawn = mean + (draw_kernels(self.places, self.root, words) - mean) / np.sqrt(1 + self.factor**2)
-        red, blue = np.exp(drawn).T
-        return rb_of(np.stack([red, np.ones_like(red), blue], axis=1))
-
-    def describe(self) -> dict[str, Any]:
-        """Return the density as plain values."""
-        return {
-            "distribution": "log kernels",
-            "file": self.file,
-            "lights": len(self.places),
-            "sha256": self.sha256,
-            "factor": self.factor,
-            "kernel": self.root.tolist(),
-        }
-
-
-def draw_kernels(places: _Array, root: _Array, words: tuple[Words, Words, Words, Words]) -> _Array:
-    """Return draws from a density of Gaussian kernels, (N, 2) float64.
-
-    `places`: (M, 2) float64, the kernels' centres, each as likely. `root`: (2, 2) float64, lower triangular, times its
-    transpose the kernels' covariance. `words`: four arrays (N,) uint32 of random words: two for the normal deviates,
-    the third for the kernel.
-    """
-    chosen = (words[2].astype(np.uint64) * np.uint64(len(places))) >> np.uint64(32)
-    normal = standard_normal(words)
-    aside = np.stack([root[0, 0] * normal[:, 0], root[1, 0] * normal[:, 0] + root[1, 1] * normal[:, 1]], axis=1)
-    return places[chosen.astype(np.intp)] + aside
 
 
 TRIPLES: Final = (
@@ -122,12 +39,10 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
     """Return the ground truths of a file.
 
     Either a CSV file whose head names the columns `GT_R,GT_G,GT_B` or `r,g,b` (others are ignored), or lines of three
-    numbers between blanks or commas, as in `gt.txt` and Cube+; or the lights of a `STATS.json` of `evaluate describe`.
+    numbers between blanks or commas, as in `gt.txt` and Cube+.
 
     Returns (N, 3) float64 ≥ 0, linear camera RGB, not normalised.
     """
-    if is_statistics(path):
-        return read_lights(path)
     lines = read_text(path, "name a text file", "ground truths").splitlines()
     numbered = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
     if not numbered:
@@ -162,11 +77,6 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
 def is_ground_truth(numbers: Sequence[float]) -> bool:
     """Return whether numbers are a light's linear RGB: three that are finite and from 0, with a sum above 0."""
     return len(numbers) == 3 and bool(np.isfinite(numbers).all()) and min(numbers) >= 0 and sum(numbers) > 0
-
-
-def is_statistics(path: Path) -> bool:
-    """Return whether a file is a `STATS.json` by its name."""
-    return path.suffix.lower() == ".json"
 
 
 _WORD: Final = float(1 << 32)
@@ -249,8 +159,11 @@ class Fitted:
         return cls(rb, root, file, hashlib.sha256(np.ascontiguousarray(truths, dtype="<f8").tobytes()).hexdigest())
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
-        """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
-        return draw_kernels(self.rb, self.root, words)
+        """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words; the third chooses kernels."""
+        chosen = (words[2].astype(np.uint64) * np.uint64(len(self.rb))) >> np.uint64(32)
+        normal, root = standard_normal(words), self.root
+        aside = np.stack([root[0, 0] * normal[:, 0], root[1, 0] * normal[:, 0] + root[1, 1] * normal[:, 1]], axis=1)
+        return self.rb[chosen.astype(np.intp)] + aside
 
     def describe(self) -> dict[str, Any]:
         """Return the distribution as plain values."""
@@ -263,7 +176,7 @@ class Fitted:
         }
 
 
-Distribution = Uniform | Gaussian | Fitted | LogKernels
+Distribution = Uniform | Gaussian | Fitted
 """Chromaticities r and b as a function of random words; some may be no chromaticities at all."""
 
 _GAUSSIAN: Final = {
@@ -281,16 +194,13 @@ def parse_distribution(text: str) -> Distribution:
     """Return the distribution that a text names.
 
     ``uniform``; ``gaussian:r=.3,b=.25,sd=.02`` or ``gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8``; ``fit:GT.csv``
-    with a file as `load_ground_truths` reads it, or the file alone; of a `STATS.json` that
-    `evaluate describe` wrote the lights are fitted in the plane of ln(R/G) and ln(B/G) (`LogKernels`).
+    with a file as `load_ground_truths` reads it, or the file alone.
     """
     kind, _, rest = text.strip().partition(":")
     if kind == "uniform" and not rest:
         return Uniform()
     path = Path(rest if kind == "fit" else text)
     if (kind == "fit" and rest) or path.is_file():
-        if is_statistics(path):
-            return LogKernels.of(load_ground_truths(path), path.name)
         return Fitted.of(load_ground_truths(path), path.name)
     if kind == "gaussian":
         numbers = parse_numbers(rest, _GAUSSIAN, "the distribution gaussian")

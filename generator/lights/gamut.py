@@ -143,7 +143,7 @@ class Gamut:
         near_r, near_b = rb_of(np.asarray(nearest.mixture.weights) @ self.white[list(nearest.mixture.lights)])
         raise OutsideGamutError(
             f"the light r={r:.4f}, b={b:.4f} lies {nearest.angle:.2f}° outside what {self.table} can make; the nearest "
-            f"it can is r={near_r:.4f}, b={near_b:.4f}: ask for that, or for the nearest with --outside nearest",
+            f"it can is r={near_r:.4f}, b={near_b:.4f}: ask for that",
             nearest.angle,
         )
 

@@ -116,14 +116,6 @@ def clear_bits(codes: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint8]
     return codes & np.uint8(0xFF << bits & 0xFF)
 
 
-def keep_bits(codes: npt.NDArray[np.uint8], bits: int | None) -> npt.NDArray[np.uint8]:
-    """Return codes (...) uint8 of which the highest `bits` bits, 0 … 8, are kept.
-
-    All of them, the same array, if None.
-    """
-    return codes if bits is None else clear_bits(codes, 8 - bits)
-
-
 Picture = npt.NDArray[np.uint8]
 
 LARGEST_SIDE: Final = 65535
@@ -214,8 +206,6 @@ class SourcePicture:
     - `profile`: how its colour profile was treated, in words, such as ``"Display P3, converted to sRGB"``;
       empty where there is no file.
     - `cuts`: the crops, where several were asked for.
-    - `weight`: by which it was drawn; None where pictures were not drawn by weights.
-    - `black_taken`: share of the print's black, 0 … 1, that is taken out of its images; None where options say it.
     - `notes`: what else of the file was not plain sRGB codes and may look unlike what its owner expects.
     """
 
@@ -223,8 +213,6 @@ class SourcePicture:
     sha256: str | None = None
     profile: str = ""
     cuts: tuple[Cut, ...] = ()
-    weight: float | None = None
-    black_taken: float | None = None
     notes: tuple[str, ...] = ()
 
 

@@ -62,9 +62,7 @@ class BlackPoint:
     Attributes
     ----------
     kind
-        ``"keep"``: nothing; ``"compensate"``: all of it is taken out; ``"random"``: of each image a random share;
-        ``"like"``: of each image the share with which its picture was drawn to be like a real data set
-        (`generator.likeness`).
+        ``"keep"``: nothing; ``"compensate"``: all of it is taken out; ``"random"``: of each image a random share.
     most
         Largest random share, above 0 and at most 1.
 
@@ -79,7 +77,7 @@ class BlackPoint:
     (1.0, 0.0)
     """
 
-    kind: Literal["keep", "compensate", "random", "like"] = "keep"
+    kind: Literal["keep", "compensate", "random"] = "keep"
     most: float = MOST
 
     def __post_init__(self) -> None:
@@ -100,12 +98,7 @@ class BlackPoint:
         return float(self.shares(words))
 
     def shares(self, words: npt.NDArray[np.uint32]) -> _Array:
-        """Return the shares (...) float64 for random words (...) uint32; an InputError of ``"like"``."""
-        if self.kind == "like":
-            raise InputError(
-                "the black point like has a share for each picture that generate --like has drawn, and there is none; "
-                "take random, keep or compensate"
-            )
+        """Return the shares (...) float64 for random words (...) uint32."""
         if self.kind == "random":
             return self.most * (np.asarray(words, np.float64) / 2.0**32)
         return np.full(np.shape(words), 1.0 if self.kind == "compensate" else 0.0)
@@ -116,15 +109,13 @@ KEEP: Final = BlackPoint()
 
 
 def parse_black_point(text: str) -> BlackPoint:
-    """Return what an option asks for: ``keep``, ``compensate``, ``random``, ``random:MAX``, or ``like``."""
-    for kind in ("keep", "compensate", "like"):
+    """Return what an option asks for: ``keep``, ``compensate``, ``random``, or ``random:MAX``."""
+    for kind in ("keep", "compensate"):
         if text == kind:
             return BlackPoint(kind)
     match = re.fullmatch(r"random(?::(\d*\.?\d+))?", text, re.ASCII)
     if not match:
-        raise InputError(
-            f"the black point is {text!r}, expected keep, compensate, random, random:MAX such as .97, or like"
-        )
+        raise InputError(f"the black point is {text!r}, expected keep, compensate, random, or random:MAX such as .97")
     return BlackPoint("random", float(match[1] or MOST))
 
 

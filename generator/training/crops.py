@@ -249,8 +249,6 @@ class Crops:
         self.rendering = rendering
         self.matrix = matrix
         self.black_point = black_point
-        if black_point.kind == "like":
-            raise InputError("the black point like is for generate --like; take keep, compensate or random for crops")
         self._memory = Recycled()
         self._truths = (whites / whites.sum(axis=1, keepdims=True)).astype(np.float32)
         self._tables, self._rows = _tables_of(lut, self.lights if rendering == "codes" else (), seed)

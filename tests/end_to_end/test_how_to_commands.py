@@ -73,13 +73,6 @@ PAGES = {
         | {"runs/a": "results", "runs/b": "results"},
         written={"Gray-world=Mine": "Gray-world=White-Patch"},
     ),
-    "describing.md": Page(
-        {"generated": "dataset", "real": "dataset", "LUT": "computed", "LUT1": "computed", "LUT2": "computed"}
-        | {"pictures": "pictures", "lights.csv": "gt.txt"},
-        written={"~/data/Cube+": "real", "~/data/mine": "real"},
-        fresh={"generate LUT ": "generated"},
-        skipped={"generate 5DSR": _REAL, "evaluate describe out": _REAL},
-    ),
     "evaluate.md": Page(
         {"DATA": "dataset", "brightest.py": "brightest.py", "c5.csv": "estimates.csv", "out/fc4.csv": "estimates.csv"},
         fresh={"evaluate": "RESULTS"},
@@ -166,7 +159,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (at / "LAB.toml").write_text(LAB + "[judge]\nresponse = false\n" + SIMULATED)
     assert run("acquire", "run", at / "LAB.toml", at / "session") == 0
     assert run("build-lut", at / "session", at / "lut") == 0
-    parts = ("--split", "1,1", "--exact-split")
+    parts = ("--split", "1,1")
     spectra = ("--lights", "2000:10000:2000K,D65")
     assert run("sim", "table", at / "computed", "--settings", at / "small.toml", *spectra) == 0
     assert run("generate", at / "computed", at / "dataset", "--sources", at / "pictures", *parts) == 0

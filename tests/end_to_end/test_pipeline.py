@@ -105,7 +105,7 @@ def test_the_ground_truth_is_the_rooms_white(lut: Lut, built: Path) -> None:
 def dataset(built: Path, pictures: Path, run: Run) -> Path:
     """Return a dataset of the pictures under two lights."""
     out = built / "dataset"
-    wish = ("--sources", pictures, "--illuminations", "3,5", "--seed", 4, "--rendering", "codes")
+    wish = ("--sources", pictures, "--light", "3,5", "--seed", 4, "--rendering", "codes")
     assert run("generator.cli", built / "lut", out, *wish) == 0
     return out
 

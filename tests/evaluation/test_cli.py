@@ -93,7 +93,6 @@ def test_what_cannot_be_done_is_one_sentence(
         (["DATA"], False),
         (["cv", "regression-trees", "DATA", "--out", "results"], False),
         (["transfer", "--train", "A", "--test", "B", "--out", "results"], False),
-        (["describe", "DATA", "--out", "stats.json"], False),
     ],
 )
 def test_going_on_is_promised_only_by_what_keeps_its_work(

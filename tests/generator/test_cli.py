@@ -62,7 +62,7 @@ def test_what_is_odd_of_a_picture_is_noted(generate: Generate, capsys: pytest.Ca
     cv2.imwrite("pictures/black.png", np.zeros((20, 20, 3), np.uint8))
     cv2.imwrite("pictures/float.tif", np.full((20, 20, 3), 0.5, np.float32))
     cv2.imwrite("pictures/tiny.png", np.zeros((20, 15, 3), np.uint8))
-    assert generate("lut", "out", "--sources", "pictures", "--illuminations", "0", "--json") == 0
+    assert generate("lut", "out", "--sources", "pictures", "--light", "0", "--json") == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out)["noted"] == 4
     with Path("out/sources.csv").open(newline="") as stream:
@@ -74,13 +74,13 @@ def test_what_is_odd_of_a_picture_is_noted(generate: Generate, capsys: pytest.Ca
         "float.tif": ["floating-point values"],
         "tiny.png": ["tiny", "all black"],
     }
-    assert generate("lut", "out", "--sources", "pictures", "--illuminations", "0") == 0
+    assert generate("lut", "out", "--sources", "pictures", "--light", "0") == 0
     assert capsys.readouterr().out.count("4 pictures have notes in sources.csv, such as alpha.png: transparent") == 1
 
 
 def test_a_dataset_with_its_contact_sheet(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
     Path("pictures/bad.png").write_bytes(b"?")
-    wish = ("--sources", "pictures", "--illuminations", "0,2-3", "--seed", "4", "--rendering", "codes")
+    wish = ("--sources", "pictures", "--light", "0,2-3", "--seed", "4", "--rendering", "codes")
     wish += ("--contact-sheet", "sheet.png")
     assert generate("lut", "out", *wish, "--max-side", "30") == 0
     printed = capsys.readouterr()
@@ -120,14 +120,12 @@ def test_a_sheet_that_could_not_be_written_is_made_alone(
 
 
 def test_shares_are_finished_and_verified(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
-    wish = ("--sources", "pictures", "--illuminations", "all", "--shard-images", "3", "--rendering", "codes")
+    wish = ("--sources", "pictures", "--light", "all", "--shard-images", "3", "--rendering", "codes")
     assert generate("lut", "out", *wish, "--shard", "1/2") == 0
     assert "1 of 3 shards of out are done; others are still to be made" in capsys.readouterr().out
-    assert generate("--finish", "out") == 2
-    assert "2 of 3 shards of out are not made yet: 0, 2; run their shares" in capsys.readouterr().err
     assert generate("lut", "out", *wish, "--shard", "0/2") == 0
-    assert "3 of 3 shards of out are done; make a dataset of them with generate --finish out" in capsys.readouterr().out
-    assert generate("--finish", "out") == 0
+    assert "3 of 3 shards of out are done; run the same command without --shard" in capsys.readouterr().out
+    assert generate("lut", "out", *wish) == 0
     assert "out: 8 images of 2 pictures under 4 lights" in capsys.readouterr().out
     assert generate("--verify", "out") == 0
     assert "out: 8 images, every file as it was made" in capsys.readouterr().out
@@ -144,7 +142,7 @@ def test_who_asks_for_the_end_is_told_and_goes_on_later(
     def ended(*_: object) -> None:
         signal.raise_signal(signal.SIGTERM)
 
-    wish = ("--sources", "pictures", "--illuminations", "all", "--rendering", "codes")
+    wish = ("--sources", "pictures", "--light", "all", "--rendering", "codes")
     with monkeypatch.context() as patched:
         patched.setattr("generator.progress._Images.advance", ended)
         assert generate("lut", "out", *wish) == 130
@@ -154,7 +152,7 @@ def test_who_asks_for_the_end_is_told_and_goes_on_later(
 
 
 def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
-    wish = ("--sources", "pictures", "--illuminations", "all", "--shard-images", "3", "--rendering", "codes")
+    wish = ("--sources", "pictures", "--light", "all", "--shard-images", "3", "--rendering", "codes")
     assert generate("lut", "out", *wish, "--shard", "0/2") == 0
     assert generate("lut", "out", *wish, "--seed", "1") == 2
     assert "out was begun with another plan (seed 0, now 1)" in " ".join(capsys.readouterr().err.split())
@@ -172,7 +170,7 @@ def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest
         (("pictures", "out", "--sources", "pictures"), "pictures is no table"),
         (("lut", "out", "--sources", "pictures", "--nearest", "none.csv"), "cannot read ground truths none.csv"),
         (("lut", "out", "--sources", "pictures", "--seed", "-1"), "the seed is -1"),
-        (("lut", "out", "--random-scenes", "1", "--size", "big"), "--size is 'big'"),
+        (("lut", "out", "--random-scenes", "1:big"), "--random-scenes is 'big'"),
         (("lut", "nowhere://out", "--sources", "pictures"), "cannot reach nowhere://out"),
         ((), "the table and the place of the dataset are missing"),
         (("lut",), "lut is the table, and the place of the dataset is missing; write generate lut OUT"),
@@ -181,16 +179,15 @@ def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest
         (("pictures", "demo:"), "generate demo: pictures"),
         (("--verify", "lut"), "lut is no dataset"),
         (("--verify", "out", "extra"), "--verify does not expect extra; leave it out"),
-        (("--finish", "out", "lut", "extra"), "--finish does not expect lut; leave it out"),
-        (("--verify", "out", "--finish", "out"), "--verify and --finish are two commands; give one of them"),
-        (("--finish", "nowhere"), "no dataset is being made at nowhere"),
+        (("lut", "out", "--random-scenes", "x"), "expected a number such as 8"),
+        (("lut", "out", "--sources", "pictures", "--crop", "9x9,left"), "expected cover or random"),
         (("lut", "out", "--sources", "pictures", "--contact-sheet", "sheet.jpg"), "end in .png"),
         (("lut", "out", "--sources", "pictures", "--contact-sheet", "pictures/one.png"), "already exists"),
         (
             ("lut", "out", "--sources", "pictures", "--contact-sheet", "out/sheet.png"),
             "would be no part of the dataset",
         ),
-        (("lut", "out", "--shard", "0/2", "--contact-sheet", "sheet.png"), "ask for it with --finish"),
+        (("lut", "out", "--shard", "0/2", "--contact-sheet", "sheet.png"), "when all shares are done"),
         (("lut", "", "--sources", "pictures"), "'' names no place"),
         (("lut", "/", "--sources", "pictures"), "'/' names no place"),
         (("lut", "out", "--sources", ""), "'' names no place"),

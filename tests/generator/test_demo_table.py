@@ -68,7 +68,7 @@ def test_without_a_place_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) ->
 def test_one_command_makes_images_of_a_picture(tmp_path: Path) -> None:
     picture = tmp_path / "cat.png"
     cv2.imwrite(str(picture), np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8))
-    assert main(["demo:", str(tmp_path / "out"), "--sources", str(picture), "--illuminations", "0-1"]) == 0
+    assert main(["demo:", str(tmp_path / "out"), "--sources", str(picture), "--light", "0-1"]) == 0
     assert json.loads((tmp_path / "out" / "dataset.json").read_text("utf-8"))["images"]
 
 

@@ -114,4 +114,4 @@ def test_the_array_of_jobs() -> None:
         env={**os.environ, **job, "PATH": path},
     )
     assert done.returncode == 0, done.stderr
-    assert "1 of 1 shards of out are done; make a dataset of them with generate --finish out" in done.stdout
+    assert "1 of 1 shards of out are done; run the same command without --shard" in done.stdout

@@ -93,7 +93,7 @@ def place(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_the_matrix_is_told(
     place: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], told: str, not_told: str
 ) -> None:
-    wish = ("--sources", "grey.png", "--illuminations", "1", "--no-preview", "--rendering", "colorimetric")
+    wish = ("--sources", "grey.png", "--light", "1", "--no-preview", "--rendering", "colorimetric")
     assert main(["lut", "out", *wish, *more]) == 0
     printed = capsys.readouterr().out
     assert told in printed

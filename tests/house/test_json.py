@@ -146,12 +146,10 @@ CALLS: dict[str, tuple[str, dict[str, Any]]] = {
     "generate": ("MADE/lut OUT/set --sources MADE/pictures", {"images": 6, "made": True, "skipped": []}),
     "generate again": ("MADE/lut MADE/set --sources MADE/pictures --random 2", {"images": 12, "made": False}),
     "generate --verify": ("MADE/set", {"faults": [], "images": 12}),
-    "generate --finish": ("MADE/set", {"made": False}),
     "evaluate run": ("MADE/set --methods gray-world", {"data_set": "set", "images": 12}),
     "evaluate cv": ("constant-light MADE/set --folds 2", {"folds": 2, "images": 12}),
     "evaluate train": ("constant-light MADE/set --out OUT/model.npz", {"images": 12, "unused": 0}),
     "evaluate tune": ("shades-of-gray MADE/set", {"images": 12, "family": "shades-of-gray"}),
-    "evaluate describe": ("MADE/set", {"data_sets": ["set"]}),
     "evaluate paper bits": ("MADE/set --sigma 1", {}),
     "evaluate paper flash": ("MADE/set --out OUT/codes --clear 2", {"images": 12, "cleared": 2}),
     "evaluate paper reduction": ("MADE/pictures/0.png", {}),
@@ -196,7 +194,7 @@ def test_the_inverse_of_flash_and_comparisons(made: Path, tmp_path: Path, capsys
 
 @pytest.mark.slow
 def test_faults_are_figures_too(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    wish = ["--random-scenes", "2", "--size", "20x20"]
+    wish = ["--random-scenes", "2:20x20"]
     found = json_of(main_of("generate"), [made / "lut", tmp_path / "set", *wish, "--shard-images", "1"], capsys)
     assert found["splits"] == {}
     (tmp_path / "set/images/000001.png").write_bytes(b"")

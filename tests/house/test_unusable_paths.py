@@ -23,7 +23,6 @@ COMMANDS = (
     ("calibration.cli", "info", "{}"),
     ("generator.cli", "{}", "dataset", "--random-scenes", "1"),
     ("generator.cli", "--verify", "{}"),
-    ("generator.cli", "--finish", "{}"),
 )
 CAPABILITIES_3 = 0x20080522
 IGNORE_PERMISSIONS = 1 << 1 | 1 << 2

@@ -20,7 +20,7 @@ import pytest
 import calibration.pipeline.build as building
 from calibration.pipeline import checkpoint
 from calibration.pipeline.build import TableProgress, append, build
-from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, unfinished_table
+from calibration.pipeline.checkpoint import RECORD, Checkpoint, unfinished_table
 from calibration.pipeline.collecting import stored_names
 from calibration.pipeline.frames import frame_faults
 from calibration.table import writing
@@ -76,7 +76,7 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def files(folder: Path) -> dict[str, bytes]:
     """Return a table's files, but for the reports that only the command writes."""
-    assert not (folder / CHECKPOINT).exists()
+    assert not list(folder.glob(f"{RECORD}*"))
     return {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.startswith("report")}
 
 
@@ -127,14 +127,14 @@ def test_a_build_that_goes_on_does_not_start_over(
     assert files(tmp_path / "lut") == undisturbed
 
 
-@pytest.mark.parametrize("what", ["checkpoint", "samples"])
+@pytest.mark.parametrize("what", ["checkpoint", "checkpoint.*.npz", "samples.npy"])
 def test_damage_to_what_was_done_is_noticed(
     session: Session, undisturbed: dict[str, bytes], tmp_path: Path, what: str
 ) -> None:
     interrupted_at(session, tmp_path / "lut", 8)
-    path = tmp_path / ".lut.partial" / (CHECKPOINT if what == "checkpoint" else "samples.npy")
+    (path,) = (tmp_path / ".lut.partial").glob(what)
     data = bytearray(path.read_bytes())
-    data[-1 if what == "checkpoint" else 128 + 7] ^= 1
+    data[128 + 7] ^= 1
     path.write_bytes(data)
     build(session, tmp_path / "lut")
     assert files(tmp_path / "lut") == undisturbed
@@ -191,8 +191,9 @@ def test_a_table_follows_its_session(session_under_way: Session, undisturbed: di
             open_lut(out)
     # Of few colours the lens would be measured on the white frames that came since, too: all are taken in again.
     assert seen == [(0, 1), (3, 4), (3, 0), (lights - 1, every - 3)]
-    with np.load(tmp_path / ".lut.partial" / CHECKPOINT) as stored:
-        arrays = {name.rpartition(".")[2] for name in stored.files} - {"text"}
+    (path,) = (tmp_path / ".lut.partial").glob(f"{RECORD}.*.npz")
+    with np.load(path) as stored:
+        arrays = {name.rpartition(".")[2] for name in stored.files}
     assert arrays <= {name.partition(".")[2] for name in stored_names()}, "a checkpoint with other names is not used"
     with pytest.raises(FormatError, match=r"1 of \d+ lights .*--append"):
         build(session, out)
@@ -239,15 +240,6 @@ def test_a_checkpoint_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     assert (back.identity, back.frames, back.values) == ({"a": "b"}, ["x"], values)
     assert back.arrays["sum"].tobytes() == np.array([0.1, np.inf], np.float32).tobytes()
     assert not list(tmp_path.iterdir())
-
-
-def test_a_checkpoint_of_another_form_is_not_gone_on_from(tmp_path: Path) -> None:
-    """Versions before this one stored other keys."""
-    text = np.frombuffer(b'{"identity": {"a": "b"}, "frames": ["x"], "told": {}}', dtype=np.uint8)
-    with unfinished_table(tmp_path / "lut") as unfinished:
-        (unfinished.folder / "samples.npy").touch()
-        np.savez(unfinished.folder / CHECKPOINT, text=text)
-        assert unfinished.load({"a": "b"}, ["x"]) is None
 
 
 def test_the_frames_of_a_table_are_found_again(session: Session, session_under_way: Session, tmp_path: Path) -> None:

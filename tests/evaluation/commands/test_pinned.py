@@ -77,17 +77,11 @@ SEQUENCES: dict[str, tuple[str, ...]] = {
         "compare one two --method gray-world=pca --images",
         "compare one --method white-patch --method pca --method gray-world --method gray-edge-1",
     ),
-    "describe": (
-        "describe world.npz --against made --out s.json --report page.html --workers 1",
-        "describe s.json --against nus8 --cells 4 --workers 1",
-        "describe lsmi --saturation 20000 --workers 1",
-    ),
     "transfer": (
         "transfer --train made --test world.npz --methods kernel-ridge --statistics gray-world --naive pictures "
         "--real 3,all --images 8 --seeds 2 --out one --error recovery --workers 1",
         "transfer --train made --test other.npz --methods kernel-ridge --statistics gray-world --naive pictures "
         "--real 3,all --images 8 --seeds 2 --out two --side 8 --error recovery --workers 1",
-        "pool one two --base made:\\ generated --out pooled",
     ),
     "paper": (
         "paper table1 lut --pictures pictures --lights-like world.npz --side 16 --sizes 8,24 --hot 500 --out t1 "
@@ -123,7 +117,7 @@ def test_commands(
         if "--out one" not in command:
             told[command] = compact(json.loads(out)) if command.endswith("--json") else printed(out)
     new = [path for path in sorted(place.rglob("*")) if path not in before and path.is_file()]
-    # Tables are printed as well, pages are those of runs, and what is compared or pooled shows in what is made of it.
+    # Tables are printed as well, pages are those of runs, and what is compared shows in what is made of it.
     new = [path for path in new if path.suffix != ".tex"]
     if name in ("cv", "transfer"):
         new = [path for path in new if path.suffix != ".html" and path.parent.name != "two"]
@@ -136,8 +130,8 @@ def test_commands(
 REFUSED = (
     *("compare one two --method other",),
     *("compare nowhere", "compare a b c", "compare one one/errors.csv", "compare one --method pca", "run nowhere"),
-    *("compare one three", "compare one --method gray-world --method x", "compare one --level 0.4", "pool"),
-    *("pool one", "run world.npz --estimates nowhere.csv", "run world.npz --camera a", "run world.npz --layout x"),
+    *("compare one three", "compare one --method gray-world --method x", "compare one --level 0.4"),
+    *("run world.npz --estimates nowhere.csv", "run world.npz --camera a", "run world.npz --layout x"),
     *("run world.npz --methods pca,pca", "run world.npz --method kernel-ridge", "run world.npz --black -1"),
     *("run world.npz --csv a.csv --images ./a.csv", "run world.npz --out o --csv o/t.csv"),
     *("run folder --saturation 0", "cv world.npz kernel-ridge", "cv pca world.npz", "cv magic world.npz"),
@@ -146,7 +140,6 @@ REFUSED = (
     *("cv kernel-ridge made --folds 7", "cv kernel-ridge world.npz --folds 2.5", "train all world.npz --out a.npz"),
     *("train kernel-ridge world.npz --out a.txt", "train world.npz kernel-ridge --out a.npz", "tune pca world.npz"),
     *("train kernel-ridge world.npz --out world.npz", "train kernel-ridge world.npz --adapt world.npz --out a.npz"),
-    *("describe nowhere", "describe world.npz --against world.npz --out world.npz"),
     *("paper table1 lut --pictures made --lights-like world.npz",),
     *("paper table1 lut --pictures x --lights-like x.csv",),
     *("paper table1 lut --pictures pictures --lights-like world.npz --sizes 0", "paper reduction nowhere.png"),

@@ -12,7 +12,6 @@ import pytest
 from evaluation.cli import main
 from evaluation.datasets.generated import open_generated
 from evaluation.experiments.transfer import rows as transfer_rows
-from evaluation.metrics import summarise
 from evaluation.results.files import read_errors
 from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
 from tests.json_of import json_of
@@ -116,22 +115,6 @@ def test_only_some_images_are_tested(place: Path, capsys: pytest.CaptureFixture[
     lines = list(csv.DictReader(Path("part0/results.csv").read_text().splitlines()))
     assert {line["images"] for line in lines if line["training"] == "cross-validation"} == {"15"}
     assert Path("part0/folds_0.csv").read_text() == Path("whole/folds_0.csv").read_text()
-    pool = ["pool", "part0", "part1", "--error", "recovery", "--base", "MADE: GENERATED", "--out", "pool"]
-    pooled_json = json_of(main, pool, capsys)
-    assert (pooled_json["command"], pooled_json["error"]) == ("evaluate pool", "recovery")
-    assert all(table["rows"] for table in pooled_json["tables"])
-    assert "trained on made: generated" in str(pooled_json["tables"])
-    together = csv.DictReader(Path("pool/results.csv").read_text().splitlines())
-    pooled = {(line["method"], line["training"], line["statistic"]): float(line["degrees"]) for line in together}
-    error = whole["Map of the mean, made: generated"].errors["recovery"]
-    assert pooled["Map of the mean", "generated", "median"] == pytest.approx(summarise(error).median, abs=2e-6)
-    assert pooled["Map of the mean", "generated", "worst25"] == pytest.approx(summarise(error).worst25, abs=2e-6)
-    assert {line["test_images"] for line in csv.DictReader(Path("pool/by_test_set.csv").read_text().splitlines())} == {
-        "30"
-    }
-    pair = ("Map of the mean, made: generated", "Gray-world")
-    assert main(["compare", "pool", "--method", pair[0], "--method", pair[1]]) == 0
-    assert "errs less" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -82,7 +82,7 @@ def test_every_layout(made_lut: Path, tmp_path: Path, layout: Layout, together: 
 
 @pytest.mark.parametrize("layout", get_args(Layout))
 def test_parts_are_those_of_generate_and_share_no_picture(made_lut: Path, tmp_path: Path, layout: Layout) -> None:
-    options = DatasetOptions(previews=False, layout=layout, split=(0.5, 0, 0.5), split_exact=True)
+    options = DatasetOptions(previews=False, layout=layout, split=(0.5, 0, 0.5))
     generate_dataset(open_lut(made_lut), tmp_path / "made", random_scenes(6, 24, 20), [0, 1], options=options)
     parts = {part: open_scenes(tmp_path / "made", options=DataOptions(subset=part)) for part in ("train", "test")}
     assert [data.name for data in parts.values()] == ["made train", "made test"]

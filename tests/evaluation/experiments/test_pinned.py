@@ -12,7 +12,6 @@ import pytest
 
 from evaluation import metrics
 from evaluation.experiments import bootstrap, comparing, cross_validation, folds, suspicions
-from evaluation.experiments.describing import description, report
 from evaluation.experiments.paper import colour_reduction, material, published, reporting, table1
 from evaluation.experiments.run_folder import describe_run
 from evaluation.experiments.running import evaluate
@@ -24,8 +23,8 @@ from evaluation.results.files import MethodErrors, errors_csv, several_lights_cs
 from evaluation.results.result import Result, images_csv, indistinct, read_light, table_csv
 from evaluation.results.tables import Table, lights_tables, statistics_rows, summary_table
 from foundation.errors import CropError
-from tests.evaluation.experiments.describing.scenes import Made, MadeMixture, made_set, random_set
 from tests.evaluation.experiments.one_sample import intervals
+from tests.evaluation.made_scenes import Made
 from tests.evaluation.made_up import MixedWall, as_set, walls
 from tests.evaluation.shown import lines, numbers, printed, recorded_figures, table, words
 from tests.pinned import Pinned
@@ -353,101 +352,6 @@ def test_forest_plots(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
     ranges = [outcome._range(lines[:end]) for end in (1, 2, 3, 4)]
     ticks = [outcome.round_numbers(*ends) for ends in ((0.77, 1.3), (0.6, 2.2), (0.01, 40.0), (0.99, 1.01), (0.1, 1.0))]
     pinned("forest plots", [figures, ranges, ticks])
-
-
-def described() -> list[description.DataDescription]:
-    """Return descriptions of three sets: random, with clipped and masked images of odd sizes and a mixture, flat."""
-    random = np.random.default_rng(4)
-    scenes: list[Made] = []
-    for number in range(7):
-        height, width = 60 + 13 * number, 140 - 9 * number
-        light = np.array([0.6, 1, 0.4 + 0.05 * number])
-        signal = np.exp(random.uniform(3, 8, (-(-height // 16), -(-width // 16), 1)))
-        flat = signal.repeat(16, axis=0).repeat(16, axis=1)[:height, :width] * light
-        image = np.rint(np.maximum(flat + random.normal(0, 1, flat.shape) * np.sqrt(4 + 0.5 * flat), 0)).astype(
-            np.uint16
-        )
-        mask = np.zeros((height, width), bool)
-        mask[: 5 * number] = True
-        scenes.append(Made(f"noisy {number}", light, image, 2500.0, mask if number else None))
-    mixed = MadeMixture(
-        "mixed", np.array([1.0, 1, 1]), scenes[2].image, 2500.0, None, np.array([[2.0, 1, 1], [1, 1, 2]])
-    )
-    grey = [Made(f"grey {at}", np.array([1.0, 1, 1]), np.full((9, 70, 3), 100.0 * at)) for at in range(4)]
-    sets = [random_set("random", 9), made_set("noisy", [*scenes, mixed]), made_set("grey", grey)]
-    return [description.describe(data, side) for data, side in zip(sets, (64, 10, 4), strict=True)]
-
-
-def test_descriptions(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
-    figures = recorded_figures(monkeypatch)
-    made = described()
-    random = np.random.default_rng(0)
-    lights = random.uniform(0.3, 2, (40, 3))
-    compared = report.compare_figures(made[0], made[1], 2)
-    found: dict[str, Any] = {
-        "described": [
-            *([one.sizes, one.masked, one.mixed, one.groups, one.luminance, one.chroma] for one in made),
-            *([one.noise, one.noise_unit, one.values] for one in made),
-        ],
-        "figures": [description.figures(one) for one in made],
-        "lights": [description.light_distribution(lights[:count]) for count in (1, 2, 3, 40)],
-        "energy": [
-            description.energy_distance(lights[:20], lights[20:], seed=1),
-            description.energy_distance(np.ones((4, 2)), np.ones((3, 2))),
-        ],
-        "compared": [[one.quantity.name, *one.change, one.scale, one.distance, one.p] for one in compared],
-        "sentences": [report.sentence(one, ("random", "noisy")) for one in compared],
-        "side by side": [lines(one) for one in report.compared_tables(compared, ("random", "noisy"))],
-        "tables": [lines(one) for one in (*map(report.figures_table, made), report.lights_table(made[:2]))],
-        "sizes": [lines(report.sizes_table(one)) for one in made],
-        "notes": [report.seen_notes(made[0], one) for one in made[1:]] + [report.noise_notes(one) for one in made],
-        "page": words(report.describe_page(made[1]))[:60],
-        "drawn": figures,
-    }
-    pinned("descriptions of data sets", found, same=1e-5, nothing=1e-7)
-
-
-def test_parts_of_descriptions(pinned: Pinned) -> None:
-    random = np.random.default_rng(7)
-    blocks = np.empty((900, 2, 3))
-    blocks[:, 0] = np.exp(random.uniform(-5, 0, (900, 1)))
-    blocks[:, 1] = np.sqrt(1e-6 + 1e-3 * blocks[:, 0]) * random.uniform(1, 1.3, (900, 1))
-    image = random.uniform(1, 1000, (70, 45, 3))
-    image[10, 10] = np.nan
-    mask = random.random((70, 45)) < 0.004
-    found = {
-        "noise": [
-            description.relative_noise(blocks[:count], least) for count in (9, 10, 11, 900) for least in (-1, 0.1)
-        ],
-        "curves": [description.photon_transfer([blocks[:count]]) for count in (0, 30, 119, 900)],
-        "narrow": description.photon_transfer([blocks[np.abs(blocks[:, 0, 0] - 0.3) < 0.2]]),
-        "texture": description.photon_transfer(
-            [
-                blocks
-                * [
-                    [[1.0]],
-                ]
-                if False
-                else blocks ** [[1.0], [0.1]]
-            ]
-        ),
-        "blocks": [
-            description.measure_blocks(image, saturation, hidden, limit)
-            for saturation in (None, 999.0)
-            for hidden in (None, mask)
-            for limit in (3, 256)
-        ],
-        "usable": [
-            [int(part.sum()) for part in description.usable_pixels(image, saturation, hidden)]
-            for saturation in (None, 500.0, float(image[3, 3, 0]))
-            for hidden in (None, mask)
-        ],
-        "bands": [
-            list(description._bands(np.array([0, 4, 9, 9 + rows]), width))
-            for rows, width in ((1, 5), (9, 40_000), (5, 1 << 18))
-        ],
-    }
-    pinned("parts of descriptions", found, nothing=1e-8)
 
 
 def test_parts_of_the_paper(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from evaluation.experiments import folds
-from evaluation.experiments.describing.description import describe, read_statistics, statistics_to_json
 from evaluation.experiments.paper.material import read_truths
 from evaluation.learning.adapting import restore
 from evaluation.learning.feature_learner import FeatureLearner
@@ -26,7 +25,6 @@ from evaluation.results.files import read_errors, read_estimates
 from evaluation.results.method_records import describe_method
 from foundation.errors import CropError
 from tests.evaluation.datasets.test_pinned import damages
-from tests.evaluation.experiments.describing.scenes import random_set
 from tests.evaluation.learning.made_up_world import world
 from tests.evaluation.learning.stories import story
 from tests.evaluation.shown import unversioned
@@ -154,27 +152,6 @@ def test_damaged_models(tmp_path: Path, pinned: Pinned) -> None:
 
 def arrays_of_ridge() -> dict[str, Any]:
     return dict(KernelRidge().fit(world(3, 0, size=8)).model.arrays())
-
-
-def test_damaged_statistics(tmp_path: Path, pinned: Pinned) -> None:
-    path = tmp_path / "s.json"
-    whole = statistics_to_json(describe(random_set("made", 3)))
-    found: dict[str, Any] = {}
-    for how, text in (
-        ("whole", whole),
-        ("format", whole.replace("crop.statistics", "crop.other")),
-        ("version", whole.replace('"version": 1', '"version": 2')),
-        ("no name", whole.replace('"name": "made"', '"title": "made"')),
-        ("an image less", whole.replace('"made 0", ', "", 1)),
-        ("a value less", whole.replace('"edges": [', '"edges": [1, ')),
-        ("another quantity", whole.replace('"near_grey": [', '"other": [')),
-        ("no groups", whole.replace('"groups": 3, ', "")),
-        ("list", "[]"),
-    ):
-        path.write_text(text)
-        told = attempt(lambda: read_statistics(path), tmp_path)
-        found[how] = told if isinstance(told, str) else [told.name, told.side, told.groups, len(told.images)]
-    pinned("damaged statistics of data sets", found)
 
 
 @dataclass(frozen=True)

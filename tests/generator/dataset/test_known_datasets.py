@@ -10,31 +10,28 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from foundation.errors import CropError
 from generator.cli import main
 from generator.dataset.reader import file_faults, open_dataset
 from tests.generator.dataset.known import held_by, table_in
-from tests.generator.stats_files import write_stats
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
 
 RUNS = {
-    "all lights of the table": "--illuminations all --rendering codes --no-preview --split 2,1",
-    "listed lights and an exact split": "--illuminations 0,2-3 --rendering codes --split .5,.25,.25 --exact-split",
-    "random lights": "--random 3 --rendering codes --format tiff --scale full --shard-images 4",
+    "all lights of the table": "--light all --rendering codes --no-preview --split 2,1",
+    "listed lights": "--light 0,2-3 --rendering codes --split .5,.25,.25",
+    "random lights": "--random 3 --rendering codes --format tiff --shard-images 4",
     "mixed lights": "--light 1 --light 0:0.25+3:0.75 --light 5600K --light E --light r=.32,b=.3 --rendering "
     "codes --uncertainty",
-    "lights drawn evenly": "--distribution uniform --random 3 --rendering codes --format exr --bits 1",
-    "lights drawn from a bell": "--distribution gaussian:r=.32,b=.28,sd_r=.03,sd_b=.02,corr=-.6 --random 2 --outside "
-    "nearest --rendering codes",
-    "lights drawn like a file's": "--distribution truths.csv --random 3 --outside nearest --rendering codes",
+    "lights drawn evenly": "--distribution uniform --random 3 --rendering codes --format exr",
+    "lights drawn from a bell": "--distribution gaussian:r=.32,b=.28,sd_r=.03,sd_b=.02,corr=-.6 --random 2 "
+    "--rendering codes",
+    "lights drawn like a file's": "--distribution truths.csv --random 3 --rendering codes",
     "nearest lights": "--nearest truths.csv --rendering codes --format dng",
-    "matched lights": "--match truths.csv --outside nearest --rendering codes --format jxl",
-    "lights by name": "--lights-by-name named.csv --outside nearest --rendering codes --sources small",
+    "matched lights": "--match truths.csv --rendering codes --format jxl",
     "two lights of half-planes": "--masks half-plane:angle=30 --rendering codes --uncertainty",
     "three lights with soft edges": "--masks soft-edge:width=.4 --lights-per-image 3 --rendering codes",
     "four lights in spots": "--masks spots:count=2,radius=.3,softness=.2 --lights-per-image 4 --rendering codes",
@@ -42,7 +39,7 @@ RUNS = {
     "three lights through a window": "--masks window:columns=3,rows=1,softness=.02 --lights-per-image 3 --rendering "
     "codes --layout parquet",
     "masks of a folder": "--masks masks --lights-per-image 2 --light 0 --light 3 --rendering codes",
-    "a fixed exposure": "--exposure .37 --rendering codes --illuminations 1",
+    "a fixed exposure": "--exposure .37 --rendering codes --light 1",
     "stops and speed": "--exposure stops:low=-2,high=1 --iso 1600:read=3 --rendering codes --random 2",
     "clipped shares under a gradient": "--exposure clip:share=.05,most=20 --gradient spots:count=1,stops=2,least=1 "
     "--rendering codes",
@@ -50,15 +47,15 @@ RUNS = {
     "800/100 --rendering codes --uncertainty",
     "normal exposures and soft edges": "--exposure normal:mean=-1,sd=.6 --gradient soft-edge:width=.5,stops=3 "
     "--rendering codes --layout webdataset --split .6,.2,.2",
-    "crops": "--crop 13x12 --crops 3 --cover --rendering codes --sources small --split .5,.5",
-    "small crops in the centre": "--max-side 24 --crop 17x11 --crop-at centre --rendering codes --sources small",
-    "random crops": "--crop 20x9 --crop-at random --profiles ignore --rendering codes --sources small --split 1,1",
+    "crops": "--crop 13x12,cover --crops 3 --rendering codes --sources small --split .5,.5",
+    "small crops in the centre": "--max-side 24 --crop 17x11 --rendering codes --sources small",
+    "random crops": "--crop 20x9,random --rendering codes --sources small --split 1,1",
     "colours without black": "--black-point random:.8 --random 2",
     "colours of two lights": "--black-point compensate --masks smooth --random 1 --exposure .5",
-    "codes without black": "--black-point compensate --rendering codes --illuminations 0,3",
+    "codes without black": "--black-point compensate --rendering codes --light 0,3",
     "codes without black of two lights": "--black-point random --rendering codes --masks window",
-    "colours by a camera's matrix": "--matrix matrix.txt --illuminations 2 --layout parquet --gradient window:stops=1",
-    "colours without a matrix": "--matrix none --illuminations 2 --split .4,.3,.3 --black-point random",
+    "colours by a camera's matrix": "--matrix matrix.txt --light 2 --layout parquet --gradient window:stops=1",
+    "colours without a matrix": "--matrix none --light 2 --split .4,.3,.3 --black-point random",
 }
 
 
@@ -88,7 +85,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             cv2.imencode(".png", np.arange(48, dtype=np.uint8).reshape(6, 8))[1].tobytes()
         )
         Path("truths.csv").write_text("GT_R,GT_G,GT_B\n.4,.36,.24\n.3,.36,.34\n.35,.39,.26\n.2,.5,.3\n", "utf-8")
-        Path("named.csv").write_text("name,r,g,b\na.png,.42,.35,.23\nb.png,.3,.35,.35\nc.png,.3,.45,.25\n")
         Path("matrix.txt").write_text(".6 .3 .1\n.1 .7 .2\n.05 .25 .7\n")
         yield folder
 
@@ -97,54 +93,20 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def test_a_dataset(name: str, place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
     words = RUNS[name].split()
     if "--sources" not in words:
-        words += ["--sources", "cat.png", "--random-scenes", "1", "--size", "21x16"]
+        words += ["--sources", "cat.png", "--random-scenes", "1:21x16"]
     out = place / name.replace(" ", "-")
     assert main(["lut", out.name, *words, "--seed", "5", "--workers", "1"]) in (0, 1)
     pinned(f"dataset, {name}", {"said": capsys.readouterr().out, **held_by(out)})
-
-
-LIKE = {
-    "like real data": "--draw 14",
-    "like real data in lights and size": "--like-in lights,size --illuminations 1",
-    "like real data with crops": "--like-in pictures,exposure --crop 12x10 --crops 2 --draw 5 --rendering codes",
-    "like real data in black": "--black-point like --like-in pictures --illuminations 2 --draw 9",
-}
-
-
-@pytest.mark.parametrize("name", LIKE)
-def test_a_dataset_like_real_ones(name: str, place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
-    """Weights are found by a descent that ends within a thousandth."""
-    rng = np.random.default_rng(15)
-    values: dict[str, npt.ArrayLike] = {name: rng.uniform(low, high, 40) for name, (low, high) in REAL.items()}
-    write_stats(place / "stats.json", rng.normal([0.36, 0.39, 0.25], 0.01, (20, 3)), values)
-    for number in range(8):
-        picture(f"many/{number}.png", 30 + number, 60 - 3 * number, 20 + number)
-    out = place / name.replace(" ", "-")
-    words = f"lut {out.name} --sources many --like stats.json --seed 4 --workers 1 {LIKE[name]}".split()
-    code = main(words)
-    said = capsys.readouterr()
-    pinned(f"dataset, {name}", [code, said.out, said.err if code else held_by(out)], same=1e-3)
-
-
-REAL = {
-    "luminance_1": (0.005, 0.05),
-    "luminance_50": (0.1, 0.45),
-    "luminance_95": (0.5, 0.9),
-    "chroma_spread": (0.02, 0.12),
-    "grey_red": (-0.2, 0.2),
-    "grey_blue": (-0.1, 0.3),
-    "exposure": (0.2, 1.0),
-}
 
 
 def test_scenes_under_the_lights_of_another_table(
     place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table_in(place / "other", order=(3, 1, 0, 2))
-    first = "--sources small --random-scenes 2 --size 9x7 --seed 6 --max-side 30 --rendering codes"
+    first = "--sources small --random-scenes 2:9x7 --seed 6 --max-side 30 --rendering codes"
     found: list[Any] = []
     for name, lights in (
-        ("single", "--illuminations 0,3"),
+        ("single", "--light 0,3"),
         ("mixed", "--light 0:.3+2:.7"),
         ("masks", "--lights-per-image 2 --light 0 --light 2"),
     ):
@@ -159,13 +121,13 @@ def test_scenes_under_the_lights_of_another_table(
 
 
 def test_a_dataset_in_shares(place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
-    plan = "lut shares --random-scenes 7 --size 12x9 --random 2 --rendering codes --seed 1 --shard-images 3"
+    plan = "lut shares --random-scenes 7:12x9 --random 2 --rendering codes --seed 1 --shard-images 3"
     found: list[Any] = []
 
     def run(words: str) -> None:
         found.append([main([*words.split(), "--json"]), *told(capsys)])
 
-    for words in (f"{plan} --shard 0/2", f"{plan} --shard 2/2", f"{plan} --shard 1/2", "--finish shares", plan):
+    for words in (f"{plan} --shard 0/2", f"{plan} --shard 2/2", f"{plan} --shard 1/2", plan, plan):
         run(words)
     run("--verify shares")
     found.append(held_by(place / "shares", ()))
@@ -189,30 +151,19 @@ REFUSED = """lut new --sources small --crop 5
 lut new --sources small --crop 99x99
 lut new --random-scenes 2 --crop 4x4
 lut new --sources small --random-scenes 1 --crop 4x4 --crops 2
-lut new --random-scenes 1 --bits 3 --rendering codes
-lut new --random-scenes 1 --scale full --format exr
-lut new --random-scenes 1 --exact-split
 lut new --random-scenes 1 --black-point like
 lut new --random-scenes 1 --iso 50
-lut new --random-scenes 1 --like-in lights
-lut new --random-scenes 1 --draw 2
-lut new --random-scenes 1 --like stats.json --like-in lights,other
-lut new --random-scenes 1 --like stats.json --like-in lights --random 2 --light 1
-lut new --random-scenes 1 --like stats.json --like-in size --draw 3
-lut new --random-scenes 1 --like truths.csv
-lut new --random-scenes 1 --like stats.json --lights-of old
 lut new --random-scenes 1 --lights-of old
 lut new --sources small --lights-of old --light 1
 lut new --sources small --lights-of old --max-side 9
 lut new --sources small --lights-of lut
 lut new --random-scenes 1 --nearest cat.png
-lut old --random-scenes 2 --size 9x8
-lut old --random-scenes 1 --size 9x8 --seed 7"""
+lut old --random-scenes 2:9x8
+lut old --random-scenes 1:9x8 --seed 7"""
 
 
 def test_what_is_refused(place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
-    write_stats(place / "stats.json", [[0.3, 0.4, 0.3]] * 3, {name: [0.1, 0.2, 0.3] for name in REAL})
-    assert main(["lut", "old", "--random-scenes", "1", "--size", "9x8", "--rendering", "codes"]) == 0
+    assert main(["lut", "old", "--random-scenes", "1:9x8", "--rendering", "codes"]) == 0
     capsys.readouterr()
     found: dict[str, Any] = {}
     for words in REFUSED.splitlines():
@@ -253,7 +204,7 @@ DAMAGES: dict[str, list[tuple[str, str]]] = {
 
 
 def test_damaged_datasets(place: Path, pinned: Pinned) -> None:
-    plan = "lut damaged --random-scenes 2 --size 9x8 --rendering codes --light 0 --no-preview"
+    plan = "lut damaged --random-scenes 2:9x8 --rendering codes --light 0 --no-preview"
     assert main(plan.split()) == 0
     found: dict[str, Any] = {}
     for name, changes in DAMAGES.items():

@@ -68,8 +68,8 @@ def test_texts_beside_datasets(lut: Lut, tmp_path: Path, pinned: Pinned) -> None
     matrix = ColourMatrix("mine", MATRIX, "a test")
     masks = SimultaneousLights(RandomLights(2, 5, 1), 2, parse_masks("smooth", 2, 1))
     datasets = {
-        "plain": made(lut, tmp_path / "a", random_scenes(3, 9, 8), [0, 3], split=(0.5, 0.25, 0.25), scale="full"),
-        "tar": made(lut, tmp_path / "b", random_scenes(2, 9, 8), [1], layout="webdataset", bits=1),
+        "plain": made(lut, tmp_path / "a", random_scenes(3, 9, 8), [0, 3], split=(0.5, 0.25, 0.25)),
+        "tar": made(lut, tmp_path / "b", random_scenes(2, 9, 8), [1], layout="webdataset"),
         "parquet": made(
             lut, tmp_path / "c", random_scenes(2, 24, 25), masks, layout="parquet", previews=True, uncertainty=True,
             variation=varied_by(lut, parse_exposure(".5")),

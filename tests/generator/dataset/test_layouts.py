@@ -360,21 +360,3 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
     monkeypatch.setattr("generator.dataset.layouts.find_spec", find_spec)
     with pytest.raises(InputError, match=r"pip install pyarrow"):
         make("parquet")
-
-
-def test_a_dataset_of_version_1_is_read(make: Make) -> None:
-    made = make("folder", split=None)
-    folder = place_of(made)
-    content = json.loads((folder / "dataset.json").read_text())
-    sources = [source.model_dump(exclude={"split", "profile"}) for source in made.sources]
-    for key in ("planned", "pixels", "replaced_pixels", "splits"):
-        del content[key]
-    content |= {"version": 1, "sources": sources}
-    content["options"] = {key: content["options"][key] for key in ("format", "lights", "previews")} | {"max_side": None}
-    (folder / "dataset.json").write_text(json.dumps(content))
-    (folder / "sources.csv").unlink()
-    old = open_dataset(folder)
-    assert old.entries == made.entries
-    assert (old.description.sources, old.description.pixels, old.description.planned) == (9, 9 * 28 * 24, 18)
-    assert old.sources == made.sources
-    np.testing.assert_array_equal(old.read_image(old.entries[5]), made.read_image(made.entries[5]))

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from foundation.errors import InputError
 from generator.dataset.making import generate_dataset, parse_share
-from generator.dataset.plan import DatasetOptions, Plan, exact_parts
+from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.shards import split_of
 from generator.lights.lighting import ListedLights
 from generator.pictures.random_scenes import random_scenes
@@ -81,20 +81,6 @@ def test_parts_are_of_sources_and_stay_when_others_come(make_lut: MakeLut, tmp_p
     assert {name: now[name] for name in parts} == parts
 
 
-def test_what_is_in_a_picture_decides_its_part_only_where_it_has_a_copy(tmp_path: Path) -> None:
-    found: list[tuple[str, ...]] = []
-    for times in (1, 2):
-        for number in range(16):
-            (tmp_path / f"{number:02d}.png").write_bytes(bytes([number]) * times * (1 + number))
-        found.append(exact_parts(find_pictures([tmp_path]), (0.5, 0.25, 0.25), 3))
-    assert found[0] == found[1]
-    assert Counter(found[0]) == {"train": 8, "validation": 4, "test": 4}
-    for number in range(6):
-        (tmp_path / f"{number:02d}.png").write_bytes((tmp_path / "09.png").read_bytes())
-    parts = exact_parts(find_pictures([tmp_path]), (0.5, 0.25, 0.25), 3)
-    assert {*parts[:6], parts[9]} == {"train"}, "the only part that has room for seven"
-
-
 def test_shares_of_the_work() -> None:
     assert parse_share("3/16") == (3, 16)
     for text in ("16/16", "3", "-1/4", "a/b", "3/"):
@@ -125,12 +111,8 @@ def test_a_plan_at_its_limits_and_beyond(make_lut: MakeLut) -> None:
 
     full = plan(1 << 31, shard_images=1000)
     assert (full.total, full.shards, full.images_of(full.shards - 1)) == (1 << 32, 4_294_968, 296)
-    plan(rendering="codes", bits=2)
-    plan(rendering="colorimetric", bits=3)
     with pytest.raises(InputError, match="4294967298 images"):
         plan((1 << 31) + 1)
-    with pytest.raises(InputError, match="3 bits"):
-        plan(rendering="codes", bits=3)
 
 
 def test_a_shard_takes_the_pictures_that_its_images_show(make_lut: MakeLut) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from foundation.errors import FormatError
-from generator.dataset.making import finish_dataset, generate_dataset
+from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.reader import open_dataset
 from generator.lights.choices import SimultaneousLights
@@ -71,8 +71,6 @@ def test_a_dataset_just_made_is_as_it_is_when_opened(
     assert made == opened
     assert made.light_labels == opened.light_labels == {label for entry in opened.entries for label in entry.lights}
     assert made.entries == opened.entries
-    finished = finish_dataset(tmp_path / "out")
-    assert finished.light_labels == opened.light_labels
 
 
 def test_a_dataset_just_made_is_not_read_again(make_lut: MakeLut, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from foundation.errors import InputError
 from generator.cli import main
-from generator.dataset.making import finish_dataset, generate_dataset, make_share, workplace
+from generator.dataset.making import generate_dataset, make_dataset, make_share, workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import open_dataset
 from generator.dataset.shards import make_shard
@@ -98,7 +98,7 @@ def test_an_image_is_that_of_its_light_without_a_share_of_black(
 
 def test_what_was_begun_or_made_by_codes_goes_on_so(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
     lut, out = make_lut(), str(tmp_path / "out")
-    wish = (str(lut.folder), out, "--sources", str(pictures), "--illuminations", "1,2", "--seed", "5")
+    wish = (str(lut.folder), out, "--sources", str(pictures), "--light", "1,2", "--seed", "5")
     assert main((*wish, "--rendering", "codes", "--shard", "0/2", "--shard-images", "2")) == 0
     assert main((*wish, "--shard-images", "2")) == 0
     assert open_dataset(out).description.rendering is None
@@ -119,7 +119,7 @@ def test_workers_shards_shares_and_other_processes_change_no_byte(
     with workplace(out, plan.identity(), alone=False) as place, ThreadPoolExecutor(1) as pool:
         make_shard(job, lut, place, pool, 1)
     make_share(plan, out, (0, 1))
-    finish_dataset(out)
+    make_dataset(plan, out)
     assert {name: one[name] for name in ("images.csv", "dataset.json", "images/000003.png")} == {
         name: hashlib.sha256((out / name).read_bytes()).hexdigest()
         for name in ("images.csv", "dataset.json", "images/000003.png")

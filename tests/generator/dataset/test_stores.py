@@ -21,7 +21,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.registry import register_implementation
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.making import finish_dataset, generate_dataset, make_dataset, make_share, workplace
+from generator.dataset.making import generate_dataset, make_dataset, make_share, workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import file_faults, open_dataset
 from generator.dataset.records import Layout
@@ -239,7 +239,7 @@ def test_shares_in_a_store(make_lut: MakeLut, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"memory://out.*3.*4"):
         make(lut, "memory://out", seed=4)
     assert make_share(plan, "memory://out", (0, 2)) == (3, 3)
-    finish_dataset("memory://out")
+    make_dataset(plan, "memory://out")
     assert contents("memory://out") == contents(tmp_path / "out")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import signal
@@ -20,7 +19,7 @@ from foundation.errors import FormatError, InputError
 from foundation.folders import FolderLock, held_folder
 from generator.dataset import layouts as plain_files
 from generator.dataset import shards
-from generator.dataset.making import Workers, finish_dataset, generate_dataset, make_dataset, make_share, workplace
+from generator.dataset.making import Workers, generate_dataset, make_dataset, make_share, workplace
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, open_dataset
 from generator.dataset.records import FinishedImage, Layout, ShardRecord
@@ -136,7 +135,7 @@ def one_shard(
 def noted_images(out: Path) -> list[int]:
     """Return the numbers of the images that whole lines are there of."""
     lines = filter(None, notes_of(out).read_bytes().splitlines())
-    return [json.loads(line[65:])["image"]["number"] for line in lines if line.endswith(b"}")]
+    return [int(line.split(b"\t")[1]) for line in lines if line.endswith(b"}")]
 
 
 def notes_of(out: Path) -> Path:
@@ -374,21 +373,14 @@ def test_shares_make_the_whole(make_lut: MakeLut, tmp_path: Path) -> None:
     make_dataset(plan_of(lut), tmp_path / "whole")
     assert make_share(plan_of(lut), out, (1, 3), Workers(count=2)) == (2, 6)
     assert make_share(plan_of(lut), out, (0, 3)) == (4, 6)
-    with pytest.raises(InputError, match=r"2 of 6 shards .*: 2, 5"):
-        finish_dataset(out)
     with pytest.raises(InputError, match=r"share 3 of 3.*0 to 2"):
         make_share(plan_of(lut), out, (3, 3))
     assert make_share(plan_of(lut), out, (2, 3)) == (6, 6)
     assert make_share(plan_of(lut), out, (2, 3)) == (6, 6), "made again, nothing changes"
     assert not out.exists()
-    finish_dataset(out)
+    make_dataset(plan_of(lut), out)
     assert contents(out) == contents(tmp_path / "whole")
     assert not list(tmp_path.glob(".out*"))
-    before = contents(out)
-    assert finish_dataset(out).description.images == plan_of(lut).total, "finished before: it is there"
-    assert contents(out) == before
-    with pytest.raises(InputError, match="being made at"):
-        finish_dataset(tmp_path / "elsewhere")
 
 
 def test_shares_are_made_beside_each_other(make_lut: MakeLut, tmp_path: Path) -> None:
@@ -396,7 +388,7 @@ def test_shares_are_made_beside_each_other(make_lut: MakeLut, tmp_path: Path) ->
     with workplace(tmp_path / "out", plan_of(lut).identity(), alone=False):
         assert make_share(plan_of(lut), tmp_path / "out", (0, 1)) == (6, 6)
         with pytest.raises(InputError, match="another program"):
-            finish_dataset(tmp_path / "out")
+            make_dataset(plan_of(lut), tmp_path / "out")
 
 
 def test_a_share_that_waited_for_the_whole_is_refused(
@@ -416,18 +408,26 @@ def test_a_share_that_waited_for_the_whole_is_refused(
     assert not (tmp_path / ".out.partial").exists()
 
 
-def test_a_damaged_record_and_a_changed_source_are_reported(make_lut: MakeLut, tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", [lambda text: text[:-9], lambda text: text.replace("24", "25"), lambda text: ""])
+def test_a_shard_of_a_damaged_record_is_made_again(
+    make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[str], str]
+) -> None:
     lut, out = make_lut(), tmp_path / "out"
     make_share(plan_of(lut), out, (0, 1))
-    (record,) = (tmp_path / ".out.partial" / "plan" / "shards").glob("000001.*.json")
-    text = record.read_text()
-    record.write_text(text[:-9])
-    with pytest.raises(FormatError, match=r"000001\.\w+\.json: damaged: .*; remove it and run the same command again"):
-        finish_dataset(out)
-    record.write_text(text.replace('"width":24', '"width":25'))
-    with pytest.raises(FormatError, match="random-000000"):
-        finish_dataset(out)
-    record.unlink()
-    make_dataset(plan_of(lut), out)
+    (record,) = (tmp_path / ".out.partial" / "plan" / "shards").glob("000001.*")
+    record.write_text(damage(record.read_text()))
+    done = made_after(monkeypatch, lambda seen: make_dataset(plan_of(lut), out, callbacks=seen))
+    assert done == (10, 2, [2, 3])
     make_dataset(plan_of(lut), tmp_path / "whole")
     assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_a_picture_that_changed_between_two_shares_is_reported(make_lut: MakeLut, tmp_path: Path) -> None:
+    lut, out, folder = make_lut(), tmp_path / "out", tmp_path / "pictures"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "a.png"), np.full((16, 24, 3), 50, np.uint8))
+    plan = Plan(lut, find_pictures(folder), RandomLights(3, 4, 9), 9, DatasetOptions(shard_images=2))
+    make_share(plan, out, (0, 2))
+    cv2.imwrite(str(folder / "a.png"), np.full((16, 24, 3), 60, np.uint8))
+    with pytest.raises(FormatError, match=r"a\.png changed"):
+        make_dataset(plan, out)

@@ -15,15 +15,13 @@ import pytest
 
 from calibration.table.lut import Lut
 from generator import philox
-from generator.lights.choices import parse_light, parse_lights
+from generator.lights.choices import light_numbers, parse_light
 from generator.lights.distributions import load_ground_truths, parse_distribution
 from generator.lights.gamut import Gamut, OutsideGamut, black_body, rgb_of
 from generator.lights.lighting import LightChoice, mixture_of, parse_mixture
-from generator.lights.named_lights import load_named_truths
 from generator.options import LightOptions
 from tests.generator.dataset.known import table_in
 from tests.generator.said import said
-from tests.generator.stats_files import write_stats
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -75,8 +73,6 @@ def lut(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lut]:
         Path("many.csv").write_text(
             "b,image,r,g\n.2,one.cr2,.4,.4\n.25,two.png,.35,.4\n.3,one.cr2,.3,.4\n.2,two.png,.45,.35\n"
         )
-        write_stats(Path("stats.json"), truths, {})
-        write_stats(Path("far.json"), truths[:2], {})
         yield table_in(Path("lut"))
 
 
@@ -97,7 +93,7 @@ def test_mixtures_for_wanted_lights(name: str, pinned: Pinned) -> None:
 def test_draws_of_distributions(pinned: Pinned) -> None:
     words = philox.words(3, np.arange(100), 1, 2, philox.CHROMATICITIES)
     texts = ("uniform", "gaussian:r=.3,b=.25,sd=.02", "gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8", "fit:gt.csv")
-    texts += ("gt.csv", "gt.txt", "stats.json", "far.json", "gaussian:r=.3,sd=.1", "gaussian:r=.3,b=.2,sd_r=.1", "none")
+    texts += ("gt.csv", "gt.txt", "gaussian:r=.3,sd=.1", "gaussian:r=.3,b=.2,sd_r=.1", "none")
     found: dict[str, Any] = {}
     for text in texts:
         distribution = said(parse_distribution, text)
@@ -125,7 +121,7 @@ def test_lights_that_texts_name(lut: Lut, pinned: Pinned) -> None:
     found = {text: said(parse_light, text, lut) for text in texts}
     found |= {f"{text} nearest": said(parse_light, text, lut, None, "nearest") for text in texts}
     lists = ("all", " ALL ", "0,2-4", "4-4,1,4", "3-1", "0-5", "1,,2", "0 - 2 , 4", "-1")
-    found |= {f"list {text}": said(parse_lights, text, 5) for text in lists}
+    found |= {f"list {text}": said(light_numbers, text, 5) for text in lists}
     parts = ({4: 3, 1: 1, 2: 0.0}, {0: 1, 1: 4e-10}, {0: 1, 1: 6e-10}, {0: 1, 1: 1, 2: 1})
     found |= {f"parts {number}": mixture_of(one) for number, one in enumerate(parts)}
     found["parsed"] = [parse_mixture(text) for text in ("7", "3:.2+1:.8", "1:.3333333+2:.3333333+5:.3333334")]
@@ -138,8 +134,8 @@ def test_files_of_lights(pinned: Pinned) -> None:
     Path("few.txt").write_text("1 2\n", "utf-8")
     Path("none.csv").write_text("r,g,b\n", "utf-8")
     Path("other.csv").write_text("x,y\n1,2\n", "utf-8")
-    names = ("gt.csv", "gt.txt", "many.csv", "stats.json", "wrong.csv", "few.txt", "none.csv", "other.csv")
-    found = {name: [said(read, Path(name)) for read in (load_ground_truths, load_named_truths)] for name in names}
+    names = ("gt.csv", "gt.txt", "many.csv", "wrong.csv", "few.txt", "none.csv", "other.csv")
+    found = {name: said(load_ground_truths, Path(name)) for name in names}
     pinned("files of lights", found)
 
 
@@ -148,32 +144,23 @@ REQUESTS: dict[str, dict[str, Any]] = {
     "three random": {"random": 3},
     "drawn": {"distribution": "gaussian:r=.32,b=.28,sd=.03", "random": 2},
     "drawn evenly together": {"distribution": "uniform", "random": 2, "lights_per_image": 2},
-    "like statistics": {"distribution": "stats.json", "lights_per_image": 3, "masks": "spots"},
     "nearest": {"nearest": Path("gt.csv")},
     "nearest together": {"nearest": Path("gt.txt"), "lights_per_image": 2},
-    "matched": {"match": Path("gt.csv"), "outside": "nearest", "masks": "window"},
-    "matched inside": {"match": Path("gt.csv")},
-    "by name": {"lights_by_name": Path("many.csv"), "outside": "nearest"},
-    "by name together": {"lights_by_name": Path("many.csv"), "outside": "nearest", "lights_per_image": 2},
-    "listed together": {"illuminations": "0-3", "lights_per_image": 2, "masks": "half-plane"},
-    "listed unevenly": {"illuminations": "0-2", "lights_per_image": 2},
+    "matched": {"match": Path("gt.csv"), "masks": "window"},
+    "listed together": {"light": ["0-3"], "lights_per_image": 2, "masks": "half-plane"},
+    "listed unevenly": {"light": ["0-2"], "lights_per_image": 2},
     "texts": {"light": ("A", "r=.33,b=.27", "4000K"), "lights_per_image": 3},
     "one of several": {"masks": "smooth", "lights_per_image": 1},
     "none": {"lights_per_image": 0},
-    "both": {"illuminations": "0", "random": 2},
+    "both": {"light": ["0"], "random": 2},
     "too many": {"random": 6},
     "far": {"distribution": "gaussian:r=.9,b=.02,sd=.001"},
 }
 
 
 def test_requests(lut: Lut, pinned: Pinned) -> None:
-    names = ["one.png", "raw/two.png", "one.png", "raw/two.png"]
     found: dict[str, Any] = {}
     for name, wishes in REQUESTS.items():
-        choice = said(LightOptions(**wishes).choose, lut, SEED, names[:2])
-        scenes = (0, 1) if "by name" in name else (0, 1, 70000)
-        found[name] = choice if isinstance(choice, str) else said(shown, choice, scenes)
-    by_name = LightOptions(lights_by_name=Path("many.csv"), outside="nearest")
-    found["crops by name"] = shown(by_name.choose(lut, SEED, names[:2], 2), (0, 1, 2, 3))
-    found["ambiguous"] = said(by_name.choose, lut, SEED, names)
+        choice = said(LightOptions(**wishes).choose, lut, SEED)
+        found[name] = choice if isinstance(choice, str) else said(shown, choice, (0, 1, 70000))
     pinned("requests of lights", found)

@@ -16,7 +16,6 @@ from generator.pictures.sources import (
     Preparation,
     clear_bits,
     find_pictures,
-    keep_bits,
     open_picture,
     random_places,
 )
@@ -123,8 +122,6 @@ def test_prepared_pictures(tmp_path: Path, pinned: Pinned) -> None:
         clear_bits(bits, 0),
         clear_bits(bits, 5),
         clear_bits(bits, 8),
-        keep_bits(bits, 3),
-        keep_bits(bits, None),
     ]
     scenes = random_scenes(3, 7, 5, 2**33 + 2)
     found["scenes"] = [

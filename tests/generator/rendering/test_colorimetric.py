@@ -57,7 +57,7 @@ def test_greys_are_of_the_light_with_the_noise_of_the_table_and_no_step(make_tab
     assert angles_deg(own, lut.white[1]).max() > 4
     options = DatasetOptions(rendering="colorimetric", matrix=MINE)
     for light in (plain(0), plain(1), Mixture((0, 2), (0.3, 0.7))):
-        image = photograph(lut, RAMP, Lighting((light,)), options, 3, 4, 11536)[0].astype(np.float64)
+        image = photograph(lut, RAMP, Lighting((light,)), options, 3, 4, 11536).counts.astype(np.float64)
         means, spreads = image.mean(axis=1), image.std(axis=1)
         assert angles_deg(means, light.white(lut))[20:].max() < 0.4
         # The table's noise is that of photons: a variance of a count for each count.
@@ -191,8 +191,8 @@ def test_light_adds_but_for_the_tint_of_greys(make_table: MakeTable) -> None:
 def test_black_that_is_taken_out_leaves_means_and_white(make_table: MakeTable) -> None:
     lut = make_table(bits=3)
     options = DatasetOptions(rendering="colorimetric", matrix=MINE, black_point=BlackPoint("compensate"))
-    kept = photograph(lut, RAMP, Lighting((plain(1),)), replace(options, black_point=BlackPoint()), 3, 4, 11536)[0]
-    bare = photograph(lut, RAMP, Lighting((plain(1),)), options, 3, 4, 11536)[0]
+    kept = photograph(lut, RAMP, Lighting((plain(1),)), replace(options, black_point=BlackPoint()), 3, 4, 11536).counts
+    bare = photograph(lut, RAMP, Lighting((plain(1),)), options, 3, 4, 11536).counts
     black, white = kept[0].mean(axis=0), lut.white[1]
     wanted = (kept.mean(axis=1) - black) / (1 - black / white)
     # Cut off at 0, noise would lift black by .4 of it, 6 counts here.

@@ -33,7 +33,7 @@ from evaluation.methods.standard import standard_methods
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
 from generator.files import Flash, fit_flash
-from tests.evaluation.experiments.describing.scenes import Made
+from tests.evaluation.made_scenes import Made
 
 pytestmark = pytest.mark.slow
 

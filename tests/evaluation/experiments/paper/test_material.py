@@ -30,8 +30,8 @@ from generator.lights.choices import nearest_lights
 from generator.lights.lighting import RandomLights
 from generator.pictures.random_scenes import random_scenes
 from generator.rendering.matrices import camera_matrix
-from tests.evaluation.experiments.describing.scenes import Made
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
+from tests.evaluation.made_scenes import Made
 
 
 @pytest.mark.parametrize("camera", ["Canon EOS 550D", "Canon EOS-1Ds Mark III", "Canon EOS 600D"])

@@ -14,7 +14,7 @@ from evaluation.methods.prepared import unit
 from evaluation.metrics import recovery_error
 from evaluation.scene import Scene
 from foundation.errors import InputError
-from tests.evaluation.experiments.describing.scenes import Made
+from tests.evaluation.made_scenes import Made
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from foundation.errors import FormatError, InputError, first_of
 from generator.dataset.layouts import LAYOUTS, FileLayout
-from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.reader import Dataset
 from generator.dataset.records import GROUND_TRUTH, Light
 from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture
 from generator.masks.making import GivenMaskPlan, find_masks
@@ -108,21 +108,6 @@ class LeftOutPicture:
     def to_json(self) -> dict[str, Any]:
         """Return its name as a JSON object."""
         return {"left_out": self.name}
-
-
-def open_scenes(place: str) -> Dataset:
-    """Return the dataset whose scenes and lights are to be taken.
-
-    An InputError says that its images cannot be numbered, a FormatError that there is none.
-    """
-    dataset = open_dataset(place)
-    made = dataset.description
-    if made.planned % _scenes(dataset):
-        raise InputError(
-            f"{place} has {made.planned} images of {_scenes(dataset)} scenes, which are not equally many of each; "
-            "it was made by software that numbered images without holes: make it again"
-        )
-    return dataset
 
 
 def lights_of(dataset: Dataset, lut: Lut) -> LightsOf:
@@ -224,7 +209,7 @@ def _require_single(dataset: Dataset, tinted: bool) -> None:
         raise InputError(
             f"{len(mixed)} images of {dataset.store.place}, such as {mixed[0]}, are under several spectra at once, of "
             "which each was exposed by itself for its camera, so that their proportion is not known; make the first "
-            "dataset under single lights (--illuminations, --light, --random, --nearest)"
+            "dataset under single lights (--light, --random, --nearest)"
         )
 
 

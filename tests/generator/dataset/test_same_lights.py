@@ -12,7 +12,7 @@ import pytest
 from calibration.table.lut import open_lut
 from generator.cli import main
 from generator.dataset.reader import open_dataset
-from tests.generator.likeness.tables import CAMERAS, SPECTRA, make_table
+from tests.generator.dataset.two_cameras import CAMERAS, SPECTRA, make_table
 
 pytestmark = pytest.mark.slow
 
@@ -42,11 +42,11 @@ def spectrum(table: str, label: str) -> npt.NDArray[np.float64]:
     )
 
 
-@pytest.mark.parametrize("lights", [("--random", "2"), ("--match", "gt.csv", "--outside", "nearest")])
+@pytest.mark.parametrize("lights", [("--random", "2"), ("--match", "gt.csv")])
 def test_both_cameras_see_the_same_scenes_under_the_same_light(lab: Path, lights: tuple[str, ...]) -> None:
     del lab
     wish = ("--sources", "pictures", "--no-preview")
-    assert main(("one", "first", *wish, *lights, "--crop", "20x16", "--crop-at", "random", "--seed", "7")) == 0
+    assert main(("one", "first", *wish, *lights, "--crop", "20x16,random", "--seed", "7")) == 0
     assert main(("two", "second", *wish, "--lights-of", "first")) == 0
     first, second = open_dataset("first"), open_dataset("second")
     assert [entry.image for entry in second.entries] == [entry.image for entry in first.entries]
@@ -91,7 +91,7 @@ def test_masks_that_lie_in_shards_are_refused(lab: Path, capsys: pytest.CaptureF
 
 def test_what_is_refused(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wish = ("--sources", "pictures", "--no-preview")
-    assert main(("one", "first", *wish, "--illuminations", "all")) == 0
+    assert main(("one", "first", *wish, "--light", "all")) == 0
     capsys.readouterr()
 
     def refused(*arguments: str) -> str:
@@ -101,7 +101,7 @@ def test_what_is_refused(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
     of = ("--lights-of", "first")
     assert "lacks 1 of the 4 lights of first: number 3 of codes 9 8 3" in refused("fewer", "out", *wish, *of)
-    assert "--draw 2 says what --like is to do" in refused("two", "out", *wish, *of, "--draw", "2")
+    assert "--max-side, --crop and --crops" in refused("two", "out", *wish, *of, "--max-side", "9")
     (lab / "pictures" / "b.png").rename(lab / "b.png")
     assert "1 of the 3 pictures of first are not found: b.png" in refused("two", "out", *wish, *of)
     (lab / "pictures" / "a.png").rename(lab / "pictures" / "b.png")
@@ -111,7 +111,7 @@ def test_what_is_refused(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_random_scenes_are_made_again(lab: Path) -> None:
     del lab
-    assert main(("one", "first", "--random-scenes", "2", "--size", "12x10", "--seed", "9", "--no-preview")) == 0
+    assert main(("one", "first", "--random-scenes", "2:12x10", "--seed", "9", "--no-preview")) == 0
     assert main(("one", "again", "--lights-of", "first", "--seed", "9", "--no-preview")) == 0
     for name in ("000000.png", "000001.png"):
         assert Path("again/images", name).read_bytes() == Path("first/images", name).read_bytes()
@@ -136,7 +136,7 @@ def test_spectra_of_one_colour_are_told_by_their_names(lab: Path, capsys: pytest
     make_table(lab / "turned", "two", (1, 0), ("LED-B1", "FL2"))
     make_table(lab / "others", "two", (1, 0), ("LED-B1", "HP1"))
     wish = ("--sources", "pictures", "--no-preview")
-    assert main(("lamps", "first", *wish, "--illuminations", "all")) == 0
+    assert main(("lamps", "first", *wish, "--light", "all")) == 0
     assert main(("turned", "second", *wish, "--lights-of", "first")) == 0
     first, second = open_dataset("first"), open_dataset("second")
     assert [entry.lights for entry in first.entries[:2]] == [("0",), ("1",)]

@@ -1,0 +1,24 @@
+"""Scenes of given pixels, made up for tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A scene in memory."""
+
+    name: str
+    truth: npt.NDArray[np.float64]
+    image: npt.NDArray[np.float64] | npt.NDArray[np.uint16]
+    saturation: float | None = None
+    mask: npt.NDArray[np.bool_] | None = None
+
+    def read(
+        self,
+    ) -> tuple[npt.NDArray[np.float64] | npt.NDArray[np.uint16], npt.NDArray[np.bool_] | None]:
+        return self.image, self.mask
