@@ -297,7 +297,7 @@ class CameraCable(Settings):
 class ProjectorCable(Settings):
     """How the projector of a real lab is controlled, and what its light is like."""
 
-    control: Literal["none", "pjlink", "epson", "benq", "optoma", "nec"] = "none"
+    control: Literal["none", "pjlink", "epson", "benq", "optoma"] = "none"
     """Language of its control port; none: someone switches it by hand."""
     host: Host | None = None
     """Address, for PJLink and for languages over TCP."""
@@ -316,16 +316,10 @@ class ProjectorCable(Settings):
 
 
 class LightSource(Settings):
-    """What fills the projector's picture with one plain colour."""
+    """The display of this machine that the projector shows."""
 
-    shown_by: Literal["display", "lightcrafter", "jvc"] = "display"
-    """A display of this machine that the projector mirrors, or the projector itself by command."""
     display: str | int | None = None
     """Name, position or number of the display; acquire devices lists them."""
-    host: Host | None = None
-    """JVC: address."""
-    port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """JVC: TCP port."""
 
 
 class LabRig(Settings):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.serial_projectors import benq, epson, nec, optoma
+from drivers.serial_projectors import benq, epson, optoma
 from drivers.serial_projectors.driver import SerialProjector
 from foundation.errors import ConfigurationError
 
@@ -39,7 +39,6 @@ LANGUAGES: Mapping[str, Language] = {
     for language in (
         Language("benq", benq.BAUD, benq.BenqProjector, benq.TCP_PORT, benq.BenqProjector),
         Language("epson", epson.BAUD, epson.EpsonProjector, epson.TCP_PORT, epson.EpsonOnNetwork),
-        Language("nec", nec.BAUD, nec.NecProjector, nec.TCP_PORT, nec.NecProjector),
         Language("optoma", optoma.BAUD, optoma.OptomaProjector),
     )
 }

@@ -11,11 +11,10 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from drivers.links.link import Peer
-from drivers.pjlink import NoResolution
 from drivers.projector import Power, Severity
-from drivers.serial_projectors import benq, epson, nec, optoma
+from drivers.serial_projectors import benq, epson, optoma
 from drivers.serial_projectors.driver import take_line
-from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
+from foundation.errors import DeviceFault, DeviceRefused
 from sim.projectors.projector import SimulatedProjector
 
 SERIAL_NUMBER = "CROP0000001"
@@ -239,72 +238,9 @@ class OptomaPeer(_Listener):
         return optoma.PASSED
 
 
-class NecPeer(_Listener):
-    """A NEC: a binary answer to every command; what is no command is not answered."""
-
-    def receive(self, data: bytes) -> bytes:
-        """Take the next bytes and return the answers to the commands that they complete."""
-        self._heard += data
-        said = b""
-        try:
-            while (taken := nec.take_command(self._heard)) is not None:
-                command, length = taken
-                self._heard = self._heard[length:]
-                said += nec.encode_reply(self._answer(command))
-        except ProtocolError:
-            self._heard = b""
-        return said
-
-    def _answer(self, command: nec.NecCommand) -> nec.NecReply:
-        try:
-            return nec.NecReply(command.kind, command.code, self._done(command))
-        except DeviceRefused:
-            return nec.NecReply(command.kind, command.code, failed=nec.POWER_IS_OFF)
-        except DeviceFault:
-            return nec.NecReply(command.kind, command.code, failed=nec.EXECUTION_FAILED)
-        except ValueError:
-            return nec.NecReply(command.kind, command.code, failed=nec.UNKNOWN_COMMAND)
-
-    def _done(self, command: nec.NecCommand) -> bytes:
-        projector = self._projector
-        match command:
-            case nec.POWER_ON:
-                projector.switch_on()
-            case nec.POWER_OFF:
-                projector.switch_off()
-            case nec.MUTE_ON:
-                projector.set_muted(True)
-            case nec.MUTE_OFF:
-                projector.set_muted(False)
-            case nec.SHUTTER_CLOSE | nec.SHUTTER_OPEN:
-                projector.shutter_closed = command == nec.SHUTTER_CLOSE
-            case nec.FREEZE_ON | nec.FREEZE_OFF:
-                projector.set_frozen(command == nec.FREEZE_ON)
-                return b"\0"
-            case nec.COVER:
-                return bytes([projector.shutter_closed])
-            case nec.BASIC_INFORMATION:
-                on = projector.power() is Power.ON
-                silent = projector.signal is NoResolution.NO_SIGNAL
-                return nec.format_basic_information(nec.NO_SIGNAL if silent else 0, on and projector.frozen())
-            case nec.RUNNING:
-                return nec.format_running(projector.power())
-            case nec.MUTES:
-                return bytes([projector.power() is Power.ON and projector.muted()]).ljust(16, b"\0")
-            case nec.MODEL:
-                return projector.identity().model.encode("ascii")[:31].ljust(32, b"\0")
-            case nec.ERRORS:
-                return nec.format_errors(projector.faults())
-            case nec.INFORMATION:
-                return nec.format_information(projector.identity().name, projector.lamps()[0].hours * 3600)
-            case _:
-                raise ValueError(command)
-        return b""
-
-
 class _PeerOf(Protocol):
     def __call__(self, projector: SimulatedProjector) -> Peer: ...
 
 
-PEERS: Mapping[str, _PeerOf] = {"benq": BenqPeer, "epson": EpsonPeer, "nec": NecPeer, "optoma": OptomaPeer}
+PEERS: Mapping[str, _PeerOf] = {"benq": BenqPeer, "epson": EpsonPeer, "optoma": OptomaPeer}
 """The far side for each of `drivers.serial_projectors.LANGUAGES`."""

@@ -109,7 +109,7 @@ def free_port() -> int:
     ("text", "words"),
     [
         ('control = "optoma"\nhost = "127.0.0.1"', "Optoma projectors are reached over a serial port only"),
-        ('control = "nec"\nbaud = 12345678901\ndevice = "{port}"', "choose another speed"),
+        ('control = "epson"\nbaud = 12345678901\ndevice = "{port}"', "choose another speed"),
     ],
 )
 def test_a_cable_that_cannot_be(bench: Bench, camera: str, text: str, words: str) -> None:

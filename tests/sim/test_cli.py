@@ -165,5 +165,5 @@ def test_a_projector_takes_its_time_as_told() -> None:
 
 
 def test_a_serial_projector_answers_at_its_own_pace(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["projector", "--serial", "nec", "--answer-after", "1"]) == 2
+    assert main(["projector", "--serial", "epson", "--answer-after", "1"]) == 2
     assert "--answer-after and --class are PJLink's" in capsys.readouterr().err

@@ -13,9 +13,6 @@ from acquisition.run.devices import Devices, LightNotShown, ask_all, require_who
 from drivers.camera import Camera
 from drivers.canon import CanonEos
 from drivers.display.fullscreen import FullScreen, display_warnings, identify_displays, list_displays
-from drivers.display.jvc import PORT as JVC_PORT
-from drivers.display.jvc import JvcFlatField
-from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
 from drivers.gphoto2_camera import Gphoto2Camera
 from drivers.links.network import TcpLink
 from drivers.links.serial import SerialLink, list_serial_ports
@@ -28,7 +25,7 @@ from drivers.ptp.codes import VENDOR_CANON_USB
 from drivers.ptp.ip import IpTransport
 from drivers.ptp.usb import UsbTransport
 from drivers.serial_projectors import language
-from experiment.config import CameraCable, LabSettings, LightSource, ProjectorCable
+from experiment.config import CameraCable, LabSettings, ProjectorCable
 from experiment.session.folder import Session
 from experiment.session.records import last_moment
 from foundation.clock import Clock, SteadyClock, SystemClock
@@ -70,8 +67,11 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, 
         cameras.append(camera)
 
     def open_presenter() -> None:
-        light = _lab_presenter if shows and cameras and projectors else _light_not_shown
-        presenters.append(light(settings.lab.light, clock, settings.file))
+        display = settings.lab.light.display
+        if shows and cameras and projectors:
+            presenters.append(FullScreen(display, clock))
+        else:
+            presenters.append(LightNotShown(display_warnings(display)))
         opened.callback(presenters[0].close)
 
     # One that cannot be used does not keep the others' faults from being told.
@@ -154,31 +154,6 @@ def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector 
         label=f"the projector at {device}",
         clock=clock,
     )
-
-
-def _lab_presenter(light: LightSource, clock: Clock, file: str) -> Presenter:
-    match light.shown_by:
-        case "display":
-            return FullScreen(light.display, clock)
-        case "lightcrafter":
-            return LightCrafter(find_lightcrafter, clock)
-        case "jvc":
-            host = _required(light.host, "lab.light.host", "the projector's address", file)
-            port = light.port or JVC_PORT
-            label = f"the JVC projector at {host}:{port}"
-            return JvcFlatField(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
-
-
-def _light_not_shown(light: LightSource, _: Clock, file: str) -> LightNotShown:
-    """Return what stands for a light that is not to be shown; a fault where it could not be."""
-    match light.shown_by:
-        case "display":
-            return LightNotShown(display_warnings(light.display))
-        case "lightcrafter":
-            return LightNotShown((), "light: the LightCrafter is black as soon as it is opened")
-        case "jvc":
-            _required(light.host, "lab.light.host", "the projector's address", file)
-            return LightNotShown((), "light: the projector's picture is black as soon as it is opened")
 
 
 def _required(value: str | None, key: str, what: str, file: str) -> str:

@@ -17,12 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.links.link import MAX_MESSAGE, Link
-from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, ReportsPictureFault, Severity
-from drivers.serial_projectors import LANGUAGES, benq, epson, language, nec, optoma
+from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
+from drivers.serial_projectors import LANGUAGES, benq, epson, language, optoma
 from drivers.serial_projectors.benq import BenqProjector
 from drivers.serial_projectors.driver import SerialProjector, take_line
 from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
-from drivers.serial_projectors.nec import NecProjector, parse_errors
 from drivers.serial_projectors.optoma import OptomaProjector
 from experiment.config import ProjectorCable
 from foundation.clock import SimulatedClock
@@ -37,7 +36,7 @@ from foundation.errors import (
 )
 from sim.buses.serial import SerialPeerLink
 from sim.projectors.projector import SimulatedProjector
-from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, NecPeer, OptomaPeer
+from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling
 
@@ -45,12 +44,6 @@ ROOT = Path(__file__).parents[3]
 NAMES = sorted(LANGUAGES)
 
 OPTOMA_STATE = bytes.fromhex("7E 30 30 31 32 34 20 31 0D")
-RUNNING = "00 85 00 00 01 01 87"
-
-
-def running(data: str, sum_: str) -> str:
-    """Return the running status as a projector 1 of model 40h sends it; the sums are worked out by hand."""
-    return f"20 85 01 40 10 {data}" + " 00" * 10 + sum_
 
 
 @dataclass(frozen=True)
@@ -83,12 +76,6 @@ EXPECTED: dict[str, Expected] = {
     ),
     "epson": Expected(
         ProjectorIdentity("Epson", "", SERIAL_NUMBER), errors_of, b"PWR?\r", b"PWR=01\r:", before=(b"\r",)
-    ),
-    "nec": Expected(
-        ProjectorIdentity("NEC", "Simulated Projector", "dark room"),
-        lambda faults: faults,
-        bytes.fromhex(RUNNING),
-        bytes.fromhex(running("00 00 01 00 00 04", "FB")),
     ),
     "optoma": Expected(ProjectorIdentity("Optoma", "model 1", ""), errors_of, OPTOMA_STATE, b"INFO3\rOK1\r"),
 }
@@ -210,7 +197,7 @@ def test_a_maker_of_whom_half_is_written_cannot_be_made() -> None:
             return ()
 
     with pytest.raises(TypeError, match="muted"):
-        Half(lambda: SerialPeerLink(NecPeer(SimulatedProjector(SimulatedClock()))))  # pyrefly: ignore[bad-instantiation]
+        Half(lambda: SerialPeerLink(EpsonPeer(SimulatedProjector(SimulatedClock()))))  # pyrefly: ignore[bad-instantiation]
 
 
 @pytest.mark.parametrize(
@@ -516,201 +503,11 @@ def test_optoma_failures_are_overheard(number: int, part: str) -> None:
     assert projector.faults() == (Fault(part, Severity.ERROR),)
 
 
-def nec_script(*turns: tuple[str, str]) -> tuple[NecProjector, Script]:
-    script = Script(*((bytes.fromhex(heard), bytes.fromhex(said)) for heard, said in turns))
-    return NecProjector(lambda: script, clock=SimulatedClock()), script
-
-
-@pytest.mark.parametrize(
-    ("data", "sum_", "power"),
-    [
-        ("00 00 00 00 00 00", "F6", Power.STANDBY),
-        ("00 00 00 00 00 0F", "05", Power.STANDBY),
-        ("00 00 00 00 00 10", "06", Power.STANDBY),
-        ("00 00 00 00 00 06", "FC", Power.STANDBY),
-        ("00 00 01 00 00 04", "FB", Power.ON),
-        ("00 00 01 00 01 04", "FC", Power.WARMING),
-        ("00 00 00 01 00 05", "FC", Power.COOLING),
-        ("00 00 01 FF 00 FF", "F5", Power.ON),
-    ],
-)
-def test_nec_power(data: str, sum_: str, power: Power) -> None:
-    projector, script = nec_script((RUNNING, running(data, sum_)))
-    assert projector.power() is power
-    assert script.ended()
-
-
-def test_nec_switches_and_mutes() -> None:
-    projector, script = nec_script(
-        (RUNNING, running("00 00 00 00 00 00", "F6")),
-        ("02 00 00 00 00 02", "22 00 01 40 00 63"),
-        ("02 10 00 00 00 12", "22 10 01 40 00 73"),
-        ("00 85 00 00 01 03 89", "20 85 01 40 10 01" + " 00" * 15 + "F7"),
-        ("02 11 00 00 00 13", "A2 11 01 40 02 02 0D 05"),
-        (RUNNING, running("00 00 01 00 00 04", "FB")),
-        ("02 01 00 00 00 03", "22 01 01 40 00 64"),
-        (RUNNING, running("00 00 01 00 01 04", "FC")),
-    )
-    projector.switch_on()
-    projector.set_muted(True)
-    assert projector.muted()
-    with pytest.raises(DeviceRefused, match="02h 0Dh"):
-        projector.set_muted(False)
-    projector.switch_off()
-    assert projector.power() is Power.COOLING, "it was told to switch off, so that is what it is switching to"
-    assert script.ended()
-
-
-@pytest.mark.parametrize(("reason", "sum_"), [("00 00", (0x68, 0x6B, 0x70)), ("00 01", (0x69, 0x6C, 0x71))])
-def test_nec_that_does_not_know_a_question_cannot_tell(reason: str, sum_: tuple[int, ...]) -> None:
-    projector, script = nec_script(
-        ("00 85 00 00 01 03 89", f"A0 85 01 40 02 {reason} {sum_[0]:02X}"),
-        ("00 88 00 00 00 88", f"A0 88 01 40 02 {reason} {sum_[1]:02X}"),
-        ("03 8A 00 00 00 8D", f"A3 8A 01 40 02 {reason} {sum_[2]:02X}"),
-    )
-    assert projector.muted() is None
-    assert projector.faults() == ()
-    assert projector.lamps() == ()
-    assert script.ended()
-
-
-def test_nec_switched_off_and_on_again_warms_up() -> None:
-    projector, _ = nec_script(
-        (RUNNING, running("00 00 01 00 00 04", "FB")),
-        ("02 01 00 00 00 03", "22 01 01 40 00 64"),
-        (RUNNING, running("00 00 00 00 00 00", "F6")),
-        ("02 00 00 00 00 02", "22 00 01 40 00 63"),
-        (RUNNING, running("00 00 01 00 01 04", "FC")),
-    )
-    projector.switch_off()
-    projector.switch_on()
-    assert projector.power() is Power.WARMING
-
-
 def test_what_was_said_too_much_answers_no_later_question() -> None:
     projector, script = epson_script((b"PWR?\r", b"PWR=01\r:PWR=04\r:"), (b"PWR?\r", b"PWR=03\r:"))
     assert projector.power() is Power.ON
     assert projector.power() is Power.COOLING
     assert script.ended()
-
-
-def test_nec_names_itself() -> None:
-    # The model's name as an M311X sent it to NEC's own software; the information is built after the manual's table.
-    model = "20 85 01 40 20 4d 33 31 31 58" + " 00" * 27 + "40"
-    body = b"\x23\x8a\x01\x40\x62" + b"hall".ljust(82, b"\0") + bytes.fromhex("50 46 00 00") + bytes(12)
-    information = (body + bytes([sum(body) % 256])).hex()
-    projector, script = nec_script(
-        ("00 85 00 00 01 04 8A", model),
-        ("03 8A 00 00 00 8D", information),
-        ("03 8A 00 00 00 8D", information),
-        (RUNNING, running("00 00 01 00 00 04", "FB")),
-    )
-    assert projector.identity() == ProjectorIdentity("NEC", "M311X", "hall")
-    assert projector.lamps() == (Lamp(5, lit=True),), "18000 s, the manual's example"
-    assert script.ended()
-
-
-def test_nec_bits_of_the_manual_s_table() -> None:
-    """Error status, 009: of each bit of the first four bytes the part, in capitals where it is a fault."""
-    # Fan (bit 4 of the first byte) and dust (bit 2 of the fourth).
-    projector, _ = nec_script(("00 88 00 00 00 88", "20 88 01 40 0C 10 00 00 04" + " 00" * 8 + "09"))
-    assert set(projector.faults()) == {Fault("fan", Severity.ERROR), Fault("temperature", Severity.WARNING)}
-    manual = (
-        {0: "COVER", 1: "TEMPERATURE", 4: "FAN", 6: "LAMP", 7: "lamp"},
-        {0: "lamp", 2: "LAMP"},
-        {2: "TEMPERATURE", 3: "LAMP", 4: "LAMP", 5: "COVER", 6: "lamp", 7: "lamp"},
-        {0: "LAMP", 1: "LAMP", 2: "temperature"},
-    )
-    for place, bits in enumerate(manual):
-        for bit in range(8):
-            data = bytearray(12)
-            data[place] = 1 << bit
-            part = bits.get(bit, "OTHER")
-            expected = Fault(part.lower(), Severity.ERROR if part.isupper() else Severity.WARNING)
-            assert parse_errors(bytes(data)) == (expected,), f"byte {place}, bit {bit}"
-
-
-@pytest.mark.parametrize(
-    ("reason", "said"),
-    [
-        ("00 00", "know this command"),
-        ("00 01", "model cannot"),
-        ("01 00", "know this value"),
-        ("01 01", "no such terminal"),
-        ("02 03", "cannot be set now"),
-        ("02 04", "forced on"),
-        ("02 08", "test pattern"),
-        ("02 0D", "is off"),
-        ("02 0F", "in its menu"),
-    ],
-)
-def test_nec_refusals_of_the_manual_s_table(reason: str, said: str) -> None:
-    body = bytes.fromhex(f"A2 11 01 40 02 {reason}")
-    projector, _ = nec_script(("02 11 00 00 00 13", (body + bytes([sum(body) % 256])).hex()))
-    with pytest.raises(DeviceRefused, match=said):
-        projector.set_muted(False)
-
-
-# Cover (078-6), basic information (305-3) and the refusal 02h 0Fh as public command lists quote revision 7.1 of NEC's
-# manual: 20 BF ID1 ID2 10 02 DATA01 … 15, DATA02 what is shown, DATA09 freeze.
-OPEN_COVER = ("00 85 00 00 01 05 8B", "20 85 01 40 01 00 E7")
-
-
-def basic_information(shown: int, frozen: int) -> tuple[str, str]:
-    body = bytes([0x20, 0xBF, 1, 0x40, 0x10, 2, 4, shown, 1, 0x21, 0xFF, 0, 0, 0, frozen, 0, 0, 0, 0, 0, 0])
-    return "00 BF 00 00 01 02 C2", (body + bytes([sum(body) % 256])).hex()
-
-
-@pytest.mark.parametrize(
-    ("turns", "fault"),
-    [
-        ([OPEN_COVER, basic_information(0, 0)], None),
-        ([("00 85 00 00 01 05 8B", "20 85 01 40 01 01 E8")], "shutter or lens cover is closed"),
-        ([OPEN_COVER, basic_information(0, 1)], "frozen"),
-        ([OPEN_COVER, basic_information(1, 0)], "no signal"),
-        ([OPEN_COVER, basic_information(3, 0)], "test pattern"),
-        (
-            [
-                ("00 85 00 00 01 05 8B", "A0 85 01 40 02 00 01 69"),
-                ("00 BF 00 00 01 02 C2", "A0 BF 01 40 02 00 01 A3"),
-            ],
-            None,
-        ),
-    ],
-)
-def test_nec_tells_what_keeps_its_picture_away(turns: list[tuple[str, str]], fault: str | None) -> None:
-    projector, script = nec_script(*turns)
-    told = projector.picture_fault()
-    assert (told is None) if fault is None else (fault in (told or ""))
-    assert script.ended()
-
-
-def test_a_closed_shutter_of_a_simulated_nec_is_a_fault_and_no_mute() -> None:
-    device = SimulatedProjector(SimulatedClock(), Power.ON)
-    peer = NecPeer(device)
-    projector = NecProjector(lambda: SerialPeerLink(peer))
-    assert isinstance(projector, ReportsPictureFault)
-    assert projector.picture_fault() is None
-    # Somebody else's controller closes it, and freezes the picture: 051 and 079 of the manual.
-    assert peer.receive(bytes.fromhex("02 16 00 00 00 18")) == bytes.fromhex("22 16 01 40 00 79")
-    assert device.light() == 0
-    assert not projector.muted()
-    assert "shutter" in (projector.picture_fault() or "")
-    peer.receive(bytes.fromhex("02 17 00 00 00 19"))
-    peer.receive(bytes.fromhex("01 98 00 00 01 01 9B"))
-    assert "frozen" in (projector.picture_fault() or "")
-    peer.receive(bytes.fromhex("01 98 00 00 01 02 9C"))
-    assert projector.picture_fault() is None
-    assert device.light() == 1
-
-
-def test_nec_wrong_sum_and_wrong_answer() -> None:
-    projector, _ = nec_script((RUNNING, running("00 00 01 00 00 04", "FA")))
-    with pytest.raises(ProtocolError, match="0xfb"):
-        projector.power()
-    projector, _ = nec_script((RUNNING, "22 00 01 40 00 63"))
-    with pytest.raises(ProtocolError, match="02h 00h"):
-        projector.power()
 
 
 @pytest.mark.slow
@@ -739,12 +536,10 @@ TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
     benq.reply_parser(b"\r*pow=?#\r"),
     epson.take_reply,
     epson.take_welcome,
-    nec.take_reply,
     optoma.take_message,
 ]
 COMMAND_TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
     take_line,
-    nec.take_command,
     optoma.take_command,
 ]
 
@@ -784,16 +579,6 @@ def test_whatever_is_said_to_a_simulated_one_it_goes_on_answering(name: str, noi
     peer.receive(noise)
     # A new connection ends what was half-said.
     assert LANGUAGES[name].projector(lambda: SerialPeerLink(peer)).power() in Power
-
-
-@given(kind=st.integers(0, 3), code=st.integers(0, 255), data=st.binary(max_size=255))
-def test_nec_frames_survive_both_ends(kind: int, code: int, data: bytes) -> None:
-    command = nec.NecCommand(kind, code, data)
-    frame = nec.encode_command(command)
-    assert nec.take_command(frame + b"more") == (command, len(frame))
-    reply = nec.NecReply(kind, code, data)
-    frame = nec.encode_reply(reply)
-    assert nec.take_reply(frame + b"more") == (reply, len(frame))
 
 
 def troubled(name: str, trouble: Callable[[Link], Link]) -> Projector:

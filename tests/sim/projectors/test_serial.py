@@ -139,7 +139,7 @@ def test_a_pseudo_terminal_that_nobody_reads_can_be_closed(device: SimulatedProj
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["epson", "nec"])
+@pytest.mark.parametrize("name", ["epson", "optoma"])
 def test_serves_a_serial_projector_until_interrupted(name: str) -> None:
     spoken = LANGUAGES[name]
     with sim_serving("projector", "--serial", name) as (line,):
