@@ -1,6 +1,6 @@
 """Ports, speeds, identifiers and codes are those that makers and standards publish: both ends of our cables share them.
 
-Sources, where the module itself names no clause: IANA's list of ports; PJLink 2.10; Epson, ESC/VP21 guide; X.Org,
+Sources, where the module itself names no clause: IANA's list of ports; PJLink 2.10; X.Org,
 X.h and dpms.h; Khronos, gl.xml; TIFF 6.0 and DNG 1.7.1; USB 2.0, chapter 9; ISO 15740 and CIPA DC-005.
 """
 
@@ -14,7 +14,6 @@ from drivers.links import link, network, usb
 from drivers.ptp import ip, protocol
 from drivers.ptp import usb as ptp_usb
 from drivers.raw import rawfile
-from drivers.serial_projectors import benq, epson, optoma
 from sim.buses import usbip
 
 
@@ -22,11 +21,7 @@ from sim.buses import usbip
     ("ours", "published"),
     [
         ((pjlink.PORT, ip.PORT, usbip.PORT), (4352, 15740, 3240)),
-        ((benq.TCP_PORT, epson.TCP_PORT), (8000, 3629)),
-        ((benq.BAUD, epson.BAUD, optoma.BAUD), (115200, 9600, 9600)),
         ((pjlink.MAX_LINE, pjlink.MAX_PASSWORD, pjlink.IDLE_LIMIT_S, pjlink.COLLECT_S), (136, 32, 30, 30)),
-        ((epson.WELCOME, optoma.POWER, optoma.AV_MUTE, optoma.LAMP_HOURS), (0x20, 0, 2, 108)),
-        ((optoma.POWER_STATE, optoma.MODEL, optoma.AV_MUTE_STATE, optoma.EVERYBODY), (124, 151, 355, 0)),
         ((usb.STILL_IMAGE_CLASS, usb._CLASS_OUT, usb._CLASS_IN, usb._BULK), ((6, 1, 1), 0x21, 0xA1, 2)),
         ((usb._INTERRUPT,), (3,)),
         ((x11.INPUT_ONLY, x11.VIEWABLE, x11._ANY_TYPE, x11._Z_PIXMAP), (2, 2, 0, 2)),

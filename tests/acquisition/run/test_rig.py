@@ -115,9 +115,11 @@ def test_an_imported_session_cannot_be_taken() -> None:
     [
         ('[lab.camera]\nconnection = "ptpip"\n', "lab.camera.host is missing"),
         ('[lab.projector]\ncontrol = "pjlink"\n', "lab.projector.host is missing"),
-        ('[lab.projector]\ncontrol = "epson"\n', "lab.projector.device is missing"),
+        ('[lab.projector]\ncontrol = "serial"\nlanguage = "epson"\n', "lab.projector.device is missing"),
+        ('[lab.projector]\ncontrol = "serial"\ndevice = "/dev/ttyS0"\n', "lab.projector.language is missing"),
+        ('[lab.projector]\ncontrol = "serial"\nlanguage = "klingon"\n', "no projector language 'klingon'"),
         ('[lab.projector]\ncontrol = "pjlink"\ndevice = "/dev/ttyS0"\n', "PJLink goes by the network"),
-        ('[lab.projector]\ncontrol = "epson"\nhost = "h"\ndevice = "/dev/ttyS0"\n', "both given"),
+        ('[lab.projector]\ncontrol = "serial"\nlanguage = "epson"\nhost = "h"\ndevice = "/dev/ttyS0"\n', "both given"),
         ('[lab.camera]\nhost = "1.2.3.4"\n', "connection is"),
         ("[camera]\nshutter_s = 0.51\n", "whole turns"),
     ],
@@ -166,8 +168,8 @@ def test_a_lab_at_which_another_command_is_at_work_is_not_touched(
         other.communicate(b"\n")
 
 
-def test_an_unknown_language_is_named_with_the_known_ones() -> None:
-    with pytest.raises(ConfigurationError, match=r"'pjlink', .*'optoma'"):
+def test_an_unknown_control_is_named_with_the_known_ones() -> None:
+    with pytest.raises(ConfigurationError, match="'none', 'pjlink', 'serial'"):
         parse_lab(HEAD + '[lab.projector]\ncontrol = "klingon"\n', "LAB.toml")
 
 

@@ -1,32 +1,26 @@
-"""Projectors on serial cables: the contract in every language, conversations in the manuals' bytes, and trouble.
+"""Projectors that speak a line protocol: the contract in every language, the manuals' bytes, and trouble.
 
-The conversations are written after the manuals that each driver names, and from the recordings named here; a line
-marked "not confirmed" follows other drivers, as the driver's docstring says.
+The conversations are written after the manuals that each language file names; a line marked "not confirmed" follows
+other drivers, as the file says.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, get_args
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.links.link import MAX_MESSAGE, Link
+from drivers.links.serial import SerialLink
 from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
-from drivers.serial_projectors import LANGUAGES, benq, epson, language, optoma
-from drivers.serial_projectors.benq import BenqProjector
-from drivers.serial_projectors.driver import SerialProjector, take_line
-from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
-from drivers.serial_projectors.optoma import OptomaProjector
-from experiment.config import ProjectorCable
+from drivers.serial_projectors.driver import LineProjector
+from drivers.serial_projectors.language import Language, built_in_languages, encode_command, load_language
 from foundation.clock import SimulatedClock
 from foundation.errors import (
-    ConfigurationError,
     DeviceError,
     DeviceFault,
     DeviceRefused,
@@ -34,54 +28,41 @@ from foundation.errors import (
     LinkTimeout,
     ProtocolError,
 )
-from sim.buses.serial import SerialPeerLink
-from sim.projectors.projector import SimulatedProjector
-from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
+from sim.buses.serial import PseudoTerminal, SerialPeerLink
+from sim.projectors.projector import IDENTITY, SimulatedProjector
+from sim.projectors.serial import LinePeer
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling
+from tests.drivers.serial_projectors.conversation import Script, scripted
+from tests.drivers.serial_projectors.made_up import MADE_UP
 
-ROOT = Path(__file__).parents[3]
+LANGUAGES: dict[str, Language] = {
+    **{name: load_language(name) for name in built_in_languages()},
+    "made up": MADE_UP,
+}
 NAMES = sorted(LANGUAGES)
+EPSON = LANGUAGES["epson"]
 
 OPTOMA_STATE = bytes.fromhex("7E 30 30 31 32 34 20 31 0D")
 
 
-@dataclass(frozen=True)
-class Expected:
-    """What a language is held to.
-
-    - `identity`: of the simulated projector.
-    - `reported`: which of its faults the language can say.
-    - `question`, `answer`: the manual's bytes that ask for the power state, and those that say it is on.
-    - `before`: what is sent over a new connection before the first question; ``:`` answers it.
-    """
-
-    identity: ProjectorIdentity
-    reported: Callable[[frozenset[Fault]], frozenset[Fault]]
-    question: bytes
-    answer: bytes
-    before: tuple[bytes, ...] = ()
+def identity_in(language: Language) -> ProjectorIdentity:
+    """Return what of the simulated projector's names a language can say."""
+    model = "" if language.model is None else language.model.shown.replace("{}", IDENTITY.model)
+    return ProjectorIdentity(language.maker, model, "" if language.name is None else IDENTITY.name)
 
 
-def errors_of(faults: frozenset[Fault]) -> frozenset[Fault]:
+def faults_in(language: Language, faults: frozenset[Fault]) -> frozenset[Fault]:
+    """Return which faults a language can say: errors, if any."""
+    announces = any(message.fault is not None for message in language.unasked)
+    if language.faults is None and not announces:
+        return frozenset()
     return frozenset(fault for fault in faults if fault.severity is Severity.ERROR)
 
 
-EXPECTED: dict[str, Expected] = {
-    "benq": Expected(
-        ProjectorIdentity("BenQ", "Simulated Projector", ""),
-        lambda faults: frozenset(),
-        b"\r*pow=?#\r",
-        b"\r\n>*pow=?#\r\n*POW=ON#\r\n>",
-    ),
-    "epson": Expected(
-        ProjectorIdentity("Epson", "", SERIAL_NUMBER), errors_of, b"PWR?\r", b"PWR=01\r:", before=(b"\r",)
-    ),
-    "optoma": Expected(ProjectorIdentity("Optoma", "model 1", ""), errors_of, OPTOMA_STATE, b"INFO3\rOK1\r"),
-}
-
-
-def bench_of(name: str, device: SimulatedProjector, projector: Projector, catch_up: Callable[[], None]) -> Bench:
+def bench_of(
+    language: Language, device: SimulatedProjector, projector: Projector, catch_up: Callable[[], None]
+) -> Bench:
     """Return the bench of a simulated projector; `catch_up` lets its cable bring what it says unasked."""
 
     def wait(seconds: float) -> None:
@@ -96,108 +77,47 @@ def bench_of(name: str, device: SimulatedProjector, projector: Projector, catch_
 
     def repair() -> None:
         device.repair()
-        if name == "optoma":
-            # That it is well again, it cannot say: only that its lamp is struck anew.
+        if language.faults is None and language.has_news:
+            # That it is well again, it cannot say: only that its lamp is struck again.
             device.switch_on()
         catch_up()
 
-    own = {"wait": wait, "break_part": break_part, "repair": repair}
-    identity, told = EXPECTED[name].identity, EXPECTED[name].reported
-    return replace(Bench.of(projector, device), **own, identity=identity, told=told)
+    own = {"wait": wait, "break_part": break_part, "repair": repair, "identity": identity_in(language)}
+    return replace(Bench.of(projector, device), **own, told=lambda faults: faults_in(language, faults))
 
 
 class TestOverMemory(ProjectorContract):
     @pytest.fixture(params=[(name, whole) for name in NAMES for whole in (True, False)], ids=str)
     def bench(self, request: pytest.FixtureRequest) -> Bench:
         name, whole = request.param
-        device = SimulatedProjector(SimulatedClock())
-        peer = PEERS[name](device)
+        language, device = LANGUAGES[name], SimulatedProjector(SimulatedClock())
+        peer = LinePeer(device, language)
         cable = (lambda: SerialPeerLink(peer)) if whole else (lambda: Dribbling(SerialPeerLink(peer)))
-        return bench_of(name, device, LANGUAGES[name].projector(cable, clock=device.clock), lambda: None)
+        return bench_of(language, device, LineProjector(language, cable, clock=device.clock), lambda: None)
 
 
 class TestOverTheNetwork(ProjectorContract):
-    """Epson after its handshake, BenQ without echo and prompt."""
+    """With a handshake, and without echo and prompt."""
 
-    @pytest.fixture(params=["benq", "epson"])
+    @pytest.fixture(params=[name for name in NAMES if LANGUAGES[name].network is not None])
     def bench(self, request: pytest.FixtureRequest) -> Bench:
-        device = SimulatedProjector(SimulatedClock())
-        if request.param == "benq":
-            silent = BenqPeer(device, network=True)
-            return bench_of("benq", device, BenqProjector(lambda: SerialPeerLink(silent)), lambda: None)
-        greeting = EpsonPeer(device, network=True)
-        projector = EpsonOnNetwork(lambda: SerialPeerLink(greeting), clock=device.clock)
-        return bench_of("epson", device, projector, lambda: None)
+        language, device = LANGUAGES[request.param], SimulatedProjector(SimulatedClock())
+        peer = LinePeer(device, language, network=True)
+        projector = LineProjector(language, lambda: SerialPeerLink(peer), network=True, clock=device.clock)
+        return bench_of(language, device, projector, lambda: None)
 
 
 @pytest.mark.slow
 class TestOverAPseudoTerminal(ProjectorContract):
     @pytest.fixture(params=NAMES)
     def bench(self, request: pytest.FixtureRequest) -> Iterator[Bench]:
-        from drivers.links.serial import SerialLink
-        from sim.buses.serial import PseudoTerminal
-
-        spoken = LANGUAGES[request.param]
-        device = SimulatedProjector(SimulatedClock())
-        with PseudoTerminal(PEERS[spoken.name](device)) as terminal:
-            projector = spoken.projector(lambda: SerialLink.open(terminal.path, spoken.baud), clock=device.clock)
-            yield bench_of(spoken.name, device, projector, terminal.catch_up)
+        language, device = LANGUAGES[request.param], SimulatedProjector(SimulatedClock())
+        with PseudoTerminal(LinePeer(device, language)) as terminal:
+            projector = LineProjector(
+                language, lambda: SerialLink.open(terminal.path, language.line.baud), clock=device.clock
+            )
+            yield bench_of(language, device, projector, terminal.catch_up)
             projector.close()
-
-
-class Script:
-    """A cable that has one conversation by heart: what it must hear, and the pieces that it answers.
-
-    A word too many or too few is an error; `more` is what it says unasked.
-    """
-
-    def __init__(self, *turns: tuple[bytes, tuple[bytes, ...] | bytes]) -> None:
-        self._turns = list(turns)
-        self._said: list[bytes] = []
-
-    def write(self, data: bytes, timeout: float) -> None:
-        assert self._turns, f"nothing more was to be said, but {data!r} was"
-        heard, said = self._turns.pop(0)
-        assert data == heard
-        self._said += (said,) if isinstance(said, bytes) else said
-
-    def read(self, limit: int, timeout: float) -> bytes:
-        if not self._said:
-            if not timeout:
-                return b""
-            raise LinkTimeout("the script has nothing more to say")
-        return self._said.pop(0)
-
-    def close(self) -> None:
-        pass
-
-    def more(self, data: bytes) -> None:
-        self._said.append(data)
-
-    def ended(self) -> bool:
-        return not self._turns and not self._said
-
-
-HELLO = (b"\r", b":")
-
-
-def epson_script(*turns: tuple[bytes, tuple[bytes, ...] | bytes]) -> tuple[EpsonProjector, Script]:
-    script = Script(HELLO, *turns)
-    return EpsonProjector(lambda: script, clock=SimulatedClock()), script
-
-
-def test_a_maker_of_whom_half_is_written_cannot_be_made() -> None:
-    class Half(SerialProjector):
-        maker = "Half"
-
-        def switch(self, on: bool) -> None:
-            del on
-
-        def lamp_hours(self) -> tuple[int, ...]:
-            return ()
-
-    with pytest.raises(TypeError, match="muted"):
-        Half(lambda: SerialPeerLink(EpsonPeer(SimulatedProjector(SimulatedClock()))))  # pyrefly: ignore[bad-instantiation]
 
 
 @pytest.mark.parametrize(
@@ -211,23 +131,23 @@ def test_a_maker_of_whom_half_is_written_cannot_be_made() -> None:
     ],
 )
 def test_epson_power(code: bytes, power: Power) -> None:
-    projector, script = epson_script((b"PWR?\r", b"PWR=" + code + b"\r:"))
+    projector, script = scripted("epson", (b"PWR?\r", b"PWR=" + code + b"\r:"))
     assert projector.power() is power
     assert script.ended()
 
 
 def test_epson_abnormal_state_is_a_fault() -> None:
-    projector, _ = epson_script((b"PWR?\r", b"PWR=05\r:"))
+    projector, _ = scripted("epson", (b"PWR?\r", b"PWR=05\r:"))
     with pytest.raises(DeviceFault, match="indicators"):
         projector.power()
 
 
 def test_epson_is_asked_nothing_until_it_has_switched_on() -> None:
     clock = SimulatedClock()
-    script = Script(HELLO, (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", b""), (b"PWR?\r", b"PWR=01\r:"))
-    projector = EpsonProjector(lambda: script, clock=clock)
+    projector, script = scripted(
+        "epson", (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()), (b"PWR?\r", b"PWR=01\r:"), clock=clock
+    )
     projector.switch_on()
-    script.read(1, 0)  # the empty answer
     assert projector.power() is Power.WARMING
     with pytest.raises(DeviceRefused, match="until that"):
         projector.lamps()
@@ -238,11 +158,11 @@ def test_epson_is_asked_nothing_until_it_has_switched_on() -> None:
 
 
 def test_epson_on_the_way_tells_no_fault_and_still_its_power() -> None:
-    projector, script = epson_script((b"ERR?\r", b"ERR\r:"), (b"PWR?\r", b"PWR=03\r:"))
+    projector, script = scripted("epson", (b"ERR?\r", b"ERR\r:"), (b"PWR?\r", b"PWR=03\r:"))
     assert projector.faults() == ()
     assert script.ended()
-    projector, script = epson_script(
-        (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()), (b"ERR?\r", b"ERR\r:"), (b"PWR?\r", b"PWR=01\r:")
+    projector, script = scripted(
+        "epson", (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()), (b"ERR?\r", b"ERR\r:"), (b"PWR?\r", b"PWR=01\r:")
     )
     projector.switch_on()
     assert projector.faults() == ()
@@ -253,8 +173,9 @@ def test_epson_on_the_way_tells_no_fault_and_still_its_power() -> None:
 
 def test_epson_that_is_on_and_does_not_know_a_question_cannot_tell() -> None:
     on, off = (b"PWR?\r", b"PWR=01\r:"), (b"PWR?\r", b"PWR=04\r:")
-    projector, script = epson_script(
-        (b"MUTE?\r", b"ERR\r:"), on, (b"LAMP?\r", b"ERR\r:"), on, (b"MUTE?\r", b"ERR\r:"), off,
+    projector, script = scripted(
+        "epson", (b"MUTE?\r", b"ERR\r:"), on, (b"LAMP?\r", b"ERR\r:"), on,
+        (b"MUTE?\r", b"ERR\r:"), off,
         (b"LAMP?\r", b"ERR\r:"), off, (b"ERR?\r", b"ERR\r:"), off,
     )  # fmt: skip
     assert projector.muted() is None
@@ -267,9 +188,9 @@ def test_epson_that_is_on_and_does_not_know_a_question_cannot_tell() -> None:
 
 def test_epson_busy_for_an_earlier_program_says_how_long_to_wait() -> None:
     clock = SimulatedClock()
-    peer = EpsonPeer(SimulatedProjector(clock))
-    EpsonProjector(lambda: SerialPeerLink(peer), clock=clock).switch_on()
-    later = EpsonProjector(lambda: SerialPeerLink(peer), clock=clock)
+    peer = LinePeer(SimulatedProjector(clock), EPSON)
+    LineProjector(EPSON, lambda: SerialPeerLink(peer), clock=clock).switch_on()
+    later = LineProjector(EPSON, lambda: SerialPeerLink(peer), clock=clock)
     with pytest.raises(LinkTimeout, match="wait 130 s"):
         later.power()
     clock.sleep(30)
@@ -278,8 +199,7 @@ def test_epson_busy_for_an_earlier_program_says_how_long_to_wait() -> None:
 
 def test_epson_that_never_finishes_is_given_up() -> None:
     clock = SimulatedClock()
-    script = Script(HELLO, (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()))
-    projector = EpsonProjector(lambda: script, clock=clock)
+    projector, _ = scripted("epson", (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()), clock=clock)
     projector.switch_on()
     clock.sleep(129)
     assert projector.power() is Power.WARMING
@@ -289,7 +209,7 @@ def test_epson_that_never_finishes_is_given_up() -> None:
 
 
 def test_epson_that_cannot_strike_its_lamp_says_so_late() -> None:
-    projector, script = epson_script((b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()), (b"PWR?\r", b"PWR=04\r:"))
+    projector, script = scripted("epson", (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()), (b"PWR?\r", b"PWR=04\r:"))
     projector.switch_on()
     script.more(b"ERR\r:")
     with pytest.raises(DeviceRefused, match="ERR to PWR ON"):
@@ -298,7 +218,8 @@ def test_epson_that_cannot_strike_its_lamp_says_so_late() -> None:
 
 
 def test_epson_mute_lamp_and_error_codes() -> None:
-    projector, script = epson_script(
+    projector, script = scripted(
+        "epson",
         (b"MUTE ON\r", b":"),
         (b"MUTE?\r", b"MUTE=ON\r:"),
         (b"MUTE OFF\r", b"ERR\r:"),
@@ -322,27 +243,33 @@ def test_epson_mute_lamp_and_error_codes() -> None:
 def test_epson_passes_over_events() -> None:
     # Not confirmed: what newer projectors send unasked.
     event = b"IMEVENT=0001 02 00000002 00000000 T1 F1\r:"
-    projector, script = epson_script((b"PWR?\r", (event, b"PWR=02\r:")))
+    projector, script = scripted("epson", (b"PWR?\r", (event, b"PWR=02\r:")))
     assert projector.power() is Power.WARMING
     assert script.ended()
 
 
+HELLO = b"ESC/VP.net\x10\x03\x00\x00\x00\x00"
 WELCOME = b"ESC/VP.net\x10\x03\x00\x00\x20\x00"
 
 
 def test_epson_network_handshake() -> None:
-    script = Script((b"ESC/VP.net\x10\x03\x00\x00\x00\x00", (WELCOME[:7], WELCOME[7:])), (b"PWR?\r", b"PWR=01\r:"))
-    assert EpsonOnNetwork(lambda: script).power() is Power.ON
+    projector, script = scripted("epson", (HELLO, (WELCOME[:7], WELCOME[7:])), (b"PWR?\r", b"PWR=01\r:"), network=True)
+    assert projector.power() is Power.ON
     assert script.ended()
 
 
-def test_epson_network_refusals_say_why() -> None:
-    script = Script((b"ESC/VP.net\x10\x03\x00\x00\x00\x00", WELCOME[:14] + b"\x41\x00"))
-    with pytest.raises(DeviceRefused, match="password"):
-        EpsonOnNetwork(lambda: script).power()
-    script = Script((b"ESC/VP.net\x10\x03\x00\x00\x00\x00", b"PJLINK 0\r"))
-    with pytest.raises(ProtocolError, match="check the port"):
-        EpsonOnNetwork(lambda: script).power()
+@pytest.mark.parametrize(
+    ("answer", "kind", "reason"),
+    [
+        (WELCOME[:14] + b"\x41\x00", DeviceRefused, "0x41: a password is required"),
+        (WELCOME[:14] + b"\x7f\x00", DeviceRefused, "0x7F: check the network settings"),
+        (b"PJLINK 0\r", ProtocolError, "check the port"),
+    ],
+)
+def test_epson_network_refusals_say_why(answer: bytes, kind: type[DeviceError], reason: str) -> None:
+    projector, _ = scripted("epson", (HELLO, answer), network=True)
+    with pytest.raises(kind, match=reason):
+        projector.power()
 
 
 def test_a_network_that_always_hangs_up_is_not_tried_for_ever() -> None:
@@ -353,13 +280,8 @@ def test_a_network_that_always_hangs_up_is_not_tried_for_ever() -> None:
         return opened[-1]
 
     with pytest.raises(LinkClosed):
-        EpsonOnNetwork(connect).power()
+        LineProjector(EPSON, connect, network=True).power()
     assert len(opened) == 1
-
-
-def benq_script(*turns: tuple[bytes, tuple[bytes, ...] | bytes]) -> tuple[BenqProjector, Script]:
-    script = Script(*turns)
-    return BenqProjector(lambda: script, clock=SimulatedClock()), script
 
 
 ON, OFF = Power.ON, Power.STANDBY
@@ -376,7 +298,7 @@ ON, OFF = Power.ON, Power.STANDBY
     ],
 )
 def test_benq_power_with_and_without_echo_and_prompt(said: bytes, power: Power) -> None:
-    projector, _ = benq_script((b"\r*pow=?#\r", said))
+    projector, _ = scripted("benq", (b"\r*pow=?#\r", said))
     assert projector.power() is power
 
 
@@ -389,14 +311,15 @@ def test_benq_power_with_and_without_echo_and_prompt(said: bytes, power: Power) 
     ids=["with a prompt", "without"],
 )
 def test_benq_answer_that_looks_like_its_echo(state: bytes, answer: bytes) -> None:
-    projector, script = benq_script((b"\r*pow=?#\r", state), (b"\r*pow=on#\r", answer))
+    projector, script = scripted("benq", (b"\r*pow=?#\r", state), (b"\r*pow=on#\r", answer))
     projector.switch_on()
     assert script.ended()
 
 
 def test_benq_on_the_way_is_known_by_where_it_was() -> None:
     blocked = b">*pow=?#\r\n*Block item#\r\n>"
-    projector, script = benq_script(
+    projector, script = scripted(
+        "benq",
         (b"\r*pow=?#\r", blocked),
         (b"\r*pow=?#\r", b">*pow=?#\r\n*POW=OFF#\r\n>"),
         (b"\r*pow=?#\r", blocked),
@@ -413,7 +336,8 @@ def test_benq_on_the_way_is_known_by_where_it_was() -> None:
 
 
 def test_benq_names_lamps_and_refusals() -> None:
-    projector, _ = benq_script(
+    projector, _ = scripted(
+        "benq",
         (b"\r*modelname=?#\r", b">*modelname=?#\r\n*MODELNAME=W1070#\r\n>"),
         (b"\r*modelname=?#\r", b">*modelname=?#\r\nW700\r\n>"),
         (b"\r*modelname=?#\r", b">*modelname=?#\r\n*Illegal format#\r\n>"),
@@ -436,13 +360,8 @@ def test_benq_names_lamps_and_refusals() -> None:
 
 @pytest.mark.parametrize("answer", [b"Illegal format", b"Unsupported item"])
 def test_benq_that_does_not_know_its_mute_cannot_tell(answer: bytes) -> None:
-    projector, _ = benq_script((b"\r*blank=?#\r", b">*blank=?#\r\n*" + answer + b"#\r\n>"))
+    projector, _ = scripted("benq", (b"\r*blank=?#\r", b">*blank=?#\r\n*" + answer + b"#\r\n>"))
     assert projector.muted() is None
-
-
-def optoma_script(*turns: tuple[bytes, tuple[bytes, ...] | bytes]) -> tuple[OptomaProjector, Script]:
-    script = Script(*turns)
-    return OptomaProjector(lambda: script, clock=SimulatedClock()), script
 
 
 # "Power ON ~XX00 1: 7E 30 30 30 30 20 31 0D", HD50 manual.
@@ -452,7 +371,8 @@ OPTOMA_MUTE = bytes.fromhex("7E 30 30 30 32 20 31 0D")
 
 # "Power State ~XX124 1: 7E 30 30 31 32 34 20 31 0D", W351 manual.
 def test_optoma_switches_on_and_is_overheard() -> None:
-    projector, script = optoma_script(
+    projector, script = scripted(
+        "optoma",
         (OPTOMA_STATE, b"OK0\r"),
         (OPTOMA_ON, b"P\r"),
         (OPTOMA_STATE, (b"INFO1\r", b"OK0\r")),
@@ -471,7 +391,8 @@ def test_optoma_switches_on_and_is_overheard() -> None:
 
 
 def test_optoma_mute_lamp_model_and_refusal() -> None:
-    projector, script = optoma_script(
+    projector, script = scripted(
+        "optoma",
         (OPTOMA_MUTE, b"P"),
         (b"~00355 1\r", b"F\r"),  # not confirmed; older models do not know it
         (b"~00108 1\r", b"OK0123\r"),
@@ -489,69 +410,59 @@ def test_optoma_mute_lamp_model_and_refusal() -> None:
 
 
 def test_optoma_mute_that_nobody_knows_cannot_be_told() -> None:
-    device = SimulatedProjector(SimulatedClock(), Power.ON)
-    peer = OptomaPeer(device, answers_mute=False)
-    projector = OptomaProjector(lambda: SerialPeerLink(peer))
+    projector, script = scripted("optoma", (b"~00355 1\r", b"F\r"), (OPTOMA_MUTE, b"P\r"), (b"~00355 1\r", b"F\r"))
     assert projector.muted() is None
     projector.set_muted(True)
     assert projector.muted()
+    assert script.ended()
 
 
 @pytest.mark.parametrize(("number", "part"), [(4, "lamp"), (6, "fan"), (7, "temperature")])
 def test_optoma_failures_are_overheard(number: int, part: str) -> None:
-    projector, _ = optoma_script((OPTOMA_STATE, b"INFO%d\rOK0\r" % number))  # INFO4 is not confirmed
+    projector, _ = scripted("optoma", (OPTOMA_STATE, b"INFO%d\rOK0\r" % number))  # INFO4 is not confirmed
     assert projector.faults() == (Fault(part, Severity.ERROR),)
 
 
 def test_what_was_said_too_much_answers_no_later_question() -> None:
-    projector, script = epson_script((b"PWR?\r", b"PWR=01\r:PWR=04\r:"), (b"PWR?\r", b"PWR=03\r:"))
+    projector, script = scripted("epson", (b"PWR?\r", b"PWR=01\r:PWR=04\r:"), (b"PWR?\r", b"PWR=03\r:"))
     assert projector.power() is Power.ON
     assert projector.power() is Power.COOLING
     assert script.ended()
+
+
+def answers_on(name: str) -> bytes:
+    """Return what the simulated projector answers to the question after its power state, when it is on."""
+    language = LANGUAGES[name]
+    peer = LinePeer(SimulatedProjector(SimulatedClock(), Power.ON), language)
+    return peer.receive(encode_command(language.line, language.power.ask))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
 def test_any_split_gives_the_same_answer(name: str, data: st.DataObject) -> None:
-    expected, answer = EXPECTED[name], EXPECTED[name].answer
+    language, answer = LANGUAGES[name], answers_on(name)
     cuts = sorted(data.draw(st.sets(st.integers(1, len(answer) - 1))))
     pieces = tuple(answer[start:end] for start, end in zip([0, *cuts], [*cuts, len(answer)], strict=True))
-    script = Script(*((said, b":") for said in expected.before), (expected.question, pieces))
-    assert LANGUAGES[name].projector(lambda: script).power() is Power.ON
+    projector, _ = scripted(language, (encode_command(language.line, language.power.ask), pieces))
+    assert projector.power() is Power.ON
 
 
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
 def test_half_an_answer_is_no_answer(name: str, data: st.DataObject) -> None:
-    expected, answer = EXPECTED[name], EXPECTED[name].answer
-    end = answer.index(b"#\r\n>") if name == "benq" else len(answer) - 1
+    language, answer = LANGUAGES[name], answers_on(name)
+    end = answer.rindex(language.line.ends[0].encode("ascii"))
     half = answer[: data.draw(st.integers(0, end))]
-    script = Script(*((said, b":") for said in expected.before), (expected.question, (half,) if half else ()))
+    projector, _ = scripted(language, (encode_command(language.line, language.power.ask), (half,) if half else ()))
     with pytest.raises(LinkTimeout, match="within 5 s"):
-        LANGUAGES[name].projector(lambda: script).power()
+        projector.power()
 
 
-TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
-    benq.reply_parser(b"\r*pow=?#\r"),
-    epson.take_reply,
-    epson.take_welcome,
-    optoma.take_message,
-]
-COMMAND_TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
-    take_line,
-    optoma.take_command,
-]
-
-
-@given(data=st.binary(max_size=80))
-def test_whatever_comes_is_taken_waited_for_or_refused(data: bytes) -> None:
-    for take in TAKERS + COMMAND_TAKERS:
-        try:
-            taken = take(data)
-        except ProtocolError:
-            continue
-        assert taken is None or 1 <= taken[1] <= len(data)
+def troubled(name: str, trouble: Callable[[Link], Link]) -> Projector:
+    language = LANGUAGES[name]
+    peer = LinePeer(SimulatedProjector(SimulatedClock(), Power.ON), language)
+    return LineProjector(language, lambda: trouble(SerialPeerLink(peer)))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -574,16 +485,11 @@ def test_whatever_is_answered_is_understood_or_refused(name: str, data: bytes) -
 @pytest.mark.parametrize("name", NAMES)
 @given(noise=st.binary(min_size=1, max_size=60))
 def test_whatever_is_said_to_a_simulated_one_it_goes_on_answering(name: str, noise: bytes) -> None:
-    device = SimulatedProjector(SimulatedClock())
-    peer = PEERS[name](device)
+    language = LANGUAGES[name]
+    peer = LinePeer(SimulatedProjector(SimulatedClock()), language)
     peer.receive(noise)
     # A new connection ends what was half-said.
-    assert LANGUAGES[name].projector(lambda: SerialPeerLink(peer)).power() in Power
-
-
-def troubled(name: str, trouble: Callable[[Link], Link]) -> Projector:
-    peer = PEERS[name](SimulatedProjector(SimulatedClock(), Power.ON))
-    return LANGUAGES[name].projector(lambda: trouble(SerialPeerLink(peer)))
+    assert LineProjector(language, lambda: SerialPeerLink(peer)).power() in Power
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -614,8 +520,9 @@ def test_noise_without_end_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_dropped_connection_is_opened_anew(name: str) -> None:
-    peer = PEERS[name](SimulatedProjector(SimulatedClock(), Power.ON))
+def test_a_dropped_connection_is_opened_again(name: str) -> None:
+    language = LANGUAGES[name]
+    peer = LinePeer(SimulatedProjector(SimulatedClock(), Power.ON), language)
     opened: list[Link] = []
 
     def connect() -> Link:
@@ -623,7 +530,7 @@ def test_a_dropped_connection_is_opened_anew(name: str) -> None:
         opened.append(DroppedAfter(good, 2) if not opened else good)
         return opened[-1]
 
-    projector = LANGUAGES[name].projector(connect)
+    projector = LineProjector(language, connect)
     for _ in range(4):
         assert projector.power() is Power.ON
     assert len(opened) == 2
@@ -631,7 +538,8 @@ def test_a_dropped_connection_is_opened_anew(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
-    peer = PEERS[name](SimulatedProjector(SimulatedClock(), Power.ON))
+    language = LANGUAGES[name]
+    peer = LinePeer(SimulatedProjector(SimulatedClock(), Power.ON), language)
     waiting: list[bytes] = []
     late: list[bool] = [False]
 
@@ -642,7 +550,7 @@ def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
                 raise LinkTimeout("later")
             return waiting.pop() if waiting else self.good.read(limit, timeout)
 
-    projector = LANGUAGES[name].projector(lambda: Late(SerialPeerLink(peer)))
+    projector = LineProjector(language, lambda: Late(SerialPeerLink(peer)))
     assert projector.power() is Power.ON
     late[0] = True
     with pytest.raises(LinkTimeout):
@@ -652,33 +560,11 @@ def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_cable_pulled_out_is_told(name: str) -> None:
-    from drivers.links.serial import SerialLink
-    from sim.buses.serial import PseudoTerminal
-
-    spoken = language(name)
-    with PseudoTerminal(PEERS[name](SimulatedProjector(SimulatedClock(), Power.ON))) as terminal:
-        projector = spoken.projector(lambda: SerialLink.open(terminal.path, spoken.baud))
+def test_a_cable_that_was_pulled_out_is_reported(name: str) -> None:
+    language = LANGUAGES[name]
+    with PseudoTerminal(LinePeer(SimulatedProjector(SimulatedClock(), Power.ON), language)) as terminal:
+        projector = LineProjector(language, lambda: SerialLink.open(terminal.path, language.line.baud))
         assert projector.power() is Power.ON
     with pytest.raises(LinkClosed, match=terminal.path):
         projector.power()
     projector.close()
-
-
-def test_languages_are_found_in_any_case_and_unknown_ones_are_told_the_known() -> None:
-    assert language("Epson") is LANGUAGES["epson"]
-    with pytest.raises(ConfigurationError, match=", ".join(LANGUAGES)):
-        language("klingon")
-
-
-def test_users_are_told_of_every_language() -> None:
-    control = ProjectorCable.model_fields["control"].annotation
-    assert set(get_args(control)) == {"none", "pjlink", *LANGUAGES}, "experiment/config.py"
-    told_by = {"docs/devices.md": "`{}` | {} |", "docs/lab.md": '"{}"', "acquisition/data/lab.toml": '"{}"'}
-    texts = {page: (ROOT / page).read_text() for page in told_by}
-    assert [
-        (page, name)
-        for page, pattern in told_by.items()
-        for name, spoken in LANGUAGES.items()
-        if pattern.format(name, spoken.baud) not in texts[page]
-    ] == []
