@@ -11,7 +11,7 @@ import os
 import re
 import shlex
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, cast
@@ -32,7 +32,7 @@ from pydantic import (
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
-from foundation.records import unknown_key
+from foundation.records import known_keys, unknown_key
 from foundation.secret_texts import MASK, is_webhook, target_label
 
 if TYPE_CHECKING:
@@ -297,8 +297,11 @@ class CameraCable(Settings):
 class ProjectorCable(Settings):
     """How the projector of a real lab is controlled, and what its light is like."""
 
-    control: Literal["none", "pjlink", "epson", "benq", "optoma", "nec"] = "none"
-    """Language of its control port; none: someone switches it by hand."""
+    control: Literal["none", "pjlink", "serial"] = "none"
+    """PJLink, or the maker's language over a serial port or TCP; none: someone switches it by hand."""
+    language: str | None = None
+    """With ``serial``: name of the language (benq, epson, optoma), or path of a language file (.toml), relative to the
+    settings file."""
     host: Host | None = None
     """Address, for PJLink and for languages over TCP."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
@@ -316,16 +319,10 @@ class ProjectorCable(Settings):
 
 
 class LightSource(Settings):
-    """What fills the projector's picture with one plain colour."""
+    """The display of this machine that the projector shows."""
 
-    shown_by: Literal["display", "lightcrafter", "jvc"] = "display"
-    """A display of this machine that the projector mirrors, or the projector itself by command."""
     display: str | int | None = None
     """Name, position or number of the display; acquire devices lists them."""
-    host: Host | None = None
-    """JVC: address."""
-    port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """JVC: TCP port."""
 
 
 class LabRig(Settings):
@@ -394,6 +391,10 @@ def load_lab(path: Path) -> LabSettings:
     changes: dict[str, Any] = {"chart": folder / settings.chart, "illuminations": folder / settings.illuminations}
     if settings.replay is not None:
         changes["replay"] = ReplaySettings(session=folder / settings.replay.session)
+    language = settings.lab.projector.language
+    if language is not None and language.lower().endswith(".toml"):
+        projector = settings.lab.projector.model_copy(update={"language": str(folder / language)})
+        changes["lab"] = settings.lab.model_copy(update={"projector": projector})
     return settings.model_copy(update=changes)
 
 
@@ -466,7 +467,7 @@ def _mistake(kind: type[Settings], error: ErrorDetails) -> str:
             elsewhere = _places(kind, str(place[-1]), str(place[-2]) if len(place) > 1 else "", is_table)
             if elsewhere:
                 return f"unknown key {key!r}; did you mean {' or '.join(elsewhere)}?"
-            return unknown_key(key, _known_keys(kind, place[:-1]))
+            return unknown_key(key, known_keys(kind, place[:-1]))
         case "missing":
             return f"{key} is missing; add it"
         case "literal_error":
@@ -576,11 +577,3 @@ def _found_secret(key: str, place: dict[str, Any], folder: Path) -> str:
                 f'{key}: expected the text itself, {{ env = "NAME" }} or {{ file = "PATH" }}, and nothing beside'
             )
     return secret
-
-
-def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterable[str]:
-    for part in location:
-        annotation = model.model_fields[str(part)].annotation
-        options = [option for option in (annotation, *getattr(annotation, "__args__", ())) if isinstance(option, type)]
-        model = next(option for option in options if issubclass(option, BaseModel))
-    return model.model_fields

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drivers.serial_projectors import LANGUAGES, language
 from foundation import console
 from foundation.console import EXIT_CODES, new_app, option
 
@@ -41,83 +40,58 @@ def projector(
         int | None, typer.Option(min=0, max=65535, help="TCP port for PJLink; 0 picks a free one.")
     ] = None,
     password: Annotated[str | None, typer.Option(help="PJLink password, at most 32 characters.")] = None,
-    udp: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="UDP port where PJLink searches are answered; 0 picks one.")
+    serial: Annotated[
+        str | None,
+        option("LANGUAGE", "Language on a serial port: benq, epson, optoma, or a language file (.toml)."),
     ] = None,
-    notify: Annotated[str | None, option("HOST:PORT", "Send PJLink status notices there, by UDP.")] = None,
-    serial: Annotated[str | None, typer.Option(help=f"Language on a serial port: {', '.join(LANGUAGES)}.")] = None,
     lit: Annotated[bool, typer.Option("--lit", help="Begin with the lamp burning, not in standby.")] = False,
     warm_up: Annotated[float, option("SECONDS", "Time to warm up.", min=0)] = 30.0,
     cool_down: Annotated[float, option("SECONDS", "Time to cool down.", min=0)] = 60.0,
-    pjlink_class: Annotated[int, typer.Option("--class", min=1, max=2, help="Class of PJLink.")] = 2,
-    answer_after: Annotated[
-        float,
-        option("SECONDS", "Time to answer by PJLink; of real ones .05 to 2.", min=0, max=10),
-    ] = 0.0,
 ) -> None:
     """Serve a simulated projector: standby, 30 s of warm-up, on, 60 s of cooling.
 
-    Reads and writes no file. With --pjlink it listens on the network, with --serial at a pseudo-terminal, which any
-    serial software can open (Linux and macOS). Prints the address or the port's path, then serves until interrupted
-    (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such language or not exactly one
-    cable, 3 when the port is taken.
+    Reads a language file if --serial names one; writes no file. With --pjlink it listens on the network, with --serial
+    at a pseudo-terminal, which any serial software can open (Linux and macOS). Prints the address or the port's path,
+    then serves until interrupted (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such
+    language or not exactly one cable, 3 when the port is taken.
     """
     from drivers.pjlink import MAX_PASSWORD
     from drivers.projector import Power
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError, InputError
+    from sim.projectors.pjlink import serve_pjlink
     from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 
     if (pjlink is None) == (serial is None):
         raise ConfigurationError("one projector has one cable: either --pjlink PORT or --serial LANGUAGE")
-    if pjlink is None and (password, udp, notify) != (None, None, None):
-        raise ConfigurationError("--password, --udp and --notify are PJLink's; a serial cable has none of them")
-    if serial is not None and (answer_after or pjlink_class != 2):
-        raise ConfigurationError("--answer-after and --class are PJLink's; a serial cable has neither")
+    if pjlink is None and password is not None:
+        raise ConfigurationError("--password is PJLink's, and a serial cable has none; leave it out")
     if password is not None and not 1 <= len(password) <= MAX_PASSWORD:
         raise InputError(
             f"the password has {len(password)} characters; PJLink allows at least 1, at most {MAX_PASSWORD}"
         )
-    traits = ProjectorTraits(warm_up_s=warm_up, cool_down_s=cool_down, pjlink_class=pjlink_class)
+    traits = ProjectorTraits(warm_up_s=warm_up, cool_down_s=cool_down)
     device = SimulatedProjector(SystemClock(), Power.ON if lit else Power.STANDBY, traits)
     if serial is not None:
         _serve_serial(device, serial)
     elif pjlink is not None:
-        controller = None if notify is None else _host_and_port(notify)
-        _serve_network(device, pjlink, password, udp, controller, answer_after)
+        with serve_pjlink(device, pjlink, password) as server:
+            _until_interrupted("PJLink projector at {}:{}".format(*server.address))
 
 
-def _serve_network(
-    device: SimulatedProjector,
-    pjlink: int,
-    password: str | None,
-    udp: int | None,
-    controller: tuple[str, int] | None,
-    answer_s: float,
-) -> None:
-    from sim.projectors.pjlink import ProjectorDatagrams, serve_pjlink
-
-    with ExitStack() as served:
-        host, port = served.enter_context(serve_pjlink(device, pjlink, password, answer_s=answer_s)).address
-        if udp is not None or controller is not None:
-            datagrams = served.enter_context(ProjectorDatagrams(device, udp or 0, controller))
-            if udp is not None:
-                print(f"PJLink searches at {datagrams.address[0]}:{datagrams.address[1]}")
-        _until_interrupted(f"PJLink projector at {host}:{port}")
-
-
-def _serve_serial(device: SimulatedProjector, name: str) -> None:
+def _serve_serial(device: SimulatedProjector, named: str) -> None:
+    from drivers.serial_projectors.language import load_language
     from foundation.errors import ConfigurationError
 
-    spoken = language(name)
+    language = load_language(named)
     try:
         from sim.buses.serial import PseudoTerminal
     except ImportError as error:
         raise ConfigurationError("this system has no pseudo-terminals; --serial needs Linux or macOS") from error
-    from sim.projectors.serial import PEERS
+    from sim.projectors.serial import LinePeer
 
-    with PseudoTerminal(PEERS[spoken.name](device)) as terminal:
-        _until_interrupted(f"{spoken.maker} projector at {terminal.path}")
+    with PseudoTerminal(LinePeer(device, language)) as terminal:
+        _until_interrupted(f"{language.maker} projector at {terminal.path}")
 
 
 @app.command()

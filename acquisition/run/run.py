@@ -542,10 +542,8 @@ def require_same_devices(session: Session, devices: Devices, settings: LabSettin
         projector = devices.projector.identity()
         names["projector"] = f"{projector.maker} {projector.model}".strip() or "of an unknown maker"
     if settings.rig == "lab":
-        light = settings.lab.light
-        names["screen"] = " ".join(
-            str(part) for part in (light.shown_by, light.display, light.host) if part is not None
-        )
+        display = settings.lab.light.display
+        names["screen"] = "display" if display is None else f"display {display}"
     for what, name in names.items():
         before = known.get(what, name)
         if before != name:

@@ -71,7 +71,6 @@ def test_keys_that_are_left_out_have_the_value_that_the_documentation_shows() ->
         ("lab.projector", "baud", 300, 10**6, (299,)),
         ("lab.projector", "refresh_hz", 0.01, 1e4, (0.0,)),
         ("lab.projector", "colour_wheel_hz", 0.0, 1e4, (-0.1,)),
-        ("lab.light", "port", 1, 65535, (0, 65536)),
     ],
 )
 def test_numbers_are_taken_up_to_their_limits(
@@ -202,9 +201,6 @@ control = "pjlink"
 password = "JBMIAProjectorLink"
 refresh_hz = 60.0
 colour_wheel_hz = 60.0
-
-[lab.light]
-shown_by = "display"
 """
 
 

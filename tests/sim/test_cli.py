@@ -8,12 +8,11 @@ import pytest
 import usbip
 import usbip.host
 
-from drivers.links.network import TcpLink, TcpServer, UdpSocket
-from drivers.pjlink import PjLinkProjector, PjLinkReply, search
+from drivers.links.network import TcpLink, TcpServer
+from drivers.pjlink import PjLinkProjector
 from drivers.projector import Power
 from sim.cli import main
 from tests.drivers.display.x_servers import virtual_screen
-from tests.drivers.pjlink.notice_port import NoticePort
 from tests.sim.conftest import sim_serving
 
 
@@ -25,18 +24,6 @@ def test_serves_a_projector_until_interrupted() -> None:
         projector.switch_on()
         assert projector.power() is Power.WARMING
     projector.close()
-
-
-@pytest.mark.slow
-def test_is_found_and_announces_itself() -> None:
-    with NoticePort(0, "127.0.0.1") as controller:
-        cables = ("--pjlink", "0", "--udp", "0", "--notify", f"127.0.0.1:{controller.address[1]}")
-        with sim_serving("projector", *cables, lines=2) as (line, _):
-            host, port = line.split()[-1].split(":")
-            found = search(30.0, enough=1, address=host, port=int(port), listen_port=0)
-            _, notice = controller.receive(30.0)
-    assert [projector.mac for projector in found] == ["02:00:00:00:00:01"]
-    assert notice == PjLinkReply("LKUP", "02:00:00:00:00:01", 2)
 
 
 @pytest.mark.slow
@@ -52,14 +39,6 @@ def test_a_taken_port_is_one_line(capsys: pytest.CaptureFixture[str], arguments:
     assert error.count("\n") == 1
 
 
-def test_a_taken_udp_port_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with UdpSocket(host="127.0.0.1") as taken:
-        assert main(["projector", "--pjlink", "0", "--udp", str(taken.address[1])]) == 3
-    error = capsys.readouterr().err
-    assert error.startswith("error: cannot receive datagrams at 127.0.0.1:")
-    assert error.count("\n") == 1
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
@@ -67,10 +46,6 @@ def test_a_taken_udp_port_is_one_line(capsys: pytest.CaptureFixture[str]) -> Non
         ["projector"],
         ["projector", "--pjlink", "x"],
         ["projector", "--pjlink", "70000"],
-        ["projector", "--pjlink", "0", "--udp", "70000"],
-        ["projector", "--pjlink", "0", "--notify", "here"],
-        ["projector", "--pjlink", "0", "--notify", "127.0.0.1:0"],
-        ["projector", "--pjlink", "0", "--notify", "127.0.0.1:65536"],
         ["toaster"],
     ],
 )
@@ -152,18 +127,12 @@ def test_a_screen_or_projector_that_is_not_there_ends_with_3(
 
 @pytest.mark.slow
 def test_a_projector_takes_its_time_as_told() -> None:
-    options = ("--warm-up", "0", "--cool-down", "0", "--class", "1", "--answer-after", "0.01")
+    options = ("--warm-up", "0", "--cool-down", "0")
     with sim_serving("projector", "--pjlink", "0", *options) as (line,):
         host, port = line.split()[-1].split(":")
         projector = PjLinkProjector(lambda: TcpLink.connect(host, int(port), 10.0), timeout=10.0)
-        assert projector.pjlink_class() == 1
         projector.switch_on()
         assert projector.power() is Power.ON
         projector.switch_off()
         assert projector.power() is Power.STANDBY
         projector.close()
-
-
-def test_a_serial_projector_answers_at_its_own_pace(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["projector", "--serial", "nec", "--answer-after", "1"]) == 2
-    assert "--answer-after and --class are PJLink's" in capsys.readouterr().err

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from drivers import canon
-from drivers.presenter import WHITE
 from drivers.ptp import codes
 from drivers.ptp import ip as ptpip
 from drivers.ptp import usb as container
@@ -28,8 +27,6 @@ from sim.buses.usb import (
     UsbIdentity,
 )
 from sim.buses.usbip import UsbIpService
-from sim.projectors.lightcrafter import Controller, LightCrafterUsb
-from sim.projectors.projector import Screen
 from tests.drivers.ptp.examples import IP_PACKETS, READERS, STREAMS
 from tests.pinned import Pinned
 from tests.sim.camera.test_eos import host_of
@@ -47,8 +44,7 @@ def camera() -> PtpUsbDevice:
 
 
 def test_usb_devices_describe_themselves_as_before(pinned: Pinned) -> None:
-    table = LightCrafterUsb(Controller(Screen(WHITE)))
-    devices: dict[str, SimulatedUsbDevice] = {"camera": camera(), "table": table}
+    devices: dict[str, SimulatedUsbDevice] = {"camera": camera()}
     found: dict[str, Any] = {}
     for name, device in devices.items():
         answers = [device.device_descriptor().hex(), device.configuration_descriptor().hex()]
