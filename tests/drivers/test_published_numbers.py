@@ -16,13 +16,12 @@ from drivers.ptp import ip, protocol
 from drivers.ptp import usb as ptp_usb
 from drivers.raw import rawfile
 from drivers.serial_projectors import benq, epson, nec, optoma
-from sim.buses import usbip
 
 
 @pytest.mark.parametrize(
     ("ours", "published"),
     [
-        ((pjlink.PORT, jvc.PORT, ip.PORT, usbip.PORT), (4352, 20554, 15740, 3240)),
+        ((pjlink.PORT, jvc.PORT, ip.PORT), (4352, 20554, 15740)),
         ((benq.TCP_PORT, epson.TCP_PORT, nec.TCP_PORT), (8000, 3629, 7142)),
         ((benq.BAUD, epson.BAUD, nec.BAUD, optoma.BAUD), (115200, 9600, 38400, 9600)),
         ((pjlink.MAX_LINE, pjlink.MAX_PASSWORD, pjlink.IDLE_LIMIT_S, pjlink.COLLECT_S), (136, 32, 30, 30)),
