@@ -251,7 +251,7 @@ def check(
         tuple[str, str, str, str] | None,
         option(
             "X,Y X,Y X,Y X,Y",
-            "As in build-lut: the corners of the field of a chart without tags that is not found automatically.",
+            "As in build-lut: the corners of the field of a chart without tags.",
         ),
     ] = None,
     linearity: Annotated[
