@@ -508,6 +508,11 @@ def import_(
         imported = import_session(frames, chart, session, advance)
     output.add(session=session, refused=imported.refused, left=imported.left)
     print(f"{session}: imported; {len(imported.refused)} frames refused")
+    if imported.unchecked:
+        print(
+            f"{', '.join(imported.unchecked)}: whether files of this format are complete cannot be checked; convert "
+            "them to DNG to have it checked"
+        )
     for line in imported.refused:
         print(f"  {line}")
     if imported.left:
