@@ -395,7 +395,6 @@ def status(
 
     from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path
-    from experiment.session.repair import secrets_warning
 
     journal_path(session)
     now = datetime.now(UTC)
@@ -404,30 +403,11 @@ def status(
         output.add(**status_json(view, now))
     else:
         print("\n".join(status_lines(view, now)))
-    if warning := secrets_warning(session):
-        print(f"warning: {warning}", file=sys.stderr)
     head = view.head(now)
     if head.state in ("late", "silent", "paused", "stopped", "incomplete"):
         of_none = QualityError if head.state == "incomplete" else DeviceError
         kinds = {"": of_none, "the disk": StorageError, "the frames": QualityError}
         raise kinds.get(head.cause, DeviceError)(head.sentence)
-
-
-@app.command(epilog=EXIT_CODES)
-def redact(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
-    """Take passwords and secret addresses out of the settings of a session that older software took.
-
-    Reads and writes SESSION/session.toml; frames and journal stay as they are. The projector's password is removed, of
-    sequence.notify the host or the program's name is left. Sessions that this software takes hold no secret.
-    """
-    from experiment.session.repair import SETTINGS_FILE
-    from experiment.session.repair import redact as take_out
-
-    found = take_out(session)
-    if found:
-        print(f"{session / SETTINGS_FILE}: {' and '.join(found)} taken out; change it where copies are about")
-    else:
-        print(f"{session / SETTINGS_FILE}: holds no secret")
 
 
 @app.command(epilog=EXIT_CODES)

@@ -362,14 +362,11 @@ def _fetch_table(url: str, folder: Path, expect: str | None, output: JsonOutput)
 
 def _vouched(lut: Lut, expect: str | None) -> str:
     """Return in words what is known of a table that was fetched."""
-    if not lut.provenance.lights_sha256:
-        return "it has no hashes, so that nobody can say whether it is as it was built"
-    covered = "every file is" if lut.provenance.has_sums else "ground truth and samples are (it is an older table)"
     if expect is not None:
-        return f"it is the table expected, and {covered} as it was built"
+        return "it is the table expected, and every file is as it was built"
     return (
-        f"{covered} as its own hashes say; that it is the table you mean shows its hash, {lut.sha256}: compare it with "
-        "the one you were told, or give that with --expect"
+        "every file is as its own hashes say; that it is the table you mean shows its hash, "
+        f"{lut.sha256}: compare it with the one you were told, or give that with --expect"
     )
 
 

@@ -195,7 +195,6 @@ class Figure:
     - `lines`: its lines in the summary; else `NO_LINES`.
     - `foremost`: whether a refusal speaks of it before others, which may follow from it.
     - `found`: what a refusal or remark adds, and the remedy, where that depends on what was found.
-    - `former_name`: its name in the reports of earlier software; "" where it is the same.
     """
 
     name: str
@@ -220,7 +219,6 @@ class Figure:
     lines: tuple[Line, ...]
     foremost: bool = False
     found: Callable[[TableMeasurements], tuple[str, str] | None] | None = None
-    former_name: str = ""
 
     def outcome(self, value: float) -> Outcome:
         """Return what a value does to a table; one that is not a number is as bad as can be."""

@@ -394,7 +394,6 @@ WHITE_DEFICIT = Figure(
     of_one_frame="unknown",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("brightness", light_evidence),
     drawing=NOT_DRAWN, lines=NO_LINES,
-    former_name="white_short",
 )  # fmt: skip
 
 
@@ -561,7 +560,6 @@ CROSS_CHECKED_SHARE = Figure(
     measure=_of_codes(lambda codes: float(codes.held.mean())), forecast=ONLY_OF_A_SESSION,
     of_one_frame="unknown", worst=NO_PLACE, where=_checked_text, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing=NOT_DRAWN, lines=(Line(230, _checked_row),),
-    former_name="held_share",
 )  # fmt: skip
 
 _WhiteValues = Callable[["CodeAgreement"], "npt.NDArray[np.float64]"]

@@ -183,7 +183,6 @@ FRAME_BLUR = Figure(
     where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
     cause=Explanation("frame", blur_evidence),
     drawing="course", lines=NO_LINES,
-    former_name="softer_bleed",
 )  # fmt: skip
 
 
@@ -215,7 +214,6 @@ FRAME_SCATTER = Figure(
     retake=_frames_beyond(lambda table, frame: frame.consistency.scatter),
     cause=Explanation("frame", scatter_evidence, follows=("block_deviation", "disturbed_cells")),
     drawing="course", lines=NO_LINES,
-    former_name="unlike_scatter",
 )  # fmt: skip
 
 
@@ -236,7 +234,6 @@ BLOCK_DEVIATION = Figure(
     worst=_worst_block, where=OF_ITS_CAUSE, retake=_frames_beyond(lambda table, frame: frame.consistency.block),
     cause=Explanation("block", block_evidence),
     drawing="course", lines=NO_LINES,
-    former_name="unlike_block",
 )  # fmt: skip
 
 
@@ -281,7 +278,6 @@ REREGISTERED_FRAMES = Figure(
     of_one_frame="bounded",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("movement", movement_evidence),
     drawing="course", lines=(Line(120, _movement_row),),
-    former_name="moved_anew",
 )  # fmt: skip
 
 

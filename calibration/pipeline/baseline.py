@@ -376,7 +376,7 @@ def select_frames(session: Session) -> SelectedFrames:
 def _in_order_taken(session: Session, records: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
     """Return frames in the order taken, by the journal, with times that go on.
 
-    White frames are interpolated in time: where a clock was set back between two frames (sessions of older software),
+    White frames are interpolated in time: where a clock was set back between two frames,
     what follows counts as taken the usual interval later. Frames that were taken by other means have their times alone.
     """
     if any(event.what == "import" for event in session.journal.events()):
@@ -423,7 +423,7 @@ def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> Fra
 
 
 def stated_origin(session: Session) -> StatedOrigin:
-    """Return what a session states; what older software did not write, or is damaged, is not known."""
+    """Return what a session states; what is damaged, is not known."""
     try:
         document: dict[str, Any] = tomllib.loads(session.settings_text())
         rig: Rig | None = next((known for known in get_args(Rig) if known == document.get("rig")), None)
@@ -446,8 +446,6 @@ def frame_faults(lut: Lut, session: Session, progress: ReportProgress | None = N
     """Return which of the frames that a table was made of are missing or changed, each fault in words."""
     if lut.provenance.computed is not None:
         raise FormatError(f"{lut.folder} was computed, no frame was taken for it; verify it without a session")
-    if not lut.frames:
-        raise FormatError(f"{lut.folder} lists no frames; build it again from its session to have them listed")
     faults: list[str] = []
     if session.chart.sha256 != lut.provenance.chart_sha256:
         faults.append(f"{session.folder / 'chart.json'} is not the chart of the table")

@@ -15,8 +15,6 @@ from tests.calibration.lab import LIGHTS
 
 pytestmark = pytest.mark.slow
 
-VERSION_1 = Path(__file__).parent / "table" / "table_v1"
-
 Command = Callable[..., tuple[int, str, str]]
 
 
@@ -43,14 +41,6 @@ def test_info_tells_what_the_table_is(lut: Path, command: Command) -> None:
     assert f"{len(LIGHTS)}: {len(LIGHTS) - 3} uniform, 3 black bodies 2500 to 6500 K" in out
     assert "512 (3 bits a channel), 25 samples each" in out
     assert "black, half size, saturation, field, rounding" in out
-
-
-def test_info_tells_of_a_table_of_version_1(command: Command) -> None:
-    code, out, _ = command("--info", VERSION_1)
-    assert code == 0
-    assert "1 of 8, 1 covered" in out
-    assert "no hash recorded" in out
-    assert "not listed" in out
 
 
 def test_a_check_tells_nothing_that_one_frame_cannot(session: Session, command: Command) -> None:
@@ -115,12 +105,11 @@ def _refuse(folder: Path, file: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--info", VERSION_1, "--check", "s"], "--check and --info"),
+        (["--info", "lut", "--check", "s"], "--check and --info"),
         (["--compare", "a", "b", "--info", "a"], "are two commands"),
-        (["--info", VERSION_1, "session"], "--info does not expect session"),
-        (["--window", 3, "--info", VERSION_1], "--info reads one"),
+        (["--info", "lut", "session"], "--info does not expect session"),
+        (["--window", 3, "--info", "lut"], "--info reads one"),
         (["--window", 4, "session", "lut"], "4 pixels"),
-        (["--verify", VERSION_1], "records no hashes"),
         (["session", "--out", "x"], "--out goes with --compare"),
         (["--compare", "a", "b", "--linearity", "x"], "leave it out of --compare"),
         (["--check", "nowhere", "lut"], "--check writes nothing"),

@@ -23,7 +23,7 @@ PACKAGES = ("foundation", "drivers", "sim", "experiment", "calibration", "acquis
 def test_a_figure_that_lacks_a_part_does_not_import() -> None:
     parts: dict[str, Any] = {part.name: getattr(DARKEST_COUNTS, part.name) for part in fields(Figure) if part.init}
     assert Figure(**parts) == DARKEST_COUNTS
-    for name in parts.keys() - {"foremost", "found", "former_name"}:
+    for name in parts.keys() - {"foremost", "found"}:
         with pytest.raises(TypeError, match=name):
             Figure(**{key: value for key, value in parts.items() if key != name})
 
@@ -36,9 +36,6 @@ def test_a_figure_that_lacks_a_part_does_not_import() -> None:
         {"source": ""},
         {"refuse": 301.0},
         {"name": "bleed"},
-        {"name": "held_share"},
-        {"former_name": "bleed"},
-        {"former_name": "held_share"},
         {"lines": light.ADDITIVITY.lines},
         {"cause": replace(light.ADDITIVITY.cause, follows=("nothing",)) if light.ADDITIVITY.cause else None},
     ],
