@@ -228,7 +228,7 @@ def check(
         tuple[str, str, str, str] | None,
         option(
             "X,Y X,Y X,Y X,Y",
-            "As in build-lut: the corners of the field of a chart without tags that is not found automatically.",
+            "As in build-lut: the corners of the field of a chart without tags.",
         ),
     ] = None,
     linearity: Annotated[
@@ -364,7 +364,6 @@ def status(
 
     from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path
-    from experiment.session.repair import secrets_warning
 
     journal_path(session)
     now = datetime.now(UTC)
@@ -373,30 +372,11 @@ def status(
         output.add(**status_json(view, now))
     else:
         print("\n".join(status_lines(view, now)))
-    if warning := secrets_warning(session):
-        print(f"warning: {warning}", file=sys.stderr)
     head = view.head(now)
     if head.state in ("late", "silent", "paused", "stopped", "incomplete"):
         of_none = QualityError if head.state == "incomplete" else DeviceError
         kinds = {"": of_none, "the disk": StorageError, "the frames": QualityError}
         raise kinds.get(head.cause, DeviceError)(head.sentence)
-
-
-@app.command(epilog=EXIT_CODES)
-def redact(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
-    """Take passwords and secret addresses out of the settings of a session that older software took.
-
-    Reads and writes SESSION/session.toml; frames and journal stay as they are. The projector's password is removed, of
-    sequence.notify the host or the program's name is left. Sessions that this software takes hold no secret.
-    """
-    from experiment.session.repair import SETTINGS_FILE
-    from experiment.session.repair import redact as take_out
-
-    found = take_out(session)
-    if found:
-        print(f"{session / SETTINGS_FILE}: {' and '.join(found)} taken out; change it where copies are about")
-    else:
-        print(f"{session / SETTINGS_FILE}: holds no secret")
 
 
 @app.command(epilog=EXIT_CODES)
@@ -477,6 +457,11 @@ def import_(
         imported = import_session(frames, chart, session, advance)
     output.add(session=session, refused=imported.refused, left=imported.left)
     print(f"{session}: imported; {len(imported.refused)} frames refused")
+    if imported.unchecked:
+        print(
+            f"{', '.join(imported.unchecked)}: whether files of this format are complete cannot be checked; convert "
+            "them to DNG to have it checked"
+        )
     for line in imported.refused:
         print(f"  {line}")
     if imported.left:

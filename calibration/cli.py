@@ -36,8 +36,8 @@ Corners = Annotated[
     tuple[str, str, str, str] | None,
     option(
         "X,Y X,Y X,Y X,Y",
-        "For a chart without tags that is not found by itself: the corners of its field of cells in the frame "
-        "that is registered, pixels of the raw file, clockwise from the printed top-left.",
+        "For a chart without tags: the corners of its field of cells in the frame that is registered first, pixels "
+        "of the raw file, clockwise from the printed top-left.",
     ),
 ]
 Linearity = Annotated[

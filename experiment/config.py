@@ -157,7 +157,7 @@ class SequenceSettings(Settings):
     ended lets the lamp go out."""
     order: Literal["shuffled", "listed"] = "shuffled"
     """Order of the lights: shuffled by `seed`, so that neither the lamp's drift nor a picture that did not change runs
-    along with the colour; or as they are listed. An older session keeps the order of its journal."""
+    along with the colour; or as they are listed."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the shuffled order."""
     switch_off: bool = True
@@ -415,21 +415,7 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ConfigurationError(f"{where} is not TOML: {error}{_toml_hint(text, str(error))}") from error
-
-
-def _toml_hint(text: str, message: str) -> str:
-    """Return what helps against the mistake in a line of a TOML text, "" where nothing is known; no value of it."""
-    if message.startswith("Cannot declare"):
-        return "; a table stands in a file once: put its keys together"
-    number = re.search(r"at line (\d+)", message)
-    line = text.splitlines()[int(number[1]) - 1] if number else ""
-    _, _, value = line.partition("=")
-    if re.match(r"\s*[-+]?\d+,\d", value):
-        return "; a number has a decimal point: 8.0 and not 8,0"
-    if re.match(r"\s*[^\W\d]|\s*[/~.\u2018-\u201f]", value):
-        return '; text stands in straight quotation marks: "like this"'
-    return ""
+        raise ConfigurationError(f"{where} is not TOML: {error}; correct that line") from error
 
 
 def checked(kind: type[_AnySettings], document: dict[str, Any], where: str) -> _AnySettings:
@@ -463,10 +449,6 @@ def _mistake(kind: type[Settings], error: ErrorDetails) -> str:
     key, place = _key_of(error), error["loc"]
     match error["type"]:
         case "extra_forbidden":
-            is_table = isinstance(error["input"], dict)
-            elsewhere = _places(kind, str(place[-1]), str(place[-2]) if len(place) > 1 else "", is_table)
-            if elsewhere:
-                return f"unknown key {key!r}; did you mean {' or '.join(elsewhere)}?"
             return unknown_key(key, known_keys(kind, place[:-1]))
         case "missing":
             return f"{key} is missing; add it"
@@ -478,7 +460,7 @@ def _mistake(kind: type[Settings], error: ErrorDetails) -> str:
             if isinstance(error["input"], str):
                 reason += f": [{json.dumps(error['input'], ensure_ascii=False)}]"
         case "float_parsing" | "float_type" | "int_parsing" | "int_type" | "int_from_float":
-            reason = _number_expected(key, error["input"], error["type"].startswith("int"))
+            reason = _number_expected(key, error["type"].startswith("int"))
         case "string_type":
             given = error["input"]
             is_number = isinstance(given, int | float) and not isinstance(given, bool)
@@ -496,31 +478,13 @@ _BOUNDS: Final = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of a
 """What a number is to be, by the name of its bound in an error of pydantic."""
 
 
-def _number_expected(key: str, given: object, whole: bool) -> str:
-    """Return what number is expected of a key in place of something else, as it is written."""
+def _number_expected(key: str, whole: bool) -> str:
+    """Return what number is expected of a key."""
     what = "a whole number" if whole else "a number"
     reason = f"{what} of seconds was expected" if key.endswith("_s") else f"{what} was expected"
-    text = given.strip() if isinstance(given, str) else ""
-    if (parts := re.fullmatch(r"1 */ *([1-9]\d*)", text)) is not None and not whole:
-        return f"{reason}: {1 / int(parts[1]):.6g}"
     if key == "sequence.patience_s":
         return f'{reason}, or "forever"'
     return reason
-
-
-def _places(kind: type[BaseModel], name: str, table: str, is_table: bool, above: str = "") -> list[str]:
-    """Return where a key, or table, of this name may stand; [name.table] alone for one written as [table.name]."""
-    found: list[str] = []
-    for key, field in kind.model_fields.items():
-        place, below = f"{above}{key}", field.annotation
-        if not (isinstance(below, type) and issubclass(below, BaseModel)):
-            found += [place] if key == name and not is_table else []
-            continue
-        if key == name and is_table and table in below.model_fields:
-            return [f"[{place}.{table}]"]
-        found += [f"[{place}]"] if key == name and is_table else []
-        found += _places(below, name, table, is_table, f"{place}.")
-    return found
 
 
 def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None:

@@ -92,7 +92,8 @@ class LiveJudge:
 
     def __init__(self, settings: LabSettings, chart: Chart, illuminations: Sequence[Illumination]) -> None:
         self._settings = settings
-        self._chart = chart if settings.judge.chart else None
+        # A chart without tags is found by corners that are given by hand, and a run has none.
+        self._chart = chart if settings.judge.chart and chart.tags else None
         self._plan = tuple(dict.fromkeys(light.colour for light in illuminations))
         self._state = self._base = JudgeState()
         self._fresh = True

@@ -14,13 +14,12 @@ from drivers.links import link, network, usb
 from drivers.ptp import ip, protocol
 from drivers.ptp import usb as ptp_usb
 from drivers.raw import rawfile
-from sim.buses import usbip
 
 
 @pytest.mark.parametrize(
     ("ours", "published"),
     [
-        ((pjlink.PORT, ip.PORT, usbip.PORT), (4352, 15740, 3240)),
+        ((pjlink.PORT, ip.PORT), (4352, 15740)),
         ((pjlink.MAX_LINE, pjlink.MAX_PASSWORD, pjlink.IDLE_LIMIT_S, pjlink.COLLECT_S), (136, 32, 30, 30)),
         ((usb.STILL_IMAGE_CLASS, usb._CLASS_OUT, usb._CLASS_IN, usb._BULK), ((6, 1, 1), 0x21, 0xA1, 2)),
         ((usb._INTERRUPT,), (3,)),

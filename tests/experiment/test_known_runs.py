@@ -172,7 +172,7 @@ def test_charts_in_frames(name: str, pinned: Pinned, tmp_path: Path) -> None:
         hang_chart(paper_chart("A6", 3), "Test", room) if name in ("field", "upside down") else hang(2, "A6", room=room)
     )
     mosaic = lab.mosaic(tmp_path)
-    framing = finding.find_chart(mosaic, lab.chart)
+    framing = finding.find_chart(mosaic, lab.chart, corners=lab.corners_px(mosaic))
     plane = plane_of(mosaic, "G")
     moved = replace(plane, values=np.ascontiguousarray(np.roll(plane.values, (1, 2), axis=(0, 1))))
     shifts = [pictures.shift_between(plane, framing, one) for one in (plane, moved)]
@@ -209,6 +209,5 @@ def test_edges(pinned: Pinned) -> None:
     values = np.full((60, 80, 1), 50.0, np.float32)[..., 0]
     values[20:, :] = 400
     edge = Plane("G", values, (0.0, 0.0))
-    alike = [field.same_corners(seen, seen + 1, tolerance) for tolerance in (1.0, 1.4, 1.5)]
     told = [field.paper_level(edge), field.corners_text(seen), homography.on_one_line(quad), homography.rms(seen)]
-    pinned("edges and corners", [found, alike, told], **LOOSE)
+    pinned("edges and corners", [found, told], **LOOSE)

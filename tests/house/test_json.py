@@ -23,7 +23,6 @@ from tests.json_of import json_of
 
 WITHOUT_FIGURES = {
     "acquire init",
-    "acquire redact",
     "acquire rebuild",
     "acquire monitor",
     "acquire report",

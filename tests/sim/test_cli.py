@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import usbip
-import usbip.host
 
 from drivers.links.network import TcpLink, TcpServer
 from drivers.pjlink import PjLinkProjector
@@ -29,7 +27,7 @@ def test_serves_a_projector_until_interrupted() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
-    [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"], ["camera", "--model", "Test", "--usbip"]],
+    [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"]],
 )
 def test_a_taken_port_is_one_line(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
     with TcpServer(lambda link: None) as server:
@@ -58,13 +56,6 @@ def test_a_password_longer_than_the_standards_is_refused(capsys: pytest.CaptureF
     assert "at most 32" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("cables", [(), ("--port", "0", "--usbip", "0")])
-def test_a_camera_has_one_cable(capsys: pytest.CaptureFixture[str], cables: tuple[str, ...]) -> None:
-    assert main(["camera", *cables]) == 2
-    expected = "one camera has one cable: either --port N for PTP/IP or --usbip N for USB/IP"
-    assert capsys.readouterr().err == f"error: {expected}\n"
-
-
 def test_an_unknown_model_is_answered_by_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["camera", "--port", "0", "--model", "EOS R5"]) == 2
     assert "EOS 550D, EOS 6D Mark II, Test" in capsys.readouterr().err
@@ -76,15 +67,6 @@ def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.slow
-def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
-    with sim_serving("camera", "--usbip", "0", "--model", "EOS 6D Mark II") as (line,):
-        assert line.endswith("bus id 1-1\n")
-        host, port = line.split(" at ")[1].split(",")[0].split(":")
-        found = usbip.host.list_devices(usbip.USBIP(host, int(port)))
-    assert [(entry["idVendor"], entry["idProduct"]) for entry in found] == [(0x04A9, 0x32CA)]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -93,12 +75,6 @@ def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
         (["--room", "profile=shiny"], "--room.profile"),
         (["--watch-projector", "127.0.0.1:4352"], "--watch-projector needs --watch-screen"),
         (["--watch-screen", "HDMI-1"], "'HDMI-1' is no screen"),
-        (["--event", "{ what = 'bump'"], "is not TOML"),
-        (["--event", "{ what = 'flood' }"], "there is no such event; what is one of frozen screen"),
-        (
-            ["--watch-screen", ":1", "--event", "{ what = 'frozen screen' }"],
-            "frozen screen is for the simulated screen",
-        ),
         (["--chart", "chart.json"], "charts are read by the program sim"),
     ],
 )

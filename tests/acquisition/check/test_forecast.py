@@ -21,6 +21,7 @@ from acquisition.check.places import place_chart, window_px
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import OUTCOMES
 from calibration.pipeline.build import check as build_check
+from calibration.pipeline.frames import BuildOptions
 from calibration.verdict import judge
 from drivers.presenter import BLACK, WHITE
 from drivers.raw.rawfile import Mosaic, read_raw
@@ -135,7 +136,7 @@ def say(case: Case, folder: Path) -> Said:
         shots.append(Shot(0.5, read_raw(folder / f"{name}.dng"), len(data)))
     forecast = None
     try:
-        framing = find_chart(shots[0].mosaic, lab.chart, "the white frame")
+        framing = find_chart(shots[0].mosaic, lab.chart, "the white frame", lab.corners_px(shots[0].mosaic))
         place = place_chart(framing, lab.chart)
         placed = PlacedChart(framing, place, window_px(lab.chart, place))
         forecast = Forecast.of(
@@ -149,13 +150,14 @@ def say(case: Case, folder: Path) -> Said:
 
     built, figures = None, dict[str, float]()
     with take(lab, folder / "session", LIGHTS[:1], frame=frame) as session:
-        built, figures = _built(session)
+        built, figures = _built(session, lab.corners_px(shots[0].mosaic))
     return Said(forecast, built, figures)
 
 
-def _built(session: Session) -> tuple[dict[str, str] | None, dict[str, float]]:
+def _built(session: Session, corners: npt.NDArray[np.float64] | None) -> tuple[dict[str, str] | None, dict[str, float]]:
+    options = BuildOptions(corners=None if corners is None else tuple(map(tuple, corners.tolist())))
     try:
-        result = build_check(session)
+        result = build_check(session, options)
     except (RegistrationError, QualityError):
         return None, {}
     # Of a plan that has one light, more frames change nothing.

@@ -35,7 +35,7 @@ def test_cells_lie_where_the_room_shows_them(
 ) -> None:
     lab = hung()
     mosaic = lab.mosaic(tmp_path)
-    place = place_chart(find_chart(mosaic, lab.chart), lab.chart)
+    place = place_chart(find_chart(mosaic, lab.chart, corners=lab.corners_px(mosaic)), lab.chart)
     points = lab.chart.centres_mm
     off = np.asarray(place.to_pixels(points) - lab.truth_px(points, mosaic), dtype=np.float64)
     error: npt.NDArray[np.float64] = np.sqrt((off**2).sum(axis=1))

@@ -154,9 +154,13 @@ def test_a_chart_without_references_has_no_light_and_no_stains(check: Check, fol
     assert of(report, "room light").grade == "good"
 
 
-def test_a_chart_without_tags(check: Check, folder: Path) -> None:
-    paper_chart("A5", 2).save(folder / "paper.json")
-    report = check(chart="paper.json", stain_mm=20.0)
+def test_a_chart_without_tags(check: Check, folder: Path, tmp_path: Path) -> None:
+    chart = paper_chart("A5", 2)
+    chart.save(folder / "paper.json")
+    lab = hang_chart(chart, "Test", Room(stain_mm=20.0))
+    corners = lab.corners_px(lab.mosaic(tmp_path))
+    assert corners is not None
+    report = check(chart="paper.json", stain_mm=20.0, corners=tuple(map(tuple, corners.tolist())))
     assert not_good(report) == set()
     for name in ("evenness", "colour evenness", "stains"):
         assert of(report, name).grade == "not checked"

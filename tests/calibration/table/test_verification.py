@@ -117,7 +117,6 @@ def test_sha256sum_reads_the_list(tmp_path: Path) -> None:
         ("lights_sha256", ["00" * 32], "1 lights.* 5 lights"),
         ("lights_sha256", ["x"] * 5, "lights_sha256.0"),
         ("files_sha256", {"../frames.csv": "00" * 32}, "files_sha256"),
-        ("bits", 2, r"expected uint16 \(5, 64, samples, 3\)"),
         ("camera", {"a": 1}, "camera"),
     ],
 )
@@ -131,6 +130,14 @@ def test_a_description_that_does_not_fit_is_refused(tmp_path: Path, key: str, va
         open_lut(lut.folder)
 
 
+def test_samples_of_another_size_than_stated_are_refused_also_unchecked(tmp_path: Path) -> None:
+    lut = write(tmp_path / "lut")
+    path = lut.folder / "lut.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"bits": 2}))
+    with pytest.raises(FormatError, match=r"expected uint16 \(5, 64, samples, 3\)"):
+        open_lut(lut.folder, check=False)
+
+
 @pytest.mark.parametrize(
     ("change", "fault"),
     [
@@ -139,7 +146,7 @@ def test_a_description_that_does_not_fit_is_refused(tmp_path: Path, key: str, va
         (lose("SHA256SUMS"), "SHA256SUMS"),
         (lose("samples.npy"), "samples.npy"),
         (lose("illuminations.csv"), "illuminations"),
-        (forget_the_sums, "lut.json does not know of SHA256SUMS"),
+        (forget_the_sums, "has_sums is not true"),
         (lengthen, "6130 bytes, 6128"),
     ],
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 import hashlib
-import struct
 from typing import Any
 
 import pytest
@@ -15,7 +14,7 @@ from drivers.ptp import ip as ptpip
 from drivers.ptp import usb as container
 from drivers.ptp.codes import Operation
 from drivers.ptp.protocol import PtpRequest, encode_string, encode_value, next_transaction
-from foundation.errors import DeviceError, LinkClosed, LinkTimeout
+from foundation.errors import DeviceError
 from sim.buses.usb import (
     BULK_IN,
     INTERRUPT_IN,
@@ -26,13 +25,11 @@ from sim.buses.usb import (
     Stalled,
     UsbIdentity,
 )
-from sim.buses.usbip import UsbIpService
 from tests.drivers.ptp.examples import IP_PACKETS, READERS, STREAMS
 from tests.pinned import Pinned
 from tests.sim.camera.test_eos import host_of
 
 CANCEL = bytes.fromhex("0140 05000000")
-URB = struct.Struct(">IIIIIIiiii8s")
 
 
 def digest(data: bytes) -> str:
@@ -85,78 +82,6 @@ def test_packets_of_a_device_are_cut_as_before(pinned: Pinned) -> None:
                     told = type(error).__name__
                 found.append(f"{limit} {request.code:x} {endpoint:x} {room}: {told}")
     pinned("packets of a device", found)
-
-
-class Script:
-    """A link that gives pieces one after another, and notes what is written."""
-
-    def __init__(self, pieces: list[bytes | None]) -> None:
-        self.pieces, self.written = pieces, list[str]()
-
-    def read(self, limit: int, timeout: float) -> bytes:
-        if not self.pieces:
-            raise LinkClosed("the script is over")
-        piece = self.pieces.pop(0)
-        if piece is None:
-            raise LinkTimeout("nothing yet")
-        return piece
-
-    def write(self, data: bytes, timeout: float) -> None:
-        self.written.append(
-            data.hex() if len(data) < 80 else f"{data[:60].hex()}…{hashlib.sha256(data).hexdigest()[:8]}"
-        )
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-def submit(
-    number: int, inward: int, endpoint: int, length: int, data: bytes = b"", setup: bytes = b"", flags: int = 0
-) -> bytes:
-    return URB.pack(1, number, 0x10002, inward, endpoint, flags, length, 0, 0, 0, setup) + data
-
-
-def test_a_device_is_lent_over_the_network_as_before(pinned: Pinned) -> None:
-    opening, asking = (
-        container.encode(PtpRequest(code, n, given)) for n, (code, given) in enumerate(((0x1002, (1,)), (0x1001, ())))
-    )
-    wanted = struct.pack(">HHI32s", 0x0111, 0x8003, 0, b"1-2")
-    descriptor = struct.pack("<BBHHH", 0x80, 6, 0x100, 0, 18)
-    scripts: dict[str, list[bytes | None]] = {
-        "list": [struct.pack(">HHI", 0x0111, 0x8005, 0)[:5], struct.pack(">HHI", 0x0111, 0x8005, 0)[5:]],
-        "of none": [struct.pack(">HHI32s", 0x0111, 0x8003, 0, b"1-9")],
-        "another operation": [struct.pack(">HHI", 0x0111, 0x8006, 0)],
-        "transfers": [
-            wanted + submit(1, 1, 0, 18, setup=descriptor),
-            submit(2, 1, 0, 9, setup=struct.pack("<BBHHH", 0xC0, 6, 0x100, 0, 18)),
-            submit(3, 0, 2, len(opening), opening)[:50],
-            submit(3, 0, 2, len(opening), opening)[50:],
-            submit(4, 1, 1, 512),
-            None,
-            submit(5, 1, 1, 512),
-            submit(6, 1, 3, 8),
-            submit(7, 0, 2, len(asking), asking, flags=0x40),
-            submit(8, 1, 1, 5, flags=1),
-            submit(9, 1, 1, 4096, flags=1),
-            submit(10, 1, 7, 5),
-            submit(11, 0, 7, 1, b"x"),
-            submit(12, 1, 1, 100),
-            URB.pack(2, 13, 0, 0, 0, 12, 0, 0, 0, 0, b""),
-            URB.pack(2, 14, 0, 0, 0, 1, 0, 0, 0, 0, b""),
-            None,
-            submit(15, 2, 0, 1),
-        ],
-    }
-    found: dict[str, Any] = {}
-    for name, pieces in scripts.items():
-        link = Script(pieces)
-        ended = ""
-        try:
-            UsbIpService([camera(), camera()]).handle(link)
-        except DeviceError as error:
-            ended = str(error)
-        found[name] = [link.written, ended]
-    pinned("devices lent over the network", found)
 
 
 @pytest.mark.slow
