@@ -97,7 +97,7 @@ def test_spectra_of_lights(pinned: Pinned) -> None:
     found: dict[str, Any] = {}
     for name in named:
         lights = said(read_lights, name)
-        found[name] = lights if isinstance(lights, str) else [
+        found[name] = lights if isinstance(lights, dict) else [
             lights.source,
             [[one.name, one.cct_k] for one in lights.lights],
             np.array([one.power for one in lights.lights]),
@@ -109,7 +109,7 @@ def test_spectra_of_lights(pinned: Pinned) -> None:
     texts["name"] = "wavelength,1.5\n400,1\n"
     for name, text in texts.items():
         lights = said(parse_spectra, text.encode(), "lamps.csv")
-        found[name] = lights if isinstance(lights, str) else [[one.name, one.power] for one in lights]
+        found[name] = lights if isinstance(lights, dict) else [[one.name, one.power] for one in lights]
     pinned("spectra of lights", found)
 
 
@@ -132,7 +132,7 @@ def test_settings_of_tables(pinned: Pinned) -> None:
     found: list[Any] = []
     for document in documents:
         settings = said(parse_settings, document, "here")
-        if isinstance(settings, str):
+        if isinstance(settings, dict):
             found.append(settings)
             continue
         found.append(

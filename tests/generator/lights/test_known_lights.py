@@ -101,7 +101,7 @@ def test_draws_of_distributions(pinned: Pinned) -> None:
     found: dict[str, Any] = {}
     for text in texts:
         distribution = said(parse_distribution, text)
-        found[text] = distribution if isinstance(distribution, str) else [
+        found[text] = distribution if isinstance(distribution, dict) else [
             distribution.describe(),
             distribution.draw(words),
         ]  # fmt: skip
@@ -172,7 +172,7 @@ def test_requests(lut: Lut, pinned: Pinned) -> None:
     for name, wishes in REQUESTS.items():
         choice = said(LightOptions(**wishes).choose, lut, SEED, names[:2])
         scenes = (0, 1) if "by name" in name else (0, 1, 70000)
-        found[name] = choice if isinstance(choice, str) else said(shown, choice, scenes)
+        found[name] = choice if isinstance(choice, dict) else said(shown, choice, scenes)
     by_name = LightOptions(lights_by_name=Path("many.csv"), outside="nearest")
     found["crops by name"] = shown(by_name.choose(lut, SEED, names[:2], 2), (0, 1, 2, 3))
     found["ambiguous"] = said(by_name.choose, lut, SEED, names)
