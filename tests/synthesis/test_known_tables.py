@@ -98,7 +98,7 @@ def test_spectra_of_lights(pinned: Pinned) -> None:
     found: dict[str, Any] = {}
     for name in named:
         lights = said(read_lights, name)
-        found[name] = lights if isinstance(lights, str) else [
+        found[name] = lights if isinstance(lights, dict) else [
             lights.source,
             [[one.name, one.cct_k] for one in lights.lights],
             np.array([one.power for one in lights.lights]),
@@ -110,5 +110,5 @@ def test_spectra_of_lights(pinned: Pinned) -> None:
     texts["name"] = "wavelength,1.5\n400,1\n"
     for name, text in texts.items():
         lights = said(parse_spectra, text.encode(), "lamps.csv")
-        found[name] = lights if isinstance(lights, str) else [[one.name, one.power] for one in lights]
+        found[name] = lights if isinstance(lights, dict) else [[one.name, one.power] for one in lights]
     pinned("spectra of lights", found)

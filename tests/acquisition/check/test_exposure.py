@@ -149,7 +149,7 @@ def test_exposures_are_proposed_as_before(pinned: Pinned) -> None:
         start_s = (1 / 60, 0.5, 30.0)[number % 3]
         trials = tried(rate, start_s, TIMES)
         white = judge_exposure(trials, Saturation(13584, number % 4 != 0, 15831), TIMES, PERIOD_S, number % 5 == 0)
-        found.append([" ".join(f"{one.shutter_s:.6g}" for one in trials), white.grade, white.sentence(), white.value])
+        found.append([[one.shutter_s for one in trials], white.value])
     full = [
         measure_saturation(
             photographed(rate, 0.5, 13584, 20.0), lambda s, rate=rate: photographed(rate, s, 13584, 20.0), TIMES

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,12 +47,16 @@ ROUNDED = 0.011
 """Checks are rounded to two digits, which the last digits of single precision may move."""
 
 
-def said(judgement: Judgement) -> list[Any]:
-    """Return all numbers of a verdict, and the words of what people are told."""
-    numbers = {f"{one.name} {one.unit}": [one.value, one.low, one.high] for one in judgement.checks}
-    told = [f"{one.name}: {re.sub('[0-9.]+', '#', one.reason)}" for one in judgement.checks if one.reason]
-    told = [re.sub("/.*/frame#dng", "frame", one) for one in told]
-    return [{name: some for name, some in numbers.items() if any(some)}, told, judgement.voids, judgement.lasting]
+def said(judgement: Judgement) -> dict[str, Any]:
+    """Return all numbers of a verdict."""
+    numbers = {one.name: [one.value, one.low, one.high] for one in judgement.checks}
+    return {**numbers, "voids": judgement.voids, "lasting": judgement.lasting}
+
+
+def failed(judgement: Judgement) -> dict[str, Any]:
+    """Return the checks that a frame fails, with their values."""
+    wrong = {one.name: one.value for one in judgement.checks if one.reason}
+    return {**wrong, "failed": len(wrong), "voids": judgement.voids, "lasting": judgement.lasting}
 
 
 def known(now: JudgeState) -> dict[str, Any]:
@@ -129,14 +132,15 @@ def test_a_session_is_judged_as_it_was(tmp_path: Path, pinned: Pinned) -> None:
     for name, (codes, events) in WRONG.items():
         one = before.fork()
         again = [one.take(one.light(*codes), *events, before=Colour(*SKY)) for _ in range(AGAIN.get(name, 1))]
-        wrong[name] = [*map(said, again), one.judge.state.candidate, one.judge.state.refused]
+        wrong[name] = {str(number): failed(each) for number, each in enumerate(again)}
+        wrong[name] |= {"candidate": one.judge.state.candidate, "refused": one.judge.state.refused}
     references = (
         (WHITE_STEP, ("a small bump", "a weaker lamp", "light in the room", "a hand", "a pop-up", "defocus")),
         (DARK_STEP, ("light in the room", "a pop-up")),
     )
     for step, titles in references:
         for title in titles:
-            wrong[f"{step.kind}, {title}"] = said(lab.fork().take(step, *WRONG[title][1]))
+            wrong[f"{step.kind}, {title}"] = failed(lab.fork().take(step, *WRONG[title][1]))
     pinned("verdicts of what goes wrong", wrong, same=1e-3, nothing=ROUNDED)
 
 
@@ -236,7 +240,7 @@ def test_frames_are_held_against_pictures_as_they_were(pinned: Pinned) -> None:
 @pytest.mark.slow
 def test_lights_that_are_off_are_named_as_they_were(pinned: Pinned) -> None:
     _, model = learnt(3, 40)
-    random, found, numbers = np.random.default_rng(8), list[str](), list[float]()
+    random, numbers = np.random.default_rng(8), list[float]()
     nothing = state.Residuals(np.zeros(0), np.zeros(0), np.zeros(0))
     plan = ((255, 255, 255), (0, 0, 0), (255, 0, 0), (200, 100, 50), (30, 60, 90), (0, 255, 0), (255, 128, 0))
     for number in range(80):
@@ -265,18 +269,17 @@ def test_lights_that_are_off_are_named_as_they_were(pinned: Pinned) -> None:
         ways = [seen.cause(wrong, 0.01, again=again) for wrong in (True, False) for again in (True, False)]
         numbers += [fit.distance, fit.angle_deg, fit.brightness, fit.brightness_sd, seen._coloured()]
         numbers += [*seen.neutral_light(), *added[0], *added[1], *(light for _, light in ways)]
-        found += [reason for reason, _ in dict.fromkeys(ways) if reason]
-    pinned("lights that are off", [found, np.array(numbers)])
+        numbers.append(sum(bool(reason) for reason, _ in ways))
+    pinned("lights that are off", np.array(numbers))
 
 
 def test_of_two_causes_those_are_named_that_were(pinned: Pinned) -> None:
     """A value of 0.6 is less blur and movement than what stands for itself, one of 9 is plainly more."""
-    named: dict[str, str] = {}
+    named: dict[str, list[bool]] = {}
     for first, second in itertools.combinations(judge.CAUSES, 2):
         for value in (0.6, 9.0):
             found = [Check(name, value, None, 2.0, reason="wrong") for name in (first, second)]
-            left = [check.name for check in judge._named_once(found) if check.reason]
-            named[f"{first} and {second}, {value:g}"] = ", ".join(left)
+            named.setdefault(f"{first} {value:g}", []).extend(bool(check.reason) for check in judge._named_once(found))
     pinned("causes of which one is named", named)
 
 
