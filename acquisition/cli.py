@@ -246,7 +246,6 @@ def check(
         Path | None,
         typer.Option(help="Save as PNG the frame with what was found on it, maps of light, blur and print, verdicts."),
     ] = None,
-    identify: Annotated[bool, typer.Option(help="First show on every display its number for ten seconds.")] = False,
     corners: Annotated[
         tuple[str, str, str, str] | None,
         option(
@@ -255,7 +254,7 @@ def check(
         ),
     ] = None,
     linearity: Annotated[
-        bool, typer.Option("--linearity", help="Take a series of exposures too: linearity, electrons a count, noise.")
+        bool, typer.Option("--linearity", help="Take a series of exposures too, which shows the sensor's linearity.")
     ] = False,
     session: Annotated[
         Path | None, typer.Option(help="Where the session will be, for the disk's space; else beside LAB.toml.")
@@ -265,8 +264,9 @@ def check(
 ) -> None:
     """Say whether the lab is ready: a verdict on exposure, light, sharpness, print, sensor, supplies; record nothing.
 
-    Reads LAB.toml, the chart and the lights it names. Takes 10 to 20 frames and keeps none; tries shutter times until
-    one suits. Each verdict is good, a remark, a fault, or not checked, with its number, limit, reason and remedy.
+    Reads LAB.toml, the chart and the lights it names. Takes some 20 frames and keeps none; tries shutter times until
+    one suits, then judges white, dark, the primaries and grey by the figures of build-lut. Each verdict is good, a
+    remark, a fault, or not checked, with its number, limit, reason and remedy.
     Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all
     named at once, each with its remedy, and end it with 3, or with 2 where LAB.toml alone is at fault.
     """
@@ -279,10 +279,6 @@ def check(
         from experiment.framing.field import parse_corners
 
         given = parse_corners(corners)
-    if identify:
-        from acquisition.run.rig.lab import identify_displays
-
-        identify_displays(10.0)
     with orderly_end():
         report = check_lab(
             settings,

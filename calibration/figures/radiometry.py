@@ -30,9 +30,7 @@ from calibration.figures.figure import (
     NO_PLACE,
     NOT_DRAWN,
     OF_ITS_CAUSE,
-    ONLY_OF_A_SESSION,
     SIMULATED,
-    CheckMeasurements,
     Explanation,
     Figure,
     Line,
@@ -81,14 +79,6 @@ def _most_unfit(table: TableMeasurements) -> tuple[str, str] | None:
     return f", {count} of them {kind}", _UNFIT_REMEDIES.get(kind, "look at the report")
 
 
-def _unfit_in_check(check: CheckMeasurements) -> float | None:
-    """Return the share of unfit cells; None where stains are not known, and what is known, the least, is accepted."""
-    share = check.unfit_share
-    if share is None or (check.paper is None and UNFIT_SHARE.outcome(share) == "accept"):
-        return None
-    return share
-
-
 def _unfit_row(table: TableMeasurements) -> SummaryRow:
     count = len(table.cells.unfit)
     return SummaryRow("Cells unfit for use", str(count), "listed in lut.json, never filled", brief=True)
@@ -97,7 +87,7 @@ def _unfit_row(table: TableMeasurements) -> SummaryRow:
 UNFIT_SHARE = Figure(
     "unfit_share", "Cells unfit for use", "radiometry", "share", "at most", 0.005, 0.1,
     why="colours without samples are missing from every picture", source=JUDGEMENT, remedy="", found=_most_unfit,
-    measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1), forecast=_unfit_in_check,
+    measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1), before_session=True,
     of_one_frame="bounded", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
     cause=Explanation("unfit cells", unfit_evidence, follows=("block_deviation",)),
     drawing="print", lines=(Line(290, _unfit_row),),
@@ -114,10 +104,6 @@ def _most_deviating(table: TableMeasurements, chart: Chart) -> Worst | None:
     return Worst(f"colour {colour}, {100 * off[colour]:+.2g} %", file, place=PrintPlace(file, x, y, 0.0))
 
 
-def _doubtful_in_check(check: CheckMeasurements) -> float | None:
-    return None if check.stains is None or not check.stains.known else float(check.stains.doubtful.mean())
-
-
 DOUBTFUL_SHARE = Figure(
     "doubtful_share", "Cells in surroundings 1 % off their codes' colours", "radiometry", "share", "at most", 0.0003,
     None,
@@ -125,15 +111,11 @@ DOUBTFUL_SHARE = Figure(
     source=SIMULATED + ": none on a clean flat print",
     remedy="clean the print, hang it flatter, and look for shadows on it",
     measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.known else None,
-    forecast=_doubtful_in_check,
+    before_session=True,
     of_one_frame="known",
     worst=_most_deviating, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("spot", spot_evidence),
     drawing="print", lines=NO_LINES,
 )  # fmt: skip
-
-
-def _added_in_check(check: CheckMeasurements) -> float | None:
-    return None if check.stains is None or not check.stains.known else added_light(check.stains)
 
 
 ADDED_LIGHT = Figure(
@@ -144,7 +126,7 @@ ADDED_LIGHT = Figure(
     "of a thirtieth 30 %; a reflection of 3 % leaves a table with cells 57 % off",
     remedy="turn print or projector until nothing is mirrored on it, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
-    forecast=_added_in_check,
+    before_session=True,
     of_one_frame="known",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("spot", spot_evidence),
     drawing="print", lines=NO_LINES,
@@ -177,7 +159,7 @@ FRAME_BLUR = Figure(
     source=SIMULATED + ": 0.9 px of blur in one frame of a session with 0.5 px give 0.8 % and cells 1.2 % off, "
     "1.1 px 2 % and cells 4 % off",
     remedy="switch off autofocus and stabilisation, see that nothing shakes the camera",
-    measure=lambda table: table.added_bleed(_softest(table)), forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: table.added_bleed(_softest(table)), before_session=True,
     of_one_frame="bounded",
     worst=lambda table, chart: Worst(f"blur σ {_softest(table).blur_px:.2f} px", _softest(table).record.file),
     where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
@@ -209,7 +191,7 @@ FRAME_SCATTER = Figure(
     why="the frame's samples are not of their cells' colours",
     source=SIMULATED + ": to 0.8 % beyond noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
     remedy="see that nothing changes during the session",
-    measure=_of_alike_frames(lambda table, frame: frame.consistency.scatter), forecast=ONLY_OF_A_SESSION,
+    measure=_of_alike_frames(lambda table, frame: frame.consistency.scatter), before_session=True,
     of_one_frame="bounded", worst=_most_scattered,
     where=lambda table, accepted: f"in {max(table.frames, key=lambda one: one.consistency.scatter).record.file}",
     retake=_frames_beyond(lambda table, frame: frame.consistency.scatter),
@@ -231,7 +213,7 @@ BLOCK_DEVIATION = Figure(
     0.01, 0.03,
     why="something lay, or shone, on the print in that frame or in the one compared with, and its samples contain it",
     source=SIMULATED + ": to 0.4 % beyond noise", remedy="see that nobody comes between lamp, print and camera",
-    measure=_of_alike_frames(lambda table, frame: frame.consistency.block), forecast=ONLY_OF_A_SESSION,
+    measure=_of_alike_frames(lambda table, frame: frame.consistency.block), before_session=True,
     of_one_frame="bounded",
     worst=_worst_block, where=OF_ITS_CAUSE, retake=_frames_beyond(lambda table, frame: frame.consistency.block),
     cause=Explanation("block", block_evidence),
@@ -254,7 +236,7 @@ DISTURBED_CELLS = Figure(
     source=SIMULATED + ": none in healthy rooms; two cells next to each other, five standard deviations off, are one, "
     "unless the dark frames show them to be hot",
     remedy="see that nothing comes between lamp, print and camera",
-    measure=_disturbed, forecast=ONLY_OF_A_SESSION,
+    measure=_disturbed, before_session=True,
     of_one_frame="bounded", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES,
     cause=Explanation("few cells", disturbed_evidence, follows=("block_deviation",)),
     drawing="worst", lines=NO_LINES,
@@ -277,7 +259,7 @@ REREGISTERED_FRAMES = Figure(
     why="the chart or the camera moved between frames; the sampling grid followed", source=JUDGEMENT,
     remedy="fix camera and print, and let nobody walk about",
     measure=lambda table: float(_reregistered(table)),
-    forecast=ONLY_OF_A_SESSION,
+    before_session=True,
     of_one_frame="bounded",
     worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("movement", movement_evidence),
     drawing="course", lines=(Line(120, _movement_row),),
@@ -297,7 +279,7 @@ OTHER_CAMERA = Figure(
     "other_camera", "Frames of another camera", "radiometry", "", "at most", 0, 0.5, foremost=True,
     why="a table is of one camera: another body sees other colours, and another model others yet",
     source="by definition", remedy="take these frames again with the session's camera",
-    measure=lambda table: float(len(table.origins.other_camera)), forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: float(len(table.origins.other_camera)), before_session=True,
     of_one_frame="bounded", worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_camera),
     retake=lambda table, limit: [frame.record for frame in table.origins.other_camera],
     cause=Explanation("camera", camera_evidence),
@@ -308,7 +290,7 @@ OTHER_LENS = Figure(
     "other_lens", "Frames through another lens", "radiometry", "", "at most", 0, None,
     why="lenses tint, blur and shade each in its own way", source="by definition",
     remedy="take these frames again through the session's lens",
-    measure=lambda table: float(len(table.origins.other_lens)), forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: float(len(table.origins.other_lens)), before_session=True,
     of_one_frame="bounded",
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_lens), retake=NO_FRAMES,
     cause=Explanation("camera", camera_evidence),
@@ -326,7 +308,7 @@ OTHER_EXPOSURE = Figure(
     "at most", 0.01, 0.1, foremost=True,
     why="brightness would differ between lights that should be alike, and the noise with the ISO speed",
     source="shutter times are steps of 26 % apart, and are written rounded", remedy=_SAME_EXPOSURE,
-    measure=lambda table: table.origins.exposure_difference, forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: table.origins.exposure_difference, before_session=True,
     of_one_frame="bounded",
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_exposure), retake=_otherwise_exposed,
     cause=Explanation("brightness", light_evidence),
@@ -337,7 +319,7 @@ OTHER_ISO = Figure(
     "other_iso", "Frames of another ISO speed", "radiometry", "", "at most", 0, None,
     why="their noise is another, and so is the count at which they saturate; their exposure is judged apart",
     source="by definition", remedy=_SAME_EXPOSURE,
-    measure=lambda table: float(len(table.origins.other_iso)), forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: float(len(table.origins.other_iso)), before_session=True,
     of_one_frame="bounded",
     worst=NO_PLACE, where=lambda table, accepted: _foreign(table.origins.other_iso), retake=NO_FRAMES,
     cause=Explanation("iso", iso_evidence),
@@ -349,7 +331,7 @@ WHITE_FRAMES = Figure(
     why="nothing says how the lamp drifted, whether the print has stains, or whether cells are of one colour",
     source="by definition; from two on a drift is seen",
     remedy="take white frames along with the lights (sequence.reference_every)",
-    measure=lambda table: float(len(table.white_frames)), forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: float(len(table.white_frames)), before_session=False,
     of_one_frame="unknown", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="course", lines=NO_LINES,
 )  # fmt: skip
@@ -366,7 +348,7 @@ BLACK_DRIFT_COUNTS = Figure(
     why="the sensor warmed up; each frame's own black is subtracted, but an error of it shows in dark cells of about "
     "30 counts",
     source=JUDGEMENT, remedy="let the camera run for some minutes before the session, and rest between frames",
-    measure=lambda table: table.black_drift, forecast=ONLY_OF_A_SESSION,
+    measure=lambda table: table.black_drift, before_session=True,
     of_one_frame="bounded", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
     drawing="course", lines=(Line(140, _black_row),),
 )  # fmt: skip

@@ -210,6 +210,28 @@ def check(
     return BuildResult(figures, judge(judged_values(figures), judged_by), None)
 
 
+def judge_trial(
+    session: Session, saturation: int, options: BuildOptions = PAPER_OPTIONS, linearity: Path | None = None
+) -> BuildResult:
+    """Judge a few trial frames as those of a whole session; write nothing.
+
+    The lens is not measured, which takes a minute; nor are the figures that rest on it.
+
+    `saturation`: the raw count at which the sensor saturates. `linearity`: a folder with a series of exposures.
+    """
+    selected = select_frames(session)
+    first = decode_frame(session, selected.registered)
+    pure = [decode_frame(session, record) for record in selected.primaries]
+    plain = with_superposition(baseline_of(session.chart, first, options), first, pure)
+    baseline = with_primaries(plain, measure_primaries(plain, pure))
+    series = None if linearity is None else read_linearity(linearity, baseline)
+    done = Accumulator.empty(session, selected, baseline, min(saturation, first.saturation))
+    for record, early in prefetched(done.measure, selected.records, done.others_wait_for):
+        done, _ = done.with_next(record, early)
+    figures = table_figures(done, series)
+    return BuildResult(figures, judge(judged_values(figures), FIGURES), None)
+
+
 def _take_in_all(
     session: Session,
     selected: SelectedFrames,
