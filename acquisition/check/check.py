@@ -37,7 +37,7 @@ from acquisition.check.trial import (
     trial_lights,
     trial_steps,
 )
-from acquisition.judge.measure import Anchor, disagreement, measure_exposure, refusal
+from acquisition.judge.measure import Anchor, disagreement, refusal
 from acquisition.run.devices import Devices, RetryPolicy, ask_all, make_ready, period_s, reported_error
 from acquisition.run.plan import planned_steps, settings_doubts
 from acquisition.run.rig.opening import open_rig
@@ -55,6 +55,7 @@ from experiment.config import LabSettings
 from experiment.framing.field import Corners
 from experiment.framing.homography import project
 from experiment.lights import load_illuminations
+from experiment.measures.exposure import measure_exposure
 from experiment.measures.paper import falloff
 from experiment.measures.pose import keystone, off_level_deg
 from experiment.session.folder import Session
