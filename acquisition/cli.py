@@ -232,15 +232,16 @@ def check(
         ),
     ] = None,
     linearity: Annotated[
-        bool, typer.Option("--linearity", help="Take a series of exposures too: linearity, electrons a count, noise.")
+        bool, typer.Option("--linearity", help="Take a series of exposures too, which shows the sensor's linearity.")
     ] = False,
     *,
     output: JsonOutput,
 ) -> None:
     """Say whether the lab is ready: a verdict on exposure, light, sharpness, print, sensor, supplies; record nothing.
 
-    Reads LAB.toml, the chart and the lights it names. Takes 10 to 20 frames and keeps none; tries shutter times until
-    one suits. Each verdict is good, a remark, a fault, or not checked, with its number, limit, reason and remedy.
+    Reads LAB.toml, the chart and the lights it names. Takes some 20 frames and keeps none; tries shutter times until
+    one suits, then judges white, dark, the primaries and grey by the figures of build-lut. Each verdict is good, a
+    remark, a fault, or not checked, with its number, limit, reason and remedy.
     Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all
     named at once, each with its remedy, and end it with 3, or with 2 where LAB.toml alone is at fault.
     """

@@ -100,7 +100,7 @@ REPEATED_FILES = Figure(
     "repeated_files", "Frames whose file is that of another frame", "light", "", "at most", 0.0, None,
     why="one photograph stands for several: what changed between them, as the lamp's drift, was not seen",
     source="no two exposures have the same bytes", remedy="correct the list of frames that was imported",
-    measure=_repeated, of_one_frame="bounded", where=_repeated_files,
+    measure=_repeated, before_session=True, of_one_frame="bounded", where=_repeated_files,
 )  # fmt: skip
 
 
@@ -118,7 +118,7 @@ WHITE_DRIFT = Figure(
     "white_drift", "Drift of paper white between white frames", "light", "share", "at most", 0.01, 0.15,
     why="lights taken at other times differ in brightness; each has its own ground truth, so its colour is right",
     source=JUDGEMENT + "; 1 % between whites is usual for a warm lamp", remedy=_WARM_UP,
-    measure=_white_drift, cause=Explanation("drift", drift_evidence), drawing="course",
+    measure=_white_drift, before_session=True, cause=Explanation("drift", drift_evidence), drawing="course",
     lines=(Line(130, _drift_row),),
 )  # fmt: skip
 
@@ -149,7 +149,7 @@ WHITE_DRIFT_DEG = Figure(
     "white_drift_deg", "Drift of white's colour", "light", "°", "at most", 0.2, 2.0,
     why="the lamp's spectrum changes, not its brightness alone",
     source=JUDGEMENT + ": a tenth of a good method's error", remedy=_WARM_UP,
-    measure=_white_drift_deg, cause=Explanation("drift", drift_evidence), drawing="course",
+    measure=_white_drift_deg, before_session=True, cause=Explanation("drift", drift_evidence), drawing="course",
 )  # fmt: skip
 
 
@@ -180,8 +180,8 @@ LEAK_SHARE = Figure(
     why="every light contains this much of the projector's leak and the room's light, so that deep colours are paler",
     source=JUDGEMENT + "; a contrast of 1 : 1500 leaks 0.07 %",
     remedy="darken the room, cover lamps and displays, or have it subtracted (build-lut --subtract-dark)",
-    measure=_leak, forecast=lambda check: None if check.leak is None else float(np.abs(check.leak).max()),
-    of_one_frame="known", cause=Explanation("dark", dark_evidence), lines=(Line(210, _dark_row),),
+    measure=_leak, before_session=True, of_one_frame="known", cause=Explanation("dark", dark_evidence),
+    lines=(Line(210, _dark_row),),
 )  # fmt: skip
 
 DARK_DRIFT = Figure(
@@ -190,8 +190,8 @@ DARK_DRIFT = Figure(
     why="the room's light changes; what is subtracted, or part of each light, is not what was there",
     source=JUDGEMENT + ": a hundredth of a cell of a fifth of white",
     remedy="darken the room, and keep daylight out",
-    measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None, of_one_frame="bounded",
-    cause=Explanation("dark", dark_evidence),
+    measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None, before_session=True,
+    of_one_frame="bounded", cause=Explanation("dark", dark_evidence),
 )  # fmt: skip
 
 
@@ -221,7 +221,7 @@ STRAY_SHARE = Figure(
     "deep lights 1 to 2 degrees off, which is a good method's error",
     remedy="darken the room, see that no door, lamp or display changes during the session, switch power saving and "
     "dynamic contrast off, and take the frames again",
-    measure=_stray, cause=Explanation("stray", stray_evidence), lines=(Line(250, _stray_row),),
+    measure=_stray, before_session=True, cause=Explanation("stray", stray_evidence), lines=(Line(250, _stray_row),),
 )  # fmt: skip
 
 
@@ -262,7 +262,7 @@ LINEARITY = Figure(
     source="EMVA 1288; 1 % is " + JUDGEMENT,
     remedy="expose less, switch the camera's highlight priority and noise reduction off; a series of exposures of the "
     "chart, given with --linearity, shows where counts bend",
-    measure=_linearity, of_one_frame="known", lines=(Line(185, _linearity_row),),
+    measure=_linearity, before_session=True, of_one_frame="known", lines=(Line(185, _linearity_row),),
 )  # fmt: skip
 
 
@@ -348,7 +348,7 @@ ADDITIVITY = Figure(
     "they are called, or exposed otherwise",
     source=JUDGEMENT + "; the drift of the lamp is taken out first",
     remedy="switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
-    measure=_beyond_sum(-1), forecast=lambda check: check.not_additive, cause=Explanation("sum", _sum_evidence),
+    measure=_beyond_sum(-1), before_session=True, cause=Explanation("sum", _sum_evidence),
     lines=(Line(260, _sum_row),),
 )  # fmt: skip
 
@@ -358,7 +358,7 @@ WHITE_DEFICIT = Figure(
     "full white back",
     source=JUDGEMENT + "; a lamp that flickers by 1 % gives 2 %",
     remedy="look at the exposures of these frames, and switch dynamic contrast and power saving off",
-    measure=_beyond_sum(1), cause=Explanation("brightness", light_evidence),
+    measure=_beyond_sum(1), before_session=True, cause=Explanation("brightness", light_evidence),
 )  # fmt: skip
 
 
@@ -421,7 +421,8 @@ OFF_CODES_DEG = Figure(
     "of two lights the angle between them",
     remedy="correct the list of frames that was imported, let the picture settle for longer (sequence.settle_s), or "
     "expose whole turns of the colour wheel",
-    foremost=True, measure=_off_codes, worst=_furthest_off, where=_off_lights, retake=_frames_off_codes,
+    foremost=True,
+    measure=_off_codes, before_session=True, worst=_furthest_off, where=_off_lights, retake=_frames_off_codes,
     cause=Explanation("names", name_evidence), drawing="lights", lines=(Line(220, _codes_row),),
 )  # fmt: skip
 
@@ -461,8 +462,8 @@ OFF_BRIGHTNESS = Figure(
     "should be alike",
     source=JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
     remedy="keep one exposure for the session, and take the frames again",
-    measure=_of_codes(lambda codes: float(codes.off_brightness.max())), worst=_brightest_off, where=_brightness_text,
-    retake=_frames_off_brightness,
+    measure=_of_codes(lambda codes: float(codes.off_brightness.max())), before_session=True, worst=_brightest_off,
+    where=_brightness_text, retake=_frames_off_brightness,
     cause=Explanation("brightness", brightness_evidence, follows=("off_codes_deg", "exchanged_lights")),
 )  # fmt: skip
 
@@ -472,7 +473,7 @@ EXCHANGED_LIGHTS = Figure(
     "but its codes and temperature are the other's",
     source=SIMULATED + ": none in random healthy rooms, all pairs further apart than the figure below in the others",
     remedy="correct the list of frames that was imported, or take both again",
-    measure=_of_codes(lambda codes: float(len(codes.exchanges))), where=_exchanges,
+    measure=_of_codes(lambda codes: float(len(codes.exchanges))), before_session=True, where=_exchanges,
     cause=Explanation("names", name_evidence), drawing="lights",
 )  # fmt: skip
 
@@ -546,8 +547,9 @@ WHITE_FRAME_DEG = Figure(
     why="the frame shows another light than white, or the lights bear wrong names",
     source=SIMULATED + ": 0 in random healthy rooms",
     remedy="correct the list of frames that was imported, or take the white frame again",
-    foremost=True, measure=_white_frames(lambda white: white.off_deg),
-    where=lambda table, accepted: first_of([one.file for one in _beyond_deg(table, accepted)]), retake=_beyond_deg,
+    foremost=True,
+    measure=_white_frames(lambda white: white.off_deg), before_session=True, where=lambda table,
+    accepted: first_of([one.file for one in _beyond_deg(table, accepted)]), retake=_beyond_deg,
     cause=Explanation("names", name_evidence), drawing="course",
 )  # fmt: skip
 
@@ -557,9 +559,9 @@ WHITE_FRAME_BRIGHTNESS = Figure(
     why="the white frame was exposed otherwise than the lights, so that drift and stray light are read wrongly",
     source=JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
     remedy="keep one exposure for the session, and take the white frame again",
-    measure=_white_frames(lambda white: white.off_brightness),
-    where=lambda table, accepted: first_of([one.file for one in _beyond_brightness(table, accepted)]),
-    retake=_beyond_brightness, cause=Explanation("brightness", light_evidence), drawing="course",
+    measure=_white_frames(lambda white: white.off_brightness), before_session=True, where=lambda table,
+    accepted: first_of([one.file for one in _beyond_brightness(table, accepted)]), retake=_beyond_brightness,
+    cause=Explanation("brightness", light_evidence), drawing="course",
 )  # fmt: skip
 
 
@@ -610,5 +612,5 @@ GREY_TINT_DEG = Figure(
     "(glossy) where codes are ink codes, as the publication printed them",
     remedy="generate by colour, as it does unless told otherwise, which takes the print as it is measured; or have the "
     "chart printed through the printer's profile (docs/printing.md)",
-    measure=_tint, forecast=lambda check: check.tint_deg, of_one_frame="known", lines=(Line(270, _tint_row),),
+    measure=_tint, before_session=True, of_one_frame="known", lines=(Line(270, _tint_row),),
 )  # fmt: skip

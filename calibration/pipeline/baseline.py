@@ -82,18 +82,21 @@ def baseline_of(
     options: BuildOptions = PAPER_OPTIONS,
     primaries: Sequence[DecodedFrame] = (),
     more_whites: Iterable[DecodedFrame] = (),
+    *,
+    measures_lens: bool = True,
 ) -> Baseline:
     """Return what all frames share.
 
     `first`: the frame that is registered first. `primaries`: those of red, green and blue alone; the chart may lie
     elsewhere in them. `more_whites`: more frames of the first one's light, which show the same of the lens with other
-    noise.
+    noise. `measures_lens`: whether the light that the lens spreads is measured, which takes a minute.
     """
     points = ChartPoints.of(chart)
     registered = register_frame(first, chart, points, options)
     baseline = _of_first(chart, points, options, first, registered)
     baseline = replace(baseline, superposition=_superposition(baseline, first, primaries))
-    baseline = with_lens(baseline, first, primaries, more_whites)
+    if measures_lens:
+        baseline = with_lens(baseline, first, primaries, more_whites)
     return _with_primaries(baseline, primaries)
 
 

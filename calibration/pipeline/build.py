@@ -227,6 +227,26 @@ def check(
     return BuildResult(figures, judge(judged_values(figures), judged_by), None)
 
 
+def judge_trial(
+    session: Session, saturation: int, options: BuildOptions = PAPER_OPTIONS, linearity: Path | None = None
+) -> BuildResult:
+    """Judge a few trial frames as those of a whole session; write nothing.
+
+    The lens is not measured, which takes a minute; nor are the figures that rest on it.
+
+    `saturation`: the raw count at which the sensor saturates. `linearity`: a folder with a series of exposures.
+    """
+    selected = select_frames(session)
+    first = decode_frame(session, selected.registered)
+    primaries = [decode_frame(session, record) for record in selected.primaries]
+    baseline = baseline_of(session.chart, first, options, primaries, measures_lens=False)
+    series = None if linearity is None else read_linearity(linearity, baseline)
+    empty = Accumulator.empty(session, selected, baseline, min(saturation, first.saturation))
+    done, _ = deque(_collected(empty, selected.records), maxlen=1).pop()
+    figures = table_figures(done, series)
+    return BuildResult(figures, judge(judged_values(figures), FIGURES), None)
+
+
 def _take_in_all(
     session: Session,
     selected: SelectedFrames,
@@ -248,21 +268,10 @@ def _take_in_all(
     if stored is not None:
         done = done.restored(stored.values, stored.arrays)
     before = len(done.figures)
-
-    def measure_early(record: FrameRecord) -> EarlyMeasurement:
-        # In a thread, with what is collected at that moment.
-        return _measured(done, record, register_again=False)
-
-    def others_wait_for(record: FrameRecord) -> bool:
-        return options.subtract_dark and record.kind == "dark"
-
     try:
-        for record, early in prefetched(measure_early, records[before:], others_wait_for):
-            frame = early
-            if frame is None or frame.registered is not done.registered:
-                frame = _measured(done, record, register_again=True)
-                assert frame is not None
-            done = done.with_frame(frame)
+        for collected, frame in _collected(done, records[before:]):
+            done = collected
+            record = records[len(done.figures) - 1]
             if isinstance(frame, MeasuredFrame) and record.kind == "light" and record.illumination is not None:
                 writer.put(record.illumination, frame.values)
             if (len(done.figures) - before) % CHECKPOINT_EVERY == 0:
@@ -273,6 +282,27 @@ def _take_in_all(
     except (FormatError, QualityError) as error:
         raise _stopped_by(error, records[len(done.figures)], done, unfinished.out) from error
     return done, writer, series
+
+
+def _collected(
+    done: Accumulator, records: Sequence[FrameRecord]
+) -> Generator[tuple[Accumulator, MeasuredFrame | MeasuredDarkFrame]]:
+    """Yield what is collected after each frame, and that frame as measured; threads measure those that follow."""
+
+    def measure_early(record: FrameRecord) -> EarlyMeasurement:
+        # In a thread, with what is collected at that moment.
+        return _measured(done, record, register_again=False)
+
+    def others_wait_for(record: FrameRecord) -> bool:
+        return done.baseline.options.subtract_dark and record.kind == "dark"
+
+    for record, early in prefetched(measure_early, records, others_wait_for):
+        frame = early
+        if frame is None or frame.registered is not done.registered:
+            frame = _measured(done, record, register_again=True)
+            assert frame is not None
+        done = done.with_frame(frame)
+        yield done, frame
 
 
 def _measured(done: Accumulator, record: FrameRecord, register_again: bool) -> EarlyMeasurement:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from experiment.chart.layout import design_chart
 from experiment.config import load_lab
 from experiment.framing.field import Corners
 from experiment.lights import plan_illuminations, save_illuminations
-from tests.pinned import Pinned
 
 Check = Callable[..., CheckReport]
 
@@ -41,7 +39,7 @@ def lab_toml(chart: str, camera: str = "", more: str = "", seed: int = 1, **room
 
 
 @pytest.fixture(scope="session")
-def checking(folder: Path) -> Check:
+def check(folder: Path) -> Check:
     """Return what checks a room."""
 
     def run(
@@ -57,23 +55,5 @@ def checking(folder: Path) -> Check:
         lab = folder / "LAB.toml"
         lab.write_text(lab_toml(chart or f"chart{bits}.json", camera, more, seed, **room))
         return check_lab(load_lab(lab), linearity=linearity, corners=corners)
-
-    return run
-
-
-@pytest.fixture
-def check(checking: Check, pinned: Pinned, request: pytest.FixtureRequest) -> Check:
-    """Return what checks a room, and holds what it finds against what it found in the room of this test before."""
-    name = re.sub("[^a-z0-9]+", " ", str(request.node.name).removeprefix("test_")).strip()
-
-    def run(*given: Any, **named: Any) -> CheckReport:
-        report = checking(*given, **named)
-        # What is free on a disk changes by itself.
-        known = [found for found in report.findings if found.name not in ("disk", "card")]
-        found = {
-            one.name: {"value": one.value, "details": one.details if one.grade != "good" else None} for one in known
-        }
-        pinned(f"check, {name}", {**found, "forecast": report.forecast}, same=1e-4)
-        return report
 
     return run

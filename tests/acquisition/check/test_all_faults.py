@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Generator
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
-from pathlib import Path
+from contextlib import ExitStack
 from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
-from acquisition.check import check as module
-from acquisition.run.devices import Devices
 from acquisition.run.rig import lab as rig
-from acquisition.run.rig.opening import open_rig
-from experiment.config import LabSettings, load_lab, parse_lab
+from experiment.config import LabSettings, parse_lab
 from foundation.errors import ConfigurationError, DeviceError, LinkClosed
-from tests.acquisition.check.conftest import lab_toml
 
 DEVICES = ("camera", "display", "projector")
 FAULTY = [chosen for count in (1, 2, 3) for chosen in itertools.combinations(DEVICES, count)]
@@ -44,31 +37,6 @@ class Broken:
             raise LinkClosed(self._says)
 
         return fail
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("faulty", FAULTY, ids="+".join)
-def test_every_fault_of_simulated_devices_is_told_at_once(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, faulty: tuple[str, ...]
-) -> None:
-    @contextmanager
-    def opening(settings: LabSettings, *others: Any) -> Generator[Devices]:
-        with open_rig(settings, *others) as devices:
-            places = {"camera": "camera", "display": "presenter", "projector": "projector"}
-            broken: dict[str, Any] = {places[name]: Broken(SAYS[name]) for name in faulty}
-            yield replace(devices, **broken)
-
-    monkeypatch.setattr(module, "open_rig", opening)
-    (folder / "LAB.toml").write_text(lab_toml("chart1.json"))
-    with pytest.raises(DeviceError) as told:
-        module.check_lab(load_lab(folder / "LAB.toml"))
-    for name in DEVICES:
-        assert (SAYS[name] in str(told.value)) == (name in faulty)
-    assert told.value.exit_code == 3
-    if len(faulty) == 1:
-        assert str(told.value).removeprefix("the ").startswith(faulty[0])
-    else:
-        assert str(told.value).startswith(f"{len(faulty)} of 3 devices cannot be used:")
 
 
 def lab_settings() -> LabSettings:

@@ -15,6 +15,8 @@ from acquisition.judge.measure import Frame
 from acquisition.judge.state import Basis, JudgeState, ProjectorModel
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Plane
+from experiment.measures import frame as measures
+from experiment.measures.exposure import measure_exposure
 from experiment.session.records import Check, Judgement, SessionStep
 from sim.world.disturbances import (
     AmbientStep,
@@ -35,9 +37,9 @@ from sim.world.disturbances import (
 from sim.world.world import Room
 from tests.acquisition.judge import conftest
 from tests.acquisition.judge.conftest import bench
-from tests.acquisition.judge.test_measure import mosaic
 from tests.acquisition.judge.test_references import DARK, PRIMARIES, measured
 from tests.acquisition.judge.test_references import WHITE as LIT
+from tests.experiment.measures.test_frame import mosaic
 from tests.pinned import Pinned
 
 ORANGE, SKY, BLUE = (255, 197, 126), (113, 188, 255), (0, 0, 255)
@@ -295,16 +297,16 @@ def test_frames_are_measured_as_they_were(pinned: Pinned) -> None:
         counts[random.random(counts.shape) < 1e-3] = 15520
         counts[7, 9:20] = [0, 1, 31, 32, 255, 256, 257, 15513, 15514, 15515, 15831]
         odd = replace(frame, counts=np.ascontiguousarray(counts), pattern=pattern)
-        one = measure.measure(odd)
+        one = measures.measure(odd)
         places = one.places
         plane = Plane("G", counts[::2, ::2].astype(np.float32), (0.25, -0.25))
         found[f"{pattern} {black:g}"] = {
             "measured": [one.tiles, one.strips, one.samples, one.noise],
             "levels": [one.brightest_dn, one.range_dn, one.clipped, one.empty, one.level, one.digest.hex()],
             "places": [places.x_edges, places.y_edges, places.tile_blocks, [places.tile_box(n) for n in (0, 25, 383)]],
-            "exposure": measure.measure_exposure(odd),
+            "exposure": measure_exposure(odd),
             "paper": [measure._brightest(plane.values), measure._paper(plane.values, random.uniform(0, 70, (40, 2)))],
             "texture": [tag.corners_px for tag in measure._textures(plane).tags],
-            "noise": [measure._noise(random.normal(50, 3, (900, 2)) + rise) for rise in (0, np.arange(900)[:, None])],
+            "noise": [measures._noise(random.normal(50, 3, (900, 2)) + rise) for rise in (0, np.arange(900)[:, None])],
         }  # fmt: skip
     pinned("frames of chance as measured", found, same=1e-5)
