@@ -15,10 +15,6 @@ from foundation import console
 from foundation.console import (
     EXIT_CODES,
     JsonOutput,
-    Quiet,
-    Verbose,
-    Version,
-    common_first,
     new_app,
     option,
     orderly_end,
@@ -52,12 +48,7 @@ class Rig(Enum):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `acquire` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
-    return console.run(lambda: app(args=common_first(argv), prog_name="acquire"))
-
-
-@app.callback()
-def acquire(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
-    """Take what all commands take."""
+    return console.run(lambda: app(args=argv, prog_name="acquire"))
 
 
 @app.command(epilog=EXIT_CODES)
@@ -101,15 +92,10 @@ def chart(
         str | None,
         typer.Option(help="Paper, landscape: A0 … A8, or WIDTHxHEIGHT in mm; else the smallest that fits."),
     ] = None,
-    cell_mm: Annotated[
-        float | None,
-        typer.Option(help="Side of a cell, mm, to the nearest 0.21; else 5.29, or the largest that fits on the page."),
-    ] = None,
     arrangement: Annotated[
         Arrangement,
         typer.Option(help="tagged: random order, tags and references; paper: the paper's 256 × 128 grid without tags."),
     ] = Arrangement.TAGGED,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the colours.")] = 1,
     tiff: Annotated[bool, typer.Option(help="Write the 600-dpi TIFF.")] = True,
     tagged_tiff: Annotated[
         bool,
@@ -131,12 +117,7 @@ def chart(
     from experiment.framing.finding import small_parts_warning
     from foundation.folders import whole_folder
 
-    if arrangement is Arrangement.PAPER:
-        if cell_mm is not None:
-            raise InputError("the paper's arrangement fills its page; leave --cell-mm out, or choose another --page")
-        design = paper_chart(_page(page), bits)
-    else:
-        design = design_chart(bits, _page(page), seed, cell_mm)
+    design = paper_chart(_page(page), bits) if arrangement is Arrangement.PAPER else design_chart(bits, _page(page))
     with whole_folder(out, "the chart") as folder:
         save_preview(design, folder / "preview.png")
         save_pdf(design, folder / "chart.pdf")
@@ -214,9 +195,6 @@ def illuminations(
 @app.command(epilog=EXIT_CODES)
 @with_json("acquire devices")
 def devices(
-    search: Annotated[
-        float, typer.Option(min=0, help="Seconds to wait for PJLink projectors to answer; 0 does not ask.")
-    ] = 10.0,
     identify: Annotated[bool, typer.Option(help="Show on every display its number for ten seconds.")] = False,
     *,
     output: JsonOutput,
@@ -227,7 +205,7 @@ def devices(
     """
     from acquisition.run.rig.lab import attached_devices, identify_displays
 
-    for attached in attached_devices(search):
+    for attached in attached_devices():
         output.append("devices", attached)
         print(f"{attached.kind}:")
         for name in attached.found:
@@ -246,27 +224,24 @@ def check(
         Path | None,
         typer.Option(help="Save as PNG the frame with what was found on it, maps of light, blur and print, verdicts."),
     ] = None,
-    identify: Annotated[bool, typer.Option(help="First show on every display its number for ten seconds.")] = False,
     corners: Annotated[
         tuple[str, str, str, str] | None,
         option(
             "X,Y X,Y X,Y X,Y",
-            "As in build-lut: the corners of the field of a chart without tags that is not found automatically.",
+            "As in build-lut: the corners of the field of a chart without tags.",
         ),
     ] = None,
     linearity: Annotated[
-        bool, typer.Option("--linearity", help="Take a series of exposures too: linearity, electrons a count, noise.")
+        bool, typer.Option("--linearity", help="Take a series of exposures too, which shows the sensor's linearity.")
     ] = False,
-    session: Annotated[
-        Path | None, typer.Option(help="Where the session will be, for the disk's space; else beside LAB.toml.")
-    ] = None,
     *,
     output: JsonOutput,
 ) -> None:
     """Say whether the lab is ready: a verdict on exposure, light, sharpness, print, sensor, supplies; record nothing.
 
-    Reads LAB.toml, the chart and the lights it names. Takes 10 to 20 frames and keeps none; tries shutter times until
-    one suits. Each verdict is good, a remark, a fault, or not checked, with its number, limit, reason and remedy.
+    Reads LAB.toml, the chart and the lights it names. Takes some 20 frames and keeps none; tries shutter times until
+    one suits, then judges white, dark, the primaries and grey by the figures of build-lut. Each verdict is good, a
+    remark, a fault, or not checked, with its number, limit, reason and remedy.
     Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all
     named at once, each with its remedy, and end it with 3, or with 2 where LAB.toml alone is at fault.
     """
@@ -279,10 +254,6 @@ def check(
         from experiment.framing.field import parse_corners
 
         given = parse_corners(corners)
-    if identify:
-        from acquisition.run.rig.lab import identify_displays
-
-        identify_displays(10.0)
     with orderly_end():
         report = check_lab(
             settings,
@@ -290,7 +261,6 @@ def check(
             picture=picture,
             corners=given,
             linearity=linearity,
-            session=session,
         )
     if output.asked:
         output.add(**report.values())
@@ -395,7 +365,6 @@ def status(
 
     from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path
-    from experiment.session.repair import secrets_warning
 
     journal_path(session)
     now = datetime.now(UTC)
@@ -404,30 +373,11 @@ def status(
         output.add(**status_json(view, now))
     else:
         print("\n".join(status_lines(view, now)))
-    if warning := secrets_warning(session):
-        print(f"warning: {warning}", file=sys.stderr)
     head = view.head(now)
     if head.state in ("late", "silent", "paused", "stopped", "incomplete"):
         of_none = QualityError if head.state == "incomplete" else DeviceError
         kinds = {"": of_none, "the disk": StorageError, "the frames": QualityError}
         raise kinds.get(head.cause, DeviceError)(head.sentence)
-
-
-@app.command(epilog=EXIT_CODES)
-def redact(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
-    """Take passwords and secret addresses out of the settings of a session that older software took.
-
-    Reads and writes SESSION/session.toml; frames and journal stay as they are. The projector's password is removed, of
-    sequence.notify the host or the program's name is left. Sessions that this software takes hold no secret.
-    """
-    from experiment.session.repair import SETTINGS_FILE
-    from experiment.session.repair import redact as take_out
-
-    found = take_out(session)
-    if found:
-        print(f"{session / SETTINGS_FILE}: {' and '.join(found)} taken out; change it where copies are about")
-    else:
-        print(f"{session / SETTINGS_FILE}: holds no secret")
 
 
 @app.command(epilog=EXIT_CODES)
@@ -508,6 +458,11 @@ def import_(
         imported = import_session(frames, chart, session, advance)
     output.add(session=session, refused=imported.refused, left=imported.left)
     print(f"{session}: imported; {len(imported.refused)} frames refused")
+    if imported.unchecked:
+        print(
+            f"{', '.join(imported.unchecked)}: whether files of this format are complete cannot be checked; convert "
+            "them to DNG to have it checked"
+        )
     for line in imported.refused:
         print(f"  {line}")
     if imported.left:

@@ -74,7 +74,7 @@ def tried(name: str, body: str, seed: int) -> dict[str, Any]:
     shot = photographed(case, chart)
     row: dict[str, Any] = {"room": name, "body": body, "seed": seed}
     try:
-        registration = register(shot.mosaic, chart, f"room {name}")
+        registration = register(shot.mosaic, chart, f"room {name}", shot.corners_px())
     except CropError as error:
         return row | {"refused": str(error), "failed": False}
     fit = ~listed(shot, registration)

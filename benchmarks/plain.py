@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rms = worst = 0.0
             for seed in range(1, rooms + 1):
                 hung = photographed(Case(seed, body, "white", Room(waviness_mm=waviness, seed=seed)), chart)
-                error = hung.miss_px(register(hung.mosaic, chart, f"room {seed}"))
+                error = hung.miss_px(register(hung.mosaic, chart, f"room {seed}", hung.corners_px()))
                 rms = max(rms, float(np.sqrt((error**2).mean())))
                 worst = max(worst, float(error.max()))
             exceeded |= rms > rms_limit or worst > worst_limit

@@ -43,6 +43,7 @@ from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
+from experiment.framing.field import field_mm
 from sim.camera.film import write_dng
 from sim.optics import MILD_SHOULDERS
 from sim.world.rendering import Print
@@ -186,6 +187,12 @@ class PhotographedChart:
         """Return (2,) float64, half-size px: column and row of the visible frame where the frame as read begins."""
         visible = self.world.body.visible
         return np.array([self.mosaic.visible.left - visible.left, self.mosaic.visible.top - visible.top]) / 2
+
+    def corners_px(self) -> npt.NDArray[np.float64] | None:
+        """Return the corners of the field, (4, 2) float64 half-size px, whole pixels; None for a chart with tags."""
+        if self.chart.tags:
+            return None
+        return (self.world.project(field_mm(self.chart)) - self.crop_offset_px()).round()
 
     def miss_px(self, registration: Registration) -> npt.NDArray[np.float64]:
         """Return (C,) float64, the distance of each registered cell from its true place, half-size px."""

@@ -178,13 +178,15 @@ def record_session(
     every: int = 25,
     reason: Callable[[SessionStep], str | None] | None = None,
     settings: str = "rig = 'simulated'\n",
+    steps: Sequence[SessionStep] | None = None,
 ) -> Session:
     """Return an open session with a frame for every step of its plan.
 
-    `settings`: as `session.toml` has them. `reason`: why a step's frame is refused; None where it is accepted.
+    `settings`: as `session.toml` has them. `reason`: why a step's frame is refused; None where it is accepted. `steps`:
+    the plan, if it is not the usual one.
     """
     with Session.create(folder, settings, chart, lights) as session:
-        for step in plan_steps(lights, every):
+        for step in plan_steps(lights, every) if steps is None else steps:
             data = frame(step)
             at = TAKEN_AT + timedelta(seconds=SECONDS_A_FRAME * step.number)
             path = session.frames_folder / f"{step.stem}.dng"

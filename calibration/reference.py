@@ -12,16 +12,17 @@ from pathlib import Path
 
 from calibration.causes.rules import CAUSES, RULES, UNKNOWN, Condition, Evidence, Rule
 from calibration.figures.all_figures import FIGURES
-from calibration.figures.figure import QUESTIONS, Figure
+from calibration.figures.figure import QUESTIONS, Figure, Limit
+from calibration.figures.single_frames import RIG_LIMITS
 
 _PAGES = Path(__file__).parents[1] / "docs" / "reference"
 
 _FIGURES_HEAD = """# Figures
 
 What `build-lut` judges a table by. Within what is *accepted* nothing is said; beyond it a figure is remarked on, and
-beyond what is *refused* there is no table. `acquire check` forecasts some of them before a session, by the same limits.
-`build-lut --check` reads one frame, and judges those that this tells; what more frames can only make worse it judges
-where it is *beyond* already. The names are those of `report.json`; some had others in the reports of earlier software.
+beyond what is *refused* there is no table. `acquire check` judges most of them before a session, by trial frames.
+`build-lut check` reads one frame, and judges those that this tells; what more frames can only make worse it judges
+where it is *beyond* already. The names are those of `report.json`.
 
 *Written by `python -m calibration.reference` from `calibration/figures`.*
 """
@@ -58,17 +59,25 @@ def figures_page() -> str:
             "| figure | accepted | refused beyond | in a check | of one frame | what goes wrong beyond | what helps |"
         )
         parts += ["|---|---|---|---|---|---|---|", *(_limits(one) for one in FIGURES if one.group == group), ""]
-    return "\n".join(parts)
+    parts += ["## Before a session\n\nWhat only `acquire check` measures.\n"]
+    parts += ["| limit | accepted | fault beyond | what goes wrong beyond | what helps |", "|---|---|---|---|---|"]
+    parts += [
+        f"| {one.title} (`{one.name}`) | {one.expected} | {_refused(one)} | {one.why} ({one.source}) | {one.remedy} |"
+        for one in RIG_LIMITS
+    ]
+    return "\n".join([*parts, ""])
+
+
+def _refused(one: Limit) -> str:
+    return "–" if one.refuse is None else one.text(one.refuse)
 
 
 def _limits(one: Figure) -> str:
-    refused = "–" if one.refuse is None else one.text(one.refuse)
-    known = "–" if one.forecast is None else "yes"
+    refused, known = _refused(one), "yes" if one.before_session else "–"
     helps = one.remedy or "what most of them are decides"
     told = _TOLD[one.of_one_frame]
     limits = f"{one.expected} | {refused} | {known} | {told}"
-    names = f"`{one.name}`, formerly `{one.former_name}`" if one.former_name else f"`{one.name}`"
-    return f"| {one.title} ({names}) | {limits} | {one.why} ({one.source}) | {helps} |"
+    return f"| {one.title} (`{one.name}`) | {limits} | {one.why} ({one.source}) | {helps} |"
 
 
 def causes_page() -> str:

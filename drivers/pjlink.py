@@ -33,7 +33,7 @@ from typing import TypeVar
 
 from drivers.links.link import Exchange, Link, quoted
 from drivers.links.network import BROADCAST, UdpSocket
-from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
+from drivers.projector import FAULT_PARTS, Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceFault, DeviceRefused, LinkError, LinkTimeout, ProtocolError
 
@@ -210,8 +210,6 @@ def parse_reply(line: bytes) -> PjLinkReply | Refused:
 
 _POWERS = {"0": Power.STANDBY, "1": Power.ON, "2": Power.COOLING, "3": Power.WARMING}
 _POWER_DIGITS = {power: digit for digit, power in _POWERS.items()}
-FAULT_PARTS = ("fan", "lamp", "temperature", "cover", "filter", "other")
-"""The parts in the order of ERST's six digits."""
 _SEVERITIES = {"1": Severity.WARNING, "2": Severity.ERROR}
 _SEVERITY_DIGITS = {severity: digit for digit, severity in _SEVERITIES.items()}
 
@@ -352,11 +350,6 @@ def _unexpected(command: str, value: str, expected: str) -> ProtocolError:
 SEARCH = b"%2SRCH\r"
 COLLECT_S = 30.0
 """So long a controller collects answers, which projectors delay by up to 10 s."""
-
-
-def is_search(datagram: bytes) -> bool:
-    """Return whether a datagram asks projectors to answer."""
-    return datagram.strip(b"\0\r\n ").upper() == b"%2SRCH"
 
 
 def replies_in(datagram: bytes) -> tuple[PjLinkReply, ...]:

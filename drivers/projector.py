@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 
 class Power(Enum):
@@ -28,9 +28,13 @@ class Severity(Enum):
     ERROR = "error"
 
 
+FAULT_PARTS: Final = ("fan", "lamp", "temperature", "cover", "filter", "other")
+"""The parts of which a projector can report faults, in the order of PJLink 1.04, ERST."""
+
+
 @dataclass(frozen=True)
 class Fault:
-    """One fault that a projector reports: `part` is fan, lamp, temperature, cover, filter or other."""
+    """One fault that a projector reports: `part` is one of `FAULT_PARTS`."""
 
     part: str
     severity: Severity

@@ -85,21 +85,6 @@ class TiffTag(IntEnum):
     ACTIVE_AREA = 50829
     MASKED_AREAS = 50830
 
-    # Panasonic RW2: the sensor's size, how its pixels are packed, and the byte from which on they lie
-    RW2_WIDTH = 2
-    RW2_LENGTH = 3
-    RW2_BITS = 10
-    RW2_FORMAT = 45
-    RW2_PIXELS = 280
-
-    # Fujifilm RAF: the directory of the raw pixels, and in it size, bits and strips
-    RAF_IFD = 0xF000
-    RAF_WIDTH = 0xF001
-    RAF_LENGTH = 0xF002
-    RAF_BITS = 0xF003
-    RAF_OFFSETS = 0xF007
-    RAF_BYTE_COUNTS = 0xF008
-
     # Canon CR2: widths of the vertical slices in which the raw pixels are stored
     CR2_SLICES = 50752
 
@@ -165,16 +150,14 @@ _DECODED: Final[dict[int, frozenset[int]]] = {
                 _T.PHOTOMETRIC_INTERPRETATION, _T.SAMPLES_PER_PIXEL, _T.ROWS_PER_STRIP, _T.STRIP_BYTE_COUNTS,
                 _T.TILE_WIDTH, _T.TILE_LENGTH, _T.TILE_BYTE_COUNTS, _T.CFA_REPEAT_PATTERN_DIM, _T.CFA_PATTERN,
                 _T.DNG_VERSION, _T.CFA_PLANE_COLOR, _T.CFA_LAYOUT, _T.LINEARIZATION_TABLE, _T.BLACK_LEVEL_REPEAT_DIM,
-                _T.CR2_SLICES, _T.ACTIVE_AREA, _T.MASKED_AREAS, _T.RW2_WIDTH, _T.RW2_LENGTH, _T.RW2_BITS,
-                _T.RW2_FORMAT, _T.RAF_WIDTH, _T.RAF_LENGTH, _T.RAF_BITS, _T.RAF_BYTE_COUNTS, _T.SAMPLE_FORMAT,
+                _T.CR2_SLICES, _T.ACTIVE_AREA, _T.MASKED_AREAS, _T.SAMPLE_FORMAT,
                 _T.GRAY_RESPONSE_CURVE, _T.FOCAL_PLANE_RESOLUTION_UNIT,
             ),
         ),
         (
             _PLACES,
             (
-                _T.STRIP_OFFSETS, _T.TILE_OFFSETS, _T.SUB_IFDS, _T.EXIF_IFD_POINTER, _T.RW2_PIXELS, _T.RAF_IFD,
-                _T.RAF_OFFSETS,
+                _T.STRIP_OFFSETS, _T.TILE_OFFSETS, _T.SUB_IFDS, _T.EXIF_IFD_POINTER,
             ),
         ),
         (
@@ -203,7 +186,7 @@ damage. Integers may be UNDEFINED, as colour filters are in Exif.
 _EXPOSURES: Final = frozenset({TiffTag.EXPOSURE_TIME, TiffTag.F_NUMBER, TiffTag.PHOTOGRAPHIC_SENSITIVITY})
 """Tags whose zero divided by zero means that the camera does not know."""
 
-_POINTERS: Final = (TiffTag.SUB_IFDS, TiffTag.EXIF_IFD_POINTER, TiffTag.RAF_IFD)
+_POINTERS: Final = (TiffTag.SUB_IFDS, TiffTag.EXIF_IFD_POINTER)
 """Tags that point to further directories."""
 
 ReadValue = str | tuple[float, ...]

@@ -31,7 +31,7 @@ import numpy.typing as npt
 from scipy.spatial import Delaunay, cKDTree
 from scipy.stats import gaussian_kde
 
-from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, Statistic, bca, resamples
+from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, Statistic, bounded_figures, ratio_of
 from evaluation.learning.feature_learner import FeatureLearner
 from evaluation.learning.standard import standard_learners
 from evaluation.metrics import recovery_error
@@ -52,7 +52,6 @@ LINEAR = decode_srgb(np.arange(256) / 255)
 WIDTH = 32
 CODES = np.rint(np.arange(WIDTH) * 255 / (WIDTH - 1)).astype(np.int64)
 SIDE, SMALL = 128, 64
-RESAMPLES = 2000
 WHITE, VEIL = 0.97, 0.97
 """White point of the target over the paper's white, and the most of the print's black that is taken out."""
 
@@ -287,20 +286,12 @@ def ratios_of(one: Floats, other: Floats) -> list[tuple[float, float, float]]:
     A resample is of images, and one that is drawn counts in every seed, as `evaluate transfer` has it.
     """
     samples = [[ErrorSample.of(errors) for errors in several] for several in (one, other)]
-    drawn: list[list[Floats]] = [[], []]
-    for counts in resamples(one.shape[1], 0, RESAMPLES):
-        for batches, several in zip(drawn, samples, strict=True):
-            batches.append(np.mean([sample.statistics(counts) for sample in several], axis=0))
-    estimates, left_out = (
-        [np.mean([getattr(sample, name)() for sample in several], axis=0) for several in samples]
-        for name in ("estimate", "without_each")
-    )
-    replicates = np.concatenate(drawn[0]) / np.concatenate(drawn[1])
-    value, without = estimates[0] / estimates[1], left_out[0] / left_out[1]
-    return [
-        (float(value[place]), *bca(float(value[place]), replicates[:, place], [without[:, place]], 0.95))
-        for place in range(len(STATISTICS))
-    ]
+
+    def ratios(counts: npt.NDArray[np.int64]) -> Floats:
+        known = [np.mean([sample.statistics(counts) for sample in several], axis=0) for several in samples]
+        return ratio_of(*known)
+
+    return list(bounded_figures(ratios, one.shape[1]))
 
 
 def _tell(

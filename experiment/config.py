@@ -11,7 +11,7 @@ import os
 import re
 import shlex
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, cast
@@ -32,7 +32,7 @@ from pydantic import (
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
-from foundation.records import unknown_key
+from foundation.records import known_keys, unknown_key
 from foundation.secret_texts import MASK, is_webhook, target_label
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ class SequenceSettings(Settings):
     ended lets the lamp go out."""
     order: Literal["shuffled", "listed"] = "shuffled"
     """Order of the lights: shuffled by `seed`, so that neither the lamp's drift nor a picture that did not change runs
-    along with the colour; or as they are listed. An older session keeps the order of its journal."""
+    along with the colour; or as they are listed."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the shuffled order."""
     switch_off: bool = True
@@ -297,8 +297,11 @@ class CameraCable(Settings):
 class ProjectorCable(Settings):
     """How the projector of a real lab is controlled, and what its light is like."""
 
-    control: Literal["none", "pjlink", "epson", "benq", "optoma", "nec"] = "none"
-    """Language of its control port; none: someone switches it by hand."""
+    control: Literal["none", "pjlink", "serial"] = "none"
+    """PJLink, or the maker's language over a serial port or TCP; none: someone switches it by hand."""
+    language: str | None = None
+    """With ``serial``: name of the language (benq, epson, optoma), or path of a language file (.toml), relative to the
+    settings file."""
     host: Host | None = None
     """Address, for PJLink and for languages over TCP."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
@@ -316,16 +319,10 @@ class ProjectorCable(Settings):
 
 
 class LightSource(Settings):
-    """What fills the projector's picture with one plain colour."""
+    """The display of this machine that the projector shows."""
 
-    shown_by: Literal["display", "lightcrafter", "jvc"] = "display"
-    """A display of this machine that the projector mirrors, or the projector itself by command."""
     display: str | int | None = None
     """Name, position or number of the display; acquire devices lists them."""
-    host: Host | None = None
-    """JVC: address."""
-    port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """JVC: TCP port."""
 
 
 class LabRig(Settings):
@@ -394,6 +391,10 @@ def load_lab(path: Path) -> LabSettings:
     changes: dict[str, Any] = {"chart": folder / settings.chart, "illuminations": folder / settings.illuminations}
     if settings.replay is not None:
         changes["replay"] = ReplaySettings(session=folder / settings.replay.session)
+    language = settings.lab.projector.language
+    if language is not None and language.lower().endswith(".toml"):
+        projector = settings.lab.projector.model_copy(update={"language": str(folder / language)})
+        changes["lab"] = settings.lab.model_copy(update={"projector": projector})
     return settings.model_copy(update=changes)
 
 
@@ -414,21 +415,7 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ConfigurationError(f"{where} is not TOML: {error}{_toml_hint(text, str(error))}") from error
-
-
-def _toml_hint(text: str, message: str) -> str:
-    """Return what helps against the mistake in a line of a TOML text, "" where nothing is known; no value of it."""
-    if message.startswith("Cannot declare"):
-        return "; a table stands in a file once: put its keys together"
-    number = re.search(r"at line (\d+)", message)
-    line = text.splitlines()[int(number[1]) - 1] if number else ""
-    _, _, value = line.partition("=")
-    if re.match(r"\s*[-+]?\d+,\d", value):
-        return "; a number has a decimal point: 8.0 and not 8,0"
-    if re.match(r"\s*[^\W\d]|\s*[/~.\u2018-\u201f]", value):
-        return '; text stands in straight quotation marks: "like this"'
-    return ""
+        raise ConfigurationError(f"{where} is not TOML: {error}; correct that line") from error
 
 
 def checked(kind: type[_AnySettings], document: dict[str, Any], where: str) -> _AnySettings:
@@ -462,11 +449,7 @@ def _mistake(kind: type[Settings], error: ErrorDetails) -> str:
     key, place = _key_of(error), error["loc"]
     match error["type"]:
         case "extra_forbidden":
-            is_table = isinstance(error["input"], dict)
-            elsewhere = _places(kind, str(place[-1]), str(place[-2]) if len(place) > 1 else "", is_table)
-            if elsewhere:
-                return f"unknown key {key!r}; did you mean {' or '.join(elsewhere)}?"
-            return unknown_key(key, _known_keys(kind, place[:-1]))
+            return unknown_key(key, known_keys(kind, place[:-1]))
         case "missing":
             return f"{key} is missing; add it"
         case "literal_error":
@@ -477,7 +460,7 @@ def _mistake(kind: type[Settings], error: ErrorDetails) -> str:
             if isinstance(error["input"], str):
                 reason += f": [{json.dumps(error['input'], ensure_ascii=False)}]"
         case "float_parsing" | "float_type" | "int_parsing" | "int_type" | "int_from_float":
-            reason = _number_expected(key, error["input"], error["type"].startswith("int"))
+            reason = _number_expected(key, error["type"].startswith("int"))
         case "string_type":
             given = error["input"]
             is_number = isinstance(given, int | float) and not isinstance(given, bool)
@@ -495,31 +478,13 @@ _BOUNDS: Final = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of a
 """What a number is to be, by the name of its bound in an error of pydantic."""
 
 
-def _number_expected(key: str, given: object, whole: bool) -> str:
-    """Return what number is expected of a key in place of something else, as it is written."""
+def _number_expected(key: str, whole: bool) -> str:
+    """Return what number is expected of a key."""
     what = "a whole number" if whole else "a number"
     reason = f"{what} of seconds was expected" if key.endswith("_s") else f"{what} was expected"
-    text = given.strip() if isinstance(given, str) else ""
-    if (parts := re.fullmatch(r"1 */ *([1-9]\d*)", text)) is not None and not whole:
-        return f"{reason}: {1 / int(parts[1]):.6g}"
     if key == "sequence.patience_s":
         return f'{reason}, or "forever"'
     return reason
-
-
-def _places(kind: type[BaseModel], name: str, table: str, is_table: bool, above: str = "") -> list[str]:
-    """Return where a key, or table, of this name may stand; [name.table] alone for one written as [table.name]."""
-    found: list[str] = []
-    for key, field in kind.model_fields.items():
-        place, below = f"{above}{key}", field.annotation
-        if not (isinstance(below, type) and issubclass(below, BaseModel)):
-            found += [place] if key == name and not is_table else []
-            continue
-        if key == name and is_table and table in below.model_fields:
-            return [f"[{place}.{table}]"]
-        found += [f"[{place}]"] if key == name and is_table else []
-        found += _places(below, name, table, is_table, f"{place}.")
-    return found
 
 
 def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None:
@@ -576,11 +541,3 @@ def _found_secret(key: str, place: dict[str, Any], folder: Path) -> str:
                 f'{key}: expected the text itself, {{ env = "NAME" }} or {{ file = "PATH" }}, and nothing beside'
             )
     return secret
-
-
-def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterable[str]:
-    for part in location:
-        annotation = model.model_fields[str(part)].annotation
-        options = [option for option in (annotation, *getattr(annotation, "__args__", ())) if isinstance(option, type)]
-        model = next(option for option in options if issubclass(option, BaseModel))
-    return model.model_fields

@@ -98,6 +98,17 @@ def damaged(error: ValidationError, about: object, remedy: str) -> FormatError:
     )
 
 
+def known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterable[str]:
+    """Return the keys of the table that lies at a location of a model: names of tables, and places in lists."""
+    for part in location:
+        if isinstance(part, int):
+            continue
+        annotation = model.model_fields[part].annotation
+        options = [option for option in (annotation, *getattr(annotation, "__args__", ())) if isinstance(option, type)]
+        model = next(option for option in options if issubclass(option, BaseModel))
+    return model.model_fields
+
+
 def unknown_key(key: str, known: Iterable[str]) -> str:
     """Return that a key is unknown, and the nearest one that is known."""
     names = sorted(known)

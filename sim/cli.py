@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drivers.serial_projectors import LANGUAGES, language
 from foundation import console
-from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app, option
+from foundation.console import EXIT_CODES, new_app, option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,12 +31,7 @@ app = new_app(
 
 def main(argv: Sequence[str] | None = None, read_chart: Callable[[Path], Print] | None = None) -> int:
     """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
-    return console.run(lambda: app(args=common_first(argv), prog_name="sim", obj=read_chart))
-
-
-@app.callback()
-def _devices(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
-    """Serve simulated devices on loopback connections, until interrupted."""
+    return console.run(lambda: app(args=argv, prog_name="sim", obj=read_chart))
 
 
 @app.command()
@@ -46,96 +40,69 @@ def projector(
         int | None, typer.Option(min=0, max=65535, help="TCP port for PJLink; 0 picks a free one.")
     ] = None,
     password: Annotated[str | None, typer.Option(help="PJLink password, at most 32 characters.")] = None,
-    udp: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="UDP port where PJLink searches are answered; 0 picks one.")
+    serial: Annotated[
+        str | None,
+        option("LANGUAGE", "Language on a serial port: benq, epson, optoma, or a language file (.toml)."),
     ] = None,
-    notify: Annotated[str | None, option("HOST:PORT", "Send PJLink status notices there, by UDP.")] = None,
-    serial: Annotated[str | None, typer.Option(help=f"Language on a serial port: {', '.join(LANGUAGES)}.")] = None,
     lit: Annotated[bool, typer.Option("--lit", help="Begin with the lamp burning, not in standby.")] = False,
     warm_up: Annotated[float, option("SECONDS", "Time to warm up.", min=0)] = 30.0,
     cool_down: Annotated[float, option("SECONDS", "Time to cool down.", min=0)] = 60.0,
-    pjlink_class: Annotated[int, typer.Option("--class", min=1, max=2, help="Class of PJLink.")] = 2,
-    answer_after: Annotated[
-        float,
-        option("SECONDS", "Time to answer by PJLink; of real ones .05 to 2.", min=0, max=10),
-    ] = 0.0,
 ) -> None:
     """Serve a simulated projector: standby, 30 s of warm-up, on, 60 s of cooling.
 
-    Reads and writes no file. With --pjlink it listens on the network, with --serial at a pseudo-terminal, which any
-    serial software can open (Linux and macOS). Prints the address or the port's path, then serves until interrupted
-    (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such language or not exactly one
-    cable, 3 when the port is taken.
+    Reads a language file if --serial names one; writes no file. With --pjlink it listens on the network, with --serial
+    at a pseudo-terminal, which any serial software can open (Linux and macOS). Prints the address or the port's path,
+    then serves until interrupted (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such
+    language or not exactly one cable, 3 when the port is taken.
     """
     from drivers.pjlink import MAX_PASSWORD
     from drivers.projector import Power
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError, InputError
+    from sim.projectors.pjlink import serve_pjlink
     from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 
     if (pjlink is None) == (serial is None):
         raise ConfigurationError("one projector has one cable: either --pjlink PORT or --serial LANGUAGE")
-    if pjlink is None and (password, udp, notify) != (None, None, None):
-        raise ConfigurationError("--password, --udp and --notify are PJLink's; a serial cable has none of them")
-    if serial is not None and (answer_after or pjlink_class != 2):
-        raise ConfigurationError("--answer-after and --class are PJLink's; a serial cable has neither")
+    if pjlink is None and password is not None:
+        raise ConfigurationError("--password is PJLink's, and a serial cable has none; leave it out")
     if password is not None and not 1 <= len(password) <= MAX_PASSWORD:
         raise InputError(
             f"the password has {len(password)} characters; PJLink allows at least 1, at most {MAX_PASSWORD}"
         )
-    traits = ProjectorTraits(warm_up_s=warm_up, cool_down_s=cool_down, pjlink_class=pjlink_class)
+    traits = ProjectorTraits(warm_up_s=warm_up, cool_down_s=cool_down)
     device = SimulatedProjector(SystemClock(), Power.ON if lit else Power.STANDBY, traits)
     if serial is not None:
         _serve_serial(device, serial)
     elif pjlink is not None:
-        controller = None if notify is None else _host_and_port(notify)
-        _serve_network(device, pjlink, password, udp, controller, answer_after)
+        with serve_pjlink(device, pjlink, password) as server:
+            _until_interrupted("PJLink projector at {}:{}".format(*server.address))
 
 
-def _serve_network(
-    device: SimulatedProjector,
-    pjlink: int,
-    password: str | None,
-    udp: int | None,
-    controller: tuple[str, int] | None,
-    answer_s: float,
-) -> None:
-    from sim.projectors.pjlink import ProjectorDatagrams, serve_pjlink
-
-    with ExitStack() as served:
-        host, port = served.enter_context(serve_pjlink(device, pjlink, password, answer_s=answer_s)).address
-        if udp is not None or controller is not None:
-            datagrams = served.enter_context(ProjectorDatagrams(device, udp or 0, controller))
-            if udp is not None:
-                print(f"PJLink searches at {datagrams.address[0]}:{datagrams.address[1]}")
-        _until_interrupted(f"PJLink projector at {host}:{port}")
-
-
-def _serve_serial(device: SimulatedProjector, name: str) -> None:
+def _serve_serial(device: SimulatedProjector, named: str) -> None:
+    from drivers.serial_projectors.language import load_language
     from foundation.errors import ConfigurationError
 
-    spoken = language(name)
+    language = load_language(named)
     try:
         from sim.buses.serial import PseudoTerminal
     except ImportError as error:
         raise ConfigurationError("this system has no pseudo-terminals; --serial needs Linux or macOS") from error
-    from sim.projectors.serial import PEERS
+    from sim.projectors.serial import LinePeer
 
-    with PseudoTerminal(PEERS[spoken.name](device)) as terminal:
-        _until_interrupted(f"{spoken.maker} projector at {terminal.path}")
+    with PseudoTerminal(LinePeer(device, language)) as terminal:
+        _until_interrupted(f"{language.maker} projector at {terminal.path}")
 
 
 @app.command()
 def camera(
     context: typer.Context,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port for PTP/IP; 0 picks a free one.")] = None,
-    usbip: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port for USB/IP; 3240 is the usual.")] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port for PTP/IP; 0 picks a free one.")] = 15740,
     model: Annotated[str, typer.Option(help="EOS 550D, EOS 6D Mark II, or Test: a small frame.")] = "EOS 550D",
     chart: Annotated[Path | None, typer.Option(help="chart.json of the print before it; grey squares else.")] = None,
     room: Annotated[
         list[str] | None, option("NAME=VALUE", "What differs from the default room, as LAB.toml's.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything that chance decides: paper, noise.")] = 1,
     watch_screen: Annotated[
         str | None,
         option("SCREEN", "X screen that lights the chart: :1, 640x360+0+0, or :1,640x360+0+0."),
@@ -143,13 +110,8 @@ def camera(
     watch_projector: Annotated[
         str | None, option("HOST:PORT", "PJLink projector that throws it; a steady lamp else.")
     ] = None,
-    projector_password: Annotated[str | None, typer.Option(help="Its PJLink password.")] = None,
-    event: Annotated[
-        list[str] | None,
-        option("TABLE", "What goes wrong, as in LAB.toml: '{ what = \"bump\", px = 1.0 }'."),
-    ] = None,
 ) -> None:
-    """Serve a simulated Canon EOS on a network or a USB cable: it photographs grey squares under white light.
+    """Serve a simulated Canon EOS on a network: it photographs grey squares under white light.
 
     With --watch-screen it photographs the chart as the pixels of that screen light it while the shutter is open, in
     real time: a window in front lights its place, for its share of the exposure. With --watch-projector the projector's
@@ -157,16 +119,11 @@ def camera(
 
     Reads CHART where --chart names one; writes no file. Prints the address it listens on, and what each exposure of a
     watched screen saw; serves until interrupted (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there
-    is no such model, chart, room or screen, or not exactly one cable, 3 when the port is taken or the screen cannot be
-    reached.
+    is no such model, chart, room or screen, 3 when the port is taken or the screen cannot be reached.
 
-    With --port, any software that speaks PTP/IP can use it, for instance (both connections go to one port):
+    Any software that speaks PTP/IP can use it, for instance (both connections go to one port):
 
     gphoto2 --camera "PTP/IP Camera" --port ptpip:127.0.0.1:15740:15740 --capture-image-and-download
-
-    With --usbip, a Linux machine can plug it in (as root, with the kernel's vhci-hcd) and use it as any USB camera:
-
-    modprobe vhci-hcd; usbip --tcp-port 3240 attach -r 127.0.0.1 -b 1-1
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -175,77 +132,59 @@ def camera(
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError
     from sim.buses.ptp import serve_ptpip
-    from sim.buses.usb import PtpUsbDevice, UsbIdentity
-    from sim.buses.usbip import serve_usbip
     from sim.camera.bodies import EOS_BODIES
     from sim.camera.eos import SimulatedEos
     from sim.world.sensors import BODIES
     from sim.world.world import REFERENCE_EXPOSURE, World, read_room
 
-    if (port is None) == (usbip is None):
-        raise ConfigurationError("one camera has one cable: either --port N for PTP/IP or --usbip N for USB/IP")
     if model not in EOS_BODIES:
         raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
-    if watch_screen is None and (watch_projector, projector_password) != (None, None):
+    if watch_screen is None and watch_projector is not None:
         raise ConfigurationError("a projector throws a screen's picture: --watch-projector needs --watch-screen")
     changes = dict(_setting("--room", given) for given in room or ())
     # A lamp that ages would be dark by now: unless asked for, its drift counts from no day at all.
     world = World(
         _grey_squares() if chart is None else _print(context, chart),
         BODIES[model],
-        read_room(seed, {"lamp_drift_per_hour": 0.0} | changes, "the command line", "--room"),
+        read_room(_SEED, {"lamp_drift_per_hour": 0.0} | changes, "the command line", "--room"),
     )
     with ExitStack() as opened:
-        film = opened.enter_context(_film(world, watch_screen, watch_projector, projector_password, event or []))
+        film = opened.enter_context(_film(world, watch_screen, watch_projector))
         # One frame may be exposed while others are still developed.
         executor = opened.enter_context(ThreadPoolExecutor(3, "developing"))
         eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, executor=executor)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
-        if port is not None:
-            with serve_ptpip(eos, port, name=eos.body.model) as server:
-                _until_interrupted("PTP/IP camera {} at {}:{}".format(eos.body.model, *server.address))
-        elif usbip is not None:
-            device = PtpUsbDevice(eos, UsbIdentity(*eos.body.usb, serial=eos.serial, name=eos.body.model))
-            with serve_usbip([device], usbip) as server:
-                _until_interrupted("USB/IP camera {} at {}:{}, bus id 1-1".format(eos.body.model, *server.address))
+        with serve_ptpip(eos, port, name=eos.body.model) as server:
+            _until_interrupted("PTP/IP camera {} at {}:{}".format(eos.body.model, *server.address))
 
 
-_PASSWORD_OPTION = " (sim camera takes a projector's password as --projector-password)"
+# Of everything that chance decides in the simulated room: paper, lamp, noise.
+_SEED = 1
 
 
 @contextmanager
-def _film(
-    world: World, screen: str | None, projector: str | None, password: str | None, events: Sequence[str]
-) -> Generator[Film]:
+def _film(world: World, screen: str | None, projector: str | None) -> Generator[Film]:
     """Yield pictures of a world under white light, or lit by a screen that is watched."""
     from drivers.links.network import TcpLink
     from drivers.pjlink import PjLinkProjector
     from drivers.presenter import WHITE
     from foundation.clock import SystemClock
-    from foundation.errors import DeviceRefused
     from sim.camera.film import WatchedFilm, WorldFilm
     from sim.projectors.watching import Beam, ScreenPlace, Screenshots
-    from sim.world.disturbances import read_disturbances
     from sim.world.world import REFERENCE_EXPOSURE
 
-    listed = [_value("--event", text, text) for text in events]
-    happens = read_disturbances(listed, "the command line", "--event")
     serial = "0000000001"
     if screen is None:
-        yield WorldFilm(world, lambda: WHITE, lambda: 1.0, serial, {}, happens)
+        yield WorldFilm(world, lambda: WHITE, lambda: 1.0, serial, {})
         return
-    happens.require_unshown("--event")
     clock, pictures = SystemClock(), Screenshots(ScreenPlace.parse(screen))
     # A screen that is not there now is a mistake; later it is an accident of the rehearsal.
     pictures.take()
     asked = None
     if projector is not None:
         host, port = _host_and_port(projector)
-        asked = PjLinkProjector(lambda: TcpLink.connect(host, port, 5.0), password, label=projector, clock=clock)
-        try:
-            asked.power()
-        except DeviceRefused as error:
-            raise DeviceRefused(f"{error}{_PASSWORD_OPTION}") from error
+        asked = PjLinkProjector(lambda: TcpLink.connect(host, port, 5.0), label=projector, clock=clock)
+        asked.power()
     with Beam(pictures, asked, world.room.light_of, clock) as beam:
         # The first frame would else come seconds late.
         world.signal(WHITE, REFERENCE_EXPOSURE)
@@ -253,11 +192,11 @@ def _film(
         def gather(number: int, seconds: float) -> tuple[NDArray[np.float32], float]:
             print(f"exposure {number} begins, {seconds:g} s", flush=True)
             thrown = beam.gather(seconds, lambda: print(f"exposure {number} half over", flush=True))
-            dark = f"; no lamp: {beam.trouble}{_PASSWORD_OPTION}" if beam.trouble else ""
+            dark = f"; no lamp: {beam.trouble}" if beam.trouble else ""
             print(f"exposure {number} ends: {thrown}{dark}", flush=True)
             return thrown.picture, thrown.lamp
 
-        yield WatchedFilm(world, gather, serial, happens, clock.now())
+        yield WatchedFilm(world, gather, serial, clock.now())
 
 
 def _print(context: typer.Context, chart: Path) -> Print:
@@ -272,26 +211,17 @@ def _print(context: typer.Context, chart: Path) -> Print:
 
 def _setting(option: str, given: str) -> tuple[str, Any]:
     """Return name and value of ``name=value``; the value as TOML has it, text also without quotes."""
+    import tomllib
+
     from foundation.errors import InputError
 
     name, equals, value = given.partition("=")
     if not name or not equals:
         raise InputError(f"{option} {given!r}: NAME=VALUE expected, such as waviness_mm=1.5")
     try:
-        return name, _value(option, value, given)
-    except InputError:
+        return name, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
         return name, value
-
-
-def _value(option: str, text: str, given: str) -> Any:
-    import tomllib
-
-    from foundation.errors import InputError
-
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{option} {given!r} is not TOML: {error}") from error
 
 
 def _grey_squares() -> Print:

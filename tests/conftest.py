@@ -25,7 +25,7 @@ for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_
 
 import numpy as np  # noqa: E402 - after the threads
 
-from tests.pinned import Pinned  # noqa: E402 - it needs NumPy
+from tests.pinned import TESTS, Pinned  # noqa: E402 - it needs NumPy
 
 # Sessions and tables are written to the disk for good, step by step: a run of twenty lights waits for it half a second.
 # What is lost with the power is of no interest here, and in memory nobody waits.
@@ -106,10 +106,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--renew-pinned", action="store_true", help="keep the numbers of known runs as they are now")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture
 def pinned(request: pytest.FixtureRequest) -> Pinned:
-    """Return what holds the numbers of a known run against those that are kept of it."""
-    return Pinned(renew=bool(request.config.getoption("--renew-pinned")))
+    """Return what compares numbers with those in the file of the test's module."""
+    return Pinned(request.path.relative_to(TESTS), renew=bool(request.config.getoption("--renew-pinned")))
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -9,15 +9,16 @@ import io
 import textwrap
 from typing import Any
 
+import cv2
 import numpy as np
-import numpy.typing as npt
 
 from acquisition.check.findings import GRADES, CheckReport
-from acquisition.check.frames import ChartMeasurements, CheckFrames
-from acquisition.check.light_and_print import Spot, light_share
+from acquisition.check.trial import Trial
+from calibration.measurements import TableMeasurements
 from experiment.chart.model import Chart
 from experiment.framing.finding import annotated_png
-from experiment.framing.sharpness import MAX_BLUR_PX
+from experiment.framing.homography import project
+from experiment.framing.sharpness import MAX_BLUR_PX, edge_blurs
 
 COLOURS = {"fault": "#b42318", "remark": "#b54708", "not checked": "#667085", "good": "#027a48"}
 """Of the grades: dark enough to be read on white."""
@@ -26,7 +27,7 @@ _LINE = 150
 """Letters to a line of verdicts."""
 
 
-def check_png(seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart, report: CheckReport) -> bytes:
+def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:
     """Return the picture of a check as PNG bytes; without a chart, the frame with what was looked for."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -36,16 +37,16 @@ def check_png(seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart
     figure: Any = Figure(figsize=(15, frame_in + text_in), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(3, 2, height_ratios=[frame_in / 2, frame_in / 2, text_in])
-    _draw_frame(figure.add_subplot(grid[0, 0]), seen, figures, chart)
+    _draw_frame(figure.add_subplot(grid[0, 0]), trial, chart)
     places = [figure.add_subplot(grid[place]) for place in ((0, 1), (1, 0), (1, 1))]
-    if figures is None:
+    if trial.table is None:
         for axes in places:
             axes.axis("off")
             axes.text(0.5, 0.5, "not measured: the chart was not found", ha="center", color="0.4")
     else:
-        _draw_light(places[0], figures, chart)
-        _draw_sharpness(places[1], figures, chart)
-        _draw_print(places[2], figures, chart)
+        _draw_light(places[0], trial.table, chart)
+        _draw_sharpness(places[1], trial.table, chart)
+        _draw_print(places[2], trial.table, chart)
     axes = figure.add_subplot(grid[2, :])
     axes.axis("off")
     for number, (line, grade) in enumerate(lines):
@@ -63,46 +64,19 @@ def _verdict_lines(report: CheckReport) -> list[tuple[str, str]]:
     lines: list[tuple[str, str]] = []
     for grade in GRADES:
         for finding in report.of(grade):
-            text = f"{grade:<12}{finding.name:<17}{finding.sentence()}"
-            wrapped = textwrap.wrap(text, _LINE, subsequent_indent=29 * " ") or [text]
+            text = f"{grade:<12}{finding.name:<24}{finding.sentence()}"
+            wrapped = textwrap.wrap(text, _LINE, subsequent_indent=36 * " ") or [text]
             lines += [(line, grade) for line in wrapped]
     return lines
 
 
-def _draw_frame(axes: Any, seen: CheckFrames, figures: ChartMeasurements | None, chart: Chart) -> None:
-    import cv2
-
-    shot = seen.whites[0]
-    png = annotated_png(shot.mosaic, chart, None if figures is None else figures.placed.framing)
+def _draw_frame(axes: Any, trial: Trial, chart: Chart) -> None:
+    png = annotated_png(trial.white, chart, None if trial.table is None else trial.table.registration.framing)
     image = np.asarray(cv2.imdecode(np.frombuffer(png, dtype=np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)
     axes.imshow(image[..., ::-1])
-    axes.set_title(f"white at {shot.shutter_s:.4g} s, with what was found of the chart")
+    axes.set_title("white, with what was found of the chart")
     axes.set_xticks([])
     axes.set_yticks([])
-    if figures is not None and figures.state is not None:
-        for spot in figures.state.spots:
-            to_pixels = figures.placed.place.to_pixels
-            axes.add_patch(_outline(np.array([to_pixels([place])[0] for place in _rim_mm(spot, 0.0)]), 6.0))
-
-
-def _rim_mm(spot: Spot, least_mm: float) -> npt.NDArray[np.float64]:
-    """Return (N, 2) mm, an ellipse about a spot: a circle, or along a crease; its half axes are no less than given."""
-    turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    along, across = (max(side / 2, least_mm) for side in (spot.size_mm, spot.width_mm))
-    angle = np.radians(spot.angle_deg)
-    x, y = along * np.cos(turn), across * np.sin(turn)
-    turned = [x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)]
-    return np.stack(turned, axis=1) + np.array(spot.centre_mm)
-
-
-def _outline(rim: npt.NDArray[np.float64], least: float) -> Any:
-    """Return the outline through points (N, 2), made as large as can be seen."""
-    from matplotlib.patches import Polygon
-
-    middle = rim.mean(axis=0)
-    reach = float(np.linalg.norm(rim - middle, axis=1).max())
-    shown = middle + (rim - middle) * max(1.0, least / max(reach, 1e-9))
-    return Polygon(shown, closed=True, fill=False, edgecolor="#d400ff", linewidth=2)
 
 
 def _page(axes: Any, chart: Chart, title: str) -> None:
@@ -114,15 +88,13 @@ def _page(axes: Any, chart: Chart, title: str) -> None:
     axes.set_title(title)
 
 
-def _draw_light(axes: Any, figures: ChartMeasurements, chart: Chart) -> None:
+def _draw_light(axes: Any, table: TableMeasurements, chart: Chart) -> None:
     width, height = chart.page_mm
-    if figures.light is None:
-        _page(axes, chart, "light: not measured, too few white references")
-        return
     x, y = np.linspace(0, width, 90), np.linspace(0, height, 60)
     grid_x, grid_y = np.meshgrid(x, y)
     points = np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)
-    share = light_share(figures.light, points)[:, 1].reshape(grid_x.shape)
+    green = table.frames[0].paper.field.at(points)[:, 1].reshape(grid_x.shape)
+    share = green / green.max()
     image = axes.contourf(x, y, share, levels=np.linspace(0, 1, 21), cmap="viridis")
     lines = axes.contour(x, y, share, levels=np.arange(0.1, 1, 0.1), colors="white", linewidths=0.8)
     axes.clabel(lines, fmt=_per_cent, fontsize=8)
@@ -134,11 +106,12 @@ def _per_cent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def _draw_sharpness(axes: Any, figures: ChartMeasurements, chart: Chart) -> None:
-    points, sigma = figures.blur.points_mm, figures.blur.sigma_px
-    worst = MAX_BLUR_PX
+def _draw_sharpness(axes: Any, table: TableMeasurements, chart: Chart) -> None:
+    framing = table.registration.framing
+    places, sigma = edge_blurs(framing)
+    points = project(np.asarray(np.linalg.inv(framing.homography), dtype=np.float64), places)
     marks = axes.scatter(
-        points[:, 0], points[:, 1], c=sigma, s=380, cmap="RdYlGn_r", vmin=0.3, vmax=worst + 0.3, edgecolors="0.3"
+        points[:, 0], points[:, 1], c=sigma, s=380, cmap="RdYlGn_r", vmin=0.3, vmax=MAX_BLUR_PX + 0.3, edgecolors="0.3"
     )
     if len(points) <= 60:
         for (x, y), value in zip(points, sigma, strict=True):
@@ -147,20 +120,17 @@ def _draw_sharpness(axes: Any, figures: ChartMeasurements, chart: Chart) -> None
     _page(axes, chart, "blur of printed edges")
 
 
-def _draw_print(axes: Any, figures: ChartMeasurements, chart: Chart) -> None:
-    state = figures.state
-    if state is None:
-        _page(axes, chart, "print: not judged, its light is not known")
+def _draw_print(axes: Any, table: TableMeasurements, chart: Chart) -> None:
+    stains = table.cells.stains
+    if not stains.known:
+        _page(axes, chart, "print: not known of a chart of few colours")
         return
-    known = np.isfinite(state.deviation)
-    points, value = state.points_mm[known], state.deviation[known]
-    size = float(np.clip(90_000 / max(len(points), 1), 4.5, 120))
+    points, off = stains.places_mm, 100 * stains.largest_deviation()
+    size = float(np.clip(90_000 / len(points), 4.5, 120))
     marks = axes.scatter(
-        points[:, 0], points[:, 1], c=100 * value, s=size, marker="s", cmap="RdBu", vmin=-6, vmax=6, linewidths=0
+        points[:, 0], points[:, 1], c=off, s=size, marker="s", cmap="RdBu", vmin=-6, vmax=6, linewidths=0
     )
-    for spot in state.spots:
-        axes.add_patch(_outline(_rim_mm(spot, 3.0), 0.0))
-        axes.annotate(str(spot), spot.centre_mm, xytext=(0, 14), textcoords="offset points", ha="center", fontsize=8)
+    stained = points[stains.stained]
+    axes.scatter(stained[:, 0], stained[:, 1], s=2 * size, facecolors="none", edgecolors="#d400ff", linewidths=1)
     axes.figure.colorbar(marks, ax=axes, shrink=0.8, label="%, seen over expected")
-    what = "references" if state.by_references else "cells' surroundings"
-    _page(axes, chart, f"print: {what} against their codes' colours")
+    _page(axes, chart, "print: surroundings of cells against the colours of their codes")

@@ -2,7 +2,7 @@
 
 Rules that hold inside:
 
-- A frame is decoded once and measured once (`acquisition.judge.measure`); what it is compared with is one frozen value
+- A frame is decoded once and measured once (`experiment.measures.frame`); what it is compared with is one frozen value
   (`acquisition.judge.state`), which each frame replaces.
 - Every check has its number and its limits, also where it passes, and the sentence that a person is told where it
   fails; one that cannot tell has no number.
@@ -28,18 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.measure import (
-    SEGMENTS,
-    TILE_COLUMNS,
-    TILE_ROWS,
-    Anchor,
-    Exposure,
-    Frame,
-    Measured,
-    disagreement,
-    measure,
-    refusal,
-)
+from acquisition.judge.measure import Anchor, Frame, disagreement, refusal
 from acquisition.judge.state import (
     BLACK_DN,
     Basis,
@@ -63,6 +52,8 @@ from experiment.chart.model import Chart
 from experiment.config import JudgeSettings, LabSettings
 from experiment.framing.pictures import preview_jpeg
 from experiment.lights import Illumination
+from experiment.measures.exposure import Exposure
+from experiment.measures.frame import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured, measure
 from experiment.session.records import REFERENCES, Check, Judgement, SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError, RegistrationError
@@ -92,7 +83,8 @@ class LiveJudge:
 
     def __init__(self, settings: LabSettings, chart: Chart, illuminations: Sequence[Illumination]) -> None:
         self._settings = settings
-        self._chart = chart if settings.judge.chart else None
+        # A chart without tags is found by corners that are given by hand, and a run has none.
+        self._chart = chart if settings.judge.chart and chart.tags else None
         self._plan = tuple(dict.fromkeys(light.colour for light in illuminations))
         self._state = self._base = JudgeState()
         self._fresh = True

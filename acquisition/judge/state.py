@@ -37,7 +37,8 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.measure import SEGMENTS, Anchor, Frame, Measured, Noise, strip_blocks
+from acquisition.judge.measure import Anchor, Frame
+from experiment.measures.frame import SEGMENTS, Measured, Noise, strip_blocks
 from experiment.session.records import PRIMARIES, REFERENCES, TOP, SessionStep
 from foundation.robust import huber_weights, sigma_of
 

@@ -253,7 +253,7 @@ def _lights_of(folder: Path) -> tuple[Illumination, ...]:
 def with_seconds(views: Sequence[AttemptView], starts: Iterable[datetime]) -> tuple[AttemptView, ...]:
     """Return attempts, oldest first, with the seconds since the one before; none across the start of a run.
 
-    And none where time goes back, as in sessions of older software whose clock was set.
+    And none where time goes back, as where the clock was set.
     """
     begun = sorted(starts)
     timed: list[AttemptView] = []

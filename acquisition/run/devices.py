@@ -355,12 +355,10 @@ class Devices:
 class LightNotShown:
     """Stands for the presenter where nothing is to be shown, in a dry run.
 
-    - `found`: what may change the light behind the codes, as far as that is known without showing any.
-    - `unasked`: what could not be asked, and why; empty where all was.
+    `found`: what may change the light behind the codes, as far as that is known without showing any.
     """
 
     found: tuple[str, ...]
-    unasked: str = ""
 
     def warnings(self) -> tuple[str, ...]:
         """Return what was found; `drivers.presenter.ReportsWarnings`."""

@@ -17,6 +17,7 @@ from typing import BinaryIO
 from acquisition.judge.measure import judge_file, whole_frame
 from drivers.camera import CapturedFrame
 from drivers.presenter import BLACK, WHITE
+from drivers.raw.rawfile import LAYOUT_START, layout_is_known
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
 from experiment.lights import Illumination, load_illuminations
@@ -46,10 +47,12 @@ class Imported:
 
     - `refused`: what was refused, one line a frame.
     - `left`: lights and kinds of frames of which none was accepted, in words.
+    - `unchecked`: suffixes of the files of which nobody can check whether they are complete.
     """
 
     refused: tuple[str, ...]
     left: tuple[str, ...]
+    unchecked: tuple[str, ...]
 
 
 def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, ...]]:
@@ -141,7 +144,13 @@ def import_session(
             session.close()
             shutil.rmtree(folder)
             raise
-        return Imported(tuple(refused), tuple(_left(session)))
+        unchecked = {frame.path.suffix.lower() for frame in frames if not _can_be_checked(frame.path)}
+        return Imported(tuple(refused), tuple(_left(session)), tuple(sorted(unchecked)))
+
+
+def _can_be_checked(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return layout_is_known(stream.read(LAYOUT_START))
 
 
 def _left(session: Session) -> list[str]:

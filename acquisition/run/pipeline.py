@@ -19,7 +19,7 @@ And of what is taken next:
   another pair is put behind the plan before they are, so that a run that is killed meanwhile is not complete.
 - A refused reference may void all lights since the last good one. Where more lights than usual are taken again in a
   row, a pair comes between them, too.
-- What a run that is taken up shows first is put into the session's plan by `link_runs` and `white_first`.
+- What a run that is taken up shows first is put into the session's plan by `link_runs`.
 """
 
 from __future__ import annotations
@@ -895,18 +895,6 @@ def link_runs(session: Session, at: datetime) -> tuple[int, ...]:
     again = [attempt.id for attempt in taken if attempt.step in numbers]
     session.journal.void(again, at, "the frames that link runs are taken again, all of them")
     return numbers
-
-
-def white_first(session: Session) -> tuple[int, ...]:
-    """Put a white and a dark frame into the plan where no white frame was measured; return the numbers of their steps.
-
-    The frames of journals of version 1 were not measured: the judge would have nothing to hold the first lights
-    against. Nothing is added where nothing was taken yet.
-    """
-    measured = any(step.kind == "white" and accepted for step, _, _, accepted in session.journal.measurements())
-    if measured or not session.journal.accepted_files():
-        return ()
-    return _added(session, link_steps(session.steps[-1].number + 1, response=False))
 
 
 def _added(session: Session, steps: Sequence[SessionStep]) -> tuple[int, ...]:

@@ -25,7 +25,6 @@ from typing import Any, Final, TypeVar
 
 from acquisition.run.devices import (
     Devices,
-    LightNotShown,
     fault_of,
     holds_whole_turns,
     period_s,
@@ -349,8 +348,6 @@ def ask(devices: Devices) -> Answers:
     warnings: tuple[str, ...] = ()
     if isinstance(presenter, ReportsWarnings):
         warnings = answer("display", presenter.warnings, ())
-    if isinstance(presenter, LightNotShown) and presenter.unasked:
-        unasked.append(presenter.unasked)
     return Answers(identity, offered, supplies, state, lit, warnings, tuple(unasked), tuple(faults))
 
 

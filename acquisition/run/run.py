@@ -48,7 +48,7 @@ from acquisition.judge.judge import LiveJudge
 from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.view import write_session_report
 from acquisition.run.devices import TRY_S, Devices, RetryPolicy, RunEnd, RunWatch, leave_lab, make_ready, pause_cause
-from acquisition.run.pipeline import Job, Pipeline, StepQueue, Taken, link_runs, step_name, unclosed_kinds, white_first
+from acquisition.run.pipeline import Job, Pipeline, StepQueue, Taken, link_runs, step_name, unclosed_kinds
 from acquisition.run.plan import nothing_to_retake, planned_steps, require_plan, require_same
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
@@ -74,7 +74,6 @@ from experiment.session.records import (
     last_moment,
     time_left,
 )
-from experiment.session.repair import secrets_warning
 from foundation.clock import Clock, SteadyClock
 from foundation.console import Ending, shows_progress
 from foundation.errors import CropError, DeviceRefused, InputError, StorageError, first_of
@@ -470,7 +469,7 @@ def run_session(
         require_same_devices(session, devices, settings)
         if note := clock_note(session, devices.clock):
             announce(note)
-        first = link_runs(session, devices.clock.now()) or white_first(session)
+        first = link_runs(session, devices.clock.now())
         total = len(session.steps)
         observe(len(session.done_steps()), total)
         # When the screen is dark and the journal at rest.
@@ -512,8 +511,6 @@ def _taken_up(settings: LabSettings, folder: Path, announce: Callable[[str], obj
     session = Session.open_for_run(folder, settings.sequence.patience_s, announce)
     try:
         require_same(session, settings)
-        if warning := secrets_warning(folder):
-            announce(warning)
     except BaseException:
         session.close()
         raise
@@ -542,10 +539,8 @@ def require_same_devices(session: Session, devices: Devices, settings: LabSettin
         projector = devices.projector.identity()
         names["projector"] = f"{projector.maker} {projector.model}".strip() or "of an unknown maker"
     if settings.rig == "lab":
-        light = settings.lab.light
-        names["screen"] = " ".join(
-            str(part) for part in (light.shown_by, light.display, light.host) if part is not None
-        )
+        display = settings.lab.light.display
+        names["screen"] = "display" if display is None else f"display {display}"
     for what, name in names.items():
         before = known.get(what, name)
         if before != name:

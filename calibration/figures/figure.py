@@ -1,10 +1,9 @@
-"""A judged figure is one object with all that is ever asked of it; judging, reporting and forecasting loop over them.
+"""A judged figure is one object with all that is ever asked of it; judging and reporting loop over them.
 
 Rules that hold inside:
 
-- A figure has no default for what it may lack: what does not apply is said (`NO_CAUSE`, `ONLY_OF_A_SESSION`). One that
-  lacks a part does not import.
-- Limits stand in the figure alone; the check and the live judge take them from there.
+- Limits stand here alone; the check and the live judge take them from here. What no table shows has a plain `Limit`
+  (`calibration.figures.single_frames`).
 - A value within `accept` is accepted; between `accept` and `refuse` it is remarked on; beyond `refuse` there is no
   table. Without `refuse` it is only ever remarked on: what it measures does not make the table wrong.
 - Where a measurement refuses by itself (`calibration.registration.register`), the number is defined there and imported.
@@ -12,20 +11,15 @@ Rules that hold inside:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import KW_ONLY, dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from calibration.causes.gathering import Gathered, PrintPlace
     from calibration.causes.rules import Subject
     from calibration.measurements import TableMeasurements
     from experiment.chart.model import Chart
-    from experiment.measures.paper import Paper
-    from experiment.measures.stains import Stains
     from experiment.session.records import FrameRecord
 
 Sense = Literal["at most", "at least"]
@@ -33,8 +27,8 @@ Outcome = Literal["accept", "accept with remarks", "refuse"]
 OUTCOMES: Final[tuple[Outcome, ...]] = get_args(Outcome)
 """From the best to the worst."""
 
-Group = Literal["geometry", "light", "radiometry", "noise", "truth"]
-"""What a scientist asks about, one question a group of the report."""
+Group = Literal["geometry", "light", "radiometry", "noise", "truth", "devices"]
+"""What a scientist asks about, one question a group of the report; no figure is of devices."""
 
 QUESTIONS: Final[dict[Group, str]] = {
     "geometry": "Was the chart found, and does each sample lie in its cell?",
@@ -125,77 +119,20 @@ class Line:
     row: Callable[[TableMeasurements], SummaryRow | None]
 
 
-@dataclass(frozen=True, eq=False)
-class CheckMeasurements:
-    """What the frames of `acquire check` show of a table before its session; None, or no share, where they do not.
-
-    - `tags_found`, `references_used`: shares.
-    - `cell_px`, `blur_px`: shorter side of the smallest cell, and σ of the median blur, half-size px.
-    - `unfit`: share of the cells that would be unfit, by cause: ``outside``, ``clipped``, ``stained``.
-    - `unfit_share`: share of those that are one of these.
-    - `stains`: where the print does not have its codes' colours.
-    - `paper`: flat field and white of bare paper.
-    - `tint_deg`: largest angle between a printed grey and paper.
-    - `leak`: (3,) float64, light while the projector shows black, of white.
-    - `brightest_share`, `darkest_counts`: paper under white, of saturation, and under the plan's darkest light, at the
-      settings' exposure.
-    - `not_additive`: by how much white differs from the sum of the primaries, a share.
-    """
-
-    tags_found: float | None = None
-    cell_px: float | None = None
-    blur_px: float | None = None
-    unfit: Mapping[str, float] = field(default_factory=dict[str, float])
-    unfit_share: float | None = None
-    stains: Stains | None = None
-    references_used: float | None = None
-    paper: Paper | None = None
-    tint_deg: float | None = None
-    leak: npt.NDArray[np.float64] | None = None
-    brightest_share: float | None = None
-    darkest_counts: float | None = None
-    not_additive: float | None = None
-
-
-NO_PLACE: Final = None
-NO_FRAMES: Final = None
-NO_CAUSE: Final = None
-NOT_DRAWN: Final = None
-NO_LINES: Final[tuple[Line, ...]] = ()
-OF_ITS_CAUSE: Final = None
-ONLY_OF_A_SESSION: Final = None
-"""What a figure has not, said by name: a part that is left out is an error."""
-
-
 @dataclass(frozen=True)
-class Figure:
-    """One figure that a table is judged by.
+class Limit:
+    """What one measured value may be, and why: the one kind of limit in check, live judge and table.
 
-    - `name`: as in `report.json`.
-    - `title`: the figure for people.
+    - `name`: of the value in messages and files.
+    - `title`: the value for people.
     - `group`: of the report's page.
     - `unit`: of the value and both limits; "" for a count or a plain number, "share" for 0 … 1.
     - `sense`: on which side of the limits a value is accepted.
     - `accept`: up to here nothing is remarked.
-    - `refuse`: beyond it no table is made; None where the value is only ever remarked on.
+    - `refuse`: beyond it there is no table, or the frame is taken again; None where the value is only ever remarked on.
     - `why`: what goes wrong beyond.
     - `source`: where the numbers come from.
     - `remedy`: what to do about it; "" where it depends on what was found.
-    - `measure`: the value; None where it could not be measured: on a chart without tags or with few colours, without
-      dark frames or a series of exposures.
-    - `forecast`: the value from what a check has, where no check can know it `ONLY_OF_A_SESSION`.
-    - `of_one_frame`: what `build-lut --check` can say of it, which reads one light or white frame and a dark one: it is
-      `known`; or `bounded`, since more frames can only make it worse, so that it is told where it is beyond its limit
-      already; or `unknown`.
-    - `worst`: where its worst is on the report's page, whatever the verdict; else `NO_PLACE`.
-    - `where`: frames, lights or place beyond the limit accepted, for a remark; else those `OF_ITS_CAUSE`.
-    - `retake`: the frames that are beyond a limit by themselves; else `NO_FRAMES`. None where all of them are.
-    - `cause`: how its cause is found; else it explains itself, `NO_CAUSE`.
-    - `drawing`: the picture that shows it; else `NOT_DRAWN`.
-    - `lines`: its lines in the summary; else `NO_LINES`.
-    - `foremost`: whether a refusal speaks of it before others, which may follow from it.
-    - `found`: what a refusal or remark adds, and the remedy, where that depends on what was found.
-    - `former_name`: its name in the reports of earlier software; "" where it is the same.
     """
 
     name: str
@@ -209,18 +146,6 @@ class Figure:
     why: str
     source: str
     remedy: str
-    measure: Callable[[TableMeasurements], float | None]
-    forecast: Callable[[CheckMeasurements], float | None] | None
-    of_one_frame: Literal["known", "bounded", "unknown"]
-    worst: Callable[[TableMeasurements, Chart], Worst | None] | None
-    where: Callable[[TableMeasurements, float], str] | None
-    retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None
-    cause: Explanation | None
-    drawing: Drawing | None
-    lines: tuple[Line, ...]
-    foremost: bool = False
-    found: Callable[[TableMeasurements], tuple[str, str] | None] | None = None
-    former_name: str = ""
 
     def outcome(self, value: float) -> Outcome:
         """Return what a value does to a table; one that is not a number is as bad as can be."""
@@ -228,13 +153,6 @@ class Figure:
         if self.refuse is not None and not sign * value <= sign * self.refuse:
             return "refuse"
         return "accept" if sign * value <= sign * self.accept else "accept with remarks"
-
-    def judged_value(self, table: TableMeasurements) -> float | None:
-        """Return the value that is judged; None where it was not measured, or other frames may change its outcome."""
-        value = self.measure(table)
-        if value is None or not table.is_of_one_frame or self.of_one_frame == "known":
-            return value
-        return value if self.of_one_frame == "bounded" and self.outcome(value) != "accept" else None
 
     @property
     def ranges(self) -> tuple[Range, Range]:
@@ -256,6 +174,48 @@ class Figure:
         """Return its limit as in `report.json`."""
         keys = ("name", "title", "unit", "sense", "accept", "refuse", "why", "source", "remedy")
         return {key: getattr(self, key) for key in keys}
+
+
+@dataclass(frozen=True)
+class Figure(Limit):
+    """One figure that a table is judged by: a limit, and how its value is measured and explained.
+
+    - `measure`: the value; None where it could not be measured: on a chart without tags or with few colours, without
+      dark frames or a series of exposures.
+    - `before_session`: whether the trial frames of `acquire check` show it as those of a session do.
+    - `of_one_frame`: what `build-lut check` can say of it, which reads one light or white frame and a dark one: it is
+      `known`; or `bounded`, since more frames can only make it worse, so that it is told where it is beyond its limit
+      already; or `unknown`.
+    - `worst`: where its worst is on the report's page, whatever the verdict; None if it has no place.
+    - `where`: frames, lights or place beyond the limit accepted, for a remark; None for those of its cause.
+    - `retake`: the frames that are beyond a limit by themselves, None if all of them are; None for a figure that is not
+      of single frames.
+    - `cause`: how its cause is found; None if it explains itself.
+    - `drawing`: the picture that shows it; None if none does.
+    - `lines`: its lines in the summary.
+    - `foremost`: whether a refusal speaks of it before others, which may follow from it.
+    - `found`: what a refusal or remark adds, and the remedy, where that depends on what was found.
+    """
+
+    _: KW_ONLY
+    measure: Callable[[TableMeasurements], float | None]
+    before_session: bool = False
+    of_one_frame: Literal["known", "bounded", "unknown"] = "unknown"
+    worst: Callable[[TableMeasurements, Chart], Worst | None] | None = None
+    where: Callable[[TableMeasurements, float], str] | None = None
+    retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None = None
+    cause: Explanation | None = None
+    drawing: Drawing | None = None
+    lines: tuple[Line, ...] = ()
+    foremost: bool = False
+    found: Callable[[TableMeasurements], tuple[str, str] | None] | None = None
+
+    def judged_value(self, table: TableMeasurements) -> float | None:
+        """Return the value that is judged; None where it was not measured, or other frames may change its outcome."""
+        value = self.measure(table)
+        if value is None or not table.is_of_one_frame or self.of_one_frame == "known":
+            return value
+        return value if self.of_one_frame == "bounded" and self.outcome(value) != "accept" else None
 
 
 def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:

@@ -10,12 +10,6 @@ from calibration.budget import COVERAGE
 from calibration.causes.gathering import PrintPlace, noisy_evidence, reference_evidence
 from calibration.figures.figure import (
     JUDGEMENT,
-    NO_CAUSE,
-    NO_FRAMES,
-    NO_LINES,
-    NO_PLACE,
-    OF_ITS_CAUSE,
-    ONLY_OF_A_SESSION,
     SIMULATED,
     Explanation,
     Figure,
@@ -52,8 +46,7 @@ NOISE_MISFIT = Figure(
     why="there is scatter that light and sensor do not explain: the camera smooths its raw files, or the light "
     "flickers",
     source="EMVA 1288 model; " + SIMULATED + ": 0.05 to 0.15", remedy="switch the camera's noise reduction off",
-    measure=lambda table: float(table.sensor.transfer.misfit.max()), forecast=ONLY_OF_A_SESSION,
-    of_one_frame="known", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
+    measure=lambda table: float(table.sensor.transfer.misfit.max()), before_session=True, of_one_frame="known",
     drawing="noise", lines=(Line(170, _noise_row), Line(200, _at_zero_row)),
 )  # fmt: skip
 
@@ -80,10 +73,9 @@ NOISY_SHARE = Figure(
     "noisy_share", "Cells noisier than their level explains", "noise", "share", "at most", 0.002, 0.1,
     why="they are not of one colour: dirt, a fold, a neighbour's edge", source="a variance 3.5 times the model's",
     remedy="clean the print, focus, and hang it flatter",
-    measure=lambda table: float(table.sensor.transfer.noisy.mean()), forecast=ONLY_OF_A_SESSION,
-    of_one_frame="known",
-    worst=_noisiest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("noisy cells", noisy_evidence),
-    drawing="cells", lines=(Line(180, _transfer_row),),
+    measure=lambda table: float(table.sensor.transfer.noisy.mean()), before_session=True, of_one_frame="known",
+    worst=_noisiest, cause=Explanation("noisy cells", noisy_evidence), drawing="cells",
+    lines=(Line(180, _transfer_row),),
 )  # fmt: skip
 
 
@@ -101,9 +93,7 @@ REFERENCES_USED = Figure(
     "references_used", "White references used, worst frame", "truth", "share", "at least", 0.9, 0.3,
     why="flat field and ground truth rest on few places", source=JUDGEMENT,
     remedy="uncover the print, bring all of it into the picture, expose so that bare paper stays below saturation",
-    measure=_references_used, forecast=lambda check: check.references_used,
-    of_one_frame="bounded", worst=_fewest_references, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
-    drawing="course", lines=NO_LINES,
+    measure=_references_used, before_session=True, of_one_frame="bounded", worst=_fewest_references, drawing="course",
 )  # fmt: skip
 
 
@@ -126,10 +116,8 @@ REFERENCE_SPREAD = Figure(
     source=SIMULATED + ": 0.3 % of noise and photosites' response",
     remedy="clean or flatten the print, and look for shadows on it",
     measure=lambda table: max(map(_spread_of, table.white_frames), default=None),
-    forecast=lambda check: None if check.paper is None else _spread(check.paper),
-    of_one_frame="bounded",
-    worst=_most_spread, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=Explanation("references", reference_evidence),
-    drawing="rest", lines=NO_LINES,
+    before_session=True, of_one_frame="bounded", worst=_most_spread,
+    cause=Explanation("references", reference_evidence), drawing="rest",
 )  # fmt: skip
 
 
@@ -149,9 +137,8 @@ TRUTH_MEDIAN_DEG = Figure(
     "truth_median_deg", "Expanded uncertainty of the ground truth, median light", "truth", "°", "at most", 0.4, 1.0,
     why="a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + ": a quarter of a good method's error; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=lambda table: float(np.median(table.budget.expanded_deg)), forecast=ONLY_OF_A_SESSION,
-    of_one_frame="unknown", worst=NO_PLACE, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
-    drawing="budget", lines=(Line(190, _error_row),),
+    measure=lambda table: float(np.median(table.budget.expanded_deg)), drawing="budget",
+    lines=(Line(190, _error_row),),
 )  # fmt: skip
 
 
@@ -167,9 +154,7 @@ TRUTH_WORST_DEG = Figure(
     "truth_worst_deg", "Expanded uncertainty of the ground truth, worst light", "truth", "°", "at most", 0.5, 3.0,
     why="under that light a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=lambda table: float(table.budget.expanded_deg.max()), forecast=ONLY_OF_A_SESSION,
-    of_one_frame="unknown", worst=_least_known, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
-    drawing="budget", lines=NO_LINES,
+    measure=lambda table: float(table.budget.expanded_deg.max()), worst=_least_known, drawing="budget",
 )  # fmt: skip
 
 
@@ -195,9 +180,8 @@ BRIGHTEST_SHARE = Figure(
     why="the unevenness of the light carries cells into saturation",
     source=JUDGEMENT + ": 0.8 leaves room for 20 % unevenness", remedy="expose less",
     measure=lambda table: float(table.lights.white.max()) / table.sensor.white_level,
-    forecast=lambda check: check.brightest_share,
-    of_one_frame="bounded", worst=_brightest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
-    drawing="lights", lines=(Line(150, _saturation_row),),
+    before_session=True, of_one_frame="bounded", worst=_brightest, drawing="lights",
+    lines=(Line(150, _saturation_row),),
 )  # fmt: skip
 
 
@@ -215,8 +199,6 @@ DARKEST_COUNTS = Figure(
     "darkest_counts", "Bare paper under the darkest light", "radiometry", "counts", "at least", 300.0, MIN_SIGNAL,
     why="25 samples of 300 counts have a mean good to 1 %, a print's dark colours a thirtieth of that",
     source="photon noise at 1.8 electrons a count, 6 counts of read noise", remedy="expose longer",
-    measure=lambda table: float(table.lights.white.max(axis=1).min()),
-    forecast=lambda check: check.darkest_counts,
-    of_one_frame="bounded", worst=_darkest, where=OF_ITS_CAUSE, retake=NO_FRAMES, cause=NO_CAUSE,
-    drawing="lights", lines=(Line(160, _darkest_row),),
+    measure=lambda table: float(table.lights.white.max(axis=1).min()), before_session=True, of_one_frame="bounded",
+    worst=_darkest, drawing="lights", lines=(Line(160, _darkest_row),),
 )  # fmt: skip

@@ -175,7 +175,8 @@ def register(
     About 5 s of one processor for the 32 768 cells on an 18-megapixel frame, three times that without tags.
 
     `corners`: for a chart without tags: (4, 2) float half-size px, the corners of the field of cells, clockwise from
-    the printed top-left, to some 20 px; found by themselves if not given.
+    the printed top-left, to some 20 px. `near`: another frame of the session; a chart without tags lies near its place
+    there, and needs no corners then.
     """
     black = frame_black(mosaic)
     framing = find_chart(mosaic, chart, what, corners, None if near is None else near.framing)

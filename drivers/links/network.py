@@ -176,8 +176,8 @@ _TIMEOUT_S = 30.0
 """Longest wait for a client to take an answer."""
 
 
-def serve_peer(peer: Callable[[], Peer], port: int = 0, think: Callable[[], None] = lambda: None) -> TcpServer:
-    """Return a running server that gives each connection a peer, which thinks before it answers; close it."""
+def serve_peer(peer: Callable[[], Peer], port: int = 0) -> TcpServer:
+    """Return a running server that gives each connection a peer; close it."""
 
     def handle(link: TcpLink) -> None:
         there = peer()
@@ -188,7 +188,6 @@ def serve_peer(peer: Callable[[], Peer], port: int = 0, think: Callable[[], None
             except LinkTimeout:
                 said = there.receive(b"")
             if said:
-                think()
                 link.write(said, _TIMEOUT_S)
 
     return TcpServer(handle, port)

@@ -1,12 +1,12 @@
-"""USB cables: the pipes of still image devices, and the reports of HID devices.
+"""USB cables: the pipes of still image devices.
 
 Devices are distinguished by vendor, product and serial number, or by the port they are plugged into: the address
 changes whenever a device restarts. The kernel's own driver is asked to step aside, and given the interface back at the
 end. The system's errors are translated here and nowhere else, and say what helps. pyusb opens anew what was closed as
 soon as it is used; here, closed is closed.
 
-Sources: USB 2.0, clauses 5.8 (bulk), 5.7 (interrupt), 9.4 (SetConfiguration) and 9.6 (descriptors); Device Class
-Definition for HID 1.11, clauses 4.1 and 4.4; libusb 1.0's error codes.
+Sources: USB 2.0, clauses 5.8 (bulk), 5.7 (interrupt), 9.4 (SetConfiguration) and 9.6 (descriptors); libusb 1.0's error
+codes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import math
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, ClassVar, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 import usb.core
 import usb.util
@@ -97,6 +97,10 @@ _FORBIDDEN = (
     f"may not be opened by this user; on Linux install the rule {UDEV_RULE}, as docs/devices.md shows under USB "
     "permission, and plug the camera in again"
 )
+_HELD = (
+    ", such as the desktop's photo monitor; close photo programs, and on Linux run: "
+    "systemctl --user stop gvfs-gphoto2-volume-monitor.service (on macOS: killall ptpcamerad)"
+)
 
 _CLASS_OUT: Final = 0x21
 """bmRequestType of requests of the class to the interface (USB 2.0, 9.3)."""
@@ -110,85 +114,6 @@ _INTERRUPT: Final = 3
 
 _MAX_POLLING_S: Final = 0.05
 """Longest interval that is believed: a wrong descriptor must not slow the events down to seconds."""
-
-
-class _ClaimedDevice:
-    """A device whose interface is to be claimed, with what transfers raise in our words; `close` undoes all of it."""
-
-    held: ClassVar[str]
-    """What to do when another program holds it."""
-    forbidden: ClassVar[str]
-    """What to do when this user may not open it."""
-
-    def __init__(self, device: usb.core.Device, label: str) -> None:
-        self._device = device
-        self._label = label
-        self._detached: int | None = None
-        self._closed = False
-
-    @property
-    def label(self) -> str:
-        """The device's name and numbers."""
-        return self._label
-
-    def close(self) -> None:
-        """Release the device, and give it back to the kernel's driver if there was one; a second call does nothing."""
-        if self._closed:
-            return
-        self._closed = True
-        # A device that was unplugged cannot be released, and need not be.
-        with contextlib.suppress(usb.core.USBError, NotImplementedError):
-            if self._detached is not None:
-                usb.util.release_interface(self._device, self._detached)
-                self._device.attach_kernel_driver(self._detached)
-        with contextlib.suppress(usb.core.USBError, NotImplementedError):
-            usb.util.dispose_resources(self._device)
-
-    def _configuration(self) -> usb.core.Configuration:
-        """Return the device's configuration, made active if none is."""
-        try:
-            return self._device.get_active_configuration()
-        except usb.core.USBError as error:
-            if error.errno is not None:
-                raise
-            # None is active: a device fresh from the bus on systems that leave this to us.
-            self._device.set_configuration()
-            return self._device.get_active_configuration()
-
-    def _claim(self, interface: int) -> None:
-        """Claim the interface of this number, also again after a reset of the device."""
-        with contextlib.suppress(NotImplementedError):
-            if self._device.is_kernel_driver_active(interface):
-                self._device.detach_kernel_driver(interface)
-                self._detached = interface
-        usb.util.claim_interface(self._device, interface)
-
-    @contextlib.contextmanager
-    def _transfer(self, late: str) -> Generator[None]:
-        """Translate what the block raises; `late` is what a timeout means."""
-        label = self._label
-        if self._closed:
-            raise LinkClosed(f"{label} was closed; open it again")
-        try:
-            yield
-        except usb.core.USBTimeoutError as error:
-            raise LinkTimeout(f"{label} {late}; reset it, or switch it off and on") from error
-        except usb.core.USBError as error:
-            reason = error.strerror or str(error)
-            match error.errno:
-                case errno.ETIMEDOUT:
-                    fault = LinkTimeout(f"{label} does not answer ({reason}); reset it, or switch it off and on")
-                case errno.EPIPE:
-                    fault = PipeStalled(f"{label} stalls")
-                case errno.EBUSY:
-                    fault = DeviceRefused(f"{label} is held by another program{self.held}")
-                case errno.EACCES | errno.EPERM:
-                    fault = DeviceRefused(f"{label} {self.forbidden}")
-                case errno.EOVERFLOW:
-                    fault = ProtocolError(f"{label} sends more than was asked for; reset it")
-                case _:
-                    fault = LinkClosed(f"{label} is gone ({reason}); check cable and power, and open it again")
-            raise fault from error
 
 
 @dataclass(frozen=True)
@@ -246,22 +171,37 @@ def open_usb(
     return OpenUsbDevice(*matching[0])
 
 
-class OpenUsbDevice(_ClaimedDevice):
-    """The pipes of a device that `open_usb` found."""
-
-    held = (
-        ", such as the desktop's photo monitor; close photo programs, and on Linux run: "
-        "systemctl --user stop gvfs-gphoto2-volume-monitor.service (on macOS: killall ptpcamerad)"
-    )
-    forbidden = _FORBIDDEN
+class OpenUsbDevice:
+    """The claimed interface of a device that `open_usb` found; `close` releases it."""
 
     def __init__(self, device: usb.core.Device, description: UsbDevice) -> None:
-        super().__init__(device, str(description))
+        self._device = device
+        self._label = str(description)
+        self._detached: int | None = None
+        self._closed = False
         try:
             self._interface = self._claimed()
         except BaseException:
             self.close()
             raise
+
+    @property
+    def label(self) -> str:
+        """The device's name and numbers."""
+        return self._label
+
+    def close(self) -> None:
+        """Release the device, and give it back to the kernel's driver if there was one; a second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        # A device that was unplugged cannot be released, and need not be.
+        with contextlib.suppress(usb.core.USBError, NotImplementedError):
+            if self._detached is not None:
+                usb.util.release_interface(self._device, self._detached)
+                self._device.attach_kernel_driver(self._detached)
+        with contextlib.suppress(usb.core.USBError, NotImplementedError):
+            usb.util.dispose_resources(self._device)
 
     @property
     def packet_size(self) -> int:
@@ -326,6 +266,52 @@ class OpenUsbDevice(_ClaimedDevice):
             pipes = _pipes_of(interface, self._label)
             self._claim(pipes.number)
         return pipes
+
+    def _configuration(self) -> usb.core.Configuration:
+        """Return the device's configuration, made active if none is."""
+        try:
+            return self._device.get_active_configuration()
+        except usb.core.USBError as error:
+            if error.errno is not None:
+                raise
+            # None is active: a device fresh from the bus on systems that leave this to us.
+            self._device.set_configuration()
+            return self._device.get_active_configuration()
+
+    def _claim(self, interface: int) -> None:
+        """Claim the interface of this number, also again after a reset of the device."""
+        with contextlib.suppress(NotImplementedError):
+            if self._device.is_kernel_driver_active(interface):
+                self._device.detach_kernel_driver(interface)
+                self._detached = interface
+        usb.util.claim_interface(self._device, interface)
+
+    @contextlib.contextmanager
+    def _transfer(self, late: str) -> Generator[None]:
+        """Translate what the block raises; `late` is what a timeout means."""
+        label = self._label
+        if self._closed:
+            raise LinkClosed(f"{label} was closed; open it again")
+        try:
+            yield
+        except usb.core.USBTimeoutError as error:
+            raise LinkTimeout(f"{label} {late}; reset it, or switch it off and on") from error
+        except usb.core.USBError as error:
+            reason = error.strerror or str(error)
+            match error.errno:
+                case errno.ETIMEDOUT:
+                    fault = LinkTimeout(f"{label} does not answer ({reason}); reset it, or switch it off and on")
+                case errno.EPIPE:
+                    fault = PipeStalled(f"{label} stalls")
+                case errno.EBUSY:
+                    fault = DeviceRefused(f"{label} is held by another program{_HELD}")
+                case errno.EACCES | errno.EPERM:
+                    fault = DeviceRefused(f"{label} {_FORBIDDEN}")
+                case errno.EOVERFLOW:
+                    fault = ProtocolError(f"{label} sends more than was asked for; reset it")
+                case _:
+                    fault = LinkClosed(f"{label} is gone ({reason}); check cable and power, and open it again")
+            raise fault from error
 
 
 @dataclass(frozen=True)
@@ -429,86 +415,3 @@ def _absent(vendor: int | None, serial: str | None, port: str | None, others: li
 def _milliseconds(timeout: float) -> int:
     # libusb takes 0 for ever.
     return max(1, math.ceil(timeout * 1000))
-
-
-REPORT: Final = 64
-"""Bytes of a report in either direction."""
-
-_HID_CLASS: Final = 3
-"""bInterfaceClass of a human interface device (HID 1.11, 4.1)."""
-
-
-def open_hid(
-    vendor: int, product: int, *, name: str, serial: str | None = None, backend: IBackend | None = None
-) -> HidDevice:
-    """Open the one HID device with these marks."""
-    marks = f"{name} ({vendor:04x}:{product:04x}{f', serial number {serial}' if serial else ''})"
-
-    def fits(device: usb.core.Device) -> bool:
-        if (device.idVendor, device.idProduct) != (vendor, product):
-            return False
-        return serial is None or _serial(device) == serial
-
-    try:
-        found = list(usb.core.find(find_all=True, backend=backend, custom_match=fits))
-    except usb.core.NoBackendError as error:
-        raise LinkClosed("libusb is not installed; see docs/devices.md under USB permission") from error
-    if not found:
-        raise LinkClosed(f"no {marks} on USB; switch it on and check its cable")
-    if len(found) > 1:
-        raise InputError(f"{len(found)} devices on USB fit {marks}; name one by its serial number")
-    return HidDevice(found[0], marks)
-
-
-class HidDevice(_ClaimedDevice):
-    """A cable that carries reports of `REPORT` bytes, to a device that `open_hid` found."""
-
-    held = "; close its control program"
-    forbidden = (
-        "may not be opened by this user; on Linux add a udev rule for it, as docs/devices.md shows under The picture"
-    )
-
-    def __init__(self, device: usb.core.Device, label: str) -> None:
-        super().__init__(device, label)
-        try:
-            with self._transfer("does not answer"):
-                interface, self._inward, self._outward = _report_pipes(self._configuration(), label)
-                self._claim(interface)
-        except BaseException:
-            self.close()
-            raise
-
-    def write(self, report: bytes, timeout: float) -> None:
-        """Send one report; raises `LinkTimeout` or `LinkClosed`."""
-        with self._transfer(f"takes no report for {timeout:g} s"):
-            self._device.write(self._outward, report, _milliseconds(timeout))
-
-    def read(self, timeout: float) -> bytes:
-        """Return the next report; raises `LinkTimeout` or `LinkClosed`."""
-        with self._transfer(f"has not answered for {timeout:g} s"):
-            return self._device.read(self._inward, REPORT, _milliseconds(timeout)).tobytes()
-
-
-def _report_pipes(configuration: usb.core.Configuration, label: str) -> tuple[int, int, int]:
-    """Return the number of the first HID interface that has interrupt pipes both ways, and their addresses, in and out.
-
-    `label` names the device.
-    """
-    for interface in configuration:
-        ends = {
-            bool(endpoint.bEndpointAddress & 0x80): endpoint.bEndpointAddress
-            for endpoint in interface
-            if endpoint.bmAttributes & 3 == _INTERRUPT
-        }
-        if interface.bInterfaceClass == _HID_CLASS and len(ends) == 2:
-            return interface.bInterfaceNumber, ends[True], ends[False]
-    raise ProtocolError(f"{label} has no HID interface with pipes both ways; it is another device")
-
-
-def _serial(device: usb.core.Device) -> str | None:
-    try:
-        return usb.util.get_string(device, device.iSerialNumber)
-    except (usb.core.USBError, ValueError, NotImplementedError):
-        return None
-    finally:
-        usb.util.dispose_resources(device)

@@ -6,8 +6,8 @@ Rules that hold inside:
   the rotation that dcraw applies.
 - Whatever the bytes, the outcome is a `Mosaic` or one `FormatError`. LibRaw fills what is missing, and reads behind the
   end of what is stored, without a word: so each picture of a sensor that a file describes must be whole, and what
-  LibRaw makes must have the size of one of them (`Stored.holds`). A file of whose layout neither can be told is
-  refused.
+  LibRaw makes must have the size of one of them (`Stored.holds`). Of a file that is neither TIFF nor CR3
+  (`layout_is_known`) it is only checked that it has bytes enough, and that no part of the frame is empty.
 - LibRaw is called here and nowhere else in the suite. A DNG that holds its counts as memory does needs none: it is read
   as LibRaw would. LibRaw's table of colour matrices is asked by opening a raw file of nothing but a camera's name.
 
@@ -48,10 +48,6 @@ from drivers.raw.storage import (
     RawUnsupported,
     Stored,
     ciff_entries,
-    of_crw,
-    of_phase_one,
-    of_raf,
-    of_rw2,
     read_cr3,
 )
 from drivers.tiff import CFA, Directory, Tags, TiffDamaged, TiffTag, ValueType, head, is_tiff, read_directories, text
@@ -421,27 +417,29 @@ _LINEAR_RAW = 34892
 """PhotometricInterpretation of pixels that hold all colours (DNG 1.7.1)."""
 
 
-def stored_frames(data: bytes | memoryview, directories: Sequence[Directory]) -> list[Stored]:
-    """Return the frames that a file describes, the largest first; all their bytes are there.
+LAYOUT_START = 12
+"""Bytes at the beginning of a file that say which layout it has."""
 
-    `data`: the file's bytes; `directories`: those of a TIFF file.
+
+def layout_is_known(start: bytes | memoryview) -> bool:
+    """Return whether a file that begins so says where its photosites lie, in a way that is checked: TIFF and CR3.
+
+    `start`: at least the first `LAYOUT_START` bytes.
     """
-    start = bytes(data[:32])
-    if b"IIII" in start or b"MMMM" in start:
-        frames = [of_phase_one(data)]
-    elif start.startswith(b"FUJIFILM"):
-        frames = [of_raf(data)]
-    elif start[6:14] == b"HEAPCCDR":
-        frames = [of_crw(data)]
-    elif start.startswith(b"IIU\0"):
-        frames = [of_rw2(data, directories)]
-    elif is_tiff(data):
-        frames = list(_of_tiff(data, directories))
-    else:
-        raise RawDamaged(
-            "it begins as none of the raw files that can be checked (CR2, CR3, CRW, NEF, ARW, PEF, ORF, SRW, RW2, RAF, "
-            "3FR, IIQ, DNG)"
-        )
+    # Panasonic's files begin nearly as TIFF does, and their tags of the pixels mean something else.
+    return bytes(start[4:12]) == _CR3_START or (is_tiff(start) and start[:4] != b"IIU\0")
+
+
+_CR3_START = b"ftypcrx "
+"""Type and brand of the first box of a CR3, behind its size."""
+
+
+def stored_frames(data: bytes | memoryview, directories: Sequence[Directory]) -> list[Stored]:
+    """Return the frames that a TIFF file describes, the largest first; all their bytes are there.
+
+    `data`: the file's bytes; `directories`: its directories.
+    """
+    frames = list(_of_tiff(data, directories))
     return sorted(checked(data, frames), key=lambda frame: -frame.rows * frame.columns)
 
 
@@ -614,7 +612,10 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Content
         raise _not_bayer(path, "its pixels do not follow a 2×2 pattern of colour filters")
     sizes = raw.sizes
     size = sizes.raw_height, sizes.raw_width
-    stored = next((frame for frame in contents.frames if frame.holds(*size)), None)
+    if contents.frames:
+        stored = next((frame for frame in contents.frames if frame.holds(*size)), None)
+    else:
+        (stored,) = checked(data, [Stored(*size, ((0, len(data)),))])
     if stored is None:
         raise _unsupported(
             path,
@@ -654,7 +655,12 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, contents: _Content
         _require_levels(path, black, level, stored.bits)
     black.setflags(write=False)
     exposure = raw.other.iso_speed, raw.other.aperture, raw.other.shutter_speed
-    return _made(data, contents, stored, sensor, visible, letters, black, int(raw.white_level), exposure)
+    mosaic = _made(data, contents, stored, sensor, visible, letters, black, int(raw.white_level), exposure)
+    # LibRaw takes any file of 123 known sizes for a frame, zeros too.
+    fault = None if contents.frames else filled_fault(mosaic.counts, mosaic.black, mosaic.white_level)
+    if fault is not None:
+        raise _unreadable(path, fault)
+    return mosaic
 
 
 def _made(
@@ -708,7 +714,10 @@ def _read_bytes(path: Path) -> memoryview:
 
 @dataclass(frozen=True)
 class _Contents:
-    """What a file says of itself: TIFF directories, the boxes of a CR3, and the frames that are stored in it."""
+    """What a file says of itself: TIFF directories, the boxes of a CR3, and the frames that are stored in it.
+
+    No frames are known of a layout that is not checked.
+    """
 
     directories: list[Directory]
     cr3: Cr3 | None
@@ -718,9 +727,11 @@ class _Contents:
 def _examined(path: Path, data: bytes | memoryview) -> _Contents:
     """Return what a file says of itself; refuse one that cannot hold the frame that it claims."""
     try:
-        cr3 = read_cr3(data) if bytes(data[4:12]) == b"ftypcrx " else None
+        cr3 = read_cr3(data) if bytes(data[4:12]) == _CR3_START else None
         directories = read_directories(data) if is_tiff(data) else []
-        frames = stored_frames(data, directories) if cr3 is None else checked(data, cr3.frames)
+        frames: Sequence[Stored] = ()
+        if layout_is_known(data):
+            frames = stored_frames(data, directories) if cr3 is None else checked(data, cr3.frames)
     except (TiffDamaged, RawDamaged) as error:
         raise _unreadable(path, str(error)) from error
     except RawUnsupported as error:
@@ -881,9 +892,9 @@ def _plain_mosaic(path: Path, data: bytes | memoryview, contents: _Contents) -> 
 
     LibRaw copies such counts one by one, which takes longer than all that is done with a frame afterwards.
     """
-    stored, directories = contents.frames[0], contents.directories
-    pixels = stored.directory
-    if pixels is None or data[:2] != b"II" or sys.byteorder != "little":
+    stored, directories = next(iter(contents.frames), None), contents.directories
+    pixels = None if stored is None else stored.directory
+    if stored is None or pixels is None or data[:2] != b"II" or sys.byteorder != "little":
         return None
     if any(pixels.integers(tag) not in allowed for tag, allowed in _PLAIN.items()):
         return None

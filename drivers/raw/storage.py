@@ -1,25 +1,22 @@
-"""Where makers' raw files that are no plain TIFF keep the photosites of a frame: CR3, CRW, RAF, RW2 and IIQ.
+"""Where raw files keep the photosites of a frame: what every kind of file says of it, and CR3, which is no TIFF.
 
-What says it in every kind of file is a `Stored`; `drivers.raw.rawfile` reads those of TIFF files, a DNG's among them.
-Every byte sequence whatever ends in frames or `RawDamaged`; what the compressed codes of a maker decode to is LibRaw's
-to say. A CR3 (EOS R, EOS M50, EOS 250D and later) is an ISO base media file: boxes in boxes, each a size of 32 bits (1:
-of 64 bits, behind the type; 0: up to the end), a type of four letters, and content; big-endian. One that reaches beyond
-the file's end betrays a cut; what is inside a box and makes no sense is left out.
+What says it is a `Stored`; `drivers.raw.rawfile` reads those of TIFF files, a DNG's among them. Every byte sequence
+whatever ends in frames or `RawDamaged`. A CR3 (EOS R, EOS M50, EOS 250D and later) is an ISO base media file: boxes in
+boxes, each a size of 32 bits (1: of 64 bits, behind the type; 0: up to the end), a type of four letters, and content;
+big-endian. One that reaches beyond the file's end betrays a cut; what is inside a box and makes no sense is left out.
 
-Sources: Canon, CIFF 1.0 revision 4 (CRW); ISO/IEC 14496-12, 4.2 (boxes), 8.7.3 (sizes of samples) and 8.7.5 (places of
-chunks). For the rest, of which there is no public standard: P. Harvey, ExifTool (PanasonicRaw.pm, FujiFilm.pm,
-PhaseOne.pm, CanonRaw.pm); L. Clévy, "Describing the Canon Raw v3 (CR3) file format" (structure); and LibRaw 0.22 for
-which directory, size and packing it takes (src/metadata/{identify,fuji,ciff,mediumformat}.cpp), for what CDI1 holds
-(src/metadata/cr3_parser.cpp) and CMP1 (src/decoders/crx.cpp).
+Sources: ISO/IEC 14496-12, 4.2 (boxes), 8.7.3 (sizes of samples) and 8.7.5 (places of chunks). For the rest, of which
+there is no public standard: P. Harvey, ExifTool (CanonRaw.pm); L. Clévy, "Describing the Canon Raw v3 (CR3) file
+format" (structure); and LibRaw 0.22 for what CDI1 holds (src/metadata/cr3_parser.cpp) and CMP1 (src/decoders/crx.cpp).
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-from drivers.tiff import Directory, TiffDamaged, TiffTag, is_tiff, read_directories
+from drivers.tiff import Directory, TiffDamaged, TiffTag, read_directories
 
 Extent = tuple[int, int]
 """First byte, and how many."""
@@ -77,81 +74,6 @@ class Stored:
         return columns == self.columns and rows in (self.rows, self.rows + self.spare_rows)
 
 
-def of_rw2(data: bytes | memoryview, directories: Sequence[Directory]) -> Stored:
-    """Return the frame of an RW2 or RWL, whose pixels reach to the file's end: so many in each 16 bytes, by format."""
-    first = next(iter(directories), Directory({}))
-    form, bits = first.first(TiffTag.RW2_FORMAT), first.first(TiffTag.RW2_BITS)
-    start = first.first(TiffTag.RW2_PIXELS) or first.first(TiffTag.STRIP_OFFSETS)
-    if form in (5, 6, 7) and bits not in (12, 14):
-        raise RawDamaged(f"its photosites have {bits} bits, 12 or 14 expected")
-    in_block = {5: (10, 9), 6: (14, 11), 7: (10, 9)}.get(form, (14, 14))[bits > 12]
-    least = LEAST_BITS if form == 8 else 128 / in_block
-    extents = ((start, len(data) - start),)
-    return Stored(first.first(TiffTag.RW2_LENGTH), first.first(TiffTag.RW2_WIDTH), extents, least)
-
-
-def of_raf(data: bytes | memoryview) -> Stored:
-    """Return the frame of a RAF: its header, a table of big-endian values, and a TIFF of its own around the pixels."""
-    try:
-        table, _, start, size = struct.unpack_from(">4I", data, 92)
-        rows, columns = _raf_size(data, table)
-        (kind,) = struct.unpack_from(">H", data, min(start, len(data)))
-    except struct.error as error:
-        raise RawDamaged("it ends within its header") from error
-    if start + size > len(data):
-        raise RawDamaged(f"its pixels reach from byte {start} to {start + size}, and it has only {len(data)}")
-    extents, bits = ((start, size),), 16
-    if is_tiff(data[start : start + 4]):
-        try:
-            inner = read_directories(data[start : start + size])
-        except TiffDamaged as error:
-            raise RawDamaged(f"the directories of its pixels are damaged: {error}") from error
-        described = next((one for one in inner if one.integers(TiffTag.RAF_OFFSETS)), None)
-        if described is None:
-            raise RawDamaged("it describes no pixels of a sensor")
-        places, sizes = described.integers(TiffTag.RAF_OFFSETS), described.integers(TiffTag.RAF_BYTE_COUNTS)
-        extents = tuple((start + place, length) for place, length in zip(places, sizes, strict=False))
-        rows, columns = described.first(TiffTag.RAF_LENGTH), described.first(TiffTag.RAF_WIDTH)
-        bits = described.first(TiffTag.RAF_BITS)
-        kind = int.from_bytes(data[extents[0][0] : extents[0][0] + 2], "big") if extents else 0
-    if kind != _RAF_COMPRESSED:
-        return Stored(rows, columns, extents, min(bits or 16, 16))
-    return _of_compressed_raf(data, rows, columns, extents)
-
-
-_RAF_COMPRESSED = int.from_bytes(b"IS", "big")
-_RAF_BLOCK = 768
-"""Photosites across a block of a compressed RAF (fuji_compressed.cpp takes no other)."""
-
-
-def _raf_size(data: bytes | memoryview, table: int) -> tuple[int, int]:
-    """Return rows and columns of the whole sensor (tag 0x100) as the table of a RAF states them; zeros where not."""
-    (count,) = struct.unpack_from(">I", data, table)
-    at = table + 4
-    for _ in range(min(count, 255)):
-        tag, size = struct.unpack_from(">HH", data, at)
-        if tag == 0x100:
-            rows, columns = struct.unpack_from(">HH", data, at + 4)
-            return rows, columns
-        at += 4 + size
-    return 0, 0
-
-
-def _of_compressed_raf(data: bytes | memoryview, rows: int, columns: int, extents: tuple[Extent, ...]) -> Stored:
-    """Return a compressed frame, whose header has its size and how many bytes each vertical block takes."""
-    offset, size = extents[0]
-    try:
-        _, _, _, _, high, _, wide, block, blocks, _ = struct.unpack_from(">HBBBHHHHBH", data, offset)
-        sizes = struct.unpack_from(f">{blocks}I", data, offset + 16)
-    except struct.error as error:
-        raise RawDamaged("it ends within the header of its pixels") from error
-    if (high, wide, block) != (rows, columns, _RAF_BLOCK) or blocks != -(-wide // _RAF_BLOCK) or high % 6:
-        raise RawDamaged(f"its pixels are {wide}×{high} in {blocks} blocks, {columns}×{rows} are stated")
-    if min(sizes) == 0 or 16 + 4 * blocks + sum(sizes) > size:
-        raise RawDamaged(f"the blocks of its pixels take {sum(sizes)} bytes of {size}")
-    return Stored(rows, columns, extents)
-
-
 def ciff_entries(data: bytes | memoryview) -> dict[int, Extent]:
     """Return where the values of Canon's CRW lie, by tag, those of inner heaps included; none of any other file.
 
@@ -177,41 +99,6 @@ def ciff_entries(data: bytes | memoryview) -> dict[int, Extent]:
         except struct.error:
             continue
     return found
-
-
-def of_crw(data: bytes | memoryview) -> Stored:
-    """Return the frame of a CRW: pixels (0x2005), and the sensor's size (0x1031)."""
-    entries = ciff_entries(data)
-    pixels, sensor = entries.get(0x2005), entries.get(0x1031)
-    if pixels is None or sensor is None or sensor[0] + 6 > len(data):
-        raise RawDamaged("it describes no pixels of a sensor")
-    columns, rows = struct.unpack_from("<HH", data, sensor[0] + 2)
-    return Stored(rows, columns, (pixels,))
-
-
-def of_phase_one(data: bytes | memoryview) -> Stored:
-    """Return the frame of an IIQ: a directory of its own, places counted from where its mark stands."""
-    start = bytes(data[:32])
-    base = min(at for at in (start.find(b"IIII"), start.find(b"MMMM")) if at >= 0)
-    order = "<" if start[base : base + 4] == b"IIII" else ">"
-    try:
-        mark, place = struct.unpack_from(order + "II", data, base + 4)
-        (count,) = struct.unpack_from(order + "I", data, base + place)
-        found = {
-            tag: (value, size)
-            for tag, _, size, value in (
-                struct.unpack_from(order + "4I", data, base + place + 8 + 16 * number)
-                for number in range(min(count, 8192))
-            )
-        }
-    except struct.error as error:
-        raise RawDamaged("it ends within its directory") from error
-    if mark >> 8 != int.from_bytes(b"Raw", "big"):
-        raise RawDamaged("its directory has no mark")
-    (columns, _), (rows, _), (form, _), (offset, size) = (
-        found.get(tag, (0, 0)) for tag in (0x108, 0x109, 0x10E, 0x10F)
-    )
-    return Stored(rows, columns, ((base + offset, size),), LEAST_BITS if form > 2 else 16)
 
 
 MAX_BOXES = 4096

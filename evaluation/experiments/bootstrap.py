@@ -1,40 +1,54 @@
-"""Confidence intervals of error statistics by the bootstrap: what other images of the same kind would have given.
+"""Confidence intervals of error statistics by the bootstrap: the range that other images would give.
 
-Images are drawn anew, as many as there are and with replacement; the statistic of each such resample is a replicate.
-Intervals are bias-corrected and accelerated (BCa): B. Efron, "Better bootstrap confidence intervals", JASA 82 (1987)
-171-185. Errors of colour constancy are skewed, and plain percentiles of the replicates of a mean or of the worst
-quarter then lie too low. The bias correction counts replicates equal to the estimate half, as those of a median often
-are; the acceleration is that of the jackknife. Two independent samples share one acceleration: A. C. Davison,
-D. V. Hinkley, *Bootstrap Methods and their Application* (1997), section 5.4.
+Intervals are bias-corrected and accelerated (BCa) and made by `scipy.stats.bootstrap`. Errors of colour constancy are
+skewed, and plain percentiles of a mean or of the worst quarter are then too low.
 
-Images that belong together, such as one picture under several lights, are drawn together where their groups are given
-(the cluster bootstrap: Davison and Hinkley, section 3.8), and left out together by the jackknife: what they share would
-else count as often as it was seen, and intervals be too narrow. Few groups are still few: of 15 the intervals of means
-are somewhat too narrow, as those of 15 images are.
+Images that belong together, such as one picture under several lights, are drawn and left out together (the cluster
+bootstrap: A. C. Davison, D. V. Hinkley, *Bootstrap Methods and their Application* (1997), section 3.8). Drawn one by
+one, such images make intervals too narrow.
 
-A resample is a count of each image. What it comes to is read off the cumulative counts along the sorted errors, so
-nothing is sorted again, and statistics are those of `evaluation.metrics.summarise`, ties and percentiles included.
+A resample is a count of each image. Its statistics are read from the cumulative counts along the sorted errors, so
+errors are sorted once. They are those of `evaluation.metrics.summarise`, ties and percentiles included.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
-from typing import Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from foundation.errors import InputError
 
+# Counts drawn at once, resamples times images: arrays of 1.6 MB stay in a processor's cache.
 _AT_ONCE: Final = 200_000
-"""Counts drawn at once, resamples times images: arrays of 1.6 MB stay in a processor's cache."""
 
-_NORMAL: Final = NormalDist()
+# The ends of a 95 % interval then vary by some 2 % of its length (one standard deviation) between seeds.
+RESAMPLES: Final = 2000
+
+# Confidence of an interval: the usual one.
+LEVEL: Final = 0.95
 
 Floats = npt.NDArray[np.float64]
 Places = npt.NDArray[np.int64]
+
+Statistic = Literal["mean", "median", "trimean", "best25", "worst25", "avg"]
+"""The numbers of `evaluation.metrics.Summary`, by their names there."""
+
+STATISTICS: tuple[Statistic, ...] = ("mean", "median", "trimean", "best25", "worst25", "avg")
+"""All of them, in the order of the paper's tables."""
+
+
+class BoundedFigure(NamedTuple):
+    """A number with the ends of its confidence interval; NaN if it is not known."""
+
+    value: float
+    low: float
+    high: float
 
 
 def numbered(groups: Sequence[str]) -> Places:
@@ -49,30 +63,57 @@ def numbered(groups: Sequence[str]) -> Places:
     return np.array([numbers[group] for group in groups], dtype=np.int64)
 
 
-def resamples(
-    images: int, seed: int | np.random.SeedSequence, count: int, groups: Places | None = None
-) -> Iterator[npt.NDArray[np.int64]]:
-    """Give the counts (B, N) int64 of images in resamples, some resamples at a time; each row has sum N.
+def bounded_figures(
+    statistics: Callable[[Places], Floats],
+    images: int,
+    groups: Sequence[str] | None = None,
+    seed: int = 0,
+    count: int = RESAMPLES,
+) -> tuple[BoundedFigure, ...]:
+    """Return K numbers of a sample of images, each with the ends of its confidence interval.
 
-    `groups`: (N,) int64, the group of each image from 0; then groups are drawn, as many as there are, each with all its
-    images, and rows have the sum N only where groups are of one size. None: each image is one of its own.
+    `statistics`: from counts (B, N) int64 of the N images in B resamples to (B, K) float64. `groups`: what each image
+    shares with others; images of one group are drawn together. None: every image is its own group. The ends are NaN
+    if there is one group only, which says nothing of others.
     """
-    if count < 1:
-        raise InputError(f"{count} resamples; give a count of 1 or more")
-    if groups is not None:
-        for drawn in resamples(int(groups.max()) + 1, seed, count):
-            for start in range(0, len(drawn), some := max(1, _AT_ONCE // images)):
-                yield drawn[start : start + some][:, groups]
-        return
-    random = np.random.default_rng(seed)
-    some = max(1, _AT_ONCE // images)
-    for start in range(0, count, some):
-        rows = min(some, count - start)
-        drawn = random.integers(0, images, (rows, images), dtype=np.int32) + np.arange(rows)[:, None] * images
-        yield np.bincount(drawn.ravel(), minlength=rows * images).reshape(rows, images)
+    members = np.arange(images) if groups is None else numbered(groups)
+    cases = int(members.max()) + 1
+
+    def of_resamples(drawn: Places, axis: int = -1) -> Floats:
+        rows = drawn.reshape(-1, drawn.shape[axis])
+        shifted = rows + np.arange(len(rows))[:, None] * cases
+        counts = np.bincount(shifted.ravel(), minlength=len(rows) * cases).reshape(-1, cases)
+        # Rounded, since resamples that agree but for their last digit must count as equal.
+        found = np.round(statistics(counts if groups is None else counts[:, members]), 12)
+        return found.T.reshape(-1, *drawn.shape[:-1])
+
+    everything = np.arange(cases)
+    if cases == 1:
+        alone = of_resamples(everything)
+        return tuple(
+            BoundedFigure(float(value), np.nan, np.nan) for value in np.where(np.isfinite(alone), alone, np.nan)
+        )
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", stats.DegenerateDataWarning)
+        values = of_resamples(everything)
+        made: Any = stats.bootstrap(
+            (everything,),
+            of_resamples,
+            n_resamples=count,
+            batch=max(1, _AT_ONCE // images),
+            confidence_level=LEVEL,
+            method="BCa",
+            rng=np.random.default_rng(seed),
+        )
+        # BCa has no ends if all resamples agree, or if a ratio is infinite in some: percentiles have.
+        shares = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
+        plain = np.quantile(made.bootstrap_distribution, shares, axis=-1, method="inverted_cdf")
+    ends = np.where(np.isnan(made.confidence_interval), plain, made.confidence_interval)
+    rows = np.where(np.isfinite(values), [values, *ends], np.nan).T
+    return tuple(BoundedFigure(*map(float, row)) for row in rows)
 
 
-def _hazen(count: int | Places, percent: float) -> tuple[Places, Places, Floats]:
+def _hazen(count: Places, percent: float) -> tuple[Places, Places, Floats]:
     """Return the places of the two order statistics that a percentile lies between, and the weight of the second."""
     place: Floats = np.clip(np.multiply(count, percent / 100) - 0.5, 0, np.subtract(count, 1))
     low: Places = place.astype(np.int64)
@@ -87,7 +128,7 @@ class ErrorSample:
     - `errors`: (N,) float64, sorted.
     """
 
-    order: npt.NDArray[np.int64]
+    order: Places
     errors: Floats
 
     @classmethod
@@ -106,7 +147,7 @@ class ErrorSample:
         """Return the statistics (6,) float64 of the errors themselves."""
         return self.statistics(np.ones((1, len(self.order)), np.int64))[0]
 
-    def statistics(self, counts: npt.NDArray[np.int64]) -> Floats:
+    def statistics(self, counts: Places) -> Floats:
         """Return the statistics (B, 6) float64 of resamples given as counts (B, N) of the images, not sorted."""
         rows, images = counts.shape
         counts = counts[:, self.order]
@@ -133,98 +174,10 @@ class ErrorSample:
         under_sum = np.where(below >= 0, sums[row, below], 0)
         under_count = np.where(below >= 0, reached[row, below], 0)
         worst = (sums[:, -1] - under_sum) / (number - under_count)
-        return _with_avg(sums[:, -1] / number, q2, (q1 + 2 * q2 + q3) / 4, best, worst)
-
-    def without_each(self, groups: Places | None = None) -> Floats:
-        """Return the statistics (N, 6) float64 of the errors without one image, in the images' own order.
-
-        `groups`: (N,) int64, as in `resamples`; the statistics (G, 6) are then those without one group.
-        """
-        number = len(self.order)
-        if groups is not None:
-            kinds, some = int(groups.max()) + 1, max(1, _AT_ONCE // number)
-            left = [
-                self.statistics((groups != np.arange(start, min(start + some, kinds))[:, None]).astype(np.int64))
-                for start in range(0, kinds, some)
-            ]
-            return np.concatenate(left)
-        if number == 1:
-            return self.estimate()[None]
-        errors, place, rest = self.errors, np.arange(number), number - 1
-        sums = np.concatenate([[0.0], np.cumsum(errors)])
-
-        def quantile(percent: float) -> Floats:
-            low, high, weight = _hazen(rest, percent)
-            first, second = (errors[k + (place <= k)] for k in (low, high))
-            return first + (second - first) * weight
-
-        q1, q2, q3 = (quantile(percent) for percent in (25, 50, 75))
-        upto = np.searchsorted(errors, q1, side="right")
-        own = errors <= q1
-        best = (sums[upto] - errors * own) / (upto - own)
-        above = np.searchsorted(errors, q3, side="left")
-        own = errors >= q3
-        worst = (sums[-1] - sums[above] - errors * own) / (number - above - own)
-        sorted_ones = _with_avg((sums[-1] - errors) / rest, q2, (q1 + 2 * q2 + q3) / 4, best, worst)
-        given = np.empty_like(sorted_ones)
-        given[self.order] = sorted_ones
-        return given
-
-
-def _with_avg(*parts: Floats) -> Floats:
-    """Return the five statistics and their geometric mean (…, 6); numbers below 0 have none (NaN)."""
-    five = np.stack(parts, axis=-1)
-    # Sums that cancel may leave a negative last digit where all errors are 0.
-    above = np.where(five < 0, np.nan, five)
-    return np.concatenate([five, np.prod(above**0.2, axis=-1, keepdims=True)], axis=-1)
-
-
-def bca(estimate: float, replicates: Floats, left_out: list[Floats], level: float) -> tuple[float, float]:
-    """Return the ends of the BCa interval (Efron 1987, equations 2.3 and 6.6).
-
-    `replicates`: (B,) float64, that of the resamples; infinite ones, where a ratio's divisor is 0, count as large.
-    `left_out`: for each independent sample (N,) float64, the statistic without one of its images, or groups of them.
-    """
-    if not 0 < level < 1:
-        raise InputError(f"a confidence of {level:g}; expected one between 0 and 1, such as .95")
-    if np.isnan(estimate) or np.isnan(replicates).any():
-        return np.nan, np.nan
-    count = len(replicates)
-    # A rounded difference must not count as one where resamples are the images themselves.
-    near = np.isclose(replicates, estimate, rtol=1e-12, atol=0)
-    below = float(((replicates < estimate) & ~near).sum() + near.sum() / 2)
-    bias = _NORMAL.inv_cdf(min(max(below, 0.5), count - 0.5) / count)
-    cubes = squares = 0.0
-    for values in left_out:
-        # The influence of each image, or group of them, on the statistic, over their number.
-        influence = (values.mean() - values) * (len(values) - 1) / len(values)
-        cubes += float((influence**3).sum())
-        squares += float((influence**2).sum())
-    acceleration = cubes / (6 * squares**1.5) if squares > 0 else 0.0
-    ends = [bias + _NORMAL.inv_cdf(share) for share in ((1 - level) / 2, (1 + level) / 2)]
-    ranks = np.array([_NORMAL.cdf(bias + end / (1 - acceleration * end)) for end in ends])
-    ordered = np.sort(replicates)
-    # The (B + 1) α-th replicate, as Davison and Hinkley have it; between two of them, straight.
-    places: Floats = np.clip((count + 1) * ranks - 1, 0, count - 1)
-    low = np.floor(places).astype(np.int64)
-    high = np.minimum(low + 1, count - 1)
-    weight = places - low
-    with np.errstate(invalid="ignore"):
-        between = np.where(weight > 0, ordered[low] * (1 - weight) + ordered[high] * weight, ordered[low])
-    return float(between[0]), float(between[1])
-
-
-Statistic = Literal["mean", "median", "trimean", "best25", "worst25", "avg"]
-"""The numbers of `evaluation.metrics.Summary`, by their names there."""
-
-STATISTICS: tuple[Statistic, ...] = ("mean", "median", "trimean", "best25", "worst25", "avg")
-"""All of them, in the order of the paper's tables."""
-
-_COUNT: Final = 2000
-"""Resamples: the ends of a 95 % interval then vary by some 2 % of its length (one standard deviation) between seeds."""
-
-_LEVEL: Final = 0.95
-"""Confidence of an interval: the usual one."""
+        five = np.stack([sums[:, -1] / number, q2, (q1 + 2 * q2 + q3) / 4, best, worst], axis=-1)
+        # Sums that cancel may leave a negative last digit if all errors are 0.
+        above = np.where(five < 0, np.nan, five)
+        return np.concatenate([five, np.prod(above**0.2, axis=-1, keepdims=True)], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -232,104 +185,51 @@ class Compared:
     """A statistic of one set of errors against that of another.
 
     - `one`, `other`: its values, in the unit of the errors.
-    - `difference`: one - other, with the ends of its confidence interval.
-    - `ratio`: one / other, with the ends of its confidence interval; all NaN where `other` is 0.
+    - `difference`: one - other.
+    - `ratio`: one / other; all NaN if `other` is 0.
     """
 
     statistic: Statistic
     one: float
     other: float
-    difference: tuple[float, float, float]
-    ratio: tuple[float, float, float]
+    difference: BoundedFigure
+    ratio: BoundedFigure
 
 
 def paired(
     errors_a: npt.ArrayLike,
     errors_b: npt.ArrayLike,
     seed: int = 0,
-    count: int = _COUNT,
-    level: float = _LEVEL,
+    count: int = RESAMPLES,
     groups: Sequence[str] | None = None,
 ) -> tuple[Compared, ...]:
     """Return difference and ratio of every statistic for two methods on the same images.
 
     The same images are drawn for both, so what makes an image hard for both methods does not widen the intervals.
-    `errors_a`, `errors_b`: (N,) float each, N ≥ 1, finite, in the same order of images. `groups`: what each image
-    shares with others, such as its picture: those of one group are drawn together; None if every image is one of its
-    own. Of a single group there are no intervals: their ends are NaN.
+    `errors_a`, `errors_b`: (N,) float each, N ≥ 1, finite, in the same order of images. `groups`: see
+    `bounded_figures`.
     """
     one, other = ErrorSample.of(errors_a), ErrorSample.of(errors_b)
-    if len(one.order) != len(other.order):
+    images = len(one.order)
+    if images != len(other.order) or (groups is not None and images != len(groups)):
         raise InputError(
-            f"{len(one.order)} errors of one method and {len(other.order)} of the other; expected those of the same "
-            "images in the same order: match them by name first"
+            f"{images} errors of one method, {len(other.order)} of the other and {len(groups or ())} groups; expected "
+            "those of the same images in the same order: match them by name first"
         )
-    numbers = None if groups is None else numbered(groups)
-    if numbers is not None and len(numbers) != len(one.order):
-        raise InputError(f"{len(numbers)} groups of {len(one.order)} errors; expected one an image")
-    if numbers is not None and not numbers.any():
-        # What one picture comes to says nothing of others: no number of its images makes an interval.
-        lost: Floats = np.full((1, len(STATISTICS)), np.nan)
-        return _compare(one, other, (lost, lost), [], level)
-    drawn = [(one.statistics(some), other.statistics(some)) for some in resamples(len(one.order), seed, count, numbers)]
-    first, second = (np.concatenate(side) for side in zip(*drawn, strict=True))
-    return _compare(one, other, (first, second), [(one.without_each(numbers), other.without_each(numbers))], level)
 
+    def statistics(counts: Places) -> Floats:
+        first, second = one.statistics(counts), other.statistics(counts)
+        return np.concatenate([first - second, ratio_of(first, second)], axis=-1)
 
-def independent(
-    errors_a: npt.ArrayLike, errors_b: npt.ArrayLike, seed: int = 0, count: int = _COUNT
-) -> tuple[Compared, ...]:
-    """Return difference and ratio of every statistic for two sets of images that have nothing to do with each other.
-
-    `errors_a`, `errors_b`: (N,) and (M,) float, N and M ≥ 1, finite: errors, or any other number an image; each is
-    resampled by itself.
-
-    Examples
-    --------
-    >>> some, others = np.linspace(1, 3, 200), np.linspace(2, 6, 100)
-    >>> mean = independent(some, others)[0]
-    >>> f"{mean.statistic} {mean.ratio[0]:.3f}", mean.ratio[1] < 0.5 < mean.ratio[2]
-    ('mean 0.500', True)
-    """
-    one, other = ErrorSample.of(errors_a), ErrorSample.of(errors_b)
-    # Two streams of one seed: independent, unlike two generators of equal or neighbouring states.
-    seeds = np.random.SeedSequence(seed).spawn(2)
-    first, second = (
-        np.concatenate([sample.statistics(some) for some in resamples(len(sample.order), stream, count)])
-        for sample, stream in zip((one, other), seeds, strict=True)
+    made = bounded_figures(statistics, images, groups, seed, count)
+    values = zip(STATISTICS, one.estimate().tolist(), other.estimate().tolist(), strict=True)
+    return tuple(
+        Compared(statistic, first, second, made[place], made[place + len(STATISTICS)])
+        for place, (statistic, first, second) in enumerate(values)
     )
-    left_out = [(one.without_each(), other.estimate()[None]), (one.estimate()[None], other.without_each())]
-    return _compare(one, other, (first, second), left_out, _LEVEL)
 
 
-def _compare(
-    one: ErrorSample,
-    other: ErrorSample,
-    replicates: tuple[Floats, Floats],
-    left_out: Sequence[tuple[Floats, Floats]],
-    level: float,
-) -> tuple[Compared, ...]:
-    """Return difference and ratio of every statistic.
-
-    `replicates`: (B, 6) float64 of either. `left_out`: for each independent sample the statistics of both without one
-    of its images, or groups of them, (N, 6) float64, or (1, 6) of the one that has them all.
-    """
-
-    def told(rule: Callable[[Floats, Floats], Floats], place: int) -> tuple[float, float, float]:
-        a, b = one.estimate()[place], other.estimate()[place]
-        estimate = float(rule(a, b))
-        drawn = rule(replicates[0][:, place], replicates[1][:, place])
-        across = [rule(first[:, place], second[:, place]) for first, second in left_out]
-        return (estimate, *bca(estimate, drawn, across, level))
-
-    compared: list[Compared] = []
-    for place, name in enumerate(STATISTICS):
-        a, b = float(one.estimate()[place]), float(other.estimate()[place])
-        ratio = told(_divide, place) if b else (np.nan, np.nan, np.nan)
-        compared.append(Compared(name, a, b, told(np.subtract, place), ratio))
-    return tuple(compared)
-
-
-def _divide(one: Floats, other: Floats) -> Floats:
+def ratio_of(one: Floats, other: Floats) -> Floats:
+    """Return one / other; infinite, or NaN for 0 / 0, if `other` is 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return one / other

@@ -1,8 +1,8 @@
-"""A chart without tags in a picture: the field of its cells is found by its outline, and recognised by its colours.
+"""A chart without tags in a picture: the outline of its field of cells, traced from corners that are given.
 
-Candidates come from the outlines in the picture (the field against its white margin, the sheet against what is behind),
-or from corners given by hand. Each is drawn onto the edge between cells and paper and tried in all four turns, and
-mirrored; the one whose cells have the chart's colours is the field. A light that does not tell turns apart is an error.
+The corners are given by hand, or they are the corners in another frame of the session. The outline is drawn onto the
+edge between cells and paper near them. The chart's colours must fit what is seen inside; corners in a wrong order, and
+a mirrored picture, are an error.
 
 Corners given by hand are pixels of the raw file as it is stored, not turned by a viewer; x right, y down, the first
 pixel of the visible picture at 0,0; clockwise from the corner that is printed top-left. All other places are half-size
@@ -12,7 +12,7 @@ pixels. Lenses bend the outline: it is followed as it is, and `homography` is th
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -31,9 +31,6 @@ MIN_SIGNAL = 12.0
 
 CORNER_REACH_PX = 24.0
 """How far from a guess the field's outline is looked for."""
-
-SAME_PX = 3.0
-"""Half-size pixels by which corners of the same outline may differ when it is reached from different guesses."""
 
 SIDE_POINTS = 160
 """Places along a side at which the edge is looked for: many times the six coefficients of its curve."""
@@ -54,16 +51,10 @@ MIRRORED = 4
 """Of the eight orientations of a rectangle the first that is mirrored."""
 
 _SMALL_WIDTH_PX = 640
-"""Width of the small raster on which outlines are looked for: cells of a few pixels close into one dark field there."""
-
-_LEAST_AREA = 0.1
-"""Share of the picture that a field takes at least; what is smaller cannot be sampled."""
+"""Width of the small raster on which the level of paper is looked for."""
 
 _LEAST_LIGHT, _MUCH_LIGHT = 0.03, 0.2
 """Light of a colour over that of the strongest: to be looked at for colours, and for edges."""
-
-_THRESHOLDS = (0.35, 0.45, 0.55, 0.65, 0.75, 0.85)
-"""Of paper: levels at which outlines are looked for, since nobody knows how dark the cells at the edge are."""
 
 _PROFILE_STEP_PX = 0.5
 """Step of the profiles across an edge: half a half-size pixel, a photosite."""
@@ -161,6 +152,14 @@ def field_mm(chart: Chart) -> _Points:
     return np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
 
 
+HOW_TO_GIVE_CORNERS = (
+    "give the corners of its field of cells by --corners, for example --corners 297,90 4866,160 4805,3319 296,3326: "
+    "x,y in pixels of the raw file as it is stored, clockwise from the corner that is printed top-left; read them off "
+    "the ticks at the border of the picture that acquire check --picture saves, or in an image viewer"
+)
+"""The remedy of every message about a field of cells whose place is not known."""
+
+
 def find_field(
     planes: Sequence[Plane],
     chart: Chart,
@@ -172,8 +171,7 @@ def find_field(
 
     `corners_px`: (4, 2) float half-size px, the field's corners if they are given by hand, clockwise from the printed
     top-left, to some 20 px; their order gives the orientation of the chart. `near_px`: (4, 2) float half-size px, the
-    field's corners in another frame of the session, in the same order: they give the orientation, and the field may lie
-    elsewhere.
+    field's corners in another frame of the session, in the same order.
     """
     white = max(paper_level(plane) for plane in planes)
     if white < MIN_SIGNAL:
@@ -181,56 +179,29 @@ def find_field(
             f"{what} is dark: its brightest parts are {max(white, 0.0):.0f} counts above black, at least "
             f"{MIN_SIGNAL:.0f} expected; switch the projector on, open its shutter, expose longer"
         )
+    if near_px is not None:
+        return _moved_field(planes, chart, np.asarray(near_px, dtype=np.float64), what)
+    if corners_px is None:
+        raise RegistrationError(
+            f"{what}: the chart has no tags by which it is found, and no corners are given; {HOW_TO_GIVE_CORNERS}"
+        )
+    return _given_field(PreparedPicture.of(planes), chart, np.asarray(corners_px, dtype=np.float64), what)
+
+
+def _moved_field(planes: Sequence[Plane], chart: Chart, near_px: _Points, what: str) -> FoundField:
+    """Return the field near its corners (4, 2) half-size px in another frame."""
     picture = PreparedPicture.of(planes)
-    looked_for = f"the field of {chart.colour_count} cells, a rectangle of colours on white paper,"
-    if corners_px is not None:
-        return _given_field(picture, chart, np.asarray(corners_px, dtype=np.float64), what)
-    tries: list[tuple[float, float, int, _Placed]] = []
-    outlines: list[Outline] = []
-    for quad in picture.quads():
-        for start in _starts(quad, chart):
-            if any(same_corners(start, known.corners_px, SAME_PX) for known in outlines):
-                continue
-            outline = trace_outline(picture, start)
-            if outline is None or any(
-                same_corners(outline.corners_px, known.corners_px, SAME_PX) for known in outlines
-            ):
-                continue
-            outlines.append(outline)
-            for turn, placed in _orientations(outline, chart, near_px):
-                tries.append((*_misfit(picture, placed, chart), turn, placed))
-    if not tries:
-        raise RegistrationError(
-            f"{what}: {looked_for} was looked for, and no large rectangle was found; point the camera at the chart, "
-            "light all of it, or give its corners by hand (--corners)"
-        )
-    tries.sort(key=lambda tried: tried[0])
-    misfit, unexplained, turn, placed = tries[0]
-    if 1 - unexplained < MIN_EXPLAINED:
-        raise RegistrationError(
-            f"{what}: {looked_for} was looked for, and the most similar rectangle has its corners at "
-            f"{corners_text(placed.corners_px)}, but the chart's colours explain {max(1 - unexplained, 0):.0%} of "
-            f"the brightness seen there, at least {MIN_EXPLAINED:.0%} expected; name the chart.json of this print, "
-            "uncover it, or give its corners by hand (--corners)"
-        )
-    near = 0.05 * float(np.ptp(placed.corners_px, axis=0).max())
-    rivals = [
-        other[0]
-        for other in tries
-        if other[2] != turn and np.abs(other[3].corners_px.mean(axis=0) - placed.corners_px.mean(axis=0)).max() < near
-    ]
-    if min(rivals, default=1.0) < MIN_ADVANTAGE * misfit:
-        raise RegistrationError(
-            f"{what}: a field of cells has its corners at {corners_text(placed.corners_px)}, but under this light "
-            "it is not certain which way up it hangs; take a white frame, or give its corners by hand (--corners), "
-            "clockwise from the printed top-left"
-        )
-    if turn >= MIRRORED:
-        raise RegistrationError(
-            f"{what} is mirrored: the chart's colours fit only in a mirror; "
-            "take the frame without a mirror, or print the chart unmirrored"
-        )
-    return placed.field(1 - unexplained)
+    outline = trace_outline(picture, near_px)
+    if outline is not None:
+        placed = _Placed.of(outline, chart, 0)
+        explained = 1 - _misfit(picture, placed, chart)[1]
+        if explained >= MIN_EXPLAINED:
+            return placed.field(explained)
+    raise RegistrationError(
+        f"{what}: the field of cells was expected within {2 * CORNER_REACH_PX:.0f} pixels of {corners_text(near_px)}, "
+        "where it lies in another frame, and it is not there; uncover the chart and light all of it, or, if it was "
+        "moved, make a session of its own of the frames that follow"
+    )
 
 
 def _given_field(picture: PreparedPicture, chart: Chart, corners_px: _Points, what: str) -> FoundField:
@@ -265,28 +236,6 @@ def _given_field(picture: PreparedPicture, chart: Chart, corners_px: _Points, wh
         f"{what}: the corners given, {text}, do not begin at the printed top-left: the chart's colours fit if they are "
         f"{corners_text(np.roll(corners_px, -likely, axis=0))}; give them in this order"
     )
-
-
-def _orientations(outline: Outline, chart: Chart, near_px: npt.ArrayLike | None) -> list[tuple[int, _Placed]]:
-    """Return the chart laid into an outline in all eight orientations, or in the one nearest to the corners (4, 2)."""
-    placings = [(turn, _Placed.of(outline, chart, turn)) for turn in range(8)]
-    if near_px is None:
-        return placings
-    near = np.asarray(near_px, dtype=np.float64)
-    return [min(placings[:MIRRORED], key=lambda placing: float(np.abs(placing[1].corners_px - near).sum()))]
-
-
-def _starts(quad: _Points, chart: Chart) -> Generator[_Points]:
-    """Yield where the field's corners would be if a quadrilateral were the field, or the sheet lying either way."""
-    yield quad
-    width, height = chart.page_mm
-    for turned in (0, 1):
-        homography = fit_homography(
-            np.array([(0, 0), (width, 0), (width, height), (0, height)], dtype=np.float64),
-            np.roll(quad, turned, axis=0),
-        )
-        if homography is not None:
-            yield np.roll(project(homography, field_mm(chart)), -turned, axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -458,7 +407,7 @@ def require_corners(corners_px: _Points, shape: tuple[int, int] | None = None) -
 
 @dataclass(frozen=True, eq=False)
 class PreparedPicture:
-    """A picture prepared for the search.
+    """A picture in which the edge between cells and paper is looked for.
 
     - `planes`: the colours that carry light, slightly smoothed.
     - `channels`: which these are: 0, 1, 2.
@@ -466,7 +415,6 @@ class PreparedPicture:
     - `bright`: for each, whether it carries enough light for its noise not to be taken for something darker than paper.
     - `shape`: height and width, half-size px.
     - `factor`: half-size pixels per element of the small raster.
-    - `paleness`: (h, w) float32 on the small raster: the least of the colours over paper's, 1 for paper.
     """
 
     planes: tuple[Plane, ...]
@@ -475,18 +423,16 @@ class PreparedPicture:
     bright: tuple[bool, ...]
     shape: tuple[int, int]
     factor: int
-    paleness: _Float
 
     @classmethod
     def of(cls, planes: Sequence[Plane]) -> PreparedPicture:
-        """Return the planes of red, green and blue prepared for the search."""
+        """Return the planes of red, green and blue as the search for the edge needs them."""
         height, width = planes[0].values.shape
         factor = max(1, round(width / _SMALL_WIDTH_PX))
         size = (width // factor, height // factor)
         brightest = [paper_level(plane) for plane in planes]
         used = [k for k, level in enumerate(brightest) if level >= max(MIN_SIGNAL, _LEAST_LIGHT * max(brightest))]
         levels: list[_Float] = []
-        paleness = np.full(size[::-1], np.inf, dtype=np.float32)
         for k in used:
             whole = planes[k].values[: size[1] * factor, : size[0] * factor]
             small = cv2.blur(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), (3, 3))
@@ -495,12 +441,9 @@ class PreparedPicture:
             level = cv2.blur(cv2.dilate(small, np.ones((reach, reach), dtype=np.uint8)), (reach, reach))
             level = np.maximum(level, np.float32(0.2 * brightest[k])).astype(np.float32)
             levels.append(level)
-            if brightest[k] >= _MUCH_LIGHT * max(brightest):
-                paleness = np.minimum(paleness, small / level)
         smooth = tuple(replace(planes[k], values=cv2.blur(planes[k].values, (3, 3)).astype(np.float32)) for k in used)
         bright = tuple(brightest[k] >= _MUCH_LIGHT * max(brightest) for k in used)
-        shape = height, width
-        return cls(smooth, tuple(used), tuple(levels), bright, shape, factor, paleness.astype(np.float32))
+        return cls(smooth, tuple(used), tuple(levels), bright, (height, width), factor)
 
     def small(self, places_px: _Points) -> _Points:
         """Return places (..., 2) float64 half-size px as places on the small raster."""
@@ -520,41 +463,6 @@ class PreparedPicture:
             found = np.minimum(found, seen / paper)
         return found
 
-    def quads(self) -> list[_Points]:
-        """Return large quadrilaterals, (4, 2) float64 half-size px, clockwise, that outlines in the picture resemble.
-
-        Outlines at several thresholds (S. Suzuki and K. Abe, "Topological structural analysis of digitized binary
-        images by border following", 1985, as OpenCV's `findContours` has it); their convex hulls are reduced to four
-        corners.
-        """
-        found: list[_Points] = []
-        area = float(self.paleness.size)
-        for threshold in _THRESHOLDS:
-            pale = (self.paleness > threshold).astype(np.uint8)
-            outlines = list(cv2.findContours(pale, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0])
-            dark = cv2.findContours(1 - pale, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]
-            inner = [outline for outline in dark if not self._touches_border(outline)]
-            if inner:
-                # A bright cell at the field's edge may open its outline; what is dark inside still spans it.
-                outlines.append(np.concatenate(inner))
-            for outline in outlines:
-                hull = cv2.convexHull(outline)
-                if len(hull) < 4 or not _LEAST_AREA * area < cv2.contourArea(hull) < 0.99 * area:
-                    continue
-                quad = np.asarray(cv2.approxPolyN(hull, 4), dtype=np.float64).reshape(-1, 2)
-                if len(quad) != 4 or cv2.contourArea(hull) < 0.85 * cv2.contourArea(quad.astype(np.float32)):
-                    continue
-                quad = quad * self.factor + (self.factor - 1) / 2
-                if cv2.contourArea(quad.astype(np.float32), oriented=True) < 0:
-                    quad = quad[::-1]
-                if not any(same_corners(quad, other, 2.0 * self.factor) for other in found):
-                    found.append(quad)
-        return found
-
-    def _touches_border(self, outline: npt.NDArray[np.generic]) -> bool:
-        x, y, width, height = cv2.boundingRect(np.asarray(outline, dtype=np.int32))
-        return x <= 0 or y <= 0 or x + width >= self.paleness.shape[1] or y + height >= self.paleness.shape[0]
-
 
 @dataclass(frozen=True, eq=False)
 class Outline:
@@ -566,11 +474,6 @@ class Outline:
     corners_px: _Points
     sides_px: tuple[_Points, ...]
     normals: tuple[_Points, ...]
-
-
-def same_corners(one: _Points, other: _Points, tolerance: float) -> bool:
-    """Return whether two quadrilaterals (4, 2) agree to a tolerance in their unit, whichever corner they begin with."""
-    return any(np.abs(one - np.roll(other, turn, axis=0)).max() < tolerance for turn in range(4))
 
 
 def _outwards(start: _Points, end: _Points) -> _Points:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from drivers.raw.rawfile import CHANNELS, Mosaic, Plane, frame_black, plane_of, strongest_plane
 from experiment.chart.model import TAG_MODULES, Chart
-from experiment.framing.field import MIN_SIGNAL, FoundField, PreparedPicture, corners_text, find_field, paper_level
+from experiment.framing.field import MIN_SIGNAL, FoundField, corners_text, find_field, paper_level
 from experiment.framing.homography import project, rms, robust_homography
 from foundation.errors import InputError, RegistrationError
 
@@ -106,7 +106,7 @@ def find_chart(
     """Return the place and the pose of `chart` in a picture.
 
     `corners`: (4, 2) float half-size px, corners of the field of cells, clockwise from the printed top-left, for a
-    chart without tags; found automatically if not given.
+    chart without tags. `near`: the chart in another frame of the session, by which a chart without tags is found.
     """
     if chart.tags and corners is not None:
         raise InputError(
@@ -264,8 +264,8 @@ _Image = npt.NDArray[np.uint8]
 def annotated_png(mosaic: Mosaic, chart: Chart, framing: Framing | None) -> bytes:
     """Return a frame, stretched to be seen, as PNG bytes: half-size, with what was found, or looked for, drawn on it.
 
-    Found are the page's outline and tags, or the outline of the field. Where the chart was not found, the picture says
-    what was looked for, and shows what came nearest: tags of any number, or large outlines.
+    Found are the page's outline and tags, or the outline of the field. If tags were not found, the picture
+    shows tags of any number, and which were looked for; of a chart without tags, it says how to give corners.
     """
     black = frame_black(mosaic)
     plane = framing.plane if framing is not None else strongest_plane(mosaic, black)
@@ -283,7 +283,11 @@ def annotated_png(mosaic: Mosaic, chart: Chart, framing: Framing | None) -> byte
     elif chart.tags:
         _draw_missing_tags(image, plane, chart)
     else:
-        _draw_rectangles(image, [plane_of(mosaic, channel, black) for channel in CHANNELS], chart)
+        _draw_text(
+            image,
+            "this chart has no tags: give the corners of its field of cells by --corners,",
+            "X,Y as the ticks at the border count, clockwise from the printed top-left",
+        )
     return cv2.imencode(".png", image)[1].tobytes()
 
 
@@ -296,17 +300,6 @@ def _draw_missing_tags(image: _Image, plane: Plane, chart: Chart) -> None:
         image,
         f"looked for: {len(ids)} AprilTags 36h11, ids {ids[0]} to {ids[-1]}",
         f"found: {', '.join(str(tag.id) for tag in found[:12]) or 'none'}",
-    )
-
-
-def _draw_rectangles(image: _Image, planes: list[Plane], chart: Chart) -> None:
-    quads = PreparedPicture.of(planes).quads()
-    for quad in quads:
-        _draw_outline(image, quad, AMBER, 1)
-    _draw_text(
-        image,
-        f"looked for: a rectangle of {chart.colour_count} cells in white paper",
-        f"found: {len(quads) or 'no'} large rectangles, none of these cells",
     )
 
 

@@ -271,6 +271,11 @@ class PaperReader:
         return factor[: len(page_powers(order))]
 
 
+def falloff(light: _Array) -> _Array:
+    """Return (3,) float64, the share of light that the darkest of N places lacks of the brightest; `light` (N, 3)."""
+    return np.asarray(1 - light.min(axis=0) / light.max(axis=0), dtype=np.float64)
+
+
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """The light at N references by the terms that forecast best.

@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, Final, TypeVar
 
@@ -52,9 +51,6 @@ from foundation.folders import held_folder, require_free, unmounted_at, whole_fo
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""
-
-_DECODED: Final = "decoded"
-"""Record of a session whose frames were all looked at by software that sees damage inside of lossless JPEG."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +106,6 @@ class Session:
                     "restore it from a copy"
                 )
 
-    @cached_property
-    def frames_are_known_whole(self) -> bool:
-        """Whether each frame was decoded to its end when it was taken, which older software did not do."""
-        return _DECODED in self.journal.records()
-
     @classmethod
     def create(
         cls,
@@ -134,9 +125,7 @@ class Session:
             chart.save(new / "chart.json")
             save_illuminations(illuminations, new / "illuminations.csv")
             Journal.create(new / JOURNAL_FILE, steps)
-        session = cls.open_for_run(folder)
-        session.journal.record(_DECODED, "each frame, to its end, when it was taken")
-        return session
+        return cls.open_for_run(folder)
 
     @classmethod
     def open(cls, folder: Path) -> Session:
@@ -210,10 +199,7 @@ class Session:
         self.steps = self.journal.steps()
 
     def verify(self, observe: Callable[[int, int], None] = lambda done, total: None) -> tuple[str, ...]:
-        """Void the accepted frames whose files are gone or changed, so that they are taken again; return why, each.
-
-        Where older software left a step with several accepted frames, all but the newest sound one are voided too.
-        """
+        """Void the accepted frames whose files are gone or changed, so that they are taken again; return why, each."""
         unsound = unsound_files(self.folder, self.journal.accepted_files(), observe)
         for attempt, reason in unsound.items():
             self.journal.void([attempt], datetime.now(UTC), reason)

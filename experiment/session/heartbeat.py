@@ -146,7 +146,7 @@ class Heartbeat:
     - `state`: what the run does.
     - `sentence`: the same in words, for people.
     - `until`: when the next sign of life is due at the latest.
-    - `place`: the session for which it was given; None where the run did not say, as older software.
+    - `place`: the session for which it was given; None where the run could not tell.
     """
 
     at: datetime

@@ -36,7 +36,6 @@ from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from experiment.session.heartbeat import INVENTED_NUMBERS, Heartbeat, Process, RunState, SessionPlace, file_system_of
 from experiment.session.opening import (
-    JOURNAL_VERSION,
     Retry,
     beside,
     close_after_run,
@@ -154,10 +153,9 @@ class Journal:
     `retry`: with which other programs are waited for; None for a reader, for whom SQLite waits.
     """
 
-    def __init__(self, path: Path, connection: sqlite3.Connection, version: int, retry: Retry | None = None) -> None:
+    def __init__(self, path: Path, connection: sqlite3.Connection, retry: Retry | None = None) -> None:
         self.path = path
         self._connection = connection
-        self._version = version
         self._writes = retry is not None
         self._retry = retry or _LockRetry(path, 0, lambda sentence: None)
         self._ledger: _Ledger | None = None
@@ -168,13 +166,13 @@ class Journal:
     def create(path: Path, steps: Sequence[SessionStep]) -> None:
         """Write a new journal with the plan and nothing else."""
         alone = _LockRetry(path, 0, lambda sentence: None)
-        with closing(Journal(path, create_file(path), JOURNAL_VERSION, alone)) as journal:
+        with closing(Journal(path, create_file(path), alone)) as journal:
             journal.add_steps(steps)
 
     @classmethod
     def open(cls, path: Path) -> Journal:
         """Open a journal to read it, also while a run writes it; nothing is created or changed."""
-        return cls(path, *open_to_read(path))
+        return cls(path, open_to_read(path))
 
     @classmethod
     def open_for_run(
@@ -183,9 +181,9 @@ class Journal:
         patience_s: float = PATIENCE_S,
         announce: Callable[[str], object] = lambda sentence: None,
     ) -> Journal:
-        """Open a journal to write it; one of an older version gets what it lacks."""
+        """Open a journal to write it."""
         retry = _LockRetry(path, patience_s, announce)
-        return cls(path, open_for_run(path, retry), JOURNAL_VERSION, retry)
+        return cls(path, open_for_run(path, retry), retry)
 
     @staticmethod
     def rebuild(path: Path, rows: Rows) -> None:
@@ -320,22 +318,22 @@ class Journal:
 
     def records(self) -> dict[str, str]:
         """Return what the session was taken with, by key."""
-        return dict(self._newer_rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
+        return dict(self._rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
 
     def heartbeat(self) -> Heartbeat | None:
         """Return the newest sign of life; None if none was ever given."""
-        rows = self._newer_rows("SELECT at, pid, started, host, boot, state, sentence, until FROM heartbeat")
+        rows = self._rows("SELECT at, pid, started, host, boot, state, sentence, until FROM heartbeat")
         if not rows:
             return None
         at, *process, state, sentence, until = rows[0]
-        said = self._newer_rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
+        said = self._rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
         place = SessionPlace.from_text(said[0][0]) if said else None
         begun, due = datetime.fromisoformat(at), datetime.fromisoformat(until)
         return Heartbeat(begun, Process(*process), state, sentence, due, place)
 
     def run_state(self) -> RunState | None:
         """Return what the newest sign of life says that the run does; None if none was ever given."""
-        rows = self._newer_rows("SELECT state FROM heartbeat")
+        rows = self._rows("SELECT state FROM heartbeat")
         return rows[0][0] if rows else None
 
     def attempts(self, numbers: Sequence[int] | None = None) -> list[Attempt]:
@@ -363,24 +361,24 @@ class Journal:
     def details(self, attempts: Sequence[int] | None = None) -> dict[int, AttemptDetails]:
         """Return what is kept of attempts, those of these numbers or all, by number, oldest first; see `begin`.
 
-        Those of which nothing is kept, as in journals of version 1, are not there.
+        Attempts of which nothing is kept are left out.
         """
         among, numbers = _among("attempt", attempts)
         seen: dict[int, tuple[float, float, float]] = {
             attempt: (red, green, blue)
-            for attempt, red, green, blue in self._newer_rows(
+            for attempt, red, green, blue in self._rows(
                 f"SELECT attempt, red, green, blue FROM measurements WHERE red IS NOT NULL AND {among}", numbers
             )
         }
         checks: dict[int, list[Check]] = {}
-        for attempt, *check in self._newer_rows(
+        for attempt, *check in self._rows(
             "SELECT attempt, name, value, low, high, unit, reason FROM checks"
             f" WHERE {among} ORDER BY attempt, position",
             numbers,
         ):
             checks.setdefault(attempt, []).append(Check(*check))
         timings: dict[int, dict[str, float]] = {}
-        for attempt, name, seconds in self._newer_rows(
+        for attempt, name, seconds in self._rows(
             f"SELECT attempt, name, seconds FROM timings WHERE {among} ORDER BY rowid", numbers
         ):
             timings.setdefault(attempt, {})[name] = seconds
@@ -392,7 +390,7 @@ class Journal:
     def measurements(self) -> Iterator[tuple[SessionStep, int, bytes, bool]]:
         """Return what the judge keeps of each frame, in taking order: step, attempt, bytes, and whether it counts."""
         plan = {step.number: step for step in self.steps()}
-        for attempt, step, data, verdict in self._newer_rows(
+        for attempt, step, data, verdict in self._rows(
             "SELECT id, step, data, verdict FROM attempts JOIN measurements ON attempt = id ORDER BY id"
         ):
             if step in plan and data:
@@ -422,16 +420,12 @@ class Journal:
         return int(self._rows(query, (step.number,))[0][0])
 
     def frames(self) -> list[FrameRecord]:
-        """Return every frame that was taken and judged, in the order of the plan, refused ones included.
-
-        Of a step with several accepted frames, as older software could leave them, the newest counts.
-        """
+        """Return every frame that was taken and judged, in the order of the plan, refused ones included."""
         rows = self._rows(
             "SELECT step, kind, illumination, file, sha256, taken_at, exposure_s, verdict, reason, id FROM attempts"
             " WHERE sha256 IS NOT NULL ORDER BY step, id"
         )
         self._require_known_kinds(row[1] for row in rows)
-        newest = {step: attempt for step, *_, verdict, _, attempt in rows if verdict == ACCEPTED}
         return [
             FrameRecord(
                 kind,
@@ -440,10 +434,10 @@ class Journal:
                 sha256,
                 datetime.fromisoformat(taken_at),
                 exposure_s,
-                _verdict_text(verdict, reason, newest.get(step, attempt) == attempt),
+                _verdict_text(verdict, reason),
                 attempt,
             )
-            for step, kind, light, file, sha256, taken_at, exposure_s, verdict, reason, attempt in rows
+            for _, kind, light, file, sha256, taken_at, exposure_s, verdict, reason, attempt in rows
         ]
 
     def _require_known_kinds(self, kinds: Iterable[str]) -> None:
@@ -452,10 +446,6 @@ class Journal:
                 f"{self.path} holds a frame of the kind {unknown[0]!r}, this software knows {', '.join(KINDS)}; use "
                 "the software that took the session"
             )
-
-    def _newer_rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        """Return rows of a table that journals of version 1 do not have."""
-        return [] if self._version < JOURNAL_VERSION else self._rows(query, values)
 
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
         """Return all rows at once, so that nothing is held once they are read."""
@@ -631,10 +621,10 @@ def _time(text: str | None) -> datetime | None:
     return datetime.fromisoformat(text) if text else None
 
 
-def _verdict_text(verdict: str, reason: str, newest: bool) -> str:
+def _verdict_text(verdict: str, reason: str) -> str:
     """Return a verdict as readers of frames know it: accepted, or refused with the reason."""
     if verdict == ACCEPTED:
-        return ACCEPTED if newest else f"{REFUSED}: taken again since"
+        return ACCEPTED
     return f"{REFUSED}: {reason}" if reason else REFUSED
 
 

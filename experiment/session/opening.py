@@ -42,10 +42,7 @@ _log = logging.getLogger(__name__)
 _DAMAGED: Final = "it is damaged, or not to be trusted"
 
 JOURNAL_VERSION = 2
-"""`PRAGMA user_version` of the journals that this software writes (docs/formats.md); version 1 is read."""
-
-_READABLE = (1, JOURNAL_VERSION)
-"""Versions that can be read; a run brings the older one up to date by adding what is missing."""
+"""`PRAGMA user_version` of the journals that this software writes and reads (docs/formats.md)."""
 
 TRY_S = 1.0
 """How long SQLite itself waits for another program before it gives the control back: as long as Ctrl-C may wait."""
@@ -60,7 +57,7 @@ _MOST_VALUE_BYTES: Final = 64 << 20
 MOST_BYTES: Final = {"chart.json": 256 << 20, "illuminations.csv": 16 << 20, "session.toml": 1 << 20}
 """Largest sizes of what is read whole beside a journal: forty times those of 707 lights and 32 768 colours."""
 
-_VERSION_1 = """
+_TABLES = """
 CREATE TABLE attempts (
     id INTEGER PRIMARY KEY,
     step INTEGER NOT NULL,
@@ -81,26 +78,23 @@ CREATE TABLE plan (
     red INTEGER NOT NULL, green INTEGER NOT NULL, blue INTEGER NOT NULL
 );
 CREATE TABLE events (id INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, detail TEXT NOT NULL);
-"""
-
-_VERSION_2 = """
-CREATE TABLE IF NOT EXISTS checks (
+CREATE TABLE checks (
     attempt INTEGER NOT NULL, position INTEGER NOT NULL, name TEXT NOT NULL,
     value REAL, low REAL, high REAL, unit TEXT NOT NULL, reason TEXT NOT NULL,
     PRIMARY KEY (attempt, position)
 );
-CREATE TABLE IF NOT EXISTS measurements (
+CREATE TABLE measurements (
     attempt INTEGER PRIMARY KEY, red REAL, green REAL, blue REAL, data BLOB NOT NULL,
     voids INTEGER NOT NULL, lasting INTEGER NOT NULL
 );
-CREATE TABLE IF NOT EXISTS timings (
+CREATE TABLE timings (
     attempt INTEGER NOT NULL, name TEXT NOT NULL, seconds REAL NOT NULL, PRIMARY KEY (attempt, name)
 );
-CREATE TABLE IF NOT EXISTS heartbeat (
+CREATE TABLE heartbeat (
     id INTEGER PRIMARY KEY CHECK (id = 1), at TEXT NOT NULL, pid INTEGER NOT NULL, started TEXT NOT NULL,
     host TEXT NOT NULL, boot TEXT NOT NULL, state TEXT NOT NULL, sentence TEXT NOT NULL, until TEXT NOT NULL
 );
-CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
+CREATE TABLE records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
 """
 
 _CANNOT_IN_PLACE = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
@@ -151,14 +145,14 @@ def create_file(path: Path) -> sqlite3.Connection:
     """Return a connection to a new journal with its tables and nothing in them."""
     try:
         connection = connect(path, "rwc")
-        _execute_all(connection, _VERSION_1 + _VERSION_2)
+        _make_tables(connection)
     except sqlite3.DatabaseError as error:
         raise StorageError(f"cannot write {path}: {error}; free space or choose another disk") from error
     return connection
 
 
-def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
-    """Return a connection that cannot write, and the journal's version."""
+def open_to_read(path: Path) -> sqlite3.Connection:
+    """Return a connection that cannot write."""
     require_plain_folder(path.parent, MOST_BYTES)
     try:
         # A run has all three; without the third nobody is at work, and reading in place would make it.
@@ -166,20 +160,21 @@ def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
             connection = _copied(path)
         else:
             connection = _opened_or_copied(path)
-        return connection, _checked(path, connection)
+        _require_journal(path, connection)
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_fault(path, error) from error
+    return connection
 
 
 def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
-    """Return a connection that writes, after bringing the journal up to this version and into write-ahead mode.
+    """Return a connection that writes, after bringing the journal into write-ahead mode.
 
     The caller holds the session's folder, so that no other run is at work. Who else writes is waited for.
     """
     require_plain_folder(path.parent, MOST_BYTES)
     try:
         connection = retry.run(lambda: connect(path, "rw"))
-        version = retry.run(lambda: _checked(path, connection))
+        retry.run(lambda: _require_journal(path, connection))
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_fault(path, error) from error
     try:
@@ -187,8 +182,6 @@ def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
             partial_path(path).unlink(missing_ok=True)
         if not _on_network(path):
             connection = _in_write_ahead(path, connection, retry)
-        if version < JOURNAL_VERSION:
-            retry.run(lambda: _execute_all(connection, _VERSION_2))
     except OSError as error:
         connection.close()
         raise storage_error(path, error) from error
@@ -334,22 +327,16 @@ def beside(path: Path, suffix: str) -> Path:
     return path.with_name(path.name + suffix)
 
 
-def _execute_all(connection: sqlite3.Connection, statements: str) -> None:
-    """Execute statements and set the newest version, all or nothing."""
+def _make_tables(connection: sqlite3.Connection) -> None:
     connection.execute("BEGIN IMMEDIATE")
-    try:
-        for statement in statements.split(";"):
-            connection.execute(statement)
-        connection.execute(f"PRAGMA user_version = {JOURNAL_VERSION}")
-        connection.execute("COMMIT")
-    except BaseException:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
-        raise
+    for statement in _TABLES.split(";"):
+        connection.execute(statement)
+    connection.execute(f"PRAGMA user_version = {JOURNAL_VERSION}")
+    connection.execute("COMMIT")
 
 
-def _checked(path: Path, connection: sqlite3.Connection) -> int:
-    """Return the journal's version; close the connection and refuse what is not known or lacks a table."""
+def _require_journal(path: Path, connection: sqlite3.Connection) -> None:
+    """Close the connection and refuse a file that is of another version, lacks a table, or holds what no run writes."""
     try:
         # Bounds what SQLite makes of a stranger's file, and lets nothing in its schema do more than hold rows.
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_VALUE_BYTES)
@@ -359,20 +346,19 @@ def _checked(path: Path, connection: sqlite3.Connection) -> int:
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not version and not tables:
             raise FormatError(f"{path} is damaged: it is empty; {restoring(path)}")
-        if version not in _READABLE:
+        if version != JOURNAL_VERSION:
             raise FormatError(
-                f"{path} is of version {version}, this software reads {_READABLE[0]} and {_READABLE[-1]}; "
-                "use the software that wrote it"
+                f"{path} is of version {version}, this software reads version {JOURNAL_VERSION}; use the software that "
+                "wrote it"
             )
-        if lacking := set(_tables_of(version)) - tables:
+        if lacking := _COLUMNS.keys() - tables:
             raise FormatError(
                 f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; {restoring(path)}"
             )
-        require_sound_rows(path, connection, version)
+        require_sound_rows(path, connection)
     except BaseException:
         connection.close()
         raise
-    return version
 
 
 def reading_fault(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
@@ -546,8 +532,7 @@ _COLUMNS: Final = {
     },
     "records": {"key": _TEXT, "text": _TEXT},
 }
-"""What a row must fulfil, by table (those of version 1 first) and column; times as `datetime.fromisoformat` reads
-them."""
+"""What a row must fulfil, by table and column; times as `datetime.fromisoformat` reads them."""
 
 _TOGETHER: Final = {
     # A frame that has a hash was taken at a time with an exposure (0 where nobody knows), and has a verdict.
@@ -555,10 +540,6 @@ _TOGETHER: Final = {
     "AND verdict IS NOT NULL))",
     "measurements": "(red IS NULL OR (green IS NOT NULL AND blue IS NOT NULL))",
 }
-
-
-def _tables_of(version: int) -> list[str]:
-    return list(_COLUMNS)[: 3 if version == 1 else None]
 
 
 def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
@@ -572,9 +553,9 @@ def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
             )
 
 
-def require_sound_rows(path: Path, connection: sqlite3.Connection, version: int) -> None:
+def require_sound_rows(path: Path, connection: sqlite3.Connection) -> None:
     """Refuse a journal with values that no run writes; costs milliseconds."""
-    for table in _tables_of(version):
+    for table in _COLUMNS:
         columns = {row[1]: row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")}
         lacking = _COLUMNS[table].keys() - columns.keys()
         if lacking or any(columns.values()):

@@ -1,8 +1,7 @@
-"""What puts a session right: files that are damaged, lights that are to be taken again, and secrets in its settings.
+"""What puts a session right: files that are damaged, and lights that are to be taken again.
 
 Raw files are held against the hashes in the journal; the session voids what is missing, cut off or altered, so that the
-next run takes it again. Nothing is deleted. Until version 2 of the journal `session.toml` held the projector's password
-and the whole of `sequence.notify`, readable by everybody; sessions are copied, shown and published.
+next run takes it again. Nothing is deleted.
 """
 
 from __future__ import annotations
@@ -10,23 +9,16 @@ from __future__ import annotations
 import errno
 import json
 import re
-import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, cast
-
-import tomli_w
+from typing import Any
 
 from experiment.session.records import AcceptedFile
 from foundation.compiled import ordered_map, processor_count
 from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError
-from foundation.files import file_sha256, read_inside, reading_error, storage_error, write_whole
-from foundation.secret_texts import MASK, target_label
-
-SETTINGS_FILE: Final = "session.toml"
-"""Name of the settings of a session."""
+from foundation.files import file_sha256, storage_error
 
 BAD = "bad"
 """What stands for the lights that the newest report refused."""
@@ -38,14 +30,11 @@ MOST_UNREADABLE = 3
 MOST_THREADS = 8
 """Files hashed at a time at most: chosen; SHA-256 runs at .5 to 2 GB/s a thread, faster together than any disk."""
 
-_MOST_BYTES: Final = 1 << 20
-"""Settings are a few kilobytes; what is larger was not written by a session, and is not read."""
-
 _RANGE = re.compile(r"\s*(\d{1,9})\s*(?:[-–]\s*(\d{1,9})\s*)?")
 
 
 def unsound_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callable[[int, int], None]) -> dict[int, str]:
-    """Return why frames cannot be used any longer, by attempt: their files are gone or changed, or others newer."""
+    """Return why frames cannot be used any longer, by attempt: their files are gone or changed."""
     try:
         require_frames_folder(folder)
     except OSError as error:
@@ -63,10 +52,6 @@ def unsound_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callabl
             found[frame.attempt] = reason
         observe(done, len(frames))
     _require_readable(folder, unread)
-    newest = {frame.step: frame for frame in frames if frame.attempt not in found}
-    for frame in frames:
-        if frame.attempt not in found and newest[frame.step] is not frame:
-            found[frame.attempt] = f"taken again since, as {newest[frame.step].file}"
     return found
 
 
@@ -179,83 +164,12 @@ def newest_report(session: Path, taken: Mapping[str, int]) -> RefusedFrames:
         with suppress(OSError, ValueError, TypeError, KeyError):
             says: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
             refused = RefusedFrames(path, str(says["retake"]), frozenset(map(str, says["retake_sha256"])))
-            # Reports of older software do not say it, and are older.
-            newest = says.get("newest_sha256")
-            if says["registered_sha256"] in taken and newest in (None, *taken):
-                found.append((0 if newest is None else taken[newest], path.stat().st_mtime_ns, refused))
+            newest = taken[says["newest_sha256"]]
+            if says["registered_sha256"] in taken:
+                found.append((newest, path.stat().st_mtime_ns, refused))
     if not found:
         raise FormatError(
             f"no report of build-lut on {session} lies beside it in {home.parent}; build the table there "
             f"(build-lut {session} {session}-lut), or name the lights, as in --retake 12,40-44"
         )
     return max(found, key=lambda entry: entry[:2])[2]
-
-
-def held_secrets(folder: Path) -> tuple[str, ...]:
-    """Return the keys of a session's settings that hold a secret; none where the settings cannot be read."""
-    try:
-        return tuple(_secrets_of(_settings(folder / SETTINGS_FILE)))
-    except FormatError:
-        return ()
-
-
-def secrets_warning(folder: Path) -> str:
-    """Return what to say of the secrets that a session's settings hold, with the remedy; empty where there are none."""
-    keys = held_secrets(folder)
-    if not keys:
-        return ""
-    return (
-        f"{folder / SETTINGS_FILE} holds a secret in clear text ({', '.join(keys)}), as older software left it; take "
-        f"it out with acquire redact {folder}, and change it where copies of the session are about"
-    )
-
-
-def redact(folder: Path) -> tuple[str, ...]:
-    """Take the secrets out of a session's settings; return the keys that held one."""
-    path = folder / SETTINGS_FILE
-    settings = _settings(path)
-    found = _secrets_of(settings)
-    if found:
-        for key, shown in found.items():
-            holder, _, last = key.rpartition(".")
-            table = _table(settings, holder)
-            if shown is None:
-                del table[last]
-            else:
-                table[last] = shown
-        write_whole(path, tomli_w.dumps(settings))
-    return tuple(found)
-
-
-def _settings(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(read_inside(path.parent, path.name, _MOST_BYTES).decode("utf-8"))
-    except OSError as error:
-        raise reading_error(path, error, "restore it from a copy", "the session's settings") from error
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path} is damaged: {error}; restore it from a copy") from error
-
-
-def _secrets_of(settings: dict[str, Any]) -> dict[str, str | None]:
-    """Return what may stand for each secret, by its key; None where nothing may."""
-    found: dict[str, str | None] = {}
-    if _table(settings, "lab.projector").get("password"):
-        found["lab.projector.password"] = None
-    notify = _table(settings, "sequence").get("notify")
-    # What this software writes ends so, unless nothing had to be masked.
-    if isinstance(notify, str) and not notify.endswith(MASK):
-        try:
-            label = target_label(notify)
-        except ValueError:
-            label = ""
-        if label != notify:
-            found["sequence.notify"] = label
-    return found
-
-
-def _table(settings: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the table of that name, empty where there is none."""
-    table: Any = settings
-    for part in name.split("."):
-        table = cast("dict[str, Any]", table).get(part) if isinstance(table, dict) else None
-    return cast("dict[str, Any]", table) if isinstance(table, dict) else {}

@@ -1,1 +1,1 @@
-"""The simulated ends of cables, USB, USB/IP, PTP/IP, serial and memory, and what goes wrong on them."""
+"""The simulated ends of cables, USB, PTP/IP, serial and memory, and what goes wrong on them."""

@@ -30,7 +30,7 @@ from foundation.clock import OPENING
 from foundation.errors import DeviceError, DeviceRefused
 from sim.world.disturbances import CALM, Disturbances, Moment
 from sim.world.sensors import Body
-from sim.world.world import World
+from sim.world.world import UNDISTURBED, World
 
 
 @dataclass(frozen=True)
@@ -226,13 +226,11 @@ class WatchedFilm:
         world: World,
         gather: Callable[[int, float], tuple[NDArray[np.float32], float]],
         serial: str,
-        disturbances: Disturbances,
         opened: datetime,
     ) -> None:
         self._world = world
         self._gather = gather
         self._serial = serial
-        self._disturbances = disturbances
         self._opened = opened
         self._frames = itertools.count()
 
@@ -243,13 +241,11 @@ class WatchedFilm:
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
         """Photograph the world as it is lit from now on, for the exposure's time."""
         seconds = (released_at - self._opened).total_seconds()
-        moment = Moment(next(self._frames), seconds)
-        picture, lamp = self._gather(moment.frame, settings.shutter_s)
-        situation = replace(self._disturbances.situation(moment), picture=picture)
+        frame = next(self._frames)
+        picture, lamp = self._gather(frame, settings.shutter_s)
         lamp *= 1 - self._world.room.lamp_drift_per_hour * seconds / 3600
-        key = (_WATCHED, moment.frame)
-        counts = self._world.expose(BLACK, settings, key=key, lamp=lamp, situation=situation)
-        counts = self._disturbances.counted(counts, moment)
+        situation = replace(UNDISTURBED, picture=picture)
+        counts = self._world.expose(BLACK, settings, key=(_WATCHED, frame), lamp=lamp, situation=situation)
         write_dng(into, counts, self._world.body, settings=settings, taken_at=released_at, serial=self._serial)
 
 

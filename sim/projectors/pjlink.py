@@ -1,117 +1,17 @@
-"""PJLink for the simulated projector: the far side of a connection, and a TCP port that speaks for it.
-
-Over UDP a projector of class 2 answers searches and gives notice of its changes.
-"""
+"""PJLink for the simulated projector: the far side of a connection, and a TCP port that speaks for it."""
 
 from __future__ import annotations
 
-import contextlib
 import secrets
-import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
 from drivers import pjlink as wire
-from drivers.links.link import ClosedAtEnd
-from drivers.links.network import LOOPBACK, Address, TcpServer, UdpSocket, serve_peer
+from drivers.links.network import TcpServer, serve_peer
 from drivers.pjlink import ErrorCode, PjLinkReply, PjLinkRequest, Refused
-from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
+from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 from sim.projectors.projector import SimulatedProjector
-
-WATCH_S = 0.5
-"""How often a served projector looks whether there is something to announce."""
-
-
-class Announcer:
-    """The notices of a `SimulatedProjector` of class 2: its start, then each change since somebody last looked."""
-
-    def __init__(self, projector: SimulatedProjector) -> None:
-        self._projector = projector
-        self._sent = self._state()
-        self._begun = False
-
-    def news(self) -> tuple[PjLinkReply, ...]:
-        """Return the notices that are due now."""
-        if self._projector.traits.pjlink_class < 2:
-            return ()
-        begun, self._begun = self._begun, True
-        if not begun:
-            return (PjLinkReply("LKUP", self._projector.traits.mac, 2),)
-        state = self._state()
-        news = tuple(PjLinkReply(what, value, 2) for what, value in state.items() if self._sent.get(what) != value)
-        self._sent |= state
-        return news
-
-    def _state(self) -> dict[str, str]:
-        projector = self._projector
-        state = {"ERST": wire.format_faults(projector.faults()), "POWR": wire.format_power(projector.power())}
-        # In standby there is no input.
-        with contextlib.suppress(DeviceRefused):
-            state["INPT"] = projector.input()
-        return state
-
-
-class ProjectorDatagrams(ClosedAtEnd):
-    """The UDP side of a simulated projector, in threads of its own: answers searches, sends notices; close it.
-
-    An answer goes to the port from which the question came, not always to 4352: here both may share one computer.
-
-    `controller`: to whom it sends notices, as a projector has it entered in its menu; None for nobody.
-    """
-
-    def __init__(self, projector: SimulatedProjector, port: int = 0, controller: Address | None = None) -> None:
-        self._projector = projector
-        self._controller = controller
-        self._announcer = Announcer(projector)
-        self._guard = threading.Lock()
-        self._closing = threading.Event()
-        self._socket = UdpSocket(port, LOOPBACK)
-        self.address = self._socket.address
-        """Host and port at which it hears searches."""
-        self._threads = [
-            threading.Thread(target=work, name=f"{name} {self.address[1]}", daemon=True)
-            for work, name in ((self._answer, "answering searches at"), (self._watch, "announcing beside"))
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def announce(self) -> None:
-        """Send the notices that are due now; nobody need call it, for it is done every half second."""
-        with self._guard:
-            if self._controller is None:
-                return
-            for notice in self._announcer.news():
-                with contextlib.suppress(LinkClosed):
-                    self._socket.send(wire.encode_reply(notice), self._controller)
-
-    def close(self) -> None:
-        """Stop listening and wait for the threads; a second call does nothing."""
-        if self._closing.is_set():
-            return
-        self._closing.set()
-        # A datagram of our own is the one portable way to wake a thread that waits for one.
-        with contextlib.suppress(LinkClosed):
-            self._socket.send(b"", self.address)
-        for thread in self._threads:
-            thread.join()
-        self._socket.close()
-
-    def _answer(self) -> None:
-        while not self._closing.is_set():
-            try:
-                datagram, sender = self._socket.receive(wire.IDLE_LIMIT_S)
-            except LinkTimeout:
-                continue
-            except LinkClosed:
-                return
-            if wire.is_search(datagram) and self._projector.traits.pjlink_class >= 2:
-                with contextlib.suppress(LinkClosed):
-                    self._socket.send(wire.encode_reply(PjLinkReply("ACKN", self._projector.traits.mac, 2)), sender)
-
-    def _watch(self) -> None:
-        while not self._closing.wait(WATCH_S):
-            self.announce()
 
 
 @dataclass
@@ -305,15 +205,6 @@ def _selecting(projector: SimulatedProjector, codes: Iterable[str]) -> dict[str,
     return {wire.QUERY: projector.input, **{code: partial(projector.set_input, code) for code in codes}}
 
 
-def serve_pjlink(
-    projector: SimulatedProjector, port: int = 0, password: str | None = None, answer_s: float = 0.0
-) -> TcpServer:
-    """Return a running server that speaks PJLink for `projector`; close it, or use it in a `with` block.
-
-    `answer_s`: how long it takes to answer, seconds of its clock.
-    """
-
-    def think() -> None:
-        projector.clock.sleep(answer_s)
-
-    return serve_peer(lambda: PjLinkPeer(projector, password), port, think)
+def serve_pjlink(projector: SimulatedProjector, port: int = 0, password: str | None = None) -> TcpServer:
+    """Return a running server that speaks PJLink for `projector`; close it, or use it in a `with` block."""
+    return serve_peer(lambda: PjLinkPeer(projector, password), port)

@@ -10,9 +10,9 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from drivers.pjlink import FAULT_PARTS, Input, NoResolution, Resolution
+from drivers.pjlink import Input, NoResolution, Resolution
 from drivers.presenter import BLACK, Colour
-from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
+from drivers.projector import FAULT_PARTS, Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 
@@ -84,7 +84,6 @@ class ProjectorTraits:
     lamp_model: str = "LAMP-1"
     filter_model: str = "FILTER-1"
     panel: Resolution = PANEL
-    mac: str = "02:00:00:00:00:01"
 
 
 class SimulatedProjector:
@@ -200,7 +199,7 @@ class SimulatedProjector:
             return 1.0
 
     def break_part(self, part: str, severity: Severity) -> None:
-        """Inject a fault in one of `drivers.pjlink.FAULT_PARTS`; an error of the lamp puts it out."""
+        """Inject a fault in one of `drivers.projector.FAULT_PARTS`; an error of the lamp puts it out."""
         if part not in FAULT_PARTS:
             raise ValueError(f"{part} is no part that can be reported; choose of {', '.join(FAULT_PARTS)}")
         with self._guard:

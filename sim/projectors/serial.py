@@ -1,34 +1,35 @@
-"""The simulated projector on a serial cable: one peer a language, bytes in and bytes out.
+"""The simulated projector behind a line protocol: the far end of any `Language`, bytes in and bytes out.
 
-A cable has no connections: a peer goes on where it was when it is opened again, and forgets only a half-heard command.
-`receive` with no bytes asks what a peer has to say by now: a late answer, or news. Where the manuals leave open what a
-projector does, a peer does what is harder on the driver: it falls silent, or refuses.
+A cable has no connections: the projector goes on where it was when it is opened again, and forgets only a command that
+has not ended. `receive` with no bytes returns what the projector has to send by now: a late answer, or news. If the
+manuals leave open what a projector does, this one does what is harder for the driver: it is silent, or refuses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol
-
-from drivers.links.link import Peer
-from drivers.pjlink import NoResolution
 from drivers.projector import Power, Severity
-from drivers.serial_projectors import benq, epson, nec, optoma
-from drivers.serial_projectors.driver import take_line
-from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
+from drivers.serial_projectors.language import Language, encode_answer
+from foundation.errors import DeviceFault, DeviceRefused
 from sim.projectors.projector import SimulatedProjector
-
-SERIAL_NUMBER = "CROP0000001"
 
 _ON_THE_WAY = (Power.WARMING, Power.COOLING)
 
 
-class _Listener:
-    """What all of them have: a projector, and what was heard of a command that is not whole yet."""
+class LinePeer:
+    """A projector that speaks a language; `network` if it is reached over TCP."""
 
-    def __init__(self, projector: SimulatedProjector) -> None:
+    def __init__(self, projector: SimulatedProjector, language: Language, network: bool = False) -> None:
         self._projector = projector
+        self._language = language
+        self._network = network
+        self._begin, end = (part.strip("\r\n") for part in language.line.command.split("{}"))
+        self._end = end
+        self._handshake = language.network.handshake if network and language.network is not None else None
+        self._greeted = self._handshake is None
         self._heard = b""
+        self._switching_to: Power | None = None
+        self._sent_power = projector.power()
+        self._sent_faults = self._errors()
 
     @property
     def closed(self) -> bool:
@@ -36,275 +37,149 @@ class _Listener:
         return False
 
     def connect(self) -> bytes:
-        """Forget a half-heard command."""
+        """Forget a command that has not ended, and a handshake."""
         self._heard = b""
+        self._greeted = self._handshake is None
         return b""
 
-
-class EpsonPeer(_Listener):
-    """An Epson: ESC/VP21, after the handshake of ESC/VP.net if `network` says so."""
-
-    def __init__(self, projector: SimulatedProjector, network: bool = False) -> None:
-        super().__init__(projector)
-        self._network = network
-        self._greeted = not network
-        self._switching_to: Power | None = None
-
-    def connect(self) -> bytes:
-        """Forget a half-heard command, and that it has been greeted."""
-        self._greeted = not self._network
-        return super().connect()
-
     def receive(self, data: bytes) -> bytes:
-        """Take the next bytes and return the answers to them, and to what has been carried out by now."""
+        """Take the next bytes and return the answers to the lines that they complete, and the news."""
         said = self._late_answer()
         if self._switching_to is not None:
             # It accepts no command until it has carried out the one that it has.
             return said
+        said += self._news()
         self._heard += data
         if not self._greeted:
-            if len(self._heard) < len(epson.HELLO):
-                return said
-            self._greeted = self._heard.startswith(epson.HELLO)
-            self._heard = self._heard[len(epson.HELLO) :]
-            said += epson.encode_welcome(epson.WELCOME if self._greeted else 0x40)
-        while self._switching_to is None and (taken := take_line(self._heard)) is not None:
-            command, length = taken
-            self._heard = self._heard[length:]
-            said += self._answer(command)
+            said += self._greet()
+        while self._greeted and self._switching_to is None and (end := self._heard.find(b"\r")) >= 0:
+            line = self._heard[:end].decode("ascii", "replace").strip()
+            self._heard = self._heard[end + 1 :]
+            said += self._answered(line) + self._news()
         return said
+
+    def _greet(self) -> bytes:
+        handshake = self._handshake
+        if handshake is None or len(self._heard) < len(handshake.send):
+            return b""
+        hello = handshake.send.encode("ascii")
+        self._greeted = self._heard.startswith(hello)
+        self._heard = self._heard[len(hello) :]
+        answer = bytearray(handshake.answer_begins.encode("ascii").ljust(handshake.answer_length, b"\0"))
+        refused = next(iter(handshake.refusals), handshake.accepted)
+        answer[handshake.state_at] = int(handshake.accepted if self._greeted else refused, 16)
+        return bytes(answer)
 
     def _late_answer(self) -> bytes:
         if self._switching_to is None or (power := self._projector.power()) in _ON_THE_WAY:
             return b""
         reached = power is self._switching_to
         self._switching_to, self._heard = None, b""
-        return epson.encode_reply("" if reached else epson.REFUSAL)
-
-    def _answer(self, command: str) -> bytes:
-        try:
-            return self._done(command)
-        except (DeviceRefused, DeviceFault, ValueError):
-            return epson.encode_reply(epson.REFUSAL)
-
-    def _done(self, command: str) -> bytes:
-        projector = self._projector
-        power = projector.power()
-        match command.upper():
-            case "":
-                return epson.encode_reply()
-            case "PWR?":
-                return epson.encode_reply(f"PWR={epson.format_power(power)}")
-            case _ if power in _ON_THE_WAY:
-                raise DeviceRefused("busy")
-            case "PWR ON":
-                projector.switch_on()
-                self._switching_to = Power.ON
-                return self._late_answer()
-            case "PWR OFF":
-                projector.switch_off()
-                self._switching_to = Power.STANDBY
-                return self._late_answer()
-            case "MUTE?":
-                return epson.encode_reply(f"MUTE={'ON' if projector.muted() else 'OFF'}")
-            case "MUTE ON":
-                projector.set_muted(True)
-            case "MUTE OFF":
-                projector.set_muted(False)
-            case "LAMP?":
-                return epson.encode_reply("LAMP=" + " ".join(str(lamp.hours) for lamp in projector.lamps()))
-            case "ERR?":
-                errors = [fault for fault in projector.faults() if fault.severity is Severity.ERROR]
-                code = epson.format_fault(errors[0].part) if errors else "00"
-                return epson.encode_reply(f"ERR={code}")
-            case "SNO?":
-                return epson.encode_reply(f"SNO={SERIAL_NUMBER}")
-            case _:
-                raise ValueError(command)
-        return epson.encode_reply()
-
-
-class BenqPeer(_Listener):
-    """A BenQ: it echoes what it hears and ends with a prompt, as on a serial cable; not so if `network` says so."""
-
-    def __init__(self, projector: SimulatedProjector, network: bool = False) -> None:
-        super().__init__(projector)
-        self._network = network
-
-    def receive(self, data: bytes) -> bytes:
-        """Take the next bytes and return the answers to the lines that they complete."""
-        self._heard += data
-        said = b""
-        while (taken := take_line(self._heard)) is not None:
-            line, length = taken
-            self._heard = self._heard[length:]
-            if line:
-                echo = b"" if self._network else line.encode("ascii", "replace") + b"\r\n"
-                said += echo + benq.encode_answer(self._answer(line))
-            if not self._network:
-                said += benq.PROMPT
-        return said
-
-    def _answer(self, line: str) -> str:
-        name, equals, value = line.lower().removeprefix("*").removesuffix("#").partition("=")
-        if not (line.startswith("*") and line.endswith("#") and equals):
-            return benq.ILLEGAL
-        try:
-            return f"{name.upper()}={self._done(name, value)}"
-        except (DeviceRefused, DeviceFault):
-            return benq.BLOCKED
-        except ValueError:
-            return benq.UNSUPPORTED
-
-    def _done(self, name: str, value: str) -> str:
-        projector = self._projector
-        if projector.power() in _ON_THE_WAY:
-            raise DeviceRefused("busy")
-        match name, value:
-            case "pow", "?":
-                return "ON" if projector.power() is Power.ON else "OFF"
-            case "pow", "on":
-                projector.switch_on()
-            case "pow", "off":
-                projector.switch_off()
-            case "blank", "?":
-                return "ON" if projector.muted() else "OFF"
-            case "blank", "on" | "off":
-                projector.set_muted(value == "on")
-            case "ltim", "?":
-                return str(projector.lamps()[0].hours)
-            case "modelname", "?":
-                return projector.identity().model
-            case _:
-                raise ValueError(name)
-        return value.upper()
-
-
-class OptomaPeer(_Listener):
-    """An Optoma: it answers, and says unasked when its power state changes or a part fails."""
-
-    MODEL = "1"
-
-    def __init__(self, projector: SimulatedProjector, answers_mute: bool = True) -> None:
-        super().__init__(projector)
-        self._answers_mute = answers_mute
-        self._sent_power = projector.power()
-        self._sent_faults: frozenset[str] = frozenset()
-
-    def receive(self, data: bytes) -> bytes:
-        """Take the next bytes and return the answers to the lines that they complete, and the news."""
-        said = self._news()
-        self._heard += data
-        while (taken := optoma.take_command(self._heard)) is not None:
-            command, length = taken
-            self._heard = self._heard[length:]
-            if command is not None and command.projector == optoma.EVERYBODY:
-                said += optoma.encode_message(self._answer(command)) + self._news()
-        return said
+        return self._encoded(self._done(power) if reached else self._refusal())
 
     def _news(self) -> bytes:
-        power = self._projector.power()
-        broken = frozenset(fault.part for fault in self._projector.faults() if fault.severity is Severity.ERROR)
-        news = [optoma.info_of_fault(part) for part in sorted(broken - self._sent_faults)]
-        if power is not self._sent_power:
-            news.append(optoma.info_of_power(power))
-        self._sent_power, self._sent_faults = power, broken
-        return b"".join(optoma.encode_message(info) for info in news if info is not None)
+        """Return what is sent unasked about changes since this was called last."""
+        power, faults = self._projector.power(), self._errors()
+        begun = power if power is not self._sent_power else None
+        failed = [part for part in faults if part not in self._sent_faults]
+        self._sent_power, self._sent_faults = power, faults
+        told = [
+            message.text
+            for message in self._language.unasked
+            if message.fault in failed or (begun is not None and message.power is begun)
+        ]
+        return b"".join(self._encoded(text) for text in told)
 
-    def _answer(self, command: optoma.OptomaCommand) -> str:
+    def _answered(self, line: str) -> bytes:
+        language = self._language.line
+        prompt = b"" if self._network else language.prompt.encode("ascii")
+        if not line:
+            return self._encoded("") + prompt if language.wake else prompt
+        echo = line.encode("ascii", "replace") + b"\r\n" if language.echo and not self._network else b""
+        answer = self._answer(line)
+        return echo + (b"" if answer is None else self._encoded(answer)) + prompt
+
+    def _answer(self, line: str) -> str | None:
+        """Return what a line is answered; None if that comes later."""
+        if not (line.startswith(self._begin) and line.endswith(self._end)):
+            return self._refusal(known=False)
         try:
-            return self._done(command)
-        except (DeviceRefused, DeviceFault, ValueError):
-            return optoma.FAILED
+            return self._carried_out(line.removeprefix(self._begin).removesuffix(self._end).upper())
+        except (DeviceRefused, DeviceFault):
+            return self._refusal()
+        except KeyError:
+            return self._refusal(known=False)
 
-    def _done(self, command: optoma.OptomaCommand) -> str:
-        projector = self._projector
-        match command.number, command.value:
-            case optoma.POWER, "1":
-                projector.switch_on()
-            case optoma.POWER, "0" | "2":
-                projector.switch_off()
-            case optoma.AV_MUTE, "0" | "1" | "2":
-                projector.set_muted(command.value == "1")
-            case optoma.LAMP_HOURS, "1":
-                return f"{optoma.ANSWER}{projector.lamps()[0].hours:04d}"
-            case optoma.POWER_STATE, "1":
-                return optoma.ANSWER + ("1" if projector.power() is Power.ON else "0")
-            case optoma.MODEL, "1":
-                return optoma.ANSWER + self.MODEL
-            case optoma.AV_MUTE_STATE, "1" if self._answers_mute:
-                return optoma.ANSWER + ("1" if projector.muted() else "0")
-            case _:
-                raise ValueError(command)
-        return optoma.PASSED
+    def _carried_out(self, text: str) -> str | None:
+        """Return what a command or question is answered; a KeyError if the language does not have it."""
+        language, projector = self._language, self._projector
+        power = projector.power()
+        words, mute = language.power, language.mute
+        if text == words.ask.upper() and (words.value_of(power) or not language.refusals.busy):
+            value = words.value_of(power) or words.value_of(Power.STANDBY) or ""
+            return words.answer[0].replace("{}", value)
+        if power in _ON_THE_WAY and (language.refusals.busy or language.refusals.unclear):
+            raise DeviceRefused("busy")
+        commands = {
+            words.on.upper(): lambda: self._switch(Power.ON),
+            words.off.upper(): lambda: self._switch(Power.STANDBY),
+            mute.on.upper(): lambda: self._mute(True),
+            mute.off.upper(): lambda: self._mute(False),
+        }
+        return commands[text]() if text in commands else self._told(text)
 
+    def _told(self, text: str) -> str:
+        language, projector = self._language, self._projector
+        identity = projector.identity()
+        if language.mute.ask and text == language.mute.ask.upper():
+            return language.mute.answer[0].replace("{}", language.mute.value_of(projector.muted()))
+        values = (
+            (language.faults, self._fault_code),
+            (language.lamp_hours, lambda: " ".join(str(lamp.hours) for lamp in projector.lamps())),
+            (language.model, lambda: identity.model),
+            (language.name, lambda: identity.name),
+        )
+        for question, value in values:
+            if question is not None and text == question.ask.upper():
+                return question.answer[0].replace("{}", value())
+        raise KeyError(text)
 
-class NecPeer(_Listener):
-    """A NEC: a binary answer to every command; what is no command is not answered."""
+    def _switch(self, to: Power) -> str | None:
+        if to is Power.ON:
+            self._projector.switch_on()
+        else:
+            self._projector.switch_off()
+        if self._language.power.done_within_s and self._projector.power() is not to:
+            self._switching_to = to
+            return None
+        return self._done(to)
 
-    def receive(self, data: bytes) -> bytes:
-        """Take the next bytes and return the answers to the commands that they complete."""
-        self._heard += data
-        said = b""
-        try:
-            while (taken := nec.take_command(self._heard)) is not None:
-                command, length = taken
-                self._heard = self._heard[length:]
-                said += nec.encode_reply(self._answer(command))
-        except ProtocolError:
-            self._heard = b""
-        return said
+    def _mute(self, muted: bool) -> str:
+        self._projector.set_muted(muted)
+        words = self._language.mute
+        return words.done.replace("{}", words.value_of(muted))
 
-    def _answer(self, command: nec.NecCommand) -> nec.NecReply:
-        try:
-            return nec.NecReply(command.kind, command.code, self._done(command))
-        except DeviceRefused:
-            return nec.NecReply(command.kind, command.code, failed=nec.POWER_IS_OFF)
-        except DeviceFault:
-            return nec.NecReply(command.kind, command.code, failed=nec.EXECUTION_FAILED)
-        except ValueError:
-            return nec.NecReply(command.kind, command.code, failed=nec.UNKNOWN_COMMAND)
+    def _done(self, power: Power) -> str:
+        words = self._language.power
+        return words.done.replace("{}", words.value_of(power) or "")
 
-    def _done(self, command: nec.NecCommand) -> bytes:
-        projector = self._projector
-        match command:
-            case nec.POWER_ON:
-                projector.switch_on()
-            case nec.POWER_OFF:
-                projector.switch_off()
-            case nec.MUTE_ON:
-                projector.set_muted(True)
-            case nec.MUTE_OFF:
-                projector.set_muted(False)
-            case nec.SHUTTER_CLOSE | nec.SHUTTER_OPEN:
-                projector.shutter_closed = command == nec.SHUTTER_CLOSE
-            case nec.FREEZE_ON | nec.FREEZE_OFF:
-                projector.set_frozen(command == nec.FREEZE_ON)
-                return b"\0"
-            case nec.COVER:
-                return bytes([projector.shutter_closed])
-            case nec.BASIC_INFORMATION:
-                on = projector.power() is Power.ON
-                silent = projector.signal is NoResolution.NO_SIGNAL
-                return nec.format_basic_information(nec.NO_SIGNAL if silent else 0, on and projector.frozen())
-            case nec.RUNNING:
-                return nec.format_running(projector.power())
-            case nec.MUTES:
-                return bytes([projector.power() is Power.ON and projector.muted()]).ljust(16, b"\0")
-            case nec.MODEL:
-                return projector.identity().model.encode("ascii")[:31].ljust(32, b"\0")
-            case nec.ERRORS:
-                return nec.format_errors(projector.faults())
-            case nec.INFORMATION:
-                return nec.format_information(projector.identity().name, projector.lamps()[0].hours * 3600)
-            case _:
-                raise ValueError(command)
-        return b""
+    def _fault_code(self) -> str:
+        """Return the code of the first faulty part: one fault at a time, and errors only."""
+        words = self._language.faults
+        assert words is not None
+        for part in self._errors():
+            for code, meaning in words.parts.items():
+                if meaning == part:
+                    return code
+        return words.healthy
 
+    def _errors(self) -> tuple[str, ...]:
+        return tuple(fault.part for fault in self._projector.faults() if fault.severity is Severity.ERROR)
 
-class _PeerOf(Protocol):
-    def __call__(self, projector: SimulatedProjector) -> Peer: ...
+    def _refusal(self, known: bool = True) -> str:
+        refusals = self._language.refusals
+        first = refusals.busy if known else refusals.unknown
+        return (*first, *refusals.unclear, *refusals.unknown, *refusals.busy)[0]
 
-
-PEERS: Mapping[str, _PeerOf] = {"benq": BenqPeer, "epson": EpsonPeer, "nec": NecPeer, "optoma": OptomaPeer}
-"""The far side for each of `drivers.serial_projectors.LANGUAGES`."""
+    def _encoded(self, text: str) -> bytes:
+        return encode_answer(self._language.line, text)

@@ -12,7 +12,7 @@ Sizes that are left out are chosen: large enough to be wrong, small enough to be
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
@@ -406,15 +406,6 @@ class Disturbances:
         """Return the event by which the camera delivers the last file again, None where it does not."""
         return next((event for event in self.at(moment) if isinstance(event, StaleFile)), None)
 
-    def require_unshown(self, where: str) -> None:
-        """Refuse events that change what a screen shows or which file is sent: a screen that is real does so itself."""
-        for event in self.events:
-            if isinstance(event, FrozenScreen | HalfChanged | StaleFile):
-                raise ConfigurationError(
-                    f"{where}: {event.what} is for the simulated screen; freeze a projector by its control port, cover "
-                    "a screen by a window"
-                )
-
     @property
     def repeats_files(self) -> bool:
         """Whether a file is ever delivered again."""
@@ -462,31 +453,6 @@ _EXPECTED: Final = {
     "model_attributes_type": "a table",
 }
 """What a value should have been, by the first words of the kind of fault."""
-
-
-def drawn(seed: int, frames: int, count: int, kinds: Iterable[str] = KINDS) -> Disturbances:
-    """Return so many events at random frames, each there for one frame, or from there on where it is of that kind."""
-    random = np.random.Generator(np.random.PCG64(seed))
-    by_name = {kind.what: kind for kind in get_args(AnyDisturbance)}
-    some = sorted(kinds, key=KINDS.index)
-    events: list[AnyDisturbance] = []
-    for _ in range(count):
-        kind = by_name[some[int(random.integers(len(some)))]]
-        first = int(random.integers(1, frames))
-        if kind is LampDrift or kind is SensorWarming:
-            events.append(kind(from_frame=first, to_frame=frames))
-        elif kind is Bump:
-            px, direction = random.uniform(0.3, 8), random.uniform(0, 360)
-            events.append(Bump(from_frame=first, px=float(px), direction_deg=float(direction)))
-        elif kind in _LASTING:
-            events.append(kind(from_frame=first))
-        else:
-            events.append(kind(from_frame=first, to_frame=first))
-    return Disturbances(tuple(events))
-
-
-_LASTING: Final = (FrozenScreen, LampStep, AmbientStep, Defocus, Reflection)
-"""Events that do not end by themselves, beside a bump and what is gradual."""
 
 
 def _lit(situation: Situation, percent: float, rgb: tuple[float, float, float], grown: float) -> Situation:

@@ -56,7 +56,7 @@ def test_an_empty_folder_gets_the_whole_experiment(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(layout, "design_chart", designed)
     lab = tmp_path / "new" / "lab"
     assert main(["init", str(lab), "--rig", "simulated"]) == 0
-    assert asked == [(5, None, 1, None)], "the chart of all colours, of which a small one is drawn here"
+    assert asked == [(5, None)], "the chart of all colours, of which a small one is drawn here"
     assert len(load_illuminations(lab / "illuminations.csv")) == 707
     names = {path.name for path in (lab / "chart").iterdir()}
     assert names == {"chart.json", "chart.pdf", "preview.png", "proof.pdf", "PRINTING.txt"}

@@ -13,10 +13,10 @@ from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from calibration.verdict import BuildResult
 from experiment.session.folder import Session
-from foundation.errors import CropError
 from tests.calibration.lab import LIGHTS, Lab, blank_pictures, hang, lens_unmeasured, rendered_once, take
-from tests.calibration.whole import LIMITS, sketched, told
+from tests.calibration.whole import LIMITS, told
 from tests.pinned import Pinned
+from tests.pinned.drawn import drawn as numbers_of_figure
 
 __all__ = ["built", "lab", "lens_unmeasured", "rendered_once", "session"]
 
@@ -41,7 +41,7 @@ def built(session: Session, tmp_path_factory: pytest.TempPathFactory) -> BuildRe
 
 @pytest.fixture
 def pinned_builds(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, pinned: Pinned) -> Iterator[None]:
-    """Pin what is told of every table that a test builds by `build` of its module, and why there is none."""
+    """Pin the numbers of every table that a test builds by `build` of its module."""
     module: Any = request.module
     known: Callable[..., BuildResult] = module.build
     found: list[Any] = []
@@ -52,11 +52,7 @@ def pinned_builds(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
             if report is not None:
                 report(result, session, folder)
 
-        try:
-            return known(session, out, *given, report=seen, **named)
-        except CropError as error:
-            found.append(str(error).replace(str(out.parent), ""))
-            raise
+        return known(session, out, *given, report=seen, **named)
 
     monkeypatch.setattr(module, "build", kept)
     yield
@@ -66,14 +62,14 @@ def pinned_builds(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture
 def pinned_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, pinned: Pinned) -> Iterator[None]:
-    """Pin each figure that a test has drawn by `drawn` of its module."""
+    """Pin the numbers of each figure that a test has drawn by `drawn` of its module."""
     module: Any = request.module
     known: Callable[..., Any] = module.drawn
     found: list[Any] = []
 
     def kept(*given: Any) -> Any:
         figure = known(*given)
-        found.append(sketched(figure))
+        found.append(numbers_of_figure(figure))
         return figure
 
     monkeypatch.setattr(module, "drawn", kept)
@@ -83,5 +79,5 @@ def pinned_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
 
 
 def words_of_test(request: pytest.FixtureRequest) -> str:
-    """Return a test's name in words that a file may have as its name."""
+    """Return a test's name in words."""
     return re.sub(r"[^a-z0-9.-]+", " ", request.node.name.removeprefix("test_").lower()).strip()

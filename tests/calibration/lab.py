@@ -27,6 +27,7 @@ from drivers.raw.rawfile import Mosaic, read_raw
 from experiment.chart.layout import A_SERIES_MM, design_chart
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
+from experiment.framing.field import field_mm
 from experiment.lights import Illumination, plan_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, SessionStep
@@ -94,9 +95,15 @@ class Lab:
         aside = np.array([mosaic.visible.left - visible.left, mosaic.visible.top - visible.top]) / 2
         return self.world.project(points_mm) - aside
 
+    def corners_px(self, mosaic: Mosaic) -> npt.NDArray[np.float64] | None:
+        """Return corners as a person gives them, whole raw pixels, some off; None for a chart with tags."""
+        if self.chart.tags:
+            return None
+        return (self.truth_px(field_mm(self.chart), mosaic) + np.array([(4, -3), (-3, 2), (2, 4), (-4, -2)])).round()
+
     def miss_px(self, mosaic: Mosaic) -> npt.NDArray[np.float64]:
         """Return how far the registered cells lie from the truth, px."""
-        places = register(mosaic, self.chart).to_pixels(self.chart.centres_mm)
+        places = register(mosaic, self.chart, corners=self.corners_px(mosaic)).to_pixels(self.chart.centres_mm)
         return np.linalg.norm(places - self.truth_px(self.chart.centres_mm, mosaic), axis=1)
 
 
@@ -175,7 +182,8 @@ def lens_unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
     def unsuitable(chart: Chart) -> str:
         return "not measured in this test"
 
-    monkeypatch.setattr("calibration.pipeline.baseline.unsuitable", unsuitable)
+    for module in ("baseline", "table_figures"):
+        monkeypatch.setattr(f"calibration.pipeline.{module}.unsuitable", unsuitable)
 
 
 RENDERED_BYTES = 100_000_000
@@ -234,7 +242,7 @@ def rendered_once() -> Generator[None]:
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(World, "_lit", kept)
-        patched.setattr("calibration.pipeline.frames.register", registered_once)
+        patched.setattr("calibration.pipeline.measuring.register", registered_once)
         yield
 
 

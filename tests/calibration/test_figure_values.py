@@ -10,7 +10,6 @@ import pytest
 
 from calibration.causes.gathering import PrintPlace
 from calibration.figures import geometry, light, radiometry, truth
-from calibration.figures.figure import CheckMeasurements
 from calibration.radiometry.superposition import NODES, Superposition
 from experiment.chart.layout import design_chart
 
@@ -359,9 +358,3 @@ def test_a_figure_names_its_worst() -> None:
     assert where(light.OFF_BRIGHTNESS, made, 0.1) == "light 2 by -50 %, light 0 by +25 %"
     assert where(light.REPEATED_FILES, table(frames=TWICE), 0.0) == "4.dng is 0.dng"
     assert where(light.CROSS_CHECKED_SHARE, made, 0.0) == "2 of 3"
-
-
-def test_a_check_forecasts_bleed_of_a_cell_and_a_blur_that_it_saw() -> None:
-    forecast: Any = geometry.BLEED.forecast
-    assert forecast(CheckMeasurements(cell_px=17.0, blur_px=2.2)) == pytest.approx(0.00449, rel=1e-2)
-    assert forecast(CheckMeasurements(cell_px=17.0)) is forecast(CheckMeasurements(blur_px=2.2)) is None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,19 +13,11 @@ import pytest
 
 from calibration.figures import all_figures, geometry, light, radiometry, truth
 from calibration.figures.all_figures import FIGURES
-from calibration.figures.figure import QUESTIONS, CheckMeasurements, Figure
+from calibration.figures.figure import QUESTIONS
 from calibration.figures.truth import DARKEST_COUNTS
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("foundation", "drivers", "sim", "experiment", "calibration", "acquisition", "benchmarks")
-
-
-def test_a_figure_that_lacks_a_part_does_not_import() -> None:
-    parts: dict[str, Any] = {part.name: getattr(DARKEST_COUNTS, part.name) for part in fields(Figure) if part.init}
-    assert Figure(**parts) == DARKEST_COUNTS
-    for name in parts.keys() - {"foremost", "found", "former_name"}:
-        with pytest.raises(TypeError, match=name):
-            Figure(**{key: value for key, value in parts.items() if key != name})
 
 
 @pytest.mark.parametrize(
@@ -36,9 +28,6 @@ def test_a_figure_that_lacks_a_part_does_not_import() -> None:
         {"source": ""},
         {"refuse": 301.0},
         {"name": "bleed"},
-        {"name": "held_share"},
-        {"former_name": "bleed"},
-        {"former_name": "held_share"},
         {"lines": light.ADDITIVITY.lines},
         {"cause": replace(light.ADDITIVITY.cause, follows=("nothing",)) if light.ADDITIVITY.cause else None},
     ],
@@ -69,10 +58,9 @@ def test_a_name_stands_in_its_figure() -> None:
 
 
 def test_some_figures_are_asked_more_than_others() -> None:
-    """What a check forecasts, what names frames by itself, what a refusal speaks of first, what shares a cause."""
-    assert {figure.name for figure in FIGURES if figure.forecast is not None} >= {
-        "tags_found", "cell_px", "bleed", "unfit_share", "doubtful_share", "added_light", "leak_share", "additivity",
-        "grey_tint_deg", "references_used", "reference_spread", "brightest_share", "darkest_counts",
+    """What trial frames show, what names frames by itself, what a refusal speaks of first, what shares a cause."""
+    assert {figure.name for figure in FIGURES if not figure.before_session} >= {
+        "correction_residual", "truth_median_deg", "truth_worst_deg", "white_frames", "primaries_lacking",
     }  # fmt: skip
     first = {figure.name for figure in FIGURES if figure.foremost}
     assert first >= {"other_camera", "other_exposure", "off_codes_deg", "white_frame_deg"}
@@ -89,11 +77,6 @@ def test_some_figures_are_asked_more_than_others() -> None:
             "off_brightness": ("off_codes_deg", "exchanged_lights"),
         }.items()
     )
-
-
-def test_a_check_that_saw_nothing_forecasts_nothing() -> None:
-    nothing = CheckMeasurements()
-    assert [figure.name for figure in FIGURES if figure.forecast is not None and figure.forecast(nothing)] == []
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -12,14 +11,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 
 from calibration.causes.rules import Evidence
-from calibration.report.report import report_json, summary
+from calibration.report.report import report_json
 from calibration.table.lut import open_lut
-from calibration.verdict import BuildResult, findings, refusal, remark, retaken_frames
+from calibration.verdict import BuildResult, findings, retaken_frames
 from tests.pinned import NOTHING
-from tests.pinned.drawn import drawn
 
 LIMITS: dict[str, float] = {"same": 1e-3, "nothing": 1e-6}
 """What numbers of whole builds may differ by: they come from fits upon fits, and another BLAS moves some by 3e-4."""
@@ -30,8 +27,7 @@ UNSURE = ("scatter", "frame_scatter", "noise", "noise_misfit", "transfer")
 MOST_UNFIT = 3
 """Cells that are named."""
 
-CERTAIN_BLOCK = 0.005
-"""Share by which a block of cells is off in a frame from which on it is more than noise."""
+OUTCOMES = ("accept", "accept with remarks", "refuse")
 
 LEFT_OUT = (
     "gain_e",
@@ -88,11 +84,6 @@ def of_fields(record: Any, *left_out: str) -> dict[str, Any]:
     return {one.name: getattr(record, one.name) for one in fields(record) if one.name not in (*left_out, *UNSURE)}
 
 
-def masked(text: str) -> str:
-    """Return a text without measured numbers, whose last digit may be another one on another processor."""
-    return re.sub(r"[-+]?\d[\d.e-]*(?= ?[%°]| px| mm| counts)|[-+]?\d+\.\d+(e-?\d+)?", "#", text)
-
-
 def brief(value: Any) -> Any:
     """Return a record, arrays of more than four numbers by their root mean square and a sum by chance weights."""
     match value:
@@ -121,72 +112,40 @@ def brief(value: Any) -> Any:
     return [float(np.sqrt((known**2).mean())), float(weights @ known) / known.size**0.5]
 
 
-def sketched(figure: Figure) -> list[Any]:
-    """Return what a figure shows: of each kind of artist each property of all of them together, in brief."""
-    size, *artists = drawn(figure)
-    kinds: dict[str, list[list[Any]]] = {}
-    for kind, *shown in artists:
-        # A collection has as many paths as it has.
-        kinds.setdefault(kind, []).append([*shown[:3], shown[3:]])
-    return [size, {kind: [_in_brief(column) for column in zip(*shown, strict=False)] for kind, shown in kinds.items()}]
-
-
-def _in_brief(column: Sequence[Any]) -> list[Any]:
-    found = list(_numbers(column))
-    words = dict.fromkeys(one for one in found if isinstance(one, str))
-    numbers = [one for one in found if not isinstance(one, str)]
-    return [len(found), *([" | ".join(words)] if words else []), *(np.ravel(brief(numbers)) if numbers else [])]
-
-
 def known(evidence: Evidence) -> dict[str, float]:
-    """Return what is known as evidence, without what is unsure."""
-    return {name: value for name, value in evidence.known().items() if name not in UNSURE}
+    """Return the evidence that is there, without what is unsure."""
+    return {name: value for name, value in evidence.known().items() if value and name not in UNSURE}
 
 
 def told(result: BuildResult) -> dict[str, Any]:
-    """Return what is judged and said of a build, and in brief what its frames, lights, greys and cells showed."""
+    """Return the numbers of a build's verdict and of the causes that it names."""
     table, verdict = result.figures, result.verdict
-    causes, not_of_frames = findings(verdict, table).values(), ("record", "origin", "consistency")
+    causes = findings(verdict, table).values()
     return {
-        "judged": {row.figure.name: row.value for row in verdict.rows if row.figure.name not in UNSURE},
-        "outcomes": {row.figure.name: row.outcome for row in verdict.rows if row.outcome != "accept"},
-        "remarks": [masked(remark(row, table)) for row in verdict.remarks],
-        "refusal": masked(refusal(verdict, table)) if verdict.refused else None,
-        "causes": [[one.figure, one.decision.cause.name, known(one.evidence), one.places] for one in causes],
-        "files": [[frame.file for frame in one.frames] for one in causes],
-        "retake": [frame.file for frame in retaken_frames(verdict, table)],
-        "unfit": [len(table.cells.unfit), *table.cells.unfit[:MOST_UNFIT]],
-        "frames": brief(together([of_fields(one, *not_of_frames, "channel") for one in table.frames])),
-        "off": {
-            frame.record.file: brief(frame.consistency)
-            for frame in table.frames
-            if frame.consistency.block > CERTAIN_BLOCK
-        },
-        "lights": brief(table.lights),
-        "stains": brief(of_fields(table.cells.stains, "level", "places_mm")),
-        "cells": {one.name: brief(np.sqrt(one.cells)) for one in table.budget.components if one.name not in UNSURE},
-        "dark": table.dark_frames.light,
+        **{row.figure.name: row.value for row in verdict.rows if row.figure.name not in UNSURE},
+        "outcomes": {row.figure.name: OUTCOMES.index(row.outcome) for row in verdict.rows if row.outcome != "accept"},
+        "causes": {f"{one.figure}, {one.decision.cause.name}": known(one.evidence) for one in causes},
+        "cause_frames": {one.figure: len(one.frames) for one in causes},
+        "retake": len(retaken_frames(verdict, table)),
+        "unfit": [len(table.cells.unfit), *(cell.colour for cell in table.cells.unfit[:MOST_UNFIT])],
     }
 
 
 def whole(result: BuildResult) -> dict[str, Any]:
-    """Return all that was measured, judged and said in a build."""
-    table, verdict = result.figures, result.verdict
+    """Return all numbers that a build measured and judged."""
+    table = result.figures
     left_out = ("lights", "frames", "session", "origin", "origins", "registration", "cells", "budget", "primaries")
     return told(result) | {
         "frames": together([of_fields(frame, "record", "origin", "consistency") for frame in table.frames]),
         "lights": table.lights,
         "greys": table.greys,
-        "summary": [[row.name, masked(row.value), masked(row.note)] for row in summary(table)],
-        "outcomes": {row.figure.name: masked(row.text()) for row in verdict.rows},
-        "in words": [masked(one.evidence.in_words()) for one in findings(verdict, table).values()],
         "registration": of_fields(table.registration, "framing"),
         "framing": of_fields(table.registration.framing, "plane"),
-        "budget": [
-            [one.name, one.source, _root(one.lights), np.sqrt(one.cells)]
+        "budget": {
+            one.name: {"lights": _root(one.lights), "cells": np.sqrt(one.cells)}
             for one in table.budget.components
             if one.name not in UNSURE
-        ],
+        },
         "added": table.cells.added,
         "stains": of_fields(table.cells.stains, "level", "places_mm"),
         "fields": numbers_of([one.coefficients for one in table.primaries.fields]) if table.primaries else None,
@@ -244,15 +203,3 @@ def reported(result: BuildResult) -> dict[str, Any]:
                 return value
 
     return kept(json.loads(json.dumps(report_json(result))))
-
-
-def words_of(folder: Path) -> list[str]:
-    """Return what the page of a report says beside its figures: headings, captions, sentences."""
-    page = (folder / "report.html").read_text(encoding="utf-8")
-    page = page[page.index("<body") :]
-    page = re.sub(r"<table.*?</table>|src='[^']*'", "", page, flags=re.DOTALL)
-    return [
-        words
-        for line in re.split(r"</?(?:p|h2|div|figcaption|li|summary|ul)\b[^>]*>|\n", page)
-        if (words := line.strip())
-    ]

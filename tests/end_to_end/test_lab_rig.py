@@ -25,6 +25,7 @@ from drivers.links.usb import open_usb
 from drivers.presenter import Colour
 from drivers.projector import Power
 from drivers.raw.rawfile import read_raw
+from drivers.serial_projectors.language import load_language
 from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from experiment.session.folder import Session
@@ -37,9 +38,10 @@ from sim.camera.eos import SimulatedEos
 from sim.camera.film import WorldFilm
 from sim.projectors.pjlink import serve_pjlink
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
-from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer
+from sim.projectors.serial import LinePeer
 from sim.world.world import World
 from tests.drivers.display.x_servers import virtual_screen
+from tests.drivers.serial_projectors.made_up import MADE_UP, TEXT
 from tests.end_to_end.conftest import make_lab
 from tests.found_texts import files_with
 
@@ -107,9 +109,9 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
             text += 'password = { env = "LAB_PROJECTOR" }\n'
         else:
             bus.plug(PtpUsbDevice(eos))
-            terminal = opened.enter_context(PseudoTerminal(PEERS["benq"](beamer)))
+            terminal = opened.enter_context(PseudoTerminal(LinePeer(beamer, load_language("benq"))))
             text += '[lab.camera]\nconnection = "usb"\n'
-            text += f'[lab.projector]\ncontrol = "benq"\ndevice = "{terminal.path}"\n'
+            text += f'[lab.projector]\ncontrol = "serial"\nlanguage = "benq"\ndevice = "{terminal.path}"\n'
         lab.write_text(text)
         monkeypatch.setattr("acquisition.run.rig.lab.open_usb", partial(open_usb, backend=bus))
         assert run_session(load_lab(lab), folder / "real", lambda done, total: None).complete
@@ -143,16 +145,19 @@ def test_check_reports_what_may_alter_the_light(
     assert "warming up: the lamp was just lit; waiting 20 min 00 s" in printed.err
 
 
-@pytest.mark.parametrize("maker", ["epson", "benq"])
-def test_a_makers_language_over_the_network(lab: Path, maker: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("named", ["epson", "languages/lantern.toml"])
+def test_a_makers_language_over_the_network(lab: Path, named: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
     monkeypatch.setattr("acquisition.run.rig.lab.CanonEos", Mock())
+    (lab.parent / "languages").mkdir(exist_ok=True)
+    (lab.parent / "languages" / "lantern.toml").write_text(TEXT)
     beamer = SimulatedProjector(SystemClock(), power=Power.ON)
-    peer = partial(EpsonPeer, beamer, network=True) if maker == "epson" else partial(BenqPeer, beamer, network=True)
-    with serve_peer(peer) as server:
+    language = MADE_UP if named.endswith(".toml") else load_language(named)
+    with serve_peer(lambda: LinePeer(beamer, language, network=True)) as server:
         host, port = server.address
         text = lab.read_text().replace('rig = "simulated"', 'rig = "lab"')
-        text += f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\n[lab.projector]\ncontrol = "{maker}"\n'
+        text += '[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\n'
+        text += f'[lab.projector]\ncontrol = "serial"\nlanguage = "{named}"\n'
         lab.write_text(text + f'host = "{host}"\nport = {port}\n')
         settings = load_lab(lab)
         with open_rig(settings, load_chart(settings.chart)) as devices:

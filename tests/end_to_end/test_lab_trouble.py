@@ -19,6 +19,7 @@ from drivers.links.network import TcpLink, TcpServer
 from drivers.links.usb import open_usb
 from drivers.pjlink import PjLinkProjector
 from drivers.projector import Power
+from drivers.serial_projectors.language import load_language
 from foundation.clock import Clock, SystemClock
 from sim.buses.ptp import serve_ptpip
 from sim.buses.serial import PseudoTerminal
@@ -27,7 +28,7 @@ from sim.camera.bodies import EOS_BODIES
 from sim.camera.eos import SimulatedEos
 from sim.projectors.pjlink import serve_pjlink
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
-from sim.projectors.serial import EpsonPeer
+from sim.projectors.serial import LinePeer
 from tests.contracts.camera import SeededFilm
 
 pytestmark = pytest.mark.slow
@@ -108,29 +109,36 @@ def free_port() -> int:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('control = "optoma"\nhost = "127.0.0.1"', "Optoma projectors are reached over a serial port only"),
-        ('control = "nec"\nbaud = 12345678901\ndevice = "{port}"', "choose another speed"),
+        (
+            'control = "serial"\nlanguage = "optoma"\nhost = "127.0.0.1"',
+            "Optoma projectors are reached over a serial port only",
+        ),
+        ('control = "serial"\nlanguage = "epson"\nbaud = 12345678901\ndevice = "{port}"', "choose another speed"),
     ],
 )
 def test_a_cable_that_cannot_be(bench: Bench, camera: str, text: str, words: str) -> None:
-    with PseudoTerminal(EpsonPeer(SimulatedProjector(SystemClock()))) as terminal:
+    with PseudoTerminal(LinePeer(SimulatedProjector(SystemClock()), load_language("epson"))) as terminal:
         code, said = bench.told(f"{camera}[lab.projector]\n{text.format(port=terminal.path)}\n")
     assert code == 2
     assert words in said
 
 
 def test_a_serial_port_that_is_not_there(bench: Bench, camera: str) -> None:
-    code, said = bench.told(f'{camera}[lab.projector]\ncontrol = "benq"\ndevice = "/dev/ttyCROP9"\n')
+    code, said = bench.told(
+        f'{camera}[lab.projector]\ncontrol = "serial"\nlanguage = "benq"\ndevice = "/dev/ttyCROP9"\n'
+    )
     assert code == 3
     assert said.startswith("projector: there is no serial port /dev/ttyCROP9; found: ")
 
 
 def test_another_language_than_the_projectors(bench: Bench, camera: str) -> None:
-    with PseudoTerminal(EpsonPeer(SimulatedProjector(SystemClock()))) as terminal:
-        code, said = bench.told(f'{camera}[lab.projector]\ncontrol = "optoma"\ndevice = "{terminal.path}"\n')
+    with PseudoTerminal(LinePeer(SimulatedProjector(SystemClock()), load_language("epson"))) as terminal:
+        code, said = bench.told(
+            f'{camera}[lab.projector]\ncontrol = "serial"\nlanguage = "optoma"\ndevice = "{terminal.path}"\n'
+        )
     assert code == 3
     assert "answers 'ERR" in said
-    assert "check that speed and parity are those set in the projector's menu, and the language its maker's" in said
+    assert "check that speed and parity are those set in the projector's menu, and that its language is right" in said
 
 
 def test_a_port_at_which_nobody_listens(bench: Bench, camera: str) -> None:

@@ -259,4 +259,4 @@ def test_following_what_a_check_recommends_leads_to_a_good_exposure(
     assert abs(float(said) * 60 - round(float(said) * 60)) < 0.01, "whole turns of a wheel of 60 Hz"
     lab.write_text(f"{text}{said}\n")
     assert run("check", lab) == 0
-    assert "good        exposure" in capsys.readouterr().out
+    assert "good        brightest_share" in capsys.readouterr().out

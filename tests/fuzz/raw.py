@@ -109,7 +109,7 @@ def entries(data: bytes) -> list[tuple[str, int]]:
                 break
             found.append((order, place))
             tag, _, _, value = struct.unpack_from(order + "HHII", data, place)
-            if tag in (330, 34665, 0xF000):
+            if tag in (330, 34665):
                 waiting.append(value)
     return found
 

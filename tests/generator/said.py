@@ -1,4 +1,4 @@
-"""What a call gives, or why it is refused, to be pinned."""
+"""The result of a call or its refusal, to be pinned."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from foundation.errors import CropError
 
 
 def said(call: Callable[..., Any], *given: Any, **named: Any) -> Any:
-    """Return what a call gives, or the sentence that refuses it."""
+    """Return the result of a call, or that it was refused."""
     try:
         return call(*given, **named)
-    except CropError as error:
-        return str(error)
+    except CropError:
+        return {"refused": 1}

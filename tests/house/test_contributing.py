@@ -35,9 +35,9 @@ COPIED = (
     "examples",
 )
 
-IGNORED = shutil.ignore_patterns("data", "*.pyc.*", "*.tmp.*")
-"""Data are linked to; half-written files of other processes go away. Kept machine code comes with the copy, whose times
-are those of the sources: compiling anew took half a minute an example."""
+IGNORED = ("*.pyc.*", "*.tmp.*")
+"""Half-written files of other processes go away. Kept machine code comes with the copy, whose times are those of the
+sources: compiling anew took half a minute an example."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Example:
 
     def files(self) -> dict[str, str]:
         """Return the new files by path."""
-        return dict(re.findall(r"^```python (\S+)\n(.*?)^```$", self.text, re.MULTILINE | re.DOTALL))
+        return dict(re.findall(r"^```(?:python|toml) (\S+)\n(.*?)^```$", self.text, re.MULTILINE | re.DOTALL))
 
     def changes(self) -> list[tuple[str, str, str]]:
         """Return path, what stands there and what shall stand there, hunk by hunk."""
@@ -78,9 +78,11 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of the repository in which all examples were followed, one after another."""
     folder = tmp_path_factory.mktemp("followed")
     for name in COPIED:
-        shutil.copytree(ROOT / name, folder / name, ignore=IGNORED)
-        for data in (ROOT / name).rglob("data"):
-            (folder / data.relative_to(ROOT)).symlink_to(data)
+        # The data of tests are large, and linked to.
+        linked = ("data",) if name == "tests" else ()
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns(*IGNORED, *linked))
+    for data in (ROOT / "tests").rglob("data"):
+        (folder / data.relative_to(ROOT)).symlink_to(data)
     (folder / "docs").mkdir()
     for name in ("pyproject.toml", "docs/lab.md"):
         shutil.copy(ROOT / name, folder / name)
@@ -117,7 +119,12 @@ def test_the_worked_examples_work(copy: Path) -> None:
 
 
 def test_constants_of_the_examples_state_their_reason() -> None:
-    texts = {path: text for example in EXAMPLES for path, text in example.files().items() if path[:5] != "tests"}
+    texts = {
+        path: text
+        for example in EXAMPLES
+        for path, text in example.files().items()
+        if path.endswith(".py") and path[:5] != "tests"
+    }
     without = [
         f"{path} {name}"
         for path, text in texts.items()

@@ -23,7 +23,6 @@ from tests.json_of import json_of
 
 WITHOUT_FIGURES = {
     "acquire init",
-    "acquire redact",
     "acquire rebuild",
     "acquire monitor",
     "acquire report",
@@ -138,11 +137,10 @@ def main_of(command: str) -> Any:
 CALLS: dict[str, tuple[str, dict[str, Any]]] = {
     "acquire chart": ("OUT/chart --bits 1 --no-tiff", {"colours": 8}),
     "acquire illuminations": ("OUT/lights.csv --grid 2 --blackbodies 5000", {"lights": 7}),
-    "acquire devices": ("--search 0", {}),
-    "build-lut --info": ("MADE/lut", {"lights": 4, "colours": 64, "samples": 25}),
-    "build-lut --verify": ("MADE/lut", {"faults": []}),
-    "build-lut --match": ("MADE/lut MADE/lut", {"match": True}),
-    "build-lut --publish": ("MADE/lut OUT/published", {"lights": 4}),
+    "build-lut info": ("MADE/lut", {"lights": 4, "colours": 64, "samples": 25}),
+    "build-lut verify": ("MADE/lut", {"faults": []}),
+    "build-lut match": ("MADE/lut MADE/lut", {"match": True}),
+    "build-lut publish": ("MADE/lut OUT/published", {"lights": 4}),
     "sim table": ("OUT/lut --settings MADE/table.toml --lights D65", {"lights": 1, "colours": 64}),
     "generate": ("MADE/lut OUT/set --sources MADE/pictures", {"images": 6, "made": True, "skipped": []}),
     "generate again": ("MADE/lut MADE/set --sources MADE/pictures --random 2", {"images": 12, "made": False}),

@@ -1,9 +1,9 @@
-"""What is pinned is seen to move, and by no less than what a processor moves it."""
+"""Tests of pins: a number that moves is noticed, a new one is not."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests import pinned as kit
-from tests.pinned import Pinned, plain, written
+from tests.pinned import FOLDER, TESTS, Pinned, numbers
 from tests.pinned.drawn import drawn
+
+MODULE = Path("room/test_x.py")
 
 
 @dataclass(frozen=True)
@@ -32,69 +34,66 @@ def run(share: float = 0.125, at: int = 7, by: float = 0.0) -> Run:
 @pytest.fixture
 def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pinned:
     monkeypatch.setattr(kit, "FOLDER", tmp_path)
-    Pinned(renew=True)("run", run())
-    return Pinned(renew=False)
+    Pinned(MODULE, renew=True)("run", run())
+    return Pinned(MODULE, renew=False)
 
 
-def test_what_is_kept_is_found_again(kept: Pinned) -> None:
+def test_accepts_equal_numbers_and_other_words(kept: Pinned) -> None:
     kept("run", run())
-    kept("run", run(share=0.125 * (1 + 1e-8), by=1e-9))
+    kept("run", replace(run(share=0.125 * (1 + 1e-8), by=1e-9), name="other"))
 
 
 @pytest.mark.parametrize(
     "moved", [run(share=0.1250002), run(share=float("nan")), run(by=1e-3), run(by=float("nan"), at=1199)]
 )
-def test_what_moved_is_told(kept: Pinned, moved: Run) -> None:
-    with pytest.raises(AssertionError, match=r"run\.json, was and is"):
+def test_refuses_changed_numbers(kept: Pinned, moved: Run) -> None:
+    with pytest.raises(AssertionError, match=r"run, was and is:\n(share|samples): "):
         kept("run", moved)
 
 
-@pytest.mark.parametrize("other", [{"a": 1}, {"a": [1, 2]}, {"a": "1"}, {"b": [1]}, {"a": [True]}])
-def test_another_form_is_told(kept: Pinned, other: Any) -> None:
-    Pinned(renew=True)("form", {"a": [1]})
-    with pytest.raises(AssertionError):
-        kept("form", other)
-
-
-def test_what_is_renewed_differs_where_it_moved(kept: Pinned, tmp_path: Path) -> None:
-    renew = Pinned(renew=True)
-    before = (tmp_path / "run.json").read_text()
-    renew("run", run(share=0.125 * (1 + 1e-8), by=1e-9))
-    assert (tmp_path / "run.json").read_text() == before
-    renew("run", run(share=0.25, by=1e-9))
-    assert (tmp_path / "run.json").read_text() == before.replace("0.125", "0.25")
-    renew("run", {"name": "bare"})
-    kept("run", {"name": "bare"})
-
-
-def test_nothing_is_written_unless_asked(kept: Pinned, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
+def test_refuses_missing_numbers_and_accepts_new_ones(kept: Pinned) -> None:
+    Pinned(MODULE, renew=True)("form", {"a": [1, 2], "b": {"c": True}})
+    kept("form", {"new": 5, "b": {"c": True, "d": 7.5}, "a": [1, 2]})
+    for other in ({"a": [1, 2]}, {"a": [1, 2, 3], "b": {"c": True}}, {"a": [1, 2], "b": {"c": "words"}}):
+        with pytest.raises(AssertionError):
+            kept("form", other)
+    with pytest.raises(AssertionError, match="renew-pinned"):
         kept("other", 1)
-    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+def test_renews_only_numbers_that_moved(kept: Pinned, tmp_path: Path) -> None:
+    renew, path = Pinned(MODULE, renew=True), tmp_path / "room" / "test_x.json"
+    before = path.read_text()
+    renew("run", run(share=0.125 * (1 + 1e-8), by=1e-9))
+    assert path.read_text() == before
+    renew("another", 1)
+    renew("run", run(share=0.25, by=1e-9))
+    pins = json.loads(path.read_text())
+    assert pins == json.loads(before.replace("0.125", "0.25")) | {"another": {"value": 1}}
+
+
+def test_names_records_by_name_and_joins_others() -> None:
+    named = [{"name": "b", "x": 1.5}, {"name": "a", "x": True}]
+    assert numbers({"r": named, "at": Path("/a"), "none": None}) == {"r.b.x": 1.5, "r.a.x": 1}
+    assert numbers({"r": [{"x": 1, "y": "word"}, {"x": np.float32(2.5)}]}) == {"r.x": [1, 2.5]}
+    assert numbers([np.zeros((2, 2)), b"ab"]) == {"0": [0, 0, 0, 0], "1.bytes": 2, "1.sha256": "fb8e20fc2e4c"}
+    assert numbers({"image": np.arange(8.0).reshape(2, 4)})["image"][:4] == [2, 4, 0, 7]  # pyrefly: ignore[bad-index]
+
+
+def test_every_file_belongs_to_a_test_module() -> None:
+    modules = [(TESTS / path.relative_to(FOLDER)).with_suffix(".py") for path in FOLDER.rglob("*.json")]
+    assert not [module for module in modules if not module.exists()], "move or delete these files of tests/pinned"
 
 
 @pytest.mark.slow
-def test_a_line_that_is_drawn_elsewhere_is_told(kept: Pinned) -> None:
+def test_notices_a_line_that_is_drawn_elsewhere(kept: Pinned) -> None:
     def figure(y: float, width: float = 1.0) -> Figure:
-        made = Figure()
+        made: Any = Figure()
         made.subplots().plot([0, 1], [0, y], linewidth=width)
         return made
 
-    Pinned(renew=True)("figure", drawn(figure(1)))
+    Pinned(MODULE, renew=True)("figure", drawn(figure(1)))
     kept("figure", drawn(figure(1)))
     for other in (figure(1.01), figure(1, width=2)):
         with pytest.raises(AssertionError):
             kept("figure", drawn(other))
-
-
-def test_every_value_is_one_of_json() -> None:
-    found = plain({1: (b"ab", np.float32(0.5), Path("/a/b"), {"b", "a"}, float("inf"), None, np.arange(3))})
-    assert json.loads(json.dumps(found))["1"][1:] == [0.5, "b", ["a", "b"], "inf", None, [0, 1, 2]]
-
-
-@pytest.mark.parametrize(
-    "value", [1, [], {}, [1, [2, "a"], {"b": [], "c": {"d": [[1.5]]}}], {"a": None, "b": {"c": True}}]
-)
-def test_what_is_written_is_json_of_the_same_value(value: Any) -> None:
-    assert json.loads(written(value)) == value
-    assert "\n" not in written([1, "a", None])

@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import usbip
-import usbip.host
 
-from drivers.links.network import TcpLink, TcpServer, UdpSocket
-from drivers.pjlink import PjLinkProjector, PjLinkReply, search
+from drivers.links.network import TcpLink, TcpServer
+from drivers.pjlink import PjLinkProjector
 from drivers.projector import Power
 from sim.cli import main
 from tests.drivers.display.x_servers import virtual_screen
-from tests.drivers.pjlink.notice_port import NoticePort
 from tests.sim.conftest import sim_serving
 
 
@@ -28,35 +25,15 @@ def test_serves_a_projector_until_interrupted() -> None:
 
 
 @pytest.mark.slow
-def test_is_found_and_announces_itself() -> None:
-    with NoticePort(0, "127.0.0.1") as controller:
-        cables = ("--pjlink", "0", "--udp", "0", "--notify", f"127.0.0.1:{controller.address[1]}")
-        with sim_serving("projector", *cables, lines=2) as (line, _):
-            host, port = line.split()[-1].split(":")
-            found = search(30.0, enough=1, address=host, port=int(port), listen_port=0)
-            _, notice = controller.receive(30.0)
-    assert [projector.mac for projector in found] == ["02:00:00:00:00:01"]
-    assert notice == PjLinkReply("LKUP", "02:00:00:00:00:01", 2)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
-    [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"], ["camera", "--model", "Test", "--usbip"]],
+    [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"]],
 )
 def test_a_taken_port_is_one_line(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
     with TcpServer(lambda link: None) as server:
         assert main([*arguments, str(server.address[1])]) == 3
     error = capsys.readouterr().err
     assert error.startswith("error: cannot listen at 127.0.0.1:")
-    assert error.count("\n") == 1
-
-
-def test_a_taken_udp_port_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with UdpSocket(host="127.0.0.1") as taken:
-        assert main(["projector", "--pjlink", "0", "--udp", str(taken.address[1])]) == 3
-    error = capsys.readouterr().err
-    assert error.startswith("error: cannot receive datagrams at 127.0.0.1:")
     assert error.count("\n") == 1
 
 
@@ -67,10 +44,6 @@ def test_a_taken_udp_port_is_one_line(capsys: pytest.CaptureFixture[str]) -> Non
         ["projector"],
         ["projector", "--pjlink", "x"],
         ["projector", "--pjlink", "70000"],
-        ["projector", "--pjlink", "0", "--udp", "70000"],
-        ["projector", "--pjlink", "0", "--notify", "here"],
-        ["projector", "--pjlink", "0", "--notify", "127.0.0.1:0"],
-        ["projector", "--pjlink", "0", "--notify", "127.0.0.1:65536"],
         ["toaster"],
     ],
 )
@@ -81,13 +54,6 @@ def test_wrong_arguments_end_with_2(arguments: list[str]) -> None:
 def test_a_password_longer_than_the_standards_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["projector", "--pjlink", "0", "--password", "x" * 33]) == 2
     assert "at most 32" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("cables", [(), ("--port", "0", "--usbip", "0")])
-def test_a_camera_has_one_cable(capsys: pytest.CaptureFixture[str], cables: tuple[str, ...]) -> None:
-    assert main(["camera", *cables]) == 2
-    expected = "one camera has one cable: either --port N for PTP/IP or --usbip N for USB/IP"
-    assert capsys.readouterr().err == f"error: {expected}\n"
 
 
 def test_an_unknown_model_is_answered_by_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,15 +67,6 @@ def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.slow
-def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
-    with sim_serving("camera", "--usbip", "0", "--model", "EOS 6D Mark II") as (line,):
-        assert line.endswith("bus id 1-1\n")
-        host, port = line.split(" at ")[1].split(",")[0].split(":")
-        found = usbip.host.list_devices(usbip.USBIP(host, int(port)))
-    assert [(entry["idVendor"], entry["idProduct"]) for entry in found] == [(0x04A9, 0x32CA)]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -118,12 +75,6 @@ def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
         (["--room", "profile=shiny"], "--room.profile"),
         (["--watch-projector", "127.0.0.1:4352"], "--watch-projector needs --watch-screen"),
         (["--watch-screen", "HDMI-1"], "'HDMI-1' is no screen"),
-        (["--event", "{ what = 'bump'"], "is not TOML"),
-        (["--event", "{ what = 'flood' }"], "there is no such event; what is one of frozen screen"),
-        (
-            ["--watch-screen", ":1", "--event", "{ what = 'frozen screen' }"],
-            "frozen screen is for the simulated screen",
-        ),
         (["--chart", "chart.json"], "charts are read by the program sim"),
     ],
 )
@@ -152,18 +103,12 @@ def test_a_screen_or_projector_that_is_not_there_ends_with_3(
 
 @pytest.mark.slow
 def test_a_projector_takes_its_time_as_told() -> None:
-    options = ("--warm-up", "0", "--cool-down", "0", "--class", "1", "--answer-after", "0.01")
+    options = ("--warm-up", "0", "--cool-down", "0")
     with sim_serving("projector", "--pjlink", "0", *options) as (line,):
         host, port = line.split()[-1].split(":")
         projector = PjLinkProjector(lambda: TcpLink.connect(host, int(port), 10.0), timeout=10.0)
-        assert projector.pjlink_class() == 1
         projector.switch_on()
         assert projector.power() is Power.ON
         projector.switch_off()
         assert projector.power() is Power.STANDBY
         projector.close()
-
-
-def test_a_serial_projector_answers_at_its_own_pace(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["projector", "--serial", "nec", "--answer-after", "1"]) == 2
-    assert "--answer-after and --class are PJLink's" in capsys.readouterr().err

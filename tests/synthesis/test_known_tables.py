@@ -12,7 +12,7 @@ import pytest
 
 from calibration.table.lut import open_lut
 from synthesis.lamps import illuminations_of, parse_spectra, read_lights
-from synthesis.settings import parse_settings, room_of, stated_by_hand, table_task
+from synthesis.settings import parse_settings, table_task
 from synthesis.table import compute_table
 from tests.generator.dataset.known import rows_of
 from tests.generator.said import said
@@ -69,9 +69,10 @@ def held_by(folder: Path) -> dict[str, Any]:
 @pytest.mark.parametrize("name", CASES)
 def test_a_table_of_spectra(name: str, tmp_path: Path, pinned: Pinned) -> None:
     camera, document, lights = CASES[name]
-    settings = parse_settings(document, "here")
+    citation = {"note": "a note", "licence": "CC0-1.0", "authors": ["One"]}
+    settings = parse_settings({**document, "citation": citation}, "here")
     task = table_task(camera, settings, "here", None if lights is None else read_lights(lights))
-    done = compute_table(replace(task, origin=stated_by_hand("a note", "CC0-1.0", ["One"])), tmp_path / "lut", 1)
+    done = compute_table(task, tmp_path / "lut", 1)
     pinned(f"computed table, {name}", [done.unfit, done.cells, held_by(done.folder)])
 
 
@@ -97,7 +98,7 @@ def test_spectra_of_lights(pinned: Pinned) -> None:
     found: dict[str, Any] = {}
     for name in named:
         lights = said(read_lights, name)
-        found[name] = lights if isinstance(lights, str) else [
+        found[name] = lights if isinstance(lights, dict) else [
             lights.source,
             [[one.name, one.cct_k] for one in lights.lights],
             np.array([one.power for one in lights.lights]),
@@ -109,41 +110,5 @@ def test_spectra_of_lights(pinned: Pinned) -> None:
     texts["name"] = "wavelength,1.5\n400,1\n"
     for name, text in texts.items():
         lights = said(parse_spectra, text.encode(), "lamps.csv")
-        found[name] = lights if isinstance(lights, str) else [[one.name, one.power] for one in lights]
+        found[name] = lights if isinstance(lights, dict) else [[one.name, one.power] for one in lights]
     pinned("spectra of lights", found)
-
-
-def test_settings_of_tables(pinned: Pinned) -> None:
-    documents: list[dict[str, Any]] = [
-        {},
-        {"window": 4},
-        {"window": 9},
-        {"room": {"blur_px": 1.0}},
-        {"chart": {"bits": 6}},
-    ]
-    documents += [
-        {"room": {"profile": "none"}},
-        {"exposure": {"iso": 20}},
-        {"seed": -1},
-        {"camera": {"black": 100}},
-        {"x": 1},
-    ]
-    documents.append({"seed": 5, "room": {"response_spread": 0.1}, "exposure": {"iso": 400}, "chart": {"page": "A4"}})
-    found: list[Any] = []
-    for document in documents:
-        settings = said(parse_settings, document, "here")
-        if isinstance(settings, str):
-            found.append(settings)
-            continue
-        found.append(
-            [
-                said(room_of, settings, "here"),
-                settings.changed(None, {}) == settings,
-                settings.changed(9, {"paper": "matt"}),
-            ]
-        )
-    small = parse_settings({"chart": {"bits": 2}, "camera": {"black": 100}}, "here")
-    task = table_task("Test", small, "here")
-    found += [task.record, task.sample_bytes, len(task.illuminations), task.exposure]
-    found += [stated_by_hand(None, None, []), stated_by_hand("n", None, []), said(stated_by_hand, None, "free", [])]
-    pinned("settings of computed tables", found)

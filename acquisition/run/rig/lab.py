@@ -13,9 +13,6 @@ from acquisition.run.devices import Devices, LightNotShown, ask_all, require_who
 from drivers.camera import Camera
 from drivers.canon import CanonEos
 from drivers.display.fullscreen import FullScreen, display_warnings, identify_displays, list_displays
-from drivers.display.jvc import PORT as JVC_PORT
-from drivers.display.jvc import JvcFlatField
-from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
 from drivers.gphoto2_camera import Gphoto2Camera
 from drivers.links.network import TcpLink
 from drivers.links.serial import SerialLink, list_serial_ports
@@ -27,8 +24,9 @@ from drivers.projector import Projector
 from drivers.ptp.codes import VENDOR_CANON_USB
 from drivers.ptp.ip import IpTransport
 from drivers.ptp.usb import UsbTransport
-from drivers.serial_projectors import language
-from experiment.config import CameraCable, LabSettings, LightSource, ProjectorCable
+from drivers.serial_projectors.driver import LineProjector
+from drivers.serial_projectors.language import built_in_languages, load_language
+from experiment.config import CameraCable, LabSettings, ProjectorCable
 from experiment.session.folder import Session
 from experiment.session.records import last_moment
 from foundation.clock import Clock, SteadyClock, SystemClock
@@ -70,8 +68,11 @@ def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, 
         cameras.append(camera)
 
     def open_presenter() -> None:
-        light = _lab_presenter if shows and cameras and projectors else _light_not_shown
-        presenters.append(light(settings.lab.light, clock, settings.file))
+        display = settings.lab.light.display
+        if shows and cameras and projectors:
+            presenters.append(FullScreen(display, clock))
+        else:
+            presenters.append(LightNotShown(display_warnings(display)))
         opened.callback(presenters[0].close)
 
     # One that cannot be used does not keep the others' faults from being told.
@@ -126,59 +127,44 @@ def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector 
             about=file,
             remedy="leave out the one that is not connected",
         )
-    if cable.control == "pjlink" and cable.device is not None:
+    if cable.control == "serial":
+        return _line_projector(cable, clock, file)
+    if cable.device is not None:
         raise ConfigurationError(
             "lab.projector.device is a serial port, and PJLink goes by the network",
             about=file,
-            remedy="give the projector's address as host, or name the language of its serial port as control",
+            remedy='give the projector\'s address as host, or write control = "serial" and its language',
         )
-    if cable.control == "pjlink":
-        host = _required(cable.host, "lab.projector.host", "the projector's address", file)
-        port = cable.port or PJLINK_PORT
-        label = f"the projector at {host}:{port}"
-        return PjLinkProjector(lambda: TcpLink.connect(host, port, CONNECT_S), cable.password, label=label, clock=clock)
-    spoken = language(cable.control)
-    if cable.device is None and cable.host is not None and spoken.network is not None:
-        host, port = cable.host, cable.port or spoken.tcp_port
-        label = f"the projector at {host}:{port}"
-        return spoken.network(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
-    if cable.device is None and cable.host is not None:
+    host = _required(cable.host, "lab.projector.host", "the projector's address", file)
+    port = cable.port or PJLINK_PORT
+    label = f"the projector at {host}:{port}"
+    return PjLinkProjector(lambda: TcpLink.connect(host, port, CONNECT_S), cable.password, label=label, clock=clock)
+
+
+def _line_projector(cable: ProjectorCable, clock: Clock, file: str) -> LineProjector:
+    if cable.language is None:
         raise ConfigurationError(
-            f"lab.projector.host: {spoken.maker} projectors are reached over a serial port only",
+            "lab.projector.language is missing",
             about=file,
-            remedy="name lab.projector.device, acquire devices lists what is there",
+            remedy=f"name one of {', '.join(built_in_languages())}, or a language file",
+            value="lab.projector.language",
         )
+    language = load_language(cable.language)
+    if cable.host is not None:
+        if language.network is None:
+            raise ConfigurationError(
+                f"lab.projector.host: {language.maker} projectors are reached over a serial port only",
+                about=file,
+                remedy="name lab.projector.device, acquire devices lists what is there",
+            )
+        host, port = cable.host, cable.port or language.network.port
+        label = f"the projector at {host}:{port}"
+        return LineProjector(language, lambda: TcpLink.connect(host, port, CONNECT_S), True, label, clock)
     device = _required(cable.device, "lab.projector.device", "the serial port", file)
-    return spoken.projector(
-        lambda: SerialLink.open(device, cable.baud or spoken.baud),
-        label=f"the projector at {device}",
-        clock=clock,
+    baud = cable.baud or language.line.baud
+    return LineProjector(
+        language, lambda: SerialLink.open(device, baud), label=f"the projector at {device}", clock=clock
     )
-
-
-def _lab_presenter(light: LightSource, clock: Clock, file: str) -> Presenter:
-    match light.shown_by:
-        case "display":
-            return FullScreen(light.display, clock)
-        case "lightcrafter":
-            return LightCrafter(find_lightcrafter, clock)
-        case "jvc":
-            host = _required(light.host, "lab.light.host", "the projector's address", file)
-            port = light.port or JVC_PORT
-            label = f"the JVC projector at {host}:{port}"
-            return JvcFlatField(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
-
-
-def _light_not_shown(light: LightSource, _: Clock, file: str) -> LightNotShown:
-    """Return what stands for a light that is not to be shown; a fault where it could not be."""
-    match light.shown_by:
-        case "display":
-            return LightNotShown(display_warnings(light.display))
-        case "lightcrafter":
-            return LightNotShown((), "light: the LightCrafter is black as soon as it is opened")
-        case "jvc":
-            _required(light.host, "lab.light.host", "the projector's address", file)
-            return LightNotShown((), "light: the projector's picture is black as soon as it is opened")
 
 
 def _required(value: str | None, key: str, what: str, file: str) -> str:
@@ -197,15 +183,12 @@ class Attached:
     trouble: str = ""
 
 
-def attached_devices(search_s: float) -> Generator[Attached]:
+def attached_devices() -> Generator[Attached]:
     """Yield what is attached and reachable, kind by kind; a kind that cannot be asked says why."""
     yield _attached("cameras on USB", lambda: [str(device) for device in list_devices()])
     yield _attached("serial ports", list_serial_ports)
     yield _attached("displays", lambda: [str(display) for display in list_displays()])
-    if search_s > 0:
-        yield _attached(
-            "projectors by PJLink", lambda: [f"{found.host}, MAC {found.mac}" for found in search(search_s)]
-        )
+    yield _attached("projectors by PJLink", lambda: [f"{found.host}, MAC {found.mac}" for found in search()])
 
 
 def _attached(kind: str, ask: Callable[[], Iterable[str]]) -> Attached:

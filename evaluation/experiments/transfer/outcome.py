@@ -9,17 +9,25 @@ The paper's own ratios stand beside ours.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.bootstrap import STATISTICS, ErrorSample, bca, numbered, resamples
+from evaluation.experiments.bootstrap import (
+    LEVEL,
+    STATISTICS,
+    BoundedFigure,
+    ErrorSample,
+    bounded_figures,
+    ratio_of,
+)
 from evaluation.experiments.folds import folds_to_csv, groups_of
 from evaluation.experiments.paper.published import TABLE2
 from evaluation.experiments.transfer.plan import TransferPlan, is_generated
@@ -31,26 +39,12 @@ from evaluation.results.result import Result
 from evaluation.results.tables import Table, finite_or_none, table_to_csv
 from evaluation.scene import SceneSet
 from foundation import pages
-from foundation.errors import InputError
 from foundation.files import write_whole
 from foundation.folders import whole_folder
 from foundation.plots import FAINT, INK, legend_label, series_style, standalone, svg_of
 from foundation.version import software
 
-COUNT: Final = 2000
-"""Resamples: as many as `bootstrap.interval` takes by default."""
-LEVEL: Final = 0.95
-"""Confidence of an interval: the usual one."""
-
 Floats = npt.NDArray[np.float64]
-
-
-class BoundedFigure(NamedTuple):
-    """A number with the ends of its confidence interval; NaN where it is not known."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -87,7 +81,6 @@ class TransferFigures:
     - `rows`: every row with its statistics.
     - `to_real`: every row that was trained elsewhere against the same method's real cross-validation.
     - `to_naive`: every generated row against the naive rows of the same pictures and lights.
-    - `to_base`: every other row against those that were asked for, of the same method.
     - `to_better`: every row adapted to N real images against the better in the mean of real images alone and of its set
       alone.
     - `to_naive_adapted`: every adapted generated row against its naive ones, adapted to the same images.
@@ -97,99 +90,63 @@ class TransferFigures:
     rows: tuple[RowFigures, ...]
     to_real: tuple[RowRatio, ...]
     to_naive: tuple[RowRatio, ...]
-    to_base: tuple[RowRatio, ...] = ()
     to_better: tuple[RowRatio, ...] = ()
     to_naive_adapted: tuple[RowRatio, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class _Replicates:
-    """Statistics of one row: of itself (6,), of resamples (B, 6), and without each image (N, 6); means over seeds."""
-
-    estimate: Floats
-    resampled: Floats
-    without: Floats
-
-
-def figures_of(
-    rows: Sequence[TransferRow],
-    error: ErrorKind,
-    base: str | None = None,
-    groups: Sequence[str] | None = None,
-) -> TransferFigures:
+def figures_of(rows: Sequence[TransferRow], error: ErrorKind, groups: Sequence[str] | None = None) -> TransferFigures:
     """Return statistics, intervals and ratios of rows on the same test images.
 
-    `base`: `TransferRow.training` of rows that every other one is held to as well, with x for × and in any case; None
-    for no such ratios. `groups`: what each test image shares with others, so that they are drawn together; None if
-    every one is one of its own.
+    `groups`: what each test image shares with others, so that they are drawn together; None if every image is its own
+    group.
     """
-    numbers = None if groups is None else numbered(groups)
-    bases = _named(rows, base)
     samples = [[ErrorSample.of(result.errors[error]) for result in row.results] for row in rows]
-    drawn: list[list[Floats]] = [[] for _ in rows]
-    for counts in resamples(len(samples[0][0].order), 0, COUNT, numbers):
-        for batches, several in zip(drawn, samples, strict=True):
-            batches.append(np.mean([one.statistics(counts) for one in several], axis=0))
-    known = [
-        _Replicates(
-            np.mean([one.estimate() for one in several], axis=0),
-            np.concatenate(batches),
-            np.mean([one.without_each(numbers) for one in several], axis=0),
-        )
-        for several, batches in zip(samples, drawn, strict=True)
-    ]
-    listed = tuple(
-        RowFigures(
-            row,
-            tuple(_figure(one.estimate[place], one.resampled[:, place], one.without[:, place]) for place in _PLACES),
-            _spread(several),
-        )
-        for row, one, several in zip(rows, known, samples, strict=True)
-    )
+    values = [np.mean([one.estimate() for one in several], axis=0) for several in samples]
+    pairs = _pairs(rows, [float(value[0]) for value in values])
 
-    def ratio(number: int, base: int) -> RowRatio:
-        one, other = known[number], known[base]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            parts = [one.estimate / other.estimate, one.resampled / other.resampled, one.without / other.without]
-        ratios = tuple(_figure(parts[0][place], parts[1][:, place], parts[2][:, place]) for place in _PLACES)
-        return RowRatio(rows[number], rows[base], ratios)
+    def numbers(counts: npt.NDArray[np.int64]) -> Floats:
+        known = [np.mean([one.statistics(counts) for one in several], axis=0) for several in samples]
+        ratios = [ratio_of(known[row], known[base]) for several in pairs.values() for row, base in several]
+        return np.concatenate([*known, *ratios], axis=1)
 
-    to_real = [
-        ratio(number, base)
-        for number, row in enumerate(rows)
-        for base, other in enumerate(rows)
-        if other.kind == "cross-validation"
-        and other.method == row.method
-        and row.kind not in ("cross-validation", "none")
-        and not row.way
-    ]
-    to_naive = [
-        ratio(number, base)
-        for number, row in enumerate(rows)
-        for base, other in enumerate(rows)
-        if row.kind == "generated" and other.kind in NAIVE and (other.method, other.data) == (row.method, row.data)
-        if not row.way and not other.way
-    ]
-    to_better = [
-        ratio(number, min(_alone(rows, row), key=lambda place: known[place].estimate[0]))
-        for number, row in enumerate(rows)
-        if row.way == "adapted"
-    ]
-    to_naive_adapted = [
-        ratio(number, base)
-        for number, row in enumerate(rows)
-        for base, other in enumerate(rows)
-        if (row.kind, row.way) == ("generated", "adapted") and other.kind in NAIVE
-        if (other.method, other.data, other.way, other.real) == (row.method, row.data, row.way, row.real)
-    ]
-    to_base = [
-        ratio(number, other)
-        for number, row in enumerate(rows)
-        for other in bases
-        if number not in bases and rows[other].method == row.method
-    ]
-    ratios = (to_real, to_naive, to_base, to_better, to_naive_adapted)
-    return TransferFigures(error, listed, *(tuple(each) for each in ratios))
+    made = _batches(bounded_figures(numbers, len(samples[0][0].order), groups))
+    listed = tuple(RowFigures(row, next(made), _spread(several)) for row, several in zip(rows, samples, strict=True))
+    ratios = {
+        name: tuple(RowRatio(rows[row], rows[base], next(made)) for row, base in several)
+        for name, several in pairs.items()
+    }
+    return TransferFigures(error, listed, **ratios)
+
+
+def _batches(figures: Sequence[BoundedFigure]) -> Iterator[tuple[BoundedFigure, ...]]:
+    """Yield the figures of one row, or of one ratio, after another."""
+    several = iter(figures)
+    while batch := tuple(itertools.islice(several, len(STATISTICS))):
+        yield batch
+
+
+def _pairs(rows: Sequence[TransferRow], means: Sequence[float]) -> dict[str, list[tuple[int, int]]]:
+    """Return the places of each row and of what it is held to, by the name of the ratios in `TransferFigures`."""
+    pairs: dict[str, list[tuple[int, int]]] = {
+        "to_real": [],
+        "to_naive": [],
+        "to_better": [],
+        "to_naive_adapted": [],
+    }
+    for place, row in enumerate(rows):
+        for base, other in enumerate(rows):
+            if other.method != row.method:
+                continue
+            if other.kind == "cross-validation" and row.kind not in ("cross-validation", "none") and not row.way:
+                pairs["to_real"].append((place, base))
+            if row.kind == "generated" and other.kind in NAIVE and other.data == row.data:
+                if not row.way and not other.way:
+                    pairs["to_naive"].append((place, base))
+                elif row.way == other.way == "adapted" and row.real == other.real:
+                    pairs["to_naive_adapted"].append((place, base))
+        if row.way == "adapted":
+            pairs["to_better"].append((place, min(_alone(rows, row), key=lambda base: means[base])))
+    return pairs
 
 
 def _alone(rows: Sequence[TransferRow], adapted: TransferRow) -> list[int]:
@@ -201,35 +158,6 @@ def _alone(rows: Sequence[TransferRow], adapted: TransferRow) -> list[int]:
         if row.method == adapted.method
         and (row.way, row.real, row.kind, "" if row.kind == "real" else row.data) in wanted
     ]
-
-
-def _named(rows: Sequence[TransferRow], base: str | None) -> list[int]:
-    """Return the places of the rows that were trained in the way of that name."""
-    if base is None:
-        return []
-    trained = [(number, row) for number, row in enumerate(rows) if row.kind != "none"]
-    found = [number for number, row in trained if _plain(row.training) == _plain(base)]
-    if not found:
-        known = dict.fromkeys(row.training for _, row in trained)
-        raise InputError(f"no row was trained on {base!r}; expected one of: {'; '.join(known)}")
-    methods = {rows[number].method for number in found}
-    if not any(row.method in methods for number, row in trained if number not in found):
-        raise InputError(f"no method was trained on anything but {base!r}; add results to hold to it, or leave it out")
-    return found
-
-
-def _plain(training: str) -> str:
-    return " ".join(training.casefold().replace("×", " x ").split())
-
-
-_PLACES: Final = range(len(STATISTICS))
-"""Places of the statistics in arrays."""
-
-
-def _figure(value: float, replicates: Floats, without: Floats) -> BoundedFigure:
-    if not np.isfinite(value):
-        return BoundedFigure(np.nan, np.nan, np.nan)
-    return BoundedFigure(float(value), *bca(float(value), replicates, [without], LEVEL))
 
 
 def _spread(several: Sequence[ErrorSample]) -> tuple[float, ...] | None:
@@ -302,17 +230,6 @@ def naive_ratios_table(found: TransferFigures, name: str) -> Table | None:
         [(one, one.base.training) for one in found.to_naive],
         "Paired by test image. Below 1: the table is worth something to this method.",
         "In parts of",
-    )
-
-
-def base_ratios_table(found: TransferFigures, name: str) -> Table | None:
-    """Return every row in parts of the row that was asked for; None if none was."""
-    if not found.to_base:
-        return None
-    return _ratios_table(
-        f"{name}: errors in parts of those of the same method, trained on {found.to_base[0].base.training}",
-        [(one, one.row.training) for one in found.to_base],
-        "Paired by test image. Sets of other pictures or lights are held together with the choice of them.",
     )
 
 
@@ -402,7 +319,6 @@ def tables_of(found: TransferFigures, name: str, images: int) -> tuple[Table, ..
         intervals_table(found, name),
         real_ratios_table(found, name),
         naive_ratios_table(found, name),
-        base_ratios_table(found, name),
         beside_table(found, name),
         naive_adapted_table(found, name),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,8 @@ from acquisition.check.check import check_lab
 from acquisition.check.findings import CheckReport
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
+from experiment.framing.field import Corners
 from experiment.lights import plan_illuminations, save_illuminations
-from tests.pinned import Pinned
 
 Check = Callable[..., CheckReport]
 
@@ -40,7 +39,7 @@ def lab_toml(chart: str, camera: str = "", more: str = "", seed: int = 1, **room
 
 
 @pytest.fixture(scope="session")
-def checking(folder: Path) -> Check:
+def check(folder: Path) -> Check:
     """Return what checks a room."""
 
     def run(
@@ -50,31 +49,11 @@ def checking(folder: Path) -> Check:
         chart: str | None = None,
         linearity: bool = False,
         seed: int = 1,
+        corners: Corners | None = None,
         **room: Any,
     ) -> CheckReport:
         lab = folder / "LAB.toml"
         lab.write_text(lab_toml(chart or f"chart{bits}.json", camera, more, seed, **room))
-        return check_lab(load_lab(lab), linearity=linearity)
-
-    return run
-
-
-@pytest.fixture
-def check(checking: Check, pinned: Pinned, request: pytest.FixtureRequest) -> Check:
-    """Return what checks a room, and holds what it finds against what it found in the room of this test before."""
-    name = re.sub("[^a-z0-9]+", " ", str(request.node.name).removeprefix("test_")).strip()
-
-    def run(*given: Any, **named: Any) -> CheckReport:
-        report = checking(*given, **named)
-        # What is free on a disk changes by itself.
-        known = [found for found in report.findings if found.name not in ("disk", "card")]
-        # Numbers in sentences are rounded, and stand among the details as they are.
-        said = [re.sub("[0-9.]+", "#", one.sentence()) if one.grade != "good" else "" for one in known]
-        found = {
-            f"{one.name}: {one.grade} {sentence}": [one.value, one.details]
-            for one, sentence in zip(known, said, strict=True)
-        }
-        pinned(f"check, {name}", [found, report.forecast, report.figures, " ".join(report.not_known)], same=1e-4)
-        return report
+        return check_lab(load_lab(lab), linearity=linearity, corners=corners)
 
     return run

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Generator
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
-from pathlib import Path
+from contextlib import ExitStack
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
-from acquisition.check import check as module
-from acquisition.run.devices import Devices
 from acquisition.run.rig import lab as rig
-from acquisition.run.rig.opening import open_rig
-from experiment.config import LabSettings, load_lab, parse_lab
+from experiment.config import LabSettings, parse_lab
 from foundation.errors import ConfigurationError, DeviceError, LinkClosed
-from tests.acquisition.check.conftest import lab_toml
 
 DEVICES = ("camera", "display", "projector")
 FAULTY = [chosen for count in (1, 2, 3) for chosen in itertools.combinations(DEVICES, count)]
@@ -45,31 +39,6 @@ class Broken:
         return fail
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("faulty", FAULTY, ids="+".join)
-def test_every_fault_of_simulated_devices_is_told_at_once(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, faulty: tuple[str, ...]
-) -> None:
-    @contextmanager
-    def opening(settings: LabSettings, *others: Any) -> Generator[Devices]:
-        with open_rig(settings, *others) as devices:
-            places = {"camera": "camera", "display": "presenter", "projector": "projector"}
-            broken: dict[str, Any] = {places[name]: Broken(SAYS[name]) for name in faulty}
-            yield replace(devices, **broken)
-
-    monkeypatch.setattr(module, "open_rig", opening)
-    (folder / "LAB.toml").write_text(lab_toml("chart1.json"))
-    with pytest.raises(DeviceError) as told:
-        module.check_lab(load_lab(folder / "LAB.toml"))
-    for name in DEVICES:
-        assert (SAYS[name] in str(told.value)) == (name in faulty)
-    assert told.value.exit_code == 3
-    if len(faulty) == 1:
-        assert str(told.value).removeprefix("the ").startswith(faulty[0])
-    else:
-        assert str(told.value).startswith(f"{len(faulty)} of 3 devices cannot be used:")
-
-
 def lab_settings() -> LabSettings:
     return parse_lab('rig = "lab"\nchart = "c"\nilluminations = "i"\n', "LAB.toml")
 
@@ -79,11 +48,11 @@ def test_every_device_of_a_real_lab_is_opened_though_another_fails(
     monkeypatch: pytest.MonkeyPatch, faulty: tuple[str, ...]
 ) -> None:
     closed: list[str] = []
-    places = {"camera": "_lab_camera", "projector": "_lab_projector", "display": "_lab_presenter"}
+    places = {"camera": "_lab_camera", "projector": "_lab_projector", "display": "FullScreen"}
     if faulty != ("display",):
         # Nothing is shown while another device is at fault: another program may be at work with it.
-        places["display"] = "_light_not_shown"
-        monkeypatch.setattr(rig, "_lab_presenter", None)
+        places["display"] = "display_warnings"
+        monkeypatch.setattr(rig, "FullScreen", None)
 
     class Sound:
         def __init__(self, name: str) -> None:
@@ -108,7 +77,7 @@ def test_every_device_of_a_real_lab_is_opened_though_another_fails(
     for name in DEVICES:
         assert (SAYS[name] in str(told.value)) == (name in faulty)
     # What was opened is closed, whatever failed beside it.
-    assert sorted(closed) == sorted(set(DEVICES) - set(faulty))
+    assert sorted(closed) == sorted({"camera", "projector"} - set(faulty))
 
 
 @pytest.mark.parametrize("silent", [("camera",), ("projector",), ("camera", "projector")], ids="+".join)
@@ -125,7 +94,7 @@ def test_a_device_that_opens_and_does_not_answer_is_told_beside_one_that_does_no
         def close(self) -> None:
             pass
 
-    monkeypatch.setattr(rig, "_light_not_shown", no_display)
+    monkeypatch.setattr(rig, "display_warnings", no_display)
     for name in ("camera", "projector"):
 
         def opens(*_: object, name: str = name) -> Broken | Sound:
@@ -138,11 +107,12 @@ def test_a_device_that_opens_and_does_not_answer_is_told_beside_one_that_does_no
         assert (SAYS[name] in str(told.value)) == (name in (*silent, "display"))
 
 
-def test_faults_of_the_settings_alone_are_the_settings_fault() -> None:
+def test_faults_of_the_settings_alone_are_the_settings_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig, "display_warnings", Mock(return_value=()))
     text = 'rig = "lab"\nchart = "c"\nilluminations = "i"\n[lab.camera]\nconnection = "ptpip"\n'
-    settings = parse_lab(text + '[lab.projector]\ncontrol = "pjlink"\n[lab.light]\nshown_by = "jvc"\n', "LAB.toml")
+    settings = parse_lab(text + '[lab.projector]\ncontrol = "pjlink"\n', "LAB.toml")
     with pytest.raises(ConfigurationError) as told, ExitStack() as opened:
         rig.open_lab(settings, None, opened)
-    for key in ("lab.projector.host", "lab.light.host"):
+    for key in ("lab.camera.host", "lab.projector.host"):
         assert f"{key} is missing" in str(told.value)
     assert told.value.exit_code == 2

@@ -1,64 +1,114 @@
-"""What is measured of a frame, and where it is looked at in which no chart is known."""
+"""Exposure is judged on counts: clipping, darkness, stray light; and where a frame is looked at without a chart."""
 
 from __future__ import annotations
+
+import io
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from acquisition.judge import measure
-from drivers.raw.rawfile import Mosaic, Plane
-from drivers.raw.storage import Area
+from acquisition.judge.measure import disagreement, refusal
+from drivers.camera import ExposureSettings
+from drivers.raw.rawfile import Mosaic, Plane, read_raw
+from experiment.config import LimitSettings
+from experiment.measures.exposure import Exposure
+from sim.camera.film import write_dng
+from sim.world.sensors import BODIES
+
+BODY = BODIES["Test"]
+RANGE = BODY.saturation - BODY.black
+LIMITS = LimitSettings()
 
 
-def mosaic(black: float = 2048.0) -> Mosaic:
-    """Return a frame of 240 × 160 blocks in which each photosite of a block has its own level above black."""
-    counts = np.tile(np.array([[1000, 2000], [2400, 1500]], dtype=np.uint16), (160, 240)) + np.uint16(black)
-    return Mosaic(counts, "RGGB", np.full((2, 2), black), 15831, "a camera", counts, Area(0, 0, 320, 480), ())
+def mosaic_of(tmp_path: Path, level: int, clipped: int = 0) -> Mosaic:
+    """Return a frame of one level above black with `clipped` saturated photosites in the visible area."""
+    counts = np.full(BODY.sensor, BODY.black, dtype=np.uint16)
+    top, left, height, width = BODY.visible
+    visible = counts[top : top + height, left : left + width]
+    visible[:] = BODY.black + level
+    places = np.random.default_rng(1).choice(height * width, clipped, replace=False)
+    visible[places // width, places % width] = BODY.saturation
+    stream = io.BytesIO()
+    write_dng(stream, counts, BODY, settings=ExposureSettings(100, 8, 0.5), taken_at=datetime(2026, 1, 1, tzinfo=UTC))
+    path = tmp_path / "frame.dng"
+    path.write_bytes(stream.getvalue())
+    return read_raw(path)
 
 
-@pytest.mark.slow
-def test_a_frame_is_measured_by_means_of_its_colours_and_shares_of_odd_photosites() -> None:
-    frame = mosaic()
-    whole = measure.measure(frame)
-    np.testing.assert_allclose(whole.tiles, np.tile([1000.0, 2200, 1500], (24 * 16, 1)))
-    np.testing.assert_allclose(whole.strips, np.tile([1000.0, 2200, 1500], (160 * 4, 1)))
-    assert (whole.brightest_dn, whole.range_dn, whole.black) == (2400, 15831 - 2048, 2048)
-    assert (whole.clipped, whole.empty, whole.black_measured) == (0, 0, False)
-    assert whole.samples.shape == (8192, 2)
-    assert (whole.samples == 2048 + np.array([2000, 2400])).all()
-    # 98 % of saturation is 15514.4; half of black 1024.
-    frame.counts[100, 100:110] = 15514
-    frame.counts[101, 100:107] = 15515
-    frame.counts[200, 200:205] = 1024
-    frame.counts[201, 200:203] = 1023
-    odd = measure.measure(frame)
-    assert (odd.clipped, odd.empty) == pytest.approx((7 / 320 / 480, 3 / 320 / 480))
-    # Rows 100 and 101 are of the sixth row of tiles, columns 100 to 109 of the sixth column.
-    rise = 5 * (15514 - 2048 - 1000)
-    assert odd.tiles[5 * 24 + 5, 0] == pytest.approx(1000 + rise / 100)
-    assert odd.strips[50 * 4, 0] == pytest.approx(1000 + rise / 60)
-    assert odd.digest != whole.digest
+@pytest.mark.parametrize(
+    ("clipped", "brightest", "kind", "expected"),
+    [
+        (0.0, 8000, "light", None),
+        (0.001, 8000, "light", None),
+        (0.0011, 8000, "light", "0.1% of the photosites are clipped, 0.1 % allowed"),
+        (0.031, 8000, "white", "3.1% of the photosites are clipped"),
+        (0.0, 99, "light", "are 99 counts above black, at least 100 expected"),
+        (0.0, 100, "white", None),
+        (0.0, 8, "dark", None),
+        (0.0, 0.06 * RANGE, "dark", "6.0% of saturation, 5 % allowed"),
+    ],
+)
+def test_a_refusal_says_value_and_limit(clipped: float, brightest: float, kind: str, expected: str | None) -> None:
+    reason = refusal(Exposure(clipped, brightest, RANGE), kind, LIMITS)  # pyrefly: ignore[bad-argument-type]
+    if expected is None:
+        assert reason is None
+    else:
+        assert reason is not None
+        assert expected in reason
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("black", "empty"), [(63.0, 0), (64.0, 4)])
-def test_counts_below_black_are_none_of_a_sensor_where_there_is_black(black: float, empty: int) -> None:
-    frame = mosaic(black)
-    frame.counts[10, 10:14] = 0
-    assert measure.measure(frame).empty == empty / frame.counts.size
+ASKED = ExposureSettings(iso=100, aperture=8, shutter_s=0.5)
 
 
-@pytest.mark.parametrize(("floor", "slope", "top"), [(36.0, 0.55, 800.0), (0.5, 0.2, 40.0), (4.0, 0.0, 800.0)])
-def test_noise_is_read_from_the_greens_of_one_block(floor: float, slope: float, top: float) -> None:
-    random = np.random.default_rng(4)
-    level = random.uniform(0, top, 40_000)
-    greens = level[:, None] + random.standard_normal((len(level), 2)) * np.sqrt(floor + slope * level)[:, None]
-    # Some blocks lie across an edge between two cells.
-    greens[::50, 0] += 200
-    found = measure._noise(greens)
-    at = top * np.array([0.25, 0.5, 1.0])
-    np.testing.assert_allclose(found.variance(at), floor + slope * at, rtol=0.12)
-    assert found.variance(-100.0) == found.variance(0.0) == found.floor
+def test_a_file_that_states_what_was_asked_agrees(tmp_path: Path) -> None:
+    assert disagreement(mosaic_of(tmp_path, 4000), ASKED) is None
+
+
+@pytest.mark.parametrize(
+    ("asked", "stated"),
+    [  # nominal value on the dial, exact value in the file: 2^(n/8) s, 2^(n/16), 100 · 2^(n/8)
+        ({"shutter_s": 30.0}, {"shutter_s": 32.0}),
+        ({"shutter_s": 1 / 60}, {"shutter_s": 1 / 64}),
+        ({"shutter_s": 0.6}, {"shutter_s": 2**-0.625}),
+        ({"shutter_s": 0.3}, {"shutter_s": 2**-1.5}),
+        ({"aperture": 3.5}, {"aperture": 2 ** (29 / 16)}),
+        ({"aperture": 1.8}, {"aperture": 2 ** (12 / 16)}),
+        ({"iso": 1250}, {"iso": 1270}),
+        ({}, {"iso": None, "aperture": None, "shutter_s": None}),
+        ({}, {"aperture": 0.0}),
+        ({"aperture": None}, {"aperture": 0.0}),
+        ({"aperture": None}, {"aperture": None}),
+    ],
+)
+def test_a_nominal_value_agrees_with_the_exact_one_behind_it(
+    tmp_path: Path, asked: dict[str, float | None], stated: dict[str, float | None]
+) -> None:
+    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyrefly: ignore[bad-argument-type]
+    assert disagreement(mosaic, replace(ASKED, **asked)) is None  # pyrefly: ignore[bad-argument-type]
+
+
+@pytest.mark.parametrize(
+    ("stated", "expected"),
+    [
+        ({"shutter_s": 0.4}, "the file states shutter time in s 0.4 instead of 0.5; was a dial of the camera turned?"),
+        ({"shutter_s": 0.6}, "shutter time in s 0.6 instead of 0.5"),
+        ({"aperture": 9.0}, "aperture 9 instead of 8"),
+        ({"iso": 125}, "ISO speed 125 instead of 100"),
+        ({"iso": 200, "shutter_s": 0.25}, "ISO speed 200 instead of 100, shutter time in s 0.25 instead of 0.5"),
+    ],
+)
+def test_a_dial_turned_by_one_third_of_a_stop_is_seen(tmp_path: Path, stated: dict[str, float], expected: str) -> None:
+    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyrefly: ignore[bad-argument-type]
+    assert expected in (disagreement(mosaic, ASKED) or "")
+
+
+def test_a_lens_put_on_in_place_of_one_without_contacts_is_seen(tmp_path: Path) -> None:
+    mosaic = replace(mosaic_of(tmp_path, 4000), aperture=5.6)
+    assert "aperture 5.6 instead of none" in (disagreement(mosaic, replace(ASKED, aperture=None)) or "")
 
 
 def test_the_brightest_place_of_each_part_is_paper() -> None:

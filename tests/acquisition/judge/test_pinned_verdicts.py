@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,8 @@ from acquisition.judge.measure import Frame
 from acquisition.judge.state import Basis, JudgeState, ProjectorModel
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Plane
+from experiment.measures import frame as measures
+from experiment.measures.exposure import measure_exposure
 from experiment.session.records import Check, Judgement, SessionStep
 from sim.world.disturbances import (
     AmbientStep,
@@ -36,9 +37,9 @@ from sim.world.disturbances import (
 from sim.world.world import Room
 from tests.acquisition.judge import conftest
 from tests.acquisition.judge.conftest import bench
-from tests.acquisition.judge.test_measure import mosaic
 from tests.acquisition.judge.test_references import DARK, PRIMARIES, measured
 from tests.acquisition.judge.test_references import WHITE as LIT
+from tests.experiment.measures.test_frame import mosaic
 from tests.pinned import Pinned
 
 ORANGE, SKY, BLUE = (255, 197, 126), (113, 188, 255), (0, 0, 255)
@@ -48,12 +49,16 @@ ROUNDED = 0.011
 """Checks are rounded to two digits, which the last digits of single precision may move."""
 
 
-def said(judgement: Judgement) -> list[Any]:
-    """Return all numbers of a verdict, and the words of what people are told."""
-    numbers = {f"{one.name} {one.unit}": [one.value, one.low, one.high] for one in judgement.checks}
-    told = [f"{one.name}: {re.sub('[0-9.]+', '#', one.reason)}" for one in judgement.checks if one.reason]
-    told = [re.sub("/.*/frame#dng", "frame", one) for one in told]
-    return [{name: some for name, some in numbers.items() if any(some)}, told, judgement.voids, judgement.lasting]
+def said(judgement: Judgement) -> dict[str, Any]:
+    """Return all numbers of a verdict."""
+    numbers = {one.name: [one.value, one.low, one.high] for one in judgement.checks}
+    return {**numbers, "voids": judgement.voids, "lasting": judgement.lasting}
+
+
+def failed(judgement: Judgement) -> dict[str, Any]:
+    """Return the checks that a frame fails, with their values."""
+    wrong = {one.name: one.value for one in judgement.checks if one.reason}
+    return {**wrong, "failed": len(wrong), "voids": judgement.voids, "lasting": judgement.lasting}
 
 
 def known(now: JudgeState) -> dict[str, Any]:
@@ -129,14 +134,15 @@ def test_a_session_is_judged_as_it_was(tmp_path: Path, pinned: Pinned) -> None:
     for name, (codes, events) in WRONG.items():
         one = before.fork()
         again = [one.take(one.light(*codes), *events, before=Colour(*SKY)) for _ in range(AGAIN.get(name, 1))]
-        wrong[name] = [*map(said, again), one.judge.state.candidate, one.judge.state.refused]
+        wrong[name] = {str(number): failed(each) for number, each in enumerate(again)}
+        wrong[name] |= {"candidate": one.judge.state.candidate, "refused": one.judge.state.refused}
     references = (
         (WHITE_STEP, ("a small bump", "a weaker lamp", "light in the room", "a hand", "a pop-up", "defocus")),
         (DARK_STEP, ("light in the room", "a pop-up")),
     )
     for step, titles in references:
         for title in titles:
-            wrong[f"{step.kind}, {title}"] = said(lab.fork().take(step, *WRONG[title][1]))
+            wrong[f"{step.kind}, {title}"] = failed(lab.fork().take(step, *WRONG[title][1]))
     pinned("verdicts of what goes wrong", wrong, same=1e-3, nothing=ROUNDED)
 
 
@@ -236,7 +242,7 @@ def test_frames_are_held_against_pictures_as_they_were(pinned: Pinned) -> None:
 @pytest.mark.slow
 def test_lights_that_are_off_are_named_as_they_were(pinned: Pinned) -> None:
     _, model = learnt(3, 40)
-    random, found, numbers = np.random.default_rng(8), list[str](), list[float]()
+    random, numbers = np.random.default_rng(8), list[float]()
     nothing = state.Residuals(np.zeros(0), np.zeros(0), np.zeros(0))
     plan = ((255, 255, 255), (0, 0, 0), (255, 0, 0), (200, 100, 50), (30, 60, 90), (0, 255, 0), (255, 128, 0))
     for number in range(80):
@@ -265,18 +271,17 @@ def test_lights_that_are_off_are_named_as_they_were(pinned: Pinned) -> None:
         ways = [seen.cause(wrong, 0.01, again=again) for wrong in (True, False) for again in (True, False)]
         numbers += [fit.distance, fit.angle_deg, fit.brightness, fit.brightness_sd, seen._coloured()]
         numbers += [*seen.neutral_light(), *added[0], *added[1], *(light for _, light in ways)]
-        found += [reason for reason, _ in dict.fromkeys(ways) if reason]
-    pinned("lights that are off", [found, np.array(numbers)])
+        numbers.append(sum(bool(reason) for reason, _ in ways))
+    pinned("lights that are off", np.array(numbers))
 
 
 def test_of_two_causes_those_are_named_that_were(pinned: Pinned) -> None:
     """A value of 0.6 is less blur and movement than what stands for itself, one of 9 is plainly more."""
-    named: dict[str, str] = {}
+    named: dict[str, list[bool]] = {}
     for first, second in itertools.combinations(judge.CAUSES, 2):
         for value in (0.6, 9.0):
             found = [Check(name, value, None, 2.0, reason="wrong") for name in (first, second)]
-            left = [check.name for check in judge._named_once(found) if check.reason]
-            named[f"{first} and {second}, {value:g}"] = ", ".join(left)
+            named.setdefault(f"{first} {value:g}", []).extend(bool(check.reason) for check in judge._named_once(found))
     pinned("causes of which one is named", named)
 
 
@@ -292,16 +297,16 @@ def test_frames_are_measured_as_they_were(pinned: Pinned) -> None:
         counts[random.random(counts.shape) < 1e-3] = 15520
         counts[7, 9:20] = [0, 1, 31, 32, 255, 256, 257, 15513, 15514, 15515, 15831]
         odd = replace(frame, counts=np.ascontiguousarray(counts), pattern=pattern)
-        one = measure.measure(odd)
+        one = measures.measure(odd)
         places = one.places
         plane = Plane("G", counts[::2, ::2].astype(np.float32), (0.25, -0.25))
         found[f"{pattern} {black:g}"] = {
             "measured": [one.tiles, one.strips, one.samples, one.noise],
             "levels": [one.brightest_dn, one.range_dn, one.clipped, one.empty, one.level, one.digest.hex()],
             "places": [places.x_edges, places.y_edges, places.tile_blocks, [places.tile_box(n) for n in (0, 25, 383)]],
-            "exposure": measure.measure_exposure(odd),
+            "exposure": measure_exposure(odd),
             "paper": [measure._brightest(plane.values), measure._paper(plane.values, random.uniform(0, 70, (40, 2)))],
             "texture": [tag.corners_px for tag in measure._textures(plane).tags],
-            "noise": [measure._noise(random.normal(50, 3, (900, 2)) + rise) for rise in (0, np.arange(900)[:, None])],
+            "noise": [measures._noise(random.normal(50, 3, (900, 2)) + rise) for rise in (0, np.arange(900)[:, None])],
         }  # fmt: skip
     pinned("frames of chance as measured", found, same=1e-5)

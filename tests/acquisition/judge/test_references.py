@@ -11,10 +11,11 @@ import pytest
 from acquisition.judge import judge as judge_module
 from acquisition.judge import limits
 from acquisition.judge.judge import MOST_RESTARTS, judge_dark, judge_first_frames, judge_first_primary, judge_white
-from acquisition.judge.measure import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Frame, FramePlaces, Measured, Noise
+from acquisition.judge.measure import Frame
 from acquisition.judge.state import Basis, Codes, Examined, JudgeState, Seen
 from drivers.presenter import Colour
 from experiment.config import JudgeSettings
+from experiment.measures.frame import SEGMENTS, TILE_COLUMNS, TILE_ROWS, FramePlaces, Measured, Noise
 from experiment.session.records import TOP, Check, SessionStep
 
 TILES = TILE_ROWS * TILE_COLUMNS

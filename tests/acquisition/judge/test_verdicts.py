@@ -11,11 +11,12 @@ import pytest
 
 from acquisition.judge import judge
 from acquisition.judge.judge import CAUSES, lamp_check
-from acquisition.judge.measure import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Frame
+from acquisition.judge.measure import Frame
 from acquisition.judge.state import Basis, FrameLight, JudgeState, LampSeen, Leaning, ProjectorModel, Residuals, Seen
 from drivers.presenter import Colour
 from experiment.config import JudgeSettings, parse_lab
 from experiment.framing.pictures import Shift
+from experiment.measures.frame import SEGMENTS, TILE_COLUMNS, TILE_ROWS
 from experiment.session.records import TOP, Check, SessionStep
 from tests.acquisition.judge.test_projector_model import at
 from tests.acquisition.judge.test_references import DARK, PRIMARIES, WHITE, begun, known, measured

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -186,20 +185,6 @@ def test_another_attempt_of_a_known_number_is_read_again(run: MadeUpRun, tmp_pat
     run.journal = Journal.open_for_run(run.folder / "journal.sqlite")
     assert run.take(run.steps[5]) == 5
     assert told(watch, cursor)["frames"][-1]["step"] == 5
-
-
-def test_a_journal_of_the_first_version_is_shown(run: MadeUpRun) -> None:
-    run.journal.close()
-    with sqlite3.connect(run.folder / "journal.sqlite") as connection:
-        for table in ("checks", "measurements", "timings", "heartbeat", "records"):
-            connection.execute(f"DROP TABLE {table}")
-        connection.execute("PRAGMA user_version = 1")
-    connection.close()
-    state = told(SessionWatch(run.folder))
-    assert state["head"]["state"] == "unknown"
-    assert state["head"]["done"] == 4
-    assert [frame["verdict"] for frame in state["frames"]] == ["accepted"] * 4
-    assert "seen" not in state["frames"][0]
 
 
 def test_what_was_seen_is_held_against_the_white_before(run: MadeUpRun) -> None:

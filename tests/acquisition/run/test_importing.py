@@ -17,6 +17,7 @@ from experiment.chart.layout import design_chart
 from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import FRAME_COLUMNS, Session
 from foundation.errors import FormatError
+from tests.drivers.raw.maker_files import raf
 from tests.drivers.raw.raw_files import write_dng
 from tests.json_of import json_of
 
@@ -51,10 +52,23 @@ def write(folder: Path, rows: Sequence[Row]) -> None:
         writer.writerows([row.get(column, "") for column in FRAME_COLUMNS] for row in rows)
 
 
+def test_formats_that_cannot_be_checked_are_named_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number in (1, 2):
+        (folder / f"{number}.RAF").write_bytes(raf(seed=number)[0])
+    rows = [light(0), *(light(number, file=f"{number}.RAF") for number in (1, 2))]
+    write(folder, [*rows, *({"kind": kind, "file": "0.cr2", "verdict": "accepted"} for kind in ("white", "dark"))])
+    assert main(["import", *(str(folder / name) for name in ("list.csv", "chart.json", "session"))]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "checked" in line]
+    assert line.startswith(".raf: ")
+    assert "complete" in line
+    with Session.open(folder / "session") as session:
+        assert all(frame.accepted for frame in session.frames())
+
+
 def test_listed_frames_make_a_session(folder: Path) -> None:
     rows = [light(0), light(1, verdict="refused: a hand"), light(2), light(2), {"kind": "white", "file": "0.cr2"}]
     imported = import_rows(folder, [*rows[:-1], {**rows[-1], "verdict": "accepted"}])
-    assert imported == Imported(("1.cr2: a hand",), ("light 1",))
+    assert imported == Imported(("1.cr2: a hand",), ("light 1",), ())
     with Session.open(folder / "session") as session:
         assert [frame.accepted for frame in session.frames()] == [True, False, True, True, True]
         assert [frame.verdict for frame in session.frames()][1] == "refused: a hand"

@@ -30,15 +30,16 @@ from drivers.links.link import PeerLink
 from drivers.pjlink import NoResolution, PjLinkProjector
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Fault, Lamp, Power, Projector, Severity
-from drivers.serial_projectors.optoma import OptomaProjector
+from drivers.serial_projectors.driver import LineProjector
 from experiment.config import SequenceSettings
 from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, DeviceFault, LinkClosed, LinkTimeout, StorageError
 from sim.buses.serial import SerialPeerLink
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import SimulatedProjector
-from sim.projectors.serial import OptomaPeer
+from sim.projectors.serial import LinePeer
 from tests.acquisition.run.scripted import Beamer, Screen, ScriptedCamera
+from tests.drivers.serial_projectors.made_up import MADE_UP
 
 ON, OFF = Power.ON, Power.COOLING
 
@@ -249,11 +250,9 @@ def test_a_projector_that_cannot_tell_its_mute_is_told() -> None:
     clock = SimulatedClock()
     device = SimulatedProjector(clock, power=Power.ON)
     device.set_muted(True)
-    make_ready(
-        OptomaProjector(lambda: SerialPeerLink(OptomaPeer(device, answers_mute=False)), clock=clock),
-        SequenceSettings(),
-        no_time(clock),
-    )
+    language = MADE_UP.model_copy(update={"mute": MADE_UP.mute.model_copy(update={"ask": ""})})
+    projector = LineProjector(language, lambda: SerialPeerLink(LinePeer(device, language)), clock=clock)
+    make_ready(projector, SequenceSettings(), no_time(clock))
     assert not device.muted()
 
 

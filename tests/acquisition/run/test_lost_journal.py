@@ -101,7 +101,7 @@ MISHAPS = (both_deleted, deleted, cut, emptied, replaced, overwritten, overwritt
 
 def facts(folder: Path) -> Rows:
     """Return what the journal says, as every reader sees it."""
-    with closing(open_to_read(folder / "journal.sqlite")[0]) as connection:
+    with closing(open_to_read(folder / "journal.sqlite")) as connection:
         return rows_of(connection)
 
 

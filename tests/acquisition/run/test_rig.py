@@ -10,10 +10,12 @@ from unittest.mock import Mock
 import pytest
 
 from acquisition.run.plan import ask
+from acquisition.run.rig import lab as attached
 from acquisition.run.rig.lab import attached_devices
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.rig.simulated import simulated_body, simulated_frame_bytes, simulated_room
 from acquisition.run.run import run_session
+from drivers.pjlink import FoundProjector
 from drivers.presenter import WHITE
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
@@ -115,11 +117,12 @@ def test_an_imported_session_cannot_be_taken() -> None:
     [
         ('[lab.camera]\nconnection = "ptpip"\n', "lab.camera.host is missing"),
         ('[lab.projector]\ncontrol = "pjlink"\n', "lab.projector.host is missing"),
-        ('[lab.projector]\ncontrol = "epson"\n', "lab.projector.device is missing"),
+        ('[lab.projector]\ncontrol = "serial"\nlanguage = "epson"\n', "lab.projector.device is missing"),
+        ('[lab.projector]\ncontrol = "serial"\ndevice = "/dev/ttyS0"\n', "lab.projector.language is missing"),
+        ('[lab.projector]\ncontrol = "serial"\nlanguage = "klingon"\n', "no projector language 'klingon'"),
         ('[lab.projector]\ncontrol = "pjlink"\ndevice = "/dev/ttyS0"\n', "PJLink goes by the network"),
-        ('[lab.projector]\ncontrol = "nec"\nhost = "h"\ndevice = "/dev/ttyS0"\n', "both given"),
+        ('[lab.projector]\ncontrol = "serial"\nlanguage = "epson"\nhost = "h"\ndevice = "/dev/ttyS0"\n', "both given"),
         ('[lab.camera]\nhost = "1.2.3.4"\n', "connection is"),
-        ('[lab.light]\nshown_by = "jvc"\n', "lab.light.host is missing"),
         ("[camera]\nshutter_s = 0.51\n", "whole turns"),
     ],
 )
@@ -133,19 +136,13 @@ def test_a_cable_that_is_not_named_is_said(text: str, expected: str, monkeypatch
         pass
 
 
-@pytest.mark.parametrize("light", ["", 'shown_by = "jvc"\nhost = "h"\n', 'shown_by = "lightcrafter"\n'])
-def test_what_a_dry_run_opens_shows_nothing(light: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("FullScreen", "JvcFlatField", "LightCrafter"):
-        monkeypatch.setattr(f"acquisition.run.rig.lab.{name}", Mock(side_effect=AssertionError("the light was opened")))
+def test_what_a_dry_run_opens_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", Mock(side_effect=AssertionError("the light was opened")))
     monkeypatch.setattr("acquisition.run.rig.lab.display_warnings", Mock(return_value=("a bent ramp",)))
     monkeypatch.setattr("acquisition.run.rig.lab.CanonEos", Mock())
-    real = parse_lab(HEAD.replace("simulated", "lab") + f"[lab.light]\n{light}", "LAB.toml")
+    real = parse_lab(HEAD.replace("simulated", "lab"), "LAB.toml")
     with open_rig(real, design_chart(bits=1), shows=False) as devices:
-        answers = ask(devices)
-        assert ("a bent ramp" in answers.warnings, any("black" in said for said in answers.unasked)) in (
-            (True, False),
-            (False, True),
-        )
+        assert "a bent ramp" in ask(devices).warnings
         with pytest.raises(DeviceRefused):
             devices.presenter.show(WHITE)
 
@@ -173,8 +170,8 @@ def test_a_lab_at_which_another_command_is_at_work_is_not_touched(
         other.communicate(b"\n")
 
 
-def test_an_unknown_language_is_named_with_the_known_ones() -> None:
-    with pytest.raises(ConfigurationError, match=r"'pjlink', .*'nec'"):
+def test_an_unknown_control_is_named_with_the_known_ones() -> None:
+    with pytest.raises(ConfigurationError, match="'none', 'pjlink', 'serial'"):
         parse_lab(HEAD + '[lab.projector]\ncontrol = "klingon"\n', "LAB.toml")
 
 
@@ -182,7 +179,9 @@ def test_an_unknown_language_is_named_with_the_known_ones() -> None:
 def test_what_cannot_be_asked_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    kinds = {attached.kind: attached for attached in attached_devices(search_s=0)}
-    assert list(kinds) == ["cameras on USB", "serial ports", "displays"]
+    monkeypatch.setattr(attached, "search", lambda: (FoundProjector("192.0.2.7", "00:00:5e:00:53:01"),))
+    kinds = {found.kind: found for found in attached_devices()}
+    assert list(kinds) == ["cameras on USB", "serial ports", "displays", "projectors by PJLink"]
+    assert kinds["projectors by PJLink"].found == ("192.0.2.7, MAC 00:00:5e:00:53:01",)
     assert kinds["displays"].found == ()
     assert kinds["displays"].trouble

@@ -12,6 +12,7 @@ import pytest
 from calibration.causes.rules import BUMP
 from calibration.cli import main
 from calibration.pipeline.build import build
+from calibration.pipeline.frames import BuildOptions
 from calibration.report.report import write_report
 from calibration.table.lut import open_lut
 from calibration.verdict import findings
@@ -66,7 +67,10 @@ def test_a_bump_is_followed_and_reported(plain: Lab, tmp_path: Path, by: tuple[f
         return (bumped if step.number >= 4 else plain).dng(step.colour, step.number)
 
     with take(plain, tmp_path / "session", lights, frame=frame) as session, blank_pictures():
-        result = build(session, tmp_path / "lut", report=write_report if anew else None)
+        corners = plain.corners_px(plain.mosaic(tmp_path))
+        assert corners is not None
+        options = BuildOptions(corners=tuple(map(tuple, corners.tolist())))
+        result = build(session, tmp_path / "lut", report=write_report if anew else None, options=options)
     assert [figures.record.illumination for figures in result.figures.frames if figures.reregistered] == anew
     first = next(figures for figures in result.figures.frames if figures.record.illumination == 2)
     assert (first.shift.dx, first.shift.dy) == pytest.approx(by, abs=0.05)
@@ -97,7 +101,7 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
     return run
 
 
-def test_corners_by_hand_stand_in_for_light_that_shows_nothing(
+def test_without_corners_the_command_says_how_to_give_them(
     plain: Lab, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of red light alone nobody can say which way up the chart hangs; white frames are all refused here."""
@@ -107,25 +111,33 @@ def test_corners_by_hand_stand_in_for_light_that_shows_nothing(
         plain, tmp_path / "session", lights, verdict=lambda step: "refused" if step.kind == "white" else ACCEPTED
     ):
         pass
-    code, said = command("--check", tmp_path / "session")
+    missed = tmp_path / "missed.png"
+    code, said = command("check", tmp_path / "session", "--picture", missed)
     assert code == 4
-    assert "which way up it hangs" in said
-    raw = 2 * plain.truth_px(field_mm(plain.chart), plain.mosaic(tmp_path)) + 0.5
-    corners = [f"{x:.0f},{y:.0f}" for x, y in raw + np.array([(9, -7), (-8, 6), (5, 8), (-9, -6)])]
+    assert "--corners 297,90" in said
+    assert f"see {missed}" in said
+    assert missed.read_bytes().startswith(b"\x89PNG")
+    corners = raw_corners(plain, tmp_path)
     code, said = command(tmp_path / "session", tmp_path / "lut", "--corners", *corners)
     assert code == 0, said
     assert worst_error(plain, tmp_path / "lut") < 0.05
+
+
+def raw_corners(lab: Lab, folder: Path) -> list[str]:
+    raw = 2 * lab.truth_px(field_mm(lab.chart), lab.mosaic(folder)) + 0.5
+    return [f"{x:.0f},{y:.0f}" for x, y in raw + np.array([(9, -7), (-8, 6), (5, 8), (-9, -6)])]
 
 
 def test_a_check_that_fails_shows_what_was_looked_for(plain: Lab, tmp_path: Path, command: Command) -> None:
     with take(plain, tmp_path / "session", renumbered(LIGHTS[4:6])):
         pass
     found = tmp_path / "found.png"
-    assert command("--check", tmp_path / "session", "--picture", found)[0] == 0
+    corners = raw_corners(plain, tmp_path)
+    assert command("check", tmp_path / "session", "--picture", found, "--corners", *corners)[0] == 0
     assert found.read_bytes().startswith(b"\x89PNG")
     design_chart(3, A_SERIES_MM["A5"]).save(tmp_path / "session" / "chart.json")
     missed = tmp_path / "missed.png"
-    code, said = command("--check", tmp_path / "session", "--picture", missed)
+    code, said = command("check", tmp_path / "session", "--picture", missed)
     assert code == 4
     assert f"see {missed}" in said
     assert missed.read_bytes().startswith(b"\x89PNG")

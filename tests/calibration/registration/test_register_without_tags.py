@@ -1,4 +1,4 @@
-"""A chart without tags registered by its outline and its cells, against the place it was rendered from."""
+"""A chart without tags registered by corners by hand and by its cells, against the place it was rendered from."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def white(plain: Lab, tmp_path_factory: pytest.TempPathFactory) -> Mosaic:
 
 @pytest.fixture(scope="module")
 def registered(plain: Lab, white: Mosaic) -> Registration:
-    return register(white, plain.chart)
+    return register(white, plain.chart, corners=plain.corners_px(white))
 
 
-def test_blue_light_shows_which_way_up_and_registers(plain: Lab, tmp_path: Path) -> None:
+def test_blue_light_registers(plain: Lab, tmp_path: Path) -> None:
     error = plain.miss_px(plain.mosaic(tmp_path, Colour(0, 0, 255)))
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert error.max() < 0.4
@@ -49,7 +49,7 @@ def test_every_colour_is_where_a_lens_with_lateral_colour_shows_it(tmp_path: Pat
     """The outline is clear in all colours, and in each it lies elsewhere."""
     lab = hang_chart(SMALL, "Test", Room(waviness_mm=0.5, seed=4, lateral_red_px=1.0, lateral_blue_px=-1.0))
     mosaic = lab.mosaic(tmp_path)
-    registration = register(mosaic, SMALL)
+    registration = register(mosaic, SMALL, corners=lab.corners_px(mosaic))
     green = lab.truth_px(SMALL.centres_mm, mosaic)
     for channel in CHANNELS:
         shift = lab.world.project(SMALL.centres_mm, channel) - lab.world.project(SMALL.centres_mm)
@@ -70,7 +70,7 @@ def test_cells_that_the_map_does_not_follow_are_known_to_be_uncertain(tmp_path: 
     """
     lab = hang_chart(SMALL, "Test", replace(WAVES, seed=2))
     mosaic = lab.mosaic(tmp_path)
-    registration = register(mosaic, SMALL)
+    registration = register(mosaic, SMALL, corners=lab.corners_px(mosaic))
     error = np.linalg.norm(registration.to_pixels(SMALL.centres_mm) - lab.truth_px(SMALL.centres_mm, mosaic), axis=1)
     assert error.max() > 0.5, "a room in which it matters"
     uncertain = registration.expanded_px(SMALL.centres_mm) > MAX_PLACE_ERROR_PX
@@ -83,7 +83,7 @@ def test_a_curl_is_not_taken_for_distortion(tmp_path: Path) -> None:
     room = Room(seed=2, curl_mm=60.0, focal_diagonals=0.8, lateral_red_px=1.0, lateral_blue_px=-1.0)
     lab = hang_chart(SMALL, "Test", room)
     mosaic = lab.mosaic(tmp_path)
-    registration = register(mosaic, SMALL)
+    registration = register(mosaic, SMALL, corners=lab.corners_px(mosaic))
     error = np.linalg.norm(registration.to_pixels(SMALL.centres_mm) - lab.truth_px(SMALL.centres_mm, mosaic), axis=1)
     assert np.sqrt((error**2).mean()) < 0.12
     assert error.max() < 0.3
@@ -100,7 +100,7 @@ def test_a_large_grid_on_a_sheet_that_waves_by_six_millimetres(tmp_path: Path) -
     """The paper's whole grid is in `benchmarks.plain`."""
     lab = hang_chart(paper_chart("A3", 4), QUARTER, Room(waviness_mm=6.0, seed=3))
     mosaic = lab.mosaic(tmp_path)
-    registration = register(mosaic, lab.chart)
+    registration = register(mosaic, lab.chart, corners=lab.corners_px(mosaic))
     truth = lab.truth_px(lab.chart.centres_mm, mosaic)
     error = np.asarray(np.linalg.norm(registration.to_pixels(lab.chart.centres_mm) - truth, axis=1), dtype=np.float64)
     assert np.sqrt(np.mean(error**2)) < 0.1
@@ -113,7 +113,7 @@ def test_a_large_grid_on_a_sheet_that_waves_by_six_millimetres(tmp_path: Path) -
 def test_another_order_of_colours_is_refused(plain: Lab, white: Mosaic) -> None:
     shuffled = replace(plain.chart, colours=np.random.default_rng(1).permutation(plain.chart.colours))
     with pytest.raises(RegistrationError, match=r"chart\.json"):
-        register(white, shuffled)
+        register(white, shuffled, corners=plain.corners_px(white))
 
 
 def test_a_field_displaced_by_one_cell_is_refused(plain: Lab, white: Mosaic) -> None:
@@ -125,7 +125,7 @@ def test_a_field_displaced_by_one_cell_is_refused(plain: Lab, white: Mosaic) -> 
     grid = plain.chart.colours.reshape(-1, columns)
     other = replace(plain.chart, colours=np.roll(grid, 1, axis=1).reshape(-1))
     with pytest.raises(RegistrationError, match="cells beside them"):
-        register(white, other)
+        register(white, other, corners=plain.corners_px(white))
 
 
 def test_a_covered_part_is_named_and_does_not_pull_its_neighbours(plain: Lab, tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_a_covered_part_is_named_and_does_not_pull_its_neighbours(plain: Lab, tm
         counts[rows, columns] = 7000
 
     mosaic = plain.mosaic(tmp_path, paint=cover)
-    registration = register(mosaic, plain.chart)
+    registration = register(mosaic, plain.chart, corners=plain.corners_px(mosaic))
     truth = plain.truth_px(plain.chart.centres_mm, mosaic)
     middle = np.array([width / 6 + 20, height / 4 + 20])
     hidden = (np.abs(truth - middle) < 14).all(axis=1)
@@ -150,5 +150,6 @@ def test_a_covered_part_is_named_and_does_not_pull_its_neighbours(plain: Lab, tm
 
 def test_out_of_focus_is_refused(tmp_path: Path) -> None:
     lab = hang_chart(SMALL, "Test", Room(waviness_mm=0.5, blur_px=1.6))
+    mosaic = lab.mosaic(tmp_path)
     with pytest.raises(RegistrationError, match="out of focus"):
-        register(lab.mosaic(tmp_path), lab.chart)
+        register(mosaic, lab.chart, corners=lab.corners_px(mosaic))

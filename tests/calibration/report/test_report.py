@@ -25,8 +25,9 @@ from experiment.session.folder import Session
 from foundation.plots import png_of
 from tests.calibration.causes.rooms import HAND, nth_white, taken
 from tests.calibration.lab import Lab
-from tests.calibration.whole import LIMITS, sketched
+from tests.calibration.whole import LIMITS
 from tests.pinned import Pinned
+from tests.pinned.drawn import drawn
 
 pytestmark = pytest.mark.slow
 
@@ -69,19 +70,20 @@ def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path, monkeypat
 def test_every_picture_of_a_report_is_drawn(
     session: Session, built: BuildResult, tmp_path: Path, pinned: Pinned, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shown: list[Any] = []
+    shown: dict[str, list[Any]] = {}
 
     def kept(draw: Callable[..., None], *arguments: Any) -> bytes:
         def drawing(figure: Figure, *given: Any) -> None:
             draw(figure, *given)
-            shown.append([draw.__name__, sketched(figure)])
+            shown.setdefault(draw.__name__, []).append(drawn(figure))
 
         return png_of(drawing, *arguments)
 
     monkeypatch.setattr("calibration.report.report.png_of", kept)
     write_report(built, session, tmp_path)
     # That of noise hangs on which cells are left out.
-    pinned("table of 13 lights, pictures", [one for one in shown if one[0] != "draw_noise"], **LIMITS)
+    del shown["draw_noise"]
+    pinned("table of 13 lights, pictures", shown, **LIMITS)
     page = (tmp_path / "report.html").read_text()
     pictures = re.findall(r"data:image/png;base64,([^'\"]+)", page)
     assert len(pictures) == 12

@@ -474,15 +474,6 @@ def test_a_restarted_server_goes_unnoticed() -> None:
         projector.close()
 
 
-def test_a_served_projector_takes_the_time_that_it_is_given_to_answer() -> None:
-    clock = SimulatedClock()
-    with serve_pjlink(SimulatedProjector(clock), answer_s=2.0) as server:
-        projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), timeout=10.0)
-        assert projector.power() is Power.STANDBY
-        projector.close()
-    assert clock.monotonic() == 2.0
-
-
 def test_what_is_logged_has_neither_password_nor_digest(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("DEBUG")
     script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")

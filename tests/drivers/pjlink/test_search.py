@@ -51,12 +51,6 @@ def test_several_in_one_datagram_keep_their_order() -> None:
     assert found == (PjLinkReply("POWR", "3", 2), PjLinkReply("INPT", "31", 2))
 
 
-def test_the_search_is_the_standards_bytes() -> None:
-    assert wire.SEARCH == b"%2SRCH\r"
-    assert all(wire.is_search(datagram) for datagram in (b"%2SRCH\r", b"%2srch\r\n", b"%2SRCH"))
-    assert not any(wire.is_search(datagram) for datagram in (b"", b"%1SRCH\r", b"%2ACKN=00:11:22:aa:bb:cc\r"))
-
-
 @given(st.binary(max_size=300))
 def test_any_datagram_is_read_without_complaint(datagram: bytes) -> None:
     assert len(wire.replies_in(datagram)) <= len(datagram)

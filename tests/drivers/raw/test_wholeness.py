@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.raw.rawfile import decode_raw, filled_fault, read_raw, stored_frames
-from drivers.raw.storage import RawDamaged, Stored, of_phase_one, of_raf, of_rw2
+from drivers.raw.rawfile import LAYOUT_START, decode_raw, filled_fault, layout_is_known, read_raw, stored_frames
+from drivers.raw.storage import Stored
 from drivers.tiff import Directory, TiffTag
 from foundation.errors import FormatError
-from tests.drivers.raw.maker_files import in_maker_tiff, maker_files, rw2
+from tests.drivers.raw.maker_files import in_maker_tiff, maker_files, raf
 from tests.drivers.raw.raw_files import Tags, dng_bytes, longs, lossless_jpeg, shorts, write_dng
 
 SIDE = 128
@@ -109,87 +109,12 @@ def test_what_real_cameras_state_is_believed(model: str) -> None:
     assert (found.columns, found.rows) == (pixels.first(T.IMAGE_WIDTH), pixels.first(T.IMAGE_LENGTH))
 
 
-@pytest.mark.parametrize(
-    ("size", "start", "length"),
-    [((4060, 3016), 667648, 14_900_000), ((4816, 3464), 649216, 20_000_000), ((3696, 2752), 614400, 12_800_000)],
-    ids=["DMC-GF1", "DMC-GF7", "DMC-LX7"],
-)
-def test_what_real_rw2_state_is_believed(size: tuple[int, int], start: int, length: int) -> None:
-    """Sizes and places from the same lists; how long the files are is made up."""
-    tags = {T.RW2_WIDTH: (size[0],), T.RW2_LENGTH: (size[1],), T.RW2_FORMAT: (4,), T.RW2_BITS: (12,)}
-    first = described({**tags, T.RW2_PIXELS: (start,), T.STRIP_OFFSETS: (0xFFFFFFFF,), T.STRIP_BYTE_COUNTS: (0,)})
-    (found,) = stored_frames(b"IIU\0".ljust(length, b"\0"), [first])
-    assert (found.columns, found.rows) == size
-
-
 @pytest.mark.parametrize(("bits", "colours", "least"), [(16, 1, 8 / 7), (12, 1, 12), (16, 32803, 16), (14, 1, 16)])
 def test_grey_photosites_of_16_bits_may_be_compressed(bits: int, colours: int, least: float) -> None:
     """Olympus writes compressed pixels so; all others that are called uncompressed have the bits that they state."""
     pixels = Directory({**one_strip((64, 48), 1, bits, 1000, 90_000).values, T.PHOTOMETRIC_INTERPRETATION: (colours,)})
     (found,) = stored_frames(b"IIRO".ljust(100_000, b"\0"), [described({T.MAKE: "OLYMPUS"}), pixels])
     assert found.least_bits == pytest.approx(least)
-
-
-# What makers' own headers say (LibRaw 0.22, src/decoders and src/metadata)
-
-
-@pytest.mark.parametrize(
-    ("form", "bits", "photosites"),
-    [(5, 12, 10), (5, 14, 9), (6, 12, 14), (6, 14, 11), (7, 12, 10), (7, 14, 9), (4, 12, 14), (0, 12, 14)],
-)
-def test_blocks_of_16_bytes_hold_so_many_photosites_of_a_panasonic(form: int, bits: int, photosites: int) -> None:
-    stated = {T.RW2_WIDTH: (200,), T.RW2_LENGTH: (100,), T.RW2_FORMAT: (form,), T.RW2_BITS: (bits,)}
-    found = of_rw2(bytes(5000), [described({**stated, T.RW2_PIXELS: (2048,)})])
-    assert (found.rows, found.columns, found.extents) == (100, 200, ((2048, 2952),))
-    assert found.least_bits == pytest.approx(16 * 8 / photosites)
-    assert of_rw2(bytes(5000), [described({**stated, T.STRIP_OFFSETS: (1024,)})]).extents == ((1024, 3976),)
-    newest = of_rw2(bytes(5000), [described({**stated, T.RW2_FORMAT: (8,), T.RW2_PIXELS: (2048,)})])
-    assert newest.least_bits == 0.25
-    with pytest.raises(RawDamaged, match="10 bits, 12 or 14"):
-        of_rw2(bytes(5000), [described({**stated, T.RW2_FORMAT: (5,), T.RW2_BITS: (10,)})])
-
-
-def compressed_raf(
-    rows: int = 60, sizes: tuple[int, ...] = (300, 200), stated: tuple[int, int, int] = (60, 1000, 768), spare: int = 0
-) -> bytes:
-    """Return a RAF of 1000 columns whose pixels are compressed in blocks of so many bytes."""
-    head = struct.pack(">HBBBHHHHBH", 0x4953, 1, 16, 14, stated[0], 1536, stated[1], stated[2], len(sizes), 10)
-    pixels = head + struct.pack(f">{len(sizes)}I", *sizes) + bytes(sum(sizes) + spare)
-    table = struct.pack(">I2H2I4H", 2, 0x111, 8, 0, 0, 0x100, 4, rows, 1000)
-    return bytes(92) + struct.pack(">4I", 120, 0, 200, len(pixels)) + bytes(12) + table.ljust(80, b"\0") + pixels
-
-
-def test_blocks_of_a_compressed_raf_are_those_that_its_header_states() -> None:
-    found = of_raf(compressed_raf())
-    assert (found.rows, found.columns, found.extents) == (60, 1000, ((200, 16 + 8 + 500),))
-    for wrong, reason in (
-        (compressed_raf(rows=54), "1000×60 in 2 blocks, 1000×54 are stated"),
-        (compressed_raf(stated=(60, 999, 768)), "999×60"),
-        (compressed_raf(stated=(60, 1000, 384)), "in 2 blocks"),
-        (compressed_raf(sizes=(300, 100, 100)), "in 3 blocks"),
-        (compressed_raf(rows=61, stated=(61, 1000, 768)), "1000×61"),
-        (compressed_raf(sizes=(500, 0)), "blocks of its pixels take 500 bytes"),
-        (compressed_raf(spare=-1), "blocks of its pixels take 500 bytes of 523"),
-    ):
-        with pytest.raises(RawDamaged, match=reason):
-            of_raf(wrong)
-
-
-@pytest.mark.parametrize(("order", "mark"), [("<", b"IIII"), (">", b"MMMM")])
-@pytest.mark.parametrize(("form", "least_bits"), [(2, 16), (3, 0.25)])
-@pytest.mark.parametrize("base", [0, 8])
-def test_places_of_a_phase_one_are_counted_from_its_mark(
-    order: str, mark: bytes, form: int, least_bits: float, base: int
-) -> None:
-    entries = {0x108: (4, 800), 0x109: (4, 600), 0x10E: (4, form), 0x10F: (5000, 400)}
-    listed = b"".join(struct.pack(order + "4I", tag, 1, size, value) for tag, (size, value) in entries.items())
-    head = mark + struct.pack(order + "II", 0x52617754, 40) + bytes(28)
-    data = bytes(base) + head + struct.pack(order + "II", len(entries), 0) + listed
-    found = of_phase_one(data)
-    assert (found.rows, found.columns, found.least_bits) == (600, 800, least_bits)
-    assert found.extents == ((base + 400, 5000),)
-    with pytest.raises(RawDamaged, match="no mark"):
-        of_phase_one(data.replace(struct.pack(order + "I", 0x52617754), struct.pack(order + "I", 0x52617354)))
 
 
 # Extents
@@ -223,15 +148,26 @@ def test_a_stub_that_points_beyond_its_end_is_no_white_frame() -> None:
     for places in (longs(0xFFFFFFFF), longs(400)):
         with pytest.raises(FormatError, match=r"photosites|has only"):
             decode_raw(stub.replace(longs(len(stub) - 12_000)[2], places[2]), WHERE)
-    data, _ = rw2(7, 14)
-    with pytest.raises(FormatError, match=r"has only|bytes of pixels"):
-        decode_raw(data.replace(longs(len(data) - 6144)[2], longs(0xFFFFFFFF)[2]), WHERE)
 
 
-def test_what_libraw_knows_by_its_size_alone_is_refused() -> None:
+def test_zeros_of_a_size_that_libraw_knows_are_refused() -> None:
     """LibRaw takes any file of 786 432 bytes for a frame of an industrial camera."""
-    with pytest.raises(FormatError, match="raw files that can"):
+    with pytest.raises(FormatError, match="do not reach one count"):
         decode_raw(bytes(786_432), WHERE)
+
+
+def test_a_file_of_a_layout_that_is_not_checked_is_what_libraw_makes_of_it() -> None:
+    data, counts = raf()
+    assert not layout_is_known(data[:LAYOUT_START])
+    np.testing.assert_array_equal(decode_raw(data, WHERE).sensor, counts)
+    for length in (0, 7, 12, 40, 200, 600):
+        with pytest.raises(FormatError):
+            decode_raw(data[:length], WHERE)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_layout_that_is_checked_is_known_by_its_beginning(name: str) -> None:
+    assert layout_is_known(FILES[name][0][:LAYOUT_START])
 
 
 def test_makers_of_whose_layout_nothing_is_known_are_named() -> None:

@@ -14,7 +14,7 @@ from evaluation.cli import main
 from tests.evaluation.datasets.made_up import COPIES
 from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
 from tests.evaluation.learning.made_up_world import world
-from tests.evaluation.shown import compact, contents, printed, recorded_figures
+from tests.evaluation.shown import contents, recorded_figures
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -73,8 +73,8 @@ SEQUENCES: dict[str, tuple[str, ...]] = {
         "run world.npz --methods standard --out one --workers 1",
         "run world.npz --method gray-world --method pca --saturation 0.3 --out two --workers 1",
         "compare one --method pca --method gray-world --out cmp --json",
-        "compare one two --error recovery --level 0.9 --seed 3",
-        "compare one two --method gray-world=pca --images",
+        "compare one two --error recovery",
+        "compare one two --method gray-world=pca",
         "compare one --method white-patch --method pca --method gray-world --method gray-edge-1",
     ),
     "transfer": (
@@ -114,54 +114,14 @@ def test_commands(
         out = capsys.readouterr().out
         if "--out two" in command:
             del figures[drawn:]
-        if "--out one" not in command:
-            told[command] = compact(json.loads(out)) if command.endswith("--json") else printed(out)
+        if command.endswith("--json"):
+            told[str(len(told) + 1)] = json.loads(out)
     new = [path for path in sorted(place.rglob("*")) if path not in before and path.is_file()]
     # Tables are printed as well, pages are those of runs, and what is compared shows in what is made of it.
     new = [path for path in new if path.suffix != ".tex"]
     if name in ("cv", "transfer"):
-        new = [path for path in new if path.suffix != ".html" and path.parent.name != "two"]
+        new = [path for path in new if path.parent.name != "two"]
     if name in ("compare", "transfer"):
         new = [path for path in new if path.parent.name not in ("one", "two") or path.suffix == ".json"]
     files = {path.relative_to(place).as_posix(): contents(path) for path in new}
     pinned(f"commands, {name}", {"told": told, "files": files, "figures": figures}, nothing=1e-7)
-
-
-REFUSED = (
-    *("compare one two --method other",),
-    *("compare nowhere", "compare a b c", "compare one one/errors.csv", "compare one --method pca", "run nowhere"),
-    *("compare one three", "compare one --method gray-world --method x", "compare one --level 0.4"),
-    *("run world.npz --estimates nowhere.csv", "run world.npz --camera a", "run world.npz --layout x"),
-    *("run world.npz --methods pca,pca", "run world.npz --method kernel-ridge", "run world.npz --black -1"),
-    *("run world.npz --csv a.csv --images ./a.csv", "run world.npz --out o --csv o/t.csv"),
-    *("run folder --saturation 0", "cv world.npz kernel-ridge", "cv pca world.npz", "cv magic world.npz"),
-    *("cv kernel-ridge,kernel-ridge world.npz", "cv kernel-ridge world.npz --folds 1"),
-    *("cv kernel-ridge world.npz --folds 15", "cv kernel-ridge world.npz --folds x"),
-    *("cv kernel-ridge made --folds 7", "cv kernel-ridge world.npz --folds 2.5", "train all world.npz --out a.npz"),
-    *("train kernel-ridge world.npz --out a.txt", "train world.npz kernel-ridge --out a.npz", "tune pca world.npz"),
-    *("train kernel-ridge world.npz --out world.npz", "train kernel-ridge world.npz --adapt world.npz --out a.npz"),
-    *("paper table1 lut --pictures made --lights-like world.npz",),
-    *("paper table1 lut --pictures x --lights-like x.csv",),
-    *("paper table1 lut --pictures pictures --lights-like world.npz --sizes 0", "paper reduction nowhere.png"),
-    *("paper table1 lut --pictures pictures --lights-like world.npz --sizes 65536",),
-    *("paper flash-inverse made --out x",),
-    *("paper table1 lut --pictures pictures --lights-like world.npz --hot 1000001", "paper bits nowhere"),
-    *("paper table1 lut --pictures pictures --lights-like world.npz --hot 1.5", "paper chromaticities made"),
-    *("paper table2 world.npz --generated world.npz", "paper flash world.npz --out made"),
-    *("paper bits world.npz --sigma 0", "compare one --level 1", "run world.npz --workers 0"),
-)
-"""Commands that are told to do what cannot be done, most at a limit."""
-
-
-def test_refusals(place: Path, pinned: Pinned, capsys: pytest.CaptureFixture[str]) -> None:
-    every = [f"world {at}" for at in range(14)]
-    for name, rows in (("one", every), ("two", every[2:]), ("three", ["else"])):
-        (place / name).mkdir()
-        text = "".join(f"{row},Gray-world,{1 + at % 3}.5,{2 + at}.25,0\n" for at, row in enumerate(rows))
-        (place / name / "errors.csv").write_text(f"image,method,recovery,reproduction,guessed\n{text}")
-    found: dict[str, Any] = {}
-    for command in REFUSED:
-        code = main(shlex.split(command))
-        told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-        found[command] = [code, *(line.replace(str(place), "PLACE") for line in told)]
-    pinned("commands that are refused", found)

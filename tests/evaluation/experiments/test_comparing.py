@@ -14,9 +14,8 @@ from evaluation.experiments.comparing import (
     Matched,
     compare,
     holm,
-    largest_differences,
+    images_table,
     match,
-    missing_images,
     signed_rank,
     statistics_table,
     verdict,
@@ -97,10 +96,10 @@ def test_a_comparison_says_who_is_better_and_when_nobody_is() -> None:
     first, second = compare(pairs)
     assert first.p_holm == pytest.approx(2 * first.test.p)
     assert second.p_holm >= second.test.p > 0.05
-    assert "A errs less than B on 26 of 26 images, more on 0: A errs less" in verdict(first)
+    assert "A errs less than B on 26 of 26 images, more on 0, equal on 0: A errs less" in verdict(first)
     assert "not significant" in verdict(second)
     assert [made.statistic for made in first.statistics] == ["mean", "median", "trimean", "best25", "worst25", "avg"]
-    assert all(made.ratio == pytest.approx((0.8, 0.8, 0.8)) for made in first.statistics)
+    assert all(tuple(made.ratio) == pytest.approx((0.8, 0.8, 0.8)) for made in first.statistics)
 
 
 def test_what_is_the_same_but_for_rounding_is_the_same() -> None:
@@ -112,13 +111,13 @@ def test_what_is_the_same_but_for_rounding_is_the_same() -> None:
         if is_same:
             match(one, other, ("A", "B"), "recovery")
         else:
-            with pytest.raises(InputError, match="those of 3 of 3"):
+            with pytest.raises(InputError):
                 match(one, other, ("A", "B"), "recovery")
     # Files hold six decimals, so that the last may differ by one on either side.
     found = signed_rank(np.add(base, [1.9e-6, 2.1e-6, -2.1e-6]), base)
     assert (found.wins, found.losses, found.ties) == (1, 1, 1)
     made = match(errors("abc", np.add(base, [1.9e-6, 2.1e-6, 0])), errors("abc", base), ("", ""), "reproduction")
-    assert largest_differences(made) == [1]
+    assert [row[0] for row in images_table(compare([made])[0]).rows] == ["b"]
 
 
 def test_lists_end_where_they_would_be_too_long() -> None:
@@ -127,9 +126,11 @@ def test_lists_end_where_they_would_be_too_long() -> None:
     rows = comparing.images_table(made).rows
     assert [row[0] for row in rows] == [*"lkjihgfedc"]
     assert rows[0] == ("l", 13, 1, 12)
-    for images, told in (("bcdef", "b, c, d, e, f"), ("bcdefg", "b, c, d, e, f and 1 more")):
-        lacking = match(errors(f"a{images}", np.ones(len(images) + 1)), errors("a", [1]), ("A", "B"), "recovery")
-        assert missing_images(lacking)[0].endswith(f"left out here: {told}")
+    lacking = match(errors("abc", np.ones(3)), errors("axyz", np.ones(4)), ("A", "B"), "recovery")
+    assert lacking.notes == (
+        "A lacks 3 images of B, left out here: x, y, z",
+        "B lacks 2 images of A, left out here: b, c",
+    )
 
 
 def test_what_chance_explains_is_not_significant_at_its_level() -> None:
@@ -140,16 +141,6 @@ def test_what_chance_explains_is_not_significant_at_its_level() -> None:
         assert ("not significant" not in said) == is_told
     # More errors of A on all: B errs less, and the effect is 1.
     assert verdict(made).endswith("B errs less (Holm-corrected p = 0.0078, effect +1.00).")
-
-
-def test_labels_are_piled_up_from_the_edge_to_the_middle_of_their_quarter() -> None:
-    # Errors of 2, 2.02 and 2.5 lie 330 ln(y) / ln(100) points above an axis from 1 to 100: 49.67, 50.38, 65.66; a
-    # label stands 3 above, or 8.5 above that before it: at 52.67, 61.17, 69.67. Above the middle likewise, downwards.
-    low = np.array([2, 2.5, 2.02])
-    x, y = np.concatenate([low, 100 / low, [50, 2]]), np.concatenate([low, 100 / low, [2, 50]])
-    rises = comparing._rises(x, y, 1.0, 100.0)
-    expected = [3, 69.67 - 65.66, 61.17 - 50.38, 3, 266.33 - 264.34, 274.83 - 279.62, 3, 3]
-    np.testing.assert_allclose(rises, expected, atol=0.011)
 
 
 @pytest.mark.slow
@@ -175,7 +166,6 @@ def test_images_of_one_picture_are_one_case() -> None:
     assert "12 groups of 480 images" in verdict(comparison)
     table = comparing.tests_table([comparison])
     assert dict(zip(table.columns, table.rows[0], strict=True))["Groups"] == 12
-    assert "over groups of images" in statistics_table(comparison, 0.95).notes[0]
 
 
 def test_a_single_group_says_nothing_of_others() -> None:
@@ -185,7 +175,7 @@ def test_a_single_group_says_nothing_of_others() -> None:
     assert comparison.test.p == 1
     assert "not significant" in verdict(comparison)
     assert np.isnan(comparison.statistics[0].difference[1:]).all()
-    assert "No intervals" in statistics_table(comparison, 0.95).notes[0]
+    assert statistics_table([comparison]).rows[0][6:8] == (None, None)
 
 
 def test_groups_of_one_image_each_change_nothing() -> None:
@@ -199,6 +189,6 @@ def test_groups_of_one_image_each_change_nothing() -> None:
 def test_a_ratio_s_interval_may_have_no_upper_end() -> None:
     other = np.array([0.0] * 4 + [1.0] * 5)
     (comparison,) = compare([match(errors("abcdefghi", other + 2), errors("abcdefghi", other), ("A", "B"), "recovery")])
-    table = statistics_table(comparison, 0.95)
-    row = next(row for row in table.rows if row[0] == "Med.")
+    table = statistics_table([comparison])
+    row = next(row for row in table.rows if row[2] == "Med.")
     assert dict(zip(table.columns, row, strict=True))["ratio to"] == np.inf

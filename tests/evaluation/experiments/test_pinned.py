@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -11,22 +10,19 @@ import numpy.typing as npt
 import pytest
 
 from evaluation import metrics
-from evaluation.experiments import bootstrap, comparing, cross_validation, folds, suspicions
+from evaluation.experiments import cross_validation, folds
 from evaluation.experiments.paper import colour_reduction, material, published, reporting, table1
-from evaluation.experiments.run_folder import describe_run
 from evaluation.experiments.running import evaluate
 from evaluation.experiments.transfer import outcome
 from evaluation.learning.constant_light import median_light
 from evaluation.methods.standard import standard_methods
-from evaluation.reports import run_page, table_output
-from evaluation.results.files import MethodErrors, errors_csv, several_lights_csv
-from evaluation.results.result import Result, images_csv, indistinct, read_light, table_csv
-from evaluation.results.tables import Table, lights_tables, statistics_rows, summary_table
+from evaluation.reports import run_page
+from evaluation.results.files import errors_csv, several_lights_csv
+from evaluation.results.result import Result, images_csv, read_light, table_csv
 from foundation.errors import CropError
-from tests.evaluation.experiments.one_sample import intervals
 from tests.evaluation.made_scenes import Made
-from tests.evaluation.made_up import MixedWall, as_set, walls
-from tests.evaluation.shown import lines, numbers, printed, recorded_figures, table, words
+from tests.evaluation.made_up import MixedWall, walls
+from tests.evaluation.shown import recorded_figures, table
 from tests.pinned import Pinned
 
 # Parts are pinned as well, since what is made of them may not show them.
@@ -37,71 +33,15 @@ Floats = npt.NDArray[np.float64]
 
 
 def outcome_of(call: Callable[[], Any]) -> Any:
-    """Return what a call gives, or in which words it refuses."""
+    """Return the result of a call, or that it was refused."""
     try:
         return call()
-    except (CropError, ValueError) as error:
-        return f"{type(error).__name__}: {error}"
-
-
-def figures_in(compared: Sequence[bootstrap.Compared]) -> Any:
-    """Return all numbers of statistics that were compared."""
-    return numbers([part for one in compared for part in (one.one, one.other, *one.difference, *one.ratio)])
+    except (CropError, ValueError):
+        return {"refused": 1}
 
 
 def errors(count: int, seed: int = 0) -> Floats:
     return np.random.default_rng(seed).gamma(1.5, 2, count)
-
-
-SAMPLES: dict[str, list[float]] = {
-    "one": [2.5],
-    "two": [1.0, 4.0],
-    "ties": [1, 1, 1, 2, 2, 3, 3, 3, 3, 9],
-    "zeros": [0, 0, 0, 0, 0],
-    "zeros and more": [0, 0, 0, 1, 5],
-    "at three": [2.9, 3.0, 3.1, 3.0],
-    "skewed": errors(23).tolist(),
-}
-
-
-def test_statistics_and_intervals(pinned: Pinned) -> None:
-    found: dict[str, Any] = {}
-    for name, values in SAMPLES.items():
-        given, other = np.array(values), np.array(values)[::-1] * 1.1 + 0.1
-        groups = [str(place // 2) for place in range(len(values))]
-        sample = bootstrap.ErrorSample.of(given)
-        found[name] = {
-            "summary": metrics.summarise(given),
-            "percentiles": metrics.percentiles(given, (0, 1, 12.5, 50, 99, 100)),
-            "left out": numbers(sample.without_each()),
-            "groups left out": numbers(sample.without_each(bootstrap.numbered(groups)).ravel().tolist())
-            if len(values) > 2
-            else None,
-            "intervals": intervals(given, seed=3, count=50),
-            "paired": figures_in(bootstrap.paired(given, other, seed=1, count=60, level=0.8)),
-            "paired by groups": figures_in(bootstrap.paired(given, other, count=40, groups=groups)),
-            "independent": figures_in(bootstrap.independent(given, [*other, 3.0], seed=2, count=30)),
-            "figures": outcome_of(lambda given=given: bootstrap.bca(2.0, np.sort(given), [given], 0.9)),
-        }
-    found["refused"] = [
-        outcome_of(call)
-        for call in (
-            lambda: metrics.summarise([]),
-            lambda: metrics.summarise([1, np.nan, np.inf]),
-            lambda: bootstrap.ErrorSample.of([]),
-            lambda: bootstrap.ErrorSample.of([1, np.nan]),
-            lambda: bootstrap.ErrorSample.of([1, np.inf]),
-            lambda: bootstrap.paired([1, 2], [1]),
-            lambda: bootstrap.paired([1, 2], [1, 3], groups=["a"]),
-            lambda: bootstrap.paired([1, 2], [1, 3], groups=["a", "a"]),
-            lambda: intervals([1, 2], count=0),
-            lambda: intervals([1, 2, 4], count=1),
-            *(lambda level=level: bootstrap.bca(1, np.ones(3), [], level) for level in (0.0, 1.0, 0.5)),
-        )
-    ]
-    found["resamples"] = np.concatenate(list(bootstrap.resamples(5, 1, 7)))
-    found["resamples of groups"] = np.concatenate(list(bootstrap.resamples(5, 1, 7, np.array([0, 1, 1, 2, 0]))))
-    pinned("statistics and intervals of errors", found)
 
 
 def test_errors_of_lights_and_maps(pinned: Pinned) -> None:
@@ -143,62 +83,6 @@ def test_errors_of_lights_and_maps(pinned: Pinned) -> None:
     pinned("errors of lights and maps", found)
 
 
-def method_errors(name: str, images: str, values: Floats, groups: str | None = None, turned: float = 0) -> MethodErrors:
-    truths = np.tile([1.0, 2, 1 + turned], (len(values), 1))
-    kinds: Any = {"recovery": values / 2, "reproduction": values}
-    return MethodErrors(
-        name, tuple(images), truths, kinds, np.zeros(len(values), bool), None, None if groups is None else tuple(groups)
-    )
-
-
-def test_comparisons(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
-    figures = recorded_figures(monkeypatch)
-    letters = "abcdefghijklmnop"
-    one = method_errors("A", letters, errors(16), "aabbccddeeffgghh")
-    two = method_errors("B", letters[2:] + "xyz", errors(17, 1), "aabbccddeeffgghhi")
-    steps = np.where(np.arange(16) % 3, 1e-6, 3e-6) * np.tile([1, -1], 8)
-    near = method_errors("C", letters, errors(16) + steps)
-    turned = [method_errors("E", letters, errors(16), None, by) for by in (0, 3e-4, 6e-4, 0.01)]
-    kinds: tuple[metrics.ErrorKind, ...] = ("recovery", "reproduction")
-    pairs = [
-        comparing.match(one, two, ("A", "B"), kinds[1]),
-        comparing.match(one, near, ("A", "C"), kinds[0]),
-        comparing.match(replace(one, groups=None), replace(two, groups=None), ("A", "B"), kinds[0]),
-        comparing.match(one, method_errors("D", letters, errors(16) * 0.5, "a" * 16), ("A", "D"), kinds[1]),
-    ]
-    made = comparing.compare(pairs, seed=1, level=0.9)
-    notes = comparing.notes_of(made)
-    points = np.array([0.0, 0.01, 0.02, 1, 1, 1.02, 5, 5, 20]), np.array([0.005, 0.3, 0.31, 1, 0.9, 1.1, 20, 20.1, 4])
-    comparing.error_scatter(points[0], points[1], ("one", "other"), {place: f"image {place}" for place in range(9)})
-    comparing.error_scatter(np.full(3, 2.0), np.array([2.0, 2.1, 1.9]), ("one", "other"), {0: "a", 1: "b"})
-    found: dict[str, Any] = {
-        "made": [[pair.images, pair.missing, pair.groups, numbers([*pair.one, *pair.other])] for pair in pairs],
-        "tests": [[one.test, one.p_holm, figures_in(one.statistics)] for one in made],
-        "cases": [[pair.cases, pair.case_errors()] for pair in pairs],
-        "verdicts": [comparing.verdict(one, level) for one in made for level in (0.5, 0.95)],
-        "largest": [comparing.largest_differences(pair, count) for pair in pairs for count in (0, 3, 99)],
-        "notes": notes,
-        "tables": [
-            *(lines(comparing.tests_table(some)) for some in (made, made[2:3])),
-            *(lines(comparing.statistics_table(one, 0.9)) for one in made),
-            *(lines(comparing.images_table(one, 2)) for one in made),
-        ],
-        "rises": comparing._rises(np.maximum(points[0], 0.01), np.maximum(points[1], 0.01), 0.009, 22.0),
-        "holm": [comparing.holm(given) for given in ([], [0.2, 0.2], [0.5, 0.01, 0.04, 0.9])],
-        "signed ranks": [
-            comparing.signed_rank([1, 2, 3, 4.0], [1, 2, 3, 4.0 + apart]) for apart in (0, 1e-6, 2e-6, 2.1e-6, 1)
-        ],
-        "refused": [
-            outcome_of(lambda other=other: comparing.match(one, other, ("A", "E"), "recovery").missing)
-            for other in turned
-        ],
-        "page": words(comparing.comparison_page(made, notes, 0.9)),
-        "figures": figures,
-    }
-    # Of differences near 1e-6 resamples know only that they are small.
-    pinned("comparisons of methods", found, nothing=1e-5)
-
-
 def test_folds_and_small_scenes(pinned: Pinned) -> None:
     random = np.random.default_rng(1)
     image = random.uniform(0, 1000, (13, 9, 3))
@@ -217,45 +101,13 @@ def test_folds_and_small_scenes(pinned: Pinned) -> None:
             for parts in (2, 3, 4)
         ],
         "small": [
-            list(map(numbers, cross_validation.shrink_image(image, side, saturation, hidden)))
+            list(map(np.asarray, cross_validation.shrink_image(image, side, saturation, hidden)))
             for side in (4, 6, 12)
             for saturation in (None, 900.0)
             for hidden in (None, mask)
         ],
     }
     pinned("folds and small images", found, same=1e-5, nothing=1e-5)
-
-
-def test_suspicions(pinned: Pinned) -> None:
-    truths = np.random.default_rng(0).uniform(0.2, 2, (12, 3))
-    names = [str(number) for number in range(1, 13)]
-    by_text = np.array(sorted(range(12), key=lambda place: names[place]))
-    ways = {
-        "right": truths,
-        "swapped": truths[:, ::-1],
-        "gains": 1 / truths,
-        "before": np.roll(truths, 1, axis=0),
-        "after": np.roll(truths, -1, axis=0),
-        "as text": truths[by_text],
-        "as numbers": truths[np.argsort(by_text)],
-        "near": truths[:, ::-1] + 0.35,
-        "nearer": truths[:, ::-1] + 0.7,
-    }
-    guessed = np.arange(12) < 4
-
-    def results(count: int, hidden: npt.NDArray[np.bool_]) -> list[Result]:
-        return [Result(name, lights[:count], {}, hidden[:count]) for name, lights in ways.items()]
-
-    found = [
-        suspicions.suspicions(names[:count], truths[:count], results(count, hidden))
-        for count in (7, 8, 12)
-        for hidden in (np.zeros(12, bool), guessed, guessed | (np.arange(12) == 5))
-    ]
-    given = results(12, guessed)
-    found.append(
-        indistinct([replace(one, errors={"reproduction": errors(12, at)}) for at, one in enumerate(given)], 0.3)
-    )
-    pinned("suspicions of lights", found)
 
 
 class Says:
@@ -280,36 +132,20 @@ def test_results_and_their_page(
         Says("B <b>", (3, 2, 1), (3, 2, 1)),
         Says("C & d", *[(1, 1, 1)] * 7),
     ]
-    data = replace(as_set(scenes), truth_uncertainty_deg=1.5)
+    names, truths = [scene.name for scene in scenes], np.array([scene.truth for scene in scenes])
     results = evaluate(scenes, methods)
-    run = describe_run(data, results, [{"name": "A", "settings": {"p": 1, "list": list(range(40))}}], notes=("A note",))
-    marks = (("a_b {c}", None, 3), ("–", 1e-9, None))
-    tables = [
-        summary_table(run.subject, results, "recovery", further=True),
-        summary_table(run.subject, results, "reproduction"),
-        *lights_tables(run.subject, results, "recovery"),
-        Table("Marks & signs: <±°²∞~^_>", ("Best 25%", "σ × λ", "n"), marks, 3, ("One.", "Two")),
-    ]
-    for one in tables:
-        table_output.print_table(one)
-    told = printed(capsys.readouterr().out)
-    pictures = {(number, place): b"\x89PNG\r\n\x1a\n" for number in range(4) for place in range(7)}
     found = {
         "results": results,
-        "page": words(run_page.run_page(run, "recovery", pictures)),
         "chosen": [run_page.chosen_images(result, "reproduction") for result in results],
-        "tables": [*told, *(table_output.table_to_latex(one).splitlines() for one in tables)],
-        "together": table_output.tables_to_latex("Both", [tables[0], tables[0]]).splitlines(),
         "csv": [
             table(text)
             for text in (
                 table_csv(results, "recovery"),
                 images_csv(scenes, results),
-                errors_csv(run.subject.images, run.truths, results, ["g"] * 7),
-                *several_lights_csv(run.subject.images, results),
+                errors_csv(names, truths, results, ["g"] * 7),
+                *several_lights_csv(names, results),
             )
         ],
-        "rows": lines(statistics_rows(run.subject, results)),
         "figures": figures,
     }
     pinned("results and their page", found, nothing=1e-6)

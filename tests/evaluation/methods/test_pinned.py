@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from evaluation.experiments.cross_validation import settings_of
-from evaluation.methods import gray_pixels, naming, pixel_loops, prepared
+from evaluation.methods import gray_pixels, pixel_loops, prepared
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.gray_pixels import GraynessIndex, LocalGraynessIndex, MeanShiftedGrayPixel, largest_cluster
 from evaluation.methods.green_stability import tune
@@ -20,9 +19,7 @@ from evaluation.methods.prepared import PreparedImage
 from evaluation.methods.retinex import ColorSparrow, ImprovedWhitePatch, SurfaceReflectance
 from evaluation.methods.standard import local_methods, standard_methods
 from evaluation.methods.wrapped import PatchwiseMethod, ResizedMethod, fill_unknown
-from foundation.errors import InputError
 from tests.evaluation.made_up import Wall
-from tests.evaluation.shown import numbers
 from tests.pinned import Pinned
 
 # Parts of a method are pinned as well, since its estimate may not show them.
@@ -130,7 +127,7 @@ def test_maps_of_lights(pinned: Pinned) -> None:
         "5 lights": LocalGraynessIndex(share=0.02, lights=5),
     }
     found = {
-        case: {name: numbers(method.estimate_map(*given)) for name, method in methods.items()}
+        case: {name: np.asarray(method.estimate_map(*given)) for name, method in methods.items()}
         for case, given in CASES.items()
     }
     pinned("maps of lights by every local method", found, same=1e-5, nothing=1e-6)
@@ -146,20 +143,20 @@ def test_what_methods_share_of_an_image(case: str, pinned: Pinned) -> None:
     one = PreparedImage(*CASES[case])
     found = {
         "peak, scale, white": (one.peak, one.scale / 2.0**60, one.white),
-        "usable": {border: numbers(one.usable(border)) for border in (0, 3)},
+        "usable": {border: np.asarray(one.usable(border)) for border in (0, 3)},
         "moments": {border: one.moments(border) / 2.0 ** (border % 2) for border in (0, 1, 2, 5)},
         "norms": {f"{p} {border}": one.norm(0, 0, p, border) for p in (1, 1.5, 3, 20, np.inf) for border in (0, 2)},
         "derivatives": {
-            f"{order} {sigma}": numbers(one.derivative(order, sigma))
+            f"{order} {sigma}": np.asarray(one.derivative(order, sigma))
             for order in (0, 1, 2)
             for sigma in (0.3, 1.0, 4.6)
             if order or sigma
         },
         "smaller": [
-            [small.image.shape, numbers(small.image), numbers(small.usable(0))]
+            [small.image.shape, np.asarray(small.image), np.asarray(small.usable(0))]
             for small in map(one.at_most, (4, 20, 64))
         ],
-        "shrunk": [numbers(prepared.shrink(one.image, one.usable(1), 5, least)[0]) for least in (0.0, 0.3, 0.75)],
+        "shrunk": [np.asarray(prepared.shrink(one.image, one.usable(1), 5, least)[0]) for least in (0.0, 0.3, 0.75)],
     }
     pinned(f"shared parts of an image, {case}", found, same=1e-5, nothing=0 if case == "tiny values" else 1e-6)
 
@@ -242,43 +239,3 @@ def test_tuning_and_names(pinned: Pinned) -> None:
     for one in found.values():
         one["best"], one["candidates"] = one["best"].name, [method.name for method in one["candidates"]]
     pinned("tuning by green stability", found, same=1e-5)
-
-
-TEXTS = (
-    *("gray-world", "gray-edge-2@1", "gray-edge-2@0", "gray-world@patches", "gray-world@patches=0", "gray-world@x"),
-    *("gray-edge-1:p=1", "gray-edge-1:p=.99", "gray-edge-1:sigma=0", "gray-edge-1:sigma=1000", "gray-edge-1:p=inf"),
-    *("gray-edge-1:sigma=1000.1", "gray-edge-1:p=2:p=3", "gray-edge-2:sigma=2:p=4@20", "shades-of-gray:sigma=3"),
-    *("gray-edge-1:", "gray-edge-1:p", "pca:p=2", "gray-wrld", "nothing like it", ":Class", "module:", "no.module:X"),
-    *("evaluation.methods.pca:Nothing", "evaluation.methods.pca:GREY", "evaluation.methods.wrapped:PatchwiseMethod"),
-    *("shades-of-gray:p=nan", "general-gray-world:sigma=-1", "no-file.py:X", "gray-world@1@2", "gray-world@1234567"),
-)
-"""Names with parameters and what is done around, at their limits and beyond."""
-
-
-def test_what_names_give(pinned: Pinned) -> None:
-    found: dict[str, Any] = {}
-    for text in TEXTS:
-        try:
-            found[text] = repr(naming.find_method(text))
-        except InputError as error:
-            found[text] = str(error)
-    pinned("methods by their names", found)
-
-
-def test_limits_of_parameters(pinned: Pinned) -> None:
-    found: list[str] = []
-    one = GrayEdge("", 0, 1, 0)
-    for change in (
-        {"order": 2, "sigma": 0.1},
-        {"order": 3},
-        {"order": 1},
-        {"p": 0.999},
-        {"sigma": -0.001},
-        {"border": 0},
-    ):
-        try:
-            found.append(repr(replace(one, **change).left_out))  # pyrefly: ignore[bad-argument-type]
-        except ValueError as error:
-            found.append(str(error))
-    scales = (0.0, 0.5, 0.999, 1.0, 1.999, 6.0)
-    pinned("limits of parameters of methods", [found, [GrayEdge("", 0, 1, sigma).left_out for sigma in scales]])

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -19,28 +18,25 @@ from evaluation.learning.feature_learner import FeatureLearner
 from evaluation.learning.kernel_ridge import KernelRidge
 from evaluation.learning.model_files import load_model, save_model
 from evaluation.learning.standard import standard_learners
-from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.wrapped import ResizedMethod
 from evaluation.results.files import read_errors, read_estimates
-from evaluation.results.method_records import describe_method
 from foundation.errors import CropError
 from tests.evaluation.datasets.test_pinned import damages
 from tests.evaluation.learning.made_up_world import world
 from tests.evaluation.learning.stories import story
-from tests.evaluation.shown import unversioned
-from tests.pinned import Pinned, plain
+from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
 
 
-def attempt(read: Callable[[], Any], folder: Path) -> Any:
-    """Return what is read, or why it is refused."""
+REFUSED = {"refused": 1}
+
+
+def attempt(read: Callable[[], Any]) -> Any:
+    """Return what is read, or that it was refused."""
     try:
         return read()
-    except TypeError:
-        return "TypeError"
-    except (CropError, KeyError, ValueError) as error:
-        return unversioned(f"{type(error).__name__}: {error}").replace(str(folder), "PLACE")
+    except (CropError, KeyError, TypeError, ValueError):
+        return REFUSED
 
 
 ERRORS = """image,method,r,g,b,truth_r,truth_g,truth_b,recovery,reproduction,guessed,cause,group
@@ -78,7 +74,7 @@ def test_damaged_tables(tmp_path: Path, pinned: Pinned) -> None:
         }
         for how, text in [*others.items(), *damages(whole)][: 3 if " with" in name else None]:
             path.write_text(text)
-            found[f"{name} {how}"] = attempt(partial(read, path), tmp_path)
+            found[f"{name} {how}"] = attempt(partial(read, path))
     pinned("damaged tables of results", found)
 
 
@@ -110,77 +106,35 @@ def test_damaged_models(tmp_path: Path, pinned: Pinned) -> None:
         made = cast("FeatureLearner", replace(cast("Any", learner), **quick.get(key, {})))
         arrays = dict(made.fit(scenes).model.arrays())
         for name, array in arrays.items():
-            for how, other in changed(array).items():
-                given = arrays | {name: other}
-                told = attempt(lambda made=made, given=given: restore(made, given), tmp_path)
-                found[f"{key} {name} {how}"] = told if isinstance(told, str) else type(told).__name__
             left = {other: arrays[other] for other in arrays if other != name}
-            told = attempt(lambda made=made, left=left: restore(made, left), tmp_path)
-            found[f"{key} without {name}"] = told if isinstance(told, str) else type(told).__name__
+            given = [arrays | {name: other} for other in changed(array).values()] + [left]
+            read = [attempt(partial(restore, made, one)) for one in given]
+            found[f"{key} {name}"] = [one is REFUSED for one in read]
     both = {f"{part}.{name}": array for part in ("elsewhere", "here") for name, array in arrays_of_ridge().items()}
     for share in (-0.1, 0.0, 0.5, 1.0, 1.1, [0.5]):
-        told = attempt(lambda share=share: restore(KernelRidge(), both | {"share": np.array(share)}), tmp_path)
-        found[f"share {share}"] = told if isinstance(told, str) else told.share
+        restored = attempt(partial(restore, KernelRidge(), both | {"share": np.array(share)}))
+        found[f"share {share}"] = restored if restored is REFUSED else restored.share
     path = tmp_path / "model.npz"
     save_model(path, KernelRidge().fit(scenes), story(scenes))
-    whole = path.read_bytes()
     with np.load(path) as content:
         parts: dict[str, Any] = dict(content)
-    found["about"] = unversioned(str(parts["about"])).splitlines()
-    found["again"] = attempt(lambda: save_model(path, KernelRidge().fit(scenes), story(scenes)), tmp_path)
-    for how, about in (
-        ("format", str(parts["about"]).replace("model 1", "model 2")),
-        ("method", str(parts["about"]).replace("kernel-ridge", "magic")),
-        ("setting", str(parts["about"]).replace('"penalty"', '"penalties"')),
-        ("kind of setting", str(parts["about"]).replace("0.3", '"0.3"')),
-        ("without brightness", str(parts["about"]).replace('"brightness": 1.0,', "")),
-        ("scenes", str(parts["about"]).replace('"scenes": 12', '"scenes": 13')),
-        ("adapted", str(parts["about"]).replace('"adapted_from": ""', '"adapted_from": "x"').replace(": 12", ": 11")),
+    about = str(parts["about"])
+    for how, text in (
+        ("format", about.replace("model 1", "model 2")),
+        ("method", about.replace("kernel-ridge", "magic")),
+        ("setting", about.replace('"penalty"', '"penalties"')),
+        ("kind of setting", about.replace("0.3", '"0.3"')),
+        ("without brightness", about.replace('"brightness": 1.0,', "")),
+        ("scenes", about.replace('"scenes": 12', '"scenes": 13')),
+        ("adapted", about.replace('"adapted_from": ""', '"adapted_from": "x"').replace(": 12", ": 11")),
     ):
-        np.savez(path, allow_pickle=False, **(parts | {"about": np.array(about)}))
-        told = attempt(lambda: load_model(path), tmp_path)
-        found[how] = told if isinstance(told, str) else [told.name, repr(told.learner)]
-    for name, array in (("trained_on", parts["trained_on"][:5]), ("trained_on", parts["trained_on"].astype(float))):
-        np.savez(path, allow_pickle=False, **(parts | {name: array}))
-        found[f"{name} {array.shape} {array.dtype}"] = attempt(lambda: load_model(path), tmp_path)
-    for at in (0, 10, len(whole) // 2):
-        path.write_bytes(whole[:at])
-        found[f"of {at} bytes"] = attempt(lambda: load_model(path), tmp_path)
-    found["nowhere"] = [attempt(partial(load_model, place), tmp_path) for place in (tmp_path / "no.npz", tmp_path)]
+        np.savez(path, allow_pickle=False, **(parts | {"about": np.array(text)}))
+        found[how] = attempt(partial(load_model, path)) is REFUSED
+    for name, array in (("shorter", parts["trained_on"][:5]), ("of floats", parts["trained_on"].astype(float))):
+        np.savez(path, allow_pickle=False, **(parts | {"trained_on": array}))
+        found[name] = attempt(partial(load_model, path)) is REFUSED
     pinned("damaged models", found)
 
 
 def arrays_of_ridge() -> dict[str, Any]:
     return dict(KernelRidge().fit(world(3, 0, size=8)).model.arrays())
-
-
-@dataclass(frozen=True)
-class Nested:
-    """A setting in a setting."""
-
-    inner: Any = None
-    name: str = "nested"
-
-
-def test_records_of_methods(pinned: Pinned) -> None:
-    deep: Any = 1
-    for _ in range(8):
-        deep = [deep]
-    values = (
-        *(
-            math.inf,
-            math.nan,
-            np.float32(0.5),
-            np.int64(3),
-            True,
-            None,
-            b"bytes",
-            "text",
-            (1, 2.5),
-            {"a": {1: object()}},
-        ),
-        *(np.arange(6).reshape(2, 3), np.array([None, "a"], dtype=object), Nested(Nested(2)), deep, Nested, object()),
-    )
-    found = [describe_method(Nested(value)).get("settings") for value in values]
-    found += [describe_method(ResizedMethod(GrayEdge("", 1, math.inf, 2), 9)), describe_method(KernelRidge())]
-    pinned("records of methods", plain(found))

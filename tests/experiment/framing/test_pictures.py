@@ -41,7 +41,7 @@ def white(tmp_path_factory: pytest.TempPathFactory) -> Mosaic:
 
 @pytest.fixture(scope="module")
 def framing(white: Mosaic) -> Framing:
-    return find_chart(white, CHART)
+    return find_chart(white, CHART, corners=lab_of(FILL).corners_px(white))
 
 
 def moved(plane: Plane, dx: float, dy: float) -> Plane:
@@ -129,7 +129,9 @@ def test_a_softer_frame_is_measured(tmp_path: Path, tags: bool, blur_px: float, 
     """Photosites and lens add by their variances, so the difference is that of the lens alone."""
     before = hung(tags, SOFT.blur_px).mosaic(tmp_path)
     later = strongest_plane(hung(tags, blur_px).mosaic(tmp_path, colour, key=2))
-    shift = shift_between(plane_of(before, later.channel), find_chart(before, hung(tags, SOFT.blur_px).chart), later)
+    lab = hung(tags, SOFT.blur_px)
+    framing = find_chart(before, lab.chart, corners=lab.corners_px(before))
+    shift = shift_between(plane_of(before, later.channel), framing, later)
     true = blur_px**2 - SOFT.blur_px**2
     assert shift.blur_growth_px2 == pytest.approx(true, rel=0.35, abs=0.05)
 

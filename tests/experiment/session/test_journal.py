@@ -18,7 +18,7 @@ from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session import opening
 from experiment.session.journal import Journal, ReceivedFile, time_text
-from experiment.session.opening import JOURNAL_VERSION, create_file, require_sound_rows
+from experiment.session.opening import create_file, require_sound_rows
 from experiment.session.records import ACCEPTED, FAILED, AcceptedFile, Judgement, SessionEvent, plan_steps
 from foundation.errors import FormatError, StorageError
 
@@ -31,7 +31,7 @@ def journal(tmp_path: Path) -> Generator[sqlite3.Connection]:
 
 def require_time(journal: sqlite3.Connection, text: str) -> None:
     journal.execute("INSERT INTO events (at, what, detail) VALUES (?, 'start', '')", (text,))
-    require_sound_rows(Path("journal.sqlite"), journal, JOURNAL_VERSION)
+    require_sound_rows(Path("journal.sqlite"), journal)
 
 
 @pytest.mark.parametrize("zone", [UTC, timezone(timedelta(hours=5, minutes=45))])
@@ -74,7 +74,7 @@ def test_hashes_that_are_none_are_refused(journal: sqlite3.Connection, text: str
         (*[time_text(datetime(2026, 1, 1, tzinfo=UTC))] * 2, text),
     )
     with pytest.raises(FormatError, match="1 rows of attempts"):
-        require_sound_rows(Path("journal.sqlite"), journal, JOURNAL_VERSION)
+        require_sound_rows(Path("journal.sqlite"), journal)
 
 
 LIGHTS = (Illumination(0, "uniform", None, Colour(255, 0, 0)),)
@@ -182,3 +182,28 @@ def test_a_journal_of_the_future(path: Path) -> None:
     journal.close()
     with pytest.raises(FormatError, match="version 99"):
         Journal.open(path)
+
+
+@pytest.mark.parametrize("version", [1, 3])
+def test_a_journal_of_another_version_is_refused_by_one_sentence(tmp_path: Path, version: int) -> None:
+    path = tmp_path / "journal.sqlite"
+    Journal.create(path, ())
+    with closing(sqlite3.connect(path)) as journal:
+        journal.execute(f"PRAGMA user_version = {version}")
+    for opened in (Journal.open, Journal.open_for_run):
+        with pytest.raises(FormatError, match=f"version {version}, this software reads version 2; use the software"):
+            opened(path)
+
+
+def test_a_kind_of_frame_that_is_not_known_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    Journal.create(path, plan_steps([], 1))
+    with closing(Journal.open_for_run(path)) as journal:
+        journal.begin(journal.steps()[0], "frames/a", datetime.now(UTC))
+    with closing(sqlite3.connect(path)) as file, file:
+        file.execute("UPDATE plan SET kind = 'flat'")
+        file.execute("UPDATE attempts SET kind = 'flat'")
+    with closing(Journal.open(path)) as journal:
+        for read in (journal.steps, journal.attempts, journal.verdicts):
+            with pytest.raises(FormatError, match=r"'flat'.*light, white, dark, resp"):
+                read()

@@ -93,22 +93,6 @@ def test_a_damaged_frame_is_voided_and_taken_again(session: Session, damage: str
     assert path.exists() == (damage != "gone"), "nothing is deleted"
 
 
-def test_two_accepted_frames_of_a_step_count_once(session: Session) -> None:
-    """Older software retook a truncated frame and left both accepted."""
-    take_again(session, 3)
-    counted = [frame.file for frame in session.frames() if frame.illumination == 1 and frame.accepted]
-    assert counted == ["frames/again.cr2"], "also where nobody has verified it"
-    assert session.verify() == ("taken again since, as frames/again.cr2",)
-    assert verdicts(session, 3) == ["voided", "accepted"]
-    assert session.done_steps() == set(range(9))
-
-
-def test_the_newest_sound_frame_stays_where_a_newer_one_is_gone(session: Session) -> None:
-    take_again(session, 3).unlink()
-    session.verify()
-    assert verdicts(session, 3) == ["accepted", "voided"]
-
-
 def unreadable(names: Sequence[str], monkeypatch: pytest.MonkeyPatch, code: int = errno.EIO) -> None:
     """Let the disk fail at files of these names."""
     real = Path.open
@@ -198,16 +182,15 @@ def test_lights_as_text_are_read_again(text: str) -> None:
 
 
 def write_report(
-    folder: Path, lights: str, frames: Sequence[bytes], registered: bytes, age: int, newest: bytes | None = None
+    folder: Path, lights: str, frames: Sequence[bytes], registered: bytes, age: int, newest: bytes = b"frame 0000_white"
 ) -> None:
     folder.mkdir()
     says: dict[str, object] = {
         "retake": lights,
         "retake_sha256": [hashlib.sha256(frame).hexdigest() for frame in frames],
         "registered_sha256": hashlib.sha256(registered).hexdigest(),
+        "newest_sha256": hashlib.sha256(newest).hexdigest(),
     }
-    if newest is not None:
-        says["newest_sha256"] = hashlib.sha256(newest).hexdigest()
     (folder / "report.json").write_text(json.dumps(says))
     os.utime(folder / "report.json", (age, age))
 
@@ -216,7 +199,7 @@ def test_what_the_newest_report_refused_is_taken_again_once(session: Session, tm
     white = b"frame 0000_white"
     write_report(tmp_path / "lut", "0", [b"frame 0002_light_000"], white, 100)
     write_report(tmp_path / "lut.refused", "2", [b"frame 0004_light_002", white], white, 200)
-    write_report(tmp_path / "of another session", "3", [b"frame 0005_light_003"], b"another", 300)
+    write_report(tmp_path / "of another session", "3", [b"frame 0005_light_003"], b"another", 300, b"another")
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "report.json").write_text("{")
     (tmp_path / "old").mkdir()

@@ -24,7 +24,7 @@ from calibration.table.lut import open_lut
 from calibration.table.verification import describe, find_faults
 from calibration.table.zarr_store import fetch
 from experiment.session.folder import Session
-from experiment.session.repair import held_secrets, unsound_files
+from experiment.session.repair import unsound_files
 from foundation.errors import CropError
 from generator.dataset.reader import file_faults, open_dataset
 from tests.fuzz.foreign.mutations import CANARY, mutate
@@ -131,7 +131,6 @@ def read_table(folder: Path, spare: Path) -> None:
 
 def read_session_folder(folder: Path, spare: Path) -> None:
     del spare
-    held_secrets(folder)
     with suppress(CropError):
         view = read_session(folder)
         now = datetime(2026, 1, 2, tzinfo=UTC)

@@ -18,10 +18,6 @@ from experiment.lights import Illumination
 from generator.dataset.reader import Dataset, file_faults, open_dataset
 from generator.kernels.choice import channels_of
 
-MADE_ELSEWHERE = ("software", "libraries")
-"""What `dataset.json` says of the machine that made it."""
-
-
 SPECTRA = ((9, 5, 2), (7, 6, 4), (5, 6, 6), (3, 5, 9), (4, 9, 3))
 """Lights in three bands."""
 
@@ -82,25 +78,20 @@ def rows_of(text: str) -> list[list[Any]]:
     return [[plain_text(cell) for cell in row] for row in csv.reader(io.StringIO(text))]
 
 
-def held_by(out: Path, without: tuple[str, ...] = ("table", "lights")) -> dict[str, Any]:
-    """Return what a dataset holds: every list, and every image and map as its shape and the hash of its values.
-
-    `without`: parts of its description that other datasets of the same table have as well.
-    """
+def held_by(out: Path) -> dict[str, Any]:
+    """Return what a dataset holds: the numbers of every list, and each image and map as shape and bytes."""
     dataset = open_dataset(out)
     described = json.loads((out / "dataset.json").read_text(encoding="utf-8"))
-    for name in (*MADE_ELSEWHERE, *without):
-        described.pop(name, None)
     lists = {path.name: rows_of(path.read_text(encoding="utf-8")) for path in sorted(out.glob("*.csv"))}
     parts = {path.stem: path.read_text().split() for path in sorted(out.glob("splits/*"))}
     sums = [line.split("  ")[1] for line in (out / "SHA256SUMS").read_text().splitlines()]
     return {
-        "described": described,
+        "pixels": [described["pixels"], described["replaced_pixels"]],
         "lists": lists,
         "truths": [[float(part) for part in line.split()] for line in (out / "gt.txt").read_text().splitlines()],
-        "parts": parts,
-        "files": " ".join(sums),
-        "faults": list(file_faults(out)),
+        "parts": {name: len(one) for name, one in parts.items()},
+        "files": len(sums),
+        "faults": len(list(file_faults(out))),
         "images": [shown_of(dataset, number) for number in range(len(dataset.entries))],
     }
 

@@ -42,7 +42,7 @@ def test_what_the_page_is_told(tmp_path: Path, pinned: Pinned, monkeypatch: pyte
                 counts = said(explorer.counts, number, light, rendering)
                 pixel = said(explorer.pixel, number, light, rendering, 3, 5)
                 found[f"counts {number} {light} {rendering}"] = [
-                    counts if isinstance(counts, str) else counts.copy(),
+                    counts if isinstance(counts, dict) else counts.copy(),
                     pixel,
                 ]
     found["outside"] = [said(explorer.pixel, 1, "0", "codes", x, y) for x, y in ((8, 0), (0, 9), (-1, 0), (7, 8))]

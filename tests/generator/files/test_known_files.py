@@ -32,7 +32,6 @@ from generator.files import (
     preview_of,
     require_plausible,
 )
-from tests.generator.said import said
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -159,38 +158,3 @@ def test_images_come_back(pinned: Pinned) -> None:
         "images that come back",
         [decode_image(encode_image(image, form, OF_A_BODY), form, "it").tobytes() for form in forms],
     )
-
-
-def test_what_cannot_be_encoded(pinned: Pinned) -> None:
-    image = np.full((22, 22, 3), 7, np.uint16)
-    found: list[Any] = []
-    for white_level, white in (
-        (0, 1.0),
-        (1, 1.0),
-        (65535, 1.0),
-        (65536, 1.0),
-        (9, 0.0),
-        (9, 1e-5),
-        (9, 1.1e-5),
-        (9, np.nan),
-    ):
-        made = said(encode_dng, image, ImageMetadata(white_level, (white, 1.0, 0.5), "Known camera"))
-        found.append(made if isinstance(made, str) else "made")
-    images = (image[:21], image[:, :21], image[:, :0], image[..., :2], image.astype(np.int16), image[0])
-    found += [str(said(encode_image, one, form, METADATA))[:90] for one in images for form in ("png", "dng")]
-    found += [
-        said(decode_image, encode_image(image, "png", METADATA)[:60], form, "it")[:40]
-        for form in ("png", "tiff", "exr")
-    ]
-
-    def empty(height: int, width: int) -> npt.NDArray[np.uint16]:
-        """Return an image without memory of its own, wider or higher than a format holds."""
-        return np.broadcast_to(image[:1, :1], (height, width, 3))
-
-    found.append(said(next, files.png_pieces(empty(1, (1 << 28) + 1), METADATA)))
-    found += [said(encode_exr, empty(1, width), METADATA) for width in (11184811, 1 << 28)]
-    found.append(said(encode_tiff, empty(1 << 15, 1 << 15), METADATA))
-    found += [said(files.suffix_of, "png"), [known.smallest_side for known in files.FILE_FORMATS.values()]]
-    found += [said(fit_flash, np.ones((1, 1, 3)), *given) for given in ((0.0,), (5.0, 0.0), (1e-9, 1e-9))]
-    found += [said(files.encode_preview, np.broadcast_to(np.zeros(3, np.uint8), (1, 65501, 3)))]
-    pinned("what cannot be encoded", found)

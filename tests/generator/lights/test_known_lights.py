@@ -97,7 +97,7 @@ def test_draws_of_distributions(pinned: Pinned) -> None:
     found: dict[str, Any] = {}
     for text in texts:
         distribution = said(parse_distribution, text)
-        found[text] = distribution if isinstance(distribution, str) else [
+        found[text] = distribution if isinstance(distribution, dict) else [
             distribution.describe(),
             distribution.draw(words),
         ]  # fmt: skip
@@ -162,5 +162,5 @@ def test_requests(lut: Lut, pinned: Pinned) -> None:
     found: dict[str, Any] = {}
     for name, wishes in REQUESTS.items():
         choice = said(LightOptions(**wishes).choose, lut, SEED)
-        found[name] = choice if isinstance(choice, str) else said(shown, choice, (0, 1, 70000))
+        found[name] = choice if isinstance(choice, dict) else said(shown, choice, (0, 1, 70000))
     pinned("requests of lights", found)

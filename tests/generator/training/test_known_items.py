@@ -72,7 +72,7 @@ def test_galleries_and_what_is_refused(tmp_path: Path, pinned: Pinned) -> None:
 
     for given in wrong:
         named: dict[str, Any] = {"size": (5, 8), "rendering": "codes", **given}
-        found += [str(given), said(Crops, lut, again, **named)]
+        found.append(said(Crops, lut, again, **named))
     crops = Crops(lut, again, (5, 8), length=4, rendering="codes")
     items: list[Any] = [[], [4], [-1], [[0]]]
     found += [said(crops.batch, one) for one in items]
@@ -82,5 +82,4 @@ def test_galleries_and_what_is_refused(tmp_path: Path, pinned: Pinned) -> None:
         said(gallery_of, [np.zeros((0, 3, 3), np.uint8)]),
     ]
     found.append(said(save_gallery, [], tmp_path / "new"))
-    places = [one.replace(str(tmp_path), "PLACE") if isinstance(one, str) else one for one in found]
-    pinned("galleries", places)
+    pinned("galleries", found)

@@ -6,15 +6,13 @@ import hashlib
 
 import pytest
 
-from drivers.links.network import UdpSocket
-from drivers.pjlink import NoResolution, PjLinkReply
+from drivers.pjlink import NoResolution
 from drivers.projector import Power, Severity
 from foundation.clock import SimulatedClock
-from foundation.errors import DeviceFault, LinkTimeout
-from sim.projectors.pjlink import Announcer, PjLinkPeer, ProjectorDatagrams
+from foundation.errors import DeviceFault
+from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.projector import Bench, ProjectorContract
-from tests.drivers.pjlink.notice_port import NoticePort
 
 
 class TestSimulatedProjector(ProjectorContract):
@@ -26,10 +24,6 @@ class TestSimulatedProjector(ProjectorContract):
         return Bench(
             device, clock.sleep, device.break_part, device.repair, traits.identity, traits.warm_up_s, traits.cool_down_s
         )
-
-
-def notice(command: str, value: str) -> PjLinkReply:
-    return PjLinkReply(command, value, 2)
 
 
 def test_light_follows_the_lamp_and_the_mute() -> None:
@@ -171,60 +165,6 @@ def test_class_2_in_standby() -> None:
         (b"%2RFIL ?", b"%2RFIL=ERR1"),
     ]
     assert conversation(peer, *(question + b"\r" for question, _ in asked)) == [answer + b"\r" for _, answer in asked]
-
-
-def test_announces_its_start_and_then_each_change() -> None:
-    clock = SimulatedClock()
-    device = SimulatedProjector(clock)
-    announcer = Announcer(device)
-    assert announcer.news() == (notice("LKUP", "02:00:00:00:00:01"),)
-    assert announcer.news() == ()
-    device.switch_on()
-    assert announcer.news() == (notice("POWR", "3"),)
-    clock.sleep(30)
-    assert announcer.news() == (notice("POWR", "1"), notice("INPT", "31"))
-    device.set_input("32")
-    device.break_part("fan", Severity.WARNING)
-    assert announcer.news() == (notice("ERST", "100000"), notice("INPT", "32"))
-    device.repair()
-    assert announcer.news() == (notice("ERST", "000000"),)
-    assert announcer.news() == ()
-
-
-def test_class_1_announces_nothing_and_is_not_found() -> None:
-    device = SimulatedProjector(SimulatedClock(), traits=ProjectorTraits(pjlink_class=1))
-    assert Announcer(device).news() == ()
-    with UdpSocket(host="127.0.0.1") as asker, ProjectorDatagrams(device) as datagrams:
-        asker.send(b"%2SRCH\r", datagrams.address)
-        # It has heard the question once it has heard what came after it: its own end.
-        datagrams.close()
-        with pytest.raises(LinkTimeout):
-            asker.receive(0.0)
-
-
-def test_answers_a_search_in_the_standards_bytes() -> None:
-    # PJLink 2.00, 3.2.
-    with (
-        UdpSocket(host="127.0.0.1") as asker,
-        ProjectorDatagrams(SimulatedProjector(SimulatedClock())) as datagrams,
-    ):
-        asker.send(b"who is there?\r", datagrams.address)
-        asker.send(b"%2SRCH\r", datagrams.address)
-        assert asker.receive(10.0) == (b"%2ACKN=02:00:00:00:00:01\r", datagrams.address)
-
-
-def test_sends_notices_to_the_controller_in_its_menu() -> None:
-    clock = SimulatedClock()
-    device = SimulatedProjector(clock)
-    with (
-        NoticePort(0, "127.0.0.1") as controller,
-        ProjectorDatagrams(device, controller=controller.address) as datagrams,
-    ):
-        datagrams.announce()
-        assert controller.receive(10.0) == ("127.0.0.1", notice("LKUP", "02:00:00:00:00:01"))
-        device.switch_on()
-        datagrams.announce()
-        assert controller.receive(10.0) == ("127.0.0.1", notice("POWR", "3"))
 
 
 def test_the_port_asks_for_the_password_once_a_connection() -> None:

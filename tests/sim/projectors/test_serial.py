@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from benqprojector import BenQProjectorSerial
@@ -12,18 +13,21 @@ from epson_projector import Projector
 
 from drivers.links.network import TcpLink, serve_peer
 from drivers.links.serial import SerialLink
-from drivers.projector import Power
-from drivers.serial_projectors import LANGUAGES
-from drivers.serial_projectors.benq import BenqProjector
-from drivers.serial_projectors.epson import EpsonOnNetwork, EpsonProjector
+from drivers.projector import Power, ProjectorIdentity
+from drivers.serial_projectors.driver import LineProjector
+from drivers.serial_projectors.language import built_in_languages, load_language
 from foundation.clock import SimulatedClock
 from sim.buses.serial import PseudoTerminal
 from sim.cli import main
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
-from sim.projectors.serial import SERIAL_NUMBER, BenqPeer, EpsonPeer
+from sim.projectors.serial import LinePeer
+from tests.drivers.serial_projectors.made_up import TEXT
 from tests.sim.conftest import sim_serving
 
-AT_ONCE = ProjectorTraits(warm_up_s=0.0, cool_down_s=0.0)
+BENQ, EPSON = load_language("benq"), load_language("epson")
+AT_ONCE = ProjectorTraits(
+    ProjectorIdentity("CroP", "Simulated Projector", "CROP0000001"), warm_up_s=0.0, cool_down_s=0.0
+)
 """Other software waits by its own clock; a projector that is on at once keeps it short."""
 
 
@@ -47,7 +51,7 @@ def test_benqprojector_drives_the_simulated_benq(device: SimulatedProjector) -> 
         assert await client.send_command("3d", check_supported=False) is None, "refused, and the client knows it"
         await client.disconnect()
 
-    with PseudoTerminal(BenqPeer(device)) as terminal:
+    with PseudoTerminal(LinePeer(device, BENQ)) as terminal:
         asyncio.run(talk(terminal.path))
     assert device.power() is Power.ON
     assert device.muted()
@@ -57,7 +61,7 @@ def test_epson_projector_drives_the_simulated_epson(device: SimulatedProjector) 
     async def talk(path: str) -> None:
         client = Projector(path, type="serial")
         assert await client.get_power() == "04"
-        assert await client.get_serial_number() == SERIAL_NUMBER
+        assert await client.get_serial_number() == "CROP0000001"
         assert await client.send_command("PWR ON") == ""
         client.close()
         # A command locks this client for the time that it takes on a real projector.
@@ -72,7 +76,7 @@ def test_epson_projector_drives_the_simulated_epson(device: SimulatedProjector) 
         assert await client.get_property("CMODE") is False, "refused, and the client knows it"
         client.close()
 
-    with PseudoTerminal(EpsonPeer(device)) as terminal:
+    with PseudoTerminal(LinePeer(device, EPSON)) as terminal:
         asyncio.run(talk(terminal.path))
     assert device.power() is Power.ON
     assert device.muted()
@@ -80,7 +84,7 @@ def test_epson_projector_drives_the_simulated_epson(device: SimulatedProjector) 
 
 def test_epson_accepts_nothing_until_it_has_switched_on() -> None:
     clock = SimulatedClock()
-    peer = EpsonPeer(SimulatedProjector(clock))
+    peer = LinePeer(SimulatedProjector(clock), EPSON)
     assert peer.receive(b"PWR ON\r") == b""
     assert peer.receive(b"PWR?\r") == b""
     clock.sleep(29)
@@ -92,25 +96,18 @@ def test_epson_accepts_nothing_until_it_has_switched_on() -> None:
 
 def test_epson_warming_up_by_remote_control_tells_its_power_only() -> None:
     device = SimulatedProjector(SimulatedClock())
-    peer = EpsonPeer(device)
+    peer = LinePeer(device, EPSON)
     device.switch_on()
     assert peer.receive(b"PWR?\rLAMP?\r") == b"PWR=02\r:ERR\r:"
 
 
-@pytest.fixture(params=["benq", "epson"])
-def served(request: pytest.FixtureRequest, device: SimulatedProjector) -> Iterator[BenqProjector | EpsonProjector]:
-    def peer() -> BenqPeer | EpsonPeer:
-        return (BenqPeer if request.param == "benq" else EpsonPeer)(device, network=True)
-
-    with serve_peer(peer) as server:
-
-        def connect() -> TcpLink:
-            return TcpLink.connect(*server.address, 10.0)
-
-        yield BenqProjector(connect) if request.param == "benq" else EpsonOnNetwork(connect)
+@pytest.fixture(params=[BENQ, EPSON], ids=lambda language: language.maker)
+def served(request: pytest.FixtureRequest, device: SimulatedProjector) -> Iterator[LineProjector]:
+    with serve_peer(lambda: LinePeer(device, request.param, network=True)) as server:
+        yield LineProjector(request.param, lambda: TcpLink.connect(*server.address, 10.0), network=True)
 
 
-def test_serves_the_network_as_well(served: BenqProjector | EpsonProjector) -> None:
+def test_serves_the_network_as_well(served: LineProjector) -> None:
     served.switch_on()
     assert served.power() is Power.ON
     served.set_muted(True)
@@ -120,9 +117,21 @@ def test_serves_the_network_as_well(served: BenqProjector | EpsonProjector) -> N
     served.close()
 
 
+def test_a_controller_that_greets_wrongly_is_refused(device: SimulatedProjector) -> None:
+    peer = LinePeer(device, EPSON, network=True)
+    answer = peer.receive(b"GET / HTTP/1.0\r\n")
+    assert (answer[:10], len(answer), answer[14]) == (b"ESC/VP.net", 16, 0x40)
+
+
+def test_answers_what_no_driver_sends(device: SimulatedProjector) -> None:
+    assert LinePeer(device, EPSON).receive(b"PWR 01\rCMODE?\r") == b"ERR\r:ERR\r:"
+    assert LinePeer(device, BENQ).receive(b"*3d=?#\r") == b"*3d=?#\r\n*Unsupported item#\r\n>"
+    assert LinePeer(device, load_language("optoma")).receive(b"hello\r~00999 1\r") == b"F\rF\r"
+
+
 def test_a_pseudo_terminal_leaves_no_thread_and_no_port(device: SimulatedProjector) -> None:
     before = threading.active_count()
-    with PseudoTerminal(EpsonPeer(device)) as terminal:
+    with PseudoTerminal(LinePeer(device, EPSON)) as terminal:
         assert threading.active_count() == before + 1
     terminal.close()
     assert threading.active_count() == before
@@ -130,7 +139,7 @@ def test_a_pseudo_terminal_leaves_no_thread_and_no_port(device: SimulatedProject
 
 @pytest.mark.slow
 def test_a_pseudo_terminal_that_nobody_reads_can_be_closed(device: SimulatedProjector) -> None:
-    with PseudoTerminal(BenqPeer(device)) as terminal:
+    with PseudoTerminal(LinePeer(device, BENQ)) as terminal:
         link = SerialLink.open(terminal.path, 115200)
         for _ in range(5):
             link.write(b"*modelname=?#\r" * 100, 10.0)
@@ -139,13 +148,17 @@ def test_a_pseudo_terminal_that_nobody_reads_can_be_closed(device: SimulatedProj
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["epson", "nec"])
-def test_serves_a_serial_projector_until_interrupted(name: str) -> None:
-    spoken = LANGUAGES[name]
-    with sim_serving("projector", "--serial", name) as (line,):
-        assert line.startswith(f"{spoken.maker} projector at /dev/")
+@pytest.mark.parametrize("named", ["optoma", "lantern.toml"])
+def test_serves_a_serial_projector_until_interrupted(
+    named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("lantern.toml").write_text(TEXT)
+    language = load_language(named)
+    with sim_serving("projector", "--serial", named) as (line,):
+        assert line.startswith(f"{language.maker} projector at /dev/")
         path = line.split()[-1]
-        projector = spoken.projector(lambda: SerialLink.open(path, spoken.baud))
+        projector = LineProjector(language, lambda: SerialLink.open(path, language.line.baud))
         assert projector.power() is Power.STANDBY
         projector.switch_on()
         assert projector.power() is Power.WARMING
@@ -156,7 +169,7 @@ def test_serves_a_serial_projector_until_interrupted(name: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--serial", "klingon"], ", ".join(LANGUAGES)),
+        (["--serial", "klingon"], ", ".join(built_in_languages())),
         (["--serial", "epson", "--pjlink", "0"], "either --pjlink PORT or --serial LANGUAGE"),
         ([], "either --pjlink PORT or --serial LANGUAGE"),
         (["--serial", "epson", "--password", "x"], "a serial cable has none"),

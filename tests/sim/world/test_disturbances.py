@@ -20,7 +20,6 @@ from foundation.clock import OPENING
 from foundation.errors import ConfigurationError
 from sim.camera.film import WorldFilm
 from sim.world.disturbances import (
-    KINDS,
     AmbientStep,
     AnyDisturbance,
     Bump,
@@ -38,7 +37,6 @@ from sim.world.disturbances import (
     SensorWarming,
     StaleFile,
     ZeroedStrip,
-    drawn,
     read_disturbances,
 )
 from sim.world.rendering import Print
@@ -351,22 +349,6 @@ def test_an_event_that_cannot_be_is_one_sentence(event: Any, words: str) -> None
     assert words in str(caught.value)
     assert "Input" not in str(caught.value)
     assert "valid" not in str(caught.value)
-
-
-def test_a_seed_draws_the_same_events() -> None:
-    assert drawn(3, 100, 20) == drawn(3, 100, 20)
-    assert drawn(3, 100, 20) != drawn(4, 100, 20)
-    everything = drawn(1, 100, 200).events
-    assert {event.what for event in everything} == set(KINDS)
-    assert all(1 <= event.from_frame < 100 for event in everything)
-    assert {event.to_frame for event in everything if isinstance(event, LampDrift | SensorWarming)} == {100}
-
-
-def test_what_a_real_screen_does_itself_is_not_pretended() -> None:
-    for event in (FrozenScreen(), HalfChanged(), StaleFile()):
-        with pytest.raises(ConfigurationError, match=f"--event: {event.what}.*screen"):
-            Disturbances((Bump(px=1.0), event)).require_unshown("--event")
-    Disturbances((Bump(px=1.0), Person())).require_unshown("--event")
 
 
 def test_a_reflection_adds_a_share_of_papers_light_whatever_is_printed() -> None:

@@ -14,7 +14,7 @@ from sim import spectral
 from sim.optics import PhotographicLens
 from sim.spectral import WAVELENGTHS_NM, daylight, paper, projector_primaries, published_spectra
 from sim.world import rendering
-from sim.world.disturbances import KINDS, AnyDisturbance, Disturbances, Moment, drawn
+from sim.world.disturbances import AnyDisturbance, Disturbances, Moment
 from sim.world.rendering import Fold, Print, Waviness, label_map
 from sim.world.sensors import BODIES, FACTS, Body, Rectangle, find_body
 from sim.world.world import REFERENCE_EXPOSURE, UNDISTURBED, Blob, Glare, Patch, Room, Situation, World, moved
@@ -130,8 +130,6 @@ def test_every_disturbance_shows_what_it_showed(pinned: Pinned) -> None:
                 "signal": world.signal(events.shown(there), BRIGHT, situation=situation),
                 "stale": events.stale(there) is not None,
             }
-    found["drawn"] = drawn(3, 50, 40)
-    found["drawn of some"] = drawn(9, 7, 5, KINDS[3:8])
     pinned("a room's disturbances", found, same=SINGLE)
 
 

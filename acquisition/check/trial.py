@@ -1,0 +1,143 @@
+"""The trial set: a session of a dozen frames, taken into a folder that is thrown away, and measured as any session is.
+
+White several times, dark, the primaries, grey, and the plan's darkest light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from acquisition.check.exposure import Photographer, Saturation
+from calibration.figures.all_figures import FIGURES
+from calibration.figures.truth import BRIGHTEST_SHARE, DARKEST_COUNTS
+from calibration.measurements import TableMeasurements
+from calibration.pipeline.build import check, judge_trial
+from calibration.pipeline.frames import PAPER_OPTIONS
+from calibration.verdict import Verdict, judge
+from drivers.presenter import BLACK, WHITE, Colour
+from drivers.raw.rawfile import Mosaic, read_raw
+from experiment.framing.field import Corners
+from experiment.lights import Illumination
+from experiment.session.folder import Session
+from experiment.session.records import MIDDLE, FrameKind, Judgement, SessionStep
+from foundation.colorimetry import decode_srgb
+from foundation.errors import FormatError, InputError, QualityError, RegistrationError
+
+WHITES = 3
+"""White frames before the lights, and as many after them: their spread is the flicker of the light."""
+
+SERIES = 8
+"""Shutter times of a series of linearity."""
+
+_COLOURS = {
+    "white": WHITE,
+    "red": Colour(255, 0, 0),
+    "green": Colour(0, 255, 0),
+    "blue": Colour(0, 0, 255),
+    "grey": Colour(MIDDLE, MIDDLE, MIDDLE),
+}
+"""The lights of a trial by name, besides the plan's darkest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Trial frames as measured.
+
+    - `white`: the first white frame.
+    - `table`: their measurements; None if the chart was not found, or cannot be used.
+    - `verdict`: the figures that trial frames show, judged.
+    - `trouble`: why there are no measurements; "" if there are.
+    - `series_trouble`: why a series of exposures shows nothing; "" if it does, or none was asked for.
+    """
+
+    white: Mosaic
+    table: TableMeasurements | None
+    verdict: Verdict
+    trouble: str = ""
+    series_trouble: str = ""
+
+    @property
+    def not_known(self) -> tuple[str, ...]:
+        """Names of the figures that only a session shows."""
+        known = {row.figure.name for row in self.verdict.rows}
+        return tuple(figure.name for figure in FIGURES if figure.name not in known)
+
+
+def trial_lights(plan: Sequence[Illumination]) -> tuple[Illumination, ...]:
+    """Return the lights of a trial: white, the primaries, grey, and the darkest light of the plan."""
+    colours = dict(_COLOURS)
+    if plan:
+        linear = [decode_srgb(np.array(light.colour) / 255).max() for light in plan]
+        darkest = plan[int(np.argmin(linear))].colour
+        if darkest not in colours.values():
+            colours["darkest"] = darkest
+    return tuple(
+        Illumination(index, "uniform", None, colour, name) for index, (name, colour) in enumerate(colours.items())
+    )
+
+
+def trial_steps(lights: Sequence[Illumination], recorded: bool) -> tuple[SessionStep, ...]:
+    """Return the plan of a trial; of a recording one white and one dark frame, which is all that it can show."""
+    around: list[tuple[FrameKind, int | None, Colour]] = [("white", None, WHITE)] * (1 if recorded else WHITES)
+    around.append(("dark", None, BLACK))
+    shown = around if recorded else [*around, *(("light", one.index, one.colour) for one in lights), *around]
+    return tuple(SessionStep(number, *step) for number, step in enumerate(shown))
+
+
+def series_times(times_s: Sequence[float], white_s: float, white_level: float) -> list[float]:
+    """Return the shutter times of a series in which white goes from 6 to 94 % of saturation, rising.
+
+    `white_s`, `white_level`: a shutter time, and white's share of saturation at it.
+    """
+    able = [time for time in times_s if 0.06 <= white_level * time / white_s <= 0.94]
+    if len(able) <= SERIES:
+        return able
+    wanted = np.geomspace(able[0], able[-1], SERIES)
+    return sorted({min(able, key=lambda time: abs(np.log(time / each))) for each in wanted.tolist()})
+
+
+def take_trial(
+    camera: Photographer, session: Session, shutter_s: float, series_s: Sequence[float], series: Path
+) -> None:
+    """Take the frames of a trial into its session, and a series of white at rising shutter times into a folder."""
+    for step in session.steps:
+        attempt = session.journal.begin(step, f"frames/{step.stem}", camera.now())
+        received = session.receive(step.stem, lambda stream, step=step: camera.capture(step.colour, shutter_s, stream))
+        session.journal.commit(attempt, received, Judgement(()), exposure_s=shutter_s, ended_at=camera.now())
+    for number, seconds in enumerate(series_s):
+        with (series / str(number)).open("wb") as stream:
+            camera.capture(WHITE, seconds, stream)
+
+
+def measure_trial(
+    session: Session, saturation: Saturation, corners: Corners | None, series: Path | None, recorded: bool
+) -> Trial:
+    """Return what trial frames show."""
+    white = read_raw(session.folder / session.frames()[0].file)
+    options = replace(PAPER_OPTIONS, corners=corners)
+    try:
+        if recorded:
+            result = check(session, options)
+        else:
+            result = judge_trial(session, round(saturation.counts), options, series)
+    except (RegistrationError, QualityError, FormatError, InputError) as error:
+        if series is not None:
+            return replace(measure_trial(session, saturation, corners, None, recorded), series_trouble=str(error))
+        return Trial(white, None, Verdict(()), str(error))
+    rows = tuple(row for row in result.verdict.rows if row.figure.before_session)
+    return Trial(white, result.figures, Verdict(rows))
+
+
+def at_settings(verdict: Verdict, white: float, ratio: float) -> Verdict:
+    """Return a verdict as of frames at the shutter time of the settings.
+
+    `white`: of saturation, there. `ratio`: that time over the time of the trial frames.
+    """
+    values = {row.figure.name: row.value for row in verdict.rows} | {BRIGHTEST_SHARE.name: white}
+    if DARKEST_COUNTS.name in values:
+        values[DARKEST_COUNTS.name] *= ratio
+    return judge(values)

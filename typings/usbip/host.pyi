@@ -1,3 +1,0 @@
-from usbip import USBIP
-
-def list_devices(transport: USBIP | None = None) -> list[dict[str, object]]: ...
