@@ -204,7 +204,7 @@ def test_a_shard_that_cannot_be_ended_is_given_up_quietly(
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name != "folder"])
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if layouts.LAYOUTS[name].is_of_the_hub])
 def test_hugging_face_finds_the_parts_by_the_card(
     make: Make, hugging_face: Any, tmp_path: Path, layout: Layout
 ) -> None:
