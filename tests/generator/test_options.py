@@ -1,4 +1,4 @@
-"""Lights of known gamuts, distributions, lists and requests, as they were chosen before.
+"""Lights of known distributions, lists and requests, as they were chosen before.
 
 Who changes what a seed decides changes datasets: who makes one again, with a later version, is to get the same.
 """
@@ -17,7 +17,7 @@ from calibration.table.lut import Lut
 from generator import philox
 from generator.lights.choices import light_numbers, parse_light
 from generator.lights.distributions import parse_distribution
-from generator.lights.gamut import Gamut, OutsideGamut, black_body, rgb_of
+from generator.lights.gamut import black_body, rgb_of
 from generator.lights.lighting import LightChoice, mixture_of, parse_mixture
 from generator.options import LightOptions
 from tests.generator.dataset.known import table_in
@@ -26,29 +26,7 @@ from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
 
-CORNERS = [[0.5, 0.1], [0.3, 0.2], [0.2, 0.45], [0.35, 0.35], [0.4, 0.25]]
 SEED = 2**40 + 9
-
-GAMUTS: dict[str, Gamut] = {
-    "five lights": Gamut(1000 * rgb_of(CORNERS) * [[1], [2], [0.7], [1.5], [1]]),
-    "a line": Gamut(rgb_of([[0.5, 0.1], [0.3, 0.3], [0.4, 0.2], [0.4, 0.2], [0.2, 0.4]])),
-    "two lights": Gamut(rgb_of(CORNERS[:2])),
-    "one light": Gamut(rgb_of(CORNERS[:1])),
-    "many lights": Gamut(np.random.default_rng(4).uniform(0.5, 2, (40, 3))),
-}
-"""Gamuts with an area, without one, and with lights in one place."""
-
-INSIDE_OR_NOT = np.random.default_rng(5).uniform(0.15, 0.45, (9, 2)).tolist()
-WANTED = [
-    *CORNERS,
-    *INSIDE_OR_NOT,
-    [0.4, 0.15],
-    [0.40002, 0.15],
-    [0.4004, 0.1501],
-    [1, 0],
-    [0, 0],
-]
-"""At lights, anywhere, half way between two, beside that by less and by more than the tolerance, and far outside."""
 
 
 def shown(choice: LightChoice, scenes: tuple[int, ...] = (0, 1, 2, 70000)) -> list[Any]:
@@ -74,20 +52,6 @@ def lut(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lut]:
             "b,image,r,g\n.2,one.cr2,.4,.4\n.25,two.png,.35,.4\n.3,one.cr2,.3,.4\n.2,two.png,.45,.35\n"
         )
         yield table_in(Path("lut"))
-
-
-@pytest.mark.parametrize("name", GAMUTS)
-def test_mixtures_for_wanted_lights(name: str, pinned: Pinned) -> None:
-    gamut = GAMUTS[name]
-    found: list[Any] = [gamut.rb, gamut.edges, gamut.triangles, gamut.contains(np.array(INSIDE_OR_NOT))]
-    ways: tuple[OutsideGamut, ...] = ("refuse", "nearest")
-
-    def matched(rb: Any, way: OutsideGamut) -> list[Any]:
-        made = gamut.match(rgb_of(rb), way)
-        return [made.mixture.label, made.angle]
-
-    found += [[said(matched, rb, way) for way in ways] for rb in WANTED]
-    pinned(f"mixtures of {name}", found, nothing=1e-5)
 
 
 def test_draws_of_distributions(pinned: Pinned) -> None:

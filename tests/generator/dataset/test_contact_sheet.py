@@ -1,4 +1,4 @@
-"""The contact sheet of a dataset, and members of shards in one file."""
+"""The contact sheet of a dataset: what it shows, in which order, within the page."""
 
 from __future__ import annotations
 

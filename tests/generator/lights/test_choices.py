@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 
 from foundation.errors import InputError
-from generator.lights.choices import SimultaneousLights, nearest_lights, parse_light
-from generator.lights.lighting import LightChoice, Lighting, RandomLights, plain
+from generator.lights.choices import (
+    SimultaneousLights,
+    light_notes,
+    matched_lights,
+    nearest_lights,
+    parse_light,
+    parse_lights,
+)
+from generator.lights.gamut import TOLERANCE_DEG, Gamut, rgb_of
+from generator.lights.lighting import LightChoice, Lighting, Mixture, RandomLights, plain
 from generator.masks.making import parse_masks
 from tests.generator.conftest import MakeLut
 
@@ -57,3 +65,28 @@ def test_lights_together_share_an_image() -> None:
     assert [lighting.masks for lighting in lightings] == [masks.maker(12), masks.maker(13)]
     assert pickle.loads(pickle.dumps(choice)).lightings_of(6) == lightings
     assert choice.describe()["lights"] == inner.describe()
+
+
+def test_lights_that_the_table_cannot_make_are_noted_and_the_nearest_taken() -> None:
+    gamut = Gamut(rgb_of([[0.5, 0.1], [0.3, 0.2], [0.2, 0.45]]))
+    inside, outside = rgb_of([[0.33, 0.25], [0.1, 0.1]])
+    choice = matched_lights(gamut, np.array([inside, outside]), "gt.csv")
+    assert choice.matches[0].angle < TOLERANCE_DEG < 5 < choice.matches[1].angle
+    (note,) = light_notes(choice)
+    assert note.startswith("1 of the 2 lights of gt.csv lie outside")
+    assert f"up to {choice.matches[1].angle:.2f} degrees" in note
+    together = SimultaneousLights(
+        matched_lights(gamut, np.array([outside]), "gt.csv", 2), 2, parse_masks("spots", 2, 0)
+    )
+    assert len(light_notes(together)) == 1
+    assert light_notes(matched_lights(gamut, np.array([inside]))) == light_notes(RandomLights(1, 3, 0)) == ()
+
+
+def test_lists_and_lights_are_told_apart(make_lut: MakeLut) -> None:
+    lut = make_lut()
+    assert parse_lights(["0,2-3", "1"], lut).lights == (0, 2, 3, 1)
+    assert parse_lights(["all", "0:.5+3:.5"], lut).lights == (0, 1, 2, 3, Mixture((0, 3), (0.5, 0.5)))
+    with pytest.raises(InputError, match="5600K"):
+        parse_lights(["5600"], lut)
+    with pytest.raises(InputError, match="lights 0 to 3"):
+        parse_lights(["2-4"], lut)

@@ -20,7 +20,7 @@ from generator.dataset.shards import photograph
 from generator.kernels.printing import NODES, SIDE
 from generator.lights.lighting import Lighting, Mixture, plain
 from generator.rendering import print_inverse
-from generator.rendering.black_points import BlackPoint, black_of, parse_black_point, veil_of, without_veil
+from generator.rendering.black_points import BlackPoint
 from generator.rendering.colorimetric import (
     BLACK_WITHIN_DEG,
     ColorimetricRendering,
@@ -376,29 +376,3 @@ def test_places_in_a_print(pinned: Pinned) -> None:
     )
     found.append([neutral_ends(one) for one in clouds])
     pinned("places in a print", found, same=1e-5, nothing=1e-7)
-
-
-def test_black_points(make_table: MakeTable, tmp_path: Path, pinned: Pinned) -> None:
-    texts = ("keep", "compensate", "like", "random", "random:.8", "random:1", "random:0", "random:1.01", "random:", "x")
-    points = {text: said(parse_black_point, text) for text in texts}
-    words = np.array([0, 1, 2**31, 2**32 - 1], np.uint32)
-    found: dict[str, Any] = {}
-    for text, point in points.items():
-        found[text] = point if isinstance(point, dict) else [
-            point.label, said(point.shares, words), [said(point.share, 2**40 + 9, image) for image in (0, 1, 70000)]
-        ]  # fmt: skip
-    assert BlackPoint() == points["keep"]
-    for name, lut in (("print", make_table()), ("known", table_in(tmp_path / "known"))):
-        for light in (plain(0), plain(1), Mixture((0, 2), (0.4, 0.6))):
-            samples = np.array(light.samples(lut))
-            for share, grey in ((0.0, None), (0.5, None), (1.0, None), (0.9, 0.1), (1.0, 0.5)):
-                veil = said(veil_of, lut, light, share, grey)
-                label = f"{name} {light.label} {share} {grey}"
-                if isinstance(veil, dict):
-                    found[label] = veil
-                    continue
-                some = np.arange(len(samples)) % 3 == 0
-                out = [without_veil(samples, veil, white, some) for white in (700, lut.provenance.white_level)]
-                out.append(without_veil(samples, veil, 65535))
-                found[label] = [black_of(lut, light), veil, b"".join(one.tobytes() for one in out)]
-    pinned("black points", found)

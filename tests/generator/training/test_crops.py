@@ -30,7 +30,6 @@ from generator.variation.sensor_noise import SensorNoise
 from tests.generator.conftest import MakeLut
 from tests.generator.dataset.known import table_in
 from tests.generator.rendering.prints import MATRIX as PRINT_MATRIX
-from tests.generator.said import said
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -332,28 +331,3 @@ def test_items(name: str, tmp_path: Path, pinned: Pinned) -> None:
         image, light = crops[12]
         found.append([image, light])
     pinned(f"training items, {name}", found)
-
-
-def test_galleries_and_what_is_refused(tmp_path: Path, pinned: Pinned) -> None:
-    saved = save_gallery(random_scenes(3, 8, 5, 1), tmp_path / "gallery")
-    again = open_gallery(tmp_path / "gallery")
-    lut = table_in(tmp_path / "lut")
-    wrong: list[dict[str, Any]] = [{"size": (0, 4)}, {"size": (6, 4)}, {"size": (5, 9)}, {"size": 3}, {"length": 0}]
-    wrong += [{"length": 2**32 + 1}, {"exposure": (0.0, 1.0)}, {"exposure": (2.0, 1.0)}, {"iso": parse_iso("200/100")}]
-    wrong += [{"seed": -1}, {"seed": 2**64}, {"lights": []}, {"lights": [9]}, {"lights": "all"}, {"epoch": -1}]
-    wrong += [{"epoch": 2**32}, {"black_point": "like"}, {"black_point": "grey"}, {"black_point": 3}]
-    found: list[Any] = [saved.names, saved.sizes, saved.offsets, saved.codes, again.names, again.picture(2), len(again)]
-
-    for options in wrong:
-        named: dict[str, Any] = {"size": (5, 8), "rendering": "codes", **options}
-        found.append(said(Crops, lut, again, **named))
-    crops = Crops(lut, again, (5, 8), length=4, rendering="codes")
-    items: list[Any] = [[], [4], [-1], [[0]]]
-    found += [said(crops.batch, one) for one in items]
-    found += [
-        said(gallery_of, []),
-        said(gallery_of, pictures(), ["a"]),
-        said(gallery_of, [np.zeros((0, 3, 3), np.uint8)]),
-    ]
-    found.append(said(save_gallery, [], tmp_path / "new"))
-    pinned("galleries", found)
