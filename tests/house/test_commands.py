@@ -20,7 +20,7 @@ from foundation.version import PACKAGES
 pytestmark = pytest.mark.slow
 
 HEAVY = (
-    *("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),
+    *("numpy", "numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),
     *("distributed", "pyarrow", "torch", "zarr"),
 )
 
