@@ -42,9 +42,8 @@ from drivers.presenter import Colour
 from foundation.compiled import compiled
 from generator.kernels.choice import SCRATCH_BYTES, choose_group, prefetch_once, row_keys
 from generator.kernels.mixing import mix_samples
-from generator.kernels.planar import draw_planar
 from generator.kernels.printing import NODES, PrintedLight, draw_printed
-from generator.kernels.rendering import draw_mosaic, draw_samples
+from generator.kernels.rendering import draw_samples
 from generator.kernels.vector import GROUP, LINE, copy8, offset_at
 from generator.masks.making import parse_masks
 from generator.rendering.black_points import Veil, without_veil
@@ -186,8 +185,6 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
     pixels = width * height / 1e6
     samples = tables[0]
     out = np.empty(picture.shape, np.uint16)
-    sites = np.empty(picture.shape[:2], np.uint16)
-    planes = np.empty((3, height, width), np.float32)
     weights = np.random.default_rng(4).random((height, width, 2), dtype=np.float32)
     masks = {kind: mask_weights(kind, height, width) for kind in ("soft-edge", "half-plane")}
     light, cells = printed_by_chance()
@@ -198,8 +195,6 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
         "bound of fetching": fetching(tables[:1], picture),
         "bound of fetching for two lights": fetching(tables, picture),
         "kernel": lambda: draw_samples(samples, picture, out=out),
-        "mosaic": lambda: draw_mosaic(samples, picture, out=sites),
-        "planes": lambda: draw_planar(samples, picture, white_level=WHITE, out=planes),
         "two lights": lambda: mix_samples(tables, picture, weights, white_level=WHITE, out=out),
     }
     for kind, mask in masks.items():

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from generator.dataset.shards import Callbacks
     from generator.files import flash
     from generator.kernels.mixing import mix_samples, mixed_table
-    from generator.kernels.planar import draw_batch, draw_planar
-    from generator.kernels.rendering import draw_mosaic, draw_samples
+    from generator.kernels.planar import draw_batch
+    from generator.kernels.rendering import draw_samples
     from generator.pictures.sources import find_pictures, read_picture
     from generator.rendering.render import render
 
@@ -34,8 +34,6 @@ __all__ = [
     "DatasetOptions",
     "Workers",
     "draw_batch",
-    "draw_mosaic",
-    "draw_planar",
     "draw_samples",
     "find_pictures",
     "flash",
@@ -53,8 +51,6 @@ _HOMES = {
     "DatasetOptions": "generator.dataset.plan",
     "Workers": "generator.dataset.making",
     "draw_batch": "generator.kernels.planar",
-    "draw_mosaic": "generator.kernels.rendering",
-    "draw_planar": "generator.kernels.planar",
     "draw_samples": "generator.kernels.rendering",
     "find_pictures": "generator.pictures.sources",
     "flash": "generator.files",

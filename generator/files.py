@@ -448,7 +448,6 @@ class FileFormat:
     - `pieces`: the file of an image (H, W, 3) uint16 and its light in pieces, whose memory may be used again for the
       next one.
     - `decode`: the array in the bytes of a file of that name, (H, W) or (H, W, channels), as it stands there.
-    - `media`: its media type; those of OpenEXR and DNG are not registered with IANA.
     - `libraries`: distributions that encode it, or for a raw file name its colour matrix: their versions may change the
       bytes of a file. None if CroP encodes it.
     - `smallest_side`: least width and height, px.
@@ -456,25 +455,22 @@ class FileFormat:
 
     pieces: Callable[[Image, ImageMetadata], Iterable[bytes | memoryview]]
     decode: Callable[[bytes, str], npt.NDArray[np.generic]]
-    media: str
     libraries: tuple[str, ...] = ()
     smallest_side: int = 1
 
 
 FILE_FORMATS: Final[Mapping[Format, FileFormat]] = {
-    "png": FileFormat(png_pieces, lambda data, _: decode_png(data), "image/png"),
-    "tiff": FileFormat(_whole(encode_tiff), lambda data, _: decode_tiff(data), "image/tiff"),
-    "exr": FileFormat(_whole(encode_exr), lambda data, _: decode_exr(data), "image/x-exr", libraries=("isal",)),
+    "png": FileFormat(png_pieces, lambda data, _: decode_png(data)),
+    "tiff": FileFormat(_whole(encode_tiff), lambda data, _: decode_tiff(data)),
+    "exr": FileFormat(_whole(encode_exr), lambda data, _: decode_exr(data), libraries=("isal",)),
     "jxl": FileFormat(
         lambda image, _: (encode_jxl(image),),
         lambda data, _: decode_jxl(data),
-        "image/jxl",
         libraries=("imagecodecs",),
     ),
     "dng": FileFormat(
         _whole(encode_dng),
         lambda data, name: half_size(decode_raw(data, Path(name)).counts),
-        "image/x-adobe-dng",
         libraries=("rawpy",),
         smallest_side=SMALLEST_SIDE,
     ),

@@ -1,14 +1,13 @@
-"""What a dataset says of itself to people and to programs: its card, its datasheet and its Croissant description.
+"""The texts beside a dataset: its card and its datasheet.
 
 `README.md` is a dataset card as the Hugging Face Hub reads it, `DATASHEET.md` answers the questions of Gebru et al.,
-"Datasheets for Datasets", Communications of the ACM 64 (2021), and `croissant.json` keeps to Croissant 1.0
-(mlcommons.org/croissant/1.0). What only the makers of a dataset know is left open, and said to be so.
+"Datasheets for Datasets", Communications of the ACM 64 (2021). What only the makers of a dataset know is marked as
+open.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
 from string import Template
@@ -16,9 +15,9 @@ from typing import Any, Final
 
 from calibration.citation import bibtex, origin_lines, table_title
 from generator.dataset.joined import JoinedLayout
-from generator.dataset.layouts import LAYOUTS, FileLayout
-from generator.dataset.records import CROISSANT, DATASHEET, GROUND_TRUTH, SOURCES, Description, one_line, table_cell
-from generator.files import FILE_FORMATS, FULL, Format, suffix_of
+from generator.dataset.layouts import LAYOUTS
+from generator.dataset.records import DATASHEET, Description, one_line, table_cell
+from generator.files import FULL, suffix_of
 
 OPEN: Final = "**TO BE ANSWERED BY THE LAB.**"
 """What stands where only the makers of a dataset know the answer."""
@@ -234,8 +233,8 @@ def card(description: Description) -> str:
         f"- **Images**: {description.images}, of {description.sources} pictures; parts: {splits}\n"
         f"- **Ground truth**: `ground_truth.csv`, r + g + b = 1, a row a light; `gt.txt`, a line an image\n"
         f"- **Made by** {description.software}, seed {description.seed}; `dataset.json` has enough to make every byte "
-        f"again, `SHA256SUMS` the hash of every file but this one, `{DATASHEET}` and `{CROISSANT}`\n"
-        f"- **More**: [{DATASHEET}]({DATASHEET}) (Datasheets for Datasets), [{CROISSANT}]({CROISSANT}) (MLCommons)\n\n"
+        f"again, `SHA256SUMS` the hash of every file but this one and `{DATASHEET}`\n"
+        f"- **More**: [{DATASHEET}]({DATASHEET}) (Datasheets for Datasets)\n\n"
         f"## Reading\n\n{_reading(description)}\n\n{brightness_note(description)}\n\n"
         f"## Noise\n\n{pixels_of(description)} {noise_of(description)}\n\n"
         f"## Licence\n\n**To be stated by whoever publishes**: images are made of pictures, which have licences of "
@@ -263,8 +262,8 @@ def _front_matter(description: Description) -> str:
 
 def _configs(description: Description) -> str:
     """Return where the files of each part lie; of plain files the table of ground truths is what rows are read from."""
-    layout = _layout(description)
-    if not layout.is_of_the_hub:
+    layout = LAYOUTS[option(description, "layout")]
+    if not isinstance(layout, JoinedLayout):
         files = "  - split: train\n    path: ground_truth.csv\n"
     else:
         files = "".join(
@@ -275,11 +274,19 @@ def _configs(description: Description) -> str:
     return f"configs:\n- config_name: default\n  data_files:\n{files}"
 
 
+_JOINED_READING: Final = (
+    "`load_dataset` finds the parts. Its decoder, Pillow, keeps 8 of 16 bits: decode the bytes with "
+    "`cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)` (then BGR), with "
+    '`.cast_column("png", Image(decode=False))` before it in WebDataset shards; or read with '
+    "`generator.open_dataset`."
+)
+
+
 def _reading(description: Description) -> str:
     """Return how the images are read without losing bits."""
-    layout = _layout(description)
+    layout = LAYOUTS[option(description, "layout")]
     if isinstance(layout, JoinedLayout):
-        return layout.reading
+        return _JOINED_READING
     names = layout.patterns(description.parts, suffix_of(option(description, "format")))
     files = " and ".join(f"`{name.replace('*', 'NNNNNN')}`" for name in names)
     return (
@@ -287,159 +294,3 @@ def _reading(description: Description) -> str:
         "`ground_truth.csv`, whose column `image` names the file. Pillow, and imageio by it, keep 8 of 16 bits of a "
         "PNG: use `cv2.imread(path, cv2.IMREAD_UNCHANGED)` (then BGR) or `generator.open_dataset`."
     )
-
-
-CONFORMS_TO: Final = "http://mlcommons.org/croissant/1.0"
-
-_CONTEXT: Final = {
-    "@language": "en",
-    "@vocab": "https://schema.org/",
-    "citeAs": "cr:citeAs",
-    "column": "cr:column",
-    "conformsTo": "dct:conformsTo",
-    "cr": "http://mlcommons.org/croissant/",
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/",
-    "examples": {"@id": "cr:examples", "@type": "@json"},
-    "extract": "cr:extract",
-    "field": "cr:field",
-    "fileProperty": "cr:fileProperty",
-    "fileObject": "cr:fileObject",
-    "fileSet": "cr:fileSet",
-    "format": "cr:format",
-    "includes": "cr:includes",
-    "isLiveDataset": "cr:isLiveDataset",
-    "jsonPath": "cr:jsonPath",
-    "key": "cr:key",
-    "md5": "cr:md5",
-    "parentField": "cr:parentField",
-    "path": "cr:path",
-    "recordSet": "cr:recordSet",
-    "references": "cr:references",
-    "regex": "cr:regex",
-    "repeated": "cr:repeated",
-    "replace": "cr:replace",
-    "sc": "https://schema.org/",
-    "separator": "cr:separator",
-    "source": "cr:source",
-    "subField": "cr:subField",
-    "transform": "cr:transform",
-}
-"""The context that the specification recommends, "Appendix 1: JSON-LD context"."""
-
-_TRUTH_COLUMNS: Final = (
-    ("image", "sc:Text", "Name of the image, as in the images' files or shards."),
-    ("source", "sc:Text", "Name of the picture that it shows."),
-    ("illumination", "sc:Text", "Number of its light in the table, or the mixture of lights."),
-    ("r", "sc:Float", "Red of the light on bare paper, linear camera RGB, r + g + b = 1."),
-    ("g", "sc:Float", "Green of the light."),
-    ("b", "sc:Float", "Blue of the light."),
-)
-
-
-def croissant(description: Description, sums: Mapping[str, str]) -> str:
-    """Return the text of croissant.json."""
-    document: dict[str, Any] = {
-        "@context": _CONTEXT,
-        "@type": "sc:Dataset",
-        "name": name_of(description),
-        "description": summary_of(description),
-        "conformsTo": CONFORMS_TO,
-        "version": "1.0.0",
-        "keywords": ["colour constancy", "white balance", "illumination estimation", "raw images"],
-        "citeAs": citation_of(description),
-        "isLiveDataset": False,
-        "distribution": [
-            *(
-                {
-                    "@type": "cr:FileObject",
-                    "@id": name,
-                    "name": name,
-                    "contentUrl": name,
-                    "encodingFormat": "text/csv",
-                    "sha256": sums[name],
-                }
-                for name in (GROUND_TRUTH, SOURCES)
-            ),
-            *_files_of_images(description),
-        ],
-        "recordSet": [_ground_truth(), *_images(description)],
-    }
-    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
-
-
-def _files_of_images(description: Description) -> list[dict[str, Any]]:
-    """Return the set of files that holds the images: themselves, or the shards that they lie in."""
-    layout = _layout(description)
-    form: Format = option(description, "format")
-    patterns = layout.patterns(description.parts, suffix_of(form))
-    if isinstance(layout, JoinedLayout):
-        return [_file_set("shards", patterns, layout.media)]
-    return [_file_set("image-files", patterns, FILE_FORMATS[form].media)]
-
-
-def _layout(description: Description) -> FileLayout | JoinedLayout:
-    """Return the layout of a dataset."""
-    return LAYOUTS[option(description, "layout")]
-
-
-def _file_set(name: str, includes: list[str], media: str) -> dict[str, Any]:
-    return {"@type": "cr:FileSet", "@id": name, "name": name, "encodingFormat": media, "includes": includes}
-
-
-def _ground_truth() -> dict[str, Any]:
-    return {
-        "@type": "cr:RecordSet",
-        "@id": "ground_truth",
-        "name": "ground_truth",
-        "description": "The lights of the images: a row a light, in the order of the images.",
-        "field": [
-            _field("ground_truth", name, kind, text, {"fileObject": {"@id": GROUND_TRUTH}, "extract": {"column": name}})
-            for name, kind, text in _TRUTH_COLUMNS
-        ],
-    }
-
-
-def _images(description: Description) -> list[dict[str, Any]]:
-    """Return the records of images: their files, or the columns of their shards."""
-    layout = _layout(description)
-    if isinstance(layout, JoinedLayout):
-        fields = [
-            _field("images", name, kind, text, {"fileSet": {"@id": "shards"}, "extract": {"column": name}})
-            for name, kind, text in layout.columns
-        ]
-        if not fields:
-            return []
-    else:
-        fields = [
-            _field(
-                "images", "name", "sc:Text", "Name of the file.",
-                {"fileSet": {"@id": "image-files"}, "extract": {"fileProperty": "filename"}},
-            ),
-            _field(
-                "images", "content", "sc:ImageObject", "The image, linear camera RGB; keep all 16 bits.",
-                {"fileSet": {"@id": "image-files"}, "extract": {"fileProperty": "content"}},
-            ),
-        ]  # fmt: skip
-    return [
-        {
-            "@type": "cr:RecordSet",
-            "@id": "images",
-            "name": "images",
-            "description": "The images, as they lie in the dataset.",
-            "field": fields,
-        }
-    ]
-
-
-def _field(record: str, name: str, kind: str, text: str, source: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "@type": "cr:Field",
-        "@id": f"{record}/{name}",
-        "name": name,
-        "description": text,
-        "dataType": kind,
-        "source": source,
-    }

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from foundation.files import write_whole
 from generator.dataset.reader import Dataset
 from generator.dataset.records import Entry, Light, Triple
+from generator.files import preview_of
 from generator.lights.lighting import parse_mixture
 
 if TYPE_CHECKING:
@@ -71,8 +72,6 @@ def _load(dataset: Dataset, entry: Entry) -> npt.NDArray[np.uint8]:
         picture = cv2.imdecode(np.frombuffer(preview, np.uint8), cv2.IMREAD_COLOR_RGB)
         if picture is not None:
             return np.asarray(picture, dtype=np.uint8)
-    from generator.files import preview_of
-
     return preview_of(dataset.read_image(entry), dataset.description.table.white_level)
 
 

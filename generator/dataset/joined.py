@@ -316,24 +316,17 @@ class Beside(NamedTuple):
 class JoinedLayout:
     """A layout in which the images of a shard lie in one file.
 
-    - `ending`, `media`: of such a file: its name's, and its media type.
+    - `ending`: of the name of such a file.
     - `begin`: begins one on a stream.
     - `read`: returns the bytes of an image's file that lies in one, named as in a tar file (``000123.masks_0.png``);
       None where it has no such. Whatever else it raises says that the file is damaged.
     - `library`: by which it is written and read; "" where Python suffices.
-    - `is_of_the_hub`: whether Hugging Face's `load_dataset` finds the images in it; else it finds the table of lights.
-    - `reading`: for the dataset's card, how images are read without losing bits.
-    - `columns`: name, type and description of those that Croissant's loaders find in it.
     """
 
     ending: str
-    media: str
     begin: Callable[[HashingWriter, Beside], _Container]
     read: Callable[[BinaryIO, str], bytes | None]
     library: str
-    is_of_the_hub: bool
-    reading: str
-    columns: tuple[tuple[str, str, str], ...]
 
     def open_writer(self, store: Store, shard: int, beside: Beside) -> JoinedWriter:
         """Return the writer of a shard."""
@@ -365,40 +358,18 @@ class JoinedLayout:
         return [f"{part}/*.{self.ending}" for part in parts]
 
 
-_HUB_READING: Final = (
-    "`load_dataset` finds the parts. Its decoder, Pillow, keeps 8 of 16 bits: decode the bytes with "
-    "`cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)` (then BGR), with "
-    '`.cast_column("png", Image(decode=False))` before it in WebDataset shards; or read with '
-    "`generator.open_dataset`."
-)
-
-
 JOINED: Final[Mapping[str, JoinedLayout]] = {
     "webdataset": JoinedLayout(
         ending="tar",
-        media="application/x-tar",
         begin=lambda stream, _: _Tar(stream),
         read=_read_tar,
         library="",
-        is_of_the_hub=True,
-        reading=_HUB_READING,
-        # Members of archives that a pattern names cannot be told to loaders; WebDataset's own reader finds them.
-        columns=(),
     ),
     "parquet": JoinedLayout(
         ending="parquet",
-        media="application/x-parquet",
         begin=lambda stream, beside: _Parquet(stream, _schema(*beside)),
         read=_read_parquet,
         library="pyarrow",
-        is_of_the_hub=True,
-        reading=_HUB_READING,
-        columns=(
-            ("number", "sc:Integer", "Number of the image."),
-            ("source", "sc:Text", "Name of the picture that it shows."),
-            ("width", "sc:Integer", "Width, px."),
-            ("height", "sc:Integer", "Height, px."),
-        ),
     ),
 }
 """Layouts of shards in one file each by name."""

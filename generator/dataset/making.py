@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import re
 import shutil
 import threading
@@ -240,8 +241,6 @@ def _by_dask(
 @contextmanager
 def _client(address: str, workers: int) -> Generator[distributed.Client]:
     """Connect to a scheduler, or to a cluster of processes of this machine that ends with the block."""
-    import logging
-
     from distributed import Client, LocalCluster
 
     if address:

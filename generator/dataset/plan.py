@@ -26,6 +26,7 @@ from foundation.version import software
 from generator.dataset.layouts import LAYOUTS, require_library
 from generator.dataset.records import SPLITS, Layout, TableRecord
 from generator.files import FORMATS, Format, libraries_of
+from generator.philox import key_of
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.black_points import KEEP, BlackPoint
 from generator.rendering.matrices import ColourMatrix, matrix_for
@@ -216,8 +217,6 @@ class Plan:
     options: DatasetOptions
 
     def __post_init__(self) -> None:
-        from generator.philox import key_of
-
         key_of(self.seed)
         if not self.sources or not self.choice.lights_each:
             raise InputError(

@@ -196,7 +196,7 @@ def file_faults(
 ) -> Iterator[str]:
     """Yield each file of a dataset that is missing, changed or unknown, in words; reads every byte of it.
 
-    Card, datasheet and Croissant metadata are completed by hand and not looked at.
+    Card and datasheet are completed by hand and not looked at.
     """
     store = open_store(place)
     sums = f"{store.place}/{SUMS}"

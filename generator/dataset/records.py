@@ -41,10 +41,9 @@ SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "repla
 TRUTHS: Final = "gt.txt"
 SUMS: Final = "SHA256SUMS"
 DATASHEET: Final = "DATASHEET.md"
-CROISSANT: Final = "croissant.json"
 CARD: Final = "README.md"
 
-COMPLETED_BY_HAND: Final = (CARD, DATASHEET, CROISSANT)
+COMPLETED_BY_HAND: Final = (CARD, DATASHEET)
 """Files that a lab completes, so that no hash of them is recorded; nothing of this software reads them."""
 
 Triple = tuple[float, float, float]

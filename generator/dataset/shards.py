@@ -41,6 +41,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from calibration.table.lut import open_lut
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
 from foundation.files import HashingWriter
@@ -48,7 +49,7 @@ from foundation.folders import publish_folder, require_free
 from foundation.pieces import Piece, pieces_of
 from foundation.records import from_json
 from foundation.version import software
-from generator.dataset.cards import card, croissant, datasheet
+from generator.dataset.cards import card, datasheet
 from generator.dataset.joined import Beside
 from generator.dataset.layouts import LAYOUTS, ShardWriter
 from generator.dataset.plan import DatasetOptions, ShardJob, versions
@@ -56,7 +57,6 @@ from generator.dataset.reader import Dataset, load_description
 from generator.dataset.records import (
     CARD,
     COMPLETED_BY_HAND,
-    CROISSANT,
     DATASHEET,
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,
@@ -85,10 +85,17 @@ from generator.dataset.records import (
     image_key,
     shard_key,
 )
-from generator.files import suffix_of
+from generator.files import FILE_FORMATS, FULL, ImageMetadata, encode_pieces, encode_preview, preview_of, suffix_of
+from generator.kernels.mixing import mix_samples
+from generator.kernels.printing import nearest_nodes
+from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, draw_samples
+from generator.kernels.unfit import colours_in, replace_unfit_colours
 from generator.lights.lighting import Lighting, Mixture
 from generator.masks.maps import encode_maps, mean_weights
 from generator.pictures.sources import Cut, Picture, Source, hash_since
+from generator.rendering.black_points import veil_of, without_veil
+from generator.rendering.colorimetric import rendering_with
+from generator.rendering.matrices import matrix_for
 from generator.stores import DESCRIPTION, LocalStore, Pieces, Store, open_store
 from generator.variation.variation import Varied
 
@@ -200,10 +207,6 @@ def photograph(
 
     `picture`: (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
     """
-    from generator.kernels.mixing import mix_samples
-    from generator.kernels.printing import nearest_nodes
-    from generator.kernels.rendering import draw_samples
-
     # The hash of the table stands for its samples in the dataset's description.
     for mixture in lighting.mixtures:
         for light in mixture.lights:
@@ -235,10 +238,6 @@ def photograph(
 
 def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int) -> npt.NDArray[np.uint16]:
     """Return the samples of a light without a share of the print's black, at least those of a picture's colours."""
-    from generator.kernels.rendering import WHOLE_LIGHT_PIXELS
-    from generator.kernels.unfit import colours_in
-    from generator.rendering.black_points import veil_of, without_veil
-
     samples = mixture.samples(lut, seed, picture)
     if not share:
         return samples
@@ -249,9 +248,6 @@ def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: i
 
 def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
     """Return the rendering by colour that the options ask for; it keeps what it has found out of a table."""
-    from generator.rendering.colorimetric import rendering_with
-    from generator.rendering.matrices import matrix_for
-
     return rendering_with(lut, options.matrix or matrix_for(lut))
 
 
@@ -512,8 +508,6 @@ def make_elsewhere(job: ShardJob, place: Workplace) -> ShardDone:
 
 @lru_cache(maxsize=2)
 def _table_of(folder: Path, sha256: str) -> Lut:
-    from calibration.table.lut import open_lut
-
     lut = open_lut(folder)
     if lut.sha256 != sha256:
         raise InputError(
@@ -534,9 +528,6 @@ def _wanted(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
 
 
 def _read(job: ShardJob, lut: Lut, place: int, finished: Mapping[int, FinishedImage]) -> _ReadSource:
-    from generator.files import FILE_FORMATS
-    from generator.kernels.unfit import replace_unfit_colours
-
     known = _known_source(job, job.position + place, finished) if finished else None
     if known is not None:
         return _ReadSource((), known)
@@ -600,8 +591,6 @@ def _photographed(
     crop: int,
     lighting: Lighting,
 ) -> Sample:
-    from generator.files import FULL, ImageMetadata, encode_pieces, encode_preview, preview_of, suffix_of
-
     options, cut = job.options, source.cuts[crop]
     height, width = cut.picture.shape[:2]
     white_level = lut.provenance.white_level
@@ -764,9 +753,8 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
         for file in written:
             sums.write(file.sum.encode())
         sums.write(f"{hashlib.sha256(text).hexdigest()}  {DESCRIPTION}\n".encode())
-        known = {file.name: file.sha256 for file in written}
         # Its makers complete them, so that no hash of them is recorded.
-        texts = {CARD: card(description), DATASHEET: datasheet(description), CROISSANT: croissant(description, known)}
+        texts = {CARD: card(description), DATASHEET: datasheet(description)}
         for name, card_text in texts.items():
             place.files.put(name, card_text.encode())
     names = [file.name for file in written]

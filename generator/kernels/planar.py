@@ -16,7 +16,6 @@ What noise takes below 0 stays below 0: cut off there, black would be too bright
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -121,88 +120,6 @@ def _checked_window(window: Sequence[int], picture: npt.NDArray[np.uint8]) -> Wi
     return x0, y0, width, height
 
 
-def draw_planar(
-    samples: npt.NDArray[np.uint16],
-    picture: npt.NDArray[np.uint8],
-    *,
-    white_level: int,
-    window: Window | None = None,
-    flip: bool = False,
-    gain: float = 1.0,
-    seed: int = 0,
-    image: int = 0,
-    threads: int = 1,
-    out: npt.NDArray[np.float32] | None = None,
-) -> npt.NDArray[np.float32]:
-    """Return a window of the raw linear image of `picture` as float32 planes; the rule stands at the head of this file.
-
-    Parameters
-    ----------
-    samples
-        (8**bits, S, 3) uint16, linear camera RGB of one light.
-    picture
-        (H, W, 3) uint8 sRGB codes.
-    white_level
-        Sample value of the sensor's saturation, which becomes 1; 1 … 65535.
-    window
-        x and y of its first pixel in the picture, width and height; None is the whole picture.
-    flip
-        Whether the window is mirrored left to right. The choices stay with the picture's pixels.
-    gain
-        Factor on the values, ≥ 0, before they are cut off at 1.
-    seed, image
-        As for `draw_samples`.
-    threads
-        Threads that share the rows; no byte depends on it.
-    out
-        (3, height, width) float32 to fill instead of a new array.
-
-    Returns
-    -------
-    ndarray
-        (3, height, width) float32, linear camera RGB, 0 … 1 = saturation.
-
-    Raises
-    ------
-    InputError
-        A shape, type or number is not as above, or the window is not inside the picture.
-
-    Examples
-    --------
-    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(8, 2, 3)
-    >>> white = np.full((6, 8, 3), 255, np.uint8)
-    >>> planes = draw_planar(samples, white, white_level=50, window=(2, 1, 4, 3), gain=2.0)
-    >>> planes.shape, planes.dtype, float(planes.max())
-    ((3, 3, 4), dtype('float32'), 1.0)
-    """
-    check_samples(samples)
-    check_picture(picture)
-    whole = (0, 0, picture.shape[1], picture.shape[0])
-    x0, y0, width, height = whole if window is None else _checked_window(window, picture)
-    target = check_out(out, (3, height, width), np.float32)
-    parts = max(1, min(threads, height))
-    edges = [height * part // parts for part in range(parts + 1)]
-    pieces = [target[:, top:bottom] for top, bottom in pairwise(edges)]
-
-    def fill(first: int, end: int) -> None:
-        for top, piece in zip(edges[first:end], pieces[first:end], strict=True):
-            draw_batch(
-                samples[None],
-                [0],
-                [picture],
-                [(x0, y0 + top, width, piece.shape[1])],
-                white_level=white_level,
-                flips=flip,
-                gains=gain,
-                seeds=seed,
-                images=image,
-                out=piece[None],
-            )
-
-    run_in_threads(fill, parts, parts)
-    return target
-
-
 def draw_batch(
     tables: npt.NDArray[np.uint16],
     lights: npt.ArrayLike,
@@ -219,7 +136,7 @@ def draw_batch(
     threads: int = 1,
     out: npt.NDArray[np.float32] | None = None,
 ) -> npt.NDArray[np.float32]:
-    """Return N crops, item i being `draw_planar(tables[lights[i]], pictures[i], window=windows[i], ...)`.
+    """Return N crops; the rule stands at the head of this file.
 
     Tables are not copied, so that they may be gigabytes mapped from disk. All work is done without the interpreter's
     lock.
@@ -235,9 +152,14 @@ def draw_batch(
     windows
         (N, 4) int, x, y, width, height; all of one width and height.
     white_level
-        As for `draw_planar`.
-    flips, gains, seeds, images
-        (N,) bool, float, int and int, or one for all, as for `draw_planar`.
+        Sample value of the sensor's saturation, which becomes 1; 1 … 65535.
+    flips
+        (N,) bool, or one for all: whether the window is mirrored left to right. The choices stay with the picture's
+        pixels.
+    gains
+        (N,) float ≥ 0, or one for all: factor on the values before they are cut off at 1.
+    seeds, images
+        (N,) int, or one for all, as for `draw_samples`.
     taken
         (N, 3) float ≥ 0, counts that are taken out of the channels of each item's samples; None takes out nothing.
     stretches

@@ -4,7 +4,7 @@ Source: paper, section 3.4. With n the table's bits (5 in the paper), a pixel R,
 
     samples[((R >> (8 - n)) << 2n) | ((G >> (8 - n)) << n) | (B >> (8 - n)), choice(seed, image, x, y)]
 
-where the choice is that of `kernels/choice.py`. Here are whole images, as camera RGB and as Bayer mosaics;
+where the choice is that of `kernels/choice.py`. Here are whole images;
 `kernels/planar.py` has crops for training and `kernels/mixing.py` several lights.
 
 Compiled loops are not split by numba's own threads: their pool cannot be entered from two Python threads at once and
@@ -47,7 +47,6 @@ from generator.kernels.vector import (
     LANES,
     LINE,
     SAMPLE_BYTES,
-    copy2,
     copy6,
     copy8,
     first_line,
@@ -134,9 +133,6 @@ WHOLE_LIGHT_PIXELS: Final = 1 << 20
 _SEGMENT_GROUPS: Final = 16
 """Groups of pixels that are put together before they are streamed: 3 KiB, which stay in the first-level cache."""
 
-PATTERNS: Final = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
-"""The channel of each site of a 2x2 Bayer block, in reading order."""
-
 
 @compiled
 def _gather(
@@ -180,54 +176,6 @@ def _gather(
             done = end
     if streamed:
         store_fence()
-
-
-@compiled
-def _gather_mosaic(
-    picture: int,
-    pitch: int,
-    width: int,
-    rows: int,
-    samples: int,
-    count: Any,
-    bits: Any,
-    seed: Any,
-    image: int,
-    first_row: int,
-    target: int,
-    target_pitch: int,
-    pattern: int,
-    scratch: int,
-) -> None:
-    """Fill rows of a mosaic; the pattern's four channels are two bits each."""
-    groups, whole = (width + GROUP - 1) // GROUP, width // GROUP
-    for y in range(rows):
-        keys = row_keys(first_row + y, 0, image, seed)
-        row, to = picture + y * pitch, target + y * target_pitch
-        channels = pattern >> (4 * ((first_row + y) & 1))
-        even, odd = samples + 2 * (channels & 3), samples + 2 * (channels >> 2 & 3)
-        group = 0
-        while group < groups + LEAD:
-            while LEAD <= group < whole:
-                source, word = row + 3 * GROUP * group, uint32(LANES * group)
-                prefetch_group(row, group)
-                choose(source, word, keys[0], keys[1], keys[2], count, bits, offsets_slot(scratch, group))
-                offsets, begin = (
-                    offsets_slot(scratch, group - LEAD),
-                    to + 2 * GROUP * (group - LEAD),
-                )
-                for i in range(0, GROUP, 2):
-                    copy2(even + offset_at(offsets + 4 * i), begin + 2 * i)
-                    copy2(odd + offset_at(offsets + 4 * i + 4), begin + 2 * i + 2)
-                group += 1
-            if group < groups:
-                choose_group(row, width, group, keys, count, bits, scratch, offsets_slot(scratch, group))
-            done = group - LEAD
-            if done >= 0:
-                for i in range(min(GROUP, width - GROUP * done)):
-                    site = (odd if i & 1 else even) + offset_at(offsets_slot(scratch, done) + 4 * i)
-                    copy2(site, to + 2 * (GROUP * done + i))
-            group += 1
 
 
 def draw_samples(
@@ -303,83 +251,6 @@ def draw_samples(
             work[top:].ctypes.data,
             work.strides[0],
             work.nbytes >= streaming.STREAMED_BYTES,
-            scratch.ctypes.data,
-        )
-
-    run_in_threads(fill, len(picture), threads)
-    return copied_back(work, target)
-
-
-def draw_mosaic(
-    samples: npt.NDArray[np.uint16],
-    picture: npt.NDArray[np.uint8],
-    *,
-    pattern: str = "RGGB",
-    seed: int = 0,
-    image: int = 0,
-    first_row: int = 0,
-    threads: int = 1,
-    out: npt.NDArray[np.uint16] | None = None,
-) -> npt.NDArray[np.uint16]:
-    """Return the Bayer mosaic of `picture`: of each pixel of `draw_samples` the one channel that its site has.
-
-    A table's sample is half-size RGB, its green the mean of two photosites; a mosaic's green is therefore quieter than
-    that of a raw file, by √2 where the two greens do not share their noise.
-
-    Parameters
-    ----------
-    pattern
-        Channels of the picture's first 2x2 block in reading order: RGGB, BGGR, GRBG or GBRG. It belongs to the whole
-        picture: with an odd `first_row` the first row is the pattern's second.
-    samples, picture
-        (8**bits, S, 3) uint16 and (H, W, 3) uint8, as for `draw_samples`.
-    seed, image, first_row, threads
-        As for `draw_samples`.
-    out
-        (H, W) uint16 to fill instead of a new array.
-
-    Returns
-    -------
-    ndarray
-        (H, W) uint16, linear camera values in the units of `samples`.
-
-    Raises
-    ------
-    InputError
-        A shape, type or number is not as above, or the pattern is none of these.
-
-    Examples
-    --------
-    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(8, 2, 3)
-    >>> draw_mosaic(samples, np.full((2, 4, 3), 255, np.uint8), pattern="RGGB")
-    array([[45, 46, 42, 46],
-           [43, 47, 46, 44]], dtype=uint16)
-    """
-    bits = check_samples(samples)
-    check_picture(picture)
-    target = check_out(out, picture.shape[:2], np.uint16)
-    key = check_seed(seed, image)
-    if pattern not in PATTERNS:
-        raise InputError(f"{pattern!r} is no Bayer pattern; expected {', '.join(PATTERNS)}")
-    channels = sum(channel << 2 * place for place, channel in enumerate(PATTERNS[pattern]))
-    source, table, work = packed_rows(picture), readable(samples), writable(target)
-
-    def fill(top: int, bottom: int) -> None:
-        scratch = np.empty(SCRATCH_BYTES, np.uint8)
-        _gather_mosaic(
-            source[top:].ctypes.data,
-            source.strides[0],
-            source.shape[1],
-            bottom - top,
-            table.ctypes.data,
-            np.uint32(samples.shape[1]),
-            np.uint32(bits),
-            key,
-            image,
-            first_row + top,
-            work[top:].ctypes.data,
-            work.strides[0],
-            channels,
             scratch.ctypes.data,
         )
 

@@ -25,6 +25,9 @@ import numpy.typing as npt
 
 from foundation.errors import InputError
 from generator import philox
+from generator.kernels.mixing import mixed_table
+from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, read_light
+from generator.kernels.unfit import colours_in
 from generator.masks.making import MaskMaker
 
 if TYPE_CHECKING:
@@ -82,10 +85,6 @@ class Mixture:
         `picture`: (H, W, 3) uint8, the picture they are for: of a small one, samples of other colours may be 0, and a
         light alone is not read whole. None: any pictures, of any size.
         """
-        from generator.kernels.mixing import mixed_table
-        from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, read_light
-        from generator.kernels.unfit import colours_in
-
         self._require(lut)
         pixels = WHOLE_LIGHT_PIXELS if picture is None else picture.shape[0] * picture.shape[1]
         if len(self.lights) == 1:

@@ -13,7 +13,7 @@ this order, so that one picture always gives the same codes::
     size          only ever made smaller, on request, by averaging areas of codes
     crop          cut, on request, from the centre or at places that the picture's name and a seed choose
 
-Other colour spaces, and AVIF, are in `generator.pictures.conversion`, random colours in `.random_scenes`.
+Other colour spaces are in `generator.pictures.conversion`, random colours in `.random_scenes`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import file_sha256, sha256_of, stream_sha256
 from foundation.secret_texts import masked
 from generator import philox
-from generator.pictures.conversion import FileValues, from_adobe_rgb, read_avif, to_srgb
+from generator.pictures.conversion import from_adobe_rgb, to_srgb
 from generator.stores import DESCRIPTION, filesystem, is_remote, local_path
 
 if TYPE_CHECKING:
@@ -216,13 +216,26 @@ class SourcePicture:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class _FileValues:
+    """Values of a file: `light` (H, W, 3) uint8 or float64, 0 … 255 or linear 0 … 1; `alpha` (H, W) float64 0 … 1."""
+
+    light: npt.NDArray[Any]
+    alpha: npt.NDArray[np.float64] | None
+    associated: bool
+    linear: bool
+    orientation: int
+    icc: bytes | None
+    adobe_rgb: bool = False
+
+
 def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
     """Return the sRGB codes (H, W, 3) uint8 of a picture file; the head of this file lists the steps.
 
     Parameters
     ----------
     path
-        Any file that OpenImageIO reads, or AVIF.
+        Any file that OpenImageIO reads.
     max_side
         Longest side allowed, px; a larger picture is made smaller. None allows any.
 
@@ -293,11 +306,9 @@ def open_picture(
     return SourcePicture(cuts[0].picture, profile=word, cuts=several, notes=notes)
 
 
-def _read(path: Path, data: bytes | None, most_pixels: int) -> FileValues:
+def _read(path: Path, data: bytes | None, most_pixels: int) -> _FileValues:
     if not path.is_file():
         raise FormatError(f"cannot read {path}: there is no such file; name a picture")
-    if path.suffix.lower() == ".avif":
-        return read_avif(path, most_pixels)
     has_profile = _checked_png(path, data)
     with _named_in_text(path) as name:
         values = _read_named(path, name, data, most_pixels)
@@ -336,7 +347,7 @@ def _checked_png(path: Path, data: bytes | None) -> bool:
     return has_profile
 
 
-def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> FileValues:
+def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> _FileValues:
     import OpenImageIO as oiio  # noqa: N813
 
     request = oiio.ImageSpec()
@@ -398,7 +409,7 @@ def _read_named(path: Path, name: str, data: bytes | None, most_pixels: int) -> 
         associated = associated and not bool(np.any(values > 255.0 * alpha[..., None] + 1.0))
     profile = None if icc is None else np.asarray(icc, dtype=np.uint8).tobytes()
     adobe_rgb = uncalibrated and profile is None and _interoperability(path) == "R03"
-    return FileValues(values, alpha, associated, linear, orientation, profile, adobe_rgb)
+    return _FileValues(values, alpha, associated, linear, orientation, profile, adobe_rgb)
 
 
 @contextmanager
@@ -505,12 +516,12 @@ def _shrink(picture: Picture, scale: float) -> Picture:
 
 
 SUFFIXES: Final = frozenset(
-    {".avif", ".bmp", ".dpx", ".exr", ".gif", ".hdr", ".j2k", ".jp2", ".jpe", ".jpeg", ".jpg"}
+    {".bmp", ".dpx", ".exr", ".gif", ".hdr", ".j2k", ".jp2", ".jpe", ".jpeg", ".jpg"}
     | {".jxl", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".psd", ".rgbe", ".sgi", ".tga", ".tif", ".tiff", ".webp"}
 )
 """Ends of the names for which a folder is searched, in either case; a file that is named itself may have any end."""
 
-UNREADABLE: Final = frozenset({".heic", ".heif"})
+UNREADABLE: Final = frozenset({".avif", ".heic", ".heif"})
 """Ends of pictures' names that no library of a plain installation reads; those in a folder are told."""
 
 _LIKE_A_BYTE: Final = re.compile(r"\\+(?=x[89a-f][0-9a-f]|[\udc80-\udcff])")
@@ -782,8 +793,8 @@ class _Search:
             return None
         others = f" and {self._unreadable - 1} more" if self._unreadable > 1 else ""
         return (
-            f"{place} holds {self._first}{others}, which {'are' if others else 'is'} left out: HEIC is not read; "
-            "convert to JPEG, PNG or AVIF"
+            f"{place} holds {self._first}{others}, which {'are' if others else 'is'} left out: HEIC and AVIF are not "
+            "read; convert to JPEG or PNG"
         )
 
 

@@ -47,6 +47,7 @@ from generator.kernels.printing import NODE_CODES, NODES, SIDE, PrintedLight, me
 from generator.lights.lighting import Mixture
 from generator.rendering import print_inverse, print_profiles
 from generator.rendering.black_points import veil_of
+from generator.rendering.matrices import ColourMatrix
 from generator.rendering.print_inverse import corners, invert, nearest_to
 from generator.rendering.print_profiles import PrintProfile, profile_of
 
@@ -320,6 +321,7 @@ def black_point(profile: PrintProfile, colours: _Array, bits: int) -> float:
 
 def _noise_of(lut: Lut) -> _Array:
     """Return what variances are of 1, y and y² at y counts, (3, 3), a column a channel; 0 where that is not known."""
+    # It loads scipy and cv2.
     from calibration.radiometry.table_noise import noise_curve
 
     with contextlib.suppress(InputError):
@@ -440,8 +442,6 @@ class ColorimetricRendering:
 
 @lru_cache(maxsize=4)
 def _rendering(lut: Lut, name: str, rows: tuple[float, ...], source: str) -> ColorimetricRendering:
-    from generator.rendering.matrices import ColourMatrix
-
     return ColorimetricRendering(lut, ColourMatrix(name, np.array(rows).reshape(3, 3), source))
 
 

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 import numpy.typing as npt
 
+from calibration.table.lut import require_lut
 from foundation.errors import InputError
 from generator.kernels.choice import check_picture
 from generator.kernels.rendering import draw_samples
 from generator.kernels.unfit import replace_unfit_colours
 from generator.lights.choices import light_of
 from generator.rendering import DEFAULT, Rendering
+from generator.rendering.colorimetric import rendering_with
 from generator.rendering.matrices import matrix_for
 
 if TYPE_CHECKING:
@@ -72,9 +74,6 @@ def render(
     >>> image.shape == picture.shape, image.dtype
     (True, dtype('uint16'))
     """
-    from calibration.table.lut import require_lut
-    from generator.rendering.colorimetric import rendering_with
-
     require_lut(lut)
     check_picture(picture)
     if rendering not in get_args(Rendering):

@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 import numpy as np
 import numpy.typing as npt
 
+from calibration.table.lut import open_lut, require_lut
 from foundation.errors import InputError, kind_of
 from generator import philox
 from generator.kernels.planar import draw_batch, scales_of
@@ -40,6 +41,9 @@ from generator.lights.choices import light_of
 from generator.lights.lighting import Mixture
 from generator.rendering import DEFAULT, Rendering
 from generator.rendering.black_points import KEEP, BlackPoint, parse_black_point, veil_of
+from generator.rendering.colorimetric import ColorimetricRendering
+from generator.rendering.matrices import matrix_for
+from generator.training.gallery import Gallery
 from generator.variation.exposing import add_noise
 
 if TYPE_CHECKING:
@@ -206,8 +210,6 @@ class Crops:
         matrix: ColourMatrix | None = None,
         black_point: BlackPoint | str = KEEP,
     ) -> None:
-        from calibration.table.lut import require_lut
-
         require_lut(lut)
         if isinstance(black_point, str):
             black_point = parse_black_point(black_point)
@@ -398,8 +400,6 @@ class Crops:
 
 def _require_kinds(gallery: object, size: object, lights: object, black_point: object) -> None:
     """Refuse arguments of another kind than expected, each with what makes one of that kind."""
-    from generator.training.gallery import Gallery
-
     if not isinstance(gallery, Gallery):
         raise InputError(
             f"the gallery is {kind_of(gallery)}, expected one of gallery_of([picture, …]) or open_gallery(FOLDER)"
@@ -437,8 +437,6 @@ _OPTIONS: Final = (
 
 
 def _reopened(folder: Path, gallery: Gallery, size: tuple[int, int], options: dict[str, Any]) -> Crops:
-    from calibration.table.lut import open_lut
-
     return Crops(open_lut(folder), gallery, size, **options)
 
 
@@ -453,9 +451,6 @@ class _Prints:
     """For each light what it makes of the print, found when it is first asked for."""
 
     def __init__(self, lut: Lut, lights: Sequence[Mixture], matrix: ColourMatrix | None) -> None:
-        from generator.rendering.colorimetric import ColorimetricRendering
-        from generator.rendering.matrices import matrix_for
-
         self._lut = lut
         self._lights = lights
         self._rendering = ColorimetricRendering(lut, matrix or matrix_for(lut))

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
-
-import numpy as np
 
 from foundation.errors import InputError
 from generator.training.crops import Batch, Crops
@@ -20,7 +18,7 @@ class TorchMissingError(InputError, ImportError):
 
 try:
     import torch
-    from torch.utils.data import Dataset, IterableDataset, get_worker_info
+    from torch.utils.data import Dataset
 except ImportError as error:
     raise TorchMissingError("training batches for PyTorch need it: pip install torch") from error
 
@@ -77,40 +75,3 @@ def collated(items: Any) -> Item:
     if isinstance(items, _WholeBatch):
         return items.whole
     return torch.utils.data.default_collate(items)
-
-
-class CropStream(IterableDataset[Item]):
-    """Whole batches in the order of their items; give it to a loader with ``batch_size=None``.
-
-    The loader asks its workers in turn, and worker w of W makes batches w, w + W, …: their order is that of one worker.
-
-    Parameters
-    ----------
-    crops
-        The items; the last batch of an epoch may be smaller.
-    batch
-        Items of a batch, ≥ 1.
-
-    Raises
-    ------
-    InputError
-        The batch is smaller than 1.
-    """
-
-    def __init__(self, crops: Crops, batch: int) -> None:
-        if batch < 1:
-            raise InputError(f"batches of {batch} items were asked for, expected 1 or more")
-        self.crops = crops
-        self.items = batch
-
-    def __len__(self) -> int:
-        """Return the batches of an epoch."""
-        return -(-len(self.crops) // self.items)
-
-    def __iter__(self) -> Iterator[Item]:
-        """Yield the batches of this worker."""
-        worker = get_worker_info()
-        first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        for number in range(first, len(self), step):
-            start = number * self.items
-            yield _tensors(self.crops.batch(np.arange(start, min(start + self.items, len(self.crops)))))

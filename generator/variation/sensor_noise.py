@@ -92,6 +92,7 @@ def measured_noise(lut: Lut) -> SensorNoise:
     Numbers have six digits, so that they are the same wherever a dataset is made.
     """
     # What measures noise also reads charts: who makes images alone is not to wait for its import.
+    # It loads scipy and cv2.
     from calibration.radiometry.table_noise import noise_curve
 
     curve = noise_curve(lut)

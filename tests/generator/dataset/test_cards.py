@@ -1,8 +1,7 @@
-"""Card, datasheet and Croissant metadata: what the Hub and loaders read, and what is left to the makers."""
+"""Card and datasheet: what the Hub reads, and what is left to the makers."""
 
 from __future__ import annotations
 
-import json
 import re
 from importlib import import_module
 from pathlib import Path
@@ -11,8 +10,7 @@ from typing import TYPE_CHECKING, get_args
 import pytest
 
 from calibration.citation import OriginRecord
-from generator.dataset.cards import CONFORMS_TO, OPEN, card, datasheet
-from generator.dataset.layouts import LAYOUTS
+from generator.dataset.cards import OPEN, card, datasheet
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.records import Description, Layout, Split
@@ -88,7 +86,7 @@ def test_the_card_is_what_the_hub_reads(made: Dataset) -> None:
     files = [entry for config in read.data.to_dict()["configs"] for entry in config["data_files"]]
     splits = made.description.splits
     named: set[Split] = {part for part, images in splits.items() if images}  # pyrefly: ignore[bad-assignment]
-    assert {entry["split"] for entry in files} == (named if LAYOUTS[made.layout].is_of_the_hub else {"train"})
+    assert {entry["split"] for entry in files} == ({"train"} if made.layout == "folder" else named)
     for entry in files:
         assert list(place_of(made).glob(entry["path"])), entry
 
@@ -136,46 +134,3 @@ def test_a_computed_table_has_neither_frames_nor_report_but_a_known_gain(plain: 
     assert "The table's report has the verdict" in datasheet(plain.description)
     # A table that others computed need not say it.
     assert "does not state gain" in card(with_origin(plain, None, computed={"by": "others"}))
-
-
-@pytest.mark.slow
-def test_croissant_names_what_is_there(made: Dataset) -> None:
-    """MLCommons Croissant 1.0: resources have their hash, fields a source that exists."""
-    root = place_of(made)
-    text = json.loads((root / "croissant.json").read_text())
-    assert text["conformsTo"] == CONFORMS_TO
-    listed = dict(line.split("  ")[::-1] for line in (root / "SHA256SUMS").read_text().splitlines())
-    resources = {entry["@id"]: entry for entry in text["distribution"]}
-    for entry in resources.values():
-        if entry["@type"] == "cr:FileObject":
-            assert entry["sha256"] == listed[entry["contentUrl"]]
-        else:
-            found = {path for pattern in entry["includes"] for path in root.glob(pattern)}
-            assert len(found) == len(listed.keys() & {path.relative_to(root).as_posix() for path in found}) > 0
-    records = text["recordSet"]
-    named = [*resources, *(one["@id"] for one in records), *(one["@id"] for each in records for one in each["field"])]
-    assert len(named) == len(set(named))
-    # Of images that are files, their files; of those in a table, columns of it; of those in a tar nothing is told.
-    told = [field["name"] for record in records if record["@id"] == "images" for field in record["field"]]
-    known = {"folder": ["name", "content"], "webdataset": [], "parquet": ["number", "source", "width", "height"]}
-    assert told == known.get(made.layout, told)
-    for path in root.rglob("*.parquet"):
-        assert set(told) <= set(import_module("pyarrow.parquet").read_schema(path).names)
-    for record in records:
-        for field in record["field"]:
-            source = field["source"]
-            (resource,) = [source[kind]["@id"] for kind in ("fileObject", "fileSet") if kind in source]
-            assert resource in resources
-            if resource == "ground_truth.csv":
-                header = (root / "ground_truth.csv").read_text().splitlines()[0]
-                assert source["extract"]["column"] in header.split(",")
-
-
-@pytest.mark.slow
-def test_mlcommons_own_reader_takes_it(made: Dataset) -> None:
-    library = pytest.importorskip("mlcroissant", reason="the reader of MLCommons is not installed")
-    dataset = library.Dataset(str(place_of(made) / "croissant.json"))
-    assert not dataset.metadata.ctx.issues.errors
-    rows = list(dataset.records("ground_truth"))
-    assert [row["ground_truth/image"].decode() for row in rows] == [entry.image for entry in made.entries]
-    assert [row["ground_truth/r"] for row in rows] == pytest.approx([entry.truth[0] for entry in made.entries])

@@ -1,4 +1,4 @@
-"""Cards, datasheets, metadata, contact sheets and members of known datasets, as they were before."""
+"""Contact sheets and members of known datasets, as they were before."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibration.citation import OriginRecord
 from calibration.table.lut import Lut
 from generator.dataset.contact_sheet import _draw as draw  # before it is painted
 from generator.dataset.making import generate_dataset
@@ -36,26 +35,6 @@ def lut(tmp_path_factory: pytest.TempPathFactory) -> Lut:
 def made(lut: Lut, out: Path, scenes: Any, lights: LightChoice | list[int], **options: Any) -> Dataset:
     given: dict[str, Any] = {"previews": False, "rendering": "codes", **options}
     return generate_dataset(lut, out, scenes, lights, seed=3, options=DatasetOptions(**given))
-
-
-ORIGIN = OriginRecord(
-    rig="simulated",
-    camera_serial="00ff",
-    camera_serial_is="hash",
-    lens="EF50mm",
-    iso=400,
-    aperture=5.6,
-    shutter_s=0.05,
-    exposure_by="settings",
-    first_frame="2026-03-01T21:30:00+00:00",
-    last_frame="2026-03-02T04:00:00+00:00",
-    projector="EPSON",
-    title="A title",
-    authors=["Family, Given", "Other"],
-    licence="CC-BY-4.0",
-    note="one\ntwo",
-    url="https://example.org/table",
-)
 
 
 SHEETS: dict[str, tuple[Any, Any, tuple[int, int]]] = {

@@ -98,7 +98,7 @@ def test_what_is_in_the_folder(make_lut: MakeLut, pictures: Path, tmp_path: Path
     assert str(tmp_path) not in (tmp_path / "out" / "dataset.json").read_text()
     lines = (tmp_path / "out" / "SHA256SUMS").read_text().splitlines()
     listed = {name: digest for digest, name in (line.split("  ") for line in lines)}
-    unlisted = {"SHA256SUMS", "README.md", "DATASHEET.md", "croissant.json"}
+    unlisted = {"SHA256SUMS", "README.md", "DATASHEET.md"}
     assert listed == {name: digest for name, digest in contents(tmp_path / "out").items() if name not in unlisted}
     # Every image is the one that its number, source and light say, by the reader and by OpenCV alone.
     again = open_dataset(tmp_path / "out")

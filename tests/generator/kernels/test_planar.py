@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from foundation.errors import InputError
-from generator.kernels.planar import draw_batch, draw_planar
+from generator.kernels.planar import draw_batch
 from generator.kernels.rendering import draw_samples
 from tests.generator.conftest import MakeLut
 
@@ -29,14 +29,13 @@ def test_the_whole_picture_is_the_plain_image_in_planes(make_lut: MakeLut, pictu
     samples = make_lut().samples[2]
     image = draw_samples(samples, picture, seed=6, image=4)
     whole = (0, 0, 1053, 37)
-    got = draw_planar(samples, picture, white_level=WHITE, seed=6, image=4)
+    (got,) = draw_batch(samples[None], [0], [picture], [whole], white_level=WHITE, seeds=6, images=4)
     np.testing.assert_array_equal(got, expected(image, whole, False, 1))
     assert got.dtype == np.float32
     assert got.max() == 1
-    target = np.zeros((2, 3, 37, 1053), np.float32)[::2][0]
-    again = draw_planar(samples, picture, white_level=WHITE, seed=6, image=4, threads=5, out=target)
-    assert again is target
-    np.testing.assert_array_equal(target, got)
+    target = np.zeros((2, 3, 37, 1053), np.float32)[::2]
+    draw_batch(samples[None], [0], [picture], [whole], white_level=WHITE, seeds=6, images=4, threads=5, out=target)
+    np.testing.assert_array_equal(target[0], got)
 
 
 @pytest.mark.slow
@@ -92,13 +91,11 @@ def test_faults_are_named(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> 
     samples = make_lut().samples
     for window in ((-1, 0, 5, 5), (0, 0, 5, 38), (1050, 0, 4, 4), (0, 0, 0, 4)):
         with pytest.raises(InputError, match=r"1053x37 pixels"):
-            draw_planar(samples[0], picture, white_level=WHITE, window=window)
-        with pytest.raises(InputError, match=r"1053x37 pixels"):
             draw_batch(samples, [0], [picture], [window], white_level=WHITE)
     with pytest.raises(InputError, match="the gain is -1"):
-        draw_planar(samples[0], picture, white_level=WHITE, gain=-1)
+        draw_batch(samples, [0], [picture], [(0, 0, 4, 4)], white_level=WHITE, gains=-1)
     with pytest.raises(InputError, match="white level is 65536"):
-        draw_planar(samples[0], picture, white_level=65536)
+        draw_batch(samples, [0], [picture], [(0, 0, 4, 4)], white_level=65536)
     ok = (0, 0, 4, 4)
     # Of pictures shown more than once each window is looked at.
     with pytest.raises(InputError, match=r"4x4 at \(1050, 2\)"):

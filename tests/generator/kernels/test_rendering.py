@@ -17,9 +17,9 @@ from foundation.errors import InputError
 from generator.kernels import vector as streaming
 from generator.kernels.choice import bits_of, readable
 from generator.kernels.mixing import mix_samples, mixed_table
-from generator.kernels.planar import draw_batch, draw_planar
+from generator.kernels.planar import draw_batch
 from generator.kernels.printing import draw_printed
-from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples
+from generator.kernels.rendering import draw_samples
 from generator.rendering.render import render
 from tests.generator.conftest import MakeLut
 
@@ -238,32 +238,13 @@ def test_wrong_shapes_and_numbers_are_named(picture: npt.NDArray[np.uint8]) -> N
 
 @pytest.mark.parametrize(
     "function",
-    [draw_samples, draw_mosaic, draw_planar, draw_batch, draw_printed, mix_samples, mixed_table, render],
+    [draw_samples, draw_batch, draw_printed, mix_samples, mixed_table, render],
 )
 def test_what_is_not_said_is_image_0_of_seed_0(function: Callable[..., object]) -> None:
     known = {"seed": 0, "seeds": 0, "image": 0, "images": 0, "first_row": 0, "threads": 1, "flip": False, "gain": 1}
     said = {name: given.default for name, given in signature(function).parameters.items() if name in known}
     assert said
     assert said == {name: known[name] for name in said}
-
-
-@pytest.mark.slow
-def test_a_mosaic_has_each_site_s_own_channel(make_lut: MakeLut, picture: npt.NDArray[np.uint8]) -> None:
-    samples = make_lut().samples[1]
-    image = draw_samples(samples, picture, seed=8, image=1)
-    red, green, blue = image[..., 0], image[..., 1], image[..., 2]
-    for pattern in PATTERNS:
-        mosaic = draw_mosaic(samples, picture, pattern=pattern, seed=8, image=1, threads=2)
-        for place, name in enumerate(pattern):
-            site = np.s_[place // 2 :: 2, place % 2 :: 2]
-            np.testing.assert_array_equal(mosaic[site], {"R": red, "G": green, "B": blue}[name][site])
-        bands = [
-            draw_mosaic(samples, picture[top : top + 5], pattern=pattern, seed=8, image=1, first_row=top)
-            for top in range(0, 37, 5)
-        ]
-        np.testing.assert_array_equal(np.concatenate(bands), mosaic)
-    with pytest.raises(InputError, match=r"'XTRANS'.*RGGB"):
-        draw_mosaic(samples, picture, pattern="XTRANS")
 
 
 @pytest.mark.parametrize("left", [0, 2, 1000])

@@ -2,7 +2,6 @@
 
 Profiles, crops and sizes: what is done to pictures on their way to the printer.
 
-AVIF pictures: read as others are, and refused where their codes are not sRGB's.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ import pytest
 import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image, ImageCms, features
+from PIL import Image, ImageCms
 
 from foundation.errors import FormatError
 from generator.pictures.conversion import to_srgb
-from generator.pictures.sources import PROFILE_UNUSED, Preparation, find_pictures, open_picture, read_picture
+from generator.pictures.sources import PROFILE_UNUSED, Preparation, open_picture, read_picture
 from tests.generator.pictures.icc import ADOBE_RGB, PROPHOTO_RGB, gamma_profile
 from tests.generator.pictures.oiio_files import write
 
@@ -212,76 +211,6 @@ def test_random_places_depend_on_name_and_seed_and_reach_every_edge(tmp_path: Pa
     np.testing.assert_array_equal(open_picture(path, cut, "a").picture, open_picture(path, cut, "a").picture)
     named = {tuple(open_picture(path, cut, str(number)).picture[0, 0]) for number in range(200)}
     assert len(named) == 12
-
-
-needs_avif = pytest.mark.skipif(not features.check("avif"), reason="this Pillow is without libavif")
-
-SMOOTH = np.linspace(20, 235, 48 * 64 * 3).reshape(48, 64, 3).astype(np.uint8)
-
-
-@pytest.fixture
-def avif_path(tmp_path: Path) -> Path:
-    """Return a picture of 64 x 48 px."""
-    place = tmp_path / "a.avif"
-    Image.fromarray(SMOOTH).save(place, quality=95, subsampling="4:4:4")
-    return place
-
-
-@needs_avif
-def test_codes_are_those_of_the_picture(avif_path: Path) -> None:
-    read = open_picture(avif_path)
-    assert read.picture.shape == (48, 64, 3)
-    assert np.abs(read.picture.astype(int) - SMOOTH).max() <= 6, "the codec loses little at this quality"
-    assert read.profile == "none, taken as sRGB"
-    assert [source.name for source in find_pictures(avif_path.parent)] == ["a.avif"]
-
-
-@needs_avif
-def test_a_profile_is_converted(tmp_path: Path) -> None:
-    wide = gamma_profile("wide", 2.2, ADOBE_RGB)
-    Image.fromarray(SMOOTH).save(tmp_path / "wide.avif", quality=95, subsampling="4:4:4", icc_profile=wide)
-    Image.fromarray(SMOOTH).save(tmp_path / "wide.png", icc_profile=wide)
-    read, other = open_picture(tmp_path / "wide.avif"), open_picture(tmp_path / "wide.png")
-    assert read.profile == other.profile == "wide, converted to sRGB"
-    assert np.abs(read.picture.astype(int) - other.picture).max() <= 12
-
-
-@needs_avif
-def test_orientation_and_transparency(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.fromarray(SMOOTH).save(tmp_path / "turned.avif", quality=95, subsampling="4:4:4", exif=exif)
-    turned = open_picture(tmp_path / "turned.avif").picture
-    assert turned.shape == (64, 48, 3)
-    assert np.abs(turned.astype(int) - np.rot90(SMOOTH, -1)).max() <= 6
-    clear = np.concatenate([SMOOTH, np.zeros((48, 64, 1), np.uint8)], axis=2)
-    Image.fromarray(clear).save(tmp_path / "clear.avif", quality=95)
-    assert open_picture(tmp_path / "clear.avif").picture.min() == 255, "paper shows through"
-
-
-@needs_avif
-@pytest.mark.parametrize(("primaries", "transfer", "is_read"), [(9, 16, False), (12, 13, False), (1, 13, True)])
-def test_other_colours_are_refused(avif_path: Path, primaries: int, transfer: int, is_read: bool) -> None:
-    """Of Rec. 2100 PQ, Display P3 and sRGB by the code points of H.273."""
-    data = bytearray(avif_path.read_bytes())
-    place = data.index(b"colrnclx") + 8
-    data[place : place + 4] = bytes((0, primaries, 0, transfer))
-    avif_path.write_bytes(data)
-    if is_read:
-        assert open_picture(avif_path).picture.shape == (48, 64, 3)
-        return
-    with pytest.raises(FormatError, match=f"{primaries}.*function {transfer}"):
-        open_picture(avif_path)
-
-
-@needs_avif
-def test_a_damaged_file_is_named(avif_path: Path) -> None:
-    avif_path.write_bytes(avif_path.read_bytes()[:200])
-    with pytest.raises(FormatError, match=r"a.avif.*convert.*PNG"):
-        open_picture(avif_path)
-    avif_path.write_bytes(b"no picture")
-    with pytest.raises(FormatError, match=r"a\.avif"):
-        open_picture(avif_path)
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif", "bmp", "ppm", "tga", "webp"])

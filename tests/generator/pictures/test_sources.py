@@ -62,9 +62,7 @@ def test_what_is_not_read_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixtu
         (tmp_path / "in" / name).touch()
     assert [source.name for source in find_pictures([tmp_path / "in"])] == ["a.png"]
     (told,) = caplog.messages
-    assert told == (
-        f"{tmp_path}/in holds IMG_1.HEIC and 1 more, which are left out: HEIC is not read; convert to JPEG, PNG or AVIF"
-    )
+    assert told.startswith(f"{tmp_path}/in holds IMG_1.HEIC and 1 more, which are left out: HEIC and AVIF are not")
     assert [source.name for source in find_pictures(f"file://{tmp_path}/in")] == ["a.png"]
     assert len(caplog.messages) == 2
     (tmp_path / "in/a.png").unlink()

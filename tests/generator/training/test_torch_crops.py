@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from foundation.errors import InputError
 from generator import open_lut
 from generator.training.crops import Crops
 from generator.training.gallery import gallery_of
@@ -21,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 torch: Any = pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
 batches: Any = pytest.importorskip("generator.training.torch_crops")
-CropDataset, CropStream, collated = batches.CropDataset, batches.CropStream, batches.collated
+CropDataset, collated = batches.CropDataset, batches.collated
 
 
 def crops_of(table: Path | str) -> Crops:
@@ -44,29 +41,6 @@ def test_a_loader_by_number_gives_every_item_once(crops: Crops) -> None:
     np.testing.assert_array_equal(torch.cat([batch["illuminant"] for batch in loaded]).numpy(), wanted.illuminants)
 
 
-STREAM = """
-import sys
-import numpy as np
-import torch
-from generator.training.torch_crops import CropStream
-from tests.generator.training.test_torch_crops import crops_of
-stream = CropStream(crops_of(sys.argv[1]), 4)
-loader = torch.utils.data.DataLoader(stream, batch_size=None, num_workers=2, multiprocessing_context="fork")
-np.save(sys.argv[2], torch.cat([batch["image"] for batch in loader]).numpy())
-"""
-
-
-def test_a_stream_keeps_the_order_of_one_worker(crops: Crops, tmp_path: Path) -> None:
-    images = [batch["image"] for batch in torch.utils.data.DataLoader(CropStream(crops, 4), batch_size=None)]
-    assert [len(image) for image in images] == [4, 4, 4, 4, 4, 2]
-    wanted = crops.batch(np.arange(22)).images
-    np.testing.assert_array_equal(torch.cat(images).numpy(), wanted)
-    # In a process of its own: to fork this one with its threads is not safe.
-    command = [sys.executable, "-W", "ignore:This DataLoader", "-c", STREAM, crops.lut.folder, tmp_path / "images.npy"]
-    subprocess.run(command, check=True, cwd=Path(__file__).parents[3])
-    np.testing.assert_array_equal(np.load(tmp_path / "images.npy"), wanted)
-
-
 def test_the_plain_collate_gives_the_same(crops: Crops) -> None:
     one = next(iter(torch.utils.data.DataLoader(CropDataset(crops), batch_size=4)))
     other = next(iter(torch.utils.data.DataLoader(CropDataset(crops), batch_size=4, collate_fn=collated)))
@@ -80,5 +54,3 @@ def test_single_items_and_their_bounds(crops: Crops) -> None:
     np.testing.assert_array_equal(dataset[21]["image"].numpy(), crops.batch([21]).images[0])
     with pytest.raises(IndexError):
         dataset[22]
-    with pytest.raises(InputError, match="batches of 0"):
-        CropStream(crops, 0)
