@@ -126,7 +126,7 @@ def ask(projector: PjLinkProjector) -> LampState:
     frozen, source = False, None
     # Class 1 knows no freeze, and some projectors no input.
     with contextlib.suppress(DeviceError):
-        source = projector.input().code
+        source = projector.input()
     with contextlib.suppress(DeviceError):
         frozen = bool(projector.frozen())
     return LampState(1.0, frozen, source)

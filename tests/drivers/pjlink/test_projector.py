@@ -14,7 +14,7 @@ import pytest
 
 from drivers.links.link import Link, PeerLink
 from drivers.links.network import TcpLink
-from drivers.pjlink import Input, NoResolution, PjLinkProjector, Resolution
+from drivers.pjlink import NoResolution, PjLinkProjector, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.clock import SimulatedClock
 from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
@@ -256,7 +256,7 @@ def test_the_input_is_asked_for_in_the_projectors_class(level: bytes, code: byte
         b"%1CLSS ?\r", b"%1CLSS=" + level + b"\r",
         b"%" + level + b"INPT ?\r", b"%" + level + b"INPT=" + code + b"\r",
     )  # fmt: skip
-    assert driver(script).input() == Input(meant)
+    assert driver(script).input() == meant
     assert script.ended()
 
 

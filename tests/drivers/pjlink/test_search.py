@@ -81,14 +81,14 @@ class PaperNetwork(UdpSocket):
         self.closed = True
 
 
-def look(network: PaperNetwork, clock: SimulatedClock, enough: int | None = None) -> tuple[FoundProjector, ...]:
+def look(network: PaperNetwork, clock: SimulatedClock) -> tuple[FoundProjector, ...]:
     ports: list[int] = []
 
     def opened(port: int) -> PaperNetwork:
         ports.append(port)
         return network
 
-    found = search(enough=enough, open_socket=opened, clock=clock)
+    found = search(open_socket=opened, clock=clock)
     assert ports == [4352]
     assert network.closed
     return found
@@ -117,13 +117,12 @@ def test_collects_for_thirty_seconds_and_names_each_once() -> None:
     assert [at for at, _, _ in network.sent] == pytest.approx([0.0, 1.0, 2.0])
 
 
-def test_ends_as_soon_as_enough_have_answered() -> None:
+def test_a_search_counts_from_its_own_begin() -> None:
     clock = SimulatedClock()
-    clock.sleep(1000)  # a search counts from its own begin
+    clock.sleep(1000)
     network = PaperNetwork(clock, (1000.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"))
-    assert [found.host for found in look(network, clock, enough=1)] == ["192.168.1.20"]
-    assert clock.monotonic() == pytest.approx(1000.5)
-    assert len(network.sent) == 1
+    assert [found.host for found in look(network, clock)] == ["192.168.1.20"]
+    assert clock.monotonic() == pytest.approx(1030.0)
 
 
 def test_an_empty_network_has_no_projectors() -> None:

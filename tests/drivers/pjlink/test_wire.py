@@ -19,23 +19,6 @@ def test_digest_is_the_standards_example() -> None:
     assert wire.authentication_digest("498e4a67", "JBMIAProjectorLink") == "5d8409bc1c3fa39749434aa3a5c38682"
 
 
-CHALLENGE = bytes.fromhex("3db25e10f69c47a85adb24cf361897e0")
-NONCE = bytes.fromhex("c14b279e603d8a5f17e849ba360f2dc5")
-
-
-def test_sha256_digest_is_the_standards_example() -> None:
-    # PJLink 2.10, 5.1, as an independent client quotes it.
-    assert wire.sha256_digest(CHALLENGE, NONCE, "JBMIAProjectorLink") == (
-        "c14b279e603d8a5f17e849ba360f2dc570ab129eac6924d4c129c9c4fcf45be42e1e776325a66db67e5b6eee50f2a692"
-    )
-
-
-def test_the_offer_of_sha256_is_the_standards_bytes() -> None:
-    assert wire.is_security_question(b"pjlink 2")
-    assert not wire.is_security_question(b"PJLINK 1")
-    assert wire.encode_challenge(CHALLENGE) == b"PJLINK 2 3db25e10f69c47a85adb24cf361897e0\r"
-
-
 @pytest.mark.parametrize(
     ("line", "greeting"),
     [
@@ -134,7 +117,6 @@ def test_values_of_class_2() -> None:
     assert wire.parse_input_resolution("1024X768") == Resolution(1024, 768)
     assert wire.parse_input_resolution("-") is NoResolution.NO_SIGNAL
     assert wire.parse_input_resolution("*") is NoResolution.UNKNOWN_SIGNAL
-    assert wire.parse_resolution("4096x2160") == Resolution(4096, 2160)
     assert [wire.parse_freeze(digit) for digit in "01"] == [False, True]
     assert [wire.parse_class(digit) for digit in "12"] == [1, 2]
 
@@ -147,9 +129,8 @@ def test_values_of_class_2() -> None:
         (wire.parse_input, "3"),
         (wire.parse_input_resolution, "1920"),
         (wire.parse_input_resolution, ""),
-        (wire.parse_resolution, "-"),
-        (wire.parse_resolution, "1920x1080p"),
-        (wire.parse_resolution, "٣x٣"),
+        (wire.parse_input_resolution, "1920x1080p"),
+        (wire.parse_input_resolution, "٣x٣"),
         (wire.parse_freeze, "2"),
         (wire.parse_class, "0"),
         (wire.parse_class, "²"),
@@ -178,7 +159,7 @@ def test_values_outside_the_standard_are_protocol_errors(parse: object, value: s
         st.from_regex("[A-Z0-9]{4}", fullmatch=True),
         PRINTABLE.filter(bool),
         st.sampled_from((1, 2)),
-        st.sampled_from(("", "5d8409bc1c3fa39749434aa3a5c38682", 3 * "5d8409bc1c3fa39749434aa3a5c38682")),
+        st.sampled_from(("", "5d8409bc1c3fa39749434aa3a5c38682")),
     )
 )
 def test_requests_come_back(request_: PjLinkRequest) -> None:
