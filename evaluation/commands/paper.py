@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from evaluation.commands.options import (
     AngularError,
-    DataReading,
+    Read,
     argument,
     choose_learners,
     image_steps,
+    open_data,
+    split_names,
     thread_option,
 )
-from foundation.console import EXIT_CODES, JsonOutput, grouped, new_app, option, with_json
+from foundation.console import EXIT_CODES, JsonOutput, new_app, option, with_json
 
 if TYPE_CHECKING:
     from evaluation.experiments.paper.reporting import PaperReport
@@ -38,7 +40,6 @@ app = new_app(no_args_is_help=True)
 Luts = Annotated[list[Path], argument("LUT", "Folders of tables; demo: for a small computed one.")]
 Kind = Annotated[AngularError, typer.Option(help="Angular error to print.")]
 Out = Annotated[Path | None, option("FOLDER", "Write page, tables and figures here.")]
-Seed = Annotated[int, typer.Option(metavar="N", help="Of all that is drawn at random.", min=0)]
 Workers = Annotated[int | None, thread_option()]
 
 _NOT_C1 = (
@@ -96,7 +97,7 @@ def table1(
         ),
     ] = "",
     error: Kind = "reproduction",
-    seed: Seed = 0,
+    seed: Annotated[int, option("N", "Of all that is drawn at random.", min=0)] = 0,
     out: Out = None,
     workers: Workers = None,
     *,
@@ -148,30 +149,21 @@ the real one, and tests on the real one. The paper's numbers stand beside those 
 
 @app.command("table2", help=_TABLE2)
 @with_json("evaluate paper table2")
-@grouped
 def table2(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
     generated: Annotated[str, option("PLACE", "Data set made by generate, to train on.")],
-    methods: Annotated[
+    method: Annotated[
         str,
-        option(
-            "LIST",
-            "Methods that learn, between commas: names, module:Class or file.py:Class. "
-            "\\[default: smart-color-cat, regression-trees, color-beaver]",
-            show_default=False,
-        ),
-    ] = "smart-color-cat,regression-trees,color-beaver",
-    folds: Annotated[str, option("N|FILE", "Folds of the cross-validation, or their file.")] = "3",
-    shared: Annotated[
-        Literal["refuse", "leave-out", "keep"],
-        typer.Option(help="Generated images that show a picture of the test; the paper's do."),
-    ] = "keep",
+        option("LIST", "Methods that learn, between commas: names, module:Class or file.py:Class."),
+    ] = "smart-color-cat, regression-trees, color-beaver",
+    unseen: Annotated[
+        bool, typer.Option("--unseen", help="Leave out generated images that show a picture of the test.")
+    ] = False,
     error: Kind = "reproduction",
-    seed: Seed = 0,
     out: Out = None,
     workers: Workers = None,
+    read: Read = None,
     *,
-    reading: DataReading,
     output: JsonOutput,
 ) -> None:
     """Train learned methods on real and on generated images."""
@@ -181,31 +173,24 @@ def table2(
     from evaluation.experiments.paper.table1 import table2 as run
     from evaluation.experiments.paper.table1 import table2_tables
     from evaluation.experiments.transfer.plan import trainable_images
-    from evaluation.learning.standard import standard_learners
     from foundation.compiled import processor_count
 
     _require_free(out)
-    asked = [name.strip() for name in methods.split(",") if name.strip()]
-    names = list(dict.fromkeys(key for name in asked for key in (standard_learners() if name == "all" else (name,))))
-    learners = dict(zip(names, choose_learners(names), strict=True))
-    real, made = reading.open(data), open_scenes(generated)
+    learners = {getattr(each, "key", each.name): each for each in choose_learners(split_names([method]))}
+    real, made = open_data(data, read), open_scenes(generated)
     count = len(real.scenes)
-    training, shared_images = trainable_images(made, real, shared, real.name, copies=False)
-    fate = (
-        "left out"
-        if shared == "leave-out"
-        else "kept, as in the paper, whose generated images show the pictures that are tested"
-    )
-    unseen = (f"{shared_images}. They were {fate}.",) if shared_images else ()
-    drawn, _ = choose_folds(real, folds, seed)
+    training, shared_images = trainable_images(made, real, unseen, real.name)
+    fate = "left out" if unseen else "kept, as in the paper, whose generated images show the pictures that are tested"
+    fates = (f"{shared_images}. They were {fate}.",) if shared_images else ()
+    drawn, _ = choose_folds(real, "3", 0)
     with image_steps(2 * count) as step:
-        found = run(real.scenes, training, learners, drawn, seed, workers or processor_count(), step)
+        found = run(real.scenes, training, learners, drawn, 0, workers or processor_count(), step)
     is_cube = real.layout == "cube-plus"
     conditions = (
         f"Real: {real.name}, {count} images, {int(drawn.max()) + 1} folds. Generated: {made.name}, {len(training)} "
-        f"images. Seed {seed}. {error.capitalize()} error, degrees.",
+        f"images. {error.capitalize()} error, degrees.",
         _treatment(real),
-        *unseen,
+        *fates,
         *(() if is_cube else ("The paper's table is of Cube+, so only its ratios stand beside these.",)),
     )
     _finish(table2_report(table2_tables(found, error, real.name, is_cube), conditions), conditions, out, output)
@@ -223,15 +208,14 @@ nothing unless asked with --out.
 
 @app.command("bits", help=_BITS)
 @with_json("evaluate paper bits")
-@grouped
 def bits(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images; the paper's is NUS C1.")],
     sigma: Annotated[float, option("PX", "Scale of Gray-Edge; 6 is usual for images of full size.", min=0.1)] = 6.0,
     error: Kind = "reproduction",
     out: Out = None,
     workers: Workers = None,
+    read: Read = None,
     *,
-    reading: DataReading,
     output: JsonOutput,
 ) -> None:
     """Run methods on images whose colours were reduced."""
@@ -240,7 +224,7 @@ def bits(
     from foundation.compiled import processor_count
 
     _require_free(out)
-    opened = reading.open(data)
+    opened = open_data(data, read)
     with image_steps(len(opened.scenes)) as step:
         found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
     first = f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px."
@@ -260,14 +244,13 @@ images, also codes that another program has changed.
 
 @app.command("flash", help=_FLASH)
 @with_json("evaluate paper flash")
-@grouped
 def flash(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images.")],
     out: Annotated[Path, option("FOLDER", "New folder of codes.")],
     clear: Annotated[int, option("N", "Bits of each code set to zero.", min=0, max=8)] = 0,
     workers: Workers = None,
+    read: Read = None,
     *,
-    reading: DataReading,
     output: JsonOutput,
 ) -> None:
     """Write tone-mapped codes of linear images."""
@@ -275,7 +258,7 @@ def flash(
     from foundation.compiled import processor_count
 
     _require_free(out)
-    opened = reading.open(data)
+    opened = open_data(data, read)
     with image_steps(len(opened.scenes)) as step:
         write_codes(opened, out, clear, workers or processor_count(), step)
     output.add(folder=out, data_set=opened.name, images=len(opened.scenes), cleared=clear)

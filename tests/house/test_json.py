@@ -148,7 +148,7 @@ CALLS: dict[str, tuple[str, dict[str, Any]]] = {
     "generate again": ("MADE/lut MADE/set --sources MADE/pictures --random 2", {"images": 12, "made": False}),
     "generate --verify": ("MADE/set", {"faults": [], "images": 12}),
     "generate --finish": ("MADE/set", {"made": False}),
-    "evaluate run": ("MADE/set --methods gray-world", {"data_set": "set", "images": 12}),
+    "evaluate run": ("MADE/set --method gray-world", {"data_set": "set", "images": 12}),
     "evaluate cv": ("constant-light MADE/set --folds 2", {"folds": 2, "images": 12}),
     "evaluate train": ("constant-light MADE/set --out OUT/model.npz", {"images": 12, "unused": 0}),
     "evaluate tune": ("shades-of-gray MADE/set", {"images": 12, "family": "shades-of-gray"}),
@@ -182,7 +182,7 @@ def test_the_inverse_of_flash_and_comparisons(made: Path, tmp_path: Path, capsys
     json_of(evaluate, ["paper", "flash", data, "--out", codes], capsys)
     found = json_of(evaluate, ["paper", "flash-inverse", codes, "--out", tmp_path / "linear"], capsys)
     assert (found["images"], found["command"]) == (12, "evaluate paper flash-inverse")
-    assert evaluate(["run", data, "--methods", "gray-world,white-patch", "--out", str(results)]) == 0
+    assert evaluate(["run", data, "--method", "gray-world,white-patch", "--out", str(results)]) == 0
     compared = json_of(evaluate, ["compare", results], capsys)
     assert len(compared["verdicts"]) == 1
     assert [len(table["rows"]) > 0 for table in compared["tables"]] == [True] * 3

@@ -114,8 +114,6 @@ def test_all_leaves_out_what_is_not_installed_and_says_why(
     [
         (["cv", "smart-color-cat", "DATA", "--folds", "none.csv"], "none.csv"),
         (["train", "all", "DATA", "--out", "x.npz"], "a model file holds one"),
-        (["run", "DATA", "--model", "m.npz"], "evaluate run DATA --method m.npz"),
-        (["DATA", "--model=m.npz"], "evaluate run DATA --method m.npz"),
         (["train", "smart-color-cat", "DATA", "--out", "model.txt"], "ends in .npz"),
     ],
 )

@@ -61,7 +61,6 @@ def test_damaged_tables(tmp_path: Path, pinned: Pinned) -> None:
         "estimates": (ESTIMATES, lambda path: read_estimates(path, IMAGES).lights),
         "estimates with semicolons": (ESTIMATES.replace(",", ";"), lambda path: read_estimates(path, IMAGES).lights),
         "folds": (FOLDS, lambda path: folds.read_folds(path, IMAGES)),
-        "names": (FOLDS, lambda path: folds.read_names(path, IMAGES)),
         "truths": (TRUTHS, lambda path: [read_truths(f"{path}{of}") for of in ("", "#A", "#B_1")]),
     }
     found: dict[str, Any] = {}
