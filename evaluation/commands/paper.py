@@ -88,14 +88,6 @@ def table1(
     ] = "none",
     side: Annotated[int, option("PX", "Longest side of every image.", min=1, max=65535)] = 512,
     sizes: Annotated[str, option("LIST", "Further sides, px, between commas, to show what they change.")] = "",
-    hot: Annotated[
-        str,
-        option(
-            "LIST",
-            "Hot photosites in a million that a table is taken to have, between commas, to show what they do to "
-            "White-Patch.",
-        ),
-    ] = "",
     error: Kind = "reproduction",
     seed: Annotated[int, option("N", "Of all that is drawn at random.", min=0)] = 0,
     out: Out = None,
@@ -107,11 +99,11 @@ def table1(
     from evaluation.experiments.paper.material import read_truths
     from evaluation.experiments.paper.published import cell_name
     from evaluation.experiments.paper.reporting import table1_report
-    from evaluation.experiments.paper.table1 import hot_table, settings, size_dependence
+    from evaluation.experiments.paper.table1 import settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
     from foundation.compiled import processor_count
 
-    sides, shares = [int(side) for side in _numbers(sizes, "side of an image, px", 65535)], _numbers(hot, "share", 1e6)
+    sides = _sides(sizes)
     _require_free(out)
     opened = _open(luts)
     scenes, says, called = _pictures(pictures, matrix)
@@ -122,13 +114,12 @@ def table1(
     with image_steps(sum(len(part.scenes) for part in chosen)) as step:
         blocks = run(chosen, threads, step)
     found = size_dependence(opened, scenes, truths.lights, sides, seed, threads, names)
-    raised = hot_table(chosen, shares, error, seed, threads) if shares else None
     conditions = (
         f"Pictures: {says}. Images: longest side {side} px. Lights like those of {truths.name}. Seed {seed}.",
         f"Tables: {'; '.join(map(_says, opened))}.",
         *(() if names == ("C1", "C1") else (_NOT_C1,)),
     )
-    _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out, output)
+    _finish(table1_report(blocks, opened, conditions, error, found), conditions, out, output)
 
 
 def _says(lut: Lut) -> str:
@@ -230,70 +221,6 @@ def bits(
     first = f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px."
     conditions = (first, _treatment(opened))
     _finish(bits_report(found, error, opened.name, conditions), conditions, out, output)
-
-
-_FLASH = f"""Tone map linear images to codes of 8 bits by the Flash operator (section 4.2).
-
-Reads DATA. Writes the new folder FOLDER: codes/ (PNG of 8 bits, of which --clear sets the lowest bits to zero), masks/,
-and flash.csv with each image's operator and ground truth. evaluate paper flash-inverse takes codes back to linear
-images, also codes that another program has changed.
-
-{EXIT_CODES}
-"""
-
-
-@app.command("flash", help=_FLASH)
-@with_json("evaluate paper flash")
-def flash(
-    data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images.")],
-    out: Annotated[Path, option("FOLDER", "New folder of codes.")],
-    clear: Annotated[int, option("N", "Bits of each code set to zero.", min=0, max=8)] = 0,
-    workers: Workers = None,
-    read: Read = None,
-    *,
-    output: JsonOutput,
-) -> None:
-    """Write tone-mapped codes of linear images."""
-    from evaluation.experiments.paper.colour_reduction import write_codes
-    from foundation.compiled import processor_count
-
-    _require_free(out)
-    opened = open_data(data, read)
-    with image_steps(len(opened.scenes)) as step:
-        write_codes(opened, out, clear, workers or processor_count(), step)
-    output.add(folder=out, data_set=opened.name, images=len(opened.scenes), cleared=clear)
-    print(f"{out}: codes of {len(opened.scenes)} images of {opened.name}, {clear} bits of each set to zero")
-
-
-_INVERSE = f"""Take codes back to linear images by the inverse of the Flash operator (section 4.2).
-
-Reads FOLDER, made by evaluate paper flash; a picture there may have been changed, or replaced by a JPEG of its name.
-Writes the new folder LINEAR: TIFF files of 32-bit floats in the units of the data set, masks, and gt.csv, as evaluate
-run reads them.
-
-{EXIT_CODES}
-"""
-
-
-@app.command("flash-inverse", help=_INVERSE)
-@with_json("evaluate paper flash-inverse")
-def flash_inverse(
-    folder: Annotated[Path, argument("FOLDER", "Folder of codes.")],
-    out: Annotated[Path, option("LINEAR", "New folder of linear images.")],
-    workers: Workers = None,
-    *,
-    output: JsonOutput,
-) -> None:
-    """Write the linear images of codes."""
-    from evaluation.experiments.paper.colour_reduction import write_linear
-    from foundation.compiled import processor_count
-    from foundation.console import progress
-
-    _require_free(out)
-    with progress("images") as shown:
-        count = write_linear(folder, out, workers or processor_count(), shown)
-    output.add(folder=out, images=count)
-    print(f"{out}: {count} linear images; evaluate run {out} estimates their lights")
 
 
 _REDUCTION = f"""One picture with 0 to 7 bits of each code set to zero (a figure of section 4.2).
@@ -405,15 +332,15 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
     return developed(data, chosen), f"{len(data.scenes)} of {data.name}, developed to sRGB {how}", data.name
 
 
-def _numbers(text: str, what: str, most: float) -> list[float]:
-    """Return the whole numbers from 1 to `most` between commas."""
+def _sides(text: str) -> list[int]:
+    """Return the sides of images between commas, px."""
     from foundation.errors import InputError
 
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts:
-        if not part.isdigit() or not 1 <= int(part) <= most:
-            raise InputError(f"{part!r} is no {what}; write whole numbers from 1 to {most:g} between commas")
-    return [float(part) for part in parts]
+        if not part.isdigit() or not 1 <= int(part) <= 65535:
+            raise InputError(f"{part!r} is no side of an image, px; write whole numbers from 1 to 65535 between commas")
+    return [int(part) for part in parts]
 
 
 def _require_free(out: Path | None) -> None:

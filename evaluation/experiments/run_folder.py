@@ -108,10 +108,10 @@ def _trained_on(name: str, record: TrainingRecord, data: SceneSet, sha256: str) 
         )
     if record.data_name != data.name:
         return ""
-    told = f"{name} was trained on {record.scenes} images of a data set of the same name: "
-    if len(record.images):
-        return f"{told}none of these has the name and light, or the source picture, of one of them"
-    return f"{told}whether these are among them is not known"
+    return (
+        f"{name} was trained on {record.scenes} images of a data set of the same name: none of these has the name and "
+        "light, or the source picture, of one of them"
+    )
 
 
 def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> dict[str, str]:

@@ -60,7 +60,7 @@ def test_the_table_names_the_dataset(
         (("lut",), "is no dataset"),
         (("made", "--out", "lut"), "lut already exists; name another place for the results"),
         (("made", "--method", "none.npz"), "none.npz"),
-        (("made", "--method", "lut/illuminations.csv"), "expected the columns image,r,g,b"),
+        (("made", "--method", "lut/illuminations.csv"), "expected image,r,g,b"),
     ],
 )
 def test_what_cannot_be_done_is_one_sentence(

@@ -9,8 +9,8 @@ The naive baseline is, for each image of a generated data set, a scene of the sa
 bright and as finely quantised, without a print, a camera or noise: codes become linear light by the sRGB curve, colours
 those of the camera by its matrix if one is given, and each channel is multiplied by the light. What a learned method
 gains by training on the generated image instead is what the table is worth. Several lights share the pixels of the
-counterpart by the masks of the generated image, and light falls off as it does there. What `generate --exposure` and
-`--iso` did to the generated image is not done to its counterpart. Its pictures are found again by name and hash.
+counterpart by the masks of the generated image. What `generate --exposure` and `--iso` did to the generated image is
+not done to its counterpart, and a set under a gradient has none. Pictures are found again by name and hash.
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ from generator.lights.lighting import parse_mixture
 from generator.pictures.random_scenes import RandomScene
 from generator.pictures.sources import Preparation, find_pictures, open_picture
 from generator.rendering.matrices import ColourMatrix, camera_matrix
-from generator.variation.variation import Falloff, described_gradient
 
 
 @dataclass(frozen=True)
@@ -281,27 +280,7 @@ class NaiveScene:
                 )
             level = sum(weight * levels[light] for light, weight in zip(mixture.lights, mixture.weights, strict=True))
             whites.append(np.array(truth) * level)
-        end = [float(self._details.get(f"end_{channel}", 1)) for channel in "rgb"]
-        if len(set(entry.lights)) == 1 and len(whites) == 2 and len(set(end)) > 1:
-            # One light that falls off with a tint: the second is what is left of the first at the far end.
-            whites[1] = whites[0] * end
         return np.array(whites)
-
-    @cached_property
-    def _falloff(self) -> Falloff | None:
-        """How the image's light falls off without a tint, which is not among its lights; None if it does not."""
-        description = self.generated.dataset.description
-        variation: Any = description.options.get("variation", {})
-        try:
-            record = variation.get("gradient")
-            gradient = None if record is None else described_gradient(record)
-        except (InputError, AttributeError) as error:
-            raise FormatError(
-                f"the data set of {self.name} describes its variation as {variation}: {error}; make it again"
-            ) from error
-        if gradient is None or gradient.colour > 0:
-            return None
-        return gradient.of_image(description.seed, int(self.generated.entry.image.partition(".")[0]))
 
     @property
     def _details(self) -> Mapping[str, str]:
@@ -315,9 +294,6 @@ class NaiveScene:
             light = self.generated.dataset.read_weights(self.generated.entry) @ self.whites
         matrix = None if self.matrix is None else self.matrix.rows
         codes = self.picture.codes(int(self._details.get("crop", 0)))
-        if self._falloff is not None:
-            far = self._falloff.weights(*codes.shape[:2])[..., 1:]
-            light = light * (1 - far * (1 - self._falloff.end[1]))
         return naive_image(codes, light, self.saturation, matrix), None
 
 
@@ -468,6 +444,8 @@ def _trainable(some: SceneSet, test: SceneSet, notes: list[str]) -> tuple[Scene,
 def _with_naive(name: str, made: Sequence[GeneratedScene], pictures: Path | str, notes: list[str]) -> list[TrainingSet]:
     """Return a generated set's images and their naive counterparts, all of the pictures that were found."""
     dataset = made[0].dataset
+    if dataset.description.options.get("variation", {}).get("gradient"):
+        raise InputError(f"{name} was made with a gradient, which naive images have not; leave out --naive")
     found, missing = find_sources(dataset, pictures)
     kept = tuple(scene for scene in made if scene.entry.source in found)
     if not kept:

@@ -96,7 +96,7 @@ def test_a_file_that_is_no_model(tmp_path: Path) -> None:
 
 def test_names_of_estimates(tmp_path: Path) -> None:
     for name in ("a.csv", "b=c.csv"):
-        (tmp_path / name).write_text("one,1,1,1\n")
+        (tmp_path / name).write_text("image,r,g,b\none,1,1,1\n")
     given = [f"{tmp_path}/a.csv", f"My own={tmp_path}/a.csv", f"{tmp_path}/b=c.csv"]
     assert [found.name for found in choose_estimates(given, ["one"])] == ["a", "My own", "b=c"]
 

@@ -127,7 +127,6 @@ def test_what_was_computed_is_kept_where_the_reader_of_the_output_left(tmp_path:
             for option, given, message in (
                 ("--sizes", "12,big", "'big' is no side of an image"),
                 ("--sizes", "1,65535", "nowhere is no table"),
-                ("--hot", "1,1000000", "nowhere is no table"),
             )
         ),
         (("bits", "nowhere.npz", "--out", "taken"), "taken already exists"),

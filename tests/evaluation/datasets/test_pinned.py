@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,6 @@ from evaluation.datasets.identity import first_copies, identities, known_again
 from evaluation.scene import MixedScene, SceneSet
 from foundation.errors import CropError
 from tests.evaluation.datasets.made_up import COPIES, MadeUp
-from tests.evaluation.datasets.published.test_mat5 import PLAIN, nested, refused, written
-from tests.evaluation.shown import compact
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -141,17 +137,3 @@ def test_damaged_texts(name: str, folder_of: Callable[[MadeUp], Path], pinned: P
             found[f"{path.relative_to(folder).as_posix()} {how}"] = data
         path.write_text(whole)
     pinned(f"damaged data set, {name}", found)
-
-
-def test_damaged_matlab_files(pinned: Pinned) -> None:
-    found: list[str] = []
-    for at in range(128, len(PLAIN) - 4, 4):
-        instead = (b"\x05\x00\x01\x00", b"\x0e\x00\x00\x00", b"\x00\x00\x00\x00")[at // 4 % 3]
-        found.append(refused(PLAIN[128:at] + instead + PLAIN[at + 4 :]))
-    pinned("damaged MATLAB files", compact(found))
-    deep = [zlib.compress(nested(depth)) for depth in (19, 20, 21, 22)]
-    found = [refused(struct.pack("<II", 15, len(part)) + part) for part in deep]
-    pinned("nested MATLAB files", [*found, *(refused(nested(depth)) for depth in (19, 20, 21))])
-    packed = written(True)[128:]
-    cut = [refused(packed[:at]) for at in range(0, len(packed), 8)]
-    pinned("compressed MATLAB files that end early", compact(cut))

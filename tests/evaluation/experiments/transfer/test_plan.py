@@ -7,7 +7,6 @@ Source pictures are found by name and hash, wherever they lie, and never mistake
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.datasets.generated import GeneratedMixedScene, GeneratedScene, open_generated
+from evaluation.datasets.generated import GeneratedMixedScene, GeneratedScene
 from evaluation.datasets.thumbnails import Thumbnail
 from evaluation.experiments.transfer.plan import (
     NaiveScene,
@@ -126,7 +125,6 @@ RANDOM_CROP = Preparation(crop=(9, 7), crop_at="random", seed=3)
         ({"preparation": RANDOM_CROP, "seed": 3}, 1),
         # Scenes of another data set are cut where that one cut them.
         ({"preparation": RANDOM_CROP, "seed": 8}, 1),
-        ({"gradient": "soft-edge:width=.5,stops=2,least=2,colour=.4"}, 2),
     ],
 )
 def test_pictures_are_prepared_and_lit_as_they_were(maker: Maker, how: dict[str, Any], away: int) -> None:
@@ -148,27 +146,6 @@ def test_every_crop_has_the_counterpart_of_its_own_place(maker: Maker) -> None:
     assert any(np.abs(image - naive[0]).max() > 500 for image in naive[2:6:2])
 
 
-@pytest.mark.parametrize("lights", ["one", "two"])
-@pytest.mark.parametrize("gradient", ["smooth:stops=3,least=2", "half-plane:angle=20,stops=2,least=2"])
-def test_light_that_falls_off_without_a_tint_does_so_in_the_counterpart(
-    maker: Maker, lights: str, gradient: str
-) -> None:
-    choice = BOTH
-    if lights == "two":
-        choice = SimultaneousLights(BOTH, 2, parse_masks("soft-edge:angle=70,width=.6", 2, 0))
-    preparation = Preparation(crop=(16, 12), crops=2)
-    made = _generated(maker.make(lights=choice, gradient=gradient, preparation=preparation, seed=0).scenes)
-    unlike: list[int] = []
-    for naive, scene in zip(_counterparts(made, maker.pictures), made, strict=True):
-        expected = scene.read()[0].astype(int)
-        np.testing.assert_allclose(naive.read()[0].astype(int), expected, atol=3)
-        weights = scene.dataset.read_weights(scene.entry) if lights == "two" else np.ones((12, 16, 1), np.float32)
-        codes = naive.picture.codes(int(scene.dataset.details[scene.name]["crop"]))
-        even = naive_image(codes, weights @ naive.whites, naive.saturation).astype(int)
-        unlike.append(int(np.abs(even - expected).max()))
-    assert min(unlike) > 500
-
-
 def test_a_counterpart_under_several_lights_has_their_maps(maker: Maker) -> None:
     choice = SimultaneousLights(BOTH, 2, parse_masks("soft-edge:angle=70,width=.6", 2, 0))
     (made, *_) = _generated(maker.make(lights=choice).scenes)
@@ -185,17 +162,10 @@ def test_a_counterpart_under_several_lights_has_their_maps(maker: Maker) -> None
     assert not isinstance(plain, MixedScene)
 
 
-def test_a_gradient_that_is_described_as_none_is_named(maker: Maker) -> None:
-    maker.make(gradient="smooth:stops=2")
-    described = maker.folder / "made" / "dataset.json"
-    record = json.loads(described.read_text())
-    for wrong in ({"gradient": {"masks": "stripes"}}, ["gradient"]):
-        record["options"]["variation"] = wrong
-        described.write_text(json.dumps(record))
-        (made, *_) = _generated(open_generated(maker.folder / "made").scenes)
-        (naive,) = _counterparts([made], maker.pictures)
-        with pytest.raises(FormatError, match=r"describes its variation"):
-            naive.read()
+def test_a_set_under_a_gradient_has_no_counterpart(maker: Maker) -> None:
+    made = maker.make(gradient="smooth:stops=2")
+    with pytest.raises(InputError, match="gradient"):
+        plan_transfer(_real("x"), [made], maker.pictures)
 
 
 def _dataset(maker: Maker) -> Dataset:
