@@ -17,7 +17,10 @@ from evaluation.commands.options import (
     thread_option,
 )
 from evaluation.commands.train import LEARNERS_HELP
-from foundation.console import EXIT_CODES, JsonOutput, option, with_json
+from foundation.compiled import processor_count
+from foundation.console import EXIT_CODES, JsonOutput, option, orderly_end, with_json
+from foundation.errors import counted, first_of
+from foundation.folders import require_free
 
 if TYPE_CHECKING:
     import numpy as np
@@ -68,9 +71,6 @@ def cv(
     from evaluation.results.method_records import describe_method
     from evaluation.results.result import indistinct
     from evaluation.results.tables import summary_table
-    from foundation.compiled import processor_count
-    from foundation.console import orderly_end
-    from foundation.folders import require_free
 
     others, left_out = choose_beside_constant(split_names([method]))
     learners = [ConstantLight(), *others]
@@ -100,7 +100,6 @@ def cv(
 def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
     """Return a sentence where images (N,) int64 by their folds are copies of images of other folds."""
     from evaluation.datasets.identity import first_copies
-    from foundation.errors import counted, first_of
 
     names = [scene.name for scene in data.scenes]
     apart = [

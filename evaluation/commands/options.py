@@ -9,12 +9,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
-from foundation.console import option
+from foundation.console import option, orderly_end, progress
+from foundation.errors import InputError, nearest_names
 
 if TYPE_CHECKING:
     from evaluation.datasets.options import DataOptions
@@ -45,8 +47,6 @@ PrintedError = Annotated[
 @contextmanager
 def image_steps(count: int) -> Generator[Callable[[], None]]:
     """Show how many of `count` images are done, and yield what moves that on by one; Ctrl-C ends the block orderly."""
-    from foundation.console import orderly_end, progress
-
     with orderly_end(), progress("images") as advance:
         steps = itertools.count(1)
         yield lambda: advance(next(steps), count)
@@ -83,10 +83,7 @@ def reading_options(texts: Sequence[str]) -> tuple[str | None, DataOptions]:
     >>> layout, options.given
     ('nus8', ('black', 'partial'))
     """
-    from dataclasses import fields
-
     from evaluation.datasets.options import DataOptions
-    from foundation.errors import InputError, nearest_names
 
     keys = ("layout", *(field.name for field in fields(DataOptions)))
     values: dict[str, Any] = {}
@@ -154,8 +151,6 @@ def choose_learners(texts: Iterable[str]) -> list[Learner]:
 
 def _each_once(texts: Iterable[str]) -> list[str]:
     """Return texts without blanks around them; one that comes twice is refused."""
-    from foundation.errors import InputError
-
     given = [text.strip() for text in texts]
     twice = next((text for number, text in enumerate(given) if text in given[:number]), None)
     if twice is not None:
@@ -192,7 +187,6 @@ def choose_estimates(texts: Sequence[str], images: Sequence[str]) -> list[GivenE
 
 def _method(text: str) -> Method:
     from evaluation.learning.standard import standard_learners
-    from foundation.errors import InputError
 
     if text in standard_learners():
         raise InputError(
@@ -208,7 +202,6 @@ def _method(text: str) -> Method:
 def _learner(text: str) -> Learner:
     from evaluation.learning.standard import standard_learners
     from evaluation.methods.standard import standard_methods
-    from foundation.errors import InputError, nearest_names
 
     known = standard_learners()
     if text in known:

@@ -18,7 +18,10 @@ from evaluation.commands.options import (
     split_names,
     thread_option,
 )
+from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, new_app, option, with_json
+from foundation.errors import FormatError, InputError
+from foundation.folders import require_free
 
 if TYPE_CHECKING:
     from evaluation.experiments.paper.reporting import PaperReport
@@ -101,7 +104,6 @@ def table1(
     from evaluation.experiments.paper.reporting import table1_report
     from evaluation.experiments.paper.table1 import settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
-    from foundation.compiled import processor_count
 
     sides = _sides(sizes)
     _require_free(out)
@@ -164,7 +166,6 @@ def table2(
     from evaluation.experiments.paper.table1 import table2 as run
     from evaluation.experiments.paper.table1 import table2_tables
     from evaluation.experiments.transfer.plan import trainable_images
-    from foundation.compiled import processor_count
 
     _require_free(out)
     learners = {getattr(each, "key", each.name): each for each in choose_learners(split_names([method]))}
@@ -212,7 +213,6 @@ def bits(
     """Run methods on images whose colours were reduced."""
     from evaluation.experiments.paper.colour_reduction import bits_methods, bits_removed
     from evaluation.experiments.paper.reporting import bits_report
-    from foundation.compiled import processor_count
 
     _require_free(out)
     opened = open_data(data, read)
@@ -311,7 +311,6 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
     from evaluation.experiments.paper.material import developed
-    from foundation.errors import FormatError, InputError
     from generator import find_pictures
     from generator.rendering.matrices import choose_matrix
 
@@ -334,8 +333,6 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
 
 def _sides(text: str) -> list[int]:
     """Return the sides of images between commas, px."""
-    from foundation.errors import InputError
-
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts:
         if not part.isdigit() or not 1 <= int(part) <= 65535:
@@ -345,7 +342,5 @@ def _sides(text: str) -> list[int]:
 
 def _require_free(out: Path | None) -> None:
     """Refuse a folder that is taken before the work begins."""
-    from foundation.folders import require_free
-
     if out is not None:
         require_free(out, "the report")

@@ -16,7 +16,9 @@ from evaluation.commands.options import (
     split_names,
     thread_option,
 )
+from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, option, with_json
+from foundation.folders import require_free
 
 HELP = f"""Estimate the light of every image of a data set and sum up the errors.
 
@@ -61,8 +63,6 @@ def run(
     from evaluation.experiments.run_folder import run_methods, write_run
     from evaluation.reports.table_output import print_table, show_notes
     from evaluation.results.tables import lights_tables, statistics_rows, summary_table
-    from foundation.compiled import processor_count
-    from foundation.folders import require_free
 
     names = split_names(method or ["standard"])
     files = [name for name in names if name.endswith(".csv")]

@@ -14,7 +14,11 @@ from evaluation.commands.options import (
     open_data,
     thread_option,
 )
+from foundation.clock import SystemClock
+from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, option, with_json
+from foundation.errors import InputError
+from foundation.folders import require_free_file
 
 LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, kernel-ridge, convnet or constant-light"
 """The suite's own, for the help of commands."""
@@ -52,10 +56,6 @@ def train(
     from evaluation.learning.feature_learner import FeatureLearner, extract, fit_extracted, require_installed, truths_of
     from evaluation.learning.model_files import load_model, provenance_of, save_model
     from evaluation.reports.table_output import show_notes
-    from foundation.clock import SystemClock
-    from foundation.compiled import processor_count
-    from foundation.errors import InputError
-    from foundation.folders import require_free_file
 
     learners = choose_learners([method])
     if len(learners) != 1:

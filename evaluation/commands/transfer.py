@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +20,10 @@ from evaluation.commands.options import (
     split_names,
     thread_option,
 )
+from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, option, with_json
+from foundation.errors import InputError
+from foundation.folders import require_free
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -79,8 +83,6 @@ def transfer(
     output: JsonOutput,
 ) -> None:
     """Train on generated data, test on real data."""
-    from dataclasses import replace
-
     from evaluation.datasets import open_scenes
     from evaluation.experiments.folds import choose_folds, groups_of
     from evaluation.experiments.transfer.outcome import TransferOutcome, figures_of, harm_notes, save_outcome
@@ -89,8 +91,6 @@ def transfer(
     from evaluation.experiments.transfer.rows import transfer as run_transfer
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
-    from foundation.compiled import processor_count
-    from foundation.folders import require_free
 
     if out is not None:
         require_free(out, "the results")
@@ -138,7 +138,6 @@ def transfer(
 def _learners(names: Sequence[str]) -> tuple[list[AnyLearner], list[str]]:
     """Return the learned methods of a list and the constant light, and why some of `all` are left out."""
     from evaluation.learning.constant_light import ConstantLight
-    from foundation.errors import InputError
 
     chosen, left_out = choose_beside_constant(names)
     titles = [each.name for each in chosen]
@@ -150,8 +149,6 @@ def _learners(names: Sequence[str]) -> tuple[list[AnyLearner], list[str]]:
 
 def _counts(real: str | None) -> tuple[int | None, ...]:
     """Return the numbers of --real; None for all, without 0: of no real images there are rows in any case."""
-    from foundation.errors import InputError
-
     words = [] if real is None else [word.strip().lower() for word in real.split(",")]
     if not all(word == "all" or (word.isascii() and word.isdigit()) for word in words):
         raise InputError(f"--real is {real!r}, expected numbers of real images between commas, or all: 0,20,100,all")
@@ -182,8 +179,6 @@ def _not_adapted(learners: Sequence[AnyLearner], counts: Sequence[int | None]) -
 
 def _suspicions(test: SceneSet, rows: Sequence[TransferRow]) -> tuple[str, ...]:
     """Return a sentence for each row whose training images have their channels in another order than the test's."""
-    from dataclasses import replace
-
     import numpy as np
 
     from evaluation.experiments.suspicions import suspicions

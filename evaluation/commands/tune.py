@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from evaluation.commands.options import AngularError, Data, Read, image_steps, open_data, thread_option
+from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"
@@ -42,7 +43,6 @@ def tune(
     """Choose a method's parameters on a data set."""
     from evaluation.experiments.cross_validation import settings_of, tune_family, tuning_table
     from evaluation.reports.table_output import show_notes, show_tables
-    from foundation.compiled import processor_count
 
     settings_of(family)  # A family that is none is told before a data set is opened.
     found = open_data(data, read)

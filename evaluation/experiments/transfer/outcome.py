@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.datasets.generated import GeneratedScene
 from evaluation.experiments.bootstrap import (
     LEVEL,
     STATISTICS,
@@ -480,8 +481,6 @@ def _provenance(outcome: TransferOutcome) -> dict[str, Any]:
 
 
 def _described(data: SceneSet) -> dict[str, Any]:
-    from evaluation.datasets.generated import GeneratedScene
-
     first = data.scenes[0]
     described: dict[str, Any] = {
         "name": data.name,
