@@ -223,11 +223,10 @@ def table1_report(
     conditions: Sequence[str],
     kind: ErrorKind,
     sizes: Sequence[SizeRow] = (),
-    hot: Table | None = None,
 ) -> PaperReport:
     """Return the report of table 1, first with one kind of error, then with the other.
 
-    `sizes`: the errors for other sizes of images; may be empty. `hot`: White-Patch's errors with hot photosites.
+    `sizes`: the errors for other sizes of images; may be empty.
     """
     other: ErrorKind = "recovery" if kind == "reproduction" else "reproduction"
     first, second = ([block_table(block, one) for block in blocks] for one in (kind, other))
@@ -254,10 +253,6 @@ def table1_report(
             "White-Patch takes the largest of all values, of which a larger image has more: of noise, and of whites."
         )
         parts += [pages.heading("Images of other sizes"), pages.figure(drawn, caption), table_part(table)]
-    if hot is not None:
-        tables.append(hot)
-        files |= _table_files("hot", hot)
-        parts += [pages.heading("Hot photosites"), table_part(hot)]
     parts += [pages.heading("The tables"), table_part(noise), table_part(prints)]
     parts += [pages.heading(f"{other.capitalize()} error, degrees"), *map(table_part, second)]
     return PaperReport("Table 1: plain methods on generated data sets", tuple(tables), tuple(parts), files)

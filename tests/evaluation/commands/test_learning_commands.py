@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 
 from evaluation.cli import main
-from evaluation.learning.kernel_ridge import KernelRidge
 from evaluation.learning.model_files import load_model
 from tests.evaluation.learning.made_up_world import world
 
@@ -62,17 +60,6 @@ def test_a_model_is_adapted(data: Path, tmp_path: Path, capsys: pytest.CaptureFi
     # What either of both trainings has seen is no test.
     assert main(["run", str(data), "--method", str(after)]) == 0
     assert ": 12 of 12 images were trained on" in " ".join(capsys.readouterr().out.split())
-    # A file from before the weighting by brightness is adapted with its own settings.
-    with np.load(before) as content:
-        old: dict[str, Any] = {name: content[name] for name in content.files}
-    about = json.loads(str(old["about"]))
-    del about["settings"]["brightness"]
-    old["about"] = np.array(json.dumps(about))
-    np.savez(tmp_path / "old.npz", **old)
-    words = ["train", "kernel-ridge", str(tmp_path / "few.npz"), "--adapt", str(tmp_path / "old.npz")]
-    assert main([*words, "--out", str(tmp_path / "new.npz")]) == 0
-    assert load_model(tmp_path / "new.npz").learner == KernelRidge(brightness=0.0)
-    capsys.readouterr()
     assert main(["train", "smart-color-cat", str(data), "--adapt", str(before), "--out", str(tmp_path / "no.npz")]) == 2
     assert "is of kernel-ridge, smart-color-cat was asked for" in " ".join(capsys.readouterr().err.split())
 
@@ -114,8 +101,6 @@ def test_all_leaves_out_what_is_not_installed_and_says_why(
     [
         (["cv", "smart-color-cat", "DATA", "--folds", "none.csv"], "none.csv"),
         (["train", "all", "DATA", "--out", "x.npz"], "a model file holds one"),
-        (["run", "DATA", "--model", "m.npz"], "evaluate run DATA --method m.npz"),
-        (["DATA", "--model=m.npz"], "evaluate run DATA --method m.npz"),
         (["train", "smart-color-cat", "DATA", "--out", "model.txt"], "ends in .npz"),
     ],
 )

@@ -157,15 +157,15 @@ def test_what_looks_like_two_must_be_named(place_of: Place, tmp_path: Path) -> N
     copy = tmp_path / "copy"
     shutil.copytree(place_of("nus8 camera"), copy)
     (copy / "cube+_gt.txt").write_text("1 1 1\n")
-    with pytest.raises(InputError, match=r"nus8.*--layout"):
+    with pytest.raises(InputError, match=r"nus8.*--read layout"):
         open_scenes(copy)
     assert open_scenes(copy, "nus8").layout == "nus8"
 
 
 def test_an_option_without_a_meaning_is_refused(place_of: Place, dataset: Path) -> None:
-    with pytest.raises(InputError, match=r"--camera.*Cube\+.*nus8, gehler-shi"):
+    with pytest.raises(InputError, match=r"--read camera.*Cube\+.*nus8, gehler-shi"):
         open_scenes(place_of("cube-plus"), options=DataOptions(camera="SonyA57"))
-    with pytest.raises(InputError, match="--black"):
+    with pytest.raises(InputError, match="--read black"):
         open_scenes(dataset, options=DataOptions(black=3))
 
 
