@@ -43,7 +43,7 @@ QUESTIONS: Final[dict[Group, str]] = {
 }
 
 Drawing = Literal[
-    "chart", "lights", "budget", "errors", "noise", "residuals", "worst", "field", "print", "course", "cells", "rest"
+    "chart", "lights", "budget", "errors", "noise", "residuals", "worst", "field", "course"
 ]  # fmt: skip
 """Names of the report's pictures (`calibration.report.report`)."""
 

@@ -92,7 +92,7 @@ UNFIT_SHARE = Figure(
     why="colours without samples are missing from every picture", source=JUDGEMENT, remedy="",
     found=_most_unfit, measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1),
     forecast=_unfit_in_check, of_one_frame="bounded",
-    cause=Explanation("unfit cells", unfit_evidence, follows=("block_deviation",)), drawing="print",
+    cause=Explanation("unfit cells", unfit_evidence, follows=("block_deviation",)), drawing="errors",
     lines=(Line(290, _unfit_row),),
 )  # fmt: skip
 
@@ -119,7 +119,7 @@ DOUBTFUL_SHARE = Figure(
     remedy="clean the print, hang it flatter, and look for shadows on it",
     measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.known else None,
     forecast=_doubtful_in_check, of_one_frame="known", worst=_most_deviating,
-    cause=Explanation("spot", spot_evidence), drawing="print",
+    cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
 
 
@@ -135,7 +135,7 @@ ADDED_LIGHT = Figure(
     "of a thirtieth 30 %; a reflection of 3 % leaves a table with cells 57 % off",
     remedy="turn print or projector until nothing is mirrored on it, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
-    forecast=_added_in_check, of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="print",
+    forecast=_added_in_check, of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
 
 

@@ -74,7 +74,7 @@ NOISY_SHARE = Figure(
     why="they are not of one colour: dirt, a fold, a neighbour's edge", source="a variance 3.5 times the model's",
     remedy="clean the print, focus, and hang it flatter",
     measure=lambda table: float(table.sensor.transfer.noisy.mean()), of_one_frame="known", worst=_noisiest,
-    cause=Explanation("noisy cells", noisy_evidence), drawing="cells", lines=(Line(180, _transfer_row),),
+    cause=Explanation("noisy cells", noisy_evidence), drawing="noise", lines=(Line(180, _transfer_row),),
 )  # fmt: skip
 
 
@@ -117,7 +117,7 @@ REFERENCE_SPREAD = Figure(
     remedy="clean or flatten the print, and look for shadows on it",
     measure=lambda table: max(map(_spread_of, table.white_frames), default=None),
     forecast=lambda check: None if check.paper is None else _spread(check.paper), of_one_frame="bounded",
-    worst=_most_spread, cause=Explanation("references", reference_evidence), drawing="rest",
+    worst=_most_spread, cause=Explanation("references", reference_evidence), drawing="field",
 )  # fmt: skip
 
 

@@ -25,7 +25,6 @@ from calibration.figures.light import ADDITIVITY, LINEARITY
 from calibration.figures.truth import TRUTH_WORST_DEG
 from calibration.measurements import TableMeasurements
 from calibration.report.plots import (
-    WORST_CELLS,
     LabelledPlace,
     cell_noise,
     draw_budget,
@@ -35,13 +34,9 @@ from calibration.report.plots import (
     draw_field,
     draw_noise,
     draw_places,
-    draw_print,
-    draw_reference_residuals,
     draw_registration,
     draw_residuals,
-    draw_worst_cells,
     half_size,
-    reference_residuals,
 )
 from calibration.sampling import largest_window
 from calibration.table.lut import REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION
@@ -61,7 +56,6 @@ from calibration.verdict import (
 )
 from drivers.raw.rawfile import read_raw
 from experiment.chart.model import Chart
-from experiment.measures.stains import Stains
 from experiment.session.folder import Session
 from foundation.errors import counted, first_of
 from foundation.files import write_whole
@@ -274,7 +268,6 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "light",
             "field",
         ),
-        *_print_picture(chart, table.cells.stains),
         _Picture(
             "The course of the session",
             "Black level, movement and blur of the chart, bare paper under white, how far cells are off their codes' "
@@ -284,15 +277,6 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "radiometry",
             "course",
         ),
-        _Picture(
-            "The worst cells",
-            f"The {WORST_CELLS} cells whose rim and middle differ most under white, in standard deviations, each "
-            "between its neighbours; the frame is the samples.",
-            png_of(draw_worst_cells, frame, chart, registration, table.cells.window),
-            "noise",
-            "cells",
-        ),
-        *_residual_picture(chart, table, frame),
         _Picture(
             "What the ground truth may be off by",
             f"Left: the expanded uncertainty (k = {COVERAGE:g}) of each light's direction, shared out among its causes "
@@ -384,33 +368,6 @@ def _place_pictures(result: BuildResult, session: Session) -> list[_Picture]:
         )
         pictures.append(_Picture(f"Where it is: {Path(file).stem}", caption, drawn))
     return pictures
-
-
-def _residual_picture(chart: Chart, table: TableMeasurements, picture: npt.NDArray[np.float32]) -> list[_Picture]:
-    """Return the picture of what the field leaves of the references, none where there are none."""
-    places_mm = np.array([reference.centre_mm for reference in chart.white_references], dtype=np.float64).reshape(-1, 2)
-    residual = reference_residuals(picture, places_mm, table.registration, table.registered_frame)
-    if not np.isfinite(residual).any():
-        return []
-    caption = (
-        "White references about the field, in the frame that was registered. Left, on the print: noise has no order, "
-        "what lies or shines on the print is one place. Right, by the distance from the middle: a bend at its end is "
-        "fall-off that the field does not follow."
-    )
-    drawn = png_of(draw_reference_residuals, chart, places_mm, residual)
-    return [_Picture("What the field leaves", caption, drawn, "truth", "rest")]
-
-
-def _print_picture(chart: Chart, stains: Stains) -> list[_Picture]:
-    """Return the picture of the print, or none where nothing is known of it: a clean sheet would be a claim."""
-    if not stains.known:
-        return []
-    caption = (
-        "How far cells and their surroundings deviate from their codes' colours elsewhere on the sheet, in the channel "
-        "that deviates most. Noise is a fine grain of some tenths of a per cent; stains, folds and shadows have a "
-        "shape. Crosses are cells listed for it."
-    )
-    return [_Picture("The print", caption, png_of(draw_print, chart, stains), "radiometry", "print")]
 
 
 MOST_UNFIT = 200
@@ -556,5 +513,5 @@ def _cause(found: ProbableCause) -> dict[str, Any]:
         "rule": found.decision.rule,
         "command": retake_command(found.frames) if found.is_of_frames else "",
         "places": places_text(found),
-        "evidence": found.evidence.in_words(),
+        "evidence": ", ".join(f"{name} {value:.3g}" for name, value in found.evidence.known().items()),
     }

@@ -27,7 +27,7 @@ from experiment.session.records import SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError
 from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
-from tests.calibration.whole import LIMITS, reported, told, whole, words_of, written
+from tests.calibration.whole import LIMITS, reported, told, whole, written
 from tests.json_of import json_of
 from tests.pinned import Pinned
 
@@ -225,7 +225,7 @@ def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Pat
 def test_the_report_stands_alone(built: BuildResult) -> None:
     assert built.lut is not None
     page = (built.lut / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 12
+    assert page.count("data:image/png;base64,") == 9
     # Verdict, what to do, and the four pictures to look at first stand before everything that is folded.
     heads = re.findall(r"<h2>([^<]+)</h2>", page[: page.index("<details")])
     assert [head for head in heads if head not in ("Probable causes",) and not head.startswith("Where it is")] == [
@@ -276,7 +276,7 @@ def test_the_whole_table_is_what_it_was(built: BuildResult, session: Session, pi
     pinned("table of 13 lights, measured", whole(built), **LIMITS)
     pinned("table of 13 lights, files", written(built.lut), **LIMITS)
     worst = {name: [one.where, one.light] for name, one in worst_of_figures(built.figures, session.chart).items()}
-    pinned("table of 13 lights, report", [reported(built), worst, words_of(built.lut)], **LIMITS)
+    pinned("table of 13 lights, report", [reported(built), worst], **LIMITS)
 
 
 def test_a_check_measures_what_it_did_and_writes_nothing(session: Session, pinned: Pinned) -> None:

@@ -20,7 +20,6 @@ from calibration.report.plots import (
     draw_chromaticities,
     draw_places,
     half_size,
-    reference_residuals,
     viewable,
 )
 from drivers.raw.rawfile import Mosaic
@@ -175,21 +174,3 @@ def test_places_are_circled_and_those_of_one_circle_share_its_numbers() -> None:
               ("one", PrintPlace("a", 60.0, 40.0, 0.0)), ("three", PrintPlace("a", 1.0, 40.0, 20.0))]  # fmt: skip
     axes, _ = drawn(draw_places, FRAME, CHART, registered(), places).axes
     assert [text.get_text() for text in axes.texts] == ["1, 2", "1", "3"]
-
-
-def test_what_the_field_leaves_is_the_mean_about_a_reference_over_field_and_white() -> None:
-    places = np.array([[30.0, 40.0], [60.0, 20.0], [-3.0, 10.0], [110.5, 50.0], [111.4, 50.0], [-2.5, -1.0]])
-    picture = np.full((160, 230, 3), 50.0, np.float32)
-    for place, level in zip(places[:2], (880.0, 1210.0), strict=True):
-        x, y = seen(place).astype(int)
-        picture[y - 2 : y + 3, x - 2 : x + 3, 1] = level
-
-    def at(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        return np.full((len(points), 3), [9.0, 1.1, 9.0])
-
-    paper = SimpleNamespace(white=np.array([10.0, 1000.0, 20.0]), field=SimpleNamespace(at=at))
-    frame: Any = SimpleNamespace(paper=paper)
-    left = reference_residuals(picture, places, registered(), frame)
-    assert left[:2] == pytest.approx((880 / 1100 - 1, 1210 / 1100 - 1), abs=1e-6)
-    # Two pixels beside the frame's edge are the least that is averaged.
-    assert np.isfinite(left).tolist() == [True, True, False, False, False, True]
