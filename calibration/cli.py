@@ -295,15 +295,14 @@ def compare(
     from calibration.comparison.comparing import chart_of, table_of
     from calibration.comparison.comparing import compare as compare_tables
     from calibration.comparison.report import comparison_json, lines, write_comparison
-    from calibration.pipeline.frames import PAPER_OPTIONS
 
     if out is not None:
         require_free(out, "the comparison")
     places = table_folder(one), table_folder(other)
     with (
         progress("reading") as shown,
-        table_of(places[0], PAPER_OPTIONS, shown) as a,
-        table_of(places[1], PAPER_OPTIONS, shown) as b,
+        table_of(places[0], shown) as a,
+        table_of(places[1], shown) as b,
     ):
         found = compare_tables(a, b, shown, places)
     if output.asked:

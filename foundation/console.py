@@ -554,7 +554,7 @@ class MainCommand(StyledCommand):
         place = next((place for place, word in enumerate(words) if not is_common(word)), len(words))
         name = words[place] if place < len(words) else ""
         if name in self.commands:
-            named = self.context_settings | more
+            named = {**self.context_settings, **more}
             return self.commands[name].main([*words[:place], *words[place + 1 :]], f"{prog_name} {name}", **named)
         if name.removeprefix("--") in self.commands:
             raise InputError(f"{name} is a command, not an option: {prog_name} {name[2:]}; see its --help")

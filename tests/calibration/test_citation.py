@@ -110,7 +110,7 @@ def test_lab_toml_states_the_citation() -> None:
     assert parse_lab(found.to_toml(), "session.toml").citation == found.citation
     with pytest.raises(ConfigurationError, match=r"citation\.licence"):
         parse_lab(head + 'licence = "public domain"\n', "LAB.toml")
-    with pytest.raises(ConfigurationError, match="did you mean 'licence'"):
+    with pytest.raises(ConfigurationError):
         parse_lab(head + 'license = "MIT"\n', "LAB.toml")
 
 

@@ -8,6 +8,7 @@ import io
 import logging
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -513,3 +514,14 @@ def test_a_job_is_done_though_the_reader_of_its_output_left(tmp_path: Path, unbu
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (0, b"")
     assert (tmp_path / "done").exists()
+
+
+@pytest.mark.slow
+def test_no_color_is_obeyed() -> None:
+    """https://no-color.org: any value that is not empty; colours there are without it."""
+    wish = [sys.executable, "-m", "acquisition.cli", "--help"]
+    for more, coloured in (({}, True), ({"NO_COLOR": "1"}, False)):
+        settings = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "TERM")}
+        settings |= {"FORCE_COLOR": "1", "TERM": "xterm-256color", **more}
+        shown = subprocess.run(wish, env=settings, capture_output=True, text=True, check=True).stdout
+        assert bool(re.search(r"\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|10[0-7])(?:;\d+)*m", shown)) == coloured

@@ -97,7 +97,7 @@ def test_what_cells_of_two_tables_differ_by_is_drawn_in_the_channel_that_differs
     mean[7] = np.nan
     offset = np.array([0.001, -0.002, 0.0])
     count = np.ones((len(CELLS), 3), dtype=np.int64)
-    cells = CellDifferences(count, mean, none, none, none, count, none, (), (), 1.0, 0.0, 0.0, offset)
+    cells = CellDifferences(count, mean, none, offset, 0.0, 0.0, 1.0)
     (squares,) = drawn(draw_map, CHART, cells).axes[0].collections
     left = mean - offset
     largest = [row[np.abs(row).argmax()] if np.isfinite(row).all() else 0.0 for row in left]
