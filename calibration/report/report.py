@@ -8,7 +8,7 @@ each with its pictures, by the names that figures give of them (`Figure.drawing`
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,8 @@ from calibration.budget import COVERAGE
 from calibration.checks.light_codes import CodeAgreement
 from calibration.citation import origin_lines
 from calibration.figures.all_figures import BY_NAME, FIGURES
-from calibration.figures.figure import QUESTIONS, Drawing, Group, Outcome, SummaryRow, Worst
+from calibration.figures.figure import QUESTIONS, Drawing, Group, Outcome, SummaryRow
 from calibration.figures.light import ADDITIVITY, LINEARITY
-from calibration.figures.truth import TRUTH_WORST_DEG
 from calibration.measurements import TableMeasurements
 from calibration.report.plots import (
     LabelledPlace,
@@ -49,13 +48,13 @@ from calibration.verdict import (
     findings,
     is_mended_by_retaking,
     judged_values,
+    place_of,
     places_text,
     retake_command,
     retake_json,
     retaken_frames,
 )
 from drivers.raw.rawfile import read_raw
-from experiment.chart.model import Chart
 from experiment.session.folder import Session
 from foundation.errors import counted, first_of
 from foundation.files import write_whole
@@ -222,23 +221,12 @@ MOST_FRAMES = 4
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
     """Write `report.html` and `report.json` into a table's folder; costs some seconds."""
-    worsts = worst_of_figures(result.figures, session.chart)
-    pictures = _pictures(result, session, worsts)
-    write_whole(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session), worsts))
+    pictures = _pictures(result, session)
+    write_whole(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session)))
     write_whole(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
 
 
-def worst_of_figures(table: TableMeasurements, chart: Chart) -> dict[str, Worst]:
-    """Return where the worst of each figure is that has one, by name.
-
-    A number that says "worst" is of little use to whoever cannot look at it. Places are drawn on the frame that was
-    registered, frames are ringed in the course of the session, lights among the lights.
-    """
-    found = ((figure.name, figure.worst(table, chart)) for figure in FIGURES if figure.worst is not None)
-    return {name: worst for name, worst in found if worst is not None}
-
-
-def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]) -> list[_Picture]:
+def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
     """Return the pictures: first chart, lights, errors and noise, then those of the groups."""
     table = result.figures
     chart, registration = session.chart, table.registration
@@ -250,7 +238,7 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "that makes of each cell by its colour is divided out too."
         )
     return [
-        *_first_pictures(result, session, frame, worsts),
+        *_first_pictures(result, session, frame),
         _Picture(
             "Residuals of the registration",
             "Left: how far the cells moved the map from what the tags and the lens alone give, which is the paper's "
@@ -259,7 +247,6 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "geometry",
             "residuals",
         ),
-        *_worst_pictures(chart, table, frame, worsts),
         _Picture(
             "The light on the print",
             "Shape of the light under the frame that was registered, from its white references; it is divided out of "
@@ -289,16 +276,15 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
     ]
 
 
-def _first_pictures(
-    result: BuildResult, session: Session, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
-) -> list[_Picture]:
+def _first_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np.float32]) -> list[_Picture]:
     """Return what a scientist looks at first: chart, lights, errors, noise."""
     table, chart = result.figures, session.chart
     registration, window = table.registration, table.cells.window
     codes = np.array([light.colour for light in session.illuminations])
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
     seen = f"seen by the {table.session.camera}"
-    truth = worsts[TRUTH_WORST_DEG.name].light if TRUTH_WORST_DEG.name in worsts else None
+    expanded = table.budget.expanded_deg
+    truth = int(np.argmax(expanded)) if len(expanded) > 1 else None
     ringed = "" if truth is None else f" Ringed is light {truth}, whose ground truth is known worst."
     return [
         _Picture(
@@ -330,25 +316,6 @@ def _first_pictures(
             name="noise",
         ),
     ]
-
-
-def _worst_pictures(
-    chart: Chart, table: TableMeasurements, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
-) -> list[_Picture]:
-    """Return the picture of the places where figures are worst."""
-    places = [
-        (f"{BY_NAME[name].title}: {worst.what}", worst.place)
-        for name, worst in worsts.items()
-        if worst.place is not None
-    ]
-    if not places:
-        return []
-    caption = (
-        "The place of the worst of each figure that has one, on the frame that was registered, whether or not it is "
-        "beyond a limit. Worst frames are ringed in the course of the session, the worst light among the lights."
-    )
-    drawn = png_of(draw_places, frame, chart, table.registration, places)
-    return [_Picture("Where the worst is", caption, drawn, "geometry", "worst")]
 
 
 def _place_pictures(result: BuildResult, session: Session) -> list[_Picture]:
@@ -395,29 +362,31 @@ class _Picture:
 
 @dataclass(frozen=True)
 class _Row:
-    """A judged value with what helps and where its worst is, as far as these are to be said."""
+    """A judged value; beyond its limit with what helps, and where it is."""
 
     judged: JudgedValue
     remedy: str
-    worst: str
+    place: str
 
 
 def page(
     result: BuildResult,
     pictures: Sequence[_Picture],
     places: Sequence[_Picture] = (),
-    worsts: Mapping[str, Worst] | None = None,
 ) -> str:
     """Return the text of `report.html`: verdict, what to do, what to look at first, then all figures in groups.
 
-    `places` are pictures of what is beyond a limit, `worsts` where the worst of figures is, by name.
+    `places` are pictures of what is beyond a limit.
     """
     table, verdict = result.figures, result.verdict
     found, beyond = findings(verdict, table), len(verdict.refused) + len(verdict.remarks)
     rows = [
-        _Row(row, _remedy(row, found.get(row.figure.name), table), "" if worst is None else worst.where)
+        _Row(
+            row,
+            _remedy(row, found.get(row.figure.name), table),
+            "" if row.outcome == "accept" else place_of(row.figure, table),
+        )
         for row in sorted(verdict.rows, key=lambda row: _ORDER.index(row.outcome))
-        for worst in [(worsts or {}).get(row.figure.name)]
     ]
     simulated = ", taken in the simulated laboratory" if table.origin.rig == "simulated" else ""
     return render(

@@ -15,7 +15,7 @@ from calibration.citation import exposure_text
 from calibration.cli import main
 from calibration.figures.figure import QUESTIONS
 from calibration.pipeline.build import build, check
-from calibration.report.report import summary, worst_of_figures
+from calibration.report.report import summary
 from calibration.table.lut import Lut, open_lut
 from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
@@ -225,7 +225,7 @@ def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Pat
 def test_the_report_stands_alone(built: BuildResult) -> None:
     assert built.lut is not None
     page = (built.lut / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 9
+    assert page.count("data:image/png;base64,") == 8
     # Verdict, what to do, and the four pictures to look at first stand before everything that is folded.
     heads = re.findall(r"<h2>([^<]+)</h2>", page[: page.index("<details")])
     assert [head for head in heads if head not in ("Probable causes",) and not head.startswith("Where it is")] == [
@@ -275,8 +275,7 @@ def test_the_whole_table_is_what_it_was(built: BuildResult, session: Session, pi
     assert built.lut is not None
     pinned("table of 13 lights, measured", whole(built), **LIMITS)
     pinned("table of 13 lights, files", written(built.lut), **LIMITS)
-    worst = {name: [one.where, one.light] for name, one in worst_of_figures(built.figures, session.chart).items()}
-    pinned("table of 13 lights, report", [reported(built), worst], **LIMITS)
+    pinned("table of 13 lights, report", [reported(built)], **LIMITS)
 
 
 def test_a_check_measures_what_it_did_and_writes_nothing(session: Session, pinned: Pinned) -> None:
