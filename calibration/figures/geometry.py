@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.causes.gathering import PrintPlace, chart_evidence
+from calibration.causes.gathering import chart_evidence
 from calibration.figures.figure import (
     JUDGEMENT,
     SIMULATED,
@@ -14,7 +14,6 @@ from calibration.figures.figure import (
     Figure,
     Line,
     SummaryRow,
-    Worst,
 )
 from calibration.registration.register import (
     MAX_BLOCK_RESIDUAL_PX,
@@ -97,13 +96,6 @@ def _bleed(table: TableMeasurements) -> float:
     return bleed(registration.cell_px, registration.blur_px, window) + table.lens.uncorrected_in_worst
 
 
-def _smallest_cell(table: TableMeasurements, chart: Chart) -> Worst:
-    file, sides = table.session.registered_file, cell_sides_px(table.registration.to_pixels, chart)
-    smallest = int(np.argmin(sides))
-    x, y = chart.centres_mm[smallest].tolist()
-    return Worst(f"smallest cell, {sides[smallest]:.1f} px", file, place=PrintPlace(file, x, y, 0.0))
-
-
 def _window_row(table: TableMeasurements) -> SummaryRow:
     """Return what windows the cells allow."""
     registration, window = table.registration, table.cells.window
@@ -124,7 +116,7 @@ BLEED = Figure(
     "0.6 % at 8.6 px; of a cell's mean a thirtieth as much, which is in its uncertainty",
     remedy="focus on the print, stop down to f/8, bring the camera nearer, or take a smaller window "
     "(build-lut --window)",
-    measure=_bleed, before_session=True, of_one_frame="known", worst=_smallest_cell, drawing="chart",
+    measure=_bleed, before_session=True, of_one_frame="known", drawing="chart",
     lines=(
         Line(50, _window_row),
         Line(60, lambda table: SummaryRow("Blur", f"σ {table.registration.blur_px:.2f} px", "about 0.6 is sharp")),
@@ -227,17 +219,6 @@ TAG_FINAL_PX = Figure(
 )  # fmt: skip
 
 
-def _worst_block(table: TableMeasurements, chart: Chart) -> Worst | None:
-    blocks, file = table.registration.blocks, table.session.registered_file
-    good = np.flatnonzero(blocks.good)
-    if not len(good):
-        return None
-    length = np.linalg.norm(blocks.residual_px[good], axis=1)
-    x, y = blocks.centres_mm[good[int(np.argmax(length))]].tolist()
-    place = PrintPlace(file, x, y, 8 * float(max(chart.cell_mm)))
-    return Worst(f"largest of a block, {length.max():.3f} px", file, place=place)
-
-
 def _blocks_row(table: TableMeasurements) -> SummaryRow:
     value, note = f"{table.registration.block_rms_px:.3f} px RMS", "displacement of blocks of cells that the final map"
     return SummaryRow("Residual of cell blocks", value, f"{note} leaves", brief=True)
@@ -248,7 +229,7 @@ BLOCK_RESIDUAL_PX = Figure(
     why="cells are sampled beside their centres; the limits are for cells of 10 px and rise with their size",
     source=SIMULATED + ": 0.01 to 0.06", remedy=_FLATTEN,
     measure=lambda table: table.registration.block_rms_px / table.registration.clearance, before_session=True,
-    of_one_frame="known", worst=_worst_block, drawing="residuals", lines=(Line(100, _blocks_row),),
+    of_one_frame="known", drawing="residuals", lines=(Line(100, _blocks_row),),
 )  # fmt: skip
 
 BLOCKS_GOOD = Figure(

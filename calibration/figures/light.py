@@ -26,7 +26,6 @@ from calibration.figures.figure import (
     Figure,
     Line,
     SummaryRow,
-    Worst,
     format_value,
 )
 from calibration.radiometry.superposition import NODES
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
 
     from calibration.checks.light_codes import CodeAgreement
     from calibration.measurements import FrameMeasurements, TableMeasurements
-    from experiment.chart.model import Chart
     from experiment.session.records import FrameRecord
 
 _PAIRS = 4
@@ -55,12 +53,6 @@ def percent(value: float) -> str:
 def percents(values: npt.NDArray[np.floating]) -> str:
     """Return shares of R, G and B, (3,) float64, for the summary."""
     return " / ".join(f"{100 * value:.2f}" for value in values.tolist()) + " %"
-
-
-def worst_light(table: TableMeasurements, light: int, what: str) -> Worst:
-    """Return a light as where the worst of a figure is, with its frame."""
-    record = next((frame.record for frame in table.frames if frame.record.illumination == light), None)
-    return Worst(what, "" if record is None else record.file, light)
 
 
 def _are_alike(table: TableMeasurements) -> bool:
@@ -372,13 +364,6 @@ def _off_codes(table: TableMeasurements) -> float | None:
     return None if off is None else float(off.max())
 
 
-def _furthest_off(table: TableMeasurements, chart: Chart) -> Worst | None:
-    off = table.lights.off_codes_deg
-    if off is None or not off.any():
-        return None
-    return worst_light(table, int(np.argmax(off)), f"{off.max():.2g}° off")
-
-
 def _light_name(index: int, count: int) -> str:
     return f"light {index}" if index < count else f"white frame {index - count}"
 
@@ -421,18 +406,9 @@ OFF_CODES_DEG = Figure(
     "of two lights the angle between them",
     remedy="correct the list of frames that was imported, let the picture settle for longer (sequence.settle_s), or "
     "expose whole turns of the colour wheel",
-    foremost=True,
-    measure=_off_codes, before_session=True, worst=_furthest_off, where=_off_lights, retake=_frames_off_codes,
+    foremost=True, measure=_off_codes, before_session=True, where=_off_lights, retake=_frames_off_codes,
     cause=Explanation("names", name_evidence), drawing="lights", lines=(Line(220, _codes_row),),
 )  # fmt: skip
-
-
-def _brightest_off(table: TableMeasurements, chart: Chart) -> Worst | None:
-    codes = table.lights.codes
-    if codes is None or not codes.off_brightness.any():
-        return None
-    light = int(np.argmax(codes.off_brightness))
-    return worst_light(table, light, f"{100 * codes.off_brightness[light]:.2g} % off")
 
 
 def _brightness_text(table: TableMeasurements, accepted: float) -> str:
@@ -462,8 +438,8 @@ OFF_BRIGHTNESS = Figure(
     "should be alike",
     source=JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
     remedy="keep one exposure for the session, and take the frames again",
-    measure=_of_codes(lambda codes: float(codes.off_brightness.max())), before_session=True, worst=_brightest_off,
-    where=_brightness_text, retake=_frames_off_brightness,
+    measure=_of_codes(lambda codes: float(codes.off_brightness.max())), before_session=True, where=_brightness_text,
+    retake=_frames_off_brightness,
     cause=Explanation("brightness", brightness_evidence, follows=("off_codes_deg", "exchanged_lights")),
 )  # fmt: skip
 

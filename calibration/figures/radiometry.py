@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.causes.gathering import (
-    PrintPlace,
     block_evidence,
     blur_evidence,
     camera_evidence,
@@ -29,7 +28,6 @@ from calibration.figures.figure import (
     Figure,
     Line,
     SummaryRow,
-    Worst,
 )
 from experiment.measures.sensor import MAX_BLACK_DRIFT
 from experiment.measures.stains import added_light
@@ -38,7 +36,6 @@ from foundation.errors import counted, first_of
 if TYPE_CHECKING:
     from calibration.checks.frame_consistency import ForeignFrame
     from calibration.measurements import FrameMeasurements, TableMeasurements
-    from experiment.chart.model import Chart
     from experiment.session.records import FrameRecord
 
 _FrameValue = Callable[["TableMeasurements", "FrameMeasurements"], float]
@@ -83,18 +80,8 @@ UNFIT_SHARE = Figure(
     why="colours without samples are missing from every picture", source=JUDGEMENT, remedy="", found=_most_unfit,
     measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1), before_session=True,
     of_one_frame="bounded", cause=Explanation("unfit cells", unfit_evidence, follows=("block_deviation",)),
-    drawing="print", lines=(Line(290, _unfit_row),),
+    drawing="errors", lines=(Line(290, _unfit_row),),
 )  # fmt: skip
-
-
-def _most_deviating(table: TableMeasurements, chart: Chart) -> Worst | None:
-    stains, file = table.cells.stains, table.session.registered_file
-    if not stains.known:
-        return None
-    off = stains.largest_deviation()
-    colour = int(np.argmax(np.abs(off)))
-    x, y = chart.centres_mm[chart.cell_of_colour[colour]].tolist()
-    return Worst(f"colour {colour}, {100 * off[colour]:+.2g} %", file, place=PrintPlace(file, x, y, 0.0))
 
 
 DOUBTFUL_SHARE = Figure(
@@ -104,8 +91,7 @@ DOUBTFUL_SHARE = Figure(
     source=SIMULATED + ": none on a clean flat print",
     remedy="clean the print, hang it flatter, and look for shadows on it",
     measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.known else None,
-    before_session=True, of_one_frame="known", worst=_most_deviating, cause=Explanation("spot", spot_evidence),
-    drawing="print",
+    before_session=True, of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
 
 
@@ -117,7 +103,7 @@ ADDED_LIGHT = Figure(
     "of a thirtieth 30 %; a reflection of 3 % leaves a table with cells 57 % off",
     remedy="turn print or projector until nothing is mirrored on it, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
-    before_session=True, of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="print",
+    before_session=True, of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
 
 
@@ -148,16 +134,9 @@ FRAME_BLUR = Figure(
     "1.1 px 2 % and cells 4 % off",
     remedy="switch off autofocus and stabilisation, see that nothing shakes the camera",
     measure=lambda table: table.added_bleed(_softest(table)), before_session=True, of_one_frame="bounded",
-    worst=lambda table, chart: Worst(f"blur σ {_softest(table).blur_px:.2f} px", _softest(table).record.file),
     where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
     cause=Explanation("frame", blur_evidence), drawing="course",
 )  # fmt: skip
-
-
-def _most_scattered(table: TableMeasurements, chart: Chart) -> Worst | None:
-    worst = max(table.frames, key=lambda frame: frame.consistency.scatter)
-    scatter = worst.consistency.scatter
-    return Worst(f"{100 * scatter:.2g} %", worst.record.file) if scatter > 0 else None
 
 
 def _of_alike_frames(value: _FrameValue) -> Callable[[TableMeasurements], float | None]:
@@ -177,18 +156,11 @@ FRAME_SCATTER = Figure(
     source=SIMULATED + ": to 0.8 % beyond noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
     remedy="see that nothing changes during the session",
     measure=_of_alike_frames(lambda table, frame: frame.consistency.scatter), before_session=True,
-    of_one_frame="bounded", worst=_most_scattered,
+    of_one_frame="bounded",
     where=lambda table, accepted: f"in {max(table.frames, key=lambda one: one.consistency.scatter).record.file}",
     retake=_frames_beyond(lambda table, frame: frame.consistency.scatter),
     cause=Explanation("frame", scatter_evidence, follows=("block_deviation", "disturbed_cells")), drawing="course",
 )  # fmt: skip
-
-
-def _worst_block(table: TableMeasurements, chart: Chart) -> Worst | None:
-    worst = max(table.frames, key=lambda frame: frame.consistency.block)
-    seen, file = worst.consistency, worst.record.file
-    place = PrintPlace(file, *seen.at_mm, seen.extent_mm)
-    return Worst(f"{100 * seen.block:.2g} %", file, place=place) if seen.block > 0 else None
 
 
 BLOCK_DEVIATION = Figure(
@@ -197,7 +169,7 @@ BLOCK_DEVIATION = Figure(
     why="something lay, or shone, on the print in that frame or in the one compared with, and its samples contain it",
     source=SIMULATED + ": to 0.4 % beyond noise", remedy="see that nobody comes between lamp, print and camera",
     measure=_of_alike_frames(lambda table, frame: frame.consistency.block), before_session=True,
-    of_one_frame="bounded", worst=_worst_block, retake=_frames_beyond(lambda table, frame: frame.consistency.block),
+    of_one_frame="bounded", retake=_frames_beyond(lambda table, frame: frame.consistency.block),
     cause=Explanation("block", block_evidence), drawing="course",
 )  # fmt: skip
 
@@ -217,7 +189,7 @@ DISTURBED_CELLS = Figure(
     "unless the dark frames show them to be hot",
     remedy="see that nothing comes between lamp, print and camera",
     measure=_disturbed, before_session=True, of_one_frame="bounded",
-    cause=Explanation("few cells", disturbed_evidence, follows=("block_deviation",)), drawing="worst",
+    cause=Explanation("few cells", disturbed_evidence, follows=("block_deviation",)), drawing="errors",
 )  # fmt: skip
 
 
