@@ -39,7 +39,6 @@ from drivers.ptp.codes import (
     AeMode,
     CaptureDestination,
     DataType,
-    DriveMode,
     EosEvent,
     ObjectFormat,
     Operation,
@@ -274,24 +273,6 @@ def test_a_550d_can_be_the_one_that_was_listed() -> None:
     assert [canon.ISO.label(code) for code in offered[Property.EOS_ISO_SPEED]] == (
         ["auto", "200", "400", "800", "1600", "3200", "6400"]
     )
-
-
-@pytest.mark.parametrize(("body", "stops"), [(EOS_550D, 2), (EOS_6D_MARK_II, 3)], ids=["550D", "6D Mark II"])
-def test_a_bracket_is_listed_in_thirds_of_a_stop(body: EosModel, stops: int) -> None:
-    host = host_of(body)
-    host.ok(Operation.OPEN_SESSION, 1)
-    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
-    codes = lists(host.events())[Property.EOS_AEB]
-    # A unit is an eighth of a stop; a third is the nearest number of them.
-    assert list(codes) == [round(8 * third / 3) for third in range(3 * stops + 1)]
-
-
-def test_a_compensation_is_listed_in_thirds_of_a_stop_to_either_side() -> None:
-    host = host_of(EOS_6D_MARK_II)
-    host.ok(Operation.OPEN_SESSION, 1)
-    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
-    codes = lists(host.events())[Property.EOS_EXPOSURE_COMPENSATION]
-    assert [(code + 128) % 256 - 128 for code in codes] == [round(8 * third / 3) for third in range(-15, 16)]
 
 
 def test_a_6d_mark_ii_is_the_one_that_was_listed() -> None:
@@ -601,76 +582,6 @@ def test_a_full_card_takes_no_more() -> None:
 
 
 # What spoils a series.
-
-
-def test_autofocus_that_finds_nothing_releases_nothing(host: Host) -> None:
-    host.eos.switch_focus(automatic=True, finds=False)
-    assert host.press(autofocus=True) == ResponseCode.DEVICE_BUSY
-    assert host.ask(Operation.EOS_REMOTE_RELEASE).response.parameters == (1,)
-    assert host.press(autofocus=False) == ResponseCode.OK
-    host.clock.sleep(5)
-    host.eos.switch_focus(automatic=True, finds=True)
-    assert host.press(autofocus=True) == ResponseCode.OK
-    host.clock.sleep(5)
-    host.eos.switch_focus(automatic=False)
-    assert host.press(autofocus=True) == ResponseCode.OK
-    assert len(host.film.frames) == 3
-
-
-def test_a_half_press_alone_focuses_and_takes_nothing(host: Host) -> None:
-    host.eos.switch_focus(automatic=True)
-    host.events()
-    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF, 0)
-    assert Property.EOS_FOCUS_INFO in changes(host.events())
-    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.FULL, 0)
-    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.FULL)
-    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF)
-    host.clock.sleep(5)
-    assert len(transfers(host.events())) == 1
-    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF, 0)
-    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF)
-    # Whoever lets go has lost the focus.
-    assert host.code(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.FULL, 0) == ResponseCode.DEVICE_BUSY
-    assert len(host.film.frames) == 1
-
-
-def test_bracketing_varies_the_exposure(host: Host) -> None:
-    assert host.set(Property.EOS_AEB, 0x08) == ResponseCode.OK
-    host.set(Property.EOS_SHUTTER_SPEED, 0x68)
-    for _ in range(4):
-        host.shoot()
-    times = [settings.shutter_s * 60 for settings, _ in host.film.exposures]
-    assert times == pytest.approx([1, 0.5, 2, 1])
-
-
-def test_timers_and_series_follow_the_drive_mode(host: Host) -> None:
-    assert host.set(Property.EOS_DRIVE_MODE, DriveMode.TIMER_2_S) == ResponseCode.OK
-    host.shoot()
-    assert host.film.exposures[0][1] == OPENING + timedelta(seconds=2)
-    assert host.set(Property.EOS_DRIVE_MODE, DriveMode.CONTINUOUS) == ResponseCode.OK
-    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, 1)
-    host.clock.sleep(1.0)
-    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
-    host.clock.sleep(60)
-    # 3.7 frames a second: at 0, 0.27, 0.54 and 0.81 s.
-    assert len(transfers(host.events())) == 4
-    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, 1)
-    host.clock.sleep(60.0)
-    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
-    # The memory holds six, and five were in it.
-    host.clock.sleep(60)
-    assert len(transfers(host.events())) == 1
-
-
-def test_bulb_lasts_as_long_as_the_press(host: Host) -> None:
-    assert host.set(Property.EOS_SHUTTER_SPEED, 0x0C) == ResponseCode.OK
-    assert host.code(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, 1) == ResponseCode.OK
-    host.clock.sleep(7.5)
-    assert Notice(EosEvent.BULB_EXPOSURE_TIME, 7) in host.events()
-    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
-    host.clock.sleep(1)
-    assert len(transfers(host.events())) == 1
-    assert host.film.exposures[0][0].shutter_s == pytest.approx(7.5)
 
 
 def test_counts_releases_and_drains_its_battery() -> None:
