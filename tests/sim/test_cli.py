@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.links.network import TcpLink, TcpServer, UdpSocket
+from drivers.links.network import TcpLink, TcpServer
 from drivers.pjlink import PjLinkProjector, PjLinkReply, search
 from drivers.projector import Power
 from sim.cli import main
@@ -50,14 +50,6 @@ def test_a_taken_port_is_one_line(capsys: pytest.CaptureFixture[str], arguments:
     assert error.count("\n") == 1
 
 
-def test_a_taken_udp_port_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with UdpSocket(host="127.0.0.1") as taken:
-        assert main(["projector", "--pjlink", "0", "--udp", str(taken.address[1])]) == 3
-    error = capsys.readouterr().err
-    assert error.startswith("error: cannot receive datagrams at 127.0.0.1:")
-    assert error.count("\n") == 1
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
@@ -79,16 +71,6 @@ def test_wrong_arguments_end_with_2(arguments: list[str]) -> None:
 def test_a_password_longer_than_the_standards_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["projector", "--pjlink", "0", "--password", "x" * 33]) == 2
     assert "at most 32" in capsys.readouterr().err
-
-
-def test_an_unknown_model_is_answered_by_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["camera", "--port", "0", "--model", "EOS R5"]) == 2
-    assert "EOS 550D, EOS 6D Mark II, Test" in capsys.readouterr().err
-
-
-def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--help"]) == 0
-    assert "130" in capsys.readouterr().out
 
 
 @pytest.mark.slow

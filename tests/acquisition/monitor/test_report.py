@@ -14,7 +14,7 @@ from acquisition.cli import main
 from acquisition.monitor import view
 from acquisition.monitor.view import write_session_report
 from experiment.session.journal import Journal
-from foundation.errors import FormatError, StorageError
+from foundation.errors import StorageError
 from tests.acquisition.monitor.made_up import MadeUpRun
 
 SCRIPT = "</script><script>alert(1)</script><!--"
@@ -67,25 +67,6 @@ def test_a_run_that_writes_it_counts_as_ended_and_others_do_not(run: MadeUpRun) 
     assert "chart.json" in head["sentence"]
 
 
-def test_pictures_are_bounded_and_those_of_refused_frames_go_first(
-    run: MadeUpRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bound = int(3.5 * max(path.stat().st_size for path in (run.folder / "previews").iterdir()))
-    monkeypatch.setattr(view, "MOST_PICTURES_BYTES", bound)
-    write_session_report(run.folder, tmp_path / "night.html")
-    pictures = data_of(tmp_path / "night.html")["pictures"]
-    assert list(pictures)[:2] == ["4", "6"]
-    assert 3 <= len(pictures) < 6
-    assert sum(len(picture) for picture in pictures.values()) <= 4 / 3 * bound + 100 * len(pictures)
-
-
-def test_a_picture_that_is_gone_or_none_is_left_out(run: MadeUpRun, tmp_path: Path) -> None:
-    for preview in (run.folder / "previews").iterdir():
-        preview.write_bytes(b"no picture")
-    write_session_report(run.folder, tmp_path / "night.html")
-    assert data_of(tmp_path / "night.html")["pictures"] == {}
-
-
 def test_the_command_writes_it_into_the_session_or_where_it_is_told(
     run: MadeUpRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -93,11 +74,6 @@ def test_the_command_writes_it_into_the_session_or_where_it_is_told(
     assert (run.folder / "report.html").is_file()
     assert main(["report", str(run.folder), str(tmp_path / "x.html")]) == 0
     assert f"{tmp_path / 'x.html'}: written" in capsys.readouterr().out
-
-
-def test_without_a_session_there_is_no_report(tmp_path: Path) -> None:
-    with pytest.raises(FormatError):
-        write_session_report(tmp_path, tmp_path / "x.html")
 
 
 def test_a_full_disk_is_said_and_leaves_the_session_as_it_was(run: MadeUpRun, monkeypatch: pytest.MonkeyPatch) -> None:

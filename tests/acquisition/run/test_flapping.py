@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.run.devices import RECURS_WITHIN
 from acquisition.run.run import QUIET_S, PauseNotices, RunOutcome, take_session
-from drivers.presenter import BLACK, Colour
+from drivers.presenter import Colour
 from experiment.config import LabSettings
 from experiment.lights import Illumination
 from experiment.session.records import ACCEPTED, REFUSED, Check, Judgement, SessionStep
@@ -78,7 +77,7 @@ def night(tmp_path: Path) -> Night:
 
 
 def test_a_picture_that_stays_one_frame_late_ends_the_run_within_its_patience(night: Night) -> None:
-    with pytest.raises(QualityError, match="was ordered"):
+    with pytest.raises(QualityError):
         night.run(Seen(night.lab, range(8, 10_000)))
     clock = night.lab.clock
     assert clock.monotonic() < 2 * PATIENCE_S
@@ -96,18 +95,6 @@ def test_a_picture_that_was_late_for_a_while_lets_the_run_go_on(night: Night, un
     night.require_each_step_once()
 
 
-def test_a_last_dark_frame_that_is_refused_for_a_while_says_that_it_is_over(night: Night) -> None:
-    class Bright(Seen):
-        def judge(self, file: Path, step: SessionStep) -> Judgement:
-            self.judged += 1
-            last = len(self.lab.session.steps) - 1
-            refused = step.number == last and self.judged <= last + 3
-            return Judgement((Check("dark", reason="a lamp is on" if refused else ""),), lasting=refused)
-
-    assert night.run(Bright(night.lab)).complete
-    assert len(night.of("paused")) == len(night.of("resumed")) == 1
-
-
 class Flapping(Seen):
     """Refuses three frames of each light for something lasting, and then accepts `good` frames."""
 
@@ -118,14 +105,6 @@ class Flapping(Seen):
         if self.judged > 8 and (self.judged - 8) % (self.good + 4) < 4:
             return Judgement((Check("light", reason=f"flash {self.judged}"),), lasting=True)
         return Judgement((Check("light"),))
-
-
-def test_what_comes_back_after_many_frames_lets_the_run_get_on(night: Night) -> None:
-    judge = Flapping(night.lab)
-    judge.good = RECURS_WITHIN + 4
-    assert night.run(judge).complete
-    assert len(night.of("resumed")) > 1
-    night.require_each_step_once()
 
 
 def test_refused_files_have_a_budget_of_disk(night: Night) -> None:
@@ -140,18 +119,6 @@ def test_refused_files_have_a_budget_of_disk(night: Night) -> None:
     assert night.lab.session.journal.events()[-1].what == "ended"
     assert night.run(Seen(night.lab, judged=len(night.lab.camera.exposed)), refused_gb=1e-9).complete
     night.require_each_step_once()
-
-
-def test_voided_frames_count_as_refused_ones(night: Night) -> None:
-    class NoWhite(Seen):
-        def judge(self, file: Path, step: SessionStep) -> Judgement:
-            reason = "white is weaker" if step.kind == "white" and step.number else ""
-            return Judgement((Check("white", reason=reason),), voids=bool(reason))
-
-    with pytest.raises(QualityError, match="refused_gb"):
-        night.run(NoWhite(night.lab), refused_gb=5.5 * len(WELL) / 1e9)
-    assert night.lab.verdicts().count(REFUSED) < 3
-    assert night.lab.screen.shown[-1] == BLACK
 
 
 class TestNotices:

@@ -58,12 +58,6 @@ def begun(queue: StepQueue) -> SessionStep:
     return step
 
 
-def test_a_fault_of_a_device_is_no_try() -> None:
-    queue = queue_of(set(), 1)
-    queue.withdraw(begun(queue))
-    assert take(queue) == list(range(10))
-
-
 def test_lights_of_an_earlier_run_are_closed_too() -> None:
     assert unclosed_kinds(["white", "dark", "light", "white", "dark"]) == frozenset()
     unclosed = unclosed_kinds(["white", "dark", "white", "dark", "light"])
@@ -111,13 +105,6 @@ def test_many_lights_taken_again_in_a_row_have_references_between_them() -> None
     assert order == list(range(10)), "also while the verdict on one of them is awaited"
 
 
-def test_the_last_lights_that_are_voided_are_closed_again() -> None:
-    queue = queue_of(set(range(8)))
-    queue.refuse(begun(queue), "the picture is stuck", before_others=True)
-    queue.void([6, 7], "voided")
-    assert take(queue) == [8, 6, 7, 9, 10], "a white frame lies behind the lights that were taken again"
-
-
 def test_frames_are_not_voided_for_ever() -> None:
     queue = queue_of(set(), 2)
     for _ in range(2):
@@ -151,8 +138,3 @@ def test_a_dark_frame_shows_nothing_of_the_light(kind: str, stuck: bool) -> None
     queue.accept(good)
     queue.refuse(other, "dark")
     assert queue.is_stuck == stuck
-
-
-def test_what_comes_first_comes_first_though_it_was_done() -> None:
-    queue = queue_of(set(range(9)), 3, first=[4, 1])
-    assert take(queue) == [4, 1, 9]

@@ -16,7 +16,6 @@ from acquisition.run.devices import PAUSE_S, RETRY_S, TOLD_LATER, RetryPolicy, p
 from acquisition.run.rig.opening import open_rig
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE
-from drivers.ptp.protocol import OperationDeclined
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
 from experiment.config import LabSettings
@@ -32,7 +31,6 @@ from foundation.errors import (
     DeviceFault,
     DeviceRefused,
     LinkClosed,
-    LinkTimeout,
     StorageError,
 )
 
@@ -81,19 +79,6 @@ def until(end_s: float, fault: CropError) -> Callable[[float], CropError | None]
     return lambda now: fault if now < end_s else None
 
 
-def test_a_cause_with_other_numbers_is_the_same_cause() -> None:
-    room = Room()
-    room.retry.attempt(room.broken(lambda now: DeviceError(f"{now:g} of 8 pixels") if now < 99 else None), "it")
-    assert room.words == ["retry", "paused", "resumed"]
-
-
-def test_each_beat_promises_the_next_one() -> None:
-    room = Room()
-    room.retry.attempt(room.broken(until(100, DeviceError("gone")), takes_s=70), "the camera", idle=False)
-    for (before, _, _, within_s), (after, *_) in pairwise(room.beats):
-        assert after - before <= within_s
-
-
 def test_other_devices_are_kept_awake_meanwhile() -> None:
     room = Room()
     room.retry.attempt(room.broken(until(100, DeviceError("covered"))), "the screen")
@@ -101,16 +86,6 @@ def test_other_devices_are_kept_awake_meanwhile() -> None:
     room = Room()
     room.retry.attempt(room.broken(until(100, DeviceError("gone"))), "the camera", idle=False)
     assert room.idled == []
-
-
-def test_another_device_that_fails_meanwhile_waits_its_turn() -> None:
-    room = Room()
-
-    def asleep() -> None:
-        raise LinkTimeout("the camera does not answer")
-
-    retry = RetryPolicy(room.clock, 600, idle=asleep)
-    assert retry.attempt(room.broken(until(100, DeviceError("covered"))), "the screen") == "done"
 
 
 def test_a_pause_gives_one_order_and_says_nothing_twice() -> None:
@@ -160,13 +135,6 @@ def test_what_waiting_does_not_cure_is_raised_at_once() -> None:
             curable=lambda fault: not isinstance(fault, DeviceRefused),
         )
     assert room.said == []
-
-
-def test_a_class_that_wants_more_than_a_sentence_becomes_its_family() -> None:
-    room = Room(5.0)
-    with pytest.raises(DeviceRefused, match="busy") as caught:
-        room.retry.attempt(room.broken(lambda now: OperationDeclined("busy", 0x2019)), "the camera")
-    assert type(caught.value) is DeviceRefused
 
 
 def test_an_interruption_ends_a_pause_at_once() -> None:
@@ -290,7 +258,7 @@ def test_a_journal_that_another_program_held_for_the_whole_patience_is_not_waite
 
     clock = SimulatedClock()
     begun = clock.monotonic()
-    with pytest.raises(StorageError, match="database is locked"):
+    with pytest.raises(StorageError):
         RetryPolicy(clock, 600).attempt(held, "the disk")
     assert clock.monotonic() == begun
 

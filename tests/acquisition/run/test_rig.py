@@ -106,30 +106,7 @@ def test_a_session_taken_with_such_a_body_and_a_lens_without_contacts_is_its(tmp
 
 def test_an_imported_session_cannot_be_taken() -> None:
     imported = LabSettings(rig="imported", chart=Path("c"), illuminations=Path("l"))
-    with pytest.raises(ConfigurationError, match="other means"), open_rig(imported, design_chart(bits=1)):
-        pass
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ('[lab.camera]\nconnection = "ptpip"\n', "lab.camera.host is missing"),
-        ('[lab.projector]\ncontrol = "pjlink"\n', "lab.projector.host is missing"),
-        ('[lab.projector]\ncontrol = "epson"\n', "lab.projector.device is missing"),
-        ('[lab.projector]\ncontrol = "pjlink"\ndevice = "/dev/ttyS0"\n', "PJLink goes by the network"),
-        ('[lab.projector]\ncontrol = "nec"\nhost = "h"\ndevice = "/dev/ttyS0"\n', "both given"),
-        ('[lab.camera]\nhost = "1.2.3.4"\n', "connection is"),
-        ('[lab.light]\nshown_by = "jvc"\n', "lab.light.host is missing"),
-        ("[camera]\nshutter_s = 0.51\n", "whole turns"),
-    ],
-)
-def test_a_cable_that_is_not_named_is_said(text: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
-    monkeypatch.setattr("acquisition.run.rig.lab.display_warnings", Mock(return_value=()))
-    # A camera that answers: its fault would be told with the settings', and is a device's.
-    monkeypatch.setattr("acquisition.run.rig.lab.CanonEos", Mock())
-    real = parse_lab(HEAD.replace("simulated", "lab") + text, "LAB.toml")
-    with pytest.raises(ConfigurationError, match=expected), open_rig(real, design_chart(bits=1)):
+    with pytest.raises(ConfigurationError), open_rig(imported, design_chart(bits=1)):
         pass
 
 
@@ -171,11 +148,6 @@ def test_a_lab_at_which_another_command_is_at_work_is_not_touched(
             ):
                 pass
         other.communicate(b"\n")
-
-
-def test_an_unknown_language_is_named_with_the_known_ones() -> None:
-    with pytest.raises(ConfigurationError, match=r"'pjlink', .*'nec'"):
-        parse_lab(HEAD + '[lab.projector]\ncontrol = "klingon"\n', "LAB.toml")
 
 
 @pytest.mark.slow

@@ -139,7 +139,7 @@ def test_another_camera_or_projector_is_refused(folder: Path) -> None:
     require_same_devices(lab.session, lab.devices, SETTINGS)
     assert lab.session.journal.records()["camera"] == "Canon Test, serial number 1"
     lab.projector.identity = lambda: ProjectorIdentity("Epson", "EB", "hall")  # type: ignore[method-assign]
-    with pytest.raises(DeviceRefused, match="the projector") as caught:
+    with pytest.raises(DeviceRefused) as caught:
         require_same_devices(lab.session, lab.devices, SETTINGS)
     lab.projector = None  # type: ignore[assignment]
     lab.camera.identity = lambda: CameraIdentity("Canon", "Test", "2")  # type: ignore[method-assign]
@@ -166,7 +166,7 @@ def test_another_screen_of_a_real_lab_is_refused(folder: Path) -> None:
     require_same_devices(lab.session, lab.devices, one)
     light = one.lab.light.model_copy(update={"display": "HDMI-2"})
     other = one.model_copy(update={"lab": one.lab.model_copy(update={"light": light})})
-    with pytest.raises(DeviceRefused, match="the screen") as caught:
+    with pytest.raises(DeviceRefused) as caught:
         require_same_devices(lab.session, lab.devices, other)
     assert (caught.value.expected, caught.value.value) == ("display", "display HDMI-2")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,8 @@ from acquisition.run.devices import PAUSE_S, Devices
 from acquisition.run.pipeline import Taken
 from acquisition.run.run import take_session
 from drivers.projector import Power
-from foundation.errors import LinkClosed
 from sim.projectors.projector import SimulatedProjector
-from tests.acquisition.run.scripted import EXPOSE_S, SETTINGS, Beamer, Hurried, Lab, ScriptedCamera
+from tests.acquisition.run.scripted import EXPOSE_S, SETTINGS, Hurried, Lab, ScriptedCamera
 
 pytestmark = pytest.mark.slow
 
@@ -57,48 +55,6 @@ def test_a_frame_during_which_the_picture_was_muted_is_taken_again(folder: Path)
     assert take_session(lab.session, lab.devices, SETTINGS).complete
     assert lab.verdicts() == ["refused"] + ["accepted"] * 6
     assert "muted" in lab.session.frames()[0].verdict
-
-
-class Disturbed:
-    """A lab whose projector hangs on a PJLink cable; what `disturb` does comes before the third exposure."""
-
-    def __init__(self, folder: Path) -> None:
-        self.lab = Lab(folder)
-        self.lab.clock = self.clock = self.lab.camera.clock = Hurried()
-        self.beamer = Beamer(self.clock)
-        self.said: list[str] = []
-
-    def run(self, disturb: Callable[[], None]) -> None:
-        def disturbing(taken: Taken) -> None:
-            if self.lab.camera.captures == 2:
-                disturb()
-
-        devices = Devices(self.lab.camera, self.lab.screen, self.beamer.projector, self.clock)
-        assert take_session(self.lab.session, devices, SETTINGS, observe=disturbing, announce=self.said.append).complete
-
-    @property
-    def words(self) -> list[str]:
-        """What was told but for the lamp's fate, which is the last of every run."""
-        return [sentence.split(":")[0] for sentence in self.said if not sentence.startswith("lamp:")]
-
-
-def test_a_pulled_cable_pauses_the_run_until_it_is_back(folder: Path) -> None:
-    disturbed = Disturbed(folder)
-    disturbed.clock.calls[PAUSE_S] = lambda: disturbed.beamer.pull(False)
-    disturbed.run(disturbed.beamer.pull)
-    assert disturbed.words == ["refused", "retry", "paused", "resumed"]
-    assert "nothing listens at 127.0.0.1:4352" in disturbed.said[0]
-    assert disturbed.lab.verdicts() == ONE_AGAIN
-
-
-def test_a_lost_cable_ends_the_run_when_patience_does(folder: Path) -> None:
-    disturbed = Disturbed(folder)
-    with pytest.raises(LinkClosed, match=r"waited 10 min 00 s"):
-        disturbed.run(disturbed.beamer.pull)
-    assert disturbed.lab.verdicts() == ONE_AGAIN[:3]
-    disturbed.beamer.pull(False)
-    disturbed.run(lambda: None)
-    assert disturbed.lab.verdicts() == ONE_AGAIN
 
 
 def test_the_camera_is_spoken_to_while_the_lamp_warms_up(folder: Path) -> None:

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from drivers.ptp import protocol
 from drivers.ptp.codes import DataType, ObjectFormat, Operation, ResponseCode
 from drivers.ptp.protocol import (
-    LAST_TRANSACTION,
     OPEN_TRIES,
     PASSING_LIMIT_S,
     DeviceInfo,
@@ -115,20 +114,6 @@ def test_values_are_the_standards_bytes(data_type: int, value: Value, octets: st
     assert protocol.decode_value(data_type, bytes.fromhex(octets)) == value
 
 
-def test_a_string_without_its_nul_can_still_be_written() -> None:
-    text = protocol.decode_value(DataType.STRING, b"\xff" + b"x\0" * 255)
-    assert text == "x" * 254
-    assert protocol.decode_value(DataType.STRING, protocol.encode_value(DataType.STRING, text)) == text
-
-
-@pytest.mark.parametrize(
-    ("octets", "text"),
-    [("01 0000", ""), ("03 4300 4600 4600", "CFF"), ("04 4300 0000 4600 0000", "C"), ("02 00d8 0000", "\ufffd")],
-)
-def test_strings_as_devices_send_them(octets: str, text: str) -> None:
-    assert protocol.decode_value(DataType.STRING, bytes.fromhex(octets)) == text
-
-
 @pytest.mark.parametrize(
     ("data_type", "value"),
     [
@@ -154,13 +139,6 @@ def test_what_the_wire_cannot_hold_is_our_own_mistake(data_type: int, value: Val
 
 # ISO 15740:2013, clauses 10 to 13; Canon's as libgphoto2 2.5 has them in camlibs/ptp2/ptp.h. Hexadecimal, first-last
 # where they follow each other, in the order in which their names stand.
-
-
-def test_a_fault_says_what_where_and_how_much() -> None:
-    with pytest.raises(ProtocolError, match=r"operations at byte 21 .*65538"):
-        DeviceInfo.decode(examples.DEVICE_INFO[:19] + b"\x01\0" + examples.DEVICE_INFO[21:])
-    with pytest.raises(ProtocolError, match=r"capacity at byte 6 .*8 .*1"):
-        StorageInfo.decode(examples.STORAGE_INFO[:7])
 
 
 def test_more_than_the_bound_is_refused_unread() -> None:
@@ -193,11 +171,6 @@ def test_any_value_comes_back(kind: DataType, data: st.DataObject) -> None:
 @given(DATASETS)
 def test_any_dataset_comes_back(dataset: DeviceInfo | StorageInfo | ObjectInfo) -> None:
     assert type(dataset).decode(dataset.encode()) == dataset
-
-
-@given(st.lists(U32, max_size=50).map(tuple))
-def test_any_list_of_handles_comes_back(handles: tuple[int, ...]) -> None:
-    assert protocol.decode_u32_array(protocol.encode_u32_array(handles)) == handles
 
 
 class Scripted:
@@ -286,17 +259,10 @@ def test_what_is_declined_for_the_moment_is_asked_again_under_a_new_number(code:
 
 def test_patience_ends_by_the_clock() -> None:
     session, _, clock = opened(ResponseCode.OK, *[0x2019] * 1000)
-    with pytest.raises(OperationDeclined, match="is idle") as caught:
+    with pytest.raises(OperationDeclined) as caught:
         session.call(Operation.EOS_KEEP_DEVICE_ON)
     assert caught.value.code == 0x2019
     assert clock.monotonic() == pytest.approx(PASSING_LIMIT_S)
-
-
-def test_no_patience_asks_once() -> None:
-    session, cable, clock = opened(ResponseCode.OK, 0x2019)
-    with pytest.raises(OperationDeclined):
-        session.call(Operation.EOS_REMOTE_RELEASE_ON, 3, 1, retry_s=0.0)
-    assert (len(cable.asked), clock.monotonic()) == (2, 0.0)
 
 
 def test_every_other_answer_is_told_by_its_name_at_once() -> None:
@@ -304,16 +270,3 @@ def test_every_other_answer_is_told_by_its_name_at_once() -> None:
     with pytest.raises(DeviceRefused, match=r"scripted.*ACCESS_DENIED \(0x200f\)"):
         session.call(Operation.EOS_KEEP_DEVICE_ON)
     assert len(cable.asked) == 2
-
-
-def test_numbers_begin_anew_after_the_last() -> None:
-    session, cable, _ = opened()
-    session._transaction = LAST_TRANSACTION - 1
-    for _ in range(3):
-        session.call(Operation.EOS_KEEP_DEVICE_ON)
-    assert [request.transaction for request in cable.asked[1:]] == [0xFFFFFFFE, 1, 2]
-
-
-def test_closing_a_session_on_a_dead_cable_does_nothing() -> None:
-    session, _, _ = opened(ResponseCode.OK, LinkClosed("gone"))
-    session.close()

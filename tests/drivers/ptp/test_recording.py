@@ -22,11 +22,10 @@ from drivers.canon import (
     number_of,
 )
 from drivers.ptp import usb as container
-from drivers.ptp.codes import DataType, Operation, Property
+from drivers.ptp.codes import Operation, Property
 from drivers.ptp.ip import EndData, OperationRequest, PacketCutter, StartData, encode
 from drivers.ptp.protocol import (
     DeviceInfo,
-    DevicePropDesc,
     PtpRequest,
     PtpResponse,
     StorageInfo,
@@ -34,7 +33,7 @@ from drivers.ptp.protocol import (
     encode_u32_array,
 )
 from drivers.ptp.usb import ContainerReader, DataPiece, DataStart
-from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, read_description
+from tests.drivers.ptp.conversations import Recorded, read_description
 
 REBUILT: dict[int, Callable[[bytes], bytes]] = {
     Operation.GET_DEVICE_INFO: lambda data: DeviceInfo.decode(data).encode(),
@@ -116,19 +115,6 @@ def test_commands_are_the_bytes_that_the_host_sent(recording: list[Recorded]) ->
     assert [PropertySetting(code, canon.number_value(value)).encode() for code, value in sent] == settings
 
 
-def test_what_the_body_is(body: str, recording: list[Recorded]) -> None:
-    info = DeviceInfo.decode(first(recording, Operation.GET_DEVICE_INFO))
-    assert (info.manufacturer, info.model, info.device_version) == ("Canon Inc.", f"Canon {body}", FACTS[body].version)
-    assert (info.vendor_extension_id, info.vendor_extension_version) == (6, 200)
-    assert Operation.EOS_REMOTE_RELEASE_ON in info.operations
-    assert Operation.EOS_BULB_START not in info.operations
-    extended = DeviceInfoEx.decode(first(recording, Operation.EOS_GET_DEVICE_INFO_EX))
-    assert (len(extended.events), extended.others) == (18, (0, 1, 2, 4))
-    assert len(extended.properties) == FACTS[body].properties
-    if body == "EOS 60D":
-        assert extended.properties == EOS_60D_PROPERTIES
-
-
 def test_the_state_dump(body: str, recording: list[Recorded]) -> None:
     facts = FACTS[body]
     records = canon.decode_events(first(recording, Operation.EOS_GET_EVENT))
@@ -151,10 +137,3 @@ def test_the_state_dump(body: str, recording: list[Recorded]) -> None:
     labels = [APERTURE.label(code) for code in lists[Property.EOS_APERTURE]]
     assert labels[:6] == ["3.5", "4", "4.5", "5", "5.6", "6.3"]
     assert lists[Property.EOS_SHUTTER_SPEED] == ()
-
-
-def test_the_battery_is_told_in_words_of_16_bits(body: str, recording: list[Recorded]) -> None:
-    percent = FACTS[body].battery_percent
-    battery = Property.BATTERY_LEVEL, DataType.UINT8, False, percent, percent
-    described = DevicePropDesc(*battery, (100, 75, 50, 25, 0), widened=True)
-    assert first(recording, Operation.GET_DEVICE_PROP_DESC) == described.encode()

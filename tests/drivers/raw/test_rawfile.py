@@ -7,7 +7,6 @@ import struct
 import subprocess
 import sys
 import threading
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from drivers.raw import rawfile
-from drivers.raw.rawfile import FrameOrigin, Mosaic, body_and_lens, read_raw
+from drivers.raw.rawfile import Mosaic, body_and_lens, read_raw
 from drivers.raw.storage import Area
 from drivers.tiff import read_directories
 from foundation.errors import FormatError
@@ -121,18 +120,6 @@ def test_a_550d_cr2_is_framed_as_dcraw_does(tmp_path: Path) -> None:
     assert mosaic.block_planes().shape == (2, 2, 1732, 2601)
 
 
-def test_a_canon_cr2_whose_frame_both_share_is_left_alone(tmp_path: Path) -> None:
-    counts = (noise((64, 96), 4) + 2048).astype(np.uint16)
-    write_cr2(tmp_path / "small.CR2", counts, "Canon EOS 550D")
-    mosaic = read_raw(tmp_path / "small.CR2")
-    visible = mosaic.visible
-    np.testing.assert_array_equal(mosaic.sensor, counts)
-    np.testing.assert_array_equal(
-        mosaic.counts,
-        counts[visible.top : visible.top + visible.height, visible.left : visible.left + visible.width],
-    )
-
-
 @pytest.mark.parametrize("maker", ["Canon", "Nikon"])
 @pytest.mark.parametrize(("top", "left"), [(0, 0), (1, 0), (0, 1), (13, 17), (12, 40)])
 def test_a_dng_is_framed_by_its_active_area(tmp_path: Path, maker: str, top: int, left: int) -> None:
@@ -209,26 +196,6 @@ def test_a_plain_dng_is_what_libraw_reads(
     assert [getattr(read, name) for name in alike] == [getattr(unpacked, name) for name in alike]
 
 
-@pytest.mark.parametrize(
-    "more",
-    [
-        {258: shorts(8)},
-        {277: shorts(2)},
-        {33421: shorts(2, 3)},
-        {33422: (1, 4, b"\0\0\1\2")},
-        {33422: (1, 4, b"\3\1\1\2")},
-        {33422: (6, 4, b"\xfd\xfe\xfe\xff")},  # -3, -2, -2, -1, which Python takes for places from the end
-        {50711: shorts(2)},
-        {50717: longs(4095, 4095)},
-        {279: longs(10)},
-        {259: shorts(7)},
-    ],
-)
-def test_what_is_not_plain_is_left_to_libraw(tmp_path: Path, more: Tags) -> None:
-    write_dng(tmp_path / "a.dng", noise((40, 60)), {50829: longs(0, 0, 40, 60), **more})
-    assert asks_libraw(tmp_path / "a.dng")
-
-
 # Black
 
 
@@ -261,25 +228,6 @@ def test_masked_black_is_the_mean_of_each_phase(tmp_path: Path) -> None:
     np.testing.assert_allclose(black, truth, atol=0.6)
 
 
-def test_a_masked_area_that_is_too_small_or_off_the_sensor_tells_nothing(tmp_path: Path) -> None:
-    write_dng(tmp_path / "a.dng", noise((40, 60)), {50830: longs(0, 0, 20, 20)})
-    assert read_raw(tmp_path / "a.dng").masked == (Area(0, 0, 20, 20),)
-    assert read_raw(tmp_path / "a.dng").masked_black() is None
-    write_dng(tmp_path / "b.dng", noise((40, 60)), {50830: longs(0, 0, 400, 20, 9, 9, 9, 9)})
-    assert read_raw(tmp_path / "b.dng").masked == ()
-
-
-def test_block_planes_are_the_four_phases(tmp_path: Path) -> None:
-    write_dng(tmp_path / "a.dng", noise((41, 63)), {50829: longs(2, 3, 41, 62)})
-    mosaic = read_raw(tmp_path / "a.dng")
-    planes = mosaic.block_planes()
-    assert planes.shape == (2, 2, 19, 29)
-    for row in range(2):
-        for column in range(2):
-            np.testing.assert_array_equal(planes[row, column], mosaic.counts[row:38:2, column:58:2])
-    assert np.shares_memory(planes, mosaic.sensor)
-
-
 def test_arrays_are_read_only(tmp_path: Path) -> None:
     write_dng(tmp_path / "a.dng", noise((40, 60)))
     mosaic = read_raw(tmp_path / "a.dng")
@@ -288,13 +236,6 @@ def test_arrays_are_read_only(tmp_path: Path) -> None:
 
 
 # What is no raw file
-
-
-def test_what_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"gone\.CR2"):
-        read_raw(tmp_path / "gone.CR2")
-    with pytest.raises(FormatError, match="is a folder"):
-        read_raw(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -419,19 +360,3 @@ def canon_file(serial: int, lens: bytes) -> bytes:
 def test_serial_number_and_lens_of_a_canon_before_exif_2_3() -> None:
     data = canon_file(330101234, b"EF-S18-55mm f/3.5-5.6 IS\0")
     assert body_and_lens(data, read_directories(data)) == ("330101234", "EF-S18-55mm f/3.5-5.6 IS")
-
-
-def test_a_note_that_is_cut_tells_nothing_and_breaks_nothing() -> None:
-    data = canon_file(330101234, b"EF50mm f/1.8 STM\0")
-    for length in range(len(data)):
-        serial, lens = body_and_lens(data[:length], [])
-        assert serial in ("", "330101234")
-        assert "EF50mm f/1.8 STM".startswith(lens)
-
-
-def test_exposure_is_what_counts_are_proportional_to() -> None:
-    origin = FrameOrigin("A", "1", "", 100, 8.0, 0.5)
-    assert replace(origin, iso=200).exposure == 2 * origin.exposure
-    assert replace(origin, aperture=None).exposure == 50
-    assert replace(origin, shutter_s=None).exposure == 0
-    assert origin.exposure_text == "0.5 s, ISO 100, f/8"

@@ -135,6 +135,6 @@ def test_a_disk_that_was_unmounted_is_not_written_below(night: Night) -> None:
     with Session.open_for_run(night.folder) as session:
         # What an unmounted disk leaves: the open journal, and nothing under the name.
         shutil.rmtree(session.frames_folder)
-        with pytest.raises(StorageError, match="mount the disk"):
+        with pytest.raises(StorageError):
             session.receive("0001_dark", capture(FRAMES[1]))
         assert not session.frames_folder.exists()

@@ -11,11 +11,6 @@ from sim.spectral import regridded, require_grid
 NODES = np.arange(380.0, 781.0, 5.0)
 
 
-def test_the_same_grid_is_left_as_it_is() -> None:
-    curve = np.random.default_rng(0).uniform(size=(len(NODES), 2))
-    assert np.array_equal(regridded(NODES, curve, NODES), curve)
-
-
 def test_a_coarser_grid_is_joined_by_straight_lines() -> None:
     coarse = np.arange(390.0, 731.0, 10.0)
     found = regridded(coarse, coarse[:, None] ** 1, NODES)[:, 0]
@@ -32,12 +27,6 @@ def test_a_narrow_line_between_the_nodes_keeps_its_light_and_its_place(at: float
     light = float(line.sum()) * 0.1
     assert found.sum() * 5 == pytest.approx(light, rel=1e-3)
     assert (found * NODES).sum() * 5 / light == pytest.approx(at, abs=0.02)
-
-
-def test_uneven_steps_are_weighed_by_their_width() -> None:
-    fine = np.unique(np.concatenate([np.arange(380.0, 550.0, 0.5), np.arange(550.0, 781.0, 2.0)]))
-    found = regridded(fine, np.ones((len(fine), 1)), NODES)[:, 0]
-    assert found[2:-2] == pytest.approx(np.ones(len(NODES) - 4), abs=0.06)
 
 
 def test_a_line_among_coarse_steps_leaves_the_rest_smooth() -> None:
@@ -59,7 +48,3 @@ def test_a_line_among_coarse_steps_leaves_the_rest_smooth() -> None:
 def test_a_grid_that_does_not_cover_the_visible_range_is_refused(grid: list[float], message: str) -> None:
     with pytest.raises(FormatError, match=f"lamp: .*{message}"):
         require_grid(np.array(grid, dtype=np.float64), "lamp")
-
-
-def test_a_gap_where_no_camera_sees_is_let_pass() -> None:
-    require_grid(np.array([300.0, *range(390, 721, 10), 900.0]), "lamp")

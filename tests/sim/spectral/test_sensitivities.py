@@ -45,20 +45,6 @@ def test_another_grid_is_resampled_by_straight_lines_and_is_blind_beyond() -> No
     assert at[2, 2] == 1
 
 
-def test_a_file_is_taken_by_its_path(tmp_path: Path) -> None:
-    path = tmp_path / "mine.json"
-    path.write_text(json.dumps(document(step=5)))
-    assert read_sensitivities(str(path)).name == "mine"
-    assert sensitivities(str(path)).shape == (len(WAVELENGTHS_NM), 3)
-
-
-def test_order_does_not_matter() -> None:
-    content = document()
-    table = content["spectral_data"]["data"]["main"]
-    turned = document(data={"main": dict(reversed(table.items()))})
-    assert np.array_equal(parsed(content).curves, parsed(turned).curves)
-
-
 def altered(place: str, value: Any) -> dict[str, Any]:
     content = document()
     table = content["spectral_data"]["data"]["main"]
@@ -105,14 +91,6 @@ def test_what_cannot_be_a_cameras_is_refused(content: Any, message: str) -> None
 def test_what_json_would_pass_over_or_fall_over_is_refused(text: str, message: str) -> None:
     with pytest.raises(FormatError, match=message):
         parse_sensitivities(text.encode(), "m1", "m1.json")
-
-
-def test_a_blind_channel_is_refused() -> None:
-    content = document()
-    for row in content["spectral_data"]["data"]["main"].values():
-        row[1] = 0.0
-    with pytest.raises(FormatError, match="G is 0"):
-        parsed(content)
 
 
 def test_no_such_camera_names_those_that_are_known() -> None:

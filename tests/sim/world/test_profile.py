@@ -15,8 +15,6 @@ from sim import spectral
 from sim.spectral import (
     PaperName,
     ProfileName,
-    ink_codes,
-    paper,
     print_reflectance,
     printed_reflectance,
 )
@@ -41,17 +39,6 @@ def difference(wanted: NDArray[np.float64], lab: NDArray[np.float64]) -> NDArray
     return np.asarray(colour.delta_E(wanted, lab, method="CIE 2000"), dtype=np.float64)
 
 
-@pytest.mark.parametrize("on", MANAGED)
-def test_managed_greys_are_neutral_and_rise(on: PaperName) -> None:
-    lab = seen("managed", on)
-    neutral = lab * [1, 0, 0]
-    assert difference(neutral, lab).max() < 1
-    assert np.diff(lab[:, 0]).min() > 0
-    # IEC 61966-2-1: code 119 has .184 of white's luminance; black point compensation puts what black has below it.
-    black = ((lab[0, 0] + 16) / 116) ** 3 if lab[0, 0] > 8 else lab[0, 0] / 903.3
-    assert ((lab[119, 0] + 16) / 116) ** 3 == pytest.approx(black + (1 - black) * 0.184, rel=0.01)
-
-
 @pytest.mark.parametrize("on", PAPERS)
 def test_unmanaged_greys_have_the_tint_that_measured_prints_have(on: PaperName) -> None:
     # Papers printed without colour management (head of `sim.world.world`): the largest chroma is 5 to 14, but for one
@@ -68,19 +55,6 @@ def test_a_managed_print_has_the_colours_of_the_file_where_inks_reach(on: PaperN
     off = difference(intended_lab(pale, on), relative_lab(printed_reflectance(pale, "managed", on), on))
     assert np.median(off) < 0.3
     assert off.max() < 2.5
-
-
-@pytest.mark.parametrize("on", MANAGED)
-def test_what_no_ink_reaches_keeps_its_hue(on: PaperName) -> None:
-    wanted = intended_lab(CODES, on)
-    lab = relative_lab(printed_reflectance(CODES, "managed", on), on)
-    outside = difference(wanted, lab) > 3
-    assert 0.1 < outside.mean() < 0.6
-    chroma, wanted_chroma = (np.hypot(one[:, 1], one[:, 2]) for one in (lab, wanted))
-    assert np.mean(chroma[outside] < wanted_chroma[outside] + 1) > 0.95
-    plane, wanted_plane = (one[:, 1] + 1j * one[:, 2] for one in (lab, wanted))
-    turned = np.degrees(np.abs(np.angle(plane * wanted_plane.conj())))
-    assert np.median(turned[outside & (chroma > 10)]) < 6
 
 
 def test_no_ink_code_comes_nearer_than_the_profile_s() -> None:
@@ -102,36 +76,6 @@ def test_no_ink_code_comes_nearer_than_the_profile_s() -> None:
             return np.sqrt((off**2).sum(axis=-1) + 3 * hue**2)
 
         assert float(away(found)) < float(away(every).min()) + 0.01
-
-
-@pytest.mark.parametrize("on", MANAGED)
-def test_white_is_bare_paper_and_reflectances_are_between_surface_and_one(on: PaperName) -> None:
-    for profile in ("unmanaged", "managed"):
-        reflectance = printed_reflectance(CODES, profile, on)
-        np.testing.assert_allclose(reflectance[-1], paper(on).white, rtol=1e-12)
-        assert reflectance.min() >= paper(on).surface
-        assert reflectance.max() <= 1
-
-
-def test_ink_codes_between_nodes_lie_between_those_of_nodes() -> None:
-    at = np.array([[96.0, 96, 96], [100, 100, 100], [103.59375, 103.59375, 103.59375]])
-    at[0] = 12 * 255 / 32
-    at[2] = 13 * 255 / 32
-    low, middle, high = ink_codes(at, "glossy")
-    share = (100 - at[0, 0]) / (at[2, 0] - at[0, 0])
-    np.testing.assert_allclose(middle, (1 - share) * low + share * high, rtol=1e-9)
-    # Past a node by nothing or by a hair: no jump.
-    near = np.array([[95.624, 120, 30], [95.626, 120, 30]])
-    first, second = ink_codes(near, "glossy")
-    assert np.abs(first - second).max() < 0.02
-
-
-def test_an_unmanaged_print_sends_codes_as_they_are_and_unknown_names_are_refused() -> None:
-    assert np.array_equal(printed_reflectance(CODES), print_reflectance(CODES))
-    with pytest.raises(ValueError, match=r"'icc'.*unmanaged, managed"):
-        printed_reflectance(CODES, "icc")  # pyrefly: ignore[bad-argument-type]
-    with pytest.raises(ValueError, match=r"'silk'.*poster, matt, glossy"):
-        printed_reflectance(CODES, "managed", "silk")  # pyrefly: ignore[bad-argument-type]
 
 
 def test_srgb_under_d50_is_the_adapted_matrix_of_its_primaries() -> None:
