@@ -18,7 +18,7 @@ from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, InputError, LinkClosed
 from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, TEST_BODY, EosModel
 from sim.camera.eos import CARD, DCIM, FOLDER, SimulatedEos
-from tests.drivers.canon.eos_lab import Lab
+from tests.drivers.eos_lab import Lab
 from tests.pinned import Pinned
 from tests.sim.camera.test_eos import Host, NumberedFilm
 
