@@ -142,7 +142,7 @@ def unplotted() -> Iterator[None]:
         return b"<svg></svg>"
 
     with pytest.MonkeyPatch.context() as patched:
-        for page in ("reports.shown_run", "experiments.comparing", "experiments.describing.report"):
+        for page in ("reports.run_page", "experiments.comparing", "experiments.describing.report"):
             patched.setattr(f"evaluation.{page}.svg_of", blank)
         yield
 

@@ -19,7 +19,7 @@ from evaluation.experiments.running import evaluate
 from evaluation.experiments.transfer import outcome
 from evaluation.learning.constant_light import median_light
 from evaluation.methods.standard import standard_methods
-from evaluation.reports import shown_run, table_output
+from evaluation.reports import run_page, table_output
 from evaluation.results.files import MethodErrors, errors_csv, several_lights_csv
 from evaluation.results.result import Result, images_csv, indistinct, read_light, table_csv
 from evaluation.results.tables import Table, lights_tables, statistics_rows, summary_table
@@ -297,8 +297,8 @@ def test_results_and_their_page(
     pictures = {(number, place): b"\x89PNG\r\n\x1a\n" for number in range(4) for place in range(7)}
     found = {
         "results": results,
-        "page": words(shown_run.shown_run(run, "recovery", pictures)),
-        "chosen": [shown_run.chosen_images(result, "reproduction") for result in results],
+        "page": words(run_page.run_page(run, "recovery", pictures)),
+        "chosen": [run_page.chosen_images(result, "reproduction") for result in results],
         "tables": [*told, *(table_output.table_to_latex(one).splitlines() for one in tables)],
         "together": table_output.tables_to_latex("Both", [tables[0], tables[0]]).splitlines(),
         "csv": [
@@ -318,12 +318,12 @@ def test_results_and_their_page(
 
 def test_pictures_of_a_page(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Any] = []
-    monkeypatch.setattr(shown_run, "_jpeg", seen.append)
+    monkeypatch.setattr(run_page, "_jpeg", seen.append)
     lights = np.array([[2.0, 1, 1], [1, 1, 3]])
     wide = Made("wide", np.array([1.0, 2, 1]), np.random.default_rng(0).uniform(0, 1, (20, 90, 3)))
     large = Made("large", np.array([1.0, 2, 0.5]), np.random.default_rng(1).uniform(0, 9, (400, 210, 3)))
     for scene in (walls(1)[0], MixedWall("a", lights), MixedWall("b", lights, None, True), wide, large):
-        shown_run.developed(scene, [np.array([0.2, 0.5, 0.3]), np.array([1.0, 0, 0])])
+        run_page.developed(scene, [np.array([0.2, 0.5, 0.3]), np.array([1.0, 0, 0])])
     pinned("pictures of a page", [[one.shape, one[::3, ::3].astype(np.int64)] for one in seen], same=1e-3)
 
 
@@ -334,8 +334,8 @@ def test_figures_of_many_methods(pinned: Pinned, monkeypatch: pytest.MonkeyPatch
         kinds: list[Any] = [{"recovery": errors(31, at), "reproduction": errors(31, at + 50)} for at in range(count)]
         results = [Result(f"method {at}", truths, kind, truths[:, 0] > 9) for at, kind in enumerate(kinds)]
         if count == 4:
-            shown_run.error_curves(results, "recovery")
-        shown_run.error_planes(results, truths, "reproduction")
+            run_page.error_curves(results, "recovery")
+        run_page.error_planes(results, truths, "reproduction")
     pinned("figures of many methods", figures)
 
 

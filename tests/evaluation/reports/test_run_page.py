@@ -19,8 +19,8 @@ from evaluation.experiments.comparing import error_scatter
 from evaluation.experiments.run_folder import describe_run
 from evaluation.experiments.running import evaluate
 from evaluation.methods import GrayEdge
-from evaluation.reports import shown_run as error_figures
-from evaluation.reports.shown_run import chosen_images, developed, error_curves, error_planes, shown_run
+from evaluation.reports import run_page as error_figures
+from evaluation.reports.run_page import chosen_images, developed, error_curves, error_planes, run_page
 from evaluation.results.result import Result
 from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
 from tests.foundation.test_pages import checked
@@ -193,7 +193,7 @@ def test_many_methods_and_images_make_a_page_that_closes() -> None:
         for number, result in enumerate(results)
         for place in sum(chosen_images(result, "recovery"), ())
     }
-    text = shown_run(run, "recovery", pictures)
+    text = run_page(run, "recovery", pictures)
     found = checked(text)
     assert text.count("<details") == len(METHODS)
     assert len(re.findall(r"src='data:image/jpeg", text)) == len(pictures)
