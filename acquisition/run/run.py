@@ -22,6 +22,7 @@ For telling:
 from __future__ import annotations
 
 import base64
+import http.client
 import json
 import math
 import os
@@ -33,6 +34,8 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -195,9 +198,6 @@ class Notices:
 def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
     """Post to a URL without user name; return why it failed, empty if it did not."""
     # They cost a thirtieth of a second, which every command would pay.
-    import http.client
-    import urllib.error
-    import urllib.request
 
     class Unredirected(urllib.request.HTTPRedirectHandler):
         """Follows no redirection: the body would be lost on the way, and the answer be a success."""

@@ -66,7 +66,7 @@ def test_ptpy_fetches_the_frames_on_the_card(tmp_path: Path) -> None:
     film, clock = SeededFilm(70_000), SimulatedClock()
     eos = SimulatedEos(TEST_BODY, film, clock, auto_power_off_s=0)
     for _ in range(2):
-        eos._full_press(automatic=False)
+        eos._full_press()
         clock.sleep(5)
         assert not eos.busy
     with serve_ptpip(eos, 0) as server:
@@ -236,7 +236,7 @@ def card() -> Iterator[tuple[SeededFilm, int]]:
     """Serve a camera with one frame on its card; return its film, and the port."""
     film, clock = SeededFilm(70_000), SimulatedClock()
     eos = SimulatedEos(TEST_BODY, film, clock, auto_power_off_s=0)
-    eos._full_press(automatic=False)
+    eos._full_press()
     clock.sleep(5)
     with serve_ptpip(eos, 0) as server:
         yield film, server.address[1]

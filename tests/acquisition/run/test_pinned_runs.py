@@ -24,10 +24,9 @@ from experiment.session.records import Check, Judgement, SessionStep
 from foundation.errors import CropError, DeviceError, DeviceFault, LinkClosed
 from tests.acquisition.run.mishaps import TroubledLab, new_session
 from tests.acquisition.run.scripted import GLARE, NIGHT, TURNED, Lab
-from tests.acquisition.run.test_pipeline import FOUR, PATIENT, ScriptedJudge, refused
+from tests.acquisition.run.test_devices import PausedRoom
+from tests.acquisition.run.test_pipeline import FOUR, PATIENT, ScriptedJudge, queue_of, refused, take
 from tests.acquisition.run.test_plan import EOS, GB, SPEEDS, settings_with, work_of
-from tests.acquisition.run.test_queue import queue_of, take
-from tests.acquisition.run.test_retry import Room
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -113,7 +112,7 @@ def test_what_fails_is_waited_for_as_it_was(pinned: Pinned) -> None:
     ):
         if math.inf in (limit,) and max(pattern) > 1e8:
             continue
-        room = Room(limit)
+        room = PausedRoom(limit)
         retry, ended = room.retry, False
 
         def fault(now: float, pattern: tuple[float, ...] = pattern) -> CropError | None:

@@ -1540,7 +1540,7 @@ def test_without_corners_the_command_says_how_to_give_them(
 ) -> None:
     """Of red light alone nobody can say which way up the chart hangs; white frames are all refused here."""
     monkeypatch.setattr("calibration.report.report.write_report", figures_alone)
-    lights = renumbered([RED])
+    lights = renumbered([RED_LIGHT])
     with take(
         plain, tmp_path / "session", lights, verdict=lambda step: "refused" if step.kind == "white" else ACCEPTED
     ):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experiment.chart.layout import (
-    A_SERIES_MM,
     GREY_CODES,
     LEAST_WHITES,
     design_chart,
     paper_chart,
-    spread,
 )
 from experiment.chart.model import Chart
 from foundation.errors import InputError
@@ -149,13 +146,6 @@ def test_the_greys_halve_the_light_of_srgb_and_are_no_colours_of_the_chart() -> 
         assert code % 8 != 0
 
 
-def test_a_page_can_be_larger_named_or_measured() -> None:
-    assert design_chart(2, "a4").page_mm == (297, 210)
-    portrait = design_chart(3, (148, 210))
-    assert portrait.page_mm == (148, 210)
-    assert len(portrait.references) == len(design_chart(3).references)
-
-
 @pytest.mark.parametrize(
     ("bits", "page", "seed", "message"),
     [
@@ -180,20 +170,6 @@ def test_what_cannot_be_designed_says_what_can(
 ) -> None:
     with pytest.raises(InputError, match=message):
         design_chart(bits, page, seed)
-
-
-@settings(max_examples=40)
-@given(st.integers(2, 20), st.integers(2, 20), st.floats(0, 1), st.floats(0.1, 1), st.integers(0, 99))
-def test_spread_chooses_as_many_as_asked_among_the_allowed(
-    rows: int, columns: int, share: float, density: float, seed: int
-) -> None:
-    rng = np.random.default_rng(seed)
-    allowed = rng.random((rows, columns)) < density
-    allowed[0, 0] = True
-    count = round(share * int(allowed.sum()))
-    chosen = spread(allowed, count, rng)
-    assert chosen.sum() == count
-    assert not (chosen & ~allowed).any()
 
 
 @pytest.mark.parametrize(("bits", "page", "pixels"), [(4, "A3", 120), (3, (100.0, 500.0), 125)])
@@ -237,26 +213,3 @@ def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:
     assert codes[0, 31].tolist() == [248, 0, 0]
     assert codes[31, 0].tolist() == [0, 248, 0]
     assert codes[0, 255].tolist() == [0, 0, 56]
-
-
-def test_the_paper_s_references_are_bare_margin() -> None:
-    chart = paper_chart()
-    places = np.array([reference.centre_mm for reference in chart.references])
-    half = np.array([reference.size_mm for reference in chart.references]) / 2
-    low, high = chart.centres_mm.min(axis=0), chart.centres_mm.max(axis=0)
-    edge = np.array(chart.cell_mm) / 2 + 1.4
-    assert all(reference.is_white for reference in chart.references)
-    assert len(places) >= 20
-    assert (((places + half <= low - edge) | (places - half >= high + edge)).any(axis=1)).all()
-    assert (places - half > 0).all()
-    assert (places + half < chart.page_mm).all()
-    for bits, page, expected in ((5, "A5", "256 × 128 cells"), (6, "A0", "1 to 5 bits")):
-        with pytest.raises(InputError, match=expected):
-            paper_chart(page, bits)
-
-
-def test_each_sheet_is_half_of_the_one_before() -> None:
-    sheets = list(A_SERIES_MM.values())
-    for (wide, high), (half_wide, half_high) in pairwise(sheets):
-        assert half_wide == high
-        assert half_high == wide // 2

@@ -18,7 +18,7 @@ from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, InputError, LinkClosed
 from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, TEST_BODY, EosModel
 from sim.camera.eos import CARD, DCIM, FOLDER, SimulatedEos
-from tests.drivers.canon.eos_lab import Lab
+from tests.drivers.eos_lab import Lab
 from tests.pinned import Pinned
 from tests.sim.camera.test_eos import Host, NumberedFilm
 
@@ -154,10 +154,9 @@ def step(host: Host, chance: random.Random, handles: list[int]) -> str:
         case "hand":
             hands = {
                 "dial": lambda: body.turn_dial(chance.choice(list(AeMode)[:8])),
-                "focus": lambda: body.switch_focus(chance.random() < 0.3, chance.random() < 0.5),
+                "focus": lambda: body.switch_focus((chance.random() < 0.3, chance.random())[0]),
                 "lockup": lambda: body.switch_mirror_lockup(chance.random() < 0.2),
                 "power": lambda: body.set_menu(Property.EOS_AUTO_POWER_OFF, chance.choice((0, 30, 240))),
-                "card": lambda: body.insert_card(chance.choice((1 << 20, 1 << 30))),
                 "no card": body.remove_card,
                 "manual": lambda: body.turn_dial(AeMode.MANUAL),
                 "wake": body.wake,

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.presenter import BLACK, WHITE, Colour
+from drivers.presenter import WHITE, Colour
 from sim.optics import APERTURE_VARIANCE, MILD_SHOULDERS, STRONG_SHOULDERS, PhotographicLens
 from sim.world.rendering import Print
 from sim.world.sensors import BODIES
-from sim.world.world import REFERENCE_EXPOSURE, Blob, Room, Situation, World, sheet_of
+from sim.world.world import REFERENCE_EXPOSURE, Blob, Room, Situation, World
 
 PAGE_MM = (180.0, 125.0)
 EOS_550D_PHOTOSITE_MM = 22.3 / 5202
@@ -106,17 +106,6 @@ def test_shoulders_spread_a_share_of_a_squares_light_as_the_profile_says() -> No
 
 
 @pytest.mark.slow
-def test_shoulders_leave_even_light_and_every_photosites_response_as_they_are() -> None:
-    sheet = Print((500, 400), np.empty((0, 4)), np.empty((0, 3), np.uint8))
-    plain, wide = (
-        World(sheet, BODIES["Test"], Room(fill=2, shoulder_share=share)).signal(WHITE, REFERENCE_EXPOSURE)
-        for share in (0.0, 0.05)
-    )
-    # The field is not quite straight within a shoulder.
-    np.testing.assert_allclose(wide[50:-50, 50:-50] / plain[50:-50, 50:-50], 1, atol=2e-4)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("situation", [Situation(), Situation(blobs=(Blob((0.2, 0.2, 0.7, 0.9)),))])
 def test_a_veil_is_the_share_of_each_channels_mean_light_also_when_someone_stands_in_it(situation: Situation) -> None:
     centres = np.array([[60.0, 50.0], [120.0, 70.0]])
@@ -135,12 +124,6 @@ def test_a_veil_is_the_share_of_each_channels_mean_light_also_when_someone_stand
         dark = (slice(0, 20), slice(0, 60))
         lifted = veiled[channel][dark].mean() - (1 - veil) * plane[dark].mean()
         assert lifted == pytest.approx(veil * plane.mean(), abs=0.3)
-
-
-def test_a_dark_frame_has_the_veil_of_the_light_that_is_there() -> None:
-    world = World(white_squares(np.array([[90.0, 60.0]]), 60), BODIES["Test"], Room(veil=0.02, black_leak=0.01))
-    share = world.signal(BLACK, REFERENCE_EXPOSURE) / world.signal(WHITE, REFERENCE_EXPOSURE)
-    np.testing.assert_allclose(share, 0.01, rtol=1e-4)
 
 
 def test_each_channel_lies_where_project_says() -> None:
@@ -173,25 +156,6 @@ def test_lateral_aberration_is_as_large_as_stated_and_half_of_it_cubic() -> None
     places = np.random.default_rng(1).uniform(-20, 2600, (50, 2))
     for channel in "RGB":
         np.testing.assert_allclose(lens.unshifted(lens.shifted(places, channel), channel), places, atol=1e-6)
-
-
-def test_short_waves_have_their_length_and_height() -> None:
-    page = (1189.0, 841.0)
-    surface = sheet_of(Room(waviness_mm=6, wave_mm=150), page, None)
-    x, y = np.meshgrid(np.arange(0, 1189, 2.0), np.arange(0, 841, 2.0))
-    heights = surface.height(np.stack([x, y], axis=-1))
-    assert np.ptp(heights) == pytest.approx(6, rel=0.05)
-    power = np.abs(np.fft.fft2((heights - heights.mean()) * np.outer(np.hanning(len(heights)), np.hanning(len(x[0])))))
-    per_mm = np.hypot(np.fft.fftfreq(len(heights), 2.0)[:, None], np.fft.fftfreq(len(x[0]), 2.0))
-    band = (per_mm > 1 / (150 * 1.3)) & (per_mm < 1 / (150 * 0.75))
-    assert (power[band] ** 2).sum() > 0.97 * (power**2).sum()
-
-
-def test_a_curl_lifts_both_edges_and_shrinks_with_the_sheet() -> None:
-    for page, height in (((1189.0, 841.0), 10.0), ((594.5, 420.5), 5.0)):
-        surface = sheet_of(Room(waviness_mm=0, curl_mm=10), page, None)
-        edges = surface.height(np.array([[0.0, 3.0], [page[0] / 2, 100.0], [page[0], 400.0]]))
-        np.testing.assert_allclose(edges, [height, 0, height], atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.links.network import TcpServer
 from sim.buses.ptp import serve_ptpip
-from tests.contracts.transport import BREAK_OFF, ECHO, GIVE, PATIENCE_S, RAISE, TAKE, Echo, payload
+from tests.contracts.transport import ECHO, GIVE, PATIENCE_S, RAISE, TAKE, Echo, payload
 
 GUID = bytes(range(100, 116))
 VERSION = bytes.fromhex("00000100")
@@ -100,15 +100,6 @@ def test_what_fits_goes_out_in_one_end_of_data(joined: tuple[Client, Client]) ->
     assert heard[1][1][4:] + heard[2][1][4:] == payload(262145)
 
 
-def test_parameters_and_errors_come_back(joined: tuple[Client, Client]) -> None:
-    command, _ = joined
-    command.ask(ECHO, 1, 2)
-    assert command.hear() == (7, OK + bytes.fromhex("01000000 02000000"))
-    command.ask(BREAK_OFF)
-    assert [command.hear()[0] for _ in range(2)] == [9, 12]
-    assert command.hear() == (7, bytes.fromhex("0720 05000000"))
-
-
 def test_data_come_in_any_packets(joined: tuple[Client, Client]) -> None:
     command, _ = joined
     command.ask(TAKE, phase=2)
@@ -118,12 +109,6 @@ def test_data_come_in_any_packets(joined: tuple[Client, Client]) -> None:
     command.say(12, TRANSACTION)
     # The CRC-32 of the digits is the algorithm's published check value.
     assert command.hear() == (7, OK + (9).to_bytes(4, "little") + (0xCBF43926).to_bytes(4, "little"))
-
-
-def test_data_that_never_come_are_an_error(joined: tuple[Client, Client]) -> None:
-    command, _ = joined
-    command.ask(TAKE)
-    assert command.hear() == (7, bytes.fromhex("0220 05000000"))
 
 
 def test_data_called_off_are_not_carried_out(joined: tuple[Client, Client], device: Echo) -> None:
@@ -144,12 +129,6 @@ def test_events_go_out_on_their_own_connection(joined: tuple[Client, Client], de
     assert event.hear() == (8, bytes.fromhex("01c1 ffffffff 00000000"))
 
 
-def test_pings_are_answered_on_both(joined: tuple[Client, Client]) -> None:
-    for connection in joined:
-        connection.say(13)
-        assert connection.hear() == (14, b"")
-
-
 def test_events_wait_until_there_is_a_connection_for_them(server: TcpServer) -> None:
     command, event = Client(server), Client(server)
     _, body = command.greet()
@@ -168,13 +147,6 @@ def test_one_initiator_at_a_time(server: TcpServer, joined: tuple[Client, Client
     second.close()
     joined[0].ask(ECHO)
     assert joined[0].hear() == (7, OK)
-
-
-def test_an_event_connection_of_nobody_is_rejected(server: TcpServer, joined: tuple[Client, Client]) -> None:
-    stranger = Client(server)
-    stranger.say(3, (4711).to_bytes(4, "little"))
-    assert stranger.hear() == (5, bytes.fromhex("01000000"))
-    stranger.close()
 
 
 def test_who_leaves_by_one_connection_has_left_by_both(joined: tuple[Client, Client]) -> None:

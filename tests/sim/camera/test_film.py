@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import io
 import shutil
-import struct
 import subprocess
 from collections.abc import Sequence
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,10 +17,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
-from drivers.raw.rawfile import camera_matrix, read_raw
-from sim.camera import film
+from drivers.raw.rawfile import read_raw
 from sim.camera.film import write_dng
-from sim.world.sensors import BODIES, Body, find_body
+from sim.world.sensors import BODIES, Body
 
 pytestmark = pytest.mark.slow
 
@@ -128,88 +126,6 @@ def test_the_tags_of_a_550d_file_are_those_of_the_standard() -> None:
     np.testing.assert_allclose(fractions(value), neutral / neutral[1], rtol=1e-3)
 
 
-def test_colours_of_bodies_are_those_that_libraw_has_and_of_unknown_ones_srgb_s() -> None:
-    for sensitivities, numbers in film._COLOUR_MATRICES.items():
-        theirs = camera_matrix(sensitivities.replace("_", " "))
-        assert theirs is not None
-        np.testing.assert_allclose(np.array(numbers).reshape(3, 3) / 1e4, theirs, atol=1e-6)
-    # IEC 61966-2-1: linear sRGB to XYZ.
-    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    unknown = np.array(film._LINEAR_SRGB).reshape(3, 3) / 1e4
-    np.testing.assert_allclose(unknown @ to_xyz, np.eye(3), atol=2e-4)
-
-
-# Columns and rows of the maker's pixels (of the first two as dcraw 9.28 shows them), width of the sensor in mm, black.
-SENSORS = {
-    "EOS 550D": (5202, 3465, 22.3, 2048),
-    "EOS 6D Mark II": (6264, 4180, 35.9, 2048),
-    "Canon_EOS_600D": (5202, 3465, 22.3, 2048),
-    "Canon_EOS_200D": (6000, 4000, 22.3, 2048),
-    "Canon_EOS-1Ds_Mark_III": (5616, 3744, 36.0, 1024),
-    "Canon_EOS_5D_Mark_II": (5616, 3744, 36.0, 1024),
-    "Canon_EOS_5DS": (8688, 5792, 36.0, 2048),
-}
-
-
-@pytest.mark.parametrize("name", SENSORS)
-def test_bodies_have_the_sizes_of_their_makers_and_noise_as_such_sensors_have(name: str) -> None:
-    columns, rows, width_mm, black = SENSORS[name]
-    body = find_body(name)
-    top, left, height, width = body.visible
-    assert (width, height, body.black, body.bits, body.pattern) == (columns, rows, black, 14, "RGGB")
-    # Canons have some fifty masked rows above, and more than a hundred masked columns at the left.
-    assert body.sensor == (top + height, left + width)
-    assert 40 < top < 60
-    assert 110 < left < 150
-    assert body.masked == ((0, 0, body.sensor[0], left - 2),)
-    assert 0.82 < body.saturation / 2**14 <= 1
-    # Full wells by area, read noise, and its part before the amplifier, of sensors of these generations (EMVA 1288).
-    full_e = (body.saturation - body.black) * body.electrons_per_dn
-    assert 1000 < full_e / (1000 * width_mm / columns) ** 2 < 2500
-    assert 10 < body.read_noise_dn * body.electrons_per_dn < 30
-    assert 2 < body.sensor_noise_e < 4
-    assert body.gain_e(400) == body.electrons_per_dn / 4
-    # At ISO 100 all of the read noise; at high speeds what arises before the amplifier, over the smaller gain.
-    assert body.noise_dn(100) == pytest.approx(body.read_noise_dn)
-    assert body.noise_dn(10**6) * body.gain_e(10**6) == pytest.approx(body.sensor_noise_e, rel=1e-3)
-
-
-def test_the_exif_directory_holds_the_exposure() -> None:
-    _, _, exif = tags_of(dng(BODIES["Test"]))[34665]
-    assert exif["ExposureTime"] == (1, 2)
-    assert exif["FNumber"] == (28, 5)
-    assert exif["ISOSpeedRatings"] == 400
-    assert exif["DateTimeOriginal"] == "2021:03:14 15:09:26"
-    assert exif["OffsetTimeOriginal"] == "+00:00"
-    assert exif["BodySerialNumber"] == "062031400123"
-
-
-def test_directories_are_sorted_and_even_and_the_strip_ends_the_file(file: Path) -> None:
-    """TIFF 6.0 section 2: entries ascend by code, directories and long values begin on even bytes."""
-    data = file.read_bytes()
-    order, version, first = struct.unpack_from("<2sHI", data)
-    assert (order, version) == (b"II", 42)
-    strip: dict[int, int] = {}
-    directories = [first]
-    for at in directories:
-        assert at % 2 == 0
-        (count,) = struct.unpack_from("<H", data, at)
-        entries = [struct.unpack_from("<HHII", data, at + 2 + 12 * i) for i in range(count)]
-        codes = [code for code, *_ in entries]
-        assert codes == sorted(set(codes))
-        sizes = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 7: 1, 10: 8}
-        for code, kind, number, value in entries:
-            if sizes[kind] * number > 4:
-                assert value % 2 == 0
-            if code == 34665:
-                directories.append(value)
-            if code in (273, 279):
-                strip[code] = value
-        assert struct.unpack_from("<I", data, at + 2 + 12 * count) == (0,)
-    assert strip[273] % 16 == 0
-    assert strip[273] + strip[279] == len(data)
-
-
 def test_libraw_reads_the_counts_and_the_exposure_back(file: Path, body: Body, counts: NDArray[np.uint16]) -> None:
     area = body.visible
     with rawpy.imread(str(file)) as raw:
@@ -248,31 +164,6 @@ def test_dcraw_sees_the_whole_visible_frame(file: Path, body: Body, counts: NDAr
     assert "Shutter: 1/2.0 sec" in told
     assert "Aperture: f/5.6" in told
     assert "Filter pattern: RG/GB" in told
-
-
-def test_the_same_frame_is_the_same_bytes_in_any_timezone() -> None:
-    body = BODIES["Test"]
-    elsewhere = TAKEN_AT.astimezone(timezone(timedelta(hours=9)))
-    assert dng(body) == dng(body, taken_at=elsewhere)
-
-
-def test_a_stream_that_cannot_seek_will_do() -> None:
-    class Pipe(io.RawIOBase):
-        def __init__(self) -> None:
-            self.received = bytearray()
-
-        def writable(self) -> bool:
-            return True
-
-        def write(self, data: object) -> int:
-            piece = bytes(memoryview(data))  # pyrefly: ignore[bad-argument-type]
-            self.received += piece
-            return len(piece)
-
-    body = BODIES["Test"]
-    pipe = Pipe()
-    write_dng(pipe, mosaic(body), body, settings=SETTINGS, taken_at=TAKEN_AT, serial="062031400123")  # pyrefly: ignore[bad-argument-type]
-    assert bytes(pipe.received) == dng(body)
 
 
 def test_counts_of_another_shape_and_times_without_zone_are_refused() -> None:

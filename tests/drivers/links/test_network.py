@@ -102,7 +102,7 @@ def test_tcp_refuses_addresses_that_are_none(host: str, port: int) -> None:
 
 
 def test_a_full_tcp_cable_is_a_timeout() -> None:
-    with _tcp_ends() as (near, _), pytest.raises(LinkTimeout, match="takes no data"):
+    with _tcp_ends() as (near, _), pytest.raises(LinkTimeout):
         # More than any socket buffer; the far end never reads.
         near.write(bytes(1 << 28), 0.05)
 

@@ -55,7 +55,7 @@ class Lab:
 
     def press(self) -> None:
         """Press the release on the camera itself, and let the frame come."""
-        self.eos._full_press(automatic=False)
+        self.eos._full_press()
         self.clock.sleep(5)
         assert not self.eos.busy
 

@@ -170,11 +170,6 @@ def test_a_lab_at_which_another_command_is_at_work_is_not_touched(
         other.communicate(b"\n")
 
 
-def test_an_unknown_control_is_named_with_the_known_ones() -> None:
-    with pytest.raises(ConfigurationError, match="'none', 'pjlink', 'serial'"):
-        parse_lab(HEAD + '[lab.projector]\ncontrol = "klingon"\n', "LAB.toml")
-
-
 @pytest.mark.slow
 def test_what_cannot_be_asked_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
