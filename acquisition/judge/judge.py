@@ -114,7 +114,7 @@ class LiveJudge:
             self.after_pause()
         expected, self._state = self._state.expected, replace(self._state, expected=None)
         if expected not in (None, step.number):
-            return Judgement.of_reason("light", _BESIDE)
+            return Judgement.of_reason("off_codes_deg", _BESIDE)
         try:
             mosaic = read_raw(file)
         except FormatError as error:
@@ -164,7 +164,7 @@ class LiveJudge:
         if any(check.reason for check in checks):
             return _Findings(frame, tuple(checks))
         if state.awaits_primaries and (step.kind == "light" or (step.kind == "response" and not _is_compared(step))):
-            return _Findings(frame, (*checks, Check("light", reason=_UNFOUNDED)))
+            return _Findings(frame, (*checks, Check("off_codes_deg", reason=_UNFOUNDED)))
         anchor = state.anchor
         if step.kind != "dark" and (
             anchor is None or (state.rested and _has_moved_far(state, mosaic, black, measured))
@@ -297,7 +297,7 @@ def _judge_origin(
             "was lost on its way: check the cable and the memory card"
         )
     return (
-        Check("camera", reason=reason),
+        Check("other_camera", reason=reason),
         Check("settings", reason=differs or ""),
         Check("data", round(100 * measured.empty, 4), None, 100 * limits.EMPTY_SHARE, "%", empty),
     )
@@ -442,7 +442,9 @@ MOST_RESTARTS: Final = 2
 """How often first frames are taken again at once because others contradict them: what passes does so within a minute,
 and what comes back for the third time wants somebody who looks."""
 
-_CONTRADICTIONS: Final = ("movement", "blur", "rows", "uniformity", "light", "ambient", "lamp")
+_CONTRADICTIONS: Final = (
+    "movement", "blur", "rows", "uniformity", "off_codes_deg", "stray_share", "dark_drift", "off_brightness",
+)  # fmt: skip
 """Checks that hold a frame against those before it."""
 
 _STALE_LEAST = 0.02
@@ -456,7 +458,7 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
     24, that changed most, so that a lamp in a corner shows.
     """
     if state.white is None:
-        return (Check("dark"),)
+        return (Check("leak_share"),)
     white = state.white.tiles - (0 if state.dark is None else state.dark.tiles)
     # Of a tile that white hardly lights, such as a black backdrop, against a third of the mean.
     scale = np.maximum(white, np.maximum(white.mean(axis=0) / 3, 1.0))
@@ -477,7 +479,7 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
             f"the dark frame has {value:.1f} % of white, {dark_percent:g} % allowed; is another light on, or the "
             "projector's picture not black?"
         )
-    checks = [Check("light" if stale else "dark", round(value, 3), None, dark_percent, "%", reason)]
+    checks = [Check("off_codes_deg" if stale else "leak_share", round(value, 3), None, dark_percent, "%", reason)]
     first = state.first_dark
     if first is not None and not reason:
         changed = _by_region(100 * (frame.tiles - first.tiles) / scale)
@@ -496,7 +498,7 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
                 f"the room is not as dark as in the first dark frame: {drift:.2f} % of white {more}, {limit:.2g} % "
                 "allowed; was a lamp or a display switched, or does daylight come in?"
             )
-        checks.append(Check("ambient", round(drift, 3), None, round(limit, 3), "%", reason))
+        checks.append(Check("dark_drift", round(drift, 3), None, round(limit, 3), "%", reason))
     return tuple(checks)
 
 
@@ -510,7 +512,7 @@ def _by_region(tiles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 def judge_white(first: Frame | None, frame: Frame) -> Check:
     """Return how far paper is from that of the session's first frame of this light, white or the brightest grey."""
     if first is None or np.isnan(frame.paper).any() or np.isnan(first.paper).any():
-        return Check("white drift")
+        return Check("white_drift")
     drift = float(100 * (frame.paper.sum() / max(first.paper.sum(), 1.0) - 1))
     reason = ""
     if abs(drift) > limits.LAMP_TOTAL:
@@ -518,7 +520,7 @@ def judge_white(first: Frame | None, frame: Frame) -> Check:
             f"paper white is {drift:+.0f} % from the session's first frame, {limits.LAMP_TOTAL:g} % allowed; let "
             "the lamp warm up, or begin a new session"
         )
-    return Check("white drift", round(drift, 2), -limits.LAMP_TOTAL, limits.LAMP_TOTAL, "%", reason)
+    return Check("white_drift", round(drift, 2), -limits.LAMP_TOTAL, limits.LAMP_TOTAL, "%", reason)
 
 
 def judge_first_primary(state: JudgeState, frame: Measured, primary: int) -> Check:
@@ -527,7 +529,7 @@ def judge_first_primary(state: JudgeState, frame: Measured, primary: int) -> Che
     Of a frame's three channels none sees another's primary better than its own, whatever the camera.
     """
     if state.white is None:
-        return Check("light")
+        return Check("off_codes_deg")
     dark = np.zeros(3) if state.dark is None else state.dark.level
     share = (frame.level - dark) / np.maximum(state.white.level - dark, 1.0)
     name = ("red", "green", "blue")[primary]
@@ -544,7 +546,7 @@ def judge_first_primary(state: JudgeState, frame: Measured, primary: int) -> Che
         reason = (
             f"{name} alone was ordered, and the frame is as bright as white everywhere; does the screen stand still?"
         )
-    return Check("light", round(100 * float(share[primary]), 1), 10.0, None, "%", reason)
+    return Check("off_codes_deg", round(100 * float(share[primary]), 1), 10.0, None, "%", reason)
 
 
 def judge_first_frames(state: JudgeState, step: SessionStep, cause: Check | None, judge: JudgeSettings) -> Check | None:
@@ -588,7 +590,7 @@ def _odd_white(state: JudgeState, judge: JudgeSettings) -> Check | None:
     limit = max(judge.light_deg, fit.angle_limit(limits.LIGHT_SIGMAS))
     if fit.angle_deg > limit:
         said = f"the first white frame is {fit.angle_deg:.1f}° from the light that greys and primaries foretell"
-        return Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", said)
+        return Check("off_codes_deg", round(fit.angle_deg, 3), None, round(limit, 3), "°", said)
     room = max(judge.drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
     if abs(fit.brightness) > room:
         percent = 100 * float(np.expm1(fit.brightness))
@@ -614,12 +616,17 @@ class _FrameCause:
     in_each_light: bool = False
 
 
-_OF_THE_LIGHT = frozenset({"uniformity", "blur", "light", "lamp", "white drift"})
+_ELSEWHERE = frozenset({"stray_share", "dark_drift"})
+"""Light from elsewhere: in a light, and in a dark frame against the first one."""
+
+_AMBIENT = _FrameCause(frozenset({"off_codes_deg", "off_brightness", "uniformity"}), is_hidden=True)
+
+_OF_THE_LIGHT = frozenset({"uniformity", "blur", "off_codes_deg", "off_brightness", "white_drift"})
 
 CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
     {
         "file": _FrameCause(),
-        "camera": _FrameCause(lasts=True),
+        "other_camera": _FrameCause(lasts=True),
         "settings": _FrameCause(),
         "data": _FrameCause(),
         "repeated": _FrameCause(),
@@ -628,13 +635,16 @@ CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
         "chart": _FrameCause(lasts=True),
         "movement": _FrameCause(_OF_THE_LIGHT | {"rows"}),
         "blur": _FrameCause(frozenset({"rows", "uniformity"})),
-        "rows": _FrameCause(_OF_THE_LIGHT | {"movement", "ambient"}, in_each_light=True),
-        "uniformity": _FrameCause(_OF_THE_LIGHT - {"uniformity"} | {"rows", "movement", "ambient"}, in_each_light=True),
-        "light": _FrameCause(frozenset({"lamp", "ambient", "white drift"}), in_each_light=True),
-        "ambient": _FrameCause(frozenset({"light", "lamp", "uniformity"}), is_hidden=True),
-        "lamp": _FrameCause(in_each_light=True),
-        "dark": _FrameCause(is_hidden=True),
-        "white drift": _FrameCause(in_each_light=True),
+        "rows": _FrameCause(_OF_THE_LIGHT | _ELSEWHERE | {"movement"}, in_each_light=True),
+        "uniformity": _FrameCause(
+            _OF_THE_LIGHT - {"uniformity"} | _ELSEWHERE | {"rows", "movement"}, in_each_light=True
+        ),
+        "off_codes_deg": _FrameCause(_ELSEWHERE | {"off_brightness", "white_drift"}, in_each_light=True),
+        "stray_share": _AMBIENT,
+        "dark_drift": _AMBIENT,
+        "off_brightness": _FrameCause(in_each_light=True),
+        "leak_share": _FrameCause(is_hidden=True),
+        "white_drift": _FrameCause(in_each_light=True),
         "additivity": _FrameCause(),
     }
 )
@@ -688,7 +698,7 @@ def _voids_others(state: JudgeState, cause: str) -> bool:
 def _is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
     """Return whether taking the frame again will not help; `state` includes it."""
     # A lamp that is another one at the beginning of a run would cost every light up to the next white frame.
-    another = cause == "white drift" and is_brightest_grey(step)
+    another = cause == "white_drift" and is_brightest_grey(step)
     # Of a session's first frame the exposure is too long, and a second one is no shorter.
     overexposed = cause == "clipping" and state.white is None
     return another or overexposed or CAUSES[cause].lasts or state.refused[1] >= limits.LASTING_FRAMES
@@ -734,7 +744,7 @@ def _judge_light(
     wrong = fit.angle_deg > limit
     reason, added = "", 0.0
     if wrong or fit.distance > limits.STALE_SIGMAS or abs(fit.brightness) > room:
-        reason, added = seen.cause(wrong, room, again=state.refused[0] == "light")
+        reason, added = seen.cause(wrong, room, again=state.refused[0] == "off_codes_deg")
     stepped = False
     lamp = ""
     if not reason and abs(fit.brightness) > room:
@@ -746,11 +756,11 @@ def _judge_light(
     if not reason and not lamp and not stepped and not state.rested:
         lamp, added = crept(state.leaning.then(leaning), drift_percent / 100)
         reason = _ambient_reason(added) if added else ""
-    ambient = (Check("ambient", round(100 * added, 2), None, None, "%", reason),) if added else ()
+    ambient = (Check("stray_share", round(100 * added, 2), None, None, "%", reason),) if added else ()
     # Where another cause changes the light, its brightness is none of the lamp's.
     checks = (
         *ambient,
-        Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
+        Check("off_codes_deg", round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
         lamp_check(fit.brightness, room, lamp),
     )
     return checks, LampSeen(fit.brightness, stepped, leaning)
@@ -764,7 +774,7 @@ def lamp_check(brightness: float, room: float, reason: str) -> Check:
     """
     allowed = round(100 * room, 2) if 100 * room < limits.LAMP_TOTAL else None
     low = None if allowed is None else -allowed
-    return Check("lamp", round(100 * float(np.expm1(brightness)), 2), low, allowed, "%", reason)
+    return Check("off_brightness", round(100 * float(np.expm1(brightness)), 2), low, allowed, "%", reason)
 
 
 def crept(leaning: Leaning, drift: float) -> tuple[str, float]:
@@ -991,7 +1001,7 @@ def _brightness_reason(brightness: float) -> str:
 def _without_model(light: FrameLight, codes: Codes, before: Seen | None) -> Check:
     """Return what can be said without frames of the primaries: whether nothing has changed since the frame before."""
     if before is None or before.amounts is None or before.codes == codes or not any(codes) or not any(before.codes):
-        return Check("light")
+        return Check("off_codes_deg")
     wanted = np.array([decode_srgb(np.array(c) / 255) for c in (codes, before.codes)])
     away = float(angles_deg(wanted[:1], wanted[1:])[0])
     brighter = abs(float(np.log(wanted[0].sum() / wanted[1].sum())))
@@ -999,7 +1009,7 @@ def _without_model(light: FrameLight, codes: Codes, before: Seen | None) -> Chec
     reason = ""
     if same < 2 * limits.STALE_SIGMAS and (away > limits.NOMINAL_DEG or brighter > 0.2):
         reason = _stale_reason(before, codes)
-    return Check("light", reason=reason)
+    return Check("off_codes_deg", reason=reason)
 
 
 def _stale_reason(before: Seen, codes: Codes) -> str:

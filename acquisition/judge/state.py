@@ -700,7 +700,7 @@ class JudgeState:
         )
         if not found.accepted:
             count = self.refused[1] + 1 if found.cause == self.refused[0] else 1
-            lamp = found.lamp.brightness if found.cause == "lamp" else float("nan")
+            lamp = found.lamp.brightness if found.cause == "off_brightness" else float("nan")
             x, y = frame.moved_px.tolist() if found.cause == "movement" else (float("nan"), float("nan"))
             doubted = self.doubted | {step.number}
             return replace(state, refused=(found.cause, count), candidate=(lamp, x, y), doubted=doubted)

@@ -247,7 +247,9 @@ class PauseNotices:
             self._tell("resumed", sentence)
 
 
-SHOWN = ("light", "movement", "blur", "white drift", "dark", "ambient", "exposure")
+SHOWN = (
+    "off_codes_deg", "movement", "blur", "white_drift", "leak_share", "stray_share", "dark_drift", "exposure",
+)  # fmt: skip
 """Checks that the line about the last frame has, as far as they have a number."""
 
 
