@@ -384,7 +384,8 @@ def test_a_projector_that_does_not_add_is_told_and_not_refused(tmp_path: Path, t
     assert [judgement.reason for judgement in said if judgement.reason] == []
     white = next(one for one, step in zip(said[::-1], lab.steps[::-1], strict=True) if step.kind == "white")
     assert check(white, "additivity").value == pytest.approx(40, abs=3)
-    limits = [check(one, "off_codes_deg").high or 0 for one, step in zip(said, lab.steps, strict=True) if step.kind == "light"]
+    of_lights = [one for one, step in zip(said, lab.steps, strict=True) if step.kind == "light"]
+    limits = [check(one, "off_codes_deg").high or 0 for one in of_lights]
     assert max(limits) > 0.8  # wider than where light adds
     assert cause(take(lab.light(*ORANGE), Colour(*SKY))) == "off_codes_deg"
 

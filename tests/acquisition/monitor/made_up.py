@@ -81,7 +81,9 @@ class MadeUpRun:
         counts = (CROSSTALK @ linear + 0.0005) * 9000 * (1 + self.random.normal(0, 0.0005, 3))
         return float(counts[0]), float(counts[1]), float(counts[2])
 
-    def take(self, step: SessionStep, reason: str = "", *, check: str = "off_codes_deg", value: float | None = None) -> int:
+    def take(
+        self, step: SessionStep, reason: str = "", *, check: str = "off_codes_deg", value: float | None = None
+    ) -> int:
         """Take a frame of a step; with a `reason` it is refused by `check`, whose value is then `value`."""
         tries = self.journal.kept_files(step) + 1
         attempt = self.expose(step, tries)

@@ -18,7 +18,8 @@ STEP = SessionStep(7, "light", 5, Colour(1, 2, 3))
 
 def test_the_verdict_has_its_numbers() -> None:
     checks = (Check("file"), Check("movement", 0.031, None, 0.2, "px"), Check("off_codes_deg", 0.2134, None, 0.5, "°"))
-    assert verdict_line(Taken(STEP, Judgement(checks), 3)) == "light 5 accepted, off_codes_deg 0.213°, movement 0.031 px"
+    line = verdict_line(Taken(STEP, Judgement(checks), 3))
+    assert line == "light 5 accepted, off_codes_deg 0.213°, movement 0.031 px"
     followed = Judgement((Check("off_brightness", -4.0, -1.0, 1.0, "%"), Check("off_codes_deg", 0.7, None, 0.5, "°")))
     assert verdict_line(Taken(STEP, followed, 3)) == "light 5 accepted, off_codes_deg 0.7° (beyond its limit)"
     dark = Judgement((Check("exposure", 0.4, None, None, "%", "too dark"),))
