@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.judged_labs import Projector, cause, lab_of, rooms
+from calibration.figures.light import OFF_CODES_DEG
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
@@ -87,7 +88,7 @@ def odd_worlds(folder: Path, lights: int) -> list[tuple[str, int, int, Counter[s
         said = lab.session(lights, 12, 3)
         causes = Counter(cause(one) for _, one in said if not one.accepted)
         limit = [
-            c.high for _, one in said[-20:] for c in one.checks if c.name == "off_codes_deg" and c.high is not None
+            c.high for _, one in said[-20:] for c in one.checks if c.name == OFF_CODES_DEG.name and c.high is not None
         ]
         found.append((name, len(said), sum(causes.values()), causes, f"{np.median(limit):.2f}°" if limit else ""))
         for step, one in said:

@@ -38,6 +38,7 @@ import numpy.typing as npt
 
 from acquisition.judge import limits
 from acquisition.judge.measure import Anchor, Frame
+from calibration.figures.light import OFF_BRIGHTNESS
 from experiment.measures.frame import SEGMENTS, Measured, Noise, strip_blocks
 from experiment.session.records import PRIMARIES, REFERENCES, TOP, SessionStep
 from foundation.robust import huber_weights, sigma_of
@@ -700,7 +701,7 @@ class JudgeState:
         )
         if not found.accepted:
             count = self.refused[1] + 1 if found.cause == self.refused[0] else 1
-            lamp = found.lamp.brightness if found.cause == "off_brightness" else float("nan")
+            lamp = found.lamp.brightness if found.cause == OFF_BRIGHTNESS.name else float("nan")
             x, y = frame.moved_px.tolist() if found.cause == "movement" else (float("nan"), float("nan"))
             doubted = self.doubted | {step.number}
             return replace(state, refused=(found.cause, count), candidate=(lamp, x, y), doubted=doubted)

@@ -51,6 +51,7 @@ from acquisition.run.devices import TRY_S, Devices, RetryPolicy, RunEnd, RunWatc
 from acquisition.run.pipeline import Job, Pipeline, StepQueue, Taken, link_runs, step_name, unclosed_kinds, white_first
 from acquisition.run.plan import nothing_to_retake, planned_steps, require_plan, require_same
 from acquisition.run.rig.opening import open_rig
+from calibration.figures.light import DARK_DRIFT, LEAK_SHARE, OFF_CODES_DEG, STRAY_SHARE, WHITE_DRIFT
 from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import load_chart
@@ -248,7 +249,8 @@ class PauseNotices:
 
 
 SHOWN = (
-    "off_codes_deg", "movement", "blur", "white_drift", "leak_share", "stray_share", "dark_drift", "exposure",
+    OFF_CODES_DEG.name, "movement", "blur", WHITE_DRIFT.name,
+    LEAK_SHARE.name, STRAY_SHARE.name, DARK_DRIFT.name, "exposure",
 )  # fmt: skip
 """Checks that the line about the last frame has, as far as they have a number."""
 
