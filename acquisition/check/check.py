@@ -27,6 +27,7 @@ from acquisition.check.exposure import (
     search,
 )
 from acquisition.check.findings import CheckReport, Finding, judged, not_checked, not_checked_all
+from acquisition.check.picture import check_png
 from acquisition.check.supplies import judge_disk, judge_noise_reduction, judge_supplies
 from acquisition.check.trial import (
     Trial,
@@ -150,8 +151,6 @@ def check_lab(
     outcome = None if trial.table is None else verdict.outcome
     report = CheckReport(tuple(lines), tuple(findings), outcome, values, trial.not_known)
     if picture is not None:
-        from acquisition.check.picture import check_png
-
         write_whole(picture, check_png(trial, chart, report))
     return report
 

@@ -26,6 +26,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import maximum_filter
 
 from acquisition.judge import limits
 from acquisition.judge.measure import Anchor, Frame, disagreement, refusal
@@ -1127,8 +1128,6 @@ def _explained(seen: _Array, by: _Array) -> tuple[_Array, float]:
 
 def _beside(basis: Basis) -> _Array:
     """Return (T,) float64, ≥ 1: white of the brightest tile beside or at each tile, over its own."""
-    from scipy.ndimage import maximum_filter
-
     strength = np.linalg.norm(basis.maps.sum(axis=0), axis=1).reshape(TILE_ROWS, TILE_COLUMNS)
     return np.asarray(maximum_filter(strength, 3) / np.maximum(strength, 1e-6), dtype=np.float64).ravel()
 

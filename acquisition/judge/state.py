@@ -35,6 +35,7 @@ from functools import cache
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import gaussian_filter1d, shift
 
 from acquisition.judge import limits
 from acquisition.judge.measure import Anchor, Frame
@@ -467,8 +468,6 @@ class Basis:
             return None
         maps = self.strip_maps
         if blur_px > 0 or abs(down_px) > _AT_REST_PX:
-            from scipy.ndimage import gaussian_filter1d, shift
-
             rows = maps.reshape(3, -1, SEGMENTS, 3)
             rows = shift(rows, (0, down_px, 0, 0), order=1, mode="nearest")
             rows = rows if blur_px == 0 else gaussian_filter1d(rows, blur_px, axis=1, mode="nearest")
