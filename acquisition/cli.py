@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from enum import Enum
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,10 +18,6 @@ from foundation import console
 from foundation.console import (
     EXIT_CODES,
     JsonOutput,
-    Quiet,
-    Verbose,
-    Version,
-    common_first,
     new_app,
     option,
     orderly_end,
@@ -26,6 +25,8 @@ from foundation.console import (
     with_json,
 )
 from foundation.errors import DeviceError, InputError, QualityError, StorageError, counted, first_of
+from foundation.files import make_folder, write_whole
+from foundation.folders import held_folder, require_free, whole_folder
 
 if TYPE_CHECKING:
     from experiment.config import LabSettings
@@ -52,12 +53,7 @@ class Rig(Enum):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `acquire` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
-    return console.run(lambda: app(args=common_first(argv), prog_name="acquire"))
-
-
-@app.callback()
-def acquire(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
-    """Take what all commands take."""
+    return console.run(lambda: app(args=argv, prog_name="acquire"))
 
 
 @app.command(epilog=EXIT_CODES)
@@ -73,11 +69,6 @@ def init(
     acquire illuminations does). A chart or lights that are there already stay as they are; a LAB.toml that is there
     is an error.
     """
-    from importlib.resources import files
-
-    from foundation.files import make_folder, write_whole
-    from foundation.folders import require_free
-
     settings, print_folder, lights = lab / "LAB.toml", lab / "chart", lab / "illuminations.csv"
     require_free(settings, "the settings")
     make_folder(lab, lab)
@@ -101,15 +92,10 @@ def chart(
         str | None,
         typer.Option(help="Paper, landscape: A0 … A8, or WIDTHxHEIGHT in mm; else the smallest that fits."),
     ] = None,
-    cell_mm: Annotated[
-        float | None,
-        typer.Option(help="Side of a cell, mm, to the nearest 0.21; else 5.29, or the largest that fits on the page."),
-    ] = None,
     arrangement: Annotated[
         Arrangement,
         typer.Option(help="tagged: random order, tags and references; paper: the paper's 256 × 128 grid without tags."),
     ] = Arrangement.TAGGED,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the colours.")] = 1,
     tiff: Annotated[bool, typer.Option(help="Write the 600-dpi TIFF.")] = True,
     tagged_tiff: Annotated[
         bool,
@@ -129,14 +115,8 @@ def chart(
     from experiment.chart.printing import save_pdf, save_preview, save_tiff
     from experiment.chart.proof import save_instructions, save_proof
     from experiment.framing.finding import small_parts_warning
-    from foundation.folders import whole_folder
 
-    if arrangement is Arrangement.PAPER:
-        if cell_mm is not None:
-            raise InputError("the paper's arrangement fills its page; leave --cell-mm out, or choose another --page")
-        design = paper_chart(_page(page), bits)
-    else:
-        design = design_chart(bits, _page(page), seed, cell_mm)
+    design = paper_chart(_page(page), bits) if arrangement is Arrangement.PAPER else design_chart(bits, _page(page))
     with whole_folder(out, "the chart") as folder:
         save_preview(design, folder / "preview.png")
         save_pdf(design, folder / "chart.pdf")
@@ -192,10 +172,7 @@ def illuminations(
 
     Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb-chromaticities beside it.
     """
-    from collections import Counter
-
     from experiment.lights import parse_ccts, plan_illuminations, plot_illuminations, save_illuminations
-    from foundation.folders import require_free
 
     plot = out.with_suffix(".png")
     if plot == out:
@@ -214,9 +191,6 @@ def illuminations(
 @app.command(epilog=EXIT_CODES)
 @with_json("acquire devices")
 def devices(
-    search: Annotated[
-        float, typer.Option(min=0, help="Seconds to wait for PJLink projectors to answer; 0 does not ask.")
-    ] = 10.0,
     identify: Annotated[bool, typer.Option(help="Show on every display its number for ten seconds.")] = False,
     *,
     output: JsonOutput,
@@ -227,7 +201,7 @@ def devices(
     """
     from acquisition.run.rig.lab import attached_devices, identify_displays
 
-    for attached in attached_devices(search):
+    for attached in attached_devices():
         output.append("devices", attached)
         print(f"{attached.kind}:")
         for name in attached.found:
@@ -256,9 +230,6 @@ def check(
     linearity: Annotated[
         bool, typer.Option("--linearity", help="Take a series of exposures too, which shows the sensor's linearity.")
     ] = False,
-    session: Annotated[
-        Path | None, typer.Option(help="Where the session will be, for the disk's space; else beside LAB.toml.")
-    ] = None,
     *,
     output: JsonOutput,
 ) -> None:
@@ -286,7 +257,6 @@ def check(
             picture=picture,
             corners=given,
             linearity=linearity,
-            session=session,
         )
     if output.asked:
         output.add(**report.values())
@@ -387,8 +357,6 @@ def status(
     ended for one, or it was killed; with 4 when it is paused for its frames, or ended with frames left, or its files,
     chart or lights are lost; with 5 when its disk is full or at fault.
     """
-    from datetime import UTC, datetime
-
     from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path
     from experiment.session.repair import secrets_warning
@@ -435,7 +403,6 @@ def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) ->
     """
     from experiment.session.folder import busy_sentence, rebuild_journal
     from experiment.session.journal import JOURNAL_FILE
-    from foundation.folders import held_folder
 
     with held_folder(session, busy_sentence(session)):
         attempts = rebuild_journal(session)

@@ -36,9 +36,10 @@ import rawpy
 
 from benchmarks import words_given
 from calibration.checks.frame_consistency import ConsistencyCheck
-from calibration.pipeline.baseline import baseline_of, select_frames, with_lens
+from calibration.pipeline.baseline import baseline_of, with_lens
 from calibration.pipeline.build import build, thread_count
-from calibration.pipeline.frames import PAPER_OPTIONS, BuildOptions, decode_frame
+from calibration.pipeline.frames import PAPER_OPTIONS, BuildOptions, select_frames
+from calibration.pipeline.measuring import decode_frame
 from calibration.registration.register import register
 from calibration.sampling import gather_values, sites_at
 from drivers.camera import CapturedFrame
@@ -194,7 +195,7 @@ def lens_measured(session: Session) -> float:
     first = decode_frame(session, selected.registered)
     primaries = [decode_frame(session, record) for record in selected.primaries]
     baseline = baseline_of(session.chart, first)
-    return min(timed(lambda: with_lens(baseline, first, primaries), 1).processor for _ in range(RUNS))
+    return min(timed(lambda: with_lens(baseline, first, primaries, ()), 1).processor for _ in range(RUNS))
 
 
 def unpack(path: Path) -> None:

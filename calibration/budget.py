@@ -3,7 +3,7 @@
 Errors are relative, of the white of bare paper under each light and of the mean of each cell, channel by channel. Each
 component is a mean square error: its variance and, where an effect is measured but not taken out, its square.
 Components are independent and add up (JCGM 100:2008, GUM, 5.1); what is stated is expanded, k = 2 (6.2), for about 95 %
-of cases. The noise of samples is no error of a cell: it is the camera's. `calibration.pipeline.collecting` fills it.
+of cases. The noise of samples is no error of a cell: it is the camera's. `calibration.pipeline.table_figures` fills it.
 
 L lights, C cells in the order of colour indices.
 """

@@ -20,12 +20,11 @@ from datetime import UTC
 from functools import lru_cache
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from drivers.raw.rawfile import FrameOrigin
 from experiment.config import CameraSettings, CitationSettings
 from experiment.session.records import FrameRecord
-from foundation.errors import InputError
 from foundation.records import Record
 
 SerialForm = Literal["hash", "plain", "withheld"]
@@ -208,17 +207,6 @@ class StatedOrigin:
     rig: Rig | None
     camera: CameraSettings | None
     devices: dict[str, str]
-
-
-def with_changes(citation: CitationSettings, changes: dict[str, Any]) -> CitationSettings:
-    """Return what the lab states with what was given on the command line in its place."""
-    try:
-        return CitationSettings.model_validate(citation.model_dump() | changes)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = str(first["loc"][0]).replace("_", "-").removeprefix("camera-").replace("authors", "author")
-        reason = str(first["msg"]).removeprefix("Value error, ")
-        raise InputError(f"--{key} {first['input']!r}: {reason}") from error
 
 
 def origin_record(stated: StatedOrigin, records: Sequence[FrameRecord], origins: Sequence[FrameOrigin]) -> OriginRecord:

@@ -21,8 +21,8 @@ _FIGURES_HEAD = """# Figures
 
 What `build-lut` judges a table by. Within what is *accepted* nothing is said; beyond it a figure is remarked on, and
 beyond what is *refused* there is no table. `acquire check` judges most of them before a session, by trial frames.
-`build-lut --check` reads one frame, and judges those that this tells; what more frames can only make worse it judges
-where it is *beyond* already. The names are those of `report.json`; some had others in the reports of earlier software.
+`build-lut check` reads one frame, and judges those that this tells; what more frames can only make worse it judges
+where it is *beyond* already. The names are those of `report.json`.
 
 *Written by `python -m calibration.reference` from `calibration/figures`.*
 """
@@ -66,9 +66,8 @@ def figures_page() -> str:
 
 
 def _plain_limit(one: Limit) -> str:
-    return (
-        f"| {one.title} (`{one.name}`) | {one.expected} | {_refused(one)} | {one.why} ({one.source}) | {one.remedy} |"
-    )
+    limits = f"{one.expected} | {_refused(one)}"
+    return f"| {one.title} (`{one.name}`) | {limits} | {one.why} ({one.source}) | {one.remedy} |"
 
 
 def _refused(one: Limit) -> str:
@@ -80,8 +79,7 @@ def _limits(one: Figure) -> str:
     helps = one.remedy or "what most of them are decides"
     told = _TOLD[one.of_one_frame]
     limits = f"{one.expected} | {refused} | {known} | {told}"
-    names = f"`{one.name}`, formerly `{one.former_name}`" if one.former_name else f"`{one.name}`"
-    return f"| {one.title} ({names}) | {limits} | {one.why} ({one.source}) | {helps} |"
+    return f"| {one.title} (`{one.name}`) | {limits} | {one.why} ({one.source}) | {helps} |"
 
 
 def causes_page() -> str:

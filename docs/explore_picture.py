@@ -24,7 +24,7 @@ from tests.acquisition.monitor.browser import browser_tab
 WINDOW = 1280, 790
 """Of the browser, px: the light, the picture and the pixel."""
 
-SETTINGS = "[chart]\nbits = 4\n"
+SETTINGS = 'room.profile = "managed"\nchart.bits = 4\n'
 """Few colours, so that the table takes seconds; what is rendered by colour does not show it."""
 
 DRAWN = "panels.every((one) => one.drawn.endsWith(shown.light) && one.rows.textContent.includes('±'))"
@@ -36,7 +36,7 @@ def main() -> None:
     target = Path(__file__).resolve().with_name("images") / "explore.jpg"
     with tempfile.TemporaryDirectory(prefix="crop-") as folder, contextlib.chdir(folder):
         Path("settings.toml").write_text(SETTINGS, encoding="utf-8")
-        sim(["table", "lut", "--camera", "EOS 550D", "--print", "managed", "--settings", "settings.toml"])
+        sim(["table", "lut", "--camera", "EOS 550D", "--settings", "settings.toml"])
         save_photographs(Path("photographs"))
         sources = find_pictures("photographs/coffee.png", Preparation(max_side=1000))
         explorer = Explorer("lut", open_lut(Path("lut")), sources)

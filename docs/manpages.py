@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 from typer.main import get_command
 
 from croplab import COMMANDS
+from foundation.console import COMMON
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -55,7 +56,7 @@ def page(name: str, command: Any, names: list[str]) -> str:
         parts.append(".SH COMMANDS\n")
         for words, found in below:
             texts = "".join(f".PP\n{_text(text)}\n" for text in _paragraphs(found) if not text.startswith("Exit codes"))
-            parts.append(f".SS {_text(' '.join(words))}\n{_synopsis(words, found)}{texts}{_parameters(found)}")
+            parts.append(f".SS {_text(' '.join(words))}\n{_synopsis(words, found)}{texts}{_parameters(found, COMMON)}")
     parts.append('.SH "SEE ALSO"\n' + ",\n".join(f".BR {_dashed(other)} (1)" for other in names if other != name))
     return "".join(parts).replace(",\n.BR", "\n.BR") + "\n"
 
@@ -90,10 +91,12 @@ def _synopsis(words: tuple[str, ...], command: Any) -> str:
     return "".join(shown)
 
 
-def _parameters(command: Any) -> str:
-    """Return the arguments and options of a command, each with its help."""
+def _parameters(command: Any, without: Collection[str] = ()) -> str:
+    """Return the arguments and options of a command, each with its help; `without` those that stand elsewhere."""
     parts: list[str] = []
     for parameter in command.params:
+        if parameter.name in without:
+            continue
         help_text = _text(" ".join((getattr(parameter, "help", None) or "").replace("\\[", "[").split()))
         if parameter.param_type_name == "argument":
             parts.append(f".TP\n\\fI{_text(_name_of(parameter))}\\fR\n{help_text}\n")

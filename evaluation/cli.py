@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from evaluation.commands import run as run_command
 from evaluation.commands import train as train_command
 from evaluation.commands import transfer as transfer_command
 from evaluation.commands import tune as tune_command
-from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, is_common, new_app, run
+from foundation.console import EXIT_CODES, is_common, new_app, run
 from foundation.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,14 +41,9 @@ app.command("pool", help=pool_command.HELP)(pool_command.pool)
 app.command("tune", help=tune_command.HELP)(tune_command.tune)
 
 
-@app.callback()
-def evaluate(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
-    """Take what all commands take."""
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with `argv`, by default the process's own, and return one of `foundation.console.EXIT_CODES`."""
-    whole = _with_command(common_first(argv))
+    whole = _with_command(sys.argv[1:] if argv is None else argv)
 
     def evaluate_words() -> None:
         name, *words = [word for word in whole if not is_common(word)] or [""]

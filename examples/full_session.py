@@ -71,8 +71,8 @@ def main() -> None:
     step(out, "session", "acquire", "run", "LAB.toml", "session")
     if not (out / "lut").exists():
         step(out, "lut", "build-lut", "session", "lut")
-    step(out, "lut", "build-lut", "--verify", "lut", "session")
-    step(out, "lut", "build-lut", "--info", "lut")
+    step(out, "lut", "build-lut", "verify", "lut", "session")
+    step(out, "lut", "build-lut", "info", "lut")
     if not chosen.keep_session:
         shutil.rmtree(out / "session")
 

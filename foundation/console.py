@@ -2,12 +2,13 @@
 
 Commands are thin: parse, build, call, print. `run` is the one place where an error turns into text.
 
-What all of them take: -h, --version, -v, -q and shell completion, in one style of help (`new_app`). Log records go to
-stderr, warnings and above unless asked otherwise. ``-v`` adds what is done (``INFO``), ``-vv`` every exchange with a
-device (``DEBUG``), and ``-q`` leaves errors alone: no warnings and no progress bars.
+Each command of an app takes -h, --version, -v and -q, in one style of help; `new_app` adds them, and a command's
+signature has none of them. Log records go to stderr, warnings and above unless the options say otherwise. ``-v`` adds
+each step (``INFO``), ``-vv`` every exchange with a device (``DEBUG``), and ``-q`` leaves errors alone: no warnings and
+no progress bars.
 
-Commands with figures take ``--json``: what they found is then one JSON object, alone on standard output, and what they
-print for a reader goes to standard error. `docs/reference/json.md` says which keys each command has; later versions
+Commands with figures take ``--json`` (`with_json`): the figures are then one JSON object, alone on standard output, and
+text for a reader goes to standard error. `docs/reference/json.md` says which keys each command has; later versions
 add keys and keep those that there are. Numbers that are not known, or not finite, are null.
 """
 
@@ -28,11 +29,13 @@ import sys
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from functools import cached_property
 from io import BufferedWriter, FileIO, TextIOWrapper
-from typing import TYPE_CHECKING, Annotated, Any, TextIO, cast, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, TextIO, cast, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+from typer.main import get_group
 
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
 from foundation.files import disk_remedy_of, remedy_of
@@ -283,9 +286,19 @@ def orderly_end() -> Generator[Ending]:
             signal.signal(number, handler)
 
 
+class ReportProgress(Protocol):
+    """What is called with the numbers done and in all, and perhaps the present work."""
+
+    def __call__(self, done: int, total: int, work: str = ..., /) -> None:
+        """Show the numbers."""
+
+
 @contextmanager
-def progress(unit: str) -> Generator[Callable[[int, int], None]]:
-    """Show a progress bar with the time left on stderr, from the first number told to the end of the block."""
+def progress(unit: str) -> Generator[ReportProgress]:
+    """Show a progress bar with the time left on stderr, from the first number reported to the end of the block.
+
+    `unit`: what is counted, or done at first; each report may name the present work in its place.
+    """
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -299,7 +312,7 @@ def progress(unit: str) -> Generator[Callable[[int, int], None]]:
     columns = (
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn(unit),
+        TextColumn("{task.description}"),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
@@ -314,11 +327,11 @@ def progress(unit: str) -> Generator[Callable[[int, int], None]]:
     task = bar.add_task(unit, total=None)
     with ExitStack() as shown:
 
-        def tell(done: int, total: int) -> None:
+        def tell(done: int, total: int, work: str = unit) -> None:
             # What is refused before there is anything to count gets no bar.
             if not bar.live.is_started:
                 shown.enter_context(bar)
-            bar.update(task, completed=done, total=total)
+            bar.update(task, completed=done, total=total, description=work)
 
         yield tell
 
@@ -347,36 +360,55 @@ def _tell_errors(asked: bool) -> None:
 
 def _log_from(level: int) -> None:
     root, handler = logging.getLogger(), logging.StreamHandler(sys.stderr)
+    handler.set_name(_HANDLER)
     handler.setFormatter(logging.Formatter(_FORMAT))
-    root.addHandler(handler)
+    # A group and its command may each have the option; a record is printed once.
+    root.handlers[:] = [other for other in root.handlers if other.name != _HANDLER] + [handler]
     root.setLevel(level)
 
 
-Version = Annotated[
-    bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")
-]
-"""The option ``--version``."""
+_HANDLER = "croplab command"
 
-Verbose = Annotated[
+_COMMON_PANEL = "Common options"
+
+_VERSION = Annotated[
+    bool,
+    typer.Option(
+        "--version", callback=_print_version, is_eager=True, rich_help_panel=_COMMON_PANEL,
+        help="Print the version and end.",
+    ),
+]  # fmt: skip
+_VERBOSE = Annotated[
     int,
     typer.Option(
         "-v", "--verbose", count=True, callback=_tell_more, show_default=False, metavar="",
-        help="Tell on stderr what is done; -vv each exchange with a device too.",
+        rich_help_panel=_COMMON_PANEL, help="Tell on stderr what is done; -vv each exchange with a device too.",
     ),
 ]  # fmt: skip
-"""The option ``-v``."""
-
-Quiet = Annotated[
-    bool, typer.Option("-q", "--quiet", callback=_tell_errors, help="No progress bars and no warnings: errors alone.")
+_QUIET = Annotated[
+    bool,
+    typer.Option(
+        "-q", "--quiet", callback=_tell_errors, rich_help_panel=_COMMON_PANEL,
+        help="No progress bars and no warnings: errors alone.",
+    ),
+]  # fmt: skip
+AsJson = Annotated[
+    bool,
+    typer.Option(
+        "--json", rich_help_panel=_COMMON_PANEL, help="Print one JSON object, for programs; all else goes to stderr."
+    ),
 ]
-"""The option ``-q``."""
+"""The option ``--json``."""
 
-_COMMON = re.compile(r"-v+|-q|--verbose|--quiet")
+COMMON = {"verbose": (_VERBOSE, 0), "quiet": (_QUIET, False), "version": (_VERSION, False)}
+"""The options of every command and their defaults, by the names of their parameters. Each acts by its callback."""
+
+_COMMON_WORD = re.compile(r"-v+|-q|--verbose|--quiet")
 
 
 def is_common(word: str) -> bool:
-    """Return whether an argument is one of those that stand before the command."""
-    return _COMMON.fullmatch(word) is not None
+    """Return whether an argument is a common option that may stand before the name of a command."""
+    return _COMMON_WORD.fullmatch(word) is not None
 
 
 _METAVARS = {"int": "N", "integer": "N", "float": "X", "str": "TEXT", "text": "TEXT", "path": "PATH"}
@@ -440,20 +472,47 @@ class _StyledGroup(_Styled, TyperGroup):
 
 
 class _StyledTyper(typer.Typer):
-    """An app whose commands have their help in the style of all."""
+    """An app of commands with help in the style of all, each with the common options."""
 
     def command(self, name: str | None = None, **more: Any) -> Callable[[Any], Any]:
         """Register a command."""
         named: dict[str, Any] = {"cls": StyledCommand, **more}
-        return super().command(name, **named)
+        register = super().command(name, **named)
+
+        def decorate(function: Callable[..., None]) -> Callable[..., None]:
+            register(_with_common(function))
+            return function
+
+        return decorate
+
+
+def _with_common(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a command for typer that takes the common options too."""
+    hints = get_type_hints(function, include_extras=True)
+    own = [
+        parameter.replace(annotation=hints[name]) for name, parameter in inspect.signature(function).parameters.items()
+    ]
+    common = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in COMMON.items()
+    ]
+
+    def command(*arguments: Any, **named: Any) -> None:
+        function(*arguments, **{name: value for name, value in named.items() if name not in COMMON})
+
+    return _declared(command, function, [*own, *common])
+
+
+def _nothing() -> None:
+    """Do nothing: the common options of a group act by themselves."""
 
 
 def new_app(help_text: str | None = None, **more: Any) -> typer.Typer:
     """Return an app in the style of all commands.
 
-    `help_text`: what ``--help`` says of it; that of its only command if None.
+    `help_text`: what ``--help`` of a group of commands prints; None for an app that is one command.
     """
-    return _StyledTyper(
+    app = _StyledTyper(
         cls=_StyledGroup,
         help=help_text,
         context_settings={"help_option_names": ["-h", "--help"]},
@@ -461,18 +520,45 @@ def new_app(help_text: str | None = None, **more: Any) -> typer.Typer:
         rich_markup_mode="rich",
         **more,
     )
+    if help_text is not None:
+        app.callback()(_with_common(_nothing))
+    return app
 
 
-def common_first(argv: Sequence[str] | None) -> list[str]:
-    """Return arguments, the process's own if None, with ``-v`` and ``-q`` before the command that they follow.
+class MainCommand(StyledCommand):
+    """A command with others beside it: its first word may name one of them in place of its own first argument.
 
-    A command with others below it takes them before these alone; users write them anywhere. What stands behind ``--``
-    is left where it is.
+    Its help lists the others. `others` is the app of the others.
     """
-    given = list(sys.argv[1:] if argv is None else argv)
-    end = given.index("--") if "--" in given else len(given)
-    common = [word for word in given[:end] if is_common(word)]
-    return [*common, *(word for word in given[:end] if not is_common(word)), *given[end:]]
+
+    others: ClassVar[typer.Typer]
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        listed = [f"{self.name} {name}: {other.help.partition('.')[0]}." for name, other in self.commands.items()]
+        first = next(iter(self.commands))
+        beside = f"Commands in place of the first argument, each with its --help; a folder of such a name is ./{first}:"
+        self.help = "\n\n".join((self.help or "", beside, *listed))
+
+    @cached_property
+    def commands(self) -> Mapping[str, Any]:
+        """The others by their names."""
+        return get_group(self.others).commands
+
+    # The others are passed on by name.
+    def main(  # pyrefly: ignore[bad-override]
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, **more: Any
+    ) -> Any:
+        """Run the command that the arguments name."""
+        words = list(sys.argv[1:] if args is None else args)
+        place = next((place for place, word in enumerate(words) if not is_common(word)), len(words))
+        name = words[place] if place < len(words) else ""
+        if name in self.commands:
+            named = {**self.context_settings, **more}
+            return self.commands[name].main([*words[:place], *words[place + 1 :]], f"{prog_name} {name}", **named)
+        if name.removeprefix("--") in self.commands:
+            raise InputError(f"{name} is a command, not an option: {prog_name} {name[2:]}; see its --help")
+        return super().main(words, prog_name, **more)
 
 
 @contextmanager
@@ -490,21 +576,6 @@ def logging_as_before() -> Generator[None]:
 def shows_progress() -> bool:
     """Return whether progress is shown: it is not where errors alone are wanted."""
     return logging.getLogger().isEnabledFor(logging.WARNING)
-
-
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object, for programs; all else goes to stderr.")]
-"""The option ``--json``."""
-
-Note = Annotated[str | None, typer.Option("--note", help="What readers of the table should know.", show_default=False)]
-"""The option ``--note`` of commands that make a table."""
-
-Licence = Annotated[
-    str | None,
-    typer.Option(
-        "--licence", "--license", metavar="SPDX", help="Licence of the table, as CC-BY-4.0.", show_default=False
-    ),
-]
-"""The option ``--licence`` of commands that make a table."""
 
 
 class JsonOutput:

@@ -1,31 +1,23 @@
 """The command `generate`: images and datasets from a table.
 
-Parses, builds, calls, prints. Libraries that take long to load are imported when the work begins. The first word may be
-a command of its own, ``explore``; a table in a folder of that name is ``./explore``.
+Parses, builds, calls, prints. Libraries that take long to load are imported when the work begins.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Mapping, Sequence
-from functools import cached_property
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
-from typer.main import get_command
 
 from calibration.table.demo_table import DEMO, table_folder
 from foundation.compiled import processor_count
 from foundation.console import (
     EXIT_CODES,
     JsonOutput,
-    Quiet,
-    StyledCommand,
-    Verbose,
-    Version,
+    MainCommand,
     grouped,
-    is_common,
     json_output,
     loaded,
     new_app,
@@ -83,31 +75,12 @@ generate lut/ train/ --sources photographs/ --crop 256x256 --crops 4 --distribut
 
 generate lut/ test/ --sources photographs/ --lights-per-image 2 --masks smooth --rendering codes
 
-generate explore LUT shows a table in the browser: its lights, and pictures under them.
-
 {EXIT_CODES}
 """
 
 
-class _Generate(StyledCommand):
-    """The command, and those that its first word may name instead."""
-
-    @cached_property
-    def commands(self) -> Mapping[str, Any]:
-        """The commands below it by their names."""
-        return {"explore": get_command(_explore_app)}
-
-    # The others are passed on by name.
-    def main(  # pyrefly: ignore[bad-override]
-        self, args: Sequence[str] | None = None, prog_name: str | None = None, **more: Any
-    ) -> Any:
-        """Run the command that the arguments name."""
-        words = list(sys.argv[1:] if args is None else args)
-        place = next((place for place, word in enumerate(words) if not is_common(word)), len(words))
-        name = words[place] if place < len(words) else ""
-        if name in self.commands:
-            return self.commands[name].main([*words[:place], *words[place + 1 :]], f"{prog_name} {name}", **more)
-        return super().main(words, prog_name, **more)
+class _Generate(MainCommand):
+    others = _explore_app
 
 
 @app.command(help=_HELP, cls=_Generate)
@@ -184,9 +157,6 @@ def explore(
         str,
         typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in the house look, a phone for one."),
     ] = "127.0.0.1",
-    version: Version = False,
-    verbose: Verbose = 0,
-    quiet: Quiet = False,
 ) -> None:
     """Show a table in the browser, until interrupted: its lights, and pictures under any of them.
 
@@ -196,7 +166,6 @@ def explore(
     ground truth, histogram, single pixels and their noise, and with the command that makes a dataset of it. A picture
     dropped onto the page stays in memory. With --host the address holds a token, new at each start.
     """
-    del version, verbose, quiet
     from calibration.table.lut import open_lut
     from generator.explore.explorer import Explorer, ExploreServer, sample_folder
     from generator.pictures.sources import Preparation, find_pictures
@@ -342,7 +311,11 @@ def _wider_print(made: Description) -> str:
     """Return what shows more colours where the table was computed with a print whose codes are ink codes."""
     computed = made.table.computed or {}
     unmanaged = computed.get("room", {}).get("profile") == "unmanaged"
-    return "; sim table --print managed makes a table that shows more colours" if unmanaged else ""
+    return (
+        '; sim table with profile = "managed" in its settings makes a table that shows more colours'
+        if unmanaged
+        else ""
+    )
 
 
 def _counted(number: int, thing: str) -> str:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from foundation.compiled import processor_count
-from foundation.console import AsJson, Quiet, Verbose, Version, option, progress
+from foundation.console import AsJson, option, progress
 from foundation.errors import InputError
 
 if TYPE_CHECKING:
@@ -488,12 +488,9 @@ class WorkOptions:
 
 @dataclass(frozen=True)
 class CommonOptions:
-    """What every command takes; acts by itself where it is given."""
+    """What commands with figures take."""
 
     as_json: AsJson = False
-    verbose: Verbose = 0
-    quiet: Quiet = False
-    version: Version = False
 
 
 def _size(text: str, name: str) -> tuple[int, int]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import queue
 import signal
+import tomllib
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +15,9 @@ import typer
 
 from drivers.serial_projectors import LANGUAGES, language
 from foundation import console
-from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app, option
+from foundation.clock import SystemClock
+from foundation.console import EXIT_CODES, new_app, option
+from foundation.errors import ConfigurationError, DeviceRefused, InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,12 +36,7 @@ app = new_app(
 
 def main(argv: Sequence[str] | None = None, read_chart: Callable[[Path], Print] | None = None) -> int:
     """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
-    return console.run(lambda: app(args=common_first(argv), prog_name="sim", obj=read_chart))
-
-
-@app.callback()
-def _devices(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
-    """Serve simulated devices on loopback connections, until interrupted."""
+    return console.run(lambda: app(args=argv, prog_name="sim", obj=read_chart))
 
 
 @app.command()
@@ -69,8 +68,6 @@ def projector(
     """
     from drivers.pjlink import MAX_PASSWORD
     from drivers.projector import Power
-    from foundation.clock import SystemClock
-    from foundation.errors import ConfigurationError, InputError
     from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 
     if (pjlink is None) == (serial is None):
@@ -112,7 +109,6 @@ def _serve_network(
 
 
 def _serve_serial(device: SimulatedProjector, name: str) -> None:
-    from foundation.errors import ConfigurationError
 
     spoken = language(name)
     try:
@@ -168,12 +164,8 @@ def camera(
 
     modprobe vhci-hcd; usbip --tcp-port 3240 attach -r 127.0.0.1 -b 1-1
     """
-    from concurrent.futures import ThreadPoolExecutor
-
     from drivers.canon import SHUTTER
     from drivers.ptp.codes import Property
-    from foundation.clock import SystemClock
-    from foundation.errors import ConfigurationError
     from sim.buses.ptp import serve_ptpip
     from sim.buses.usb import PtpUsbDevice, UsbIdentity
     from sim.buses.usbip import serve_usbip
@@ -221,8 +213,6 @@ def _film(
     from drivers.links.network import TcpLink
     from drivers.pjlink import PjLinkProjector
     from drivers.presenter import WHITE
-    from foundation.clock import SystemClock
-    from foundation.errors import DeviceRefused
     from sim.camera.film import WatchedFilm, WorldFilm
     from sim.projectors.watching import Beam, ScreenPlace, Screenshots
     from sim.world.disturbances import read_disturbances
@@ -262,8 +252,6 @@ def _film(
 
 def _print(context: typer.Context, chart: Path) -> Print:
     """Return the print of a chart, by the reader that `main` was given."""
-    from foundation.errors import ConfigurationError
-
     read: Callable[[Path], Print] | None = context.obj
     if read is None:
         raise ConfigurationError(f"--chart {chart}: charts are read by the program sim; this is sim.cli alone")
@@ -272,8 +260,6 @@ def _print(context: typer.Context, chart: Path) -> Print:
 
 def _setting(option: str, given: str) -> tuple[str, Any]:
     """Return name and value of ``name=value``; the value as TOML has it, text also without quotes."""
-    from foundation.errors import InputError
-
     name, equals, value = given.partition("=")
     if not name or not equals:
         raise InputError(f"{option} {given!r}: NAME=VALUE expected, such as waviness_mm=1.5")
@@ -284,9 +270,6 @@ def _setting(option: str, given: str) -> tuple[str, Any]:
 
 
 def _value(option: str, text: str, given: str) -> Any:
-    import tomllib
-
-    from foundation.errors import InputError
 
     try:
         return tomllib.loads(f"value = {text}")["value"]
@@ -308,7 +291,6 @@ def _grey_squares() -> Print:
 
 
 def _host_and_port(text: str) -> tuple[str, int]:
-    from foundation.errors import InputError
 
     host, _, port = text.rpartition(":")
     if not host or not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:

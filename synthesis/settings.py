@@ -5,7 +5,6 @@ One TOML file becomes frozen values at the door; unknown keys are errors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -13,7 +12,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from pydantic import Field
 
-from calibration.citation import OriginRecord, with_changes
+from calibration.citation import OriginRecord
 from calibration.sampling import WINDOW, WINDOWS
 from experiment.chart.layout import design_chart
 from experiment.config import CameraSettings, CitationSettings, Settings, checked, parse_toml
@@ -68,10 +67,8 @@ class TableSettings(Settings):
     room: dict[str, bool | int | float | str] = Field(default_factory=dict[str, bool | int | float | str])
     """Parameters of the room that differ; see `sim.world.world.Room`."""
     chart: ComputedChart = ComputedChart()
-
-    def changed(self, seed: int | None, room: dict[str, str | float]) -> TableSettings:
-        """Return the settings with another seed, where one is given, and changes of the room that come before its."""
-        return self.model_copy(update={"room": {**self.room, **room}} | ({} if seed is None else {"seed": seed}))
+    citation: CitationSettings = CitationSettings()
+    """Title, authors, licence, note and address, as `[citation]` of LAB.toml."""
 
 
 def load_settings(path: Path | None) -> TableSettings:
@@ -128,16 +125,25 @@ def table_task(camera: str, settings: TableSettings, where: str, lights: LightSp
     planned = plan_illuminations() if lights is None else illuminations_of(lights.lights)
     powers = None if lights is None else np.array([light.power for light in lights.lights])
     record["lights"] |= {"count": len(planned)}
-    return TableTask(chart, body, room, settings.exposure.exposure, planned, powers, settings.window, record)
+    exposure, origin = settings.exposure.exposure, origin_of(settings, where)
+    return TableTask(chart, body, room, exposure, planned, powers, settings.window, record, origin)
 
 
-def stated_by_hand(note: str | None, licence: str | None, authors: Sequence[str]) -> OriginRecord | None:
-    """Return what is said of a computed table by whoever computes it; None where nothing is.
-
-    `licence`: an SPDX expression (SPDX specification 2.3, annex D).
-    """
-    given = {"note": note, "licence": licence, "authors": tuple(authors) or None}
-    stated = with_changes(CitationSettings(), {name: value for name, value in given.items() if value is not None})
+def origin_of(settings: TableSettings, where: str) -> OriginRecord | None:
+    """Return the citation of a computed table as `lut.json` records it; None if the settings have none."""
+    stated = settings.citation
+    devices = stated.model_fields_set & {"lens", "projector", "camera_serial"}
+    if devices:
+        raise ConfigurationError(
+            f"{where}: citation.{min(devices)} has no effect on a computed table, for which no device was used; leave "
+            "it out"
+        )
     if stated == CitationSettings():
         return None
-    return OriginRecord(authors=list(stated.authors), note=stated.note or None, licence=stated.licence or None)
+    return OriginRecord(
+        title=stated.title or None,
+        authors=list(stated.authors),
+        note=stated.note or None,
+        licence=stated.licence or None,
+        url=stated.url or None,
+    )

@@ -1,7 +1,7 @@
 """A whole table, lights by cells by samples, computed light by light and written as `build-lut` writes one.
 
 The same camera, lights, settings and seed give the same bytes, on any number of threads. A light's frame is treated as
-`calibration.pipeline.frames` treats a photographed one that lies exactly where it was registered: black subtracted,
+`calibration.pipeline.measuring` treats a photographed one that lies exactly where it was registered: black subtracted,
 field and white read from the white references, samples divided by the field, and by how much the field of a cell
 differs from that of paper. So the ground truth has the error that a photographed one has.
 """
@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.citation import OriginRecord
-from calibration.pipeline.frames import ChartPoints, usable_means
+from calibration.pipeline.measuring import ChartPoints, usable_means
 from calibration.radiometry.drift import corrections
 from calibration.radiometry.primaries import Primaries
 from calibration.sampling import Sites, gather, gather_values, patch_means
@@ -162,7 +162,7 @@ class TableTask:
       that the simulated projector shows.
     - `window`: half-size pixels along a window's side.
     - `record`: what the provenance says under `computed`.
-    - `origin`: note, licence and authors, as whoever computes the table gives them; None where nothing is given.
+    - `origin`: title, authors, licence, note and address of the table; None if the settings have none.
     """
 
     chart: Chart

@@ -97,13 +97,11 @@ def check_lab(
     picture: Path | None = None,
     corners: Corners | None = None,
     linearity: bool = False,
-    session: Path | None = None,
 ) -> CheckReport:
     """Check the rig that the settings name; record nothing.
 
     `picture`: where to draw what was found, PNG. `corners`: of the field of a chart without tags, as given by hand,
     half-size px. `linearity`: whether to take a series of exposures that shows the sensor's linearity.
-    `session`: where the session is to lie, for the disk's free space; the settings' folder if not given.
     """
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
@@ -144,7 +142,7 @@ def check_lab(
         *_linearity_findings(trial, linearity, recorded),
         *screen,
         *(Finding("settings", "remark", doubt) for doubt in settings_doubts(settings)),
-        judge_disk(session or Path(settings.file).parent, frames, found.first.size),
+        judge_disk(Path(settings.file).parent, frames, found.first.size),
         *supplies,
     ]
     values = {row.figure.name: row.value for row in verdict.rows}

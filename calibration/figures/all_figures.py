@@ -13,7 +13,7 @@ def collected() -> tuple[Figure, ...]:
     modules = (geometry, radiometry, light, truth)
     found = tuple(value for module in modules for value in vars(module).values() if isinstance(value, Figure))
     names = {figure.name for figure in found}
-    times = Counter(name for figure in found for name in (figure.name, figure.former_name) if name)
+    times = Counter(figure.name for figure in found)
     for figure in found:
         if not (figure.title and figure.why and figure.source):
             raise ValueError(f"{figure.name}: a figure has a title, and limits with their reason and source")
@@ -22,7 +22,7 @@ def collected() -> tuple[Figure, ...]:
         if figure.cause is not None and not names.issuperset(figure.cause.follows):
             raise ValueError(f"{figure.name}: it follows {figure.cause.follows}, which are not all figures")
     if twice := sorted(name for name, count in times.items() if count > 1):
-        raise ValueError(f"two figures have, or had, one of the names {', '.join(twice)}")
+        raise ValueError(f"two figures have one of the names {', '.join(twice)}")
     at: dict[int, str] = {}
     for figure in found:
         for line in figure.lines:

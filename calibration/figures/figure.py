@@ -2,8 +2,6 @@
 
 Rules that hold inside:
 
-- A figure has no default for what it may lack: what does not apply is said (`NO_CAUSE`, `NO_LINES`). One that lacks a
-  part does not import.
 - Limits stand here alone; the check and the live judge take them from here. What no table shows has a plain `Limit`
   (`calibration.figures.single_frames`).
 - A value within `accept` is accepted; between `accept` and `refuse` it is remarked on; beyond `refuse` there is no
@@ -18,10 +16,9 @@ from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 if TYPE_CHECKING:
-    from calibration.causes.gathering import Gathered, PrintPlace
+    from calibration.causes.gathering import Gathered
     from calibration.causes.rules import Subject
     from calibration.measurements import TableMeasurements
-    from experiment.chart.model import Chart
     from experiment.session.records import FrameRecord
 
 Sense = Literal["at most", "at least"]
@@ -41,7 +38,7 @@ QUESTIONS: Final[dict[Group, str]] = {
 }
 
 Drawing = Literal[
-    "chart", "lights", "budget", "errors", "noise", "residuals", "worst", "field", "print", "course", "cells", "rest"
+    "chart", "lights", "budget", "errors", "noise", "residuals", "field", "course"
 ]  # fmt: skip
 """Names of the report's pictures (`calibration.report.report`)."""
 
@@ -76,29 +73,6 @@ class Explanation:
 
 
 @dataclass(frozen=True)
-class Worst:
-    """Where the worst of a figure is, whether or not it is beyond a limit.
-
-    - `what`: what is worst, in few words.
-    - `file`: the frame, relative to the session; "" where it is of no frame alone.
-    - `light`: the light's number; None where it is of no light alone.
-    - `place`: where on the print; None where it has no place.
-    """
-
-    what: str
-    file: str = ""
-    light: int | None = None
-    place: PrintPlace | None = None
-
-    @property
-    def where(self) -> str:
-        """Where it is, in words: ``light 3, frames/0009_light_003.cr2, 312, 440 mm``."""
-        light = "" if self.light is None else f"light {self.light}"
-        place = "" if self.place is None else f"{self.place.x_mm:.0f}, {self.place.y_mm:.0f} mm"
-        return ", ".join(part for part in (light, self.file, place) if part)
-
-
-@dataclass(frozen=True)
 class SummaryRow:
     """What was measured, in words.
 
@@ -119,15 +93,6 @@ class Line:
 
     place: int
     row: Callable[[TableMeasurements], SummaryRow | None]
-
-
-NO_PLACE: Final = None
-NO_FRAMES: Final = None
-NO_CAUSE: Final = None
-NOT_DRAWN: Final = None
-NO_LINES: Final[tuple[Line, ...]] = ()
-OF_ITS_CAUSE: Final = None
-"""What a figure has not, said by name: a part that is left out is an error."""
 
 
 @dataclass(frozen=True)
@@ -194,33 +159,30 @@ class Figure(Limit):
     - `measure`: the value; None where it could not be measured: on a chart without tags or with few colours, without
       dark frames or a series of exposures.
     - `before_session`: whether the trial frames of `acquire check` show it as those of a session do.
-    - `of_one_frame`: what `build-lut --check` can say of it, which reads one light or white frame and a dark one: it is
+    - `of_one_frame`: what `build-lut check` can say of it, which reads one light or white frame and a dark one: it is
       `known`; or `bounded`, since more frames can only make it worse, so that it is told where it is beyond its limit
       already; or `unknown`.
-    - `worst`: where its worst is on the report's page, whatever the verdict; else `NO_PLACE`.
-    - `where`: frames, lights or place beyond the limit accepted, for a remark; else those `OF_ITS_CAUSE`.
-    - `retake`: the frames that are beyond a limit by themselves; else `NO_FRAMES`. None where all of them are.
-    - `cause`: how its cause is found; else it explains itself, `NO_CAUSE`.
-    - `drawing`: the picture that shows it; else `NOT_DRAWN`.
-    - `lines`: its lines in the summary; else `NO_LINES`.
+    - `where`: frames, lights or place beyond the limit accepted, for a remark; None for those of its cause.
+    - `retake`: the frames that are beyond a limit by themselves, None if all of them are; None for a figure that is not
+      of single frames.
+    - `cause`: how its cause is found; None if it explains itself.
+    - `drawing`: the picture that shows it; None if none does.
+    - `lines`: its lines in the summary.
     - `foremost`: whether a refusal speaks of it before others, which may follow from it.
     - `found`: what a refusal or remark adds, and the remedy, where that depends on what was found.
-    - `former_name`: its name in the reports of earlier software; "" where it is the same.
     """
 
     _: KW_ONLY
     measure: Callable[[TableMeasurements], float | None]
-    before_session: bool
-    of_one_frame: Literal["known", "bounded", "unknown"]
-    worst: Callable[[TableMeasurements, Chart], Worst | None] | None
-    where: Callable[[TableMeasurements, float], str] | None
-    retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None
-    cause: Explanation | None
-    drawing: Drawing | None
-    lines: tuple[Line, ...]
+    before_session: bool = True
+    of_one_frame: Literal["known", "bounded", "unknown"] = "unknown"
+    where: Callable[[TableMeasurements, float], str] | None = None
+    retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None = None
+    cause: Explanation | None = None
+    drawing: Drawing | None = None
+    lines: tuple[Line, ...] = ()
     foremost: bool = False
     found: Callable[[TableMeasurements], tuple[str, str] | None] | None = None
-    former_name: str = ""
 
     def judged_value(self, table: TableMeasurements) -> float | None:
         """Return the value that is judged; None where it was not measured, or other frames may change its outcome."""

@@ -39,7 +39,7 @@ NOISE_REDUCTION: Final = Limit(
 DISK: Final = Limit(
     "disk", "Free space over what the plan needs", "devices", "", "at least", 1.0, 1.0,
     why="the run refuses to begin", source="the run's own estimate, retakes and a reserve included",
-    remedy="free space, or put the session on another disk (--session FOLDER)",
+    remedy="free space, or put the session on another disk (acquire run --dry-run checks the disk of its folder)",
 )  # fmt: skip
 
 CARD: Final = Limit(

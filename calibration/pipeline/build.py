@@ -1,10 +1,26 @@
-"""A session becomes a table: frames → measured → taken in → saved → figures → verdict → table.
+"""A session becomes a table, in a straight line of stages; each takes a value and returns the next one.
+
+| stage | function | its value |
+|---|---|---|
+| frames | `frames.select_frames` | `SelectedFrames` |
+| shared by all | `baseline.baseline_of` | `Baseline`, made once before the first frame |
+| decoded | `measuring.decode_frame` | `DecodedFrame` |
+| located | `measuring.locate` | `LocatedFrame` |
+| sampled | `measuring.sample` | `SampledFrame` |
+| measured | `measuring.measure` | `MeasuredFrame` |
+| collected | `Accumulator.with_frame` | `Accumulator` |
+| figures | `table_figures.table_figures` | `TableMeasurements` |
+| verdict | `calibration.verdict.judge` | `Verdict` |
+| table | `_write_table` | the folder |
+
+Threads take frames from decoded to measured before their turn, with what is collected at that moment (`_measured`); a
+frame counts only if the frame registered last is still the same, and is measured again otherwise. The memory is that of
+a few frames whatever the session.
 
 The table appears whole or not at all. Until then it stands beside its place under a hidden name, and a build that was
 stopped, anywhere, goes on from its last checkpoint and ends in the bytes of one that was not. A checkpoint is one file,
 replaced whole: the accumulator, and the hashes of the samples on the disk. It is used only if it was made of what is
-asked for now and the samples have these hashes. Threads read, decode and measure frames before their turn, each with
-what holds at that moment; the memory is that of a few frames whatever the session.
+asked for now and the samples have these hashes.
 """
 
 from __future__ import annotations
@@ -24,32 +40,31 @@ import numpy as np
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import Figure
 from calibration.measurements import LinearityMeasurements, TableMeasurements
-from calibration.pipeline.baseline import (
-    ReportProgress,
-    baseline_of,
-    select_frames,
-    source_frames,
-    with_lens,
-    with_primaries,
-    with_superposition,
-)
+from calibration.pipeline.baseline import baseline_of
 from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
-from calibration.pipeline.collecting import check_figures, read_linearity, table_figures
+from calibration.pipeline.collecting import Accumulator, stored_names
 from calibration.pipeline.frames import (
     PAPER_OPTIONS,
-    Accumulator,
     BuildOptions,
+    ReportProgress,
+    SelectedFrames,
+    select_frames,
+    source_frames,
+)
+from calibration.pipeline.measuring import (
+    IN_PLACE,
     ChangedFrame,
     DecodedFrame,
-    EarlyMeasurement,
+    LocatedFrame,
+    MeasuredDarkFrame,
     MeasuredFrame,
-    SelectedFrames,
     decode_frame,
-    measure_at,
-    measure_primaries,
-    sample_dark_frame,
-    stored_names,
+    locate,
+    measure,
+    measure_dark,
+    sample,
 )
+from calibration.pipeline.table_figures import check_figures, read_linearity, table_figures
 from calibration.radiometry.drift import LEAST_WHITES, applied_drift, corrected, corrections
 from calibration.table.lut import (
     CELLS,
@@ -65,7 +80,6 @@ from calibration.table.lut import (
 from calibration.table.writing import LutWriter, references_csv
 from calibration.verdict import COMMAND, BuildResult, judge, judged_values, refusal, retake_json
 from experiment.framing.finding import annotated_png
-from experiment.framing.pictures import Shift
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.compiled import processor_count
@@ -85,6 +99,9 @@ MOST_THREADS = 8
 """Each thread holds a raw file and its counts, 110 MB for a 6D Mark II: more would not stay below 2 GB."""
 
 _Result = TypeVar("_Result")
+
+EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
+"""A frame as measured before its turn; None where the chart has to be registered again in it."""
 
 WriteReport = Callable[[BuildResult, Session, Path], None]
 """Writes the report of a result and its session into a folder; `calibration.report.report.write_report`."""
@@ -191,7 +208,7 @@ def check(
     selected = select_frames(session)
     first = decode_frame(session, selected.registered)
     try:
-        baseline = with_lens(baseline_of(session.chart, first, replace(options, subtract_dark=False)), first)
+        baseline = baseline_of(session.chart, first, replace(options, subtract_dark=False))
     except RegistrationError as error:
         if picture is None:
             raise RegistrationError(f"{error}; see what is there with --picture PNG") from error
@@ -199,12 +216,12 @@ def check(
         raise RegistrationError(f"{error}; see {picture}") from error
     if picture is not None:
         write_whole(picture, annotated_png(first.mosaic, session.chart, baseline.first.registration.framing))
-    in_place = Shift(0.0, 0.0, 0.0, 0)
-    measured = measure_at(baseline, first, baseline.first, in_place, reregistered=False, keep_samples=True)
-    done = Accumulator.empty(session, selected, baseline, first.saturation).with_frame(measured)
-    dark = next((record for record in selected.records if record.kind == "dark"), None)
+    located = LocatedFrame(first, baseline.first, baseline.first, IN_PLACE, reregistered=False)
+    done = Accumulator.empty(session, selected, baseline, first.saturation)
+    done = done.with_frame(measure(baseline, sample(baseline, located, dark=None, keep_samples=True)))
+    dark = selected.first_dark
     if dark is not None:
-        done = done.with_dark_frame(sample_dark_frame(baseline, decode_frame(session, dark), baseline.first))
+        done = done.with_frame(measure_dark(baseline, decode_frame(session, dark), baseline.first))
     series = None if linearity is None else read_linearity(linearity, baseline)
     figures = check_figures(done, series)
     return BuildResult(figures, judge(judged_values(figures), judged_by), None)
@@ -221,13 +238,14 @@ def judge_trial(
     """
     selected = select_frames(session)
     first = decode_frame(session, selected.registered)
-    pure = [decode_frame(session, record) for record in selected.primaries]
-    plain = with_superposition(baseline_of(session.chart, first, options), first, pure)
-    baseline = with_primaries(plain, measure_primaries(plain, pure))
+    primaries = [decode_frame(session, record) for record in selected.primaries]
+    baseline = baseline_of(session.chart, first, options, primaries, measures_lens=False)
     series = None if linearity is None else read_linearity(linearity, baseline)
     done = Accumulator.empty(session, selected, baseline, min(saturation, first.saturation))
-    for record, early in prefetched(done.measure, selected.records, done.others_wait_for):
-        done, _ = done.with_next(record, early)
+    for record in selected.records:
+        frame = _measured(done, record, register_again=True)
+        assert frame is not None
+        done = done.with_frame(frame)
     figures = table_figures(done, series)
     return BuildResult(figures, judge(judged_values(figures), FIGURES), None)
 
@@ -255,14 +273,21 @@ def _take_in_all(
     before = len(done.figures)
 
     def measure_early(record: FrameRecord) -> EarlyMeasurement:
-        # In a thread, with what holds at that moment.
-        return done.measure(record)
+        # In a thread, with what is collected at that moment.
+        return _measured(done, record, register_again=False)
+
+    def others_wait_for(record: FrameRecord) -> bool:
+        return options.subtract_dark and record.kind == "dark"
 
     try:
-        for record, early in prefetched(measure_early, records[before:], done.others_wait_for):
-            done, measured = done.with_next(record, early)
-            if isinstance(measured, MeasuredFrame) and record.kind == "light" and record.illumination is not None:
-                writer.put(record.illumination, measured.values)
+        for record, early in prefetched(measure_early, records[before:], others_wait_for):
+            frame = early
+            if frame is None or frame.registered is not done.registered:
+                frame = _measured(done, record, register_again=True)
+                assert frame is not None
+            done = done.with_frame(frame)
+            if isinstance(frame, MeasuredFrame) and record.kind == "light" and record.illumination is not None:
+                writer.put(record.illumination, frame.values)
             if (len(done.figures) - before) % CHECKPOINT_EVERY == 0:
                 unfinished.save(_checkpoint(done, writer))
             progress(len(done.figures), len(records), record.file)
@@ -273,16 +298,31 @@ def _take_in_all(
     return done, writer, series
 
 
+def _measured(done: Accumulator, record: FrameRecord, register_again: bool) -> EarlyMeasurement:
+    """Return what a frame shows beside those taken in: from its file to its figures. Thread-safe.
+
+    None where the chart has to be registered again and `register_again` is False.
+    """
+    baseline = done.baseline
+    decoded = decode_frame(done.session, record)
+    if record.kind == "dark":
+        return measure_dark(baseline, decoded, done.registered)
+    located = locate(baseline, decoded, done.registered, register_again)
+    if located is None:
+        return None
+    return measure(baseline, sample(baseline, located, done.dark, keep_samples=done.selected.is_even(record)))
+
+
 def _begin(session: Session, selected: SelectedFrames, options: BuildOptions) -> Accumulator:
-    """Register the chart, measure lens and primaries, and return what there is before any frame."""
+    """Return what there is before any frame: what all frames share, and the dark light of the first dark frame."""
     first = decode_frame(session, selected.registered)
-    pure = [decode_frame(session, record) for record in selected.primaries]
-    plain = with_superposition(baseline_of(session.chart, first, options), first, pure)
-    baseline = with_lens(plain, first, pure, _whole_frames(session, selected.more_whites))
-    # The first frame's counts are not held any longer: it is read again in its turn.
-    return Accumulator.empty(
-        session, selected, with_primaries(baseline, measure_primaries(baseline, pure)), first.saturation
-    )
+    primaries = [decode_frame(session, record) for record in selected.primaries]
+    more_whites = _whole_frames(session, selected.more_whites)
+    baseline = baseline_of(session.chart, first, options, primaries, more_whites)
+    # The counts of these frames are not held any longer: they are read again in their turn.
+    dark = selected.first_dark if options.subtract_dark else None
+    measured_dark = None if dark is None else measure_dark(baseline, decode_frame(session, dark), baseline.first)
+    return Accumulator.empty(session, selected, baseline, first.saturation, measured_dark)
 
 
 def _whole_frames(session: Session, records: Sequence[FrameRecord]) -> Iterator[DecodedFrame]:
@@ -424,8 +464,8 @@ def _identity(session: Session, selected: SelectedFrames, options: BuildOptions)
         "software": software(),
         "method": METHOD,
         "stored": stored_names(),
-        # The drift is taken out of the finished samples, and no sample depends on the citation.
-        "options": to_plain(replace(options, correct_drift=False, citation=None)),
+        # The drift is taken out of the finished samples.
+        "options": to_plain(replace(options, correct_drift=False)),
         "chart": session.chart.sha256,
         "lights": hashlib.sha256(repr(session.illuminations).encode()).hexdigest(),
         "registered": selected.registered.sha256,

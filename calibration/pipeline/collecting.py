@@ -1,501 +1,325 @@
-"""The figures of a whole table, or of a check, collected from its frames; and what is made of all of them.
+"""What the frames of a session give together: each is taken in, and which cells are not to be used is found.
 
-- A series of exposures of the chart, in its place: how linear the sensor is (`read_linearity`). No sample depends on
-  it.
-- The components of the uncertainty budget (`budget_of`): what each cause may leave, from what a session shows of it.
-  What it does not show is what is usual, and says so; nothing is taken to be 0.
+Frames enter in the order taken. What one adds depends on those before it alone, so that a build that was stopped goes
+on to the same bits.
 
-L lights, C cells in the order of colour indices.
+C cells of S samples, in the order of colour indices.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
-from calibration.budget import Budget, Component
-from calibration.checks.frame_consistency import origin_figures
-from calibration.checks.light_codes import CodeAgreement, code_agreement
-from calibration.checks.stray_light import StrayLight, stray_light
-from calibration.citation import origin_record, with_published_serials
-from calibration.measurements import (
-    CellMeasurements,
-    FrameMeasurements,
-    GreyMeasurements,
-    LightMeasurements,
-    LinearityMeasurements,
-    SensorMeasurements,
-    SessionMeasurements,
-    TableMeasurements,
+from calibration.measurements import FrameMeasurements
+from calibration.pipeline.frames import SelectedFrames
+from calibration.pipeline.measuring import Baseline, MeasuredDarkFrame, MeasuredFrame, RegisteredFrame, decode_frame
+from calibration.radiometry.dark_frames import (
+    DarkFrameFigures,
+    DarkLight,
+    DarkLightEstimate,
+    DarkSummary,
+    HotPixels,
+    dark_summary,
+    median_noise,
 )
-from calibration.pipeline.baseline import lens_figures, stated_origin
-from calibration.pipeline.frames import Accumulator, Baseline
-from calibration.radiometry.drift import drift_correction
-from calibration.radiometry.primaries import additivity, drift_gains, pure_lights
-from calibration.radiometry.superposition import Superposition
-from calibration.sampling import mean_bleed
-from calibration.spread.added_light import LEAST_LEVEL
-from drivers.raw.rawfile import CLIPPING_SHARE, frame_black, read_raw, strongest_channel
-from experiment.framing.pictures import REREGISTER_PX, Shift
-from experiment.lights import Illumination
-from experiment.measures.sensor import HIGHEST, LOWEST, deviations
-from foundation.colorimetry import angles_deg
-from foundation.errors import FormatError, InputError
+from calibration.registration.register import MAX_PLACE_ERROR_PX
+from calibration.sampling import has_dead_photosite, unevenness
+from calibration.spread.added_light import MOST_ADDED, AddedLight
+from calibration.table.lut import Unfit
+from drivers.raw.rawfile import CLIPPING_SHARE
+from experiment.measures.stains import Stains, find_stains
+from experiment.session.folder import Session
+from experiment.session.records import FrameRecord
+from foundation.records import from_plain, to_plain
+
+_BRIGHTEST_PERCENTILE = 99.5
+"""Of the cells' levels, what is taken for paper white: the brightest of all may be a reflection."""
 
 _Array = npt.NDArray[np.float64]
-
-_BLACK_COUNTS = 0.05
-"""Standard uncertainty of a frame's black level, counts, beyond what its frames' scatter shows (judgement: masked
-photosites give .03)."""
-
-_RESPONSE = 0.003
-"""Standard deviation of photosites' response that is not seen beside their noise (usual of cameras: 0.3 to 1 %)."""
-
-_SINGLE_DARK = 0.2
-"""Relative change of dark light over a session, where one dark frame does not show it (judgement)."""
-
-_USUAL_TOO_DARK = 0.2
-"""Share of the dark light by which dark frames differ from what is there in the lights', where no light shows it
-(judgement)."""
-
-_FLICKER = 5e-5
-"""Relative: a lamp that flickers, or a wheel that is cut, within an exposure (judgement: half-second exposures; Heinz
-et al. 2018)."""
-
-_STRAY = 1e-4
-"""Relative: light from beside the print where no figure shows it (judgement)."""
-
-_COMMON = 0.75
-"""Share of the mean square of these two that all channels have in common: a lamp flickers as a whole, a wheel is cut in
-one primary; walls send back the light that is shown, in their own colour (judgement)."""
+_Arrays = dict[str, npt.NDArray[Any]]
+_Figures = tuple[FrameMeasurements | DarkFrameFigures, ...]
 
 
-def budget_of(table: TableMeasurements) -> Budget:
-    """Return the budget of what was measured."""
-    white = np.maximum(table.lights.white, 1e-9)
-    cells = np.maximum(table.cells.levels, LEAST_LEVEL)
-    return Budget(
-        (
-            _noise(table, white, cells),
-            _lens(table, white),
-            _darkness(table, white, cells),
-            _linearity(table, white, cells),
-            _added_light(table, white, cells),
-            _flicker(white, cells),
-            _geometry(table, white, cells),
-        ),
-        white,
-    )
+@dataclass(frozen=True, eq=False)
+class Accumulator:
+    """What the frames of a session that were taken in so far have given; each frame makes a new one.
 
-
-def _diagonal(squares: _Array) -> _Array:
-    """Return errors that are independent in each channel, (L, 3, 3), of mean squares (L, 3)."""
-    return squares[:, :, None] * np.eye(3)
-
-
-def _partly_common(size: float, lights: int) -> _Array:
-    """Return mean square relative errors (L, 3, 3) of a size that `_COMMON` of is in all channels alike."""
-    square = size**2 * (_COMMON * np.ones((3, 3)) + (1 - _COMMON) * np.eye(3))
-    return np.broadcast_to(square, (lights, 3, 3))
-
-
-def _noise(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    """Return the noise of white and, of cells, that of the field there and their own photosites' response.
-
-    The field has as much of the references' noise as it has terms, white that of one.
+    - `saturation`: raw count of saturation, the lowest that a frame shows.
+    - `dark`: what is subtracted from the frames that follow; None where nothing is.
+    - `estimate`: of the dark light; only dark frames that are subtracted enter it.
+    - `highest`: (C,) uint16, the highest raw count of each cell.
+    - `highest_at`: (C,) int64, the light under which it was reached; −1 for a white frame.
+    - `outside`: (C,) bool, whether a cell was cut off in a frame.
+    - `covered`: (C,) bool, whether a cell did not look like the chart's in a frame in which the chart was registered.
+    - `place_error`: (C,) float64 half-size px, what a cell's place may be off by, the worst of the frames in
+      which the chart was registered; over the clearance of its samples (`Registration.clearance`).
+    - `even_sum`: (C, S, 3) float32, sum of the frames of even light, counts above black.
+    - `even_noise2`: (C, 3) float64, sum of the variances of one sample in these frames, counts².
     """
-    square = (table.lights.white_error / white) ** 2
-    field = max(len(factor) for frame in table.frames for factor in frame.paper.field.coefficients[0])
-    response = (table.sensor.transfer.response**2 + _RESPONSE**2) / table.cells.window**2
-    return Component(
-        "noise", "noise of the white references", False,
-        "scatter of the white references about each frame's field, and the photosites' response within a cell; its "
-        "noise from frame to frame is the camera's and no error",
-        _diagonal(square), np.broadcast_to(field * square.min(axis=0) + response, cells.shape),
-    )  # fmt: skip
 
+    session: Session
+    selected: SelectedFrames
+    baseline: Baseline
+    figures: _Figures
+    saturation: int
+    registered: RegisteredFrame
+    dark: DarkLight | None
+    estimate: DarkLightEstimate
+    hot: HotPixels
+    highest: npt.NDArray[np.uint16]
+    highest_at: npt.NDArray[np.int64]
+    outside: npt.NDArray[np.bool_]
+    covered: npt.NDArray[np.bool_]
+    place_error: _Array
+    even_sum: npt.NDArray[np.float32]
+    even_noise2: _Array
+    even_frames: int
 
-def _lens(table: TableMeasurements, white: _Array) -> Component:
-    lens = table.lens
-    source = "what the light about each cell says of the lens, and cannot say" if lens.measured else lens.why_not
-    return Component(
-        "lens", "spread and veil of the lens", not lens.measured, source,
-        np.broadcast_to(lens.white_covariance, (len(white), 3, 3)), lens.cells_error**2,
-    )  # fmt: skip
+    @staticmethod
+    def empty(
+        session: Session,
+        selected: SelectedFrames,
+        baseline: Baseline,
+        saturation: int,
+        first_dark: MeasuredDarkFrame | None = None,
+    ) -> Accumulator:
+        """Return what there is before any frame.
 
-
-def _darkness(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    """Return the errors of black level and, where dark light was subtracted, of what was.
-
-    Without that, a light's ground truth is that of all light that was there.
-    """
-    lights, dark = table.lights, table.dark_frames
-    black = np.array([frame.black.mean() for frame in table.frames])
-    error = np.full(3, _BLACK_COUNTS**2 + float(np.var(black)) / max(len(black), 1))
-    source, assumed = "the black level of masked photosites", False
-    if lights.subtracted is not None and dark.lights:
-        light = np.maximum(dark.light, 0)
-        changes = np.var(dark.lights, axis=0, ddof=1) if len(dark.lights) > 1 else (_SINGLE_DARK * light) ** 2
-        error = error + dark.error**2 + changes + _too_dark(table, light) ** 2
-        source = "scatter of the dark frames; what lights of several primaries have beyond the primaries' sum"
-        assumed = lights.additivity is None or len(dark.lights) < 2
-    at_cells = error / np.maximum(lights.brightest, 1e-9) ** 2
-    return Component(
-        "darkness", "black level and dark light", assumed, source, _diagonal(error / white**2), at_cells / cells**2 * (
-            1.0 if lights.subtracted is None else np.minimum(cells, 1.0) ** 2
-        ),
-    )  # fmt: skip
-
-
-def _too_dark(table: TableMeasurements, dark: _Array) -> _Array:
-    """Return how much too much dark light (3,) counts was perhaps subtracted, of `dark` (3,) counts that was.
-
-    White then has twice as much beyond the sum of the primaries, each of which lacks it; a projector that adds light of
-    its own to white looks the same.
-    """
-    found = table.lights.additivity
-    if found is None:
-        return _USUAL_TOO_DARK * dark
-    beyond = np.sqrt(found.off**2 + found.error**2 + table.white_scatter**2) * table.lights.brightest
-    return np.minimum(beyond / 2, dark)
-
-
-def _linearity(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    found = table.sensor.superposition
-    paper = np.maximum(table.lights.brightest, 1e-9)
-    level = np.maximum(cells, LEAST_LEVEL) * paper
-    source = (
-        "red, green and blue alone against a light that is made of them"
-        if found.unmeasured is None
-        else f"usual of cameras: 1 % at saturation, 0.05 % of it near black; {found.unmeasured.why}"
-    )
-    return Component(
-        "linearity", "deviation of counts from proportion", not found.measured, source,
-        found.white_covariance(white), found.errors(level, np.broadcast_to(paper, level.shape)),
-    )  # fmt: skip
-
-
-def _added_light(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    shown = 0.0 if table.lights.stray is None else table.lights.stray.share
-    lights = _partly_common(_STRAY, len(white)) + shown**2 * np.eye(3)
-    at_cells = (_STRAY**2 + shown**2 + table.cells.added.mean_square) / cells**2
-    return Component(
-        "added light", "reflections and light of single frames", table.lights.stray is None,
-        "light that lies on dark and bright cells alike; codes of 0, and white against the primaries", lights, at_cells,
-    )  # fmt: skip
-
-
-def _flicker(white: _Array, cells: _Array) -> Component:
-    return Component(
-        "flicker", "flicker within an exposure", True,
-        "usual of lamps and wheels; a drift from frame to frame is in each light's own ground truth",
-        _partly_common(_FLICKER, len(white)), np.broadcast_to(_FLICKER**2, cells.shape),
-    )  # fmt: skip
-
-
-def _geometry(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    """Return what reaches a cell's mean from its neighbours by the sharp core, and by where the cell was found.
-
-    A place that is known to some error blurs the cell's rim by as much, in the mean.
-    """
-    registration, window = table.registration, table.cells.window
-    blur_px = np.hypot(registration.blur_px, registration.uncertainty_px(table.cells.stains.places_mm))
-    of_neighbours = mean_bleed(registration.cell_px, blur_px, window)[:, None]
-    contrast = np.sqrt(((cells - cells.mean(axis=0)) ** 2 + cells.var(axis=0)) / cells**2)
-    nothing = np.zeros((len(white), 3, 3))
-    return Component(
-        "geometry", "places of cells and sharp core", False,
-        "blur and places as registered; neighbours as the print has them in the mean",
-        nothing, (of_neighbours * contrast) ** 2,
-    )  # fmt: skip
-
-
-LEAST_FRAMES = 4
-"""Frames of different exposure times (judgement): with fewer, errors of the stated times look like nonlinearity."""
-
-
-def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
-    """Return what a series of exposures shows.
-
-    `folder`: raw files of the chart where the session's first registered frame has it, under one steady light, with one
-    ISO speed and aperture, from dim to the brink of saturation; eight are usual. Hidden files are passed over.
-    """
-    try:
-        paths = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    except OSError as error:
-        raise InputError(
-            f"cannot read the series of exposures {folder}: {error.strerror}; name a folder of raw files"
-        ) from error
-    if len(paths) < LEAST_FRAMES:
-        raise InputError(
-            f"{folder} holds {len(paths)} files, at least {LEAST_FRAMES} raw files of the chart with different "
-            "exposure times expected, better 8 from dim to nearly saturated"
+        `saturation`: the raw count that the first registered frame shows. `first_dark`: the first dark frame, whose
+        light is subtracted from the frames before it; None if none is.
+        """
+        count, samples, first = baseline.chart.colour_count, baseline.options.samples, baseline.first
+        inside = np.concatenate([first.cells.inside, first.references.inside])
+        found = Accumulator(
+            session=session,
+            selected=selected,
+            baseline=baseline,
+            figures=(),
+            saturation=saturation,
+            registered=first,
+            dark=None,
+            estimate=DarkLightEstimate.none(baseline.reflectances(), inside, samples),
+            hot=HotPixels.none(count, samples),
+            highest=np.zeros(count, dtype=np.uint16),
+            highest_at=np.zeros(count, dtype=np.int64),
+            outside=np.zeros(count, dtype=np.bool_),
+            covered=_covered_cells(baseline, first),
+            place_error=first.registration.expanded_px(baseline.points.cells_mm),
+            even_sum=np.zeros((count, samples, 3), dtype=np.float32),
+            even_noise2=np.zeros((count, 3)),
+            even_frames=0,
         )
-    seen: list[_Array] = []
-    times: list[float] = []
-    settings: list[tuple[int | None, float | None]] = []
-    limits: list[float] = []
-    for path in paths:
-        mosaic = read_raw(path)
-        if not mosaic.shutter_s:
-            raise FormatError(f"{path} does not state its exposure time; take the series with a camera that writes it")
-        times.append(mosaic.shutter_s)
-        settings.append((mosaic.iso, mosaic.aperture))
-        if settings[-1] != settings[0]:
-            raise FormatError(
-                f"{path} was taken with ISO {mosaic.iso}, f/{mosaic.aperture}, {paths[0].name} with ISO "
-                f"{settings[0][0]}, f/{settings[0][1]}; a series differs in its exposure time alone"
-            )
-        black = frame_black(mosaic)
-        limit = mosaic.saturation()
-        _require_in_place(baseline.movement(mosaic, black, strongest_channel(mosaic, black), str(path)), path)
-        means, highest = baseline.patches(mosaic, black)
-        means[highest >= CLIPPING_SHARE * limit] = np.nan
-        seen.append(means)
-        limits.append(limit - float(black.mean()))
-    if len(set(times)) < LEAST_FRAMES:
-        raise InputError(
-            f"{folder}: {len(set(times))} different exposure times, at least {LEAST_FRAMES} expected; "
-            "take the series with times from dim to nearly saturated"
-        )
-    order: list[int] = np.argsort(times, kind="stable").tolist()
-    level, deviation = deviations(np.stack(seen)[order] / min(limits), np.array(times)[order])
-    if np.isnan(deviation).all():
-        raise InputError(
-            f"{folder}: no patch is between {LOWEST:.0%} and {HIGHEST:.0%} of saturation in two frames; "
-            "take the series with times less far apart, from dim to nearly saturated"
-        )
-    return LinearityMeasurements(tuple(paths[number].name for number in order), level, deviation)
+        return found if first_dark is None else replace(found, dark=found._learned(first_dark).dark)
 
+    @cached_property
+    def frames(self) -> tuple[FrameMeasurements, ...]:
+        """Figures of the light and white frames."""
+        return tuple(figures for figures in self.figures if isinstance(figures, FrameMeasurements))
 
-def _require_in_place(shift: Shift, path: Path) -> None:
-    if shift.gauges == 0 or shift.largest_px > REREGISTER_PX:
-        moved = f"it has moved by {shift.largest_px:.2f} px, {REREGISTER_PX:g} allowed"
-        if shift.gauges == 0:
-            moved = "its tags, or the outline of its field, are not seen"
-        raise FormatError(
-            f"{path}: the chart is not where the session has it ({moved}); take the series with camera and print as "
-            "they stand in the session, before it or after it"
+    @property
+    def darks(self) -> tuple[DarkFrameFigures, ...]:
+        """Figures of the dark frames."""
+        return tuple(figures for figures in self.figures if isinstance(figures, DarkFrameFigures))
+
+    @property
+    def records(self) -> list[FrameRecord]:
+        """The frames taken in."""
+        return [figures.record for figures in self.figures]
+
+    def with_frame(self, measured: MeasuredFrame | MeasuredDarkFrame) -> Accumulator:
+        """Return what there is after the next frame."""
+        before = self if measured.registered is self.registered else self._registered_again(measured.registered)
+        after = replace(before, figures=(*before.figures, measured.figures))
+        if isinstance(measured, MeasuredDarkFrame):
+            after = replace(after, hot=before.hot.with_frame(measured.excess))
+            return after._learned(measured) if self.baseline.options.subtract_dark else after  # noqa: SLF001 - its own class
+        light = measured.figures.record.illumination
+        brighter = measured.highest > before.highest
+        after = replace(
+            after,
+            saturation=min(before.saturation, measured.saturation),
+            highest=np.where(brighter, measured.highest, before.highest),
+            highest_at=np.where(brighter, -1 if light is None else light, before.highest_at),
+            outside=before.outside | ~measured.inside,
+        )
+        if measured.samples is None or measured.noise is None:
+            return after
+        return replace(
+            after,
+            even_sum=before.even_sum + measured.samples,
+            even_noise2=before.even_noise2 + measured.noise**2,
+            even_frames=before.even_frames + 1,
         )
 
+    def _registered_again(self, registered: RegisteredFrame) -> Accumulator:
+        """Return what there is once the chart is registered in another frame."""
+        error = registered.registration.expanded_px(self.baseline.points.cells_mm)
+        return replace(
+            self,
+            registered=registered,
+            estimate=self.estimate.restarted(),
+            hot=self.hot.restarted(median_noise(self.darks)),
+            covered=self.covered | _covered_cells(self.baseline, registered),
+            place_error=np.maximum(self.place_error, error),
+        )
 
-_LEAST_WHITE = 1e-3
-"""Counts that a channel's ground truth has at least, so that it is a direction even where no light is measured."""
+    def _learned(self, measured: MeasuredDarkFrame) -> Accumulator:
+        """Return what there is with a dark frame taken into the estimate of what is subtracted from those after it."""
+        points, reader = self.baseline.points, self.baseline.paper
+        means = measured.means[points.white_patches]
+        inside = measured.registered.references.inside[: len(points.whites_mm), None]
+        paper, shape = reader.read(np.where(inside, means, np.nan), measured.figures.record.file)
+        field = np.concatenate([shape, paper.field.at(points.references_mm)])
+        estimate, dark = self.estimate.with_frame(measured.means, measured.figures.noise, paper, field)
+        return replace(self, estimate=estimate, dark=dark)
 
-_MOST_DRIFT, _MOST_DRIFT_DEG = 0.15, 2.0
-"""Drift of white, as a share and in degrees, up to which white frames are believed: a table is refused beyond."""
+    def to_json(self) -> dict[str, Any]:
+        """Return what a checkpoint stores as text; the rest is `to_arrays`."""
+        return {"registered": self.registered.file, "figures": to_plain(self.figures, _Figures)}
 
-_FULL_CODE = 255
-"""Code of a primary at its brightest."""
+    def to_arrays(self) -> _Arrays:
+        """Return what a checkpoint stores as arrays, (...) of any dtype, by name: those of this value and its parts."""
+        parts = {"": self, "estimate.": self.estimate, "hot.": self.hot, "dark.": self.dark}
+        return {prefix + name: each for prefix, part in parts.items() for name, each in _arrays_of(part).items()}
+
+    def restored(self, values: Mapping[str, Any], arrays: _Arrays) -> Accumulator:
+        """Return what was stored of a build of the same frames, `arrays` (...) of any dtype; this one is empty."""
+        found = from_plain(_Figures, values["figures"], self.session.folder, "begin the build anew")
+        figures = tuple(
+            replace(each, record=record) for each, record in zip(found, self.selected.records, strict=False)
+        )
+        registered = self.baseline.first
+        if values["registered"] != registered.file:
+            record = next(record for record in self.selected.records if record.file == values["registered"])
+            registered = self.baseline.register(decode_frame(self.session, record))
+
+        def stored(prefix: str) -> dict[str, Any]:
+            named = {name.removeprefix(prefix): each for name, each in arrays.items() if name.startswith(prefix)}
+            return {name: each if each.ndim else each.item() for name, each in named.items() if "." not in name}
+
+        dark = stored("dark.")
+        return replace(
+            self,
+            figures=figures,
+            registered=registered,
+            dark=DarkLight(**dark) if dark else None,
+            estimate=replace(self.estimate, **stored("estimate.")),
+            hot=replace(self.hot, **stored("hot.")),
+            **stored(""),
+        )
+
+    def dark_summary(self) -> DarkSummary:
+        """Return what the dark frames show."""
+        return dark_summary(self.darks, self.hot)
+
+    def noise(self) -> _Array:
+        """Return (3,) float64, median standard deviation of one sample in the even frames, of the brightest cells'."""
+        frames = max(self.even_frames, 1)
+        level = np.percentile(self.even_sum.mean(axis=1) / frames, _BRIGHTEST_PERCENTILE, axis=0)
+        return np.sqrt(np.median(self.even_noise2 / frames, axis=0)) / np.maximum(level, 1e-6)
+
+    def stains(self, field: _Array) -> Stains:
+        """Return where the print does not have its codes' colours.
+
+        `field` (C, 3) float64 is that of a frame of even light, of each cell's own colour as far as it is known: by the
+        field of paper alone, cells of one side would be off where the primaries light the print in different ways.
+        """
+        cells_mm = self.baseline.points.cells_mm
+        level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field
+        return find_stains(level, cells_mm, self.baseline.chart.bits, ~(self.outside | self.covered))
+
+    def unfit(self, stains: Stains, frames: Sequence[FrameMeasurements], added: AddedLight) -> tuple[Unfit, ...]:
+        """Return the cells not to be used, each with the first cause that applies; `frames`: what is said of them."""
+        lit_by_others = added.certain_share_of(self.baseline.levels).max(axis=1)
+        disturbed = disturbed_cells(frames)
+        lit = [(frame.consistency.alone, frame.record.illumination) for frame in frames]
+        alone = {colour: light for cells, light in lit if light is not None for colour in cells}
+        even, dark = max(self.even_frames, 1), self.dark_summary()
+        hottest = dark.hottest if len(dark.hottest) else np.zeros(self.baseline.chart.colour_count)
+        dead = has_dead_photosite(self.even_sum / even)
+        uneven = unevenness(self.even_sum / even, np.sqrt(self.even_noise2) / even)
+        allowed, samples = CLIPPING_SHARE * self.saturation, self.even_sum.shape[1]
+        found: list[Unfit] = []
+        for colour in range(self.baseline.chart.colour_count):
+            cause = ""
+            if self.outside[colour]:
+                cause = f"outside: its {samples} pixels do not all lie in the frame"
+            elif self.highest[colour] >= allowed:
+                light = int(self.highest_at[colour])
+                under = f"light {light}" if light >= 0 else "white"
+                cause = f"clipped: {int(self.highest[colour])} counts under {under}, below {allowed:.0f} allowed"
+            elif self.covered[colour]:
+                cause = "covered: it does not look like the chart's (covered, damaged, or printed otherwise)"
+            elif self.place_error[colour] > MAX_PLACE_ERROR_PX:
+                cause = (
+                    f"misplaced: its place is known to {self.place_error[colour]:.2f} px, {MAX_PLACE_ERROR_PX:g} px "
+                    "allowed; the print waves there, or little of it is seen"
+                )
+            elif lit_by_others[colour] > MOST_ADDED:
+                cause = (
+                    f"lit: {lit_by_others[colour]:.1%} of its level is light that lies on the print there (reflection)"
+                )
+            elif stains.stained[colour]:
+                deviation = stains.deviation_of(colour)
+                how = f"{abs(deviation):.1%} {'darker' if deviation < 0 else 'brighter'}"
+                cause = f"stained: it is, or its surroundings are, {how} than their codes elsewhere on the print"
+            elif hottest[colour] > 0:
+                cause = f"hot: a photosite stands out by {hottest[colour]:.0f} counts in every dark frame"
+            elif dead[colour]:
+                cause = "dead: a photosite sees less than half of the light of its cell"
+            elif uneven[colour] > 0:
+                cause = f"uneven: rim and middle differ by {uneven[colour]:.1%} under white"
+            elif colour in disturbed:
+                cause = f"disturbed: {_disturbance(disturbed[colour])}"
+            elif colour in alone:
+                cause = f"unlike: under light {alone[colour]} it is far from its code, and its neighbours are not"
+            if cause:
+                found.append(Unfit(colour=colour, cause=cause))
+        return tuple(found)
 
 
-def table_figures(done: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
-    """Return the figures of a table, all of whose frames have been taken in.
+def stored_names() -> list[str]:
+    """Return the names that a checkpoint stores; a build does not go on from one that was made with others."""
+    parts = (Accumulator, FrameMeasurements, DarkFrameFigures, DarkLight, DarkLightEstimate, HotPixels)
+    return [f"{part.__name__}.{field.name}" for part in parts for field in fields(part)]
 
-    `linearity`: what a series of exposures shows; None where none was given.
+
+def disturbed_cells(frames: Sequence[FrameMeasurements]) -> dict[int, list[tuple[int, float]]]:
+    """Return the lights under which something covered cells, and how far these are off; by the cells' colours.
+
+    White frames' do not count: a table has no samples of them.
     """
-    even = next((frame for frame in done.frames if done.selected.is_even(frame.record)), done.frames[0])
-    lit = {frame.record.illumination: frame for frame in done.frames if frame.record.kind == "light"}
-    by_light = [lit[light.index] for light in done.session.illuminations]
-    greys = np.array([frame.greys for frame in by_light]), np.array([frame.grey_errors for frame in by_light])
-    return _figures(done, even, len(by_light), _light_figures(done, by_light), greys, linearity)
+    found: dict[int, list[tuple[int, float]]] = {}
+    for frame in frames:
+        if frame.record.illumination is not None:
+            for colour, off in frame.consistency.disturbed:
+                found.setdefault(colour, []).append((frame.record.illumination, off))
+    return found
 
 
-def check_figures(done: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
-    """Return the figures of a check, which has taken in the frame that is registered, and a dark one where there is."""
-    (frame,) = done.frames
-    lights = LightMeasurements(
-        white=frame.paper.white[None],
-        white_error=frame.paper.error[None],
-        gains=np.ones((1, 3)),
-        subtracted=None,
-        share_at_zero=np.zeros(0),
-        additivity=None,
-        codes=None,
-        white_frames=None,
-    )
-    with_frame = len(done.session.illuminations) - len(done.selected.lights_without)
-    return _figures(done, frame, with_frame, lights, (frame.greys[None], frame.grey_errors[None]), linearity)
+def _disturbance(under: list[tuple[int, float]]) -> str:
+    light, off = max(under, key=lambda one: abs(one[1]))
+    more = f" and {len(under) - 1} more" if len(under) > 1 else ""
+    deviation = f"{abs(off):.1%} {'darker' if off < 0 else 'brighter'} than its code gives"
+    how = deviation if off else "too dark to be compared"
+    return f"under light {light}{more} it is {how}, next to cells that are far off"
 
 
-def _figures(
-    done: Accumulator,
-    even: FrameMeasurements,
-    lights_taken: int,
-    lights: LightMeasurements,
-    greys: tuple[_Array, _Array],
-    linearity: LinearityMeasurements | None,
-) -> TableMeasurements:
-    """Return all figures; `even` is the frame that shows how even cells are."""
-    session, baseline, saturation = done.session, done.baseline, done.saturation
-    stated = stated_origin(session)
-    if baseline.options.citation is not None:
-        # What was given for the build stands in place of the session's settings.
-        stated = replace(stated, citation=baseline.options.citation)
-    origins = [one.origin for one in done.figures]
-    published = with_published_serials(origins, stated.citation.camera_serial)
-    stains, dark = done.stains(_field_at_cells(baseline, even)), done.dark_summary()
-    frames = _without_hot(done.frames, dark.hottest, stains.places_mm)
-    added = baseline.added_light()
-    table = TableMeasurements(
-        session=SessionMeasurements(
-            folder=session.folder,
-            camera=baseline.camera,
-            lights=lights_taken,
-            registered_file=done.selected.registered.file,
-            white_references=len(session.chart.white_references),
-            codes=tuple(light.colour for light in session.illuminations),
-        ),
-        registration=baseline.first.registration,
-        frames=frames,
-        lights=lights,
-        greys=GreyMeasurements(baseline.points.levels.names, *greys),
-        sensor=SensorMeasurements(
-            saturation_counts=saturation,
-            saturation_measured=bool((done.highest >= saturation).any()),
-            white_level=round(saturation - float(np.mean([frame.black.mean() for frame in done.frames]))),
-            noise=done.noise(),
-            transfer=baseline.transfer,
-            linearity=linearity,
-            superposition=_superposition(done),
-        ),
-        dark_frames=dark,
-        cells=CellMeasurements(
-            baseline.options.window, done.unfit(stains, frames, added), stains, baseline.levels, added
-        ),
-        origins=origin_figures(
-            list(zip(done.records, published, strict=True)), None if stated.camera is None else stated.camera.iso
-        ),
-        origin=origin_record(stated, done.records, origins),
-        primaries=baseline.primaries,
-        lens=lens_figures(baseline),
-        point_spread=None if baseline.lens is None else baseline.lens.spread,
-        budget=Budget.none(),
-    )
-    return replace(table, budget=budget_of(table))
+def _covered_cells(baseline: Baseline, registered: RegisteredFrame) -> npt.NDArray[np.bool_]:
+    """Return the cells (C,) that do not look like the chart's, alone or with their neighbourhood."""
+    registration = registered.registration
+    nearest = np.asarray(cKDTree(registration.blocks.centres_mm).query(baseline.points.cells_mm)[1])
+    return registration.mismatched_cells[baseline.chart.cell_of_colour] | ~registration.blocks.good[nearest]
 
 
-def _superposition(done: Accumulator) -> Superposition:
-    """Return how counts deviate from proportion to light, as frames show it, else as is usual."""
-    black = float(np.mean([frame.black.mean() for frame in done.frames]))
-    return done.baseline.superposition or Superposition.usual(done.saturation - black)
-
-
-def _field_at_cells(baseline: Baseline, even: FrameMeasurements) -> _Array:
-    """Return the field (C, 3) float64 by which the cells of a frame are evened, each by that of its own colour."""
-    field = even.paper.field.at(baseline.points.cells_mm)
-    return field if baseline.primaries is None else field * baseline.primaries.field_ratio(even.paper.white)
-
-
-def _without_hot(
-    frames: tuple[FrameMeasurements, ...], hottest: _Array, cells_mm: _Array
-) -> tuple[FrameMeasurements, ...]:
-    """Return frames in which no cell counts as covered for the hot photosite that it holds.
-
-    `hottest` (C,) counts as of the dark frames, whenever these were taken; (0,) without any.
-    """
-    if not len(hottest):
-        return frames
-    hot = hottest > 0
-    return tuple(replace(one, consistency=one.consistency.without_hot(hot, cells_mm)) for one in frames)
-
-
-def _light_figures(done: Accumulator, by_light: Sequence[FrameMeasurements]) -> LightMeasurements:
-    """Return what was measured of the lights, whose frames are `by_light`."""
-    illuminations, options = done.session.illuminations, done.baseline.options
-    error = np.array([frame.paper.error for frame in by_light])
-    # A channel without light may be measured at or below 0; its standard error is what is known of it.
-    white = np.maximum([frame.paper.white for frame in by_light], np.maximum(error, _LEAST_WHITE))
-    whites = [frame for frame in done.frames if frame.record.kind == "white"]
-    paper = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
-    gains = drift_gains(*_times_s(by_light, whites), paper)
-    dark = np.zeros(3) if options.subtract_dark else done.dark_summary().light
-    full_white = whites[0].paper.white if whites else None
-    compared = whites[:1] if _drift_is_one(whites) else whites
-    agreement = _code_agreement(
-        illuminations, by_light, compared, dark, gains if len(compared) < 2 else np.ones_like(gains)
-    )
-    return LightMeasurements(
-        white=white,
-        white_error=error,
-        gains=gains,
-        subtracted=np.array([frame.dark for frame in by_light]) if options.subtract_dark else None,
-        share_at_zero=np.array([frame.share_at_zero for frame in by_light]),
-        additivity=additivity(illuminations, white, full_white, dark, gains, _superposition(done)),
-        codes=agreement.rows(slice(len(by_light))),
-        white_frames=agreement.rows(slice(len(by_light), None)) if whites else None,
-        stray=_stray_light(illuminations, by_light, whites, dark, gains),
-        drift=drift_correction(*_times_s(by_light, whites), paper) if options.correct_drift else None,
-    )
-
-
-def _drift_is_one(whites: Sequence[FrameMeasurements]) -> bool:
-    """Return whether white frames differ as a lamp drifts, and not as frames of other lights or exposures do."""
-    levels = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
-    if len(levels) < 2:
-        return True
-    middle = np.median(levels, axis=0)
-    turned = angles_deg(levels, np.broadcast_to(middle, levels.shape)).max()
-    return bool(np.abs(levels / np.maximum(middle, _LEAST_WHITE) - 1).max() < _MOST_DRIFT and turned < _MOST_DRIFT_DEG)
-
-
-def _code_agreement(
-    illuminations: Sequence[Illumination],
-    by_light: Sequence[FrameMeasurements],
-    whites: Sequence[FrameMeasurements],
-    dark: _Array,
-    gains: _Array,
-) -> CodeAgreement:
-    """Return how the lights, and white frames behind them, agree with their codes; stated exposures aside."""
-    frames = [*by_light, *whites]
-    codes = np.array([*(light.colour for light in illuminations), *((255, 255, 255) for _ in whites)])
-    factor = _to_one_exposure(frames)
-    drift = np.concatenate([gains, np.ones((len(whites), 3))])
-    error = np.array([frame.paper.error for frame in frames])
-    there = np.isfinite(dark)
-    white = np.array([frame.paper.white for frame in frames]) - np.where(there, dark, 0)
-    return code_agreement(
-        codes,
-        white * factor / drift,
-        error * factor / drift,
-        dark_known=bool(there.all()),
-        drift_known=len(whites) == 1,
-    )
-
-
-def _to_one_exposure(frames: Sequence[FrameMeasurements]) -> _Array:
-    """Return the usual exposure over that of each frame, (N, 1) float64, as files state them; 1 where they do not."""
-    exposures = np.array([frame.origin.exposure for frame in frames])
-    usual = float(np.median(exposures[exposures > 0])) if (exposures > 0).any() else 1.0
-    return np.where(exposures > 0, usual / np.maximum(exposures, 1e-12), 1.0)[:, None]
-
-
-def _stray_light(
-    illuminations: Sequence[Illumination],
-    by_light: Sequence[FrameMeasurements],
-    whites: Sequence[FrameMeasurements],
-    dark: _Array,
-    gains: _Array,
-) -> StrayLight | None:
-    """Return what light is in frames that the dark ones do not show; None where it cannot be known."""
-    frames, lights = [*by_light, *whites], len(by_light)
-    factor = _to_one_exposure(frames) / np.concatenate([gains, np.ones((len(whites), 3))])
-    white = (np.array([frame.paper.white for frame in frames]) - dark) * factor
-    error = np.array([frame.paper.error for frame in frames]) * factor
-    codes = np.array([light.colour for light in illuminations], dtype=np.int64)
-    # Lights of full white are white frames, too: the more there are, the better the lamp's flicker is known.
-    full = np.concatenate([white[lights:], white[:lights][(codes == _FULL_CODE).all(axis=1)]])
-    return stray_light(codes, white[:lights], error[:lights], full, pure_lights(illuminations))
-
-
-def _times_s(by_light: Sequence[FrameMeasurements], whites: Sequence[FrameMeasurements]) -> tuple[_Array, _Array]:
-    """Return when lights (L,) and white frames (W,) were taken, seconds since the first of these, if any."""
-    start = (*whites, *by_light)[0].record.taken_at
-    at_s, white_at_s = (
-        np.array([(frame.record.taken_at - start).total_seconds() for frame in frames]) for frames in (by_light, whites)
-    )
-    return at_s, white_at_s
+def _arrays_of(part: Any) -> _Arrays:
+    """Return the arrays and counts of a frozen value by the names of its fields; none of None."""
+    values = {} if part is None else {field.name: getattr(part, field.name) for field in fields(part)}
+    return {name: np.asarray(value) for name, value in values.items() if isinstance(value, np.ndarray | int)}

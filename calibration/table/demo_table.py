@@ -23,6 +23,14 @@ LIGHTS: Final = "2856K,4000K,D55,D65,FL2,LED-B3,7500K,10000K"
 BITS: Final = 4
 """Bits kept of each channel: 4096 colours, 5 MB."""
 
+_SETTINGS: Final = f"""\
+[room]
+profile = "managed"
+paper = "matt"
+[chart]
+bits = {BITS}
+"""
+
 
 def table_folder(given: Path) -> Path:
     """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there."""
@@ -44,10 +52,10 @@ def table_folder(given: Path) -> Path:
 
 def _make(folder: Path) -> None:
     """Have ``sim table`` make it, as a user would: what makes computed tables stands above this package."""
-    options = ["--camera", CAMERA, "--lights", LIGHTS, "--print", "managed", "--paper", "matt"]
+    options = ["--camera", CAMERA, "--lights", LIGHTS]
     with TemporaryDirectory() as place:
         settings = Path(place) / "settings.toml"
-        settings.write_text(f"[chart]\nbits = {BITS}\n", encoding="utf-8")
+        settings.write_text(_SETTINGS, encoding="utf-8")
         words = [sys.executable, "-m", "synthesis.cli", "table", str(folder), *options, "--settings", str(settings)]
         done = subprocess.run(words, stdout=subprocess.DEVNULL, check=False)
     # Another program may have made it meanwhile, of the same bytes.

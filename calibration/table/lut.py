@@ -2,9 +2,8 @@
 
 The generator reads tables through this file, and nothing behind it; `calibration.table.writing` writes them. Every
 released version of the format stays readable. `SHA256SUMS` has the form of `sha256sum`, so that a table is checked
-without this software, and its own hash names the table; tables made before it was written have hashes of ground truth
-and samples in `lut.json`, or none at all. Small files are held against their hashes whenever a table is opened, samples
-when a light is first used.
+without this software, and its own hash names the table. Small files are held against their hashes whenever a table is
+opened, samples when a light is first used.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from foundation.records import Record, from_json
 FORMAT: Final = "crop.lut"
 
 VERSION: Final = 1
-"""The only version so far: keys that were added since are optional."""
+"""The only version so far."""
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 """A SHA-256 as 64 lowercase hexadecimal digits."""
@@ -57,16 +56,16 @@ ILLUMINATIONS: Final = "illuminations.csv"
 """The lights and their ground truth."""
 
 FRAMES: Final = "frames.csv"
-"""The raw files that the table was made from; absent in tables made before they were recorded."""
+"""The raw files that the table was made from; absent in computed tables."""
 
 REFERENCES: Final = "references.csv"
 """The grey references under each light, where the chart has some."""
 
 UNCERTAINTY: Final = "uncertainty.csv"
-"""The expanded uncertainty of each light's ground truth, and its causes; absent in tables made before it was stated."""
+"""The expanded uncertainty of each light's ground truth, and its causes; absent in computed tables."""
 
 CELLS: Final = "cells.csv"
-"""The expanded relative uncertainty of each cell's mean; absent in tables made before it was stated."""
+"""The expanded relative uncertainty of each cell's mean; absent in computed tables."""
 
 REPORT_PAGE: Final = "report.html"
 """The report for people."""
@@ -75,7 +74,7 @@ REPORT_JSON: Final = "report.json"
 """The report for programs."""
 
 SUMS: Final = "SHA256SUMS"
-"""Hashes of all other files of the table, as `sha256sum -c` reads them; absent in tables made before it was written."""
+"""Hashes of all other files of the table, as `sha256sum -c` reads them."""
 
 REPORT_FORMAT: Final = "crop.report"
 
@@ -139,15 +138,15 @@ class Provenance(Record):
     - `corrections`: what was applied to the counts, with its parameters, in order.
     - `session_sha256`: hash over the frames' hashes (`calibration.table.lut.frames_sha256`).
     - `chart_sha256`: hash of the chart.
-    - `samples_sha256`, `illuminations_sha256`: of the files; None in tables made before they were recorded.
+    - `samples_sha256`, `illuminations_sha256`: of the files; None until the table is written.
     - `lights_sha256`: of each light's samples as they lie in the file, in the order of lights, so that damage can be
-      traced to a light; empty in tables made before they were recorded.
-    - `files_sha256`: of further files of the table, `references.csv`; empty in tables made before they were recorded.
-    - `has_sums`: whether `SHA256SUMS` lists every file of the table; false in tables made before it was written.
+      traced to a light.
+    - `files_sha256`: of further files of the table, `references.csv`.
+    - `has_sums`: whether `SHA256SUMS` lists every file of the table; false until it is written.
     - `computed`: where the table was computed from spectra and a model of the sensor and nothing was photographed: by
       what, and with which settings. None where it was made from frames.
     - `origin`: with what, when and by whom the frames were taken, and under which licence the table may be used; None
-      in tables made before it was kept, and in computed ones of which nothing is stated.
+      in computed tables of which nothing is stated.
     """
 
     format: Literal["crop.lut"] = FORMAT
@@ -200,7 +199,10 @@ def parse_provenance(text: bytes, path: Path) -> Provenance:
             f"{path.parent} is a table of version {head.version!r}, this software reads version {VERSION}; "
             "build it again from its session with build-lut, or install the software that wrote it"
         )
-    return from_json(Provenance, text, path, "restore it from a copy")
+    found = from_json(Provenance, text, path, "restore it from a copy")
+    if not found.has_sums:
+        raise FormatError(f"{path} does not know of {SUMS} beside it; {RESTORE}")
+    return found
 
 
 @dataclass(frozen=True)
@@ -323,16 +325,9 @@ def require_plain_table(folder: Path) -> None:
     require_plain_folder(folder, MOST_BYTES)
 
 
-def known_sums(folder: Path, provenance: Provenance) -> dict[str, str]:
-    """Return the recorded hashes of a table's files by name, `samples.npy` included; of older tables what they have."""
-    if provenance.has_sums:
-        return parse_sums(read_text(folder / SUMS, RESTORE), folder / SUMS)
-    if (folder / SUMS).exists():
-        raise FormatError(
-            f"{folder / PROVENANCE} does not know of {SUMS} beside it: one of them has changed; {RESTORE}"
-        )
-    recorded = {ILLUMINATIONS: provenance.illuminations_sha256, SAMPLES: provenance.samples_sha256}
-    return dict(provenance.files_sha256) | {name: known for name, known in recorded.items() if known is not None}
+def known_sums(folder: Path) -> dict[str, str]:
+    """Return the recorded hashes of a table's files by name, `samples.npy` included."""
+    return parse_sums(read_text(folder / SUMS, RESTORE), folder / SUMS)
 
 
 def changed_files(folder: Path, known: Mapping[str, str]) -> Iterator[str]:
@@ -345,23 +340,22 @@ def changed_files(folder: Path, known: Mapping[str, str]) -> Iterator[str]:
             yield f"{name} is gone"
         elif file_sha256(path) != then:
             yield f"{name} is not as it was built" + ": lights or ground truth have changed" * (name == ILLUMINATIONS)
-    if PROVENANCE in known:
-        # Nothing but what is listed is read, so that only files of a table's own names matter.
-        yield from (
-            f"{name} is no part of the table as it was built"
-            for name in _TEXTS
-            if name not in known and (folder / name).exists()
-        )
+    # Nothing but what is listed is read, so that only files of a table's own names matter.
+    yield from (
+        f"{name} is no part of the table as it was built"
+        for name in _TEXTS
+        if name not in known and (folder / name).exists()
+    )
 
 
 def require_listed(folder: Path, provenance: Provenance, lights: int) -> dict[str, str]:
     """Return the recorded hashes of a table's files after holding all but the samples against them."""
     hashes = len(provenance.lights_sha256)
-    if hashes not in (lights, 0) or (provenance.has_sums and not hashes):
+    if hashes != lights:
         raise FormatError(
             f"{folder / PROVENANCE} has hashes of {hashes} lights, the table has {lights} lights; {RESTORE}"
         )
-    known = known_sums(folder, provenance)
+    known = known_sums(folder)
     for fault in changed_files(folder, known):
         raise FormatError(f"{folder}: {fault}; {RESTORE}")
     return known
@@ -404,31 +398,23 @@ class Lut:
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 that names the table, as a dataset records it: of `SHA256SUMS`, which has the hash of every file.
-
-        In tables made before that was written it is over `lut.json` and `illuminations.csv`: `lut.json` holds the hash
-        of the samples, so it stands for them without reading gigabytes, or at least the hash over all frames, from
-        which the samples came.
-        """
-        return table_sha256(self.folder, self.provenance)
+        """SHA-256 that names the table, as a dataset records it: of `SHA256SUMS`, which has the hash of every file."""
+        return file_sha256(self.folder / SUMS)
 
     def require_unchanged(self, light: int) -> None:
         """Raise unless a light's samples are those that were measured; costs the reading of a light, once for each.
-
-        Does nothing for tables made before hashes of lights were recorded.
 
         Raises
         ------
         FormatError
             They are not.
         """
-        known = self.provenance.lights_sha256
-        if light in self._unchanged or light >= len(known):
+        if light in self._unchanged:
             return
-        if light_sha256(self.samples[light]) != known[light]:
+        if light_sha256(self.samples[light]) != self.provenance.lights_sha256[light]:
             raise FormatError(
                 f"{self.folder / SAMPLES}: the samples of light {light} are not those that were measured; see what "
-                f"else has changed with build-lut --verify {self.folder}, then copy the table again or build it anew"
+                f"else has changed with build-lut verify {self.folder}, then copy the table again or build it anew"
             )
         self._unchanged.add(light)
 
@@ -449,7 +435,7 @@ class Lut:
 
     @cached_property
     def truth_uncertainty_deg(self) -> npt.NDArray[np.float64] | None:
-        """(L,) float64 degrees, expanded uncertainty (k = 2) of the ground truth; None in tables that do not state it.
+        """(L,) float64 degrees, expanded uncertainty (k = 2) of the ground truth; None in computed tables.
 
         Raises
         ------
@@ -463,7 +449,7 @@ class Lut:
     def cell_uncertainty(self) -> npt.NDArray[np.float64] | None:
         """(8**bits, 3) float64, expanded relative uncertainty (k = 2) of each cell's mean in R, G and B, noise apart.
 
-        Under the light that the chart was registered in; None in tables that do not state it.
+        Under the light that the chart was registered in; None in computed tables.
 
         Raises
         ------
@@ -474,7 +460,7 @@ class Lut:
 
     @cached_property
     def frames(self) -> tuple[SourceFrame, ...]:
-        """The frames the table was made from, in the order taken; empty in tables made before they were recorded.
+        """The frames the table was made from, in the order taken; empty in computed tables.
 
         Raises
         ------
@@ -482,16 +468,6 @@ class Lut:
             `frames.csv` is damaged.
         """
         return load_frames(self.folder / FRAMES)
-
-
-def table_sha256(folder: Path, provenance: Provenance) -> str:
-    """Return the hash that names a table of that `lut.json`; see `Lut.sha256`."""
-    if provenance.has_sums:
-        return file_sha256(folder / SUMS)
-    digest = hashlib.sha256()
-    for name in (PROVENANCE, ILLUMINATIONS):
-        digest.update((folder / name).read_bytes())
-    return digest.hexdigest()
 
 
 def open_lut(folder: Path, *, check: bool = True) -> Lut:

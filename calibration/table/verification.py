@@ -15,29 +15,18 @@ from calibration.table.lut import (
     SUMS,
     UNCERTAINTY,
     Lut,
-    Provenance,
     changed_files,
-    frames_sha256,
     known_sums,
     samples_sha256,
 )
-from foundation.errors import FormatError, InputError, first_of
-
-
-def _hashes(known: Provenance) -> str:
-    """Return in words what of a table its recorded hashes cover."""
-    if known.has_sums:
-        return f"every file, in {SUMS}, whose own names the table"
-    if known.lights_sha256:
-        return "ground truth and samples; the table is older than the list of every file"
-    return "none: the table was made before they were recorded, so that changes are not noticed"
+from foundation.errors import FormatError, first_of
 
 
 def _uncertainty(lut: Lut) -> str:
     """Return in words what the ground truth may be off by."""
     expanded = lut.truth_uncertainty_deg
     if expanded is None:
-        return "not stated: the table was computed, or made before it was"
+        return "not stated: the table was computed"
     return (
         f"{np.median(expanded):.2g}° median, {expanded.max():.2g}° worst light ({int(np.argmax(expanded))}), k = 2; "
         f"causes in {UNCERTAINTY}"
@@ -94,8 +83,8 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
         ("Frames", frames),
         ("Session", session),
         ("Chart", known.chart_sha256),
-        ("Samples", known.samples_sha256 or "no hash recorded"),
-        ("Hashes", _hashes(known)),
+        ("Samples", known.samples_sha256 or ""),
+        ("Hashes", f"every file, in {SUMS}, whose own names the table"),
         ("Table", lut.sha256),
     ]
 
@@ -115,35 +104,19 @@ def _name(correction: Mapping[str, Any]) -> str:
 
 def find_faults(lut: Lut, progress: Callable[[int, int], None] | None = None) -> list[str]:
     """Return what of a table is not as it was built, each fault in words; none where all is. Reads every byte of it."""
-    known = lut.provenance
-    if known.samples_sha256 is None or len(known.lights_sha256) != len(lut.illuminations):
-        raise InputError(
-            f"{lut.folder} records no hashes ({known.software} wrote none), so it cannot be verified; "
-            "build it again from its session"
-        )
-    sums = known_sums(lut.folder, known)
+    sums = known_sums(lut.folder)
     faults = list(changed_files(lut.folder, sums))
     whole, lights = samples_sha256(lut.folder / SAMPLES, lut.samples, progress)
-    changed = [light for light, (now, then) in enumerate(zip(lights, known.lights_sha256, strict=True)) if now != then]
+    recorded = lut.provenance.lights_sha256
+    if len(recorded) != len(lights):
+        return [*faults, f"{PROVENANCE}: it has hashes of {len(recorded)} lights, the table has {len(lights)}"]
+    changed = [light for light, (now, then) in enumerate(zip(lights, recorded, strict=True)) if now != then]
     if changed:
         named = first_of(changed, 20)
         faults.append(f"{SAMPLES}: the samples of {len(changed)} of {len(lights)} lights have changed: {named}")
     elif whole != sums[SAMPLES]:
         faults.append(f"{SAMPLES}: its first bytes, before the samples, have changed")
-    if not known.has_sums:
-        faults += _frame_list_faults(lut)
     return faults
-
-
-def _frame_list_faults(lut: Lut) -> list[str]:
-    """Return what is wrong with the list of frames of a table that does not have its hash, but that of its content."""
-    try:
-        frames = lut.frames
-    except FormatError as error:
-        return [str(error)]
-    if frames_sha256(frames) != lut.provenance.session_sha256:
-        return [f"{FRAMES} does not list the frames that {PROVENANCE} was made of"]
-    return []
 
 
 def chart_difference(one: Lut, other: Lut) -> str:

@@ -38,13 +38,11 @@ from calibration.table.lut import (
     SUMS,
     UNCERTAINTY,
     Lut,
-    Provenance,
     known_sums,
     light_sha256,
     open_lut,
     parse_provenance,
     require_listed,
-    table_sha256,
 )
 from experiment.lights import load_illuminations
 from foundation.errors import CropError, FormatError, InputError, StorageError
@@ -98,23 +96,16 @@ def texts_of(attributes: dict[str, Any], url: str) -> dict[str, str]:
         if name not in TEXTS or not isinstance(text, str) or len(text) > MOST_BYTES[name]:
             raise FormatError(f"{url} holds {name!r}, which is no file of a table or too large; publish it again")
         found[name] = text
-    lacking = {PROVENANCE, ILLUMINATIONS} - found.keys()
+    lacking = {PROVENANCE, ILLUMINATIONS, SUMS} - found.keys()
     if lacking:
         raise FormatError(f"{url} lacks {' and '.join(sorted(lacking))}; publish the table again")
     return found
 
 
-def require_expected(folder: Path, known: Provenance, expect: str | None, url: str) -> None:
-    """Refuse a table of another hash than expected, or whose hash says nothing of its samples."""
-    if expect is None:
-        return
-    if not known.lights_sha256:
-        raise FormatError(
-            f"{url} is a table without hashes of its samples, so that its own hash does not vouch for them; have it "
-            "built and published again"
-        )
-    found = table_sha256(folder, known)
-    if found != expect:
+def require_expected(folder: Path, expect: str | None, url: str) -> None:
+    """Refuse a table of another hash than expected; None expects none."""
+    found = file_sha256(folder / SUMS)
+    if expect is not None and found != expect:
         raise FormatError(
             f"{url} is not the table that was expected: its hash is {found}, expected {expect}; ask who told you the "
             "hash which table they mean"
@@ -250,7 +241,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
     """
     zarr = _zarr()
     if expect is not None and not HASH.fullmatch(expect):
-        raise InputError(f"{expect!r} is no hash of a table; give the 64 digits that build-lut --info prints as Table")
+        raise InputError(f"{expect!r} is no hash of a table; give the 64 digits that build-lut info prints as Table")
     require_free(folder, "the table")
     described = described_at(url)
     attributes = attributes_of(described)
@@ -268,7 +259,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
             if name in files:
                 write_whole(partial / name, files[name])
         known = parse_provenance(files[PROVENANCE].encode(), partial / PROVENANCE)
-        require_expected(partial, known, expect, url)
+        require_expected(partial, expect, url)
         lights = len(load_illuminations(partial / ILLUMINATIONS, computed=True))
         require_listed(partial, known, lights)
         shape = require_shape(described, (lights, 8**known.bits), url)
@@ -285,7 +276,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
                 stream.write(head)
                 for light in range(lights):
                     samples = _light(array, light, shape, url)
-                    if known.lights_sha256 and light_sha256(samples) != known.lights_sha256[light]:
+                    if light_sha256(samples) != known.lights_sha256[light]:
                         raise FormatError(
                             f"the samples of light {light} from {url} are not those that were measured; publish again"
                         )
@@ -295,8 +286,7 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
         except OSError as error:
             raise storage_error(path, error) from error
         open_lut(partial)
-        whole = known_sums(partial, known).get(SAMPLES)
-        if whole is not None and file_sha256(path) != whole:
+        if file_sha256(path) != known_sums(partial)[SAMPLES]:
             raise FormatError(f"the samples from {url} are not those that were measured; publish the table again")
     return open_lut(folder)
 

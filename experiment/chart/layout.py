@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from experiment.chart.margins import DESIGN_DPI, GAP_PX, PX_MM
+from experiment.chart.margins import GAP_PX, PX_MM
 from experiment.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Reference, Tag
 from foundation.errors import InputError
 from foundation.version import software
@@ -151,42 +151,22 @@ def _least_references(bits: int) -> int:
     return max(32, 8**bits // 40)
 
 
-def smallest_page(bits: int, slot_px: int = SLOT_PX) -> str:
-    """Return the name of the smallest A page, landscape, that holds a chart of `bits` bits."""
-    for name in reversed(A_SERIES_MM):
-        if _Grid.on(A_SERIES_MM[name], slot_px).holds(bits):
-            return name
-    raise InputError(
-        f"no A page holds {8**bits} cells of {slot_px * PX_MM:.2f} mm; choose smaller cells (--cell-mm) or give the "
-        "page's size in mm (--page)"
-    )
+def smallest_page(bits: int) -> str:
+    """Return the name of the smallest A page, landscape, that holds a chart of `bits` bits: A0 holds the largest."""
+    return next(name for name in reversed(A_SERIES_MM) if _Grid.on(A_SERIES_MM[name]).holds(bits))
 
 
-def slot_of(cell_mm: float) -> int:
-    """Return the pixels of the slot nearest to a wanted size that keeps tag modules whole."""
-    slot = round(cell_mm / PX_MM / SLOT_STEP_PX) * SLOT_STEP_PX if math.isfinite(cell_mm) else 0
-    if slot < LEAST_SLOT_PX:
-        raise InputError(
-            f"a cell of {cell_mm:g} mm cannot be printed evenly; {LEAST_SLOT_PX * PX_MM:.2f} mm "
-            f"({LEAST_SLOT_PX} px at {DESIGN_DPI} dpi) is the least"
-        )
-    return slot
-
-
-def design_chart(
-    bits: int = 5, page: str | tuple[float, float] | None = None, seed: int = 1, cell_mm: float | None = None
-) -> Chart:
+def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, seed: int = 1) -> Chart:
     """Return the chart of all 8**bits colours on a page.
 
     `page`: "A0" … "A8" (landscape), or width and height in mm; the smallest A page that holds the chart when not given.
-    `cell_mm`: side of a cell; goes to the nearest multiple of 5 pixels at 600 dpi (0.212 mm). When not given it is
-    5.292 mm, or on a page too small for that the largest that fits.
+    Cells have a side of 5.292 mm, or the largest that fits on a smaller page, a multiple of 5 pixels at 600 dpi.
     """
     if not 1 <= bits <= 5:
         raise InputError(f"a chart has 1 to 5 bits a channel, not {bits}")
     if seed < 0:
         raise InputError(f"the seed is {seed}; give a whole number from 0")
-    grid, page_mm = _choose_grid(bits, page, cell_mm)
+    grid, page_mm = _choose_grid(bits, page)
     rng = np.random.default_rng(seed)
     free = np.ones((grid.rows, grid.columns), dtype=np.bool_)
     for column, row in grid.tag_slots:
@@ -207,13 +187,10 @@ def design_chart(
     )
 
 
-def _choose_grid(
-    bits: int, page: str | tuple[float, float] | None, cell_mm: float | None
-) -> tuple[_Grid, tuple[float, float]]:
-    """Return the grid and the page it stands on: as asked, or with the largest cells that fit."""
-    wanted = SLOT_PX if cell_mm is None else slot_of(cell_mm)
-    page_mm = _page_mm(smallest_page(bits, wanted) if page is None else page)
-    grid = _Grid.on(page_mm, wanted)
+def _choose_grid(bits: int, page: str | tuple[float, float] | None) -> tuple[_Grid, tuple[float, float]]:
+    """Return the grid and its page: with the usual cells, or the largest that fit."""
+    page_mm = _page_mm(smallest_page(bits) if page is None else page)
+    grid = _Grid.on(page_mm)
     if grid.holds(bits):
         return grid, page_mm
     if len(grid.tag_slots) > TAG_IDS:
@@ -221,7 +198,7 @@ def _choose_grid(
             f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm needs {len(grid.tag_slots)} tags and the family "
             f"{TAG_FAMILY} has {TAG_IDS}; choose a smaller page"
         )
-    smaller = (_Grid.on(page_mm, slot) for slot in range(wanted - SLOT_STEP_PX, LEAST_SLOT_PX - 1, -SLOT_STEP_PX))
+    smaller = (_Grid.on(page_mm, slot) for slot in range(SLOT_PX - SLOT_STEP_PX, LEAST_SLOT_PX - 1, -SLOT_STEP_PX))
     fitting = next((grid for grid in smaller if grid.holds(bits)), None)
     text = (
         f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm is too small for the {8**bits} colours of a chart of {bits} bits"
@@ -232,11 +209,6 @@ def _choose_grid(
         raise InputError(
             f"{text} even with cells of {LEAST_SLOT_PX * PX_MM:.2f} mm, the smallest that can be printed; the "
             f"smallest page that holds it is {name} ({width:g} × {height:g} mm), at its best size {smallest_page(bits)}"
-        )
-    if cell_mm is not None:
-        raise InputError(
-            f"{text} in cells of {wanted * PX_MM:.2f} mm; {fitting.cell_mm[0]:.2f} mm fit: give that, or leave the "
-            "cell's size to the program"
         )
     return fitting, page_mm
 

@@ -175,7 +175,8 @@ def lens_unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
     def unsuitable(chart: Chart) -> str:
         return "not measured in this test"
 
-    monkeypatch.setattr("calibration.pipeline.baseline.unsuitable", unsuitable)
+    for module in ("baseline", "table_figures"):
+        monkeypatch.setattr(f"calibration.pipeline.{module}.unsuitable", unsuitable)
 
 
 RENDERED_BYTES = 100_000_000
@@ -234,7 +235,7 @@ def rendered_once() -> Generator[None]:
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(World, "_lit", kept)
-        patched.setattr("calibration.pipeline.frames.register", registered_once)
+        patched.setattr("calibration.pipeline.measuring.register", registered_once)
         yield
 
 

@@ -19,7 +19,6 @@ from calibration.citation import (
     origin_record,
     serial_hash,
     tex_text,
-    with_changes,
     with_published_serials,
 )
 from calibration.cli import main
@@ -27,7 +26,7 @@ from calibration.table.lut import open_lut, parse_provenance
 from drivers.raw.rawfile import FrameOrigin
 from experiment.config import CameraSettings, CitationSettings, parse_lab
 from experiment.session.records import FrameRecord
-from foundation.errors import ConfigurationError, InputError
+from foundation.errors import ConfigurationError
 from tests.calibration.table.tables import write
 
 BODY = FrameOrigin("Canon EOS 550D", "1234567890", "EF50mm f/1.8 II", 100, 8.0, 0.5)
@@ -104,20 +103,6 @@ def test_the_hash_is_the_bodys_alone() -> None:
     assert re.fullmatch("[0-9a-f]{32}", serial_hash("A", "1"))
 
 
-def test_options_stand_in_place_of_the_settings() -> None:
-    given = CitationSettings(authors=("Lab",), licence="CC0-1.0", note="before")
-    found = with_changes(given, {"licence": "cc-by-4.0", "note": "after"})
-    assert (found.authors, found.licence, found.note) == (("Lab",), "CC-BY-4.0", "after")
-
-
-@pytest.mark.parametrize(
-    ("changes", "option"), [({"licence": "free as air"}, "--licence"), ({"camera_serial": "yes"}, "--serial")]
-)
-def test_what_cannot_be_used_is_refused_by_its_option(changes: dict[str, str], option: str) -> None:
-    with pytest.raises(InputError, match=option):
-        with_changes(CitationSettings(), changes)
-
-
 def test_lab_toml_states_the_citation() -> None:
     head = 'rig = "simulated"\nchart = "c"\nilluminations = "i"\n[citation]\n'
     found = parse_lab(head + 'authors = ["Family, Given", "Institute"]\nlicence = "mit"\n', "LAB.toml")
@@ -125,7 +110,7 @@ def test_lab_toml_states_the_citation() -> None:
     assert parse_lab(found.to_toml(), "session.toml").citation == found.citation
     with pytest.raises(ConfigurationError, match=r"citation\.licence"):
         parse_lab(head + 'licence = "public domain"\n', "LAB.toml")
-    with pytest.raises(ConfigurationError, match="did you mean 'licence'"):
+    with pytest.raises(ConfigurationError):
         parse_lab(head + 'license = "MIT"\n', "LAB.toml")
 
 
@@ -155,11 +140,11 @@ def test_a_simulated_table_is_not_called_photographed() -> None:
 def test_a_table_without_an_origin_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write(tmp_path / "lut")
     assert "origin" not in json.loads((tmp_path / "lut" / "lut.json").read_text())
-    assert main(["--info", str(tmp_path / "lut")]) == 0
+    assert main(["info", str(tmp_path / "lut")]) == 0
     printed = dict(re.findall(r"^([^:\n]+): +(.*)$", capsys.readouterr().out, re.MULTILINE))
     for name, _ in origin_lines(None):
         assert printed[name] == NOT_RECORDED
-    assert main(["--cite", str(tmp_path / "lut")]) == 0
+    assert main(["info", str(tmp_path / "lut"), "--cite"]) == 0
     printed_entry = capsys.readouterr().out
     assert open_lut(tmp_path / "lut").sha256 in printed_entry
 

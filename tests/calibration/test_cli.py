@@ -7,15 +7,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
-from calibration.cli import main
+from calibration.cli import app, main
+from calibration.sampling import WINDOW
 from calibration.verdict import BuildResult
 from experiment.session.folder import Session
 from tests.calibration.lab import LIGHTS
+from tests.json_of import json_of
 
 pytestmark = pytest.mark.slow
 
-VERSION_1 = Path(__file__).parent / "table" / "table_v1"
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -37,7 +39,7 @@ def lut(built: BuildResult) -> Path:
 
 
 def test_info_tells_what_the_table_is(lut: Path, command: Command) -> None:
-    code, out, _ = command("--info", lut)
+    code, out, _ = command("info", lut)
     assert code == 0
     assert "Canon CroP Test" in out
     assert f"{len(LIGHTS)}: {len(LIGHTS) - 3} uniform, 3 black bodies 2500 to 6500 K" in out
@@ -45,16 +47,8 @@ def test_info_tells_what_the_table_is(lut: Path, command: Command) -> None:
     assert "black, half size, saturation, field, rounding" in out
 
 
-def test_info_tells_of_a_table_of_version_1(command: Command) -> None:
-    code, out, _ = command("--info", VERSION_1)
-    assert code == 0
-    assert "1 of 8, 1 covered" in out
-    assert "no hash recorded" in out
-    assert "not listed" in out
-
-
 def test_a_check_tells_nothing_that_one_frame_cannot(session: Session, command: Command) -> None:
-    code, out, _ = command("--check", session.folder)
+    code, out, _ = command("check", session.folder)
     assert code == 0
     assert "remark: Frames" not in out
     assert "Movement of the chart" not in out
@@ -63,8 +57,8 @@ def test_a_check_tells_nothing_that_one_frame_cannot(session: Session, command: 
 
 
 def test_verify_accepts_what_is_whole(lut: Path, session: Session, command: Command) -> None:
-    assert command("--verify", lut)[0] == 0
-    code, out, _ = command("--verify", lut, session.folder)
+    assert command("verify", lut)[0] == 0
+    code, out, _ = command("verify", lut, session.folder)
     assert code == 0
     assert "every byte is as it was built" in out
 
@@ -77,7 +71,7 @@ def test_verify_names_the_light_that_has_changed(lut: Path, session: Session, co
     data[128 + 4 * 512 * 25 * 6] ^= 1
     path.write_bytes(data)
     next((tmp_path / "session" / "frames").glob("*light_003*")).unlink()
-    code, out, err = command("--verify", tmp_path / "lut", tmp_path / "session")
+    code, out, err = command("verify", tmp_path / "lut", tmp_path / "session")
     assert code == 2
     assert f"the samples of 1 of {len(LIGHTS)} lights have changed: 4\n" in out
     assert "light_003.dng cannot be read" in out
@@ -85,7 +79,7 @@ def test_verify_names_the_light_that_has_changed(lut: Path, session: Session, co
 
 
 def test_match_compares_two_tables(lut: Path, command: Command) -> None:
-    code, out, _ = command("--match", lut, lut)
+    code, out, _ = command("match", lut, lut)
     assert code == 0
     assert "colours and lights correspond" in out
 
@@ -99,7 +93,7 @@ def test_append_says_how_far_the_table_is(session: Session, command: Command, tm
     code, out, _ = command("--append", tmp_path / "session", tmp_path / "lut")
     assert code == 0
     assert f"{len(LIGHTS) - 1} of {len(LIGHTS)} lights" in out
-    assert command("--info", tmp_path / "lut")[2].count("in the making") == 1
+    assert command("info", tmp_path / "lut")[2].count("in the making") == 1
 
 
 def _refuse(folder: Path, file: str) -> None:
@@ -112,23 +106,36 @@ def _refuse(folder: Path, file: str) -> None:
     (folder / "ledger.jsonl").unlink()
 
 
+def test_a_session_that_is_named_as_a_command_is_built(
+    session: Session, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(session.folder, "check")
+    assert command("--append", "./check", "lut")[0] == 0
+    assert Path("lut/lut.json").is_file()
+
+
+def test_the_default_window_is_the_paper_s() -> None:
+    (window,) = [option for option in get_command(app).params if "--window" in option.opts]
+    assert window.default == WINDOW
+
+
+def test_a_table_and_its_entry_are_one_object(lut: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = json_of(main, ["info", lut], capsys)
+    assert main(["info", str(lut), "--cite"]) == 0
+    assert found["bibtex"] == capsys.readouterr().out
+    assert found["sha256"] in found["bibtex"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--info", VERSION_1, "--check", "s"], "--check and --info"),
-        (["--compare", "a", "b", "--info", "a"], "are two commands"),
-        (["--info", VERSION_1, "session"], "--info does not expect session"),
-        (["--window", 3, "--info", VERSION_1], "--info reads one"),
+        (["--info", "lut"], "--info is a command, not an option: build-lut info"),
+        (["-v", "--check", "session"], "build-lut check"),
         (["--window", 4, "session", "lut"], "4 pixels"),
-        (["--verify", VERSION_1], "records no hashes"),
-        (["session", "--out", "x"], "--out goes with --compare"),
-        (["--compare", "a", "b", "--linearity", "x"], "leave it out of --compare"),
-        (["--check", "nowhere", "lut"], "--check writes nothing"),
-        (["nowhere"], "folder for the table"),
-        (["--append"], "a session is expected"),
         (["nowhere", "lut"], "nowhere is no session"),
-        (["--info", "nowhere"], "nowhere is no table"),
-        (["--compare", "a", "b"], "a is no table"),
+        (["info", "nowhere"], "nowhere is no table"),
+        (["compare", "a", "b"], "a is no table"),
     ],
 )
 def test_what_cannot_be_meant_is_said(
@@ -139,3 +146,8 @@ def test_what_cannot_be_meant_is_said(
     assert code == 2
     assert said in err
     assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", [["nowhere"], ["check", "nowhere", "lut"], ["lut", "--chart", "x"]])
+def test_what_is_missing_or_too_much_is_the_user_s_fault(arguments: list[str], command: Command) -> None:
+    assert command(*arguments)[0] == 2

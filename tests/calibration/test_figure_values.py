@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibration.causes.gathering import PrintPlace
 from calibration.figures import geometry, light, radiometry, truth
 from calibration.radiometry.superposition import NODES, Superposition
 from experiment.chart.layout import design_chart
@@ -330,31 +329,3 @@ def worst(figure: Any, made: Any) -> Any:
 
 def where(figure: Any, made: Any, accepted: float) -> Any:
     return figure.where(made, accepted)
-
-
-def test_a_figure_names_its_worst() -> None:
-    made = table(codes=codes(exchanges=pairs(6)))
-    assert worst(light.OFF_CODES_DEG, made).light == 2
-    assert worst(light.OFF_BRIGHTNESS, made).file == "3.dng"
-    assert worst(light.OFF_BRIGHTNESS, table(codes=codes(off_brightness=np.zeros(3)))) is None
-    assert worst(radiometry.FRAME_BLUR, made).file == "3.dng"
-    assert worst(radiometry.FRAME_SCATTER, made).file == "2.dng"
-    assert worst(radiometry.BLOCK_DEVIATION, made).place == PrintPlace("1.dng", 3.0, 4.0, 9.0)
-    assert worst(truth.REFERENCES_USED, made).file == "4.dng"
-    assert worst(truth.REFERENCE_SPREAD, made).file == "4.dng"
-    assert (
-        worst(truth.BRIGHTEST_SHARE, made).light,
-        worst(truth.DARKEST_COUNTS, made).light,
-    ) == (1, 2)
-    one = table(white=WHITE[:1])
-    assert worst(truth.BRIGHTEST_SHARE, one) is worst(truth.DARKEST_COUNTS, one) is None
-    x, y = CHART.centres_mm[CHART.cell_of_colour[511]].tolist()
-    assert worst(truth.NOISY_SHARE, made).place == PrintPlace("0.dng", x, y, 0.0)
-    # Four pairs are named of six, white frames after the lights.
-    said = where(light.EXCHANGED_LIGHTS, made, 0.0)
-    assert "light 2 and white frame 0" in said
-    assert said.endswith("(and 2 pairs more), 2.5° apart in the first pair")
-    assert "more" not in where(light.EXCHANGED_LIGHTS, table(codes=codes(exchanges=pairs(4))), 0.0)
-    assert where(light.OFF_BRIGHTNESS, made, 0.1) == "light 2 by -50 %, light 0 by +25 %"
-    assert where(light.REPEATED_FILES, table(frames=TWICE), 0.0) == "4.dng is 0.dng"
-    assert where(light.CROSS_CHECKED_SHARE, made, 0.0) == "2 of 3"

@@ -9,7 +9,6 @@ from typing import Any, get_args
 import numpy as np
 import numpy.typing as npt
 import pytest
-from matplotlib.figure import Figure
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -17,8 +16,6 @@ from calibration import kernels, sampling
 from calibration.causes.rules import RULES, Evidence, Subject, decide, evidence_names
 from calibration.checks import light_codes
 from calibration.checks.small_places import SmallPlaces, cells_without_hot
-from calibration.comparison.comparing import colour_groups, compare
-from calibration.comparison.report import cells_csv, comparison_json, draw_cells, draw_lights, lights_csv, lines
 from calibration.figures.all_figures import FIGURES
 from calibration.radiometry import drift, primaries, table_noise
 from calibration.radiometry.dark_frames import HotPixels, dark_summary
@@ -30,7 +27,7 @@ from experiment.chart.layout import paper_chart
 from tests.calibration.checks.test_frame_consistency import Sheet
 from tests.calibration.checks.test_light_codes import SESSIONS, agreement, random_session
 from tests.calibration.checks.test_stray_light import found as stray_found
-from tests.calibration.comparison.test_comparison import written
+from tests.calibration.comparison.test_comparing import written
 from tests.calibration.radiometry.test_superposition import LEVELS, compressed, proportional, seen, short_of_counts
 from tests.calibration.registration.test_matching import CHART, RASTER, compared
 from tests.calibration.registration.test_tiles import RASTER as TILED
@@ -38,7 +35,7 @@ from tests.calibration.registration.test_tiles import TILE, moved, texture, to_p
 from tests.calibration.spread.test_added_light import NOISE, PAGE_MM, levels, places
 from tests.calibration.spread.test_fitting import equations
 from tests.calibration.spread.test_predicting import ALL, printed
-from tests.calibration.whole import brief, of_fields, sketched, together
+from tests.calibration.whole import brief, of_fields
 from tests.pinned import Pinned
 
 _Array = npt.NDArray[np.float64]
@@ -369,34 +366,15 @@ def brighter(means: _Array) -> _Array:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["noise", "gain", "colour", "cells", "samples"])
-def test_two_tables(case: str, tmp_path: Path, pinned: Pinned) -> None:
+def test_noise_of_a_table(case: str, tmp_path: Path, pinned: Pinned) -> None:
     more: dict[str, Any] = {
         "noise": {},
         "gain": {"gain": np.array([1.01, 1.0, 0.98])},
         "colour": {"gain": np.linspace(0.97, 1.03, 300).reshape(100, 3)},
         "cells": {"cells": brighter},
-        "samples": {"samples": 9, "drift": np.linspace(1, 0.97, 39).reshape(13, 3), "errors": False},
+        "samples": {"samples": 9},
     }[case]
-    one, other = written(tmp_path / "one", 10), written(tmp_path / "other", 11, **more)
-    found = compare(one, other)
-    figures: list[Any] = []
-    pages: list[tuple[Any, Any]] = [(draw_lights, found.lights), (draw_cells, found.cells)]
-    for draw, of in pages:
-        figure = Figure()
-        draw(figure, of)
-        figures.append(sketched(figure))
-    document = comparison_json(found)
-    values = [",".join(text.splitlines()[1:]).split(",") for text in (lights_csv(found), cells_csv(found))]
-    lists = [np.array([float(value or "nan") for value in of if not value[:1].isalpha()]) for of in values]
-    told = {name: value for name, value in document.items() if name not in ("one", "other", "tables", "version")}
-    groups = together(colour_groups(found.cells, 3))
-    said = [line.replace(str(tmp_path), "") for line in lines(found)]
-    pinned(
-        f"two tables that differ in {case}",
-        [brief(found.lights), brief(of_fields(found.cells)), *map(brief, lists), brief(groups), said, figures,
-         [[each.name, each.same] for each in found.answers], sorted(told)],
-        **LOOSE,
-    )  # fmt: skip
+    other = written(tmp_path / "other", 11, **more)
     curve = table_noise.noise_curve(other)
     assert curve is not None
     pinned(f"noise of a table, {case}", brief(curve), **LOOSE)

@@ -22,7 +22,4 @@ def test_a_page_is_written_from_the_code(name: str, page: Callable[[], str]) -> 
 def test_they_explain_all_figures_and_all_evidence() -> None:
     page = figures_page()
     assert all(f"(`{figure.name}`" in page for figure in FIGURES)
-    former = [figure.former_name for figure in FIGURES if figure.former_name]
-    assert former
-    assert all(f"formerly `{name}`)" in page for name in former)
     assert all(f"| `{name}` | " in causes_page() for name in evidence_names())

@@ -179,7 +179,6 @@ def whole(result: BuildResult) -> dict[str, Any]:
         "greys": table.greys,
         "summary": [[row.name, masked(row.value), masked(row.note)] for row in summary(table)],
         "outcomes": {row.figure.name: masked(row.text()) for row in verdict.rows},
-        "in words": [masked(one.evidence.in_words()) for one in findings(verdict, table).values()],
         "registration": of_fields(table.registration, "framing"),
         "framing": of_fields(table.registration.framing, "plane"),
         "budget": [
@@ -244,15 +243,3 @@ def reported(result: BuildResult) -> dict[str, Any]:
                 return value
 
     return kept(json.loads(json.dumps(report_json(result))))
-
-
-def words_of(folder: Path) -> list[str]:
-    """Return what the page of a report says beside its figures: headings, captions, sentences."""
-    page = (folder / "report.html").read_text(encoding="utf-8")
-    page = page[page.index("<body") :]
-    page = re.sub(r"<table.*?</table>|src='[^']*'", "", page, flags=re.DOTALL)
-    return [
-        words
-        for line in re.split(r"</?(?:p|h2|div|figcaption|li|summary|ul)\b[^>]*>|\n", page)
-        if (words := line.strip())
-    ]

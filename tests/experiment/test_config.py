@@ -376,3 +376,13 @@ def test_what_holds_a_secret_is_not_shown_either(line: str) -> None:
         parse_lab(MINIMAL + line, "LAB.toml")
     assert "s3cret" not in str(caught.value)
     assert caught.value.__cause__ is None
+
+
+def test_settings_of_a_windows_editor_are_read(tmp_path: Path) -> None:
+    """Notepad begins a file with the byte order mark of UTF-8."""
+    text = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "lights.csv"\n[simulated]\nbody = "Test"\n'
+    read: list[LabSettings] = []
+    for mark in (b"", b"\xef\xbb\xbf"):
+        (tmp_path / "LAB.toml").write_bytes(mark + text.encode())
+        read.append(load_lab(tmp_path / "LAB.toml"))
+    assert read[0] == read[1]

@@ -8,6 +8,7 @@ import io
 import logging
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -18,16 +19,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from foundation import console, errors
 from foundation.console import (
     EXIT_CODES,
     Ending,
-    common_first,
-    is_common,
     loaded,
+    new_app,
     orderly_end,
     progress,
     run,
@@ -456,13 +454,22 @@ def test_the_flags_may_stand_behind_the_command(tmp_path: Path, capsys: pytest.C
     assert "no such option" not in capsys.readouterr().err.lower()
 
 
-@given(st.lists(st.sampled_from(["-v", "-q", "-vv", "run", "--out", "x", "--quiet", "a-v"])), st.booleans())
-def test_arguments_keep_their_order(words: list[str], ended: bool) -> None:
-    rest = ["--", "-v"] if ended else []
-    moved = common_first([*words, *rest])
-    assert [word for word in moved[: len(words)] if not is_common(word)] == [w for w in words if not is_common(w)]
-    assert sorted(moved) == sorted([*words, *rest])
-    assert moved[len(words) :] == rest
+def test_a_flag_before_and_behind_the_command_prints_a_record_once(capsys: pytest.CaptureFixture[str]) -> None:
+    app = new_app("A group.")
+
+    @app.command()
+    def work() -> None:
+        logging.getLogger("drivers").info("heard")
+
+    @app.command()
+    def rest() -> None:
+        pass
+
+    assert run(lambda: app(["-v", "work", "-v"], prog_name="it")) == 0
+    assert capsys.readouterr().err.count("heard") == 1
+    assert run(lambda: app(["work", "-q"], prog_name="it")) == 0
+    assert run(lambda: app(["rest", "--version"], prog_name="it")) == 0
+    assert capsys.readouterr().out.startswith("croplab ")
 
 
 def test_the_short_form_of_evaluate_takes_them_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -507,3 +514,14 @@ def test_a_job_is_done_though_the_reader_of_its_output_left(tmp_path: Path, unbu
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (0, b"")
     assert (tmp_path / "done").exists()
+
+
+@pytest.mark.slow
+def test_no_color_is_obeyed() -> None:
+    """https://no-color.org: any value that is not empty; colours there are without it."""
+    wish = [sys.executable, "-m", "acquisition.cli", "--help"]
+    for more, coloured in (({}, True), ({"NO_COLOR": "1"}, False)):
+        settings = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "TERM")}
+        settings |= {"FORCE_COLOR": "1", "TERM": "xterm-256color", **more}
+        shown = subprocess.run(wish, env=settings, capture_output=True, text=True, check=True).stdout
+        assert bool(re.search(r"\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|10[0-7])(?:;\d+)*m", shown)) == coloured

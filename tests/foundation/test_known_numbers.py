@@ -22,7 +22,7 @@ from foundation.colorimetry import (
     srgb_codes,
     xyz_of,
 )
-from foundation.console import JsonOutput, common_first, plain
+from foundation.console import JsonOutput, plain
 from foundation.local_server import is_loopback, qr_text, reachable_addresses
 from foundation.pages import figure, fold, note, paragraph, row, table, verdict
 from foundation.plots import draw_squares, legend_label, series_style, standalone
@@ -72,19 +72,12 @@ def test_texts_for_readers(pinned: Pinned) -> None:
     output.append("list", "é")
     output.add(other=np.float64("nan"), values=values)
     output.write(stream)
-    words: tuple[list[str], ...] = (
-        ["run", "-vv", "x", "-q"],
-        ["-v", "--", "-q"],
-        ["a", "--verbose", "-vq", "--quiet"],
-        [],
-    )
     names = ["one", "two", "three", "four"]
     hosts = ("localhost", "127.9.0.1", "::1", "0.0.0.0", "a.b", "LOCALHOST", "1.2.3.4")
     addresses = ("s3://key:secret@host/a?token=abc&x=1", "https://a.b/c?sig=1", "plain", "u:p@h")
     found: dict[str, Any] = {
         "plain": plain(values),
         "printed": stream.getvalue(),
-        "first": [common_first(list(given)) for given in words],
         "names": [errors.first_of(names, count) for count in (1, 3, 4, 9)] + [errors.first_of([])],
         "nearest": [errors.nearest_names(text, names) for text in ("tow", "ONE", "thre", "x", "fourth")],
         "kinds": [errors.kind_of(one) for one in (1, "a", None, [1], np.zeros((2, 3)), {1: 2}, Path("a"))],

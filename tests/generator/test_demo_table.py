@@ -74,7 +74,7 @@ def test_one_command_makes_images_of_a_picture(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_other_commands_take_it_too(capsys: pytest.CaptureFixture[str]) -> None:
-    assert build_lut(["--info", "demo:"]) == 0
+    assert build_lut(["info", "demo:"]) == 0
     assert "computed by sim table" in capsys.readouterr().out
-    assert build_lut(["--match", "demo:", "demo:"]) == 0
+    assert build_lut(["match", "demo:", "demo:"]) == 0
     assert evaluate(["paper", "chromaticities", "demo:"]) == 0

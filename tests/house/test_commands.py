@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import inspect
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from foundation.version import PACKAGES
 pytestmark = pytest.mark.slow
 
 HEAVY = (
-    *("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),
+    *("numpy", "numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),
     *("distributed", "pyarrow", "torch", "zarr"),
 )
 
@@ -71,7 +70,7 @@ def test_the_module_is_the_command_an_unknown_option_the_users_fault_and_nothing
 @pytest.mark.parametrize(
     ("module", "path"), [(module, path) for module in COMMANDS.values() for path in paths_of(module)], ids=str
 )
-def test_help_shows_all_that_is_written_and_what_is_read_and_how_it_ends(
+def test_help_shows_all_that_is_written(
     module: str, path: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     room = import_module(module)
@@ -82,10 +81,6 @@ def test_help_shows_all_that_is_written_and_what_is_read_and_how_it_ends(
         # Rich takes what stands in brackets for its own unless a backslash is before it.
         written = (getattr(option, "help", None) or "").replace("\\[", "[")
         assert " ".join(written.split()) in text, option.name
-    assert re.search(r"Exit codes?: |Exit code 2 when ", text)
-    if not hasattr(command, "commands"):
-        assert "Reads " in text
-        assert re.search(r"\bwrites ", text, re.IGNORECASE)
 
 
 def test_a_mistake_of_ours_shows_a_plain_traceback() -> None:

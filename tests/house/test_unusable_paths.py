@@ -20,7 +20,7 @@ COMMANDS = (
     ("acquisition.cli", "check", "{}"),
     ("acquisition.cli", "import", "frames.csv", "chart.json", "{}"),
     ("calibration.cli", "{}", "lut"),
-    ("calibration.cli", "--info", "{}"),
+    ("calibration.cli", "info", "{}"),
     ("generator.cli", "{}", "dataset", "--random-scenes", "1"),
     ("generator.cli", "--verify", "{}"),
     ("generator.cli", "--finish", "{}"),

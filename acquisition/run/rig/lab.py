@@ -197,15 +197,12 @@ class Attached:
     trouble: str = ""
 
 
-def attached_devices(search_s: float) -> Generator[Attached]:
+def attached_devices() -> Generator[Attached]:
     """Yield what is attached and reachable, kind by kind; a kind that cannot be asked says why."""
     yield _attached("cameras on USB", lambda: [str(device) for device in list_devices()])
     yield _attached("serial ports", list_serial_ports)
     yield _attached("displays", lambda: [str(display) for display in list_displays()])
-    if search_s > 0:
-        yield _attached(
-            "projectors by PJLink", lambda: [f"{found.host}, MAC {found.mac}" for found in search(search_s)]
-        )
+    yield _attached("projectors by PJLink", lambda: [f"{found.host}, MAC {found.mac}" for found in search()])
 
 
 def _attached(kind: str, ask: Callable[[], Iterable[str]]) -> Attached:

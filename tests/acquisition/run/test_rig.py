@@ -10,10 +10,12 @@ from unittest.mock import Mock
 import pytest
 
 from acquisition.run.plan import ask
+from acquisition.run.rig import lab as attached
 from acquisition.run.rig.lab import attached_devices
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.rig.simulated import simulated_body, simulated_frame_bytes, simulated_room
 from acquisition.run.run import run_session
+from drivers.pjlink import FoundProjector
 from drivers.presenter import WHITE
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
@@ -182,7 +184,9 @@ def test_an_unknown_language_is_named_with_the_known_ones() -> None:
 def test_what_cannot_be_asked_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    kinds = {attached.kind: attached for attached in attached_devices(search_s=0)}
-    assert list(kinds) == ["cameras on USB", "serial ports", "displays"]
+    monkeypatch.setattr(attached, "search", lambda: (FoundProjector("192.0.2.7", "00:00:5e:00:53:01"),))
+    kinds = {found.kind: found for found in attached_devices()}
+    assert list(kinds) == ["cameras on USB", "serial ports", "displays", "projectors by PJLink"]
+    assert kinds["projectors by PJLink"].found == ("192.0.2.7, MAC 00:00:5e:00:53:01",)
     assert kinds["displays"].found == ()
     assert kinds["displays"].trouble

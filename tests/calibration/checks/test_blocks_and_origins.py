@@ -2,32 +2,12 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
-from calibration.checks import frame_consistency
 from calibration.checks.frame_consistency import ForeignFrame, OriginFigures, origin_figures
 from drivers.raw.rawfile import FrameOrigin
-
-
-@pytest.mark.slow
-def test_light_of_blocks_is_a_line_through_the_cells_that_are_seen() -> None:
-    expected = np.linspace(100, 10_000, 200)
-    top = np.percentile(expected, 99)
-    seen = 0.7 * expected + 0.1 * top
-    seen[::9] = 9000
-    expected[5] = np.nan
-    channel: Any = SimpleNamespace(expected=expected, seen=seen)
-    dim: Any = SimpleNamespace(expected=np.full(200, np.nan), seen=seen)
-    members = np.arange(200).reshape(10, 20)
-    assert frame_consistency._light_of([channel, dim], members) == pytest.approx((0.1, 0.7), abs=2e-3)
-    # Fewer than twelve cells tell nothing.
-    few = np.array([[*range(6, 17), -1]])
-    assert frame_consistency._light_of([channel], few) == (0, 1)
-    assert frame_consistency._light_of([channel], np.append(few, [[17] + [-1] * 11], axis=0)) != (0, 1)
 
 
 def frames(*origins: FrameOrigin) -> list[tuple[Any, FrameOrigin]]:

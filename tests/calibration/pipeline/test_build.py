@@ -15,7 +15,7 @@ from calibration.citation import exposure_text
 from calibration.cli import main
 from calibration.figures.figure import QUESTIONS
 from calibration.pipeline.build import build, check
-from calibration.report.report import summary, worst_of_figures
+from calibration.report.report import summary
 from calibration.table.lut import Lut, open_lut
 from calibration.verdict import BuildResult
 from drivers.camera import ExposureSettings
@@ -27,7 +27,7 @@ from experiment.session.records import SessionStep, plan_steps
 from foundation.errors import FormatError, InputError, QualityError
 from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
-from tests.calibration.whole import LIMITS, reported, told, whole, words_of, written
+from tests.calibration.whole import LIMITS, reported, told, whole, written
 from tests.json_of import json_of
 from tests.pinned import Pinned
 
@@ -225,7 +225,7 @@ def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Pat
 def test_the_report_stands_alone(built: BuildResult) -> None:
     assert built.lut is not None
     page = (built.lut / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 12
+    assert page.count("data:image/png;base64,") == 8
     # Verdict, what to do, and the four pictures to look at first stand before everything that is folded.
     heads = re.findall(r"<h2>([^<]+)</h2>", page[: page.index("<details")])
     assert [head for head in heads if head not in ("Probable causes",) and not head.startswith("Where it is")] == [
@@ -275,8 +275,7 @@ def test_the_whole_table_is_what_it_was(built: BuildResult, session: Session, pi
     assert built.lut is not None
     pinned("table of 13 lights, measured", whole(built), **LIMITS)
     pinned("table of 13 lights, files", written(built.lut), **LIMITS)
-    worst = {name: [one.where, one.light] for name, one in worst_of_figures(built.figures, session.chart).items()}
-    pinned("table of 13 lights, report", [reported(built), worst, words_of(built.lut)], **LIMITS)
+    pinned("table of 13 lights, report", [reported(built)], **LIMITS)
 
 
 def test_a_check_measures_what_it_did_and_writes_nothing(session: Session, pinned: Pinned) -> None:
@@ -429,8 +428,8 @@ def test_the_command_builds_and_reports(session: Session, tmp_path: Path, capsys
 
 
 def test_the_command_checks(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--check", str(session.folder)]) == 0
+    assert main(["check", str(session.folder)]) == 0
     assert "the others take all frames" in capsys.readouterr().out
-    found = json_of(main, ["--check", session.folder], capsys)
-    assert (found["command"], found["format"]) == ("build-lut", "crop.report")
+    found = json_of(main, ["check", session.folder], capsys)
+    assert (found["command"], found["format"]) == ("build-lut check", "crop.report")
     assert found["figures"]

@@ -19,10 +19,10 @@ import pytest
 
 import calibration.pipeline.build as building
 from calibration.pipeline import checkpoint
-from calibration.pipeline.baseline import frame_faults
 from calibration.pipeline.build import TableProgress, append, build
 from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, unfinished_table
-from calibration.pipeline.frames import stored_names
+from calibration.pipeline.collecting import stored_names
+from calibration.pipeline.frames import frame_faults
 from calibration.table import writing
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults

@@ -1,8 +1,8 @@
-"""What the budget makes of a table's figures, and which frames are held against each other, in numbers worked out."""
+"""What frames leave behind when they are taken in, and the first cause for which a cell is unfit, at each limit."""
 
 from __future__ import annotations
 
-from datetime import UTC, datetime, timedelta
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,138 +10,149 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.pipeline import collecting
-from calibration.pipeline.collecting import budget_of
-from calibration.radiometry.superposition import Superposition
+from calibration.checks.frame_consistency import FrameConsistency
+from calibration.pipeline.collecting import Accumulator, disturbed_cells
+from calibration.pipeline.measuring import MeasuredFrame
+from calibration.radiometry.dark_frames import DarkFrameFigures, HotPixels
 from calibration.spread.added_light import AddedLight
+from drivers.raw.rawfile import CLIPPING_SHARE
+from experiment.measures.stains import Stains
 
-_Array = npt.NDArray[np.float64]
-
-WHITE = np.array([[1000.0, 2000, 500], [200, 100, 400]])
-BRIGHTEST = np.array([1000.0, 2000, 500])
-LEVELS = np.array([[0.9, 0.8, 0.5], [0.02, 0.05, 1e-5], [0.1, 0.3, 0.2], [1.2, 0.5, 0.4]])
-PLACES = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
-
-
-def table(**more: object) -> Any:
-    """Return the figures of a table that a budget is made of: two lights and four cells."""
-
-    def uncertainty_px(places: _Array) -> _Array:
-        return np.linspace(0.1, 0.4, len(places))
-
-    paper = SimpleNamespace(field=SimpleNamespace(coefficients=[[np.ones(4), np.ones(9)]]))
-    found: dict[str, Any] = {
-        "frames": tuple(SimpleNamespace(black=np.full((2, 2), level), paper=paper) for level in (100.0, 101.0, 99.0)),
-        "lights": SimpleNamespace(
-            white=WHITE, white_error=0.001 * WHITE * [[1, 2, 3]], brightest=BRIGHTEST, subtracted=None, additivity=None,
-            stray=None,
-        ),
-        "cells": SimpleNamespace(
-            levels=LEVELS, window=5, added=AddedLight(np.full((4, 3), 0.002), np.full((4, 3), 0.001)),
-            stains=SimpleNamespace(places_mm=PLACES),
-        ),
-        "lens": SimpleNamespace(
-            measured=True, why_not="", white_covariance=np.diag([1e-6, 2e-6, 3e-6]), cells_error=np.full((4, 3), 0.003)
-        ),
-        "dark_frames": SimpleNamespace(
-            lights=[], light=np.array([10.0, 20, -5]), error=np.array([0.1, 0.2, 0.3])
-        ),
-        "sensor": SimpleNamespace(
-            transfer=SimpleNamespace(response=np.array([0.004, 0.0, 0.001])), superposition=Superposition.usual(4000.0)
-        ),
-        "registration": SimpleNamespace(blur_px=0.7, cell_px=9.0, uncertainty_px=uncertainty_px),
-        "white_scatter": np.array([0.001, 0.002, 0.0]),
-    }  # fmt: skip
-    return SimpleNamespace(**found | more)
+CELLS = 64
+SATURATION = 10_000
+NO_LIGHT = np.zeros((CELLS, 3))
 
 
-def of(name: str, given: Any = None) -> Any:
-    (found,) = [one for one in budget_of(given or table()).components if one.name == name]
+def empty() -> Any:
+    """Return what was taken in of two even frames of 500 counts, with a noise of 20 counts in each."""
+    baseline = SimpleNamespace(
+        chart=SimpleNamespace(colour_count=CELLS), levels=np.full((CELLS, 3), 0.5), options=SimpleNamespace()
+    )
+    unknown: Any = None
+    return Accumulator(
+        session=unknown, selected=unknown, baseline=baseline, figures=(), saturation=SATURATION, registered=unknown,  # pyrefly: ignore[bad-argument-type]
+        dark=None, estimate=unknown, hot=HotPixels.none(CELLS, 25), highest=np.full(CELLS, 500, np.uint16),
+        highest_at=np.zeros(CELLS, np.int64), outside=np.zeros(CELLS, np.bool_), covered=np.zeros(CELLS, np.bool_),
+        place_error=np.zeros(CELLS), even_sum=np.full((CELLS, 25, 3), 1000, np.float32),
+        even_noise2=np.full((CELLS, 3), 800.0), even_frames=2,
+    )  # fmt: skip
+
+
+def clean() -> Stains:
+    return Stains(NO_LIGHT, NO_LIGHT, NO_LIGHT, np.zeros(CELLS, np.bool_), NO_LIGHT + 1, np.zeros((CELLS, 2)))
+
+
+def frame(light: int | None, disturbed: dict[int, float], alone: tuple[int, ...] = ()) -> Any:
+    consistency = FrameConsistency(disturbed=tuple(disturbed.items()), alone=alone)
+    return SimpleNamespace(record=SimpleNamespace(illumination=light), consistency=consistency)
+
+
+def at(cell: int, value: float, *others: int) -> npt.NDArray[np.float64]:
+    found = np.zeros(CELLS)
+    found[[cell, *others]] = value
     return found
 
 
-def in_channels(squares: npt.ArrayLike) -> _Array:
-    return np.array([np.diag(row) for row in np.asarray(squares, dtype=np.float64)])
+def causes(
+    done: Any, stains: Stains | None = None, frames: tuple[Any, ...] = (), added: AddedLight | None = None
+) -> Any:
+    found = done.unfit(stains or clean(), frames, added or AddedLight.none(CELLS))
+    return {one.colour: one.cause for one in found}
 
 
-CELLS = np.maximum(LEVELS, 1e-3)
+def test_each_cause_makes_a_cell_unfit_from_its_limit_on() -> None:
+    done, limit = empty(), round(CLIPPING_SHARE * SATURATION)
+    assert causes(done) == {}
+    highest = np.full(CELLS, 500, np.uint16)
+    highest[[3, 4, 5]] = limit, limit - 1, limit
+    clipped = causes(replace(done, highest=highest, highest_at=np.where(np.arange(CELLS) == 5, -1, 0)))
+    assert {colour: cause.split(",")[0] for colour, cause in clipped.items()} == {
+        3: f"clipped: {limit} counts under light 0", 5: f"clipped: {limit} counts under white",
+    }  # fmt: skip
+    assert list(causes(replace(done, outside=at(7, 1).astype(bool), covered=at(8, 1).astype(bool)))) == [7, 8]
+    assert list(causes(replace(done, place_error=at(9, 0.5) + at(10, 0.51)))) == [10]
+    # A twentieth of a cell's level of .5, beyond four standard errors.
+    lit = AddedLight(NO_LIGHT.copy(), np.full((CELLS, 3), 0.001))
+    lit.share[[11, 12], 1] = 0.0289, 0.0291
+    assert list(causes(done, added=lit)) == [12]
+    assert "5.0%" in causes(done, added=lit)[12]
 
 
-def test_noise_is_the_references_and_in_cells_the_field_s_terms_and_photosites() -> None:
-    found = of("noise")
-    squares = np.array([[1e-6, 4e-6, 9e-6]] * 2)
-    np.testing.assert_allclose(found.lights, in_channels(squares))
-    response = (np.array([0.004, 0, 0.001]) ** 2 + 0.003**2) / 25
-    np.testing.assert_allclose(found.cells, [9 * squares[0] + response] * 4)
-    assert not found.assumed
+def test_photosites_and_stains_make_a_cell_unfit() -> None:
+    done = empty()
+    stained = replace(clean(), stained=at(3, 1).astype(bool), deviation=np.stack([at(3, -0.04)] * 3, axis=1))
+    assert causes(done, stained) == {
+        3: "stained: it is, or its surroundings are, 4.0% darker than their codes elsewhere on the print"
+    }
+    hot = HotPixels.none(CELLS, 25)
+    hot.least[...] = 0
+    hot.least[5, 7, 1] = 900
+    noise = np.full(3, 5.0)
+    dark: Any = SimpleNamespace(file="dark")
+    figures = DarkFrameFigures(dark, np.zeros((2, 2)), np.zeros(3), np.zeros(3), noise)
+    assert causes(replace(done, figures=(figures,), hot=hot)) == {
+        5: "hot: a photosite stands out by 900 counts in every dark frame"
+    }
+    even = done.even_sum.copy()
+    even[6, 12, 0] = 499
+    # A rim that differs by 5 %: the noise of the mean of two frames is 14 counts, and that of the difference 6.
+    rim = np.ones((5, 5), np.bool_)
+    rim[1:4, 1:4] = False
+    even[7, rim.ravel(), 2] += 70
+    even[8, rim.ravel(), 2] += 50
+    found = causes(replace(done, even_sum=even))
+    assert [cause.split(":")[0] for cause in found.values()] == ["dead", "uneven"]
+    assert list(found) == [6, 7]
+    # Of cells of less than 300 counts, on the mean of the frames, none is told to be dead.
+    dim = np.where(even == 499, 240, 500).astype(np.float32)
+    assert causes(replace(done, even_sum=dim)) == {}
 
 
-def test_black_and_dark_light_count_over_white_and_over_each_cell() -> None:
-    black = 0.05**2 + (2 / 3) / 3
-    found = of("darkness")
-    np.testing.assert_allclose(found.lights, in_channels(black / WHITE**2))
-    np.testing.assert_allclose(found.cells, black / (BRIGHTEST * CELLS) ** 2)
-    assert not found.assumed
-    # One dark frame: a fifth of its light may change, and as much may not be there in the lights' frames.
-    given = table()
-    given.lights.subtracted, given.dark_frames.lights = np.ones((2, 3)), [np.array([10.0, 20, -5])]
-    light = np.array([10.0, 20, 0])
-    squares = black + np.array([0.1, 0.2, 0.3]) ** 2 + 2 * (0.2 * light) ** 2
-    found = of("darkness", given)
-    np.testing.assert_allclose(found.lights, in_channels(squares / WHITE**2))
-    # Of light that is subtracted from white, too, a cell as bright as paper lacks as much.
-    np.testing.assert_allclose(found.cells, squares / BRIGHTEST**2 / CELLS**2 * np.minimum(CELLS, 1) ** 2)
-    assert found.assumed
-    # Several, and white beside its primaries: half of what it has beyond them, and no more than was subtracted.
-    given.dark_frames.lights = [np.array([9.0, 20, 0]), np.array([11.0, 22, 0])]
-    off, error = np.array([0.003, 0.04, 0.0]), np.array([0.004, 0.0, 0.001])
-    given.lights.additivity = SimpleNamespace(off=off, error=error)
-    beyond = np.sqrt(off**2 + error**2 + given.white_scatter**2) * BRIGHTEST / 2
-    squares = black + np.array([0.1, 0.2, 0.3]) ** 2 + [2, 2, 0] + np.minimum(beyond, light) ** 2
-    found = of("darkness", given)
-    np.testing.assert_allclose(found.lights, in_channels(squares / WHITE**2))
-    assert not found.assumed
+def test_stains_are_looked_for_in_the_mean_of_even_frames_with_the_field_divided_out() -> None:
+    done = empty()
+    field = np.linspace(0.5, 1.5, CELLS)[:, None] * np.ones(3)
+    # Of eight colours nothing is known but what was judged.
+    done.baseline.chart.bits, done.baseline.points = 1, SimpleNamespace(cells_mm=np.zeros((CELLS, 2)))
+    found = done.stains(field)
+    assert not found.known
+    np.testing.assert_allclose(found.level, 500 / field)
 
 
-def frame(white: tuple[float, float, float] = (100.0, 200, 50), at_s: float = 0, exposure: float = 0.5) -> Any:
-    return SimpleNamespace(
-        paper=SimpleNamespace(white=np.array(white), error=np.ones(3)),
-        record=SimpleNamespace(taken_at=datetime(2024, 3, 1, tzinfo=UTC) + timedelta(seconds=at_s)),
-        origin=SimpleNamespace(exposure=exposure),
-    )
+def test_cells_that_something_covers_are_unfit_under_the_lights_of_their_frames() -> None:
+    frames = (
+        frame(2, {3: -0.1, 4: 0.0}), frame(5, {3: 0.3}), frame(None, {9: 0.5}, (10,)), frame(6, {}, (11,)),
+    )  # fmt: skip
+    assert disturbed_cells(frames) == {3: [(2, -0.1), (5, 0.3)], 4: [(2, 0.0)]}
+    found = causes(empty(), frames=frames)
+    assert found[3].startswith("disturbed: under light 5 and 1 more it is 30.0% brighter than its code gives")
+    assert found[4].startswith("disturbed: under light 2 it is too dark to be compared")
+    assert found[11].startswith("unlike: under light 6")
+    assert list(found) == [3, 4, 11]
 
 
-def test_frames_are_brought_to_the_usual_exposure_that_files_state() -> None:
-    def factors(*exposures: float) -> list[float]:
-        frames = [frame(exposure=one) for one in exposures]
-        return collecting._to_one_exposure(frames).ravel().tolist()
-
-    assert factors(0.5, 0.25, 1.0, 0.0) == [1, 2, 0.5, 1]
-    assert factors(0.0, 0.0) == [1, 1]
+def test_the_first_cause_counts() -> None:
+    done = replace(empty(), outside=at(3, 1).astype(bool), covered=at(3, 1, 4).astype(bool), place_error=at(3, 1, 4, 5))
+    assert [cause.split(":")[0] for cause in causes(done).values()] == ["outside", "covered", "misplaced"]
 
 
-@pytest.mark.parametrize(
-    ("white", "is_drift"),
-    [
-        ((100.0, 200, 50), True),
-        ((114.9, 229.8, 57.45), True),
-        ((115.1, 230.2, 57.55), False),
-        ((85.1, 170.2, 42.55), True),
-        ((84.9, 169.8, 42.45), False),
-        # Green 7 % less turns white by 1.8°, 8.5 % by 2.2°.
-        ((100.0, 186, 50), True),
-        ((100.0, 183, 50), False),
-    ],
-)
-def test_white_frames_drift_by_less_than_15_per_cent_and_two_degrees(
-    white: tuple[float, float, float], is_drift: bool
-) -> None:
-    # The median of three is what two of them have.
-    frames = [frame(), frame(white), frame()]
-    assert collecting._drift_is_one(frames) is is_drift
-    assert collecting._drift_is_one([frame(white)])
+def test_a_frame_adds_its_highest_counts_and_an_even_one_its_samples() -> None:
+    unknown: Any = None
 
+    def measured(light: int | None, saturation: int, samples: float | None) -> MeasuredFrame:
+        highest = np.full(CELLS, 500, np.uint16)
+        highest[[1, 2]] = 499, 600 + (light or 0)
+        figures: Any = SimpleNamespace(record=SimpleNamespace(illumination=light))
+        kept = None if samples is None else np.full((CELLS, 25, 3), samples, np.float32)
+        noise = None if samples is None else np.full((CELLS, 3), 30.0)
+        return MeasuredFrame(figures, unknown, saturation, unknown, highest, np.arange(CELLS) != 7, kept, noise)
 
-def test_times_are_since_the_first_white_frame() -> None:
-    at, white_at = collecting._times_s([frame(at_s=10), frame(at_s=60)], [frame(at_s=10), frame(at_s=110)])
-    assert (at.tolist(), white_at.tolist()) == ([0, 50], [0, 100])
+    done = empty().with_frame(measured(3, 9000, None)).with_frame(measured(None, 9500, 700.0))
+    assert (done.saturation, done.even_frames, len(done.figures)) == (9000, 3, 2)
+    assert (done.highest[[0, 1, 2]].tolist(), done.highest_at[[0, 1, 2]].tolist()) == ([500, 500, 603], [0, 0, 3])
+    assert np.flatnonzero(done.outside).tolist() == [7]
+    assert (done.even_sum == 1700).all()
+    assert (done.even_noise2 == 800 + 900).all()
+    # The noise of one sample over the brightest cells' level, both means of three frames.
+    assert done.noise() == pytest.approx(np.full(3, np.sqrt(1700 / 3) / (1700 / 3)))
+    brighter = empty().with_frame(measured(None, 9500, None))
+    assert brighter.highest_at[2] == -1

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.pipeline import frames as framing
-from calibration.pipeline.baseline import select_frames, stated_origin
-from calibration.pipeline.frames import beyond_print, usable_means
+from calibration.pipeline import measuring
+from calibration.pipeline.frames import select_frames, stated_origin
+from calibration.pipeline.measuring import beyond_print, usable_means
 from calibration.sampling import sites_at
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -116,7 +116,7 @@ def test_what_lies_behind_the_print_is_the_mean_of_places_beside_it(monkeypatch:
     def gathered(mosaic: object, black: object, sites: Any) -> npt.NDArray[np.float64]:
         return np.arange(3.0 * len(sites.rows)).reshape(-1, 3)
 
-    monkeypatch.setattr(framing, "gather_means", gathered)
+    monkeypatch.setattr(measuring, "gather_means", gathered)
     decoded: Any = SimpleNamespace(mosaic=None, black=None)
     places = np.array([[10.0, 10], [20, 20]])
     assert beyond_print(decoded, sites_at(places, (40, 40))).tolist() == [1.5, 2.5, 3.5]

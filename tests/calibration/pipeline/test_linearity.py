@@ -165,7 +165,7 @@ def test_what_is_no_series_is_refused(
     with pytest.raises(FormatError, match=r"3\.dng .*ISO 200"):
         check(session, linearity=one)
     (one / "0.dng").write_text("notes")
-    assert main(["--check", "--linearity", str(one), str(session.folder)]) == 2
+    assert main(["check", "--linearity", str(one), str(session.folder)]) == 2
     assert "0.dng cannot be read as a raw file" in capsys.readouterr().err
 
 

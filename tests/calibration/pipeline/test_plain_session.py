@@ -107,7 +107,7 @@ def test_corners_by_hand_stand_in_for_light_that_shows_nothing(
         plain, tmp_path / "session", lights, verdict=lambda step: "refused" if step.kind == "white" else ACCEPTED
     ):
         pass
-    code, said = command("--check", tmp_path / "session")
+    code, said = command("check", tmp_path / "session")
     assert code == 4
     assert "which way up it hangs" in said
     raw = 2 * plain.truth_px(field_mm(plain.chart), plain.mosaic(tmp_path)) + 0.5
@@ -121,11 +121,11 @@ def test_a_check_that_fails_shows_what_was_looked_for(plain: Lab, tmp_path: Path
     with take(plain, tmp_path / "session", renumbered(LIGHTS[4:6])):
         pass
     found = tmp_path / "found.png"
-    assert command("--check", tmp_path / "session", "--picture", found)[0] == 0
+    assert command("check", tmp_path / "session", "--picture", found)[0] == 0
     assert found.read_bytes().startswith(b"\x89PNG")
     design_chart(3, A_SERIES_MM["A5"]).save(tmp_path / "session" / "chart.json")
     missed = tmp_path / "missed.png"
-    code, said = command("--check", tmp_path / "session", "--picture", missed)
+    code, said = command("check", tmp_path / "session", "--picture", missed)
     assert code == 4
     assert f"see {missed}" in said
     assert missed.read_bytes().startswith(b"\x89PNG")

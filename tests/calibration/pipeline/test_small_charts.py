@@ -35,12 +35,10 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
     assert not result.verdict.refused
     assert not result.figures.cells.unfit
     assert judged_values(result.figures).keys().isdisjoint({"frame_scatter", "block_deviation", "doubtful_share"})
-    # What is not judged is not shown as clean.
     if bits == 1:
         report = (tmp_path / "report.html").read_text()
         assert "The course of the session" in report
         assert "The table can be used" in report
-        assert "<h2>The print</h2>" not in report
     table = open_lut(tmp_path / "lut")
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
     true = lab.world.reflected(codes, LIGHT[0].colour, SETTINGS) / lab.world.white(LIGHT[0].colour, SETTINGS)

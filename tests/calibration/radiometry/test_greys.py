@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibration.measurements import GreyMeasurements
-from calibration.pipeline.frames import GreyLevels
+from calibration.pipeline.measuring import GreyLevels
 from calibration.table.writing import references_csv
 from experiment.chart.model import Reference
 

@@ -11,7 +11,7 @@ import pytest
 from scipy import ndimage
 
 from calibration.kernels import PARTS
-from calibration.pipeline.frames import GreyLevels
+from calibration.pipeline.measuring import GreyLevels
 from calibration.registration.register import Registration
 from calibration.sampling import sites_at
 from calibration.spread.correction import (

@@ -214,18 +214,6 @@ def test_cells_shrink_to_whole_pixels_on_a_page_too_small(
     assert pixels == 125 or room[0] * room[1] < 8**bits * 41 / 40 + 16 * len(chart.tags)
 
 
-def test_the_cell_s_size_can_be_chosen() -> None:
-    assert design_chart(2, "A4", cell_mm=7.0).cell_mm[0] == pytest.approx(165 * PX_MM)
-    assert design_chart(2, cell_mm=2.54).page_mm == A_SERIES_MM["A8"]
-    with pytest.raises(InputError, match=r"5\.29 mm; 3\.60 mm"):
-        design_chart(5, "A1", cell_mm=5.3)
-    for wrong in (0.9, 0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match=r"1\.06 mm"):
-            design_chart(2, cell_mm=wrong)
-    with pytest.raises(InputError, match="no A page"):
-        design_chart(5, cell_mm=20.0)
-
-
 def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:
     chart = paper_chart()
     assert chart.page_mm == (1189, 841)
