@@ -54,6 +54,7 @@ from acquisition.run.devices import TRY_S, Devices, RetryPolicy, RunEnd, RunWatc
 from acquisition.run.pipeline import Job, Pipeline, StepQueue, Taken, link_runs, step_name, unclosed_kinds
 from acquisition.run.plan import nothing_to_retake, planned_steps, require_plan, require_same
 from acquisition.run.rig.opening import open_rig
+from calibration.figures.light import DARK_DRIFT, LEAK_SHARE, OFF_CODES_DEG, STRAY_SHARE, WHITE_DRIFT
 from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import load_chart
@@ -246,7 +247,10 @@ class PauseNotices:
             self._tell("resumed", sentence)
 
 
-SHOWN = ("light", "movement", "blur", "white drift", "dark", "ambient", "exposure")
+SHOWN = (
+    OFF_CODES_DEG.name, "movement", "blur", WHITE_DRIFT.name,
+    LEAK_SHARE.name, STRAY_SHARE.name, DARK_DRIFT.name, "exposure",
+)  # fmt: skip
 """Checks that the line about the last frame has, as far as they have a number."""
 
 

@@ -174,7 +174,7 @@ class Figure(Limit):
 
     _: KW_ONLY
     measure: Callable[[TableMeasurements], float | None]
-    before_session: bool = False
+    before_session: bool = True
     of_one_frame: Literal["known", "bounded", "unknown"] = "unknown"
     where: Callable[[TableMeasurements, float], str] | None = None
     retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None = None

@@ -44,8 +44,8 @@ NOISE_MISFIT = Figure(
     why="there is scatter that light and sensor do not explain: the camera smooths its raw files, or the light "
     "flickers",
     source="EMVA 1288 model; " + SIMULATED + ": 0.05 to 0.15", remedy="switch the camera's noise reduction off",
-    measure=lambda table: float(table.sensor.transfer.misfit.max()), before_session=True, of_one_frame="known",
-    drawing="noise", lines=(Line(170, _noise_row), Line(200, _at_zero_row)),
+    measure=lambda table: float(table.sensor.transfer.misfit.max()), of_one_frame="known", drawing="noise",
+    lines=(Line(170, _noise_row), Line(200, _at_zero_row)),
 )  # fmt: skip
 
 
@@ -61,7 +61,7 @@ NOISY_SHARE = Figure(
     "noisy_share", "Cells noisier than their level explains", "noise", "share", "at most", 0.002, 0.1,
     why="they are not of one colour: dirt, a fold, a neighbour's edge", source="a variance 3.5 times the model's",
     remedy="clean the print, focus, and hang it flatter",
-    measure=lambda table: float(table.sensor.transfer.noisy.mean()), before_session=True, of_one_frame="known",
+    measure=lambda table: float(table.sensor.transfer.noisy.mean()), of_one_frame="known",
     cause=Explanation("noisy cells", noisy_evidence), drawing="noise", lines=(Line(180, _transfer_row),),
 )  # fmt: skip
 
@@ -79,7 +79,8 @@ REFERENCES_USED = Figure(
     "references_used", "White references used, worst frame", "truth", "share", "at least", 0.9, 0.3,
     why="flat field and ground truth rest on few places", source=JUDGEMENT,
     remedy="uncover the print, bring all of it into the picture, expose so that bare paper stays below saturation",
-    measure=_references_used, before_session=True, of_one_frame="bounded", where=_fewest_references, drawing="course",
+    measure=_references_used, of_one_frame="bounded",
+    where=_fewest_references, drawing="course",
 )  # fmt: skip
 
 
@@ -97,7 +98,8 @@ REFERENCE_SPREAD = Figure(
     source=SIMULATED + ": 0.3 % of noise and photosites' response",
     remedy="clean or flatten the print, and look for shadows on it",
     measure=lambda table: max(map(_spread_of, table.white_frames), default=None),
-    before_session=True, of_one_frame="bounded", cause=Explanation("references", reference_evidence), drawing="field",
+    of_one_frame="bounded",
+    cause=Explanation("references", reference_evidence), drawing="field",
 )  # fmt: skip
 
 
@@ -117,7 +119,7 @@ TRUTH_MEDIAN_DEG = Figure(
     "truth_median_deg", "Expanded uncertainty of the ground truth, median light", "truth", "°", "at most", 0.4, 1.0,
     why="a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + ": a quarter of a good method's error; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=lambda table: float(np.median(table.budget.expanded_deg)), drawing="budget",
+    before_session=False, measure=lambda table: float(np.median(table.budget.expanded_deg)), drawing="budget",
     lines=(Line(190, _error_row),),
 )  # fmt: skip
 
@@ -126,7 +128,7 @@ TRUTH_WORST_DEG = Figure(
     "truth_worst_deg", "Expanded uncertainty of the ground truth, worst light", "truth", "°", "at most", 0.5, 3.0,
     why="under that light a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=lambda table: float(table.budget.expanded_deg.max()), drawing="budget",
+    before_session=False, measure=lambda table: float(table.budget.expanded_deg.max()), drawing="budget",
 )  # fmt: skip
 
 
@@ -151,7 +153,7 @@ BRIGHTEST_SHARE = Figure(
     why="the unevenness of the light carries cells into saturation",
     source=JUDGEMENT + ": 0.8 leaves room for 20 % unevenness", remedy="expose less",
     measure=lambda table: float(table.lights.white.max()) / table.sensor.white_level,
-    before_session=True, of_one_frame="bounded", where=_brightest, drawing="lights",
+    of_one_frame="bounded", where=_brightest, drawing="lights",
     lines=(Line(150, _saturation_row),),
 )  # fmt: skip
 
@@ -169,6 +171,6 @@ DARKEST_COUNTS = Figure(
     "darkest_counts", "Bare paper under the darkest light", "radiometry", "counts", "at least", 300.0, MIN_SIGNAL,
     why="25 samples of 300 counts have a mean good to 1 %, a print's dark colours a thirtieth of that",
     source="photon noise at 1.8 electrons a count, 6 counts of read noise", remedy="expose longer",
-    measure=lambda table: float(table.lights.white.max(axis=1).min()), before_session=True, of_one_frame="bounded",
-    where=_darkest, drawing="lights", lines=(Line(160, _darkest_row),),
+    measure=lambda table: float(table.lights.white.max(axis=1).min()),
+    of_one_frame="bounded", where=_darkest, drawing="lights", lines=(Line(160, _darkest_row),),
 )  # fmt: skip

@@ -14,6 +14,7 @@ import pytest
 from calibration.figures import all_figures, geometry, light, radiometry, truth
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import QUESTIONS
+from calibration.figures.single_frames import FRAME_LIMITS, RIG_LIMITS
 from calibration.figures.truth import DARKEST_COUNTS
 
 ROOT = Path(__file__).parents[2]
@@ -40,6 +41,16 @@ def test_figures_that_contradict_themselves_do_not_import(
         all_figures.collected()
 
 
+def test_a_limit_of_single_frames_has_a_name_of_its_own_and_a_reason() -> None:
+    limits = (*RIG_LIMITS, *FRAME_LIMITS)
+    names = [one.name for one in (*FIGURES, *limits)]
+    assert len(set(names)) == len(names)
+    for one in limits:
+        assert all((one.title, one.why, one.source, one.remedy))
+        assert one.outcome(one.accept) == "accept"
+        assert one.refuse is None or one.outcome(one.refuse) != "refuse"
+
+
 def test_figures_are_listed_in_the_order_of_their_definitions() -> None:
     assert all_figures.collected() == FIGURES
     texts = [Path(module.__file__ or "").read_text() for module in (geometry, radiometry, light, truth)]
@@ -49,8 +60,11 @@ def test_figures_are_listed_in_the_order_of_their_definitions() -> None:
 
 @pytest.mark.slow
 def test_a_name_stands_in_its_figure() -> None:
-    """A figure has one home: at most two other files hold its name, as a key or a word of their own."""
-    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    """A figure has one home: at most two other files hold its name, as a key or a word of their own.
+
+    Besides these `acquire status` has few words on each number of the live judge.
+    """
+    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py") if path.name != "status.py"]
     words = {path: set(re.findall(r"(?<=[\"'])\w+(?=[\"'])", path.read_text())) for path in files}
     for figure in FIGURES:
         found = [path for path in files if figure.name in words[path]]

@@ -47,24 +47,26 @@ def of_dark(state: JudgeState, frame: Measured) -> dict[str, Check]:
 
 
 def test_a_dark_frame_before_any_white_one_is_not_measured() -> None:
-    assert judge_dark(JudgeState(), measured(WHITE), JUDGE.dark_percent, JUDGE.ambient_percent) == (Check("dark"),)
+    assert judge_dark(JudgeState(), measured(WHITE), JUDGE.dark_percent, JUDGE.ambient_percent) == (
+        Check("leak_share"),
+    )
 
 
 @pytest.mark.parametrize(("percent", "passes"), [(4.9, True), (5.1, False)])
 def test_a_dark_frame_is_held_against_white_in_its_worst_channel(percent: float, passes: bool) -> None:
     # Of what white adds to green; the others stay at 0.
     found = of_dark(known(first_dark=None), measured((0.0, 40.0 * percent, 0.0)))
-    assert found["dark"].passed is passes
-    assert found["dark"].value == pytest.approx(percent, abs=0.001)
-    assert (found["dark"].high, found["dark"].unit) == (5.0, "%")
-    assert "ambient" not in found, "there is no first dark frame that it could have changed from"
+    assert found["leak_share"].passed is passes
+    assert found["leak_share"].value == pytest.approx(percent, abs=0.001)
+    assert (found["leak_share"].high, found["leak_share"].unit) == (5.0, "%")
+    assert "dark_drift" not in found, "there is no first dark frame that it could have changed from"
 
 
 @pytest.mark.parametrize(("lit", "passes"), [(TILES // 20, True), (TILES // 10, False)])
 def test_light_in_a_part_of_a_dark_frame_counts_from_six_of_a_hundred_tiles(lit: int, passes: bool) -> None:
     tiles = np.zeros((TILES, 3))
     tiles[:lit] = 0.06 * (np.array(WHITE) - DARK)
-    assert of_dark(known(first_dark=None), measured(tiles))["dark"].passed is passes
+    assert of_dark(known(first_dark=None), measured(tiles))["leak_share"].passed is passes
 
 
 def test_where_white_hardly_lights_a_third_of_its_mean_stands_for_it() -> None:
@@ -74,7 +76,7 @@ def test_where_white_hardly_lights_a_third_of_its_mean_stands_for_it() -> None:
     # 60 counts of green are 1.5 % of white where it lights, and 5.6 % of a third of its mean.
     unlit = np.zeros((TILES, 3))
     unlit[: TILES // 5, 1] = 60.0
-    assert of_dark(state, measured(unlit))["dark"].value == pytest.approx(
+    assert of_dark(state, measured(unlit))["leak_share"].value == pytest.approx(
         100 * 60 / (4000 * (1 - TILES // 5 / TILES) / 3), abs=1e-3
     )
 
@@ -85,17 +87,17 @@ def test_a_lamp_in_a_corner_is_told_by_its_region(more: bool) -> None:
     grid = np.tile(np.array(DARK), (TILE_ROWS, TILE_COLUMNS, 1))
     grid[-4:, -4:] += (0.01 if more else -0.01) * (np.array(WHITE) - DARK)
     found = of_dark(known(), measured(grid.reshape(TILES, 3)))
-    assert found["dark"].passed
-    assert not found["ambient"].passed
-    assert found["ambient"].value == pytest.approx(1.0, abs=0.001)
-    assert ("of white more" in found["ambient"].reason) is more
-    assert ("of white less" in found["ambient"].reason) is not more
-    assert of_dark(known(), measured(DARK))["ambient"] == Check("ambient", 0.0, None, 0.2, "%")
+    assert found["leak_share"].passed
+    assert not found["dark_drift"].passed
+    assert found["dark_drift"].value == pytest.approx(1.0, abs=0.001)
+    assert ("of white more" in found["dark_drift"].reason) is more
+    assert ("of white less" in found["dark_drift"].reason) is not more
+    assert of_dark(known(), measured(DARK))["dark_drift"] == Check("dark_drift", 0.0, None, 0.2, "%")
 
 
 def test_the_change_that_is_allowed_in_the_dark_is_wider_where_noise_or_the_black_level_makes_one() -> None:
     def allowed(frame: Measured, white: npt.ArrayLike = WHITE) -> float:
-        return of_dark(replace(known(), white=measured(white)), frame)["ambient"].high or 0.0
+        return of_dark(replace(known(), white=measured(white)), frame)["dark_drift"].high or 0.0
 
     assert allowed(measured(DARK)) == JUDGE.ambient_percent
     # The black level's drift is .3 counts; σ is 40 counts, in 100 blocks of each of 16 tiles 1 count; white is 2000.
@@ -121,7 +123,7 @@ def test_a_dark_frame_with_the_light_of_the_frame_before_is_named_a_screen_that_
         return found
 
     same, other, unknown = seen(basis.light(lit).amounts), seen(orange), seen(None)
-    assert [found.name for found in (same, other, unknown)] == ["light", "dark", "dark"]
+    assert [found.name for found in (same, other, unknown)] == ["off_codes_deg", "leak_share", "leak_share"]
     assert not any(found.passed for found in (same, other, unknown))
     assert "stand still" in same.reason
 
@@ -147,7 +149,7 @@ def test_white_without_paper_or_a_first_frame_is_not_measured() -> None:
     paper = Frame(measured(WHITE), np.full(3, 500.0), np.zeros(2))
     unknown = replace(paper, paper=np.array([500.0, np.nan, 500.0]))
     for first, now in ((None, paper), (unknown, paper), (paper, unknown)):
-        assert judge_white(first, now) == Check("white drift")
+        assert judge_white(first, now) == Check("white_drift")
 
 
 @pytest.mark.parametrize("primary", [0, 1, 2])
@@ -186,7 +188,7 @@ def test_a_primary_below_a_tenth_of_white_is_nearly_black(own: float, other: flo
 
 
 def test_a_primary_before_any_white_frame_is_not_measured() -> None:
-    assert judge_first_primary(JudgeState(), measured(DARK), 0) == Check("light")
+    assert judge_first_primary(JudgeState(), measured(DARK), 0) == Check("off_codes_deg")
 
 
 def picture(codes: Codes, gain: npt.ArrayLike = 1.0) -> Measured:
@@ -211,14 +213,20 @@ LIGHT = SessionStep(20, "light", 0, Colour(255, 197, 126))
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("gain", "name"),
-    [((1, 1, 1), None), ((1.2, 1, 1), "light"), ((1, 1, 0.8), "light"), (1.3, "lamp"), (0.7, "lamp")],
+    [
+        ((1, 1, 1), None),
+        ((1.2, 1, 1), "off_codes_deg"),
+        ((1, 1, 0.8), "off_codes_deg"),
+        (1.3, "off_brightness"),
+        (0.7, "off_brightness"),
+    ],
 )
 def test_the_first_white_frame_is_held_against_what_the_others_say_before_the_first_light(
     gain: npt.ArrayLike, name: str | None
 ) -> None:
     found = judge_first_frames(begun(gain), LIGHT, None, JUDGE)
     assert (None if found is None else found.name) == name
-    if name == "lamp" and found is not None:
+    if name == "off_brightness" and found is not None:
         assert found.value == pytest.approx(100 * (float(np.max(gain)) - 1), abs=2)
         assert found.low is not None
         assert found.low == -(found.high or 0) < -JUDGE.drift_percent
@@ -246,9 +254,9 @@ def test_first_frames_are_doubted_where_a_step_contradicts_them_twice() -> None:
     assert judge_first_frames(doubted, LIGHT, replace(uneven, name="file"), JUDGE) is None, "contradicts no frame"
     # A frame refused for want of the primaries has nothing that it could contradict.
     awaiting = replace(doubted, basis=None, asked=True)
-    assert judge_first_frames(awaiting, LIGHT, Check("light", reason="is accepted"), JUDGE) is None
+    assert judge_first_frames(awaiting, LIGHT, Check("off_codes_deg", reason="is accepted"), JUDGE) is None
     assert judge_first_frames(awaiting, LIGHT, uneven, JUDGE) is not None
-    assert judge_first_frames(doubted, LIGHT, Check("light", reason="is another"), JUDGE) is not None
+    assert judge_first_frames(doubted, LIGHT, Check("off_codes_deg", reason="is another"), JUDGE) is not None
     only_dark = replace(doubted, first_frames=(Seen((0, 0, 0), measured(DARK), None),))
     assert judge_first_frames(only_dark, LIGHT, uneven, JUDGE) is None, "of a dark frame nothing is learnt"
 

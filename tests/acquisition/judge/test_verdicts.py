@@ -186,7 +186,7 @@ def test_brighter_light_of_one_colour_is_the_rooms_where_that_fits_better() -> N
 @pytest.mark.parametrize(("room", "allowed"), [(0.03, 3.0), (0.149, 14.9), (0.15, None)])
 def test_the_lamp_s_limits_are_stated_below_what_no_session_may_have(room: float, allowed: float | None) -> None:
     low = None if allowed is None else -allowed
-    assert lamp_check(np.log(0.98), room, "") == Check("lamp", -2.0, low, allowed, "%")
+    assert lamp_check(np.log(0.98), room, "") == Check("off_brightness", -2.0, low, allowed, "%")
 
 
 def test_the_lamp_is_followed_where_it_is_shown_twice_alike_and_by_five_per_cent_at_most() -> None:
@@ -198,7 +198,7 @@ def test_the_lamp_is_followed_where_it_is_shown_twice_alike_and_by_five_per_cent
         light = seen_light((level, level, level)).light
         state = replace(known(basis=basis, model=MODEL), candidate=(float(np.log(before)), np.nan, np.nan))
         checks, seen = judge._judge_light(state, step, light, (), 0.5, 1.0)
-        assert [check.name for check in checks] == ["light", "lamp"]
+        assert [check.name for check in checks] == ["off_codes_deg", "off_brightness"]
         assert isinstance(seen, LampSeen)
         return not checks[1].reason, seen.stepped
 
@@ -376,7 +376,7 @@ def test_the_noise_of_two_frames_is_as_independent_as_it_is_not_correlated() -> 
 @pytest.mark.parametrize(
     ("checks", "named"),
     [
-        ({"movement": 0.5, "light": 3.0, "rows": 9.0}, ["movement"]),
+        ({"movement": 0.5, "off_codes_deg": 3.0, "rows": 9.0}, ["movement"]),
         ({"movement": None, "rows": 9.0}, ["rows"]),
         ({"blur": 0.69, "rows": 9.0}, ["rows"]),
         ({"blur": 0.71, "rows": 9.0}, ["blur"]),
@@ -385,9 +385,9 @@ def test_the_noise_of_two_frames_is_as_independent_as_it_is_not_correlated() -> 
         ({"movement": 1.01, "uniformity": 4.1}, ["movement"]),
         ({"blur": -0.69, "uniformity": 4.1}, ["uniformity"]),
         ({"blur": 0.71, "uniformity": 4.1}, ["blur"]),
-        ({"light": 3.0, "lamp": 4.0, "ambient": 1.0}, ["light"]),
-        ({"ambient": 1.0, "uniformity": 2.5}, ["uniformity"]),
-        ({"dark": 6.0, "white drift": 20.0}, ["dark", "white drift"]),
+        ({"off_codes_deg": 3.0, "off_brightness": 4.0, "stray_share": 1.0}, ["off_codes_deg"]),
+        ({"stray_share": 1.0, "uniformity": 2.5}, ["uniformity"]),
+        ({"leak_share": 6.0, "white_drift": 20.0}, ["leak_share", "white_drift"]),
         ({}, []),
     ],
 )
@@ -395,7 +395,7 @@ def test_a_cause_is_named_once(checks: dict[str, float | None], named: list[str]
     """Uniformity has a limit of 2 here, of which twice as much is plainly uneven."""
     found = [Check(name, value, None, 2.0, "", "is off") for name, value in checks.items()]
     # What passed does not matter, nor does a check that one of two measurements passed.
-    found += [Check("camera"), *(Check(name) for name in checks)]
+    found += [Check("other_camera"), *(Check(name) for name in checks)]
     assert [check.name for check in judge._named_once(found) if check.reason] == named
 
 
@@ -403,16 +403,17 @@ def test_causes_last_or_put_others_in_doubt() -> None:
     light, grey = SessionStep(20, "light", 0, Colour(9, 9, 9)), SessionStep(3, "response", None, Colour(*FULL))
     white = known()
     lasting = judge._is_lasting
-    assert {name for name in CAUSES if lasting(white, light, name)} == {"camera", "chart"}
-    assert {name for name in CAUSES if lasting(JudgeState(), light, name)} == {"camera", "chart", "clipping"}
-    assert {name for name in CAUSES if lasting(white, grey, name)} == {"camera", "chart", "white drift"}
-    assert lasting(replace(white, refused=("light", 3)), light, "light")
-    assert not lasting(replace(white, refused=("light", 2)), light, "light")
+    assert {name for name in CAUSES if lasting(white, light, name)} == {"other_camera", "chart"}
+    assert {name for name in CAUSES if lasting(JudgeState(), light, name)} == {"other_camera", "chart", "clipping"}
+    assert {name for name in CAUSES if lasting(white, grey, name)} == {"other_camera", "chart", "white_drift"}
+    assert lasting(replace(white, refused=("off_codes_deg", 3)), light, "off_codes_deg")
+    assert not lasting(replace(white, refused=("off_codes_deg", 2)), light, "off_codes_deg")
     voids = judge._voids_others
-    unmodelled = {"rows", "uniformity", "light", "ambient", "lamp", "dark", "white drift"}
+    hidden = {"stray_share", "dark_drift", "leak_share"}
+    unmodelled = hidden | {"rows", "uniformity", "off_codes_deg", "off_brightness", "white_drift"}
     assert {name for name in CAUSES if voids(white, name)} == unmodelled
     modelled = replace(white, basis=begun().basis, untold=frozenset({"blur"}))
-    assert {name for name in CAUSES if voids(modelled, name)} == {"ambient", "dark", "blur"}
+    assert {name for name in CAUSES if voids(modelled, name)} == hidden | {"blur"}
 
 
 def flat() -> Basis:

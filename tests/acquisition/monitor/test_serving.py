@@ -105,7 +105,7 @@ def test_the_state_has_what_the_page_draws(opened: MonitorServer, run: MadeUpRun
     refused = state["frames"][2]
     assert refused["verdict"] == "refused"
     assert refused["reason"] == f"{SCRIPT} in the light"
-    assert ["light", "°", 8.0, None, 1.0, f"{SCRIPT} in the light"] in refused["checks"]
+    assert ["off_codes_deg", "°", 8.0, None, 1.0, f"{SCRIPT} in the light"] in refused["checks"]
     # Red at full, green by its crosstalk: the camera sees the red light less red than its codes.
     assert refused["seen_at"][0] < 1
     assert b"<script" not in ask(opened, "/state.json")[2]

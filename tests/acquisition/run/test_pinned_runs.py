@@ -153,7 +153,7 @@ def test_changes_that_a_run_follows_are_told_as_they_were(pinned: Pinned) -> Non
     dark = SessionStep(1, "dark", None, BLACK)
     steps = (first, light, dark, replace(first, number=9))
     for step, value in product(steps, (-2.0, -1.0, -0.2, 0.0, 0.2, 0.5, 0.51, 1.0, 1.01)):
-        for name in ("movement", "lamp", "dark"):
+        for name in ("movement", "off_brightness", "leak_share"):
             judged = Judgement((Check(name, value, -1.5, 1.5),))
             found.append(len(list(pipeline._followed_changes(step, judged, steps, JudgeSettings()))))
     pinned("changes that a run follows", found)

@@ -61,7 +61,7 @@ def test_light_in_the_room_is_doubted_once_and_lastingly(folder: Path, percent: 
     class Lit(ScriptedJudge):
         def judge(self, file: Path, step: SessionStep) -> Judgement:
             known = super().judge(file, step)
-            return Judgement((Check("dark", percent, None, 2.5, "%"),)) if step.kind == "dark" else known
+            return Judgement((Check("leak_share", percent, None, 2.5, "%"),)) if step.kind == "dark" else known
 
     lab = Lab(folder, lights=FOUR, reference_every=2)
     judge = Lit()
