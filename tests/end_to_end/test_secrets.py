@@ -11,11 +11,7 @@ import pytest
 
 from acquisition.monitor.serving import open_monitor
 from acquisition.run.run import run_session
-from experiment.chart.model import Chart, load_chart
 from experiment.config import load_lab
-from experiment.lights import Illumination, load_illuminations
-from experiment.session.folder import Session
-from experiment.session.repair import held_secrets
 from tests.end_to_end.conftest import make_lab
 from tests.found_texts import files_with
 
@@ -88,34 +84,3 @@ def test_no_file_of_a_session_and_its_table_holds_a_secret(
     told = "".join(capsys.readouterr()) + "".join(said) + shown
     assert PASSWORD not in told
     assert TOKEN not in told
-
-
-def test_the_secrets_of_an_older_session_are_told_and_taken_out(
-    lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    session = tmp_path / "session"
-    with Session.create(session, LAB.format(notify=f"curl -H {TOKEN}", password=PASSWORD), *_designed(lab)):
-        pass
-    assert held_secrets(session) == ("lab.projector.password", "sequence.notify")
-    assert command("acquisition.cli", "status", session) == 0
-    told = capsys.readouterr().err
-    assert "holds a secret in clear text (lab.projector.password, sequence.notify)" in told
-    assert f"acquire redact {session}" in told
-    said: list[str] = []
-    run_session(load_lab(lab), session, lambda done, total: None, said.append)
-    assert any("acquire redact" in sentence for sentence in said)
-    assert files_with(session, PASSWORD)
-    assert files_with(session, TOKEN)
-    assert command("acquisition.cli", "redact", session) == 0
-    assert "lab.projector.password and sequence.notify taken out" in capsys.readouterr().out
-    assert files_with(session, PASSWORD, TOKEN) == []
-    assert command("acquisition.cli", "redact", session) == 0
-    assert "holds no secret" in capsys.readouterr().out
-    assert command("acquisition.cli", "status", session) == 4, "a plan without frames is never complete"
-    assert "redact" not in capsys.readouterr().err
-    # It is still the session of these settings.
-    run_session(load_lab(lab), session, lambda done, total: None, said.append)
-
-
-def _designed(lab: Path) -> tuple[Chart, tuple[Illumination, ...]]:
-    return load_chart(lab.parent / "chart.json"), load_illuminations(lab.parent / "illuminations.csv")

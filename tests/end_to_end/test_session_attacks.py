@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import errno
 import shutil
-import sqlite3
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -42,14 +40,6 @@ def interrupted(lab: Path, frames: int) -> Path:
     with pytest.raises(KeyboardInterrupt):
         run_session(load_lab(lab), folder, interrupt)
     return folder
-
-
-def make_old(folder: Path) -> None:
-    """Bring a session's journal back to version 1."""
-    with closing(sqlite3.connect(folder / "journal.sqlite")) as journal, journal:
-        for table in ("checks", "measurements", "timings", "heartbeat", "records"):
-            journal.execute(f"DROP TABLE {table}")
-        journal.execute("PRAGMA user_version = 1")
 
 
 def counted_once(folder: Path) -> bool:
@@ -90,26 +80,6 @@ def test_a_copy_of_a_session_that_is_being_taken_goes_on_by_itself(lab: Path, fr
     assert frame_hashes(folder) == before
 
 
-def test_lights_of_an_old_journal_are_held_against_a_new_white_frame(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = interrupted(lab, 6)
-    make_old(folder)
-    with Session.open(folder) as session:
-        taken = len(session.journal.attempts())
-    person = f'{{ what = "person", from_frame = {taken + 2}, to_frame = {taken + 2} }}'
-    lab.write_text(lab.read_text().replace("seed = 7\n", f"seed = 7\nevents = [{person}]\n"))
-    assert run("run", lab, folder) == 0
-    assert "does somebody or something stand before the chart" in capsys.readouterr().err
-    with Session.open(folder) as session:
-        newer = [attempt for attempt in session.journal.attempts() if attempt.id > taken]
-        assert [attempt.kind for attempt in newer[:3]] == ["white", "dark", "light"]
-        assert [
-            check.name for check in session.journal.details([newer[2].id])[newer[2].id].checks if not check.passed
-        ] == ["uniformity"]
-    assert counted_once(folder)
-
-
 def test_a_session_that_another_run_makes_meanwhile_is_not_to_be_removed(
     lab: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,7 +92,7 @@ def test_a_session_that_another_run_makes_meanwhile_is_not_to_be_removed(
         return real(*given)
 
     monkeypatch.setattr(runs, "require_plan", meanwhile)
-    with pytest.raises(InputError, match="another program"):
+    with pytest.raises(InputError):
         run_session(load_lab(lab), folder, lambda done, total: None)
     assert counted_once(folder)
 

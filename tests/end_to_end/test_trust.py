@@ -155,7 +155,7 @@ def test_a_random_room_is_refused_or_right(tmp_path: Path) -> None:
 def test_another_poster_that_is_hung_up_midway_is_refused(lab: Lab, tmp_path: Path) -> None:
     """Its tags lie where those of the first lay, so that nothing seems to have moved."""
     frame = swapped(lab, hang(seed=7))
-    with session_of(lab, tmp_path, frame) as session, pytest.raises(QualityError, match="no table is made") as refused:
+    with session_of(lab, tmp_path, frame) as session, pytest.raises(QualityError) as refused:
         build(session, tmp_path / "lut")
     assert not (tmp_path / "lut").exists()
     assert re.search("print|poster|chart", str(refused.value))

@@ -83,6 +83,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(ROOT / name, folder / name)
     for example in EXAMPLES:
         for path, text in example.files().items():
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_text(text, encoding="utf-8")
         for path, before, after in example.changes():
             text = (folder / path).read_text(encoding="utf-8")
