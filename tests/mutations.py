@@ -233,11 +233,14 @@ def noticed_by(mutation: Mutation, covered: Covered, folder: Path, limit_s: floa
             return failed or "pytest"
         # It fails without the mutation as well.
         asked = [test for test in asked if test != failed]
-    checker = [str(Path(sys.executable).with_name("pyrefly")), "check", "--threads", "1", "--summary=none"]
     with mutation.applied(folder):
-        words = [*checker, "--python-interpreter-path", sys.executable]
-        checked = subprocess.run(words, cwd=folder, capture_output=True, check=False)
-    return "types" if checked.returncode else ""
+        return "" if has_types_that_fit(folder) else "types"
+
+
+def has_types_that_fit(folder: Path) -> bool:
+    words = [str(Path(sys.executable).with_name("pyrefly")), "check", "--threads", "1", "--summary=none"]
+    words += ["--python-interpreter-path", sys.executable]
+    return subprocess.run(words, cwd=folder, capture_output=True, check=False).returncode == 0
 
 
 def tested(folder: Path, words: Sequence[str], limit_s: float) -> tuple[int | None, str]:
@@ -305,6 +308,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         free: Queue[Path] = Queue()
         for number in range(given.jobs):
             free.put(copied(Path(scratch) / str(number)))
+        if not has_types_that_fit(Path(scratch) / "0"):
+            raise SystemExit("pyrefly reports errors in the repository as it is: mend them first")
 
         def tried(mutation: Mutation) -> bool:
             folder = free.get()
