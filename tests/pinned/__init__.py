@@ -48,6 +48,7 @@ class Pinned:
 
         `same`, `nothing`: relative and absolute difference of two numbers that count as equal.
         """
+        __tracebackhide__ = True
         now = numbers(found, same)
         assert now, f"{name}: there is no number to pin"
         if self._renew:
