@@ -58,19 +58,6 @@ def test_figures_are_listed_in_the_order_of_their_definitions() -> None:
     assert {figure.group for figure in FIGURES} == QUESTIONS.keys()
 
 
-@pytest.mark.slow
-def test_a_name_stands_in_its_figure() -> None:
-    """A figure has one home: at most two other files hold its name, as a key or a word of their own.
-
-    Besides these `acquire status` has few words on each number of the live judge.
-    """
-    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py") if path.name != "status.py"]
-    words = {path: set(re.findall(r"(?<=[\"'])\w+(?=[\"'])", path.read_text())) for path in files}
-    for figure in FIGURES:
-        found = [path for path in files if figure.name in words[path]]
-        assert 1 <= len(found) <= 3, (figure.name, found)
-
-
 def test_some_figures_are_asked_more_than_others() -> None:
     """What trial frames show, what names frames by itself, what a refusal speaks of first, what shares a cause."""
     assert {figure.name for figure in FIGURES if not figure.before_session} >= {

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import importlib.metadata
 import inspect
+import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.main import get_command
 
 from croplab import COMMANDS
+from experiment.config import LabSettings, load_lab
 from foundation.version import PACKAGES
 
 pytestmark = pytest.mark.slow
+
+COLOUR = re.compile(r"\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|10[0-7])(?:;\d+)*m")
+"""Escape sequences that choose a colour (ECMA-48, SGR)."""
 
 HEAVY = (
     *("numpy", "numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO"),
@@ -100,3 +107,23 @@ def test_a_mistake_of_ours_shows_a_plain_traceback() -> None:
 def test_every_name_of_ours_has_one_owner() -> None:
     owners = importlib.metadata.packages_distributions()
     assert {room: set(owners[room]) for room in PACKAGES} == {room: {"croplab"} for room in PACKAGES}
+
+
+def test_no_color_is_obeyed() -> None:
+    """https://no-color.org: any value that is not empty; colours there are without it."""
+    wish = [sys.executable, "-m", "acquisition.cli", "--help"]
+    for more, coloured in (({}, True), ({"NO_COLOR": "1"}, False)):
+        settings = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "TERM")}
+        settings |= {"FORCE_COLOR": "1", "TERM": "xterm-256color", **more}
+        shown = subprocess.run(wish, env=settings, capture_output=True, text=True, check=True).stdout
+        assert bool(COLOUR.search(shown)) == coloured
+
+
+def test_settings_of_a_windows_editor_are_read(tmp_path: Path) -> None:
+    """Notepad begins a file with the byte order mark of UTF-8."""
+    text = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "lights.csv"\n[simulated]\nbody = "Test"\n'
+    read: list[LabSettings] = []
+    for mark in (b"", b"\xef\xbb\xbf"):
+        (tmp_path / "LAB.toml").write_bytes(mark + text.encode())
+        read.append(load_lab(tmp_path / "LAB.toml"))
+    assert read[0] == read[1]

@@ -48,6 +48,7 @@ class Pinned:
 
         `same`, `nothing`: relative and absolute difference of two numbers that count as equal.
         """
+        __tracebackhide__ = True
         now = numbers(found, same)
         assert now, f"{name}: there is no number to pin"
         if self._renew:
@@ -113,22 +114,27 @@ def numbers(value: Any, same: float = SAME) -> dict[str, Kept]:
 
 
 def _kept(leaf: Any, digits: int) -> Kept:
+    """Return a number, few numbers, or shape, minimum, maximum and weighted sum of many."""
     match leaf:
-        case str() | int():
+        case str():
             return leaf
-        case float():
-            return float(f"{leaf:.{digits}g}")
+        case int() | float():
+            return _rounded(leaf, digits)
         case list() if len(leaf) <= LISTED:
-            return [_kept(one, digits) for one in leaf]
+            return [_rounded(one, digits) for one in leaf]
         case _:
             array = np.asarray(leaf)
             values = array.astype(np.float64, casting="unsafe").ravel()
             if array.size <= LISTED:
-                return [_kept(one, digits) for one in values.tolist()]
+                return [_rounded(one, digits) for one in values.tolist()]
             finite = values[np.isfinite(values)]
             weights = np.random.default_rng(values.size).normal(size=finite.size) / max(finite.size, 1) ** 0.5
             summary = [finite.min(initial=np.inf), finite.max(initial=-np.inf), weights @ finite]
-            return [*array.shape, *(_kept(float(one), digits) for one in summary)]
+            return [*array.shape, *(_rounded(float(one), digits) for one in summary)]
+
+
+def _rounded(number: float, digits: int) -> int | float:
+    return number if isinstance(number, int) else float(f"{number:.{digits}g}")
 
 
 def _leaves(value: Any, name: str = "", by_place: bool = False) -> Iterator[tuple[str, Any]]:

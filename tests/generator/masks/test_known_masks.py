@@ -62,9 +62,8 @@ def test_masks_of_every_kind(pinned: Pinned) -> None:
                 b"".join(weights.tobytes() for weights in made),
             ]
     for text in REFUSED:
-        with pytest.raises(CropError) as refused:
+        with pytest.raises(CropError):
             parse_masks(text, 2, 0)
-        found[text] = str(refused.value)
     # More rows than are computed at a time.
     found["tall"] = parse_masks("smooth", 2, 1).maker(0).weights(1200, 60, 2)
     pinned("masks of every kind", found)
@@ -98,8 +97,8 @@ def test_masks_of_files(pinned: Pinned, tmp_path: Path) -> None:
                 sizes = ((6, 8), (3, 4), (12, 17), (3, 16))
                 masks = [plan.maker(number).weights(*size, lights) for number, size in enumerate(sizes)]
                 found[f"{name} {lights}"] = [described, [maker.files for maker in plan.sets], plan.places, masks]
-            except CropError as error:
-                found[f"{name} {lights}"] = str(error).replace(str(tmp_path), "PLACE")
+            except CropError:
+                found[f"{name} {lights}"] = {"refused": 1}
     # Sizes are fitted by a library, to whole 65535ths after that.
     pinned("masks of files", found, nothing=2e-5)
 
