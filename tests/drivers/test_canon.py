@@ -221,11 +221,6 @@ def test_what_would_spoil_a_series_is_refused_with_its_remedy(
     assert lab.film.frames == []
 
 
-def test_a_low_battery_is_refused() -> None:
-    with pytest.raises(DeviceRefused):
-        Lab(battery=0.05).camera.configure(SETTINGS)
-
-
 def test_a_dial_turned_during_the_series_is_set_back_or_refused(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.take()
@@ -246,14 +241,6 @@ def test_raw_beside_jpeg_is_not_offered_as_raw_alone() -> None:
     )
     with pytest.raises(DeviceRefused, match=r"RAW \+ JPEG L fine"):
         Lab(replace(EOS_550D, properties=properties)).camera.configure(SETTINGS)
-
-
-def test_the_body_is_given_back_as_it_was(lab: Lab) -> None:
-    lab.camera.configure(SETTINGS)
-    lab.take()
-    lab.camera.close()
-    assert lab.eos._number_of(Property.EOS_CAPTURE_DESTINATION) == CaptureDestination.CARD
-    assert lab.waiting() == 0
 
 
 class Listening(faults.TroubledResponder):
@@ -284,15 +271,6 @@ def test_a_large_frame_comes_in_pieces_of_a_mebibyte() -> None:
     pieces = [parameters[1:] for parameters in listening.parameters(Operation.EOS_GET_PARTIAL_OBJECT)]
     assert pieces == [(0, 1 << 20), (1 << 20, 1 << 20), (2 << 20, size - (2 << 20))]
     assert lab.waiting() == 0
-
-
-@pytest.mark.parametrize("absent", [Operation.EOS_REMOTE_RELEASE_ON, Operation.EOS_GET_PARTIAL_OBJECT])
-def test_a_body_without_an_operation_is_used_by_another(absent: Operation) -> None:
-    lab = Lab(without=(absent,))
-    lab.camera.configure(SETTINGS)
-    lab.take()
-    lab.take()
-    assert lab.openings == 1
 
 
 class Stuck(faults.TroubledResponder):
@@ -345,16 +323,6 @@ def test_a_body_that_gives_no_parts_gives_whole_frames(lists: bool) -> None:
     assert lab.openings == 1
     assert [len(listening.parameters(code)) for code in PIECES] == [lists, lists], "it is not asked again"
     assert lab.waiting() == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("after", [1_500_000, 2_499_990])
-def test_a_whole_frame_that_broke_off_is_completed(after: int) -> None:
-    lab = Lab(film_bytes=2_500_000, without=PIECES)
-    lab.pipes = lambda pipes: faults.CutOff(pipes, after) if lab.openings == 1 else pipes
-    goes_on(lab)
-    assert lab.openings > 1
-    assert len(lab.film.frames) == 3
 
 
 @pytest.mark.slow

@@ -22,7 +22,6 @@ from foundation.files import (
     HashingWriter,
     file_sha256,
     is_partial,
-    make_folder,
     open_inside,
     partial_path,
     read_csv,
@@ -112,12 +111,6 @@ class TestWholeFile:
             stream.write(bytes(50_000))
         assert names(tmp_path) == []
 
-    def test_a_disk_that_fills_at_the_last_flush(self, tmp_path: Path) -> None:
-        path = tmp_path / "small.csv"
-        with pytest.raises(StorageError), small_disk(10), whole_file(path) as stream:
-            stream.write(b"stays in the buffer until the end")
-        assert names(tmp_path) == []
-
     @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS])
     def test_each_fault_of_a_disk(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
         def fail(handle: int) -> None:
@@ -132,64 +125,10 @@ class TestWholeFile:
         assert path.read_text() == "old"
         assert names(tmp_path) == ["a.csv"]
 
-    def test_a_link_to_nowhere_is_told(self, tmp_path: Path) -> None:
-        (tmp_path / "link").symlink_to(tmp_path / "gone" / "a.csv")
-        with pytest.raises(InputError):
-            make_folder(tmp_path / "link")
-
-    @pytest.mark.skipif(not Path("/proc/self").exists(), reason="this system has no /proc")
-    def test_a_file_system_that_takes_no_files_is_told_from_a_disk_that_is_gone(self) -> None:
-        with pytest.raises(InputError, match=r"/proc/crop: .*ordinary disk"):
-            write_whole(Path("/proc/crop"), "x")
-        with pytest.raises(InputError, match=r"/proc/crop: .*ordinary disk"):
-            make_folder(Path("/proc/crop"))
-
     def test_a_disk_that_was_taken_away_is_not_taken_for_one_that_takes_no_files(self, tmp_path: Path) -> None:
         """The empty folder it was mounted on is there; what was written is not."""
         with pytest.raises(StorageError), whole_file(tmp_path / "a.csv"):
             (tmp_path / ".a.csv.partial").unlink()
-
-    def test_a_name_below_a_file_is_told(self, tmp_path: Path) -> None:
-        write_whole(tmp_path / "file", "x")
-        for path in (tmp_path / "file" / "a", tmp_path / "file" / "deeper" / "a"):
-            with pytest.raises(InputError):
-                write_whole(path, "x")
-        assert (tmp_path / "file").read_text() == "x"
-
-    @pytest.mark.parametrize(
-        ("name", "message"),
-        [
-            ("taken", r"cannot write .*taken: Is a directory; a folder is called so; name a file$"),
-            ("x" * 300, r"cannot write .*xxx: File name too long; name it shorter$"),
-        ],
-    )
-    def test_a_name_that_cannot_be_a_file_is_told(self, tmp_path: Path, name: str, message: str) -> None:
-        (tmp_path / "taken").mkdir()
-        with pytest.raises(InputError, match=message):
-            write_whole(tmp_path / name, "x")
-        assert names(tmp_path) == ["taken"]
-
-    @pytest.mark.parametrize(
-        ("number", "remedy"),
-        [
-            (errno.ENOSPC, "free space"),
-            (errno.EDQUOT, "what this user may use"),
-            (errno.EFBIG, "no file may be so large"),
-            (errno.EROFS, "mount it for writing"),
-            (errno.EIO, "check its cable"),
-            (errno.ENODEV, "connect and mount it"),
-            (errno.ENXIO, "connect and mount it"),
-            (errno.ENOENT, "its folder is gone"),
-            (errno.ESTALE, "mount it again here"),
-            (errno.EMFILE, "ulimit -n"),
-        ],
-    )
-    def test_each_fault_of_a_disk_has_its_own_remedy(self, tmp_path: Path, number: int, remedy: str) -> None:
-        error = storage.storage_error(tmp_path, OSError(number, os.strerror(number)))
-        assert isinstance(error, StorageError)
-        assert remedy in str(error)
-        assert str(error).endswith("then run the same command again")
-        assert ("free space" in str(error)) == (number == errno.ENOSPC)
 
     def test_a_folder_whose_names_cannot_be_flushed_is_a_fault_where_the_disk_fails(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -205,30 +144,6 @@ class TestWholeFile:
             storage.sync_folder(tmp_path)
         fail(errno.EINVAL)
         storage.sync_folder(tmp_path)
-
-    @pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
-    def test_a_place_where_nobody_may_write_keeps_its_code(self, tmp_path: Path, number: int) -> None:
-        error = storage.storage_error(tmp_path, OSError(number, os.strerror(number)))
-        assert isinstance(error, StorageError)
-        assert str(error).endswith("; ask its owner for permission, or name another place")
-
-    @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-    def test_a_folder_without_permission(self, tmp_path: Path) -> None:
-        tmp_path.chmod(0o500)
-        try:
-            with pytest.raises(StorageError):
-                write_whole(tmp_path / "a", "x")
-        finally:
-            tmp_path.chmod(0o700)
-
-    def test_a_fault_of_something_read_meanwhile_is_not_blamed_on_the_disk(self, tmp_path: Path) -> None:
-        with pytest.raises(FileNotFoundError), whole_file(tmp_path / "out") as stream:
-            stream.write((tmp_path / "source").read_bytes())
-        with pytest.raises(PermissionError), whole_file(tmp_path / "out"):
-            raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "source"))
-        with pytest.raises(ConnectionResetError), whole_file(tmp_path / "out"):
-            raise ConnectionResetError(errno.ECONNRESET, "the camera left")
-        assert names(tmp_path) == []
 
     def test_a_killed_writer_leaves_only_a_hidden_leftover(self, tmp_path: Path) -> None:
         write_whole(tmp_path / "a", "old")
@@ -302,15 +217,6 @@ class TestWholeFolder:
         with whole_folder(tmp_path / "lut", "the table") as folder:
             write_whole(folder / "fresh", "x")
         assert names(tmp_path / "lut") == ["fresh"]
-
-    def test_a_name_below_a_file_is_told(self, tmp_path: Path) -> None:
-        write_whole(tmp_path / "file", "x")
-        with pytest.raises(InputError), whole_folder(tmp_path / "file" / "lut", "the table"):
-            pytest.fail("the block must not begin")
-
-    def test_a_fault_of_a_source_is_not_blamed_on_the_disk(self, tmp_path: Path) -> None:
-        with pytest.raises(FileNotFoundError), whole_folder(tmp_path / "lut", "the table"):
-            (tmp_path / "source").read_bytes()
 
 
 def test_partial_names_are_told_from_others() -> None:

@@ -173,32 +173,6 @@ def test_without_locks_the_work_goes_on_with_a_warning(
     ]
 
 
-@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC])
-def test_a_lock_file_that_cannot_be_made_is_the_disk_s_fault(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
-    system = os.open
-
-    def opened(path: str | Path, flags: int, mode: int = 0o777, *, dir_fd: int | None = None) -> int:
-        if path == LOCK_FILE:
-            raise OSError(number, os.strerror(number), path)
-        return system(path, flags, mode, dir_fd=dir_fd)
-
-    monkeypatch.setattr(folders.fcntl, "flock", refuse_folders)
-    monkeypatch.setattr(folders.os, "open", opened)
-    with pytest.raises(StorageError, match=f"cannot write {tmp_path}"), held_folder(tmp_path, BUSY):
-        pytest.fail("held without a lock")
-
-
-def test_another_fault_of_locking_is_the_disk_s_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(handle: int, operation: int) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-    monkeypatch.setattr(folders.fcntl, "flock", fails)
-    with pytest.raises(StorageError, match=f"cannot write {tmp_path}"), held_folder(tmp_path, BUSY):
-        pytest.fail("held without a lock")
-
-
 def test_a_folder_that_is_made_and_never_there_is_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

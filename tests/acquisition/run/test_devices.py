@@ -24,7 +24,6 @@ from acquisition.run import devices, run
 from acquisition.run.devices import (
     ENGRAVED_S,
     PAUSE_S,
-    POWER_LIMIT_S,
     RETRY_S,
     TOLD_LATER,
     Devices,
@@ -137,19 +136,6 @@ def test_a_lamp_that_does_not_obey_is_said_to_burn() -> None:
     assert "burns on though the projector was told" in said
     assert "by hand" in said
     assert clock.monotonic() == 5
-
-
-@pytest.mark.parametrize("end", RunEnd)
-def test_a_projector_out_of_reach_hides_nothing(end: RunEnd) -> None:
-    class Gone(SimulatedProjector):
-        def power(self) -> Power:
-            raise LinkClosed("nothing listens at 192.168.1.30:4352")
-
-    clock = SimulatedClock()
-    said = lamp_fate(Gone(clock, power=ON), end, SequenceSettings(), clock)
-    assert ("nothing listens" in said) == (end is not RunEnd.INTERRUPTED)
-    assert "by hand" in said
-    assert lamp_fate(None, end, SequenceSettings(), clock).endswith("by hand")
 
 
 def test_a_screen_that_fails_and_a_full_disk_raise_nothing() -> None:
@@ -274,17 +260,6 @@ def test_a_projector_deaf_while_its_lamp_is_struck_is_waited_for() -> None:
     projector = Deaf(clock)
     make_ready(projector, SEQUENCE, no_time(clock))
     assert clock.monotonic() >= 600 + projector.traits.warm_up_s
-
-
-def test_a_lamp_that_never_lights_is_given_up() -> None:
-    class Dead(SimulatedProjector):
-        def power(self) -> Power:
-            return Power.STANDBY
-
-    clock = SimulatedClock()
-    with pytest.raises(DeviceFault):
-        make_ready(Dead(clock), SequenceSettings(), no_time(clock))
-    assert clock.monotonic() <= POWER_LIMIT_S + 2
 
 
 @pytest.mark.slow

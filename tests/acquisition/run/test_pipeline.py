@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -116,12 +115,6 @@ class TestTime:
         assert run(lab).complete
         assert min(settled) >= SETTLE_S - 1e-9
 
-    def test_attempts_tile_the_time_of_the_run(self, folder: Path) -> None:
-        lab = Lab(folder)
-        run(lab)
-        attempts = lab.session.journal.attempts()
-        assert all(earlier.ended_at == later.started_at for earlier, later in pairwise(attempts))
-
     def test_every_step_of_an_attempt_has_its_time_in_the_journal(self, folder: Path) -> None:
         lab = Lab(folder)
         run(lab)
@@ -175,17 +168,6 @@ class TestRefusals:
         monkeypatch.setattr(Session, "lost_files", look)
         assert run(Lab(folder, lights=FOUR, reference_every=2)).complete
         assert len(looked) == 3 + 1
-
-    @pytest.mark.slow
-    def test_what_was_measured_of_earlier_frames_is_recalled(self, folder: Path) -> None:
-        lab = Lab(folder)
-        run(lab, ScriptedJudge({3: refused("another light"), 5: refused("again"), 7: refused("again")}))
-        earlier = lab.session.journal.attempts()
-        judge = ScriptedJudge()
-        assert run(lab, judge).complete
-        assert [(number, accepted) for number, _, accepted in judge.recalled] == [
-            (attempt.step, attempt.verdict == "accepted") for attempt in earlier
-        ]
 
     def test_a_covered_screen_refuses_the_frame_and_the_judge_does_not_learn_from_it(self, folder: Path) -> None:
         lab = Lab(folder)
@@ -299,17 +281,6 @@ class TestFaults:
         assert "bytes" in said[0]
         assert all(len(path.read_bytes()) in (len(WELL), len(NIGHT)) for path in (folder / "frames").iterdir())
 
-    @pytest.mark.slow
-    def test_a_device_that_stays_silent_ends_the_run_when_patience_does(self, folder: Path) -> None:
-        lab = Lab(folder, dict.fromkeys(range(3, 2000), LinkTimeout("no answer from the camera")))
-        said: list[str] = []
-        with pytest.raises(LinkTimeout):
-            run(lab, announce=said.append)
-        assert [sentence.split(":")[0] for sentence in said[:2]] == ["retry", "paused"]
-        assert len(lab.session.frames()) == 3, "the frame before was saved and judged"
-        lab.camera.script = {}
-        assert run(lab).complete
-
     def test_a_camera_that_exposes_and_never_delivers_ends_the_run(self, folder: Path) -> None:
         lab = Lab(folder)
 
@@ -350,14 +321,6 @@ class TestFaults:
         assert sorted(accepted) == list(range(6)), "each step once"
         if place in ("download", "commit", "begin", "fail"):
             assert lab.camera.captures == 7, "the frame in the camera was not lost"
-
-    def test_a_disk_that_never_saves_ends_the_run(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        lab = Lab(folder)
-        broken = failing(StorageError("Input/output error"), calls=range(100_000))
-        monkeypatch.setattr(IncomingFile, "complete", broken(IncomingFile.complete, IncomingFile.abandon))
-        with pytest.raises(StorageError, match="Input/output error"):
-            run(lab)
-        assert lab.clock.monotonic() < 2 * PATIENT.sequence.patience_s
 
     def test_the_first_fault_is_kept_though_saving_what_was_taken_fails_too(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch
@@ -475,16 +438,6 @@ class TestEnding:
         with pytest.raises(KeyboardInterrupt):
             run(lab, ending=ending)
         assert lab.clock.monotonic() < 60
-
-    def test_the_last_frame_is_no_interruption(self, folder: Path) -> None:
-        lab = Lab(folder)
-        ending = Ending(lambda sentence: None)
-
-        def ask(taken: Taken) -> None:
-            if taken.left == 1:
-                ending.ask()
-
-        assert run(lab, ending=ending, observe=ask).complete
 
 
 STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(4)], 2)

@@ -120,25 +120,6 @@ def test_the_paper_s_chart_on_a0() -> None:
     }
 
 
-def test_references_on_a0_are_even_and_no_lattice() -> None:
-    chart = design_chart()
-    places = np.array([reference.centre_mm for reference in chart.references]) / chart.cell_mm[0]
-    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    # 36.3 slots a reference: a square lattice would stand 6.02 apart, a random choice has pairs side by side.
-    assert apart.min() >= 4
-    holes = np.array(
-        [np.linalg.norm(places - centre, axis=1).min() for centre in chart.centres_mm[::7] / chart.cell_mm[0]]
-    )
-    assert holes.max() <= 6
-    # A lattice has peaks as high as the number of its points; noise has 1 everywhere.
-    picture = np.zeros((155, 221))
-    column, row = np.rint(places - places.min(axis=0)).astype(int).T
-    picture[row, column] = 1
-    power = np.abs(np.fft.fft2(picture - picture.mean())) ** 2 / len(places)
-    assert power.max() < len(places) / 20
-
-
 def test_the_greys_halve_the_light_of_srgb_and_are_no_colours_of_the_chart() -> None:
     # IEC 61966-2-1: code 188 is linear 0.5029, and so on by hand.
     for code, linear in zip(GREY_CODES, (0.5, 0.25, 0.125, 0.0625), strict=True):
@@ -170,24 +151,6 @@ def test_what_cannot_be_designed_says_what_can(
 ) -> None:
     with pytest.raises(InputError, match=message):
         design_chart(bits, page, seed)
-
-
-@pytest.mark.parametrize(("bits", "page", "pixels"), [(4, "A3", 120), (3, (100.0, 500.0), 125)])
-def test_cells_shrink_to_whole_pixels_on_a_page_too_small(
-    bits: int, page: str | tuple[float, float], pixels: int
-) -> None:
-    chart = design_chart(bits, page)
-    assert chart.cell_mm == pytest.approx((pixels * PX_MM, pixels * PX_MM))
-    assert sorted(chart.colours.tolist()) == list(range(8**bits))
-    module = np.ptp(chart.tags[0].corners_mm[:, 0]) / 8 / PX_MM
-    assert module == pytest.approx(0.4 * pixels)
-    assert module == pytest.approx(round(module)), "a module is whole pixels"
-    for edges in (chart.centres_mm - np.array(chart.cell_mm) / 2, np.array([tag.corners_mm for tag in chart.tags])):
-        assert np.abs(edges / PX_MM - np.rint(edges / PX_MM)).max() < 1e-6
-    # One size larger does not fit: there is no room for as many slots within the margins.
-    larger = pixels + 5
-    room = [int((side / PX_MM - 2 * 189) // larger) for side in chart.page_mm]
-    assert pixels == 125 or room[0] * room[1] < 8**bits * 41 / 40 + 16 * len(chart.tags)
 
 
 def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -52,23 +51,6 @@ def test_what_is_saved_is_read_again(chart: Chart, tmp_path: Path) -> None:
     np.testing.assert_allclose(again.centres_mm, chart.centres_mm, rtol=0, atol=1e-6)
     assert again.to_json() == chart.to_json()
     assert again.sha256 == chart.sha256
-
-
-def test_seed_and_software_are_kept_and_an_old_file_keeps_its_hash(tmp_path: Path) -> None:
-    chart = design_chart(1, seed=3)
-    document = json.loads(chart.to_json())
-    assert document["seed"] == 3
-    assert document["software"] == chart.software
-    # The text of version 1 before the keys were there: those of the design, in that order, and nothing else.
-    for key in ("seed", "software"):
-        del document[key]
-    old = json.dumps(document, separators=(",", ":")) + "\n"
-    path = tmp_path / "chart.json"
-    path.write_text(old)
-    again = load_chart(path)
-    assert (again.seed, again.software) == (None, None)
-    assert again.to_json() == old
-    assert again.sha256 == hashlib.sha256(old.encode()).hexdigest()
 
 
 def set_(*keys: str | int, to: object) -> Callable[[dict[str, Any]], None]:

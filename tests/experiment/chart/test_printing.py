@@ -22,12 +22,10 @@ import pytest
 import tifffile
 from pyapriltags import Detector
 
-from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.margins import text_boxes
 from experiment.chart.model import Chart, Tag
 from experiment.chart.printing import (
     drawing,
-    field_px,
     preview,
     save_pdf,
     save_preview,
@@ -138,22 +136,6 @@ def test_the_proof_is_one_a4_page_with_tags_at_true_size(a0: Chart, tmp_path: Pa
         np.testing.assert_allclose(found[number] * 25.4 / 200 - shift, a0.tags[number].corners_mm, atol=0.1)
 
 
-@pytest.mark.parametrize("chart", [design_chart(1), paper_chart("A6", 3)], ids=["1", "paper"])
-def test_the_piece_is_the_sheet_s_own(chart: Chart) -> None:
-    proof, sheet = proof_drawing(chart), drawing(chart)
-    assert (proof.rectangles_mm >= 0).all()
-    assert (proof.rectangles_mm[:, 2:] <= proof.page_mm).all()
-    assert proof.tiles > 0
-    shift = (np.array([360, 330]) - field_px(chart)[:2]) * PX_MM
-    known = {(*box, *code) for box, code in zip(sheet.rectangles_mm.round(3).tolist(), sheet.rgb.tolist(), strict=True)}
-    tiles = (proof.rectangles_mm[-proof.tiles :] - np.tile(shift, 2)).round(3)
-    assert all(
-        (*box, *code) in known for box, code in zip(tiles.tolist(), proof.rgb[-proof.tiles :].tolist(), strict=True)
-    )
-    # The piece does not reach the greys below it.
-    assert proof.rectangles_mm[-proof.tiles :, 3].max() < 130
-
-
 def detect(picture: npt.NDArray[np.uint8]) -> dict[int, npt.NDArray[np.float64]]:
     """Corners of the tags that the AprilTag authors' library finds, clockwise from the print's top-left, px.
 
@@ -237,24 +219,6 @@ def test_an_independent_library_reads_all_tags_of_the_paper_s_chart(a0: Chart) -
     assert sorted(found) == list(range(35))
     for tag in a0.tags:
         np.testing.assert_allclose(found[tag.id], tag.corners_mm * 1600 / 1189, atol=0.15)
-
-
-def test_a_preview_is_the_mean_of_what_it_covers(a7: Chart, tmp_path: Path) -> None:
-    # 248 pixels across 105 mm: ten pixels of the 600 dpi print to one, all but 1 in 7000.
-    small, large = preview(a7, 248), painted(a7, 600)
-    means = large[:1740].reshape(174, 10, 248, 10, 3).mean(axis=(1, 3))
-    rows, columns = field_of(a7, 60)
-    middle = slice(rows.start + 51, rows.stop - 51), slice(columns.start + 51, columns.stop - 51)
-    assert small[middle].size > 5000
-    assert np.abs(small[middle] - means[middle]).max() < 25
-    assert np.abs(small[middle] - means[middle]).mean() < 2
-    save_preview(a7, tmp_path / "preview.png", 248)
-    written = cv2.imread(str(tmp_path / "preview.png"))
-    assert written is not None
-    np.testing.assert_array_equal(written[:, :, ::-1], small)
-    assert preview(a7, 1).shape == (1, 1, 3)
-    with pytest.raises(InputError, match="0 pixels"):
-        preview(a7, 0)
 
 
 def test_the_pdf_shows_what_the_tiff_shows(a7: Chart, tiff: Path, tmp_path: Path) -> None:
