@@ -263,7 +263,7 @@ def _front_matter(description: Description) -> str:
 def _configs(description: Description) -> str:
     """Return where the files of each part lie; of plain files the table of ground truths is what rows are read from."""
     layout = LAYOUTS[option(description, "layout")]
-    if not isinstance(layout, JoinedLayout):
+    if not layout.is_of_the_hub:
         files = "  - split: train\n    path: ground_truth.csv\n"
     else:
         files = "".join(
@@ -274,19 +274,11 @@ def _configs(description: Description) -> str:
     return f"configs:\n- config_name: default\n  data_files:\n{files}"
 
 
-_JOINED_READING: Final = (
-    "`load_dataset` finds the parts. Its decoder, Pillow, keeps 8 of 16 bits: decode the bytes with "
-    "`cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)` (then BGR), with "
-    '`.cast_column("png", Image(decode=False))` before it in WebDataset shards; or read with '
-    "`generator.open_dataset`."
-)
-
-
 def _reading(description: Description) -> str:
     """Return how the images are read without losing bits."""
     layout = LAYOUTS[option(description, "layout")]
     if isinstance(layout, JoinedLayout):
-        return _JOINED_READING
+        return layout.reading
     names = layout.patterns(description.parts, suffix_of(option(description, "format")))
     files = " and ".join(f"`{name.replace('*', 'NNNNNN')}`" for name in names)
     return (

@@ -321,12 +321,16 @@ class JoinedLayout:
     - `read`: returns the bytes of an image's file that lies in one, named as in a tar file (``000123.masks_0.png``);
       None where it has no such. Whatever else it raises says that the file is damaged.
     - `library`: by which it is written and read; "" where Python suffices.
+    - `is_of_the_hub`: whether Hugging Face's `load_dataset` finds the images in it; else it finds the table of lights.
+    - `reading`: for the dataset's card, how images are read without losing bits.
     """
 
     ending: str
     begin: Callable[[HashingWriter, Beside], _Container]
     read: Callable[[BinaryIO, str], bytes | None]
     library: str
+    is_of_the_hub: bool
+    reading: str
 
     def open_writer(self, store: Store, shard: int, beside: Beside) -> JoinedWriter:
         """Return the writer of a shard."""
@@ -358,18 +362,30 @@ class JoinedLayout:
         return [f"{part}/*.{self.ending}" for part in parts]
 
 
+_HUB_READING: Final = (
+    "`load_dataset` finds the parts. Its decoder, Pillow, keeps 8 of 16 bits: decode the bytes with "
+    "`cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)` (then BGR), with "
+    '`.cast_column("png", Image(decode=False))` before it in WebDataset shards; or read with '
+    "`generator.open_dataset`."
+)
+
+
 JOINED: Final[Mapping[str, JoinedLayout]] = {
     "webdataset": JoinedLayout(
         ending="tar",
         begin=lambda stream, _: _Tar(stream),
         read=_read_tar,
         library="",
+        is_of_the_hub=True,
+        reading=_HUB_READING,
     ),
     "parquet": JoinedLayout(
         ending="parquet",
         begin=lambda stream, beside: _Parquet(stream, _schema(*beside)),
         read=_read_parquet,
         library="pyarrow",
+        is_of_the_hub=True,
+        reading=_HUB_READING,
     ),
 }
 """Layouts of shards in one file each by name."""

@@ -90,6 +90,7 @@ class FileLayout:
 
     place: Callable[[str, str, str], str]
     library: ClassVar[str] = ""
+    is_of_the_hub: ClassVar[bool] = False
 
     def open_writer(self, store: Store, shard: int, beside: Beside) -> FileWriter:
         """Return the writer of a shard."""

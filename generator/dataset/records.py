@@ -29,6 +29,8 @@ class SparseRecord(Record):
 
 FORMAT: Final = "crop.dataset"
 VERSION: Final = 2
+"""Of `dataset.json`; raised when a reader of the version before would misread a dataset."""
+
 
 GROUND_TRUTH: Final = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")

@@ -30,7 +30,7 @@ def test_the_words_are_the_authors(counter: str, key: str, answer: str) -> None:
 
 @pytest.mark.parametrize("seed", [-1, 1 << 64])
 def test_a_seed_out_of_range_is_refused(seed: int) -> None:
-    with pytest.raises(InputError, match=r"0 to 2\^64 - 1"):
+    with pytest.raises(InputError):
         philox.key_of(seed)
 
 

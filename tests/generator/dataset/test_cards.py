@@ -11,6 +11,7 @@ import pytest
 
 from calibration.citation import OriginRecord
 from generator.dataset.cards import OPEN, card, datasheet
+from generator.dataset.layouts import LAYOUTS
 from generator.dataset.making import generate_dataset
 from generator.dataset.plan import DatasetOptions
 from generator.dataset.records import Description, Layout, Split
@@ -86,7 +87,7 @@ def test_the_card_is_what_the_hub_reads(made: Dataset) -> None:
     files = [entry for config in read.data.to_dict()["configs"] for entry in config["data_files"]]
     splits = made.description.splits
     named: set[Split] = {part for part, images in splits.items() if images}  # pyrefly: ignore[bad-assignment]
-    assert {entry["split"] for entry in files} == ({"train"} if made.layout == "folder" else named)
+    assert {entry["split"] for entry in files} == (named if LAYOUTS[made.layout].is_of_the_hub else {"train"})
     for entry in files:
         assert list(place_of(made).glob(entry["path"])), entry
 

@@ -1,4 +1,4 @@
-"""The contact sheet of a dataset: what is on it, and that it is within the page."""
+"""The contact sheet of a dataset, and members of shards in one file."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from calibration.table.lut import Lut
 from generator.dataset.contact_sheet import MAX_COLUMNS, MAX_ROWS, contact_sheet
 from generator.dataset.contact_sheet import _draw as draw
 from generator.dataset.making import generate_dataset
@@ -19,14 +20,14 @@ from generator.lights.lighting import LightChoice, ListedLights, RandomLights, m
 from generator.pictures.random_scenes import random_scenes
 from tests.generator.conftest import MakeLut
 
-pytestmark = pytest.mark.slow
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from matplotlib.figure import Figure
 
     from calibration.table.lut import Lut
+
+pytestmark = pytest.mark.slow
 
 
 def made_of(

@@ -84,7 +84,7 @@ def test_parts_are_of_sources_and_stay_when_others_come(make_lut: MakeLut, tmp_p
 def test_shares_of_the_work() -> None:
     assert parse_share("3/16") == (3, 16)
     for text in ("16/16", "3", "-1/4", "a/b", "3/"):
-        with pytest.raises(InputError, match="I/N"):
+        with pytest.raises(InputError):
             parse_share(text)
 
 

