@@ -146,4 +146,4 @@ def test_settings_of_tables(pinned: Pinned) -> None:
     task = table_task("Test", small, "here")
     found += [task.record, task.sample_bytes, len(task.illuminations), task.exposure]
     found += [stated_by_hand(None, None, []), stated_by_hand("n", None, []), said(stated_by_hand, None, "free", [])]
-    pinned("settings of computed tables", found)
+    pinned("settings of computed tables", {"tables": found})
