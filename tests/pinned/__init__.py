@@ -9,7 +9,6 @@ are not kept. A missing or changed number is a failure, a new one is not. A pin 
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import math
@@ -60,6 +59,8 @@ class Pinned:
         assert not moved, f"{name}, was and is:\n" + "\n".join(moved[:SHOWN]) + more
 
     def _write(self, name: str, now: dict[str, Kept], same: float, nothing: float) -> None:
+        import fcntl  # which Windows does not have
+
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("a+", encoding="utf-8") as file:
             # Tests of one module may run in several processes.

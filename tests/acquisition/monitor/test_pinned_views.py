@@ -50,7 +50,7 @@ def test_a_session_stands_as_it_stood(pinned: Pinned) -> None:
         alive, stopped = chance.choice((True, True, False, None)), chance.random() < 0.1
         stands = head_of(session, NOW, alive, is_stopped=stopped, free_bytes=chance.choice((None, 10**7, 10**12)))
         found.append(asdict(stands))
-    pinned("how sessions stand", found)
+    pinned("how sessions stand", {"heads": found})
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 
 from evaluation import metrics
 from evaluation.experiments import cross_validation, folds
-from evaluation.experiments.paper import colour_reduction, material, published, reporting, table1
+from evaluation.experiments.paper import colour_reduction, material, reporting, table1
 from evaluation.experiments.running import evaluate
 from evaluation.learning.constant_light import median_light
 from evaluation.methods.standard import standard_methods
@@ -201,7 +201,6 @@ def test_parts_of_the_paper(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> 
         ],
         "thinned": [list(table1.thinned(range(count), most)) for count, most in ((7, 3), (3, 7), (64, 64), (65, 64))],
         "sizes": table1.size_table(rows),
-        "published": [published.TABLE1, published.TABLE2],
         "figures": figures,
     }
     pinned("parts of the paper's experiments", found, same=1e-5)
