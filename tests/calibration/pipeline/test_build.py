@@ -1565,9 +1565,6 @@ def test_a_check_that_fails_shows_what_was_looked_for(plain: Lab, tmp_path: Path
     assert code == 4
     assert f"see {missed}" in said
     assert missed.read_bytes().startswith(b"\x89PNG")
-    code, said = command(tmp_path / "session", tmp_path / "lut", "--picture", missed)
-    assert code == 2
-    assert "--picture goes with --check" in said
 
 
 # Frames on which threads work before their turn come back in order, and wait for one another where they must.
