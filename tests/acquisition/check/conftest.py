@@ -13,6 +13,7 @@ from acquisition.check.check import check_lab
 from acquisition.check.findings import CheckReport
 from experiment.chart.layout import design_chart
 from experiment.config import load_lab
+from experiment.framing.field import Corners
 from experiment.lights import plan_illuminations, save_illuminations
 
 Check = Callable[..., CheckReport]
@@ -48,10 +49,11 @@ def check(folder: Path) -> Check:
         chart: str | None = None,
         linearity: bool = False,
         seed: int = 1,
+        corners: Corners | None = None,
         **room: Any,
     ) -> CheckReport:
         lab = folder / "LAB.toml"
         lab.write_text(lab_toml(chart or f"chart{bits}.json", camera, more, seed, **room))
-        return check_lab(load_lab(lab), linearity=linearity)
+        return check_lab(load_lab(lab), linearity=linearity, corners=corners)
 
     return run

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from acquisition.check import check as check_module
@@ -21,6 +22,7 @@ from acquisition.run.rig.opening import open_rig
 from benchmarks.sessions import record_session
 from calibration.figures.all_figures import BY_NAME, FIGURES
 from drivers.presenter import BLACK, WHITE
+from experiment.chart.layout import paper_chart
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings, load_lab
 from experiment.lights import load_illuminations
@@ -152,6 +154,20 @@ def test_a_chart_that_is_not_found_is_a_fault_and_what_rests_on_it_is_not_checke
     for name in ("figures", "evenness", "turn", "keystone"):
         assert of(report, name).grade == "not checked"
     assert report.forecast is None
+
+
+def test_a_chart_without_tags_is_judged_where_its_corners_are_given(check: Check, folder: Path, tmp_path: Path) -> None:
+    chart = paper_chart("A5", 2)
+    chart.save(folder / "paper.json")
+    lab = hang_chart(chart, "Test", Room(seed=1))
+    half = np.array(chart.cell_mm) / 2
+    (left, top), (right, bottom) = chart.centres_mm.min(axis=0) - half, chart.centres_mm.max(axis=0) + half
+    outline = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+    corners = lab.truth_px(outline, lab.mosaic(tmp_path))
+    report = check(chart="paper.json", corners=tuple((x, y) for x, y in corners.tolist()))
+    assert not report.of("fault")
+    assert {"agreement", "bleed", "additivity"} <= report.figures.keys()
+    assert "tags_found" in report.not_known
 
 
 def test_the_run_s_own_limit_makes_dark_light_a_fault(check: Check) -> None:
