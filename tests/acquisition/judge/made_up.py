@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.judge import judge as judge
 from acquisition.judge.state import Basis, Codes, JudgeState, Seen
 from experiment.measures.frame import SEGMENTS, TILE_COLUMNS, TILE_ROWS, FramePlaces, Measured, Noise
 from experiment.session.records import TOP

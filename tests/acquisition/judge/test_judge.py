@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.judge import judge as judge
-from acquisition.judge import limits
+from acquisition.judge import judge, limits
 from acquisition.judge.judge import (
     CAUSES,
     MOST_RESTARTS,
