@@ -1,4 +1,4 @@
-"""A check tells the faults of all devices at once, whichever of them fail."""
+"""Every device of a real lab is opened, and the faults of all are named at once."""
 
 from __future__ import annotations
 
