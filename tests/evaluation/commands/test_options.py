@@ -49,14 +49,6 @@ def test_the_standard_ones_are_seven_and_what_a_run_takes_unasked(
     assert list(dict.fromkeys(row["method"] for row in rows)) == [method.name for method in chosen]
 
 
-def test_the_help_names_every_method(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setenv("COLUMNS", "1000")
-    assert main(["run", "--help"]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert f"standard: {', '.join(STANDARD)}. all: these and " in printed
-    assert ", ".join(name for name in standard_methods() if name not in STANDARD) in printed
-
-
 LEARNER = """
 class Learns:
     name = "Learns"
@@ -113,22 +105,6 @@ def test_a_class_that_has_to_learn_before_it_estimates_is_sent_to_cv(
     said = capsys.readouterr().err
     assert "AttributeError" in said
     assert "give it to evaluate cv" in said
-
-
-@pytest.mark.parametrize(
-    ("command", "whole"),
-    [
-        (["transfer"], "gray-world, shades-of-gray, gray-edge-1"),
-        (["paper", "table2"], "smart-color-cat, regression-trees, color-beaver"),
-    ],
-)
-def test_defaults_are_whole_in_a_narrow_help(
-    command: list[str], whole: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    assert main([*command, "--help"]) == 0
-    printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert whole in printed
 
 
 def test_what_is_given_arrives() -> None:

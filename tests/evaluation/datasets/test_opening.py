@@ -66,10 +66,6 @@ OWN = {"generated", "thumbnails", "folder"}
 """Layouts whose readers have met more than made-up copies, or that are the user's own."""
 
 
-def test_every_layout_has_a_copy() -> None:
-    assert {copy.layout for copy in COPIES.values()} == set(LAYOUTS) - {"generated"}
-
-
 @pytest.mark.parametrize("name", COPIES)
 def test_a_layout_is_told_from_every_other(name: str, place_of: Place) -> None:
     place = place_of(name)
@@ -102,35 +98,6 @@ def test_hidden_leftovers_of_systems_are_not_seen(name: str, place_of: Place, tm
         (Path(folder) / ".DS_Store").write_bytes(b"finder")
     names = [scene.name for scene in open_scenes(place_of(name)).scenes]
     assert [scene.name for scene in open_scenes(copy).scenes] == names
-
-
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name != "generated"])
-def test_a_layout_named_for_something_else_says_what_is_missing(layout: str, tmp_path: Path) -> None:
-    (tmp_path / "notes.md").write_text("nothing")
-    with pytest.raises(InputError) as told:
-        open_scenes(tmp_path, layout)
-    assert str(tmp_path) in str(told.value)
-    assert ";" in str(told.value) or "expected" in str(told.value)
-
-
-def test_a_folder_that_looks_like_none_is_told_what_was_looked_for(tmp_path: Path) -> None:
-    (tmp_path / "1.png").write_bytes(b"")
-    with pytest.raises(FormatError, match=r"\(1\.png\) without") as told:
-        open_scenes(tmp_path)
-    assert len(str(told.value)) < 400
-    (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(FormatError) as told:
-        open_scenes(tmp_path)
-    for name, layout in LAYOUTS.items():
-        assert f"{layout.signs} ({name})" in str(told.value)
-
-
-def test_what_is_not_there_or_no_folder_is_told(tmp_path: Path) -> None:
-    with pytest.raises(FormatError):
-        open_scenes(tmp_path / "nowhere")
-    (tmp_path / "set.zip").write_bytes(b"PK")
-    with pytest.raises(FormatError, match=r"set\.zip"):
-        open_scenes(tmp_path / "set.zip")
 
 
 @pytest.mark.parametrize("layout", [name for name, known in LAYOUTS.items() if known.takes == "folder"])
@@ -191,11 +158,6 @@ def test_a_truncated_image_is_an_error_with_its_name(name: str, place_of: Place,
     with pytest.raises(FormatError) as told:
         scene.read()
     assert path.name in str(told.value)
-
-
-def test_the_reference_describes_every_layout() -> None:
-    told = (Path(__file__).parents[3] / "docs" / "reference" / "datasets.md").read_text(encoding="utf-8")
-    assert [name for name in LAYOUTS if f"| `{name}` |" not in told] == []
 
 
 FILES = {

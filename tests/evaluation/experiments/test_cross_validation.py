@@ -26,7 +26,6 @@ from evaluation.experiments.cross_validation import (
 from evaluation.experiments.folds import draw_folds
 from evaluation.experiments.running import evaluate
 from evaluation.learning.regression_trees import RegressionTrees
-from evaluation.methods.green_stability import tune
 from evaluation.methods.method import Method
 from evaluation.methods.prepared import GREY, unit
 from evaluation.scene import Image, Scene
@@ -327,17 +326,3 @@ def test_images_without_a_light_are_left_out_and_told() -> None:
     assert tuning_table(tuned).notes == ("1 of 9 images give no light with some setting and do not count for any.",)
     with pytest.raises(InputError, match="1 of 2 images"):
         tune_family("shades-of-gray", "shops", scenes[-2:])
-
-
-def test_a_family_that_is_none() -> None:
-    with pytest.raises(InputError, match="'gray-world' is no family"):
-        tune_family("gray-world", "shops", BLIND)
-    with pytest.raises(InputError, match="'sigma=1@large' is no parameter"):
-        tune_family("gray-edge-1@large", "shops", BLIND)
-
-
-def test_too_little_to_tune_with_is_refused() -> None:
-    with pytest.raises(InputError, match="1 sets of parameters on 8 images"):
-        tune(methods_of("gray-edge-1")[:1], BLIND)
-    with pytest.raises(InputError, match="30 sets of parameters on 1 images"):
-        tune(methods_of("gray-edge-1"), BLIND[:1])

@@ -15,7 +15,6 @@ import pytest
 
 from evaluation.experiments.paper.published import TABLE1
 from evaluation.experiments.paper.table1 import (
-    LEARNERS,
     Block,
     block_table,
     joint_table,
@@ -31,7 +30,6 @@ from evaluation.methods.prepared import unit
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import recovery_error
 from evaluation.scene import Scene
-from foundation.errors import InputError
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import SourcePicture
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
@@ -147,11 +145,6 @@ def test_images_without_a_usable_pixel_are_told(make_table: TableMaker) -> None:
     assert "White-Patch: no usable pixel in 1 image, whose" in " ".join(block_table(blocks[0], "recovery").notes)
 
 
-def test_no_pictures(make_table: TableMaker) -> None:
-    with pytest.raises(InputError):
-        settings([make_table("Test")], [], TRUTHS)
-
-
 @dataclass(frozen=True, eq=False)
 class Constant:
     """Always the same light."""
@@ -187,16 +180,3 @@ def test_who_was_trained_on_what() -> None:
         others = REAL_LIGHTS[place // 2 != FOLDS].mean(axis=0)
         assert trained.real.errors["recovery"][place] == pytest.approx(float(recovery_error(others, light)))
         assert trained.generated.errors["recovery"][place] == pytest.approx(float(recovery_error([2, 1, 1], light)))
-
-
-def test_the_learners_are_the_paper_s() -> None:
-    from evaluation.experiments.paper.published import TABLE2
-
-    assert set(LEARNERS.values()) == set(TABLE2["real"]) == set(TABLE2["generated"])
-
-
-def test_nothing_to_train_on() -> None:
-    with pytest.raises(InputError, match="0 generated images"):
-        table2(REAL, [], {"mine": MeanLight()}, FOLDS)
-    with pytest.raises(InputError, match="0 learners"):
-        table2(REAL, MADE, {}, FOLDS)
