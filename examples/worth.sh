@@ -11,8 +11,7 @@
 #
 # LEVERS (environment) chooses some of the renderings below, by default all. Naive rows are made for each of them, of the same
 # pictures under the same lights; NAIVE=no leaves them out, which are half of the work. LEARNERS names the methods; most
-# of the time is log-chroma's. REAL=0,20,100,400,all also trains beside so many real images of the other parts, in the
-# ways that BESIDE names (adapted; pooled doubles the time).
+# of the time is log-chroma's. REAL=20,100,all also trains beside so many real images of the tested part.
 set -euo pipefail
 pictures=$(realpath "$1") archives=$(realpath "$2") out=$3 seeds=${4:-5}
 here=$(realpath "$(dirname "$0")")

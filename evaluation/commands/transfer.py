@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
     from evaluation.experiments.cross_validation import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
-    from evaluation.experiments.transfer.rows import TransferRow
     from evaluation.scene import SceneSet
 
 # Ratio of sizes from which all images are made small: learned methods reduce images by up to 2 themselves.
@@ -106,7 +105,7 @@ def transfer(
     drawn = tuple(choose_folds(tested, None, seed)[0] for seed in range(seeds))
     counts, too_many = _within(asked, drawn)
     side, made_small = _side(tested, plan)
-    notes = [*plan.notes, *made_small, *left_out, *too_many, *_not_adapted(learners, counts)]
+    notes = [*plan.notes, *made_small, *left_out, *too_many]
     images = min(len(some.scenes) for some in plan.training)
     with image_steps(count_images(tested.scenes, plan.training, len(drawn), images)) as step:
         rows = run_transfer(
@@ -116,7 +115,7 @@ def transfer(
             beside=counts,
         )
     figures = figures_of(rows, error, groups=groups_of(tested.scenes))
-    plan = replace(plan, notes=(*notes, *_suspicions(tested, rows), *harm_notes(figures)))
+    plan = replace(plan, notes=(*notes, *harm_notes(figures)))
     settings: dict[str, Any] = {
         "methods": [describe_method(each) for each in (*learners, *references)],
         "images": images,
@@ -165,26 +164,6 @@ def _within(
     left_out = [count for count in counts if count is not None and count > least]
     notes = [f"No rows beside {count} real images: a fold that is tested leaves {least}" for count in left_out]
     return tuple(count for count in counts if count not in left_out), notes
-
-
-def _not_adapted(learners: Sequence[AnyLearner], counts: Sequence[int | None]) -> list[str]:
-    from evaluation.learning.feature_learner import FeatureLearner
-
-    return [
-        f"{learner.name} is a class of your own, which is not adapted: it has rows alone"
-        for learner in learners
-        if counts and not isinstance(learner, FeatureLearner)
-    ]
-
-
-def _suspicions(test: SceneSet, rows: Sequence[TransferRow]) -> tuple[str, ...]:
-    """Return a sentence for each row whose training images have their channels in another order than the test's."""
-    import numpy as np
-
-    from evaluation.experiments.suspicions import suspicions
-
-    results = [replace(row.results[0], method=f"{row.method}, {row.training}") for row in rows]
-    return suspicions([scene.name for scene in test.scenes], np.stack([scene.truth for scene in test.scenes]), results)
 
 
 def _side(test: SceneSet, plan: TransferPlan) -> tuple[int | None, list[str]]:

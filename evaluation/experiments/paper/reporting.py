@@ -7,7 +7,6 @@ data sets, to see which of their lights a table can stand for.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,9 +31,9 @@ from evaluation.experiments.paper.table1 import (
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex, tables_to_latex
 from evaluation.results.tables import Table, table_to_csv
-from foundation import pages, plots
+from foundation import pages
 from foundation.folders import whole_folder
-from foundation.plots import FAINT, INK, legend_label, series_style, svg_of
+from foundation.plots import FAINT, INK, legend_label, series_style, standalone, svg_of
 from generator.lights.choices import nearest_lights
 
 if TYPE_CHECKING:
@@ -95,9 +94,6 @@ _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 _SEEN: Final = 0.004
 """Width of a dot in the figure of chromaticities; of points in one square of that width one is drawn."""
-
-_PLACE: Final = re.compile(rb'(<use [^>]*\bx="[\d.]+?\.\d)\d*(" y="[\d.]+?\.\d)\d*"')
-"""The place of a dot, of which a tenth of a point is as much as can be seen."""
 
 
 def _draw_bits(figure: Any, found: BitsResult, kind: ErrorKind) -> None:
@@ -177,11 +173,6 @@ def _draw_chromaticities(figure: Any, luts: Sequence[Lut], sets: Mapping[str, np
         axes.set_ylim(0, reach)
         axes.set_aspect("equal")
         axes.legend(loc="upper right", fontsize=8, markerscale=1.6, handletextpad=0.2)
-
-
-def standalone(svg: bytes) -> bytes:
-    """Return an SVG of `svg_of` as a file of its own, light or dark as the reader likes."""
-    return _PLACE.sub(rb'\1\2"', plots.standalone(svg))
 
 
 _TABLE1 = (

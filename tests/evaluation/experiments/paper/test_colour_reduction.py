@@ -21,7 +21,6 @@ from evaluation.experiments.paper.colour_reduction import (
     reduction_table,
 )
 from evaluation.experiments.running import evaluate
-from evaluation.methods.standard import standard_methods
 from foundation.errors import InputError
 from generator.files import fit_flash
 from tests.evaluation.made_scenes import Made
@@ -106,16 +105,6 @@ def test_images_as_they_are_give_what_evaluate_gives() -> None:
         near = np.abs(exact.errors["recovery"] - raw.errors["recovery"]).max()
         assert near < 0.15
         assert np.abs(coarse.errors["recovery"] - raw.errors["recovery"]).max() > near
-
-
-def test_the_usual_scale_is_the_standard_method() -> None:
-    assert bits_methods()[2] is not None
-    assert bits_methods()[2].name == standard_methods()["gray-edge-1"].name
-
-
-def test_nothing_to_do() -> None:
-    with pytest.raises(InputError, match="0 images"):
-        bits_removed([], bits_methods())
 
 
 def test_what_is_left() -> None:

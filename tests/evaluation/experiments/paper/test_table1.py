@@ -5,9 +5,12 @@ What a table holds: its noise, and how grey its print is.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from evaluation.experiments.paper.published import TABLE1
@@ -20,13 +23,17 @@ from evaluation.experiments.paper.table1 import (
     sensor_of,
     settings,
     table1,
+    table2,
 )
 from evaluation.experiments.running import evaluate
+from evaluation.methods.prepared import unit
 from evaluation.methods.standard import standard_methods
-from foundation.errors import InputError
+from evaluation.metrics import recovery_error
+from evaluation.scene import Scene
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import SourcePicture
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
+from tests.evaluation.made_scenes import Made
 
 TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
 
@@ -138,6 +145,38 @@ def test_images_without_a_usable_pixel_are_told(make_table: TableMaker) -> None:
     assert "White-Patch: no usable pixel in 1 image, whose" in " ".join(block_table(blocks[0], "recovery").notes)
 
 
-def test_no_pictures(make_table: TableMaker) -> None:
-    with pytest.raises(InputError, match="no picture"):
-        settings([make_table("Test")], [], TRUTHS)
+@dataclass(frozen=True, eq=False)
+class Constant:
+    """Always the same light."""
+
+    name: str
+    light: npt.NDArray[np.float64]
+
+    def estimate(
+        self, image: object, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+    ) -> npt.NDArray[np.float64]:
+        return self.light
+
+
+@dataclass(frozen=True)
+class MeanLight:
+    """Learns the mean of the training lights."""
+
+    name: str = "Mean light"
+
+    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Constant:
+        return Constant(self.name, unit(np.mean([scene.truth for scene in scenes], axis=0)))
+
+
+REAL_LIGHTS = np.array([[1.0, 2, 1], [1.2, 2, 1], [1, 2, 1.3], [1.4, 2, 0.9], [1, 2, 0.8], [1.1, 2, 1.2]])
+REAL = [Made(f"r{place}", light, np.ones((4, 4, 3))) for place, light in enumerate(REAL_LIGHTS)]
+MADE = [Made("m", np.array([2.0, 1, 1]), np.ones((4, 4, 3)))]
+FOLDS = np.array([0, 0, 1, 1, 2, 2])
+
+
+def test_who_was_trained_on_what() -> None:
+    (trained,) = table2(REAL, MADE, {"regression-trees": MeanLight()}, FOLDS)
+    for place, light in enumerate(REAL_LIGHTS):
+        others = REAL_LIGHTS[place // 2 != FOLDS].mean(axis=0)
+        assert trained.real.errors["recovery"][place] == pytest.approx(float(recovery_error(others, light)))
+        assert trained.generated.errors["recovery"][place] == pytest.approx(float(recovery_error([2, 1, 1], light)))

