@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from enum import Enum
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,6 +25,8 @@ from foundation.console import (
     with_json,
 )
 from foundation.errors import DeviceError, InputError, QualityError, StorageError, counted, first_of
+from foundation.files import make_folder, write_whole
+from foundation.folders import held_folder, require_free, whole_folder
 
 if TYPE_CHECKING:
     from experiment.config import LabSettings
@@ -64,11 +69,6 @@ def init(
     acquire illuminations does). A chart or lights that are there already stay as they are; a LAB.toml that is there
     is an error.
     """
-    from importlib.resources import files
-
-    from foundation.files import make_folder, write_whole
-    from foundation.folders import require_free
-
     settings, print_folder, lights = lab / "LAB.toml", lab / "chart", lab / "illuminations.csv"
     require_free(settings, "the settings")
     make_folder(lab, lab)
@@ -115,7 +115,6 @@ def chart(
     from experiment.chart.printing import save_pdf, save_preview, save_tiff
     from experiment.chart.proof import save_instructions, save_proof
     from experiment.framing.finding import small_parts_warning
-    from foundation.folders import whole_folder
 
     design = paper_chart(_page(page), bits) if arrangement is Arrangement.PAPER else design_chart(bits, _page(page))
     with whole_folder(out, "the chart") as folder:
@@ -173,10 +172,7 @@ def illuminations(
 
     Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb-chromaticities beside it.
     """
-    from collections import Counter
-
     from experiment.lights import parse_ccts, plan_illuminations, plot_illuminations, save_illuminations
-    from foundation.folders import require_free
 
     plot = out.with_suffix(".png")
     if plot == out:
@@ -361,8 +357,6 @@ def status(
     ended for one, or it was killed; with 4 when it is paused for its frames, or ended with frames left, or its files,
     chart or lights are lost; with 5 when its disk is full or at fault.
     """
-    from datetime import UTC, datetime
-
     from acquisition.status import read_status, status_json, status_lines
     from experiment.session.folder import journal_path
 
@@ -389,7 +383,6 @@ def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) ->
     """
     from experiment.session.folder import busy_sentence, rebuild_journal
     from experiment.session.journal import JOURNAL_FILE
-    from foundation.folders import held_folder
 
     with held_folder(session, busy_sentence(session)):
         attempts = rebuild_journal(session)

@@ -34,11 +34,12 @@ MEANINGS = {
     "blur": "of the print, softer than in the first white frame",
     "rows": "strips of rows that show what belongs elsewhere",
     "uniformity": "the tile that deviates most from the frame's light",
-    "light": "from the light ordered to the one seen",
-    "lamp": "brighter than foretold from the frames before",
-    "ambient": "light from elsewhere, of white",
-    "dark": "light in the dark frame, of white",
-    "white drift": "brightness of white since the first white frame",
+    "off_codes_deg": "from the light ordered to the one seen",
+    "off_brightness": "brighter than foretold from the frames before",
+    "stray_share": "light from elsewhere, of white",
+    "dark_drift": "change of the light in dark frames, of white",
+    "leak_share": "light in the dark frame, of white",
+    "white_drift": "brightness of white since the first white frame",
     "additivity": "white beyond the sum of the primaries",
 }
 """What the numbers of the checks are, for who has not read docs/how-to/night-run.md."""
@@ -149,7 +150,7 @@ def check_text(check: Check) -> str:
     sign = "+" if check.low is not None and check.low < 0 else ""
     match check.low, check.high:
         case None, None:
-            allowed = "; no limits before more frames tell how it scatters" if check.name == "lamp" else ""
+            allowed = "; no limits before more frames tell how it scatters" if check.name == "off_brightness" else ""
         case None, high:
             allowed = f", at most {high:.4g}{unit}"
         case low, None:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.judged_labs import Projector, cause, lab_of, rooms
+from calibration.figures.light import OFF_CODES_DEG
 from drivers.presenter import Colour
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.model import Chart
@@ -86,7 +87,9 @@ def odd_worlds(folder: Path, lights: int) -> list[tuple[str, int, int, Counter[s
         lab = lab_of(folder, more.pop("room", room), **more)
         said = lab.session(lights, 12, 3)
         causes = Counter(cause(one) for _, one in said if not one.accepted)
-        limit = [c.high for _, one in said[-20:] for c in one.checks if c.name == "light" and c.high is not None]
+        limit = [
+            c.high for _, one in said[-20:] for c in one.checks if c.name == OFF_CODES_DEG.name and c.high is not None
+        ]
         found.append((name, len(said), sum(causes.values()), causes, f"{np.median(limit):.2f}°" if limit else ""))
         for step, one in said:
             if not one.accepted:

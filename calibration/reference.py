@@ -13,7 +13,7 @@ from pathlib import Path
 from calibration.causes.rules import CAUSES, RULES, UNKNOWN, Condition, Evidence, Rule
 from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import QUESTIONS, Figure, Limit
-from calibration.figures.single_frames import RIG_LIMITS
+from calibration.figures.single_frames import FRAME_LIMITS, RIG_LIMITS
 
 _PAGES = Path(__file__).parents[1] / "docs" / "reference"
 
@@ -59,13 +59,15 @@ def figures_page() -> str:
             "| figure | accepted | refused beyond | in a check | of one frame | what goes wrong beyond | what helps |"
         )
         parts += ["|---|---|---|---|---|---|---|", *(_limits(one) for one in FIGURES if one.group == group), ""]
-    parts += ["## Before a session\n\nWhat only `acquire check` measures.\n"]
-    parts += ["| limit | accepted | fault beyond | what goes wrong beyond | what helps |", "|---|---|---|---|---|"]
-    parts += [
-        f"| {one.title} (`{one.name}`) | {one.expected} | {_refused(one)} | {one.why} ({one.source}) | {one.remedy} |"
-        for one in RIG_LIMITS
-    ]
-    return "\n".join([*parts, ""])
+    for heading, limits in (("Before a session", RIG_LIMITS), ("While a session is taken", FRAME_LIMITS)):
+        parts += [f"## {heading}\n", "| limit | accepted | fault beyond | what goes wrong beyond | what helps |"]
+        parts += ["|---|---|---|---|---|", *(_plain_limit(one) for one in limits), ""]
+    return "\n".join(parts)
+
+
+def _plain_limit(one: Limit) -> str:
+    limits = f"{one.expected} | {_refused(one)}"
+    return f"| {one.title} (`{one.name}`) | {limits} | {one.why} ({one.source}) | {one.remedy} |"
 
 
 def _refused(one: Limit) -> str:

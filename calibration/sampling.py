@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from numpy import uint64
+from scipy.optimize import nnls
+from scipy.special import ndtr
 
 from drivers.raw.rawfile import CHANNELS, Mosaic, phases
 from experiment.framing.sharpness import MAX_BLUR_PX
@@ -352,7 +354,6 @@ def photon_transfer(level: _Array, variance: _Array, samples: int = 25) -> Photo
     `level`: (N, 3) float64 mean of each cell, counts above black. `variance`: (N, 3) float64 variance of one sample of
     each, counts².
     """
-    from scipy.optimize import nnls
     from scipy.stats import chi2
 
     terms, misfit = np.zeros((3, 3)), np.zeros(3)
@@ -381,8 +382,6 @@ def bleed(cell_px: float, blur_px: float, window: int = WINDOW) -> float:
 
     `cell_px`: shorter side of a cell, half-size px. `blur_px`: σ of the blur, half-size px.
     """
-    from scipy.special import ndtr
-
     return float(ndtr(-(cell_px / 2 - window // 2 - MISPLACEMENT_PX) / max(blur_px, _LEAST_BLUR_PX)))
 
 
@@ -391,8 +390,6 @@ def mean_bleed(cell_px: float, blur_px: npt.NDArray[np.float64], window: int = W
 
     Units and sources are those of `bleed`.
     """
-    from scipy.special import ndtr
-
     at = np.arange(-(window // 2), window // 2 + 1)
     inside = 1 - 2 * ndtr(-(cell_px / 2 - at) / np.maximum(blur_px, _LEAST_BLUR_PX)[:, None]).mean(axis=1)
     return np.asarray(1 - inside**2, dtype=np.float64)

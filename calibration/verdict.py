@@ -254,9 +254,13 @@ def _cause_text(finding: ProbableCause | None) -> str:
 
 def _with_place(row: JudgedValue, table: TableMeasurements) -> str:
     """Return a value against its limit, and where the worst of it is."""
-    figure = row.figure
-    place = places_text(explain(figure, table)) if figure.where is None else figure.where(table, figure.accept)
+    place = place_of(row.figure, table)
     return f"{row.text()}, {place}" if place else row.text()
+
+
+def place_of(figure: Figure, table: TableMeasurements) -> str:
+    """Return the frames, lights or place of a figure that is beyond its limit; "" if it has none."""
+    return places_text(explain(figure, table)) if figure.where is None else figure.where(table, figure.accept)
 
 
 def places_text(finding: ProbableCause | None) -> str:

@@ -1,6 +1,6 @@
 """The states that a step of a session goes through, as a table, of which docs/explanation/steps.md has the drawing.
 
-`tests/experiment/session/test_states.py` takes sessions and holds them against it; no program reads it.
+`docs/figures.py` draws it.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ projector also sends notices to the one controller whose address was entered in 
 each change of fault, power and input. Nothing there is proved by a password.
 
 Source: JBMIA, PJLink Specifications 1.04 (class 1), 2.00 (class 2: same lines, digit 2; 3.2 search, 3.3 status
-notification), 2.10 (SHA-256).
+notification).
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ PORT = 4352
 """TCP and UDP port of PJLink (PJLink Specifications 1.04 and 2.00)."""
 MAX_LINE = 136
 """Bytes of a command or reply, its CR included."""
-MAX_DIGEST = 96
-"""Characters before the first command: 32 with MD5, 32 of random number and 64 of digest with SHA-256."""
+DIGEST_LENGTH = 32
+"""Characters before the first command: the digest by MD5 (PJLink Specifications 1.04, 5.1)."""
 MAX_PASSWORD = 32
 """Characters of a password (PJLink Specifications 1.04, authentication)."""
 IDLE_LIMIT_S = 30.0
@@ -50,9 +50,6 @@ IDLE_LIMIT_S = 30.0
 
 QUERY = "?"
 OK = "OK"
-RAISE = "1"
-LOWER = "0"
-"""SVOL and MVOL move by one step; their level cannot be read."""
 MUTE_ON = "31"
 MUTE_OFF = "30"
 
@@ -117,25 +114,6 @@ def authentication_digest(seed: str, password: str) -> str:
     return hashlib.md5((seed + password).encode(), usedforsecurity=False).hexdigest()
 
 
-def is_security_question(line: bytes) -> bool:
-    """Return whether a line, without its end, asks for SHA-256."""
-    return line.strip().upper() == b"PJLINK 2"
-
-
-def encode_challenge(challenge: bytes) -> bytes:
-    """Return the line by which a projector agrees to SHA-256; `challenge` is its 16 random bytes."""
-    return f"PJLINK 2 {challenge.hex()}\r".encode("ascii")
-
-
-def sha256_digest(challenge: bytes, nonce: bytes, password: str) -> str:
-    """Return the digest that proves the password to a projector with SHA-256 (2.10, 5.1).
-
-    `challenge`: the projector's 16 random bytes. `nonce`: the controller's own 16 random bytes.
-    """
-    mixed = bytes(ours ^ theirs for ours, theirs in zip(nonce, challenge, strict=True))
-    return nonce.hex() + hashlib.sha256((mixed.hex() + password).encode()).hexdigest()
-
-
 def encode_greeting(seed: str | None) -> bytes:
     """Return the projector's first line; no seed where no password is wanted."""
     return b"PJLINK 0\r" if seed is None else f"PJLINK 1 {seed}\r".encode("ascii")
@@ -176,7 +154,7 @@ def encode_request(request: PjLinkRequest) -> bytes:
 
 def parse_request(line: bytes) -> PjLinkRequest:
     """Return the command in a line, without its end."""
-    found = re.fullmatch(rb"([0-9A-Fa-f]{96}|[0-9A-Fa-f]{32})?%([0-9])([0-9A-Za-z]{4}) (.{1,128})", line, re.DOTALL)
+    found = re.fullmatch(rb"([0-9A-Fa-f]{32})?%([0-9])([0-9A-Za-z]{4}) (.{1,128})", line, re.DOTALL)
     if found is None:
         raise ProtocolError(
             f"{quoted(line)} is no PJLink command; expected %1 or %2, four letters, a space, a parameter"
@@ -266,14 +244,6 @@ def parse_lamps(value: str) -> tuple[Lamp, ...]:
     return tuple(Lamp(int(hours), lit == "1") for hours, lit in zip(words[::2], words[1::2], strict=True))
 
 
-@dataclass(frozen=True)
-class Input:
-    """One input: its code of two characters, kind and number, and its name, empty where the projector has none."""
-
-    code: str
-    name: str = ""
-
-
 def is_class_1_input(code: str) -> bool:
     """Return whether a code may be used in class 1."""
     return re.fullmatch("[1-5][1-9]", code) is not None
@@ -302,26 +272,20 @@ class NoResolution(Enum):
 
 
 def format_resolution(resolution: Resolution | NoResolution) -> str:
-    """Return the value of IRES or RRES."""
+    """Return the value of IRES."""
     if isinstance(resolution, NoResolution):
         return resolution.value
     return f"{resolution.width}x{resolution.height}"
 
 
-def parse_resolution(value: str, command: str = "RRES") -> Resolution:
-    """Return the resolution in a value ``1920x1080``."""
+def parse_input_resolution(value: str) -> Resolution | NoResolution:
+    """Return the resolution that IRES answers, such as ``1920x1080``, or why there is none."""
+    if value in ("-", "*"):
+        return NoResolution(value)
     found = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", value, re.ASCII)
     if found is None:
-        raise _unexpected(command, value, "width, x and height in pixels")
+        raise _unexpected("IRES", value, "width, x and height in pixels, - or *")
     return Resolution(int(found[1]), int(found[2]))
-
-
-def parse_input_resolution(value: str) -> Resolution | NoResolution:
-    """Return the resolution that IRES answers, or why there is none."""
-    try:
-        return NoResolution(value)
-    except ValueError:
-        return parse_resolution(value, "IRES")
 
 
 def format_freeze(frozen: bool) -> str:
@@ -458,9 +422,9 @@ class PjLinkProjector:
             self._class = 1 if value is None else parse_class(value)
         return self._class
 
-    def input(self) -> Input:
-        """Return the input that is selected, without its name; refused unless the projector is on."""
-        return Input(parse_input(self._ask("INPT", level=min(self.pjlink_class(), 2))))
+    def input(self) -> str:
+        """Return the code of the input that is selected; refused unless the projector is on."""
+        return parse_input(self._ask("INPT", level=min(self.pjlink_class(), 2)))
 
     def input_resolution(self) -> Resolution | NoResolution | None:
         """Return the resolution of the signal, or why it has none; None where it cannot tell; class 2."""
@@ -639,27 +603,22 @@ class FoundProjector:
 
 def search(
     seconds: float = COLLECT_S,
-    enough: int | None = None,
     address: str = BROADCAST,
-    port: int = PORT,
     listen_port: int = PORT,
     open_socket: Callable[[int], UdpSocket] = UdpSocket,
     clock: Clock = SYSTEM_CLOCK,
 ) -> tuple[FoundProjector, ...]:
     """Ask all projectors of the network to answer, and return those that do, in the order of their answers.
 
-    `enough`: return as soon as so many have answered; None waits the whole time. `clock`: measures `seconds`.
+    `address`: of the broadcast. `clock`: measures `seconds`.
     """
     found: dict[FoundProjector, None] = {}
     with open_socket(listen_port) as datagrams:
         start = clock.monotonic()
         asked = 0
-        while enough is None or len(found) < enough:
-            passed = clock.monotonic() - start
-            if passed >= seconds:
-                break
+        while (passed := clock.monotonic() - start) < seconds:
             if asked < ASKED and passed >= asked * ASK_EVERY_S:
-                datagrams.send(SEARCH, (address, port))
+                datagrams.send(SEARCH, (address, PORT))
                 asked += 1
             ends = min(seconds, asked * ASK_EVERY_S) if asked < ASKED else seconds
             try:

@@ -1,14 +1,11 @@
 """Divide an archive of thumbnails at random: the lights of one part to generate under, the rest to test on.
 
 `python examples/halves.py nus_canon_600d_64x64.npz [FOLDER] [--names PART] [--parts N]` writes for each half H, 0 and
-1, into the folder (the working folder by default): `half_H.npz`, the images; `lights_H.csv` (r,g,b a line, of sum 1)
-for `generate --match`; and `images_H.csv` (column image) for `evaluate transfer --only`. A set that was made by half 0
-is tested on the images of half 1 and the reverse, so that every image is tested once and no test light was looked at.
-`all.npz` holds both halves; with `--names` only images whose names contain PART.
-
-Of N parts, `others_P.npz` and `others_P.csv` are images and lights of all but part P, whose images `images_P.csv`
-names; `folds.csv` (image,fold) is for `evaluate transfer --folds`: real images beside a set are then drawn of those
-under whose lights it was made.
+1, into the folder (the working folder by default): `half_H.npz`, the images, for `evaluate transfer`; and
+`lights_H.csv` (r,g,b a line, of sum 1) for `generate --match`. A set that was made by half 0 is tested on the images of
+half 1 and the reverse, so that every image is tested once and no test light was looked at. With `--names` only images
+whose names contain PART are taken. Of N parts, `others_P.npz` and `others_P.csv` are images and lights of all but part
+P, whose images are `half_P.npz`.
 """
 
 from __future__ import annotations
@@ -39,7 +36,6 @@ def main() -> None:
     if given.names:
         chosen = np.array([given.names in name for name in data["names"].tolist()])
         data = {name: values[chosen] for name, values in data.items()}
-    save(given.folder / "all.npz", **data)
     order = np.random.default_rng(SEED).permutation(len(data["gt"]))
     chromaticities = data["gt"] / data["gt"].sum(axis=1, keepdims=True)
     folds = np.empty(len(order), np.int64)
@@ -50,10 +46,6 @@ def main() -> None:
             save(given.folder / f"{name}.npz", **{key: values[kept] for key, values in data.items()})
             lights = "".join("{:.6f},{:.6f},{:.6f}\n".format(*row) for row in chromaticities[kept])
             (given.folder / f"{name.replace('half', 'lights')}.csv").write_text(f"r,g,b\n{lights}")
-        listed = "\n".join(data["names"][folds == part].tolist())
-        (given.folder / f"images_{part}.csv").write_text(f"image\n{listed}\n")
-    rows = "".join(f"{name},{fold}\n" for name, fold in zip(data["names"].tolist(), folds, strict=True))
-    (given.folder / "folds.csv").write_text(f"image,fold\n{rows}")
     print(f"{given.folder}: {' and '.join(map(str, np.bincount(folds)))} images")
 
 

@@ -11,8 +11,7 @@
 #
 # LEVERS (environment) chooses some of the renderings below, by default all. Naive rows are made for each of them, of the same
 # pictures under the same lights; NAIVE=no leaves them out, which are half of the work. LEARNERS names the methods; most
-# of the time is log-chroma's. REAL=0,20,100,400,all also trains beside so many real images of the other parts, in the
-# ways that BESIDE names (adapted; pooled doubles the time).
+# of the time is log-chroma's. REAL=20,100,all also trains beside so many real images of the tested part.
 set -euo pipefail
 pictures=$(realpath "$1") archives=$(realpath "$2") out=$3 seeds=${4:-5}
 here=$(realpath "$(dirname "$0")")
@@ -35,7 +34,6 @@ for camera in 600d 1ds 5dsr; do
     half=halves/$camera
     once "$half" python "$here/halves.py" "$archives/${archive[$camera]}.npz" "$half" \
         --names "${part[$camera]}" --parts "${parts[$camera]}"
-    [ -e "$half/$camera.npz" ] || mv "$half/all.npz" "$half/$camera.npz"
     once "tables/$camera" sim table --camera "${sensitivities[$camera]}" "tables/$camera"
     for ((test = 0; test < parts[$camera]; test++)); do
         colorimetric=(--rendering colorimetric --matrix "${matrix[$camera]}")
@@ -51,14 +49,12 @@ for camera in 600d 1ds 5dsr; do
             set=sets/$camera$test/$lever
             once "$set" generate "tables/$camera" "$set" --sources "$pictures" --max-side 160 --no-preview \
                 --match "$half/others_$test.csv" --seed 1 "${options[@]}"
-            sets+=(--train "$set")
+            sets+=("$set")
         done
-        naive=(--naive "$pictures" --matrix "${matrix[$camera]}")
+        naive=(--naive "$pictures")
         [ "${NAIVE:-yes}" = no ] && naive=()
-        once "results/$camera$test" evaluate transfer "${sets[@]}" --test "$half/$camera.npz" \
-            --only "$half/images_$test.csv" --side 64 --images 900 --seeds "$seeds" --error recovery --statistics none \
-            --methods "$learners" "${naive[@]}" --folds "$half/folds.csv" \
-            --relit "$archives/${archive[${relit[$camera]}]}.npz" \
-            ${REAL:+--real "$REAL" --beside "${BESIDE:-adapted}"} --out "results/$camera$test"
+        once "results/$camera$test" evaluate transfer "$half/half_$test.npz" "${sets[@]}" --seeds "$seeds" \
+            --error recovery --method "$learners" "${naive[@]}" \
+            --relit "$archives/${archive[${relit[$camera]}]}.npz" ${REAL:+--real "$REAL"} --out "results/$camera$test"
     done
 done

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, cast
 from urllib.parse import urlsplit
 
 import tomli_w
+from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -74,8 +75,6 @@ def spdx_expression(licence: str) -> str:
 
     SPDX specification 2.3, annex D, so that programs and lawyers read the same; anything else is a ValueError.
     """
-    from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
-
     if not licence.strip():
         return ""
     try:

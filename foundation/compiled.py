@@ -18,6 +18,7 @@ import re
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache, update_wrapper
 from pathlib import Path
@@ -244,8 +245,6 @@ def ordered_map(function: Callable[[_In], _Out], things: Iterable[_In], workers:
     >>> list(ordered_map(abs, [-3, 2, -1], workers=2))
     [3, 2, 1]
     """
-    from concurrent.futures import Future, ThreadPoolExecutor
-
     if workers <= 1:
         yield from map(function, things)
         return

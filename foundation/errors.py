@@ -25,6 +25,7 @@ of these at the place where the library is called, with ``from error``.
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import PurePath
@@ -180,8 +181,6 @@ def nearest_names(wanted: str, known: Iterable[str], most: int = 1) -> str:
     >>> nearest_names("Grey_World", ["gray-world", "white-patch"])
     "did you mean 'gray-world'?"
     """
-    import difflib
-
     plain = {re.sub(r"[\s_-]+", "", name).lower(): name for name in known}
     near = difflib.get_close_matches(re.sub(r"[\s_-]+", "", wanted).lower(), plain, n=most, cutoff=0.5)
     return f"did you mean {' or '.join(repr(plain[name]) for name in near)}?" if near else ""

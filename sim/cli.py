@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import queue
 import signal
+import tomllib
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from foundation import console
+from foundation.clock import SystemClock
 from foundation.console import EXIT_CODES, new_app, option
+from foundation.errors import ConfigurationError, InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -57,8 +61,6 @@ def projector(
     """
     from drivers.pjlink import MAX_PASSWORD
     from drivers.projector import Power
-    from foundation.clock import SystemClock
-    from foundation.errors import ConfigurationError, InputError
     from sim.projectors.pjlink import serve_pjlink
     from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 
@@ -81,7 +83,6 @@ def projector(
 
 def _serve_serial(device: SimulatedProjector, named: str) -> None:
     from drivers.serial_projectors.language import load_language
-    from foundation.errors import ConfigurationError
 
     language = load_language(named)
     try:
@@ -125,12 +126,8 @@ def camera(
 
     gphoto2 --camera "PTP/IP Camera" --port ptpip:127.0.0.1:15740:15740 --capture-image-and-download
     """
-    from concurrent.futures import ThreadPoolExecutor
-
     from drivers.canon import SHUTTER
     from drivers.ptp.codes import Property
-    from foundation.clock import SystemClock
-    from foundation.errors import ConfigurationError
     from sim.buses.ptp import serve_ptpip
     from sim.camera.bodies import EOS_BODIES
     from sim.camera.eos import SimulatedEos
@@ -168,7 +165,6 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
     from drivers.links.network import TcpLink
     from drivers.pjlink import PjLinkProjector
     from drivers.presenter import WHITE
-    from foundation.clock import SystemClock
     from sim.camera.film import WatchedFilm, WorldFilm
     from sim.projectors.watching import Beam, ScreenPlace, Screenshots
     from sim.world.world import REFERENCE_EXPOSURE
@@ -201,8 +197,6 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
 
 def _print(context: typer.Context, chart: Path) -> Print:
     """Return the print of a chart, by the reader that `main` was given."""
-    from foundation.errors import ConfigurationError
-
     read: Callable[[Path], Print] | None = context.obj
     if read is None:
         raise ConfigurationError(f"--chart {chart}: charts are read by the program sim; this is sim.cli alone")
@@ -211,10 +205,6 @@ def _print(context: typer.Context, chart: Path) -> Print:
 
 def _setting(option: str, given: str) -> tuple[str, Any]:
     """Return name and value of ``name=value``; the value as TOML has it, text also without quotes."""
-    import tomllib
-
-    from foundation.errors import InputError
-
     name, equals, value = given.partition("=")
     if not name or not equals:
         raise InputError(f"{option} {given!r}: NAME=VALUE expected, such as waviness_mm=1.5")
@@ -238,7 +228,6 @@ def _grey_squares() -> Print:
 
 
 def _host_and_port(text: str) -> tuple[str, int]:
-    from foundation.errors import InputError
 
     host, _, port = text.rpartition(":")
     if not host or not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:

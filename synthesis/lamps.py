@@ -35,6 +35,7 @@ from drivers.raw.storage import Area
 from experiment.lights import Illumination, parse_ccts, shown_colour
 from foundation.colorimetry import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError, nearest_names
+from foundation.files import sha256_of
 from sim.spectral import (
     WAVELENGTHS_NM,
     PublishedSpectrum,
@@ -94,8 +95,6 @@ class LightSpectra:
 
 def read_lights(given: str) -> LightSpectra:
     """Return the lights that a text names: a CSV file's, or published ones."""
-    from foundation.files import sha256_of
-
     path = Path(given)
     if path.is_file() or path.suffix.lower() == ".csv":
         try:

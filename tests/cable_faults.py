@@ -46,23 +46,18 @@ class TroubledResponder:
         self.good = good
 
     def takes_data(self, request: PtpRequest) -> bool:
-        """Ask the good device."""
         return self.good.takes_data(request)
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-        """Ask the good device."""
         return self.good.answer(request, data)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Ask the good device."""
         return self.good.events()
 
     def cancelled(self, transaction: int) -> None:
-        """Tell the good device."""
         self.good.cancelled(transaction)
 
     def unplugged(self) -> None:
-        """Tell the good device."""
         self.good.unplugged()
 
 
@@ -183,49 +178,38 @@ class TroubledPipes:
 
     @property
     def label(self) -> str:
-        """Ask the good pipes."""
         return self.good.label
 
     @property
     def packet_size(self) -> int:
-        """Ask the good pipes."""
         return self.good.packet_size
 
     @property
     def polling_s(self) -> float:
-        """Ask the good pipes."""
         return self.good.polling_s
 
     def bulk_write(self, data: bytes, timeout: float) -> None:
-        """Write to the good pipe."""
         self.good.bulk_write(data, timeout)
 
     def bulk_read(self, limit: int, timeout: float) -> bytes:
-        """Read from the good pipe."""
         return self.good.bulk_read(limit, timeout)
 
     def interrupt_read(self, timeout: float) -> bytes:
-        """Read from the good pipe."""
         return self.good.interrupt_read(timeout)
 
     def control_out(self, request: int, data: bytes, timeout: float) -> None:
-        """Write to the good pipe."""
         self.good.control_out(request, data, timeout)
 
     def control_in(self, request: int, limit: int, timeout: float) -> bytes:
-        """Read from the good pipe."""
         return self.good.control_in(request, limit, timeout)
 
     def clear_halt(self, pipe: Pipe) -> None:
-        """Tell the good pipes."""
         self.good.clear_halt(pipe)
 
     def reset_port(self) -> None:
-        """Tell the good pipes."""
         self.good.reset_port()
 
     def close(self) -> None:
-        """Close the good pipes."""
         self.good.close()
 
 
@@ -385,7 +369,6 @@ class TroubledTransport:
 
     @property
     def label(self) -> str:
-        """Ask the good cable."""
         return self.good.label
 
     def transact(
@@ -396,19 +379,15 @@ class TroubledTransport:
         receive: Callable[[bytes], object] | None = None,
         timeout: float,
     ) -> Transaction:
-        """Carry it out over the good cable."""
         return self.good.transact(request, send=send, receive=receive, timeout=timeout)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Ask the good cable."""
         return self.good.events()
 
     def reset(self) -> None:
-        """Reset the good cable."""
         self.good.reset()
 
     def close(self) -> None:
-        """Close the good cable."""
         self.good.close()
 
 

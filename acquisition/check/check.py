@@ -27,6 +27,7 @@ from acquisition.check.exposure import (
     search,
 )
 from acquisition.check.findings import CheckReport, Finding, judged, not_checked, not_checked_all
+from acquisition.check.picture import check_png
 from acquisition.check.supplies import judge_disk, judge_noise_reduction, judge_supplies
 from acquisition.check.trial import (
     Trial,
@@ -101,7 +102,6 @@ def check_lab(
 
     `picture`: where to draw what was found, PNG. `corners`: of the field of a chart without tags, as given by hand,
     half-size px. `linearity`: whether to take a series of exposures that shows the sensor's linearity.
-    `session`: where the session is to lie, for the disk's free space; the settings' folder if not given.
     """
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
@@ -149,8 +149,6 @@ def check_lab(
     outcome = None if trial.table is None else verdict.outcome
     report = CheckReport(tuple(lines), tuple(findings), outcome, values, trial.not_known)
     if picture is not None:
-        from acquisition.check.picture import check_png
-
         write_whole(picture, check_png(trial, chart, report))
     return report
 

@@ -26,6 +26,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import maximum_filter
 
 from acquisition.judge import limits
 from acquisition.judge.measure import Anchor, Frame, disagreement, refusal
@@ -47,6 +48,17 @@ from acquisition.judge.state import (
     is_brightest_grey,
     primary_of,
 )
+from calibration.figures.light import (
+    ADDITIVITY,
+    DARK_DRIFT,
+    LEAK_SHARE,
+    OFF_BRIGHTNESS,
+    OFF_CODES_DEG,
+    STRAY_SHARE,
+    WHITE_DRIFT,
+)
+from calibration.figures.radiometry import OTHER_CAMERA
+from calibration.figures.single_frames import EMPTY_PHOTOSITES, REPEATED, ROWS, UNIFORMITY
 from drivers.raw.rawfile import CHANNELS, Channel, Mosaic, filled_fault, frame_black, phases, read_raw
 from experiment.chart.model import Chart
 from experiment.config import JudgeSettings, LabSettings
@@ -115,7 +127,7 @@ class LiveJudge:
             self.after_pause()
         expected, self._state = self._state.expected, replace(self._state, expected=None)
         if expected not in (None, step.number):
-            return Judgement.of_reason("light", _BESIDE)
+            return Judgement.of_reason(OFF_CODES_DEG.name, _BESIDE)
         try:
             mosaic = read_raw(file)
         except FormatError as error:
@@ -165,7 +177,7 @@ class LiveJudge:
         if any(check.reason for check in checks):
             return _Findings(frame, tuple(checks))
         if state.awaits_primaries and (step.kind == "light" or (step.kind == "response" and not _is_compared(step))):
-            return _Findings(frame, (*checks, Check("light", reason=_UNFOUNDED)))
+            return _Findings(frame, (*checks, Check(OFF_CODES_DEG.name, reason=_UNFOUNDED)))
         anchor = state.anchor
         if step.kind != "dark" and (
             anchor is None or (state.rested and _has_moved_far(state, mosaic, black, measured))
@@ -220,7 +232,7 @@ class LiveJudge:
         checks += [*evenness, *of_light]
         if step.kind == "white" and state.modelled:
             # Told, and never a reason to refuse.
-            checks.append(Check("additivity", round(100 * state.model.overlap, 2), None, None, "%"))
+            checks.append(Check(ADDITIVITY.name, round(100 * state.model.overlap, 2), None, None, "%"))
         return _Findings(frame, tuple(checks), light, off, lamp)
 
     def _preview(
@@ -264,7 +276,7 @@ def _judge_basis(state: JudgeState, following: JudgeState) -> Check | None:
     checks, _ = _judge_evenness(following.basis, following.basis.light(state.witness), state.witness, moved)
     if all(check.passed for check in checks):
         return None
-    uneven = next((check for check in checks if check.name == "uniformity"), Check("uniformity"))
+    uneven = next((check for check in checks if check.name == "uniformity"), Check(UNIFORMITY.name))
     return replace(
         uneven,
         reason="the frames of the three primaries do not add up to the white or grey frame before them everywhere; did "
@@ -292,15 +304,15 @@ def _judge_origin(
                 )
     differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
     empty = ""
-    if measured.empty > limits.EMPTY_SHARE:
+    if measured.empty > EMPTY_PHOTOSITES.accept:
         empty = (
-            f"{measured.empty:.2%} of the photosites have no count, {limits.EMPTY_SHARE:.3%} allowed; part of the file "
-            "was lost on its way: check the cable and the memory card"
+            f"{measured.empty:.2%} of the photosites have no count, {EMPTY_PHOTOSITES.accept:.3%} allowed; "
+            f"{EMPTY_PHOTOSITES.why}: {EMPTY_PHOTOSITES.remedy}"
         )
     return (
-        Check("camera", reason=reason),
+        Check(OTHER_CAMERA.name, reason=reason),
         Check("settings", reason=differs or ""),
-        Check("data", round(100 * measured.empty, 4), None, 100 * limits.EMPTY_SHARE, "%", empty),
+        Check(EMPTY_PHOTOSITES.name, round(100 * measured.empty, 4), None, 100 * EMPTY_PHOTOSITES.accept, "%", empty),
     )
 
 
@@ -308,17 +320,17 @@ def _judge_repeated(state: JudgeState, measured: Measured, settings: LabSettings
     """Return whether the camera gave a frame again that it gave before: its noise is the same."""
     if settings.rig == "replay":
         # A recording has one frame of a light, and gives it as often as it is asked.
-        return Check("repeated")
-    reason = "the camera handed out a frame that it had given before; check its cable and its memory card"
+        return Check(REPEATED.name)
+    reason = f"{REPEATED.why}; {REPEATED.remedy}"
     if measured.digest in state.digests:
-        return Check("repeated", 0.0, limits.SAME_NOISE, None, "", reason)
+        return Check(REPEATED.name, 0.0, REPEATED.accept, None, "", reason)
     values = [_independence(measured, seen.measured) for seen in state.recent]
     told = [value for value in values if value is not None]
     if not told:
-        return Check("repeated")
+        return Check(REPEATED.name)
     least = min(told)
-    low = least < limits.SAME_NOISE
-    return Check("repeated", round(least, 3), limits.SAME_NOISE, None, "", reason if low else "")
+    low = least < REPEATED.accept
+    return Check(REPEATED.name, round(least, 3), REPEATED.accept, None, "", reason if low else "")
 
 
 def _independence(one: Measured, other: Measured) -> float | None:
@@ -443,7 +455,10 @@ MOST_RESTARTS: Final = 2
 """How often first frames are taken again at once because others contradict them: what passes does so within a minute,
 and what comes back for the third time wants somebody who looks."""
 
-_CONTRADICTIONS: Final = ("movement", "blur", "rows", "uniformity", "light", "ambient", "lamp")
+_CONTRADICTIONS: Final = (
+    "movement", "blur", "rows", "uniformity",
+    OFF_CODES_DEG.name, STRAY_SHARE.name, DARK_DRIFT.name, OFF_BRIGHTNESS.name,
+)  # fmt: skip
 """Checks that hold a frame against those before it."""
 
 _STALE_LEAST = 0.02
@@ -457,7 +472,7 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
     24, that changed most, so that a lamp in a corner shows.
     """
     if state.white is None:
-        return (Check("dark"),)
+        return (Check(LEAK_SHARE.name),)
     white = state.white.tiles - (0 if state.dark is None else state.dark.tiles)
     # Of a tile that white hardly lights, such as a black backdrop, against a third of the mean.
     scale = np.maximum(white, np.maximum(white.mean(axis=0) / 3, 1.0))
@@ -478,7 +493,7 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
             f"the dark frame has {value:.1f} % of white, {dark_percent:g} % allowed; is another light on, or the "
             "projector's picture not black?"
         )
-    checks = [Check("light" if stale else "dark", round(value, 3), None, dark_percent, "%", reason)]
+    checks = [Check(OFF_CODES_DEG.name if stale else LEAK_SHARE.name, round(value, 3), None, dark_percent, "%", reason)]
     first = state.first_dark
     if first is not None and not reason:
         changed = _by_region(100 * (frame.tiles - first.tiles) / scale)
@@ -497,7 +512,7 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
                 f"the room is not as dark as in the first dark frame: {drift:.2f} % of white {more}, {limit:.2g} % "
                 "allowed; was a lamp or a display switched, or does daylight come in?"
             )
-        checks.append(Check("ambient", round(drift, 3), None, round(limit, 3), "%", reason))
+        checks.append(Check(DARK_DRIFT.name, round(drift, 3), None, round(limit, 3), "%", reason))
     return tuple(checks)
 
 
@@ -511,7 +526,7 @@ def _by_region(tiles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 def judge_white(first: Frame | None, frame: Frame) -> Check:
     """Return how far paper is from that of the session's first frame of this light, white or the brightest grey."""
     if first is None or np.isnan(frame.paper).any() or np.isnan(first.paper).any():
-        return Check("white drift")
+        return Check(WHITE_DRIFT.name)
     drift = float(100 * (frame.paper.sum() / max(first.paper.sum(), 1.0) - 1))
     reason = ""
     if abs(drift) > limits.LAMP_TOTAL:
@@ -519,7 +534,7 @@ def judge_white(first: Frame | None, frame: Frame) -> Check:
             f"paper white is {drift:+.0f} % from the session's first frame, {limits.LAMP_TOTAL:g} % allowed; let "
             "the lamp warm up, or begin a new session"
         )
-    return Check("white drift", round(drift, 2), -limits.LAMP_TOTAL, limits.LAMP_TOTAL, "%", reason)
+    return Check(WHITE_DRIFT.name, round(drift, 2), -limits.LAMP_TOTAL, limits.LAMP_TOTAL, "%", reason)
 
 
 def judge_first_primary(state: JudgeState, frame: Measured, primary: int) -> Check:
@@ -528,7 +543,7 @@ def judge_first_primary(state: JudgeState, frame: Measured, primary: int) -> Che
     Of a frame's three channels none sees another's primary better than its own, whatever the camera.
     """
     if state.white is None:
-        return Check("light")
+        return Check(OFF_CODES_DEG.name)
     dark = np.zeros(3) if state.dark is None else state.dark.level
     share = (frame.level - dark) / np.maximum(state.white.level - dark, 1.0)
     name = ("red", "green", "blue")[primary]
@@ -545,7 +560,7 @@ def judge_first_primary(state: JudgeState, frame: Measured, primary: int) -> Che
         reason = (
             f"{name} alone was ordered, and the frame is as bright as white everywhere; does the screen stand still?"
         )
-    return Check("light", round(100 * float(share[primary]), 1), 10.0, None, "%", reason)
+    return Check(OFF_CODES_DEG.name, round(100 * float(share[primary]), 1), 10.0, None, "%", reason)
 
 
 def judge_first_frames(state: JudgeState, step: SessionStep, cause: Check | None, judge: JudgeSettings) -> Check | None:
@@ -589,7 +604,7 @@ def _odd_white(state: JudgeState, judge: JudgeSettings) -> Check | None:
     limit = max(judge.light_deg, fit.angle_limit(limits.LIGHT_SIGMAS))
     if fit.angle_deg > limit:
         said = f"the first white frame is {fit.angle_deg:.1f}° from the light that greys and primaries foretell"
-        return Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", said)
+        return Check(OFF_CODES_DEG.name, round(fit.angle_deg, 3), None, round(limit, 3), "°", said)
     room = max(judge.drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
     if abs(fit.brightness) > room:
         percent = 100 * float(np.expm1(fit.brightness))
@@ -615,12 +630,17 @@ class _FrameCause:
     in_each_light: bool = False
 
 
-_OF_THE_LIGHT = frozenset({"uniformity", "blur", "light", "lamp", "white drift"})
+_ELSEWHERE = frozenset({STRAY_SHARE.name, DARK_DRIFT.name})
+"""Light from elsewhere: in a light, and in a dark frame against the first one."""
+
+_AMBIENT = _FrameCause(frozenset({OFF_CODES_DEG.name, OFF_BRIGHTNESS.name, "uniformity"}), is_hidden=True)
+
+_OF_THE_LIGHT = frozenset({"uniformity", "blur", OFF_CODES_DEG.name, OFF_BRIGHTNESS.name, WHITE_DRIFT.name})
 
 CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
     {
         "file": _FrameCause(),
-        "camera": _FrameCause(lasts=True),
+        OTHER_CAMERA.name: _FrameCause(lasts=True),
         "settings": _FrameCause(),
         "data": _FrameCause(),
         "repeated": _FrameCause(),
@@ -629,14 +649,17 @@ CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
         "chart": _FrameCause(lasts=True),
         "movement": _FrameCause(_OF_THE_LIGHT | {"rows"}),
         "blur": _FrameCause(frozenset({"rows", "uniformity"})),
-        "rows": _FrameCause(_OF_THE_LIGHT | {"movement", "ambient"}, in_each_light=True),
-        "uniformity": _FrameCause(_OF_THE_LIGHT - {"uniformity"} | {"rows", "movement", "ambient"}, in_each_light=True),
-        "light": _FrameCause(frozenset({"lamp", "ambient", "white drift"}), in_each_light=True),
-        "ambient": _FrameCause(frozenset({"light", "lamp", "uniformity"}), is_hidden=True),
-        "lamp": _FrameCause(in_each_light=True),
-        "dark": _FrameCause(is_hidden=True),
-        "white drift": _FrameCause(in_each_light=True),
-        "additivity": _FrameCause(),
+        "rows": _FrameCause(_OF_THE_LIGHT | _ELSEWHERE | {"movement"}, in_each_light=True),
+        "uniformity": _FrameCause(
+            _OF_THE_LIGHT - {"uniformity"} | _ELSEWHERE | {"rows", "movement"}, in_each_light=True
+        ),
+        OFF_CODES_DEG.name: _FrameCause(_ELSEWHERE | {OFF_BRIGHTNESS.name, WHITE_DRIFT.name}, in_each_light=True),
+        STRAY_SHARE.name: _AMBIENT,
+        DARK_DRIFT.name: _AMBIENT,
+        OFF_BRIGHTNESS.name: _FrameCause(in_each_light=True),
+        LEAK_SHARE.name: _FrameCause(is_hidden=True),
+        WHITE_DRIFT.name: _FrameCause(in_each_light=True),
+        ADDITIVITY.name: _FrameCause(),
     }
 )
 """Checks in the order in which they are named as the cause: what comes first explains what comes after."""
@@ -689,7 +712,7 @@ def _voids_others(state: JudgeState, cause: str) -> bool:
 def _is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
     """Return whether taking the frame again will not help; `state` includes it."""
     # A lamp that is another one at the beginning of a run would cost every light up to the next white frame.
-    another = cause == "white drift" and is_brightest_grey(step)
+    another = cause == WHITE_DRIFT.name and is_brightest_grey(step)
     # Of a session's first frame the exposure is too long, and a second one is no shorter.
     overexposed = cause == "clipping" and state.white is None
     return another or overexposed or CAUSES[cause].lasts or state.refused[1] >= limits.LASTING_FRAMES
@@ -735,7 +758,7 @@ def _judge_light(
     wrong = fit.angle_deg > limit
     reason, added = "", 0.0
     if wrong or fit.distance > limits.STALE_SIGMAS or abs(fit.brightness) > room:
-        reason, added = seen.cause(wrong, room, again=state.refused[0] == "light")
+        reason, added = seen.cause(wrong, room, again=state.refused[0] == OFF_CODES_DEG.name)
     stepped = False
     lamp = ""
     if not reason and abs(fit.brightness) > room:
@@ -747,11 +770,11 @@ def _judge_light(
     if not reason and not lamp and not stepped and not state.rested:
         lamp, added = crept(state.leaning.then(leaning), drift_percent / 100)
         reason = _ambient_reason(added) if added else ""
-    ambient = (Check("ambient", round(100 * added, 2), None, None, "%", reason),) if added else ()
+    ambient = (Check(STRAY_SHARE.name, round(100 * added, 2), None, None, "%", reason),) if added else ()
     # Where another cause changes the light, its brightness is none of the lamp's.
     checks = (
         *ambient,
-        Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
+        Check(OFF_CODES_DEG.name, round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
         lamp_check(fit.brightness, room, lamp),
     )
     return checks, LampSeen(fit.brightness, stepped, leaning)
@@ -765,7 +788,7 @@ def lamp_check(brightness: float, room: float, reason: str) -> Check:
     """
     allowed = round(100 * room, 2) if 100 * room < limits.LAMP_TOTAL else None
     low = None if allowed is None else -allowed
-    return Check("lamp", round(100 * float(np.expm1(brightness)), 2), low, allowed, "%", reason)
+    return Check(OFF_BRIGHTNESS.name, round(100 * float(np.expm1(brightness)), 2), low, allowed, "%", reason)
 
 
 def crept(leaning: Leaning, drift: float) -> tuple[str, float]:
@@ -992,7 +1015,7 @@ def _brightness_reason(brightness: float) -> str:
 def _without_model(light: FrameLight, codes: Codes, before: Seen | None) -> Check:
     """Return what can be said without frames of the primaries: whether nothing has changed since the frame before."""
     if before is None or before.amounts is None or before.codes == codes or not any(codes) or not any(before.codes):
-        return Check("light")
+        return Check(OFF_CODES_DEG.name)
     wanted = np.array([decode_srgb(np.array(c) / 255) for c in (codes, before.codes)])
     away = float(angles_deg(wanted[:1], wanted[1:])[0])
     brighter = abs(float(np.log(wanted[0].sum() / wanted[1].sum())))
@@ -1000,7 +1023,7 @@ def _without_model(light: FrameLight, codes: Codes, before: Seen | None) -> Chec
     reason = ""
     if same < 2 * limits.STALE_SIGMAS and (away > limits.NOMINAL_DEG or brighter > 0.2):
         reason = _stale_reason(before, codes)
-    return Check("light", reason=reason)
+    return Check(OFF_CODES_DEG.name, reason=reason)
 
 
 def _stale_reason(before: Seen, codes: Codes) -> str:
@@ -1058,7 +1081,7 @@ def _judge_evenness(
     still be seen in a part; None where there is none.
     """
     rest = light.tiles
-    systematic = limits.UNEVEN if basis.of_primaries else limits.UNEVEN_WHITE
+    systematic = UNIFORMITY.accept if basis.of_primaries else limits.UNEVEN_WHITE
     by = float(np.hypot(*moved_px)) / float(np.diff(frame.places.x_edges).mean())
     # Cells that moved across a tile's edge are others than before, and so is paper that moved over the backdrop.
     systematic = systematic + by * _CONTRAST * _beside(basis)
@@ -1071,7 +1094,7 @@ def _judge_evenness(
     late = _share_of_before(basis, light, frame, off, before)
     reason = _uneven_reason(rest, off, late) if off.sum() >= least else ""
     value, limit = (100 * float(np.nan_to_num(number)) for number in (rest.relative[worst], allowed[worst]))
-    checks = [Check("uniformity", round(value, 2), None, round(limit, 2), "%", reason)]
+    checks = [Check(UNIFORMITY.name, round(value, 2), None, round(limit, 2), "%", reason)]
     if len(frame.strips):
         checks += _judge_rows(basis, light, frame, moved_px, bool(reason))
     return checks, off if reason else np.zeros_like(off)
@@ -1106,8 +1129,6 @@ def _explained(seen: _Array, by: _Array) -> tuple[_Array, float]:
 
 def _beside(basis: Basis) -> _Array:
     """Return (T,) float64, ≥ 1: white of the brightest tile beside or at each tile, over its own."""
-    from scipy.ndimage import maximum_filter
-
     strength = np.linalg.norm(basis.maps.sum(axis=0), axis=1).reshape(TILE_ROWS, TILE_COLUMNS)
     return np.asarray(maximum_filter(strength, 3) / np.maximum(strength, 1e-6), dtype=np.float64).ravel()
 
@@ -1120,8 +1141,8 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
         return []
     wrong = _wrong_rows(basis, rest, moved_px)
     count = int(wrong.sum())
-    checks = [Check("rows", float(count), None, float(limits.ROWS))]
-    if count <= limits.ROWS:
+    checks = [Check(ROWS.name, float(count), None, float(ROWS.accept))]
+    if count <= ROWS.accept:
         return checks
     for sigma in _BLURS:
         soft = basis.strips(frame, light.amounts, down, sigma)
@@ -1146,14 +1167,14 @@ def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Arr
         f"{len(rows)} rows of blocks, from row {2 * int(rows[0])} of the frame to {2 * int(rows[-1]) + 1}, do not show "
         f"what belongs there; {cause}"
     )
-    return [Check("rows", float(count), None, float(limits.ROWS), "", reason)]
+    return [Check(ROWS.name, float(count), None, float(ROWS.accept), "", reason)]
 
 
 def _is_ragged(rest: Residuals, wrong: npt.NDArray[np.bool_]) -> bool:
     """Return whether strips (S,) bool that deviate do so row by row otherwise; a shadow goes on from row to row."""
     deviation, of = np.nan_to_num(rest.signed).reshape(-1, SEGMENTS), wrong.reshape(-1, SEGMENTS)
     both = of[1:] & of[:-1]
-    if np.count_nonzero(both) < limits.ROWS:
+    if np.count_nonzero(both) < ROWS.accept:
         return False
     steps = np.abs(np.diff(deviation, axis=0))[both]
     return bool(np.median(steps) > _RAGGED * np.median(np.abs(rest.signed[wrong])))

@@ -1,4 +1,4 @@
-"""By which limits frames are judged, beside those that LAB.toml sets in `[judge]` and `[limits]`, each with its reason.
+"""How surely frames are judged, besides the limits of `calibration.figures` and of LAB.toml, each with its reason.
 
 What scatters (colour wheel, shutter, lamp) has limits in standard deviations of the scatter that was seen; the numbers
 here are how many, and the least that makes sense.
@@ -34,10 +34,6 @@ OTHER_ADVANTAGE: Final = 20.0
 ROOM_LIGHT_PERCENT: Final = 100 * LEAK_SHARE.accept
 """Light under the black picture, of white, from which on `build-lut` remarks on it: a night of it is to be known."""
 
-UNEVEN: Final = 0.02
-"""Deviation of a tile from the light of the whole frame, relative: an LCD's unevenness changes by as much between
-codes; a lamp's arc that wanders shifts the field by less."""
-
 UNEVEN_WHITE: Final = 0.25
 """The same where the primaries are not known and the camera's own colours stand for them."""
 
@@ -53,16 +49,6 @@ cells differ by 6 to 8 % on an EOS 550D, 20 % where strips have few cells, rows 
 
 ROW_SIGMAS: Final = 8.0
 """Standard deviations of a strip, of those usual in the frame and of noise, beyond which it counts so, too."""
-
-ROWS: Final = 3
-"""Strips of rows that may deviate: a fly covers as many."""
-
-EMPTY_SHARE: Final = 1e-5
-"""Share of photosites without any count: a body's dead photosites are fewer, one lost row is 3e-4."""
-
-SAME_NOISE: Final = 0.3
-"""Noise of the difference of two frames over that of two independent ones: 1 if independent, rather more where
-photosites' own differences are large; 0.3 is a correlation of 0.9, 0 the same frame."""
 
 LEAST_NOISE: Final = 0.4
 """Standard deviation of a photosite, counts, below which noise cannot tell a repeated frame: rounding remains."""

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -159,8 +160,6 @@ class Anchor:
 
 def _paper(values: npt.NDArray[np.float32], places: _Array) -> npt.NDArray[np.int64]:
     """Return (N, 2) the middles of the brightest squares near places (N, 2) px, if they are as bright as paper."""
-    import cv2
-
     height, width = values.shape
     reach, half = _PAPER_REACH_PX, _PAPER_PX // 2
     seen = reach + half
@@ -185,8 +184,6 @@ def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
 
     Their noise is high in this frame, too: without a chart, a few tenths of a percent of a drift of white are none.
     """
-    import cv2
-
     smooth = cv2.blur(values, (3, 3))
     height, width = smooth.shape
     found: list[tuple[int, int]] = []
@@ -203,8 +200,6 @@ def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
 
 def _textures(plane: Plane) -> Framing:
     """Return a framing whose tags are the places of most texture, one in each part of the frame."""
-    import cv2
-
     values = plane.values
     height, width = values.shape
     energy = cv2.boxFilter(cv2.Laplacian(values, cv2.CV_32F) ** 2, -1, (_TEXTURE_PX, _TEXTURE_PX))

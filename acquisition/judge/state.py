@@ -35,9 +35,11 @@ from functools import cache
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import gaussian_filter1d, shift
 
 from acquisition.judge import limits
 from acquisition.judge.measure import Anchor, Frame
+from calibration.figures.light import OFF_BRIGHTNESS
 from experiment.measures.frame import SEGMENTS, Measured, Noise, strip_blocks
 from experiment.session.records import PRIMARIES, REFERENCES, TOP, SessionStep
 from foundation.robust import huber_weights, sigma_of
@@ -466,8 +468,6 @@ class Basis:
             return None
         maps = self.strip_maps
         if blur_px > 0 or abs(down_px) > _AT_REST_PX:
-            from scipy.ndimage import gaussian_filter1d, shift
-
             rows = maps.reshape(3, -1, SEGMENTS, 3)
             rows = shift(rows, (0, down_px, 0, 0), order=1, mode="nearest")
             rows = rows if blur_px == 0 else gaussian_filter1d(rows, blur_px, axis=1, mode="nearest")
@@ -700,7 +700,7 @@ class JudgeState:
         )
         if not found.accepted:
             count = self.refused[1] + 1 if found.cause == self.refused[0] else 1
-            lamp = found.lamp.brightness if found.cause == "lamp" else float("nan")
+            lamp = found.lamp.brightness if found.cause == OFF_BRIGHTNESS.name else float("nan")
             x, y = frame.moved_px.tolist() if found.cause == "movement" else (float("nan"), float("nan"))
             doubted = self.doubted | {step.number}
             return replace(state, refused=(found.cause, count), candidate=(lamp, x, y), doubted=doubted)

@@ -45,6 +45,7 @@ from acquisition.run.devices import (
     await_health,
     is_curable,
 )
+from calibration.figures.light import LEAK_SHARE, OFF_BRIGHTNESS
 from drivers.presenter import Colour, ReadsBack
 from experiment.config import JudgeSettings, LabSettings
 from experiment.session.folder import Session
@@ -666,9 +667,9 @@ def _followed_changes(
             "begin a new session"
         )
         said.append(("moved", sentence))
-    percent = values.get("lamp", 0.0)
+    percent = values.get(OFF_BRIGHTNESS.name, 0.0)
     # A step of the lamp that was shown twice is beyond its limit. Frames that link runs have wide limits.
-    stepped = any(check.name == "lamp" and check.is_beyond for check in judgement.checks)
+    stepped = any(check.name == OFF_BRIGHTNESS.name and check.is_beyond for check in judgement.checks)
     links = step.kind == "response" and any(one.kind == "light" and one.number < step.number for one in steps)
     if stepped or (links and abs(percent) > judge.drift_percent):
         more = "stronger" if percent > 0 else "weaker"
@@ -677,7 +678,7 @@ def _followed_changes(
             "on at the new level, and build-lut follows it by the white frames"
         )
         said.append(("level", sentence))
-    room_percent = values.get("dark", 0.0)
+    room_percent = values.get(LEAK_SHARE.name, 0.0)
     if room_percent > ROOM_LIGHT_PERCENT and step.number == min(one.number for one in steps if one.kind == step.kind):
         sentence = (
             f"{step_name(step)}: black has {room_percent:.1f} % of white, {ROOM_LIGHT_PERCENT:g} % expected; every "

@@ -22,6 +22,7 @@ For telling:
 from __future__ import annotations
 
 import base64
+import http.client
 import json
 import math
 import os
@@ -33,6 +34,8 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -51,6 +54,7 @@ from acquisition.run.devices import TRY_S, Devices, RetryPolicy, RunEnd, RunWatc
 from acquisition.run.pipeline import Job, Pipeline, StepQueue, Taken, link_runs, step_name, unclosed_kinds
 from acquisition.run.plan import nothing_to_retake, planned_steps, require_plan, require_same
 from acquisition.run.rig.opening import open_rig
+from calibration.figures.light import DARK_DRIFT, LEAK_SHARE, OFF_CODES_DEG, STRAY_SHARE, WHITE_DRIFT
 from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import load_chart
@@ -195,9 +199,6 @@ class Notices:
 def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
     """Post to a URL without user name; return why it failed, empty if it did not."""
     # They cost a thirtieth of a second, which every command would pay.
-    import http.client
-    import urllib.error
-    import urllib.request
 
     class Unredirected(urllib.request.HTTPRedirectHandler):
         """Follows no redirection: the body would be lost on the way, and the answer be a success."""
@@ -246,7 +247,10 @@ class PauseNotices:
             self._tell("resumed", sentence)
 
 
-SHOWN = ("light", "movement", "blur", "white drift", "dark", "ambient", "exposure")
+SHOWN = (
+    OFF_CODES_DEG.name, "movement", "blur", WHITE_DRIFT.name,
+    LEAK_SHARE.name, STRAY_SHARE.name, DARK_DRIFT.name, "exposure",
+)  # fmt: skip
 """Checks that the line about the last frame has, as far as they have a number."""
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Final, Literal
+from typing import Literal
 
 Mends = Literal["frames", "session", "nothing"]
 """What is to be taken again: the frames that are named, the whole session, or nothing, as no new frame helps."""
@@ -253,58 +253,6 @@ class Evidence:
     def known(self) -> dict[str, float]:
         """Return what was measured, by name."""
         return {name: value for name in evidence_names() if (value := getattr(self, name)) == value}
-
-    def in_words(self) -> str:
-        """Return what was measured as a report says it, with units."""
-        return ", ".join(_reading(*READINGS[name], value) for name, value in self.known().items())
-
-
-READINGS: Final = {
-    "frames": ("frames compared", ""), "showing": ("of them show it", "%"),
-    "even_showing": ("of the white frames show it", "%"),
-    "white_residual": ("of the white frames have references off there", "%"),
-    "some_whites": ("in some white frames alone", "yes"), "spot": ("of the cells there have another colour", "%"),
-    "in_first": ("in the frame compared with", "yes"), "share": ("of the print deviates", "%"),
-    "deviation": ("brighter there", "±%"), "tint": ("channels differ, of that", "%"),
-    "added": ("light added, of white", "%"), "kept": ("of its own light left", "%"),
-    "rim": ("residual at the rim", "±%"), "rim_frames": ("of the white frames are dark at the rim", "%"),
-    "radial": ("of the residuals go with the distance from the middle", "%"),
-    "hot": ("of the cells hold a hot photosite", "%"), "scatter": ("spread of the frame's cells", "%"),
-    "softer": ("light of neighbouring cells by the frame's blur", "%"), "moved_px": ("chart moved by", "px"),
-    "anew": ("of the frames registered again", "%"), "agreement": ("correlation where the chart was", ""),
-    "exposure": ("exposure over that of the others", ""), "off_codes_deg": ("light off its codes by", "°"),
-    "named_right": ("the light is its codes'", "yes"), "cameras": ("cameras or lenses", ""),
-    "room": ("light under black, of white", "%"), "room_change": ("its change, of white", "%"),
-    "stray": ("light of a primary at code 0", "%"), "stray_primaries": ("primaries beyond white", "±%"),
-    "lone_primary": ("white has of one primary more", "±%"),
-    "mixed": ("white has of one primary more, of another less", "±%"),
-    "colour_scatter": ("scatter of white's colour", "%"), "other_iso": ("frames of another ISO speed", ""),
-    "lit": ("of the unfit cells have added light", "%"),
-    "misplaced": ("of the unfit cells lie at an unsure place", "%"),
-    "uneven": ("of the unfit cells are uneven", "%"), "waves_px": ("waves of the sheet", "px"),
-    "beyond_cell": ("light from beyond the cell", "%"),
-}  # fmt: skip
-"""What a report calls each value of `Evidence`, and its unit: per cent of a share, with its sign where it has one."""
-
-
-_ROUNDING = 1e-9
-"""Of a share, pixels or degrees: far below what any of them is measured to."""
-
-
-def _reading(words: str, unit: str, value: float) -> str:
-    """Return a value in words, the number first where the words go on from it; what rounding alone leaves is 0."""
-    if abs(value) < _ROUNDING:
-        value = 0.0
-    match unit:
-        case "yes":
-            return f"{words}: {'yes' if value else 'no'}"
-        case "%" | "±%":
-            number = f"{100 * value:{'+' if unit == '±%' else ''}.3g} %"
-            return f"{number} {words}" if words.startswith("of ") else f"{words}: {number}"
-        case "°":
-            return f"{words}: {value:.3g}°"
-        case _:
-            return f"{words}: {value:.3g}{f' {unit}' if unit else ''}"
 
 
 @cache

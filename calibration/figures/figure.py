@@ -16,10 +16,9 @@ from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 if TYPE_CHECKING:
-    from calibration.causes.gathering import Gathered, PrintPlace
+    from calibration.causes.gathering import Gathered
     from calibration.causes.rules import Subject
     from calibration.measurements import TableMeasurements
-    from experiment.chart.model import Chart
     from experiment.session.records import FrameRecord
 
 Sense = Literal["at most", "at least"]
@@ -39,7 +38,7 @@ QUESTIONS: Final[dict[Group, str]] = {
 }
 
 Drawing = Literal[
-    "chart", "lights", "budget", "errors", "noise", "residuals", "worst", "field", "print", "course", "cells", "rest"
+    "chart", "lights", "budget", "errors", "noise", "residuals", "field", "course"
 ]  # fmt: skip
 """Names of the report's pictures (`calibration.report.report`)."""
 
@@ -71,29 +70,6 @@ class Explanation:
     about: Subject
     gather: Callable[[TableMeasurements, float], Gathered | None]
     follows: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Worst:
-    """Where the worst of a figure is, whether or not it is beyond a limit.
-
-    - `what`: what is worst, in few words.
-    - `file`: the frame, relative to the session; "" where it is of no frame alone.
-    - `light`: the light's number; None where it is of no light alone.
-    - `place`: where on the print; None where it has no place.
-    """
-
-    what: str
-    file: str = ""
-    light: int | None = None
-    place: PrintPlace | None = None
-
-    @property
-    def where(self) -> str:
-        """Where it is, in words: ``light 3, frames/0009_light_003.cr2, 312, 440 mm``."""
-        light = "" if self.light is None else f"light {self.light}"
-        place = "" if self.place is None else f"{self.place.x_mm:.0f}, {self.place.y_mm:.0f} mm"
-        return ", ".join(part for part in (light, self.file, place) if part)
 
 
 @dataclass(frozen=True)
@@ -186,7 +162,6 @@ class Figure(Limit):
     - `of_one_frame`: what `build-lut check` can say of it, which reads one light or white frame and a dark one: it is
       `known`; or `bounded`, since more frames can only make it worse, so that it is told where it is beyond its limit
       already; or `unknown`.
-    - `worst`: where its worst is on the report's page, whatever the verdict; None if it has no place.
     - `where`: frames, lights or place beyond the limit accepted, for a remark; None for those of its cause.
     - `retake`: the frames that are beyond a limit by themselves, None if all of them are; None for a figure that is not
       of single frames.
@@ -199,9 +174,8 @@ class Figure(Limit):
 
     _: KW_ONLY
     measure: Callable[[TableMeasurements], float | None]
-    before_session: bool = False
+    before_session: bool = True
     of_one_frame: Literal["known", "bounded", "unknown"] = "unknown"
-    worst: Callable[[TableMeasurements, Chart], Worst | None] | None = None
     where: Callable[[TableMeasurements, float], str] | None = None
     retake: Callable[[TableMeasurements, float], list[FrameRecord] | None] | None = None
     cause: Explanation | None = None

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.causes.gathering import PrintPlace, chart_evidence
+from calibration.causes.gathering import chart_evidence
 from calibration.figures.figure import (
     JUDGEMENT,
     SIMULATED,
@@ -14,7 +14,6 @@ from calibration.figures.figure import (
     Figure,
     Line,
     SummaryRow,
-    Worst,
 )
 from calibration.registration.register import (
     MAX_BLOCK_RESIDUAL_PX,
@@ -72,8 +71,8 @@ TAGS_FOUND = Figure(
     "tags_found", "Tags found", "geometry", "share", "at least", 1.0, MIN_TAG_SHARE,
     why="where a tag is missing, the place of the cells around it rests on the cells alone", source=JUDGEMENT,
     remedy="bring all of the chart into the picture, and uncover it",
-    measure=_tags_found, before_session=True, of_one_frame="known", cause=Explanation("chart", chart_evidence),
-    drawing="chart", lines=(Line(30, _tags_row),),
+    measure=_tags_found, of_one_frame="known",
+    cause=Explanation("chart", chart_evidence), drawing="chart", lines=(Line(30, _tags_row),),
 )  # fmt: skip
 
 
@@ -87,7 +86,7 @@ CELL_PX = Figure(
     why="25 pixels reach 3.25 px from a cell's centre, rounding and registration included",
     source="geometry: half of 5 px, 0.5 px rounding, 0.25 px registration; 8.6 px bleeds 1.3 % at a blur of 0.7 px",
     remedy="bring the camera nearer or take a longer lens",
-    measure=lambda table: table.registration.cell_px, before_session=True, of_one_frame="known",
+    measure=lambda table: table.registration.cell_px, of_one_frame="known",
     drawing="chart", lines=(Line(40, _cell_row),),
 )  # fmt: skip
 
@@ -95,13 +94,6 @@ CELL_PX = Figure(
 def _bleed(table: TableMeasurements) -> float:
     registration, window = table.registration, table.cells.window
     return bleed(registration.cell_px, registration.blur_px, window) + table.lens.uncorrected_in_worst
-
-
-def _smallest_cell(table: TableMeasurements, chart: Chart) -> Worst:
-    file, sides = table.session.registered_file, cell_sides_px(table.registration.to_pixels, chart)
-    smallest = int(np.argmin(sides))
-    x, y = chart.centres_mm[smallest].tolist()
-    return Worst(f"smallest cell, {sides[smallest]:.1f} px", file, place=PrintPlace(file, x, y, 0.0))
 
 
 def _window_row(table: TableMeasurements) -> SummaryRow:
@@ -124,7 +116,7 @@ BLEED = Figure(
     "0.6 % at 8.6 px; of a cell's mean a thirtieth as much, which is in its uncertainty",
     remedy="focus on the print, stop down to f/8, bring the camera nearer, or take a smaller window "
     "(build-lut --window)",
-    measure=_bleed, before_session=True, of_one_frame="known", worst=_smallest_cell, drawing="chart",
+    measure=_bleed, of_one_frame="known", drawing="chart",
     lines=(
         Line(50, _window_row),
         Line(60, lambda table: SummaryRow("Blur", f"σ {table.registration.blur_px:.2f} px", "about 0.6 is sharp")),
@@ -178,7 +170,7 @@ CORRECTION_RESIDUAL = Figure(
     source=SIMULATED + ": 0.3 to 0.5 % where light falls off towards the corners, and the means twice as good; 1.4 % "
     "in even light or on a chart of 512 colours, which do not show a veil of the usual 1 %",
     remedy=_LESS_VEIL,
-    measure=_left_by_lens, where=_veil, lines=(Line(70, _lens_row),),
+    before_session=False, measure=_left_by_lens, where=_veil, lines=(Line(70, _lens_row),),
 )  # fmt: skip
 
 CORRECTION_WORST = Figure(
@@ -187,7 +179,7 @@ CORRECTION_WORST = Figure(
     source="geometry: by a cell of a twentieth of paper six times the veil's error; 3 % is three standard deviations "
     "of a mean of 300 counts; " + SIMULATED + ": 0.3 to 1.9 % where the mean is accepted",
     remedy=_LESS_VEIL,
-    measure=_left_in_worst_cell, where=_veil,
+    before_session=False, measure=_left_in_worst_cell, where=_veil,
 )  # fmt: skip
 
 
@@ -212,8 +204,8 @@ TAG_RESIDUAL_PX = Figure(
     "tag_residual_px", "Residual of tags, plane and lens", "geometry", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,
     why="the place of a sheet that waves more rests on its cells alone",
     source=SIMULATED + ": 6 mm of waves and 10 mm of curl give 2.3", remedy=_FLATTEN,
-    measure=lambda table: table.registration.lens_residual_px, before_session=True, of_one_frame="known",
-    drawing="residuals", lines=(Line(90, _plane_row),),
+    measure=lambda table: table.registration.lens_residual_px, of_one_frame="known", drawing="residuals",
+    lines=(Line(90, _plane_row),),
 )  # fmt: skip
 
 TAG_FINAL_PX = Figure(
@@ -221,21 +213,9 @@ TAG_FINAL_PX = Figure(
     why="cells and tags disagree about where the print is; the limits are for cells of 10 px and rise with their size",
     source=SIMULATED + ": 0.05 to 0.2, the detector's own error 0.09",
     remedy="check that chart.json is that of the print, and that the print is one flat sheet",
-    measure=lambda table: table.registration.marks_rms_px / table.registration.clearance, before_session=True,
-    of_one_frame="known",
+    measure=lambda table: table.registration.marks_rms_px / table.registration.clearance, of_one_frame="known",
     drawing="residuals", lines=(Line(80, _final_row),),
 )  # fmt: skip
-
-
-def _worst_block(table: TableMeasurements, chart: Chart) -> Worst | None:
-    blocks, file = table.registration.blocks, table.session.registered_file
-    good = np.flatnonzero(blocks.good)
-    if not len(good):
-        return None
-    length = np.linalg.norm(blocks.residual_px[good], axis=1)
-    x, y = blocks.centres_mm[good[int(np.argmax(length))]].tolist()
-    place = PrintPlace(file, x, y, 8 * float(max(chart.cell_mm)))
-    return Worst(f"largest of a block, {length.max():.3f} px", file, place=place)
 
 
 def _blocks_row(table: TableMeasurements) -> SummaryRow:
@@ -247,15 +227,15 @@ BLOCK_RESIDUAL_PX = Figure(
     "block_residual_px", "Residual of cell blocks", "geometry", "px RMS", "at most", 0.1, MAX_BLOCK_RESIDUAL_PX,
     why="cells are sampled beside their centres; the limits are for cells of 10 px and rise with their size",
     source=SIMULATED + ": 0.01 to 0.06", remedy=_FLATTEN,
-    measure=lambda table: table.registration.block_rms_px / table.registration.clearance, before_session=True,
-    of_one_frame="known", worst=_worst_block, drawing="residuals", lines=(Line(100, _blocks_row),),
+    measure=lambda table: table.registration.block_rms_px / table.registration.clearance, of_one_frame="known",
+    drawing="residuals", lines=(Line(100, _blocks_row),),
 )  # fmt: skip
 
 BLOCKS_GOOD = Figure(
     "blocks_good", "Cell blocks that match the chart", "geometry", "share", "at least", 0.98, MIN_GOOD_BLOCKS,
     why="part of the print is covered, damaged, or another print", source=JUDGEMENT,
     remedy="uncover the print, or print it anew",
-    measure=lambda table: float(table.registration.blocks.good.mean()), before_session=True, of_one_frame="known",
+    measure=lambda table: float(table.registration.blocks.good.mean()), of_one_frame="known",
     cause=Explanation("chart", chart_evidence), drawing="residuals",
 )  # fmt: skip
 
@@ -270,6 +250,6 @@ AGREEMENT = Figure(
     why="the colours are not those of the chart",
     source=SIMULATED + ": 0.99 and more; another order of the cells has about 0",
     remedy="name the chart.json of this print, and print without colour management",
-    measure=lambda table: table.registration.agreement, before_session=True, of_one_frame="known",
+    measure=lambda table: table.registration.agreement, of_one_frame="known",
     cause=Explanation("chart", chart_evidence), drawing="chart", lines=(Line(110, _agreement_row),),
 )  # fmt: skip

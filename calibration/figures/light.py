@@ -26,7 +26,6 @@ from calibration.figures.figure import (
     Figure,
     Line,
     SummaryRow,
-    Worst,
     format_value,
 )
 from calibration.radiometry.superposition import NODES
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
 
     from calibration.checks.light_codes import CodeAgreement
     from calibration.measurements import FrameMeasurements, TableMeasurements
-    from experiment.chart.model import Chart
     from experiment.session.records import FrameRecord
 
 _PAIRS = 4
@@ -55,12 +53,6 @@ def percent(value: float) -> str:
 def percents(values: npt.NDArray[np.floating]) -> str:
     """Return shares of R, G and B, (3,) float64, for the summary."""
     return " / ".join(f"{100 * value:.2f}" for value in values.tolist()) + " %"
-
-
-def worst_light(table: TableMeasurements, light: int, what: str) -> Worst:
-    """Return a light as where the worst of a figure is, with its frame."""
-    record = next((frame.record for frame in table.frames if frame.record.illumination == light), None)
-    return Worst(what, "" if record is None else record.file, light)
 
 
 def _are_alike(table: TableMeasurements) -> bool:
@@ -100,7 +92,7 @@ REPEATED_FILES = Figure(
     "repeated_files", "Frames whose file is that of another frame", "light", "", "at most", 0.0, None,
     why="one photograph stands for several: what changed between them, as the lamp's drift, was not seen",
     source="no two exposures have the same bytes", remedy="correct the list of frames that was imported",
-    measure=_repeated, before_session=True, of_one_frame="bounded", where=_repeated_files,
+    measure=_repeated, of_one_frame="bounded", where=_repeated_files,
 )  # fmt: skip
 
 
@@ -118,7 +110,7 @@ WHITE_DRIFT = Figure(
     "white_drift", "Drift of paper white between white frames", "light", "share", "at most", 0.01, 0.15,
     why="lights taken at other times differ in brightness; each has its own ground truth, so its colour is right",
     source=JUDGEMENT + "; 1 % between whites is usual for a warm lamp", remedy=_WARM_UP,
-    measure=_white_drift, before_session=True, cause=Explanation("drift", drift_evidence), drawing="course",
+    measure=_white_drift, cause=Explanation("drift", drift_evidence), drawing="course",
     lines=(Line(130, _drift_row),),
 )  # fmt: skip
 
@@ -136,7 +128,7 @@ DRIFT_LEFT = Figure(
     source=SIMULATED + ": 0.1 % of a steady drift on a small chart; a jump of 1 % leaves 0.5 %",
     remedy="build the table without --correct-drift, let the lamp warm up, or take white frames more often "
     "(sequence.reference_every)",
-    measure=_drift_left, drawing="course",
+    before_session=False, measure=_drift_left, drawing="course",
 )  # fmt: skip
 
 
@@ -149,7 +141,7 @@ WHITE_DRIFT_DEG = Figure(
     "white_drift_deg", "Drift of white's colour", "light", "°", "at most", 0.2, 2.0,
     why="the lamp's spectrum changes, not its brightness alone",
     source=JUDGEMENT + ": a tenth of a good method's error", remedy=_WARM_UP,
-    measure=_white_drift_deg, before_session=True, cause=Explanation("drift", drift_evidence), drawing="course",
+    measure=_white_drift_deg, cause=Explanation("drift", drift_evidence), drawing="course",
 )  # fmt: skip
 
 
@@ -180,8 +172,8 @@ LEAK_SHARE = Figure(
     why="every light contains this much of the projector's leak and the room's light, so that deep colours are paler",
     source=JUDGEMENT + "; a contrast of 1 : 1500 leaks 0.07 %",
     remedy="darken the room, cover lamps and displays, or have it subtracted (build-lut --subtract-dark)",
-    measure=_leak, before_session=True, of_one_frame="known", cause=Explanation("dark", dark_evidence),
-    lines=(Line(210, _dark_row),),
+    measure=_leak,
+    of_one_frame="known", cause=Explanation("dark", dark_evidence), lines=(Line(210, _dark_row),),
 )  # fmt: skip
 
 DARK_DRIFT = Figure(
@@ -190,8 +182,8 @@ DARK_DRIFT = Figure(
     why="the room's light changes; what is subtracted, or part of each light, is not what was there",
     source=JUDGEMENT + ": a hundredth of a cell of a fifth of white",
     remedy="darken the room, and keep daylight out",
-    measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None, before_session=True,
-    of_one_frame="bounded", cause=Explanation("dark", dark_evidence),
+    measure=lambda table: table.dark_change if len(table.dark_frames.lights) > 1 else None, of_one_frame="bounded",
+    cause=Explanation("dark", dark_evidence),
 )  # fmt: skip
 
 
@@ -221,7 +213,7 @@ STRAY_SHARE = Figure(
     "deep lights 1 to 2 degrees off, which is a good method's error",
     remedy="darken the room, see that no door, lamp or display changes during the session, switch power saving and "
     "dynamic contrast off, and take the frames again",
-    measure=_stray, before_session=True, cause=Explanation("stray", stray_evidence), lines=(Line(250, _stray_row),),
+    measure=_stray, cause=Explanation("stray", stray_evidence), lines=(Line(250, _stray_row),),
 )  # fmt: skip
 
 
@@ -262,7 +254,7 @@ LINEARITY = Figure(
     source="EMVA 1288; 1 % is " + JUDGEMENT,
     remedy="expose less, switch the camera's highlight priority and noise reduction off; a series of exposures of the "
     "chart, given with --linearity, shows where counts bend",
-    measure=_linearity, before_session=True, of_one_frame="known", lines=(Line(185, _linearity_row),),
+    measure=_linearity, of_one_frame="known", lines=(Line(185, _linearity_row),),
 )  # fmt: skip
 
 
@@ -282,7 +274,7 @@ LINEARITY_KNOWN = Figure(
     source="uncertainty budget",
     remedy="plan red, green and blue each alone (acquire illuminations does) for a chart of 512 colours or more, or "
     "give a series of exposures of the chart with --linearity",
-    found=_linearity_lacks, measure=_linearity_known,
+    found=_linearity_lacks, before_session=False, measure=_linearity_known,
 )  # fmt: skip
 
 
@@ -314,7 +306,7 @@ TOO_DARK = Figure(
     source="0.2 % of white puts a light of a tenth of white 1 degree off",
     remedy="build the table without --subtract-dark; a lamp or a display was on while the dark frames were taken, or "
     "the projector closes an iris for black: take the dark frames as the lights are taken",
-    measure=_too_dark,
+    before_session=False, measure=_too_dark,
 )  # fmt: skip
 
 
@@ -348,7 +340,7 @@ ADDITIVITY = Figure(
     "they are called, or exposed otherwise",
     source=JUDGEMENT + "; the drift of the lamp is taken out first",
     remedy="switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
-    measure=_beyond_sum(-1), before_session=True, cause=Explanation("sum", _sum_evidence),
+    measure=_beyond_sum(-1), cause=Explanation("sum", _sum_evidence),
     lines=(Line(260, _sum_row),),
 )  # fmt: skip
 
@@ -358,7 +350,7 @@ WHITE_DEFICIT = Figure(
     "full white back",
     source=JUDGEMENT + "; a lamp that flickers by 1 % gives 2 %",
     remedy="look at the exposures of these frames, and switch dynamic contrast and power saving off",
-    measure=_beyond_sum(1), before_session=True, cause=Explanation("brightness", light_evidence),
+    measure=_beyond_sum(1), cause=Explanation("brightness", light_evidence),
 )  # fmt: skip
 
 
@@ -370,13 +362,6 @@ def _of_codes(value: Callable[[CodeAgreement], float]) -> Callable[[TableMeasure
 def _off_codes(table: TableMeasurements) -> float | None:
     off = table.lights.off_codes_deg
     return None if off is None else float(off.max())
-
-
-def _furthest_off(table: TableMeasurements, chart: Chart) -> Worst | None:
-    off = table.lights.off_codes_deg
-    if off is None or not off.any():
-        return None
-    return worst_light(table, int(np.argmax(off)), f"{off.max():.2g}° off")
 
 
 def _light_name(index: int, count: int) -> str:
@@ -421,18 +406,9 @@ OFF_CODES_DEG = Figure(
     "of two lights the angle between them",
     remedy="correct the list of frames that was imported, let the picture settle for longer (sequence.settle_s), or "
     "expose whole turns of the colour wheel",
-    foremost=True,
-    measure=_off_codes, before_session=True, worst=_furthest_off, where=_off_lights, retake=_frames_off_codes,
+    foremost=True, measure=_off_codes, where=_off_lights, retake=_frames_off_codes,
     cause=Explanation("names", name_evidence), drawing="lights", lines=(Line(220, _codes_row),),
 )  # fmt: skip
-
-
-def _brightest_off(table: TableMeasurements, chart: Chart) -> Worst | None:
-    codes = table.lights.codes
-    if codes is None or not codes.off_brightness.any():
-        return None
-    light = int(np.argmax(codes.off_brightness))
-    return worst_light(table, light, f"{100 * codes.off_brightness[light]:.2g} % off")
 
 
 def _brightness_text(table: TableMeasurements, accepted: float) -> str:
@@ -462,8 +438,8 @@ OFF_BRIGHTNESS = Figure(
     "should be alike",
     source=JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
     remedy="keep one exposure for the session, and take the frames again",
-    measure=_of_codes(lambda codes: float(codes.off_brightness.max())), before_session=True, worst=_brightest_off,
-    where=_brightness_text, retake=_frames_off_brightness,
+    measure=_of_codes(lambda codes: float(codes.off_brightness.max())), where=_brightness_text,
+    retake=_frames_off_brightness,
     cause=Explanation("brightness", brightness_evidence, follows=("off_codes_deg", "exchanged_lights")),
 )  # fmt: skip
 
@@ -473,7 +449,7 @@ EXCHANGED_LIGHTS = Figure(
     "but its codes and temperature are the other's",
     source=SIMULATED + ": none in random healthy rooms, all pairs further apart than the figure below in the others",
     remedy="correct the list of frames that was imported, or take both again",
-    measure=_of_codes(lambda codes: float(len(codes.exchanges))), before_session=True, where=_exchanges,
+    measure=_of_codes(lambda codes: float(len(codes.exchanges))), where=_exchanges,
     cause=Explanation("names", name_evidence), drawing="lights",
 )  # fmt: skip
 
@@ -482,7 +458,7 @@ CODE_MISFIT = Figure(
     why="no projector makes these whites of these codes, whichever light it is that is wrong",
     source=SIMULATED + ": 1 is what random healthy rooms stay below; of more than 24 lights each is judged by itself",
     remedy="look whether frames and lights belong together, and whether the lamp was steady",
-    measure=_of_codes(lambda codes: codes.misfit), drawing="lights",
+    before_session=False, measure=_of_codes(lambda codes: codes.misfit), drawing="lights",
 )  # fmt: skip
 
 EXCHANGE_DEG = Figure(
@@ -490,7 +466,7 @@ EXCHANGE_DEG = Figure(
     why="two lights less far apart than this could bear each other's names unnoticed",
     source=SIMULATED + ": 0.3 with 707 lights, 0 with eight that lie far apart",
     remedy="take white and the primaries along with the lights, and expose longer",
-    measure=_of_codes(lambda codes: codes.exchange_deg), drawing="lights",
+    before_session=False, measure=_of_codes(lambda codes: codes.exchange_deg), drawing="lights",
 )  # fmt: skip
 
 
@@ -513,6 +489,7 @@ CROSS_CHECKED_SHARE = Figure(
     why="of the others nothing says that they bear their own names",
     source="the angle from which a wrong name is refused, beyond what codes predict of so few lights",
     remedy="take white, red, green and blue along with the lights, and expose longer",
+    before_session=False,
     measure=_of_codes(lambda codes: float(codes.held.mean())), where=_checked_text, lines=(Line(230, _checked_row),),
 )  # fmt: skip
 
@@ -547,9 +524,8 @@ WHITE_FRAME_DEG = Figure(
     why="the frame shows another light than white, or the lights bear wrong names",
     source=SIMULATED + ": 0 in random healthy rooms",
     remedy="correct the list of frames that was imported, or take the white frame again",
-    foremost=True,
-    measure=_white_frames(lambda white: white.off_deg), before_session=True, where=lambda table,
-    accepted: first_of([one.file for one in _beyond_deg(table, accepted)]), retake=_beyond_deg,
+    foremost=True, measure=_white_frames(lambda white: white.off_deg),
+    where=lambda table, accepted: first_of([one.file for one in _beyond_deg(table, accepted)]), retake=_beyond_deg,
     cause=Explanation("names", name_evidence), drawing="course",
 )  # fmt: skip
 
@@ -559,9 +535,9 @@ WHITE_FRAME_BRIGHTNESS = Figure(
     why="the white frame was exposed otherwise than the lights, so that drift and stray light are read wrongly",
     source=JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
     remedy="keep one exposure for the session, and take the white frame again",
-    measure=_white_frames(lambda white: white.off_brightness), before_session=True, where=lambda table,
-    accepted: first_of([one.file for one in _beyond_brightness(table, accepted)]), retake=_beyond_brightness,
-    cause=Explanation("brightness", light_evidence), drawing="course",
+    measure=_white_frames(lambda white: white.off_brightness),
+    where=lambda table, accepted: first_of([one.file for one in _beyond_brightness(table, accepted)]),
+    retake=_beyond_brightness, cause=Explanation("brightness", light_evidence), drawing="course",
 )  # fmt: skip
 
 
@@ -584,7 +560,7 @@ PRIMARIES_LACKING = Figure(
     why="the fields of the primaries were not measured, so that coloured cells are evened by the field of paper",
     source="where the primaries' fields differ by 10 %, coloured cells at corners are off by some tenths of a per cent",
     remedy="take red, green and blue, each alone, along with the lights",
-    measure=_primaries_lacking, drawing="field", lines=(Line(240, _fields_row),),
+    before_session=False, measure=_primaries_lacking, drawing="field", lines=(Line(240, _fields_row),),
 )  # fmt: skip
 
 
@@ -612,5 +588,5 @@ GREY_TINT_DEG = Figure(
     "(glossy) where codes are ink codes, as the publication printed them",
     remedy="generate by colour, as it does unless told otherwise, which takes the print as it is measured; or have the "
     "chart printed through the printer's profile (docs/printing.md)",
-    measure=_tint, before_session=True, of_one_frame="known", lines=(Line(270, _tint_row),),
+    measure=_tint, of_one_frame="known", lines=(Line(270, _tint_row),),
 )  # fmt: skip

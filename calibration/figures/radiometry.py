@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.causes.gathering import (
-    PrintPlace,
     block_evidence,
     blur_evidence,
     camera_evidence,
@@ -29,7 +28,6 @@ from calibration.figures.figure import (
     Figure,
     Line,
     SummaryRow,
-    Worst,
 )
 from experiment.measures.sensor import MAX_BLACK_DRIFT
 from experiment.measures.stains import added_light
@@ -38,7 +36,6 @@ from foundation.errors import counted, first_of
 if TYPE_CHECKING:
     from calibration.checks.frame_consistency import ForeignFrame
     from calibration.measurements import FrameMeasurements, TableMeasurements
-    from experiment.chart.model import Chart
     from experiment.session.records import FrameRecord
 
 _FrameValue = Callable[["TableMeasurements", "FrameMeasurements"], float]
@@ -80,21 +77,12 @@ def _unfit_row(table: TableMeasurements) -> SummaryRow:
 
 UNFIT_SHARE = Figure(
     "unfit_share", "Cells unfit for use", "radiometry", "share", "at most", 0.005, 0.1,
-    why="colours without samples are missing from every picture", source=JUDGEMENT, remedy="", found=_most_unfit,
-    measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1), before_session=True,
-    of_one_frame="bounded", cause=Explanation("unfit cells", unfit_evidence, follows=("block_deviation",)),
-    drawing="print", lines=(Line(290, _unfit_row),),
+    why="colours without samples are missing from every picture", source=JUDGEMENT, remedy="",
+    found=_most_unfit, measure=lambda table: len(table.cells.unfit) / max(_cell_count(table), 1),
+    of_one_frame="bounded",
+    cause=Explanation("unfit cells", unfit_evidence, follows=("block_deviation",)), drawing="errors",
+    lines=(Line(290, _unfit_row),),
 )  # fmt: skip
-
-
-def _most_deviating(table: TableMeasurements, chart: Chart) -> Worst | None:
-    stains, file = table.cells.stains, table.session.registered_file
-    if not stains.known:
-        return None
-    off = stains.largest_deviation()
-    colour = int(np.argmax(np.abs(off)))
-    x, y = chart.centres_mm[chart.cell_of_colour[colour]].tolist()
-    return Worst(f"colour {colour}, {100 * off[colour]:+.2g} %", file, place=PrintPlace(file, x, y, 0.0))
 
 
 DOUBTFUL_SHARE = Figure(
@@ -104,8 +92,8 @@ DOUBTFUL_SHARE = Figure(
     source=SIMULATED + ": none on a clean flat print",
     remedy="clean the print, hang it flatter, and look for shadows on it",
     measure=lambda table: float(table.cells.stains.doubtful.mean()) if table.cells.stains.known else None,
-    before_session=True, of_one_frame="known", worst=_most_deviating, cause=Explanation("spot", spot_evidence),
-    drawing="print",
+    of_one_frame="known",
+    cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
 
 
@@ -117,7 +105,7 @@ ADDED_LIGHT = Figure(
     "of a thirtieth 30 %; a reflection of 3 % leaves a table with cells 57 % off",
     remedy="turn print or projector until nothing is mirrored on it, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
-    before_session=True, of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="print",
+    of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip
 
 
@@ -147,17 +135,10 @@ FRAME_BLUR = Figure(
     source=SIMULATED + ": 0.9 px of blur in one frame of a session with 0.5 px give 0.8 % and cells 1.2 % off, "
     "1.1 px 2 % and cells 4 % off",
     remedy="switch off autofocus and stabilisation, see that nothing shakes the camera",
-    measure=lambda table: table.added_bleed(_softest(table)), before_session=True, of_one_frame="bounded",
-    worst=lambda table, chart: Worst(f"blur σ {_softest(table).blur_px:.2f} px", _softest(table).record.file),
+    measure=lambda table: table.added_bleed(_softest(table)), of_one_frame="bounded",
     where=_softest_text, retake=_frames_beyond(lambda table, frame: table.added_bleed(frame)),
     cause=Explanation("frame", blur_evidence), drawing="course",
 )  # fmt: skip
-
-
-def _most_scattered(table: TableMeasurements, chart: Chart) -> Worst | None:
-    worst = max(table.frames, key=lambda frame: frame.consistency.scatter)
-    scatter = worst.consistency.scatter
-    return Worst(f"{100 * scatter:.2g} %", worst.record.file) if scatter > 0 else None
 
 
 def _of_alike_frames(value: _FrameValue) -> Callable[[TableMeasurements], float | None]:
@@ -176,19 +157,11 @@ FRAME_SCATTER = Figure(
     why="the frame's samples are not of their cells' colours",
     source=SIMULATED + ": to 0.8 % beyond noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
     remedy="see that nothing changes during the session",
-    measure=_of_alike_frames(lambda table, frame: frame.consistency.scatter), before_session=True,
-    of_one_frame="bounded", worst=_most_scattered,
+    measure=_of_alike_frames(lambda table, frame: frame.consistency.scatter), of_one_frame="bounded",
     where=lambda table, accepted: f"in {max(table.frames, key=lambda one: one.consistency.scatter).record.file}",
     retake=_frames_beyond(lambda table, frame: frame.consistency.scatter),
     cause=Explanation("frame", scatter_evidence, follows=("block_deviation", "disturbed_cells")), drawing="course",
 )  # fmt: skip
-
-
-def _worst_block(table: TableMeasurements, chart: Chart) -> Worst | None:
-    worst = max(table.frames, key=lambda frame: frame.consistency.block)
-    seen, file = worst.consistency, worst.record.file
-    place = PrintPlace(file, *seen.at_mm, seen.extent_mm)
-    return Worst(f"{100 * seen.block:.2g} %", file, place=place) if seen.block > 0 else None
 
 
 BLOCK_DEVIATION = Figure(
@@ -196,8 +169,8 @@ BLOCK_DEVIATION = Figure(
     0.01, 0.03,
     why="something lay, or shone, on the print in that frame or in the one compared with, and its samples contain it",
     source=SIMULATED + ": to 0.4 % beyond noise", remedy="see that nobody comes between lamp, print and camera",
-    measure=_of_alike_frames(lambda table, frame: frame.consistency.block), before_session=True,
-    of_one_frame="bounded", worst=_worst_block, retake=_frames_beyond(lambda table, frame: frame.consistency.block),
+    measure=_of_alike_frames(lambda table, frame: frame.consistency.block), of_one_frame="bounded",
+    retake=_frames_beyond(lambda table, frame: frame.consistency.block),
     cause=Explanation("block", block_evidence), drawing="course",
 )  # fmt: skip
 
@@ -216,8 +189,8 @@ DISTURBED_CELLS = Figure(
     source=SIMULATED + ": none in healthy rooms; two cells next to each other, five standard deviations off, are one, "
     "unless the dark frames show them to be hot",
     remedy="see that nothing comes between lamp, print and camera",
-    measure=_disturbed, before_session=True, of_one_frame="bounded",
-    cause=Explanation("few cells", disturbed_evidence, follows=("block_deviation",)), drawing="worst",
+    measure=_disturbed, of_one_frame="bounded",
+    cause=Explanation("few cells", disturbed_evidence, follows=("block_deviation",)), drawing="errors",
 )  # fmt: skip
 
 
@@ -236,7 +209,7 @@ REREGISTERED_FRAMES = Figure(
     "reregistered_frames", "Frames registered again", "geometry", "", "at most", 0, None,
     why="the chart or the camera moved between frames; the sampling grid followed", source=JUDGEMENT,
     remedy="fix camera and print, and let nobody walk about",
-    measure=lambda table: float(_reregistered(table)), before_session=True, of_one_frame="bounded",
+    measure=lambda table: float(_reregistered(table)), of_one_frame="bounded",
     cause=Explanation("movement", movement_evidence), drawing="course", lines=(Line(120, _movement_row),),
 )  # fmt: skip
 
@@ -252,9 +225,9 @@ def _foreign(frames: tuple[ForeignFrame, ...]) -> str:
 OTHER_CAMERA = Figure(
     "other_camera", "Frames of another camera", "radiometry", "", "at most", 0, 0.5,
     why="a table is of one camera: another body sees other colours, and another model others yet",
-    source="by definition", remedy="take these frames again with the session's camera",
-    foremost=True,
-    measure=lambda table: float(len(table.origins.other_camera)), before_session=True, of_one_frame="bounded",
+    source="by definition",
+    remedy="take these frames again with the session's camera",
+    foremost=True, measure=lambda table: float(len(table.origins.other_camera)), of_one_frame="bounded",
     where=lambda table, accepted: _foreign(table.origins.other_camera),
     retake=lambda table, limit: [frame.record for frame in table.origins.other_camera],
     cause=Explanation("camera", camera_evidence),
@@ -264,7 +237,7 @@ OTHER_LENS = Figure(
     "other_lens", "Frames through another lens", "radiometry", "", "at most", 0, None,
     why="lenses tint, blur and shade each in its own way", source="by definition",
     remedy="take these frames again through the session's lens",
-    measure=lambda table: float(len(table.origins.other_lens)), before_session=True, of_one_frame="bounded",
+    measure=lambda table: float(len(table.origins.other_lens)), of_one_frame="bounded",
     where=lambda table, accepted: _foreign(table.origins.other_lens), cause=Explanation("camera", camera_evidence),
 )  # fmt: skip
 
@@ -278,9 +251,9 @@ OTHER_EXPOSURE = Figure(
     "other_exposure", "Exposure of a frame against that of most, as the files state it", "radiometry", "share",
     "at most", 0.01, 0.1,
     why="brightness would differ between lights that should be alike, and the noise with the ISO speed",
-    source="shutter times are steps of 26 % apart, and are written rounded", remedy=_SAME_EXPOSURE,
-    foremost=True,
-    measure=lambda table: table.origins.exposure_difference, before_session=True, of_one_frame="bounded",
+    source="shutter times are steps of 26 % apart, and are written rounded",
+    remedy=_SAME_EXPOSURE,
+    foremost=True, measure=lambda table: table.origins.exposure_difference, of_one_frame="bounded",
     where=lambda table, accepted: _foreign(table.origins.other_exposure), retake=_otherwise_exposed,
     cause=Explanation("brightness", light_evidence),
 )  # fmt: skip
@@ -289,7 +262,7 @@ OTHER_ISO = Figure(
     "other_iso", "Frames of another ISO speed", "radiometry", "", "at most", 0, None,
     why="their noise is another, and so is the count at which they saturate; their exposure is judged apart",
     source="by definition", remedy=_SAME_EXPOSURE,
-    measure=lambda table: float(len(table.origins.other_iso)), before_session=True, of_one_frame="bounded",
+    measure=lambda table: float(len(table.origins.other_iso)), of_one_frame="bounded",
     where=lambda table, accepted: _foreign(table.origins.other_iso), cause=Explanation("iso", iso_evidence),
 )  # fmt: skip
 
@@ -298,7 +271,7 @@ WHITE_FRAMES = Figure(
     why="nothing says how the lamp drifted, whether the print has stains, or whether cells are of one colour",
     source="by definition; from two on a drift is seen",
     remedy="take white frames along with the lights (sequence.reference_every)",
-    measure=lambda table: float(len(table.white_frames)), drawing="course",
+    before_session=False, measure=lambda table: float(len(table.white_frames)), drawing="course",
 )  # fmt: skip
 
 
@@ -313,6 +286,5 @@ BLACK_DRIFT_COUNTS = Figure(
     why="the sensor warmed up; each frame's own black is subtracted, but an error of it shows in dark cells of about "
     "30 counts",
     source=JUDGEMENT, remedy="let the camera run for some minutes before the session, and rest between frames",
-    measure=lambda table: table.black_drift, before_session=True, of_one_frame="bounded", drawing="course",
-    lines=(Line(140, _black_row),),
+    measure=lambda table: table.black_drift, of_one_frame="bounded", drawing="course", lines=(Line(140, _black_row),),
 )  # fmt: skip

@@ -39,7 +39,7 @@ NOISE_REDUCTION: Final = Limit(
 DISK: Final = Limit(
     "disk", "Free space over what the plan needs", "devices", "", "at least", 1.0, 1.0,
     why="the run refuses to begin", source="the run's own estimate, retakes and a reserve included",
-    remedy="free space, or put the session on another disk (--session FOLDER)",
+    remedy="free space, or put the session on another disk (acquire run --dry-run checks the disk of its folder)",
 )  # fmt: skip
 
 CARD: Final = Limit(
@@ -55,6 +55,37 @@ BATTERY: Final = Limit(
     "ages, and waiting between frames takes charge, too",
     remedy="use a mains adapter",
 )  # fmt: skip
+
+EMPTY_PHOTOSITES: Final = Limit(
+    "data", "Photosites without any count", "devices", "share", "at most", 1e-5, 1e-5,
+    why="part of the file was lost on its way", source="a body's dead photosites are fewer, one lost row is 3e-4",
+    remedy="check the cable and the memory card",
+)  # fmt: skip
+
+REPEATED: Final = Limit(
+    "repeated", "Noise of the difference to earlier frames, of that of independent ones", "devices", "", "at least",
+    0.3, 0.3,
+    why="the camera handed out a frame that it had given before",
+    source="a correlation of 0.9; the same frame has 0, independent ones 1",
+    remedy="check its cable and its memory card",
+)  # fmt: skip
+
+UNIFORMITY: Final = Limit(
+    "uniformity", "Deviation of the worst tile from the light of the whole frame", "light", "share", "at most", 0.02,
+    0.02,
+    why="something stands before the chart, or only a part of the picture is the light that was ordered",
+    source="an LCD's unevenness changes by as much between codes; a lamp's arc that wanders shifts the field by less",
+    remedy="look at the chart and at the picture",
+)  # fmt: skip
+
+ROWS: Final = Limit(
+    "rows", "Strips of rows that do not show what belongs there", "devices", "", "at most", 3, 3,
+    why="the file was damaged on its way, or something covers a part of the picture", source="a fly covers as many",
+    remedy="check the cable and the memory card, and look at the picture",
+)  # fmt: skip
+
+FRAME_LIMITS: Final = (EMPTY_PHOTOSITES, REPEATED, UNIFORMITY, ROWS)
+"""What only the live judge measures, besides what LAB.toml limits."""
 
 RIG_LIMITS: Final = (EVENNESS, TURN, KEYSTONE, NOISE_REDUCTION, DISK, CARD, BATTERY)
 """What only `acquire check` measures."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.budget import COVERAGE
-from calibration.causes.gathering import PrintPlace, noisy_evidence, reference_evidence
+from calibration.causes.gathering import noisy_evidence, reference_evidence
 from calibration.figures.figure import (
     JUDGEMENT,
     SIMULATED,
@@ -15,15 +15,13 @@ from calibration.figures.figure import (
     Figure,
     Line,
     SummaryRow,
-    Worst,
 )
-from calibration.figures.light import percent, percents, worst_light
+from calibration.figures.light import percent, percents
 from drivers.raw.rawfile import CLIPPING_SHARE
 from experiment.framing.field import MIN_SIGNAL
 
 if TYPE_CHECKING:
     from calibration.measurements import FrameMeasurements, TableMeasurements
-    from experiment.chart.model import Chart
     from experiment.measures.paper import Paper
 
 
@@ -46,19 +44,9 @@ NOISE_MISFIT = Figure(
     why="there is scatter that light and sensor do not explain: the camera smooths its raw files, or the light "
     "flickers",
     source="EMVA 1288 model; " + SIMULATED + ": 0.05 to 0.15", remedy="switch the camera's noise reduction off",
-    measure=lambda table: float(table.sensor.transfer.misfit.max()), before_session=True, of_one_frame="known",
-    drawing="noise", lines=(Line(170, _noise_row), Line(200, _at_zero_row)),
+    measure=lambda table: float(table.sensor.transfer.misfit.max()), of_one_frame="known", drawing="noise",
+    lines=(Line(170, _noise_row), Line(200, _at_zero_row)),
 )  # fmt: skip
-
-
-def _noisiest(table: TableMeasurements, chart: Chart) -> Worst | None:
-    ratio, file = table.sensor.transfer.ratio, table.session.registered_file
-    if len(ratio) != len(chart.cell_of_colour):
-        return None
-    colour = int(np.argmax(ratio))
-    x, y = chart.centres_mm[chart.cell_of_colour[colour]].tolist()
-    what = f"colour {colour}, {ratio[colour]:.2g} times the curve's variance"
-    return Worst(what, file, place=PrintPlace(file, x, y, 0.0))
 
 
 def _transfer_row(table: TableMeasurements) -> SummaryRow:
@@ -73,9 +61,8 @@ NOISY_SHARE = Figure(
     "noisy_share", "Cells noisier than their level explains", "noise", "share", "at most", 0.002, 0.1,
     why="they are not of one colour: dirt, a fold, a neighbour's edge", source="a variance 3.5 times the model's",
     remedy="clean the print, focus, and hang it flatter",
-    measure=lambda table: float(table.sensor.transfer.noisy.mean()), before_session=True, of_one_frame="known",
-    worst=_noisiest, cause=Explanation("noisy cells", noisy_evidence), drawing="cells",
-    lines=(Line(180, _transfer_row),),
+    measure=lambda table: float(table.sensor.transfer.noisy.mean()), of_one_frame="known",
+    cause=Explanation("noisy cells", noisy_evidence), drawing="noise", lines=(Line(180, _transfer_row),),
 )  # fmt: skip
 
 
@@ -84,16 +71,16 @@ def _references_used(table: TableMeasurements) -> float:
     return used / max(table.session.white_references, 1)
 
 
-def _fewest_references(table: TableMeasurements, chart: Chart) -> Worst:
-    fewest = min(table.frames, key=lambda frame: frame.paper.references)
-    return Worst(f"{fewest.paper.references} used", fewest.record.file)
+def _fewest_references(table: TableMeasurements, accepted: float) -> str:
+    return f"in {min(table.frames, key=lambda frame: frame.paper.references).record.file}"
 
 
 REFERENCES_USED = Figure(
     "references_used", "White references used, worst frame", "truth", "share", "at least", 0.9, 0.3,
     why="flat field and ground truth rest on few places", source=JUDGEMENT,
     remedy="uncover the print, bring all of it into the picture, expose so that bare paper stays below saturation",
-    measure=_references_used, before_session=True, of_one_frame="bounded", worst=_fewest_references, drawing="course",
+    measure=_references_used, of_one_frame="bounded",
+    where=_fewest_references, drawing="course",
 )  # fmt: skip
 
 
@@ -105,19 +92,14 @@ def _spread_of(frame: FrameMeasurements) -> float:
     return _spread(frame.paper)
 
 
-def _most_spread(table: TableMeasurements, chart: Chart) -> Worst | None:
-    worst = max(table.white_frames, key=_spread_of, default=None)
-    return None if worst is None else Worst(f"{100 * _spread_of(worst):.2g} %", worst.record.file)
-
-
 REFERENCE_SPREAD = Figure(
     "reference_spread", "White references about the flat field, under white", "truth", "share", "at most", 0.01, 0.05,
     why="what is not smooth, or falls off otherwise than lenses do, is left in the samples by the flat field",
     source=SIMULATED + ": 0.3 % of noise and photosites' response",
     remedy="clean or flatten the print, and look for shadows on it",
     measure=lambda table: max(map(_spread_of, table.white_frames), default=None),
-    before_session=True, of_one_frame="bounded", worst=_most_spread,
-    cause=Explanation("references", reference_evidence), drawing="rest",
+    of_one_frame="bounded",
+    cause=Explanation("references", reference_evidence), drawing="field",
 )  # fmt: skip
 
 
@@ -137,30 +119,17 @@ TRUTH_MEDIAN_DEG = Figure(
     "truth_median_deg", "Expanded uncertainty of the ground truth, median light", "truth", "°", "at most", 0.4, 1.0,
     why="a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + ": a quarter of a good method's error; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=lambda table: float(np.median(table.budget.expanded_deg)), drawing="budget",
+    before_session=False, measure=lambda table: float(np.median(table.budget.expanded_deg)), drawing="budget",
     lines=(Line(190, _error_row),),
 )  # fmt: skip
-
-
-def _least_known(table: TableMeasurements, chart: Chart) -> Worst | None:
-    error = table.budget.expanded_deg
-    if len(error) < 2:
-        return None
-    light = int(np.argmax(error))
-    return worst_light(table, light, f"{error[light]:.2g}°, most by {table.budget.main_cause(light).title}")
 
 
 TRUTH_WORST_DEG = Figure(
     "truth_worst_deg", "Expanded uncertainty of the ground truth, worst light", "truth", "°", "at most", 0.5, 3.0,
     why="under that light a method's error cannot be measured finer than the ground truth is known",
     source=JUDGEMENT + "; k = 2 (JCGM 100)", remedy=_BY_CAUSE,
-    measure=lambda table: float(table.budget.expanded_deg.max()), worst=_least_known, drawing="budget",
+    before_session=False, measure=lambda table: float(table.budget.expanded_deg.max()), drawing="budget",
 )  # fmt: skip
-
-
-def _brightest(table: TableMeasurements, chart: Chart) -> Worst | None:
-    paper = table.lights.white.max(axis=1)
-    return worst_light(table, int(np.argmax(paper)), f"{paper.max():.0f} counts") if len(paper) > 1 else None
 
 
 def _saturation_row(table: TableMeasurements) -> SummaryRow:
@@ -174,20 +143,19 @@ def _saturation_row(table: TableMeasurements) -> SummaryRow:
     return SummaryRow("Saturation", f"{sensor.white_level} counts above black", note)
 
 
+def _brightest(table: TableMeasurements, accepted: float) -> str:
+    return f"under light {int(np.argmax(table.lights.white.max(axis=1)))}"
+
+
 BRIGHTEST_SHARE = Figure(
     "brightest_share", "Bare paper under the brightest light, of saturation", "radiometry", "share", "at most", 0.9,
     CLIPPING_SHARE,
     why="the unevenness of the light carries cells into saturation",
     source=JUDGEMENT + ": 0.8 leaves room for 20 % unevenness", remedy="expose less",
     measure=lambda table: float(table.lights.white.max()) / table.sensor.white_level,
-    before_session=True, of_one_frame="bounded", worst=_brightest, drawing="lights",
+    of_one_frame="bounded", where=_brightest, drawing="lights",
     lines=(Line(150, _saturation_row),),
 )  # fmt: skip
-
-
-def _darkest(table: TableMeasurements, chart: Chart) -> Worst | None:
-    paper = table.lights.white.max(axis=1)
-    return worst_light(table, int(np.argmin(paper)), f"{paper.min():.0f} counts") if len(paper) > 1 else None
 
 
 def _darkest_row(table: TableMeasurements) -> SummaryRow:
@@ -195,10 +163,14 @@ def _darkest_row(table: TableMeasurements) -> SummaryRow:
     return SummaryRow("Darkest light", f"{darkest:.0f} counts", "its strongest channel on bare paper")
 
 
+def _darkest(table: TableMeasurements, accepted: float) -> str:
+    return f"under light {int(np.argmin(table.lights.white.max(axis=1)))}"
+
+
 DARKEST_COUNTS = Figure(
     "darkest_counts", "Bare paper under the darkest light", "radiometry", "counts", "at least", 300.0, MIN_SIGNAL,
     why="25 samples of 300 counts have a mean good to 1 %, a print's dark colours a thirtieth of that",
     source="photon noise at 1.8 electrons a count, 6 counts of read noise", remedy="expose longer",
-    measure=lambda table: float(table.lights.white.max(axis=1).min()), before_session=True, of_one_frame="bounded",
-    worst=_darkest, drawing="lights", lines=(Line(160, _darkest_row),),
+    measure=lambda table: float(table.lights.white.max(axis=1).min()),
+    of_one_frame="bounded", where=_darkest, drawing="lights", lines=(Line(160, _darkest_row),),
 )  # fmt: skip

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import nnls
 
 from calibration.radiometry.superposition import Superposition
 from experiment.lights import Illumination
@@ -153,8 +154,6 @@ class Primaries:
 
         By non-negative least squares; 1 is the primary as bright as in its own frame.
         """
-        from scipy.optimize import nnls
-
         return np.asarray(nnls(self.paper.T, np.maximum(white, 0))[0])
 
     def field_ratio(self, white: _Array) -> _Array:

@@ -15,19 +15,15 @@ import numpy.typing as npt
 from calibration.budget import Budget
 from calibration.causes.gathering import PrintPlace
 from calibration.checks.frame_consistency import has_enough_cells
-from calibration.measurements import FrameMeasurements, TableMeasurements
+from calibration.measurements import TableMeasurements
 from calibration.registration.register import Registration
-from calibration.sampling import PhotonTransfer, noise_levels, rim_difference, sample_noise, sites_at
+from calibration.sampling import PhotonTransfer, noise_levels, sites_at
 from drivers.raw.rawfile import CHANNELS, Mosaic, frame_black, phases
 from experiment.chart.model import Chart
 from experiment.framing.pictures import STILL_PX
 from experiment.measures.paper import FlatField
-from experiment.measures.stains import Stains
 from foundation.colorimetry import decode_srgb
 from foundation.plots import CHANNEL_INK, FAINT, INK, MARK, draw_squares
-
-WORST_CELLS = 20
-"""Cells that are shown magnified: two rows of ten."""
 
 _PAPER_PERCENTILE = 99.5
 """What is taken for paper white: brighter are highlights and hot photosites."""
@@ -196,20 +192,6 @@ def draw_field(figure: Any, chart: Chart, shape: FlatField) -> None:
         axes.set(title="RGB"[channel], xlabel="mm")
     grid[0].set_ylabel("mm")
     figure.colorbar(image, ax=list(grid), label="light, mean 1", shrink=0.85)
-
-
-def draw_print(figure: Any, chart: Chart, stains: Stains) -> None:
-    """Draw how far the print is from its codes' colours, cell by cell."""
-    page_w, page_h = chart.page_mm
-    figure.set_size_inches(10, 8.6 * page_h / page_w)
-    axes = figure.subplots()
-    places = chart.centres_mm[chart.cell_of_colour]
-    deviation, side_mm = 100 * stains.largest_deviation(), float(np.mean(chart.cell_mm))
-    image = draw_squares(axes, chart.page_mm, places, side_mm, deviation, 8.2, cmap="RdBu", vmin=-3, vmax=3)
-    side = float(np.sqrt(image.get_sizes()[0]))
-    axes.plot(*places[stains.stained].T, "x", color=INK, markersize=max(3.0, 0.5 * side), markeredgewidth=0.8)
-    axes.set_ylabel("mm")
-    figure.colorbar(image, ax=axes, label="deviation, %; brighter is positive", shrink=0.8, extend="both")
 
 
 def draw_chromaticities(
@@ -389,25 +371,6 @@ def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], table: TableMea
     _ring_largest(axes, block, table)
 
 
-def draw_worst_cells(figure: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:
-    """Draw the cells whose rim and middle differ most, magnified.
-
-    `picture` is (H, W, 3) float32 counts; all parameters are those of `draw_registration`.
-    """
-    figure.set_size_inches(10, 3.1)
-    places = registration.to_pixels(chart.centres_mm)
-    at, samples = _samples(picture, places, window)
-    difference, sigma = rim_difference(samples, sample_noise(samples))
-    score = (difference / np.maximum(sigma, 1e-6)).max(axis=1)
-    shown = viewable(picture)
-    order = np.argsort(-score)[:WORST_CELLS]
-    for axes, index in zip(figure.subplots(2, WORST_CELLS // 2).ravel(), order, strict=False):
-        cell = int(at[index])
-        _magnified(axes, shown, places[cell], 0.95 * registration.cell_px, chart, registration, places, window)
-        red, green, blue = chart.rgb[cell]
-        axes.set_title(f"{red} {green} {blue}\n{score[index]:.1f} σ", fontsize=8)
-
-
 _LEAST_LEVEL = 1.0
 """Counts from which on a level is drawn: the axes are logarithmic."""
 
@@ -515,9 +478,6 @@ _LEAST_LEVELS = 6
 _LEAST_CIRCLE = 0.012
 """Radius of a circle at least, as a share of the page's width: one about a single cell is not seen in a thumbnail."""
 
-_WINDOW = 2
-"""Pixels about a reference's middle, to each side, that are averaged for the picture: those of the table's samples."""
-
 LabelledPlace = tuple[str, PrintPlace]
 """What is said of a place, in few words, and the place."""
 
@@ -563,48 +523,6 @@ def draw_places(figure: Any, picture: _Image, chart: Chart, registration: Regist
     below.axis("off")
     for row, (label, number) in enumerate(numbers.items()):
         below.text(0.01, 1 - (row + 0.5) / len(numbers), f"{number}   {label}", va="center", transform=below.transAxes)
-
-
-def reference_residuals(
-    picture: _Image, places_mm: _Array, registration: Registration, frame: FrameMeasurements
-) -> _Array:
-    """Return how far references are from a frame's field, (N,) shares, in its strongest channel; NaN beyond the frame.
-
-    `picture`: (H, W, 3) float32 counts above black, the frame at half size. `places_mm`: (N, 2) float64 mm, the white
-    references.
-    """
-    height, width = picture.shape[:2]
-    columns, rows = np.rint(registration.to_pixels(places_mm)).astype(np.int64).T
-    channel = int(np.argmax(frame.paper.white))
-    inside = (columns >= _WINDOW) & (columns < width - _WINDOW) & (rows >= _WINDOW) & (rows < height - _WINDOW)
-    offsets = np.arange(-_WINDOW, _WINDOW + 1)
-    seen = np.full(len(places_mm), np.nan)
-    parts = picture[rows[inside, None, None] + offsets[:, None], columns[inside, None, None] + offsets, channel]
-    seen[inside] = parts.mean(axis=(1, 2), dtype=np.float64)
-    return seen / (frame.paper.field.at(places_mm)[:, channel] * frame.paper.white[channel]) - 1
-
-
-def draw_reference_residuals(figure: Any, chart: Chart, places_mm: _Array, residual: _Array) -> None:
-    """Draw what the field leaves of the white references, over the page and against the distance from its middle.
-
-    `places_mm`: (N, 2) float64 mm. `residual`: (N,) shares, as `reference_residuals` returned them.
-    """
-    page_w, page_h = chart.page_mm
-    figure.set_size_inches(10, 3.6)
-    left, right = figure.subplots(1, 2)
-    percent = 100 * residual
-    limit = max(1.0, float(np.nanpercentile(np.abs(percent), 99)))
-    dots = left.scatter(
-        *places_mm.T, c=percent, s=14, cmap="RdBu", vmin=-limit, vmax=limit, edgecolors=FAINT, linewidths=0.3
-    )
-    left.set(xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal", facecolor="#f2f3f5")
-    figure.colorbar(dots, ax=left, label="%, brighter is positive", shrink=0.8, extend="both")
-    away = np.linalg.norm(places_mm - np.array([page_w, page_h]) / 2, axis=1)
-    right.axhline(0, color=FAINT, linewidth=0.8)
-    right.plot(away, percent, ".", color=INK, markersize=3)
-    right.set(xlabel="mm from the page's middle", ylabel="%")
-    reach = max(1.0, 1.1 * float(np.nanmax(np.abs(percent))))
-    right.set_ylim(-reach, reach)
 
 
 def half_size(mosaic: Mosaic) -> npt.NDArray[np.float32]:

@@ -8,7 +8,7 @@ each with its pictures, by the names that figures give of them (`Figure.drawing`
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,10 @@ from calibration.budget import COVERAGE
 from calibration.checks.light_codes import CodeAgreement
 from calibration.citation import origin_lines
 from calibration.figures.all_figures import BY_NAME, FIGURES
-from calibration.figures.figure import QUESTIONS, Drawing, Group, Outcome, SummaryRow, Worst
+from calibration.figures.figure import QUESTIONS, Drawing, Group, Outcome, SummaryRow
 from calibration.figures.light import ADDITIVITY, LINEARITY
-from calibration.figures.truth import TRUTH_WORST_DEG
 from calibration.measurements import TableMeasurements
 from calibration.report.plots import (
-    WORST_CELLS,
     LabelledPlace,
     cell_noise,
     draw_budget,
@@ -35,13 +33,9 @@ from calibration.report.plots import (
     draw_field,
     draw_noise,
     draw_places,
-    draw_print,
-    draw_reference_residuals,
     draw_registration,
     draw_residuals,
-    draw_worst_cells,
     half_size,
-    reference_residuals,
 )
 from calibration.sampling import largest_window
 from calibration.table.lut import REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION
@@ -54,14 +48,13 @@ from calibration.verdict import (
     findings,
     is_mended_by_retaking,
     judged_values,
+    place_of,
     places_text,
     retake_command,
     retake_json,
     retaken_frames,
 )
 from drivers.raw.rawfile import read_raw
-from experiment.chart.model import Chart
-from experiment.measures.stains import Stains
 from experiment.session.folder import Session
 from foundation.errors import counted, first_of
 from foundation.files import write_whole
@@ -228,23 +221,12 @@ MOST_FRAMES = 4
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
     """Write `report.html` and `report.json` into a table's folder; costs some seconds."""
-    worsts = worst_of_figures(result.figures, session.chart)
-    pictures = _pictures(result, session, worsts)
-    write_whole(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session), worsts))
+    pictures = _pictures(result, session)
+    write_whole(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session)))
     write_whole(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
 
 
-def worst_of_figures(table: TableMeasurements, chart: Chart) -> dict[str, Worst]:
-    """Return where the worst of each figure is that has one, by name.
-
-    A number that says "worst" is of little use to whoever cannot look at it. Places are drawn on the frame that was
-    registered, frames are ringed in the course of the session, lights among the lights.
-    """
-    found = ((figure.name, figure.worst(table, chart)) for figure in FIGURES if figure.worst is not None)
-    return {name: worst for name, worst in found if worst is not None}
-
-
-def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]) -> list[_Picture]:
+def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
     """Return the pictures: first chart, lights, errors and noise, then those of the groups."""
     table = result.figures
     chart, registration = session.chart, table.registration
@@ -256,7 +238,7 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "that makes of each cell by its colour is divided out too."
         )
     return [
-        *_first_pictures(result, session, frame, worsts),
+        *_first_pictures(result, session, frame),
         _Picture(
             "Residuals of the registration",
             "Left: how far the cells moved the map from what the tags and the lens alone give, which is the paper's "
@@ -265,7 +247,6 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "geometry",
             "residuals",
         ),
-        *_worst_pictures(chart, table, frame, worsts),
         _Picture(
             "The light on the print",
             "Shape of the light under the frame that was registered, from its white references; it is divided out of "
@@ -274,7 +255,6 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "light",
             "field",
         ),
-        *_print_picture(chart, table.cells.stains),
         _Picture(
             "The course of the session",
             "Black level, movement and blur of the chart, bare paper under white, how far cells are off their codes' "
@@ -284,15 +264,6 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
             "radiometry",
             "course",
         ),
-        _Picture(
-            "The worst cells",
-            f"The {WORST_CELLS} cells whose rim and middle differ most under white, in standard deviations, each "
-            "between its neighbours; the frame is the samples.",
-            png_of(draw_worst_cells, frame, chart, registration, table.cells.window),
-            "noise",
-            "cells",
-        ),
-        *_residual_picture(chart, table, frame),
         _Picture(
             "What the ground truth may be off by",
             f"Left: the expanded uncertainty (k = {COVERAGE:g}) of each light's direction, shared out among its causes "
@@ -305,16 +276,15 @@ def _pictures(result: BuildResult, session: Session, worsts: Mapping[str, Worst]
     ]
 
 
-def _first_pictures(
-    result: BuildResult, session: Session, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
-) -> list[_Picture]:
+def _first_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np.float32]) -> list[_Picture]:
     """Return what a scientist looks at first: chart, lights, errors, noise."""
     table, chart = result.figures, session.chart
     registration, window = table.registration, table.cells.window
     codes = np.array([light.colour for light in session.illuminations])
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
     seen = f"seen by the {table.session.camera}"
-    truth = worsts[TRUTH_WORST_DEG.name].light if TRUTH_WORST_DEG.name in worsts else None
+    expanded = table.budget.expanded_deg
+    truth = int(np.argmax(expanded)) if len(expanded) > 1 else None
     ringed = "" if truth is None else f" Ringed is light {truth}, whose ground truth is known worst."
     return [
         _Picture(
@@ -348,25 +318,6 @@ def _first_pictures(
     ]
 
 
-def _worst_pictures(
-    chart: Chart, table: TableMeasurements, frame: npt.NDArray[np.float32], worsts: Mapping[str, Worst]
-) -> list[_Picture]:
-    """Return the picture of the places where figures are worst."""
-    places = [
-        (f"{BY_NAME[name].title}: {worst.what}", worst.place)
-        for name, worst in worsts.items()
-        if worst.place is not None
-    ]
-    if not places:
-        return []
-    caption = (
-        "The place of the worst of each figure that has one, on the frame that was registered, whether or not it is "
-        "beyond a limit. Worst frames are ringed in the course of the session, the worst light among the lights."
-    )
-    drawn = png_of(draw_places, frame, chart, table.registration, places)
-    return [_Picture("Where the worst is", caption, drawn, "geometry", "worst")]
-
-
 def _place_pictures(result: BuildResult, session: Session) -> list[_Picture]:
     """Return a picture of each frame in which something is beyond its limit at a place, which is circled."""
     by_file: dict[str, list[LabelledPlace]] = {}
@@ -384,33 +335,6 @@ def _place_pictures(result: BuildResult, session: Session) -> list[_Picture]:
         )
         pictures.append(_Picture(f"Where it is: {Path(file).stem}", caption, drawn))
     return pictures
-
-
-def _residual_picture(chart: Chart, table: TableMeasurements, picture: npt.NDArray[np.float32]) -> list[_Picture]:
-    """Return the picture of what the field leaves of the references, none where there are none."""
-    places_mm = np.array([reference.centre_mm for reference in chart.white_references], dtype=np.float64).reshape(-1, 2)
-    residual = reference_residuals(picture, places_mm, table.registration, table.registered_frame)
-    if not np.isfinite(residual).any():
-        return []
-    caption = (
-        "White references about the field, in the frame that was registered. Left, on the print: noise has no order, "
-        "what lies or shines on the print is one place. Right, by the distance from the middle: a bend at its end is "
-        "fall-off that the field does not follow."
-    )
-    drawn = png_of(draw_reference_residuals, chart, places_mm, residual)
-    return [_Picture("What the field leaves", caption, drawn, "truth", "rest")]
-
-
-def _print_picture(chart: Chart, stains: Stains) -> list[_Picture]:
-    """Return the picture of the print, or none where nothing is known of it: a clean sheet would be a claim."""
-    if not stains.known:
-        return []
-    caption = (
-        "How far cells and their surroundings deviate from their codes' colours elsewhere on the sheet, in the channel "
-        "that deviates most. Noise is a fine grain of some tenths of a per cent; stains, folds and shadows have a "
-        "shape. Crosses are cells listed for it."
-    )
-    return [_Picture("The print", caption, png_of(draw_print, chart, stains), "radiometry", "print")]
 
 
 MOST_UNFIT = 200
@@ -438,29 +362,31 @@ class _Picture:
 
 @dataclass(frozen=True)
 class _Row:
-    """A judged value with what helps and where its worst is, as far as these are to be said."""
+    """A judged value; beyond its limit with what helps, and where it is."""
 
     judged: JudgedValue
     remedy: str
-    worst: str
+    place: str
 
 
 def page(
     result: BuildResult,
     pictures: Sequence[_Picture],
     places: Sequence[_Picture] = (),
-    worsts: Mapping[str, Worst] | None = None,
 ) -> str:
     """Return the text of `report.html`: verdict, what to do, what to look at first, then all figures in groups.
 
-    `places` are pictures of what is beyond a limit, `worsts` where the worst of figures is, by name.
+    `places` are pictures of what is beyond a limit.
     """
     table, verdict = result.figures, result.verdict
     found, beyond = findings(verdict, table), len(verdict.refused) + len(verdict.remarks)
     rows = [
-        _Row(row, _remedy(row, found.get(row.figure.name), table), "" if worst is None else worst.where)
+        _Row(
+            row,
+            _remedy(row, found.get(row.figure.name), table),
+            "" if row.outcome == "accept" else place_of(row.figure, table),
+        )
         for row in sorted(verdict.rows, key=lambda row: _ORDER.index(row.outcome))
-        for worst in [(worsts or {}).get(row.figure.name)]
     ]
     simulated = ", taken in the simulated laboratory" if table.origin.rig == "simulated" else ""
     return render(
@@ -556,5 +482,5 @@ def _cause(found: ProbableCause) -> dict[str, Any]:
         "rule": found.decision.rule,
         "command": retake_command(found.frames) if found.is_of_frames else "",
         "places": places_text(found),
-        "evidence": found.evidence.in_words(),
+        "evidence": ", ".join(f"{name} {value:.3g}" for name, value in found.evidence.known().items()),
     }

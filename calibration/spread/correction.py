@@ -13,8 +13,10 @@ from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr
 
 from calibration import kernels
 from calibration.registration.register import Registration
@@ -511,8 +513,6 @@ def _of_white(off_by: _Array, of_paper: list[_Array]) -> _Array:
 
 def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:
     """Return the share (N,) of each near kernel from beyond a cell, in the worst sample and in the mean of a window."""
-    from scipy.special import ndtr
-
     cell, reach = float(around.pitch_px.min()), around.window // 2
     worst, mean = np.empty(len(NEAR_PX)), np.empty(len(NEAR_PX))
     # A corner's pixel, half a pixel of rounding towards the corner.
@@ -526,8 +526,6 @@ def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:
 
 def _places_beyond(grid: PrintedGrid, registration: Registration, shape: tuple[int, int], window: int) -> Sites:
     """Return places that show what lies behind the print, all over the frame beside it."""
-    import cv2
-
     rows, columns = shape
     width, height = grid.pitch_mm
     # The outermost patches, and from them straight on to the sheet's edge and a margin.

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import nnls
 
 from calibration.spread.predicting import VARYING_BITS, LevelModel
 from experiment.measures.least_squares import page_polynomial, page_powers
@@ -730,8 +731,6 @@ def _positive(matrix: _Array, vector: _Array, kept: npt.NDArray[np.int64]) -> tu
     Far kernels' and the veil's are 0 or more: non-negative least squares of the equations' Cholesky factor (C. Lawson
     and R. Hanson, Solving Least Squares Problems, 1974), the free ones eliminated.
     """
-    from scipy.optimize import nnls
-
     shares = np.zeros(TERMS)
     free, bound = (kept[free_terms()[kept] == wanted] for wanted in (True, False))
     inner, across = matrix[np.ix_(free, free)], matrix[np.ix_(free, bound)]

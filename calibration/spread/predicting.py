@@ -20,6 +20,10 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import cholesky, lapack, solve_triangular
+from scipy.ndimage import uniform_filter
+
+from calibration import kernels
 
 FULL_BITS = 5
 """Bits of a full chart, whose codes stand so near each other that their curvature is less than the noise of a cell."""
@@ -110,8 +114,6 @@ def neighbour_residual(columns: npt.NDArray[np.floating], bits: int) -> _Array:
     `columns`: (C, M) float, values of C = 8**bits cells in the order of colour indices. Returns (C, M) float64, 0 of
     cells without two neighbours along any axis.
     """
-    from calibration import kernels
-
     side = 1 << bits
     if bits < FULL_BITS:
         return _less_curvature(columns, side)
@@ -130,8 +132,6 @@ def _has_neighbours(bits: int) -> _Mask:
 
 def _less_curvature(columns: npt.NDArray[np.floating], side: int) -> _Array:
     """Return the residuals (C, M) of a chart of fewer codes."""
-    from scipy.ndimage import uniform_filter
-
     cube = np.asarray(columns, dtype=np.float64).reshape(side, side, side, -1)
     total, count = np.zeros_like(cube), np.zeros((side, side, side, 1))
     for axis in range(3):
@@ -187,8 +187,6 @@ def _left_of(roots: bytes, usables: bytes, bits: int) -> tuple[_Array, _Array]:
 
 def _likeliest(function: _Array, noise: _Array, root: _Array, *shares: float) -> tuple[_Array, float]:
     """Return the inverse (C, C) of the covariance whose noise has the likeliest share of the function, and that."""
-    from scipy.linalg import cholesky, lapack, solve_triangular
-
     found: list[tuple[float, float, _Array]] = []
     for share in shares or _NOISES:
         # Symmetric, and so in LAPACK's order as well.

@@ -19,6 +19,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr
 
 from calibration import kernels
 from calibration.kernels import PARTS, REACH
@@ -311,8 +312,6 @@ class NearLight:
 
 def far_taps(scale: float) -> _Float:
     """Return the shares (n,) float32, n odd, of slots on a line in a Gaussian's light, σ `scale` slots, of sum 1."""
-    from scipy.special import ndtr
-
     reach = max(1, math.ceil(_FAR_REACH * scale))
     edges = np.arange(-reach, reach + 2) - 0.5
     taps = np.diff(ndtr(edges / scale))

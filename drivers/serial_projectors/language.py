@@ -78,7 +78,7 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
-class Framing(_Table):
+class LineFormat(_Table):
     """How commands and answers are written."""
 
     baud: Annotated[int, Field(ge=300)]
@@ -244,7 +244,7 @@ class Language(_Table):
     """Maker, for messages and records."""
     source: str
     """Manual that the language is from."""
-    line: Framing
+    line: LineFormat
     network: Network | None = None
     refusals: Refusals
     power: PowerWords
@@ -309,18 +309,18 @@ def _mistake(kind: str, place: tuple[int | str, ...], reason: str, given: Any) -
     return f"{key}{value}: {reason.removeprefix('Value error, ')}"
 
 
-def encode_command(line: Framing, text: str) -> bytes:
+def encode_command(line: LineFormat, text: str) -> bytes:
     """Return the bytes of a command."""
     return line.command.replace(_VALUE, text).encode("ascii")
 
 
-def encode_answer(line: Framing, text: str) -> bytes:
+def encode_answer(line: LineFormat, text: str) -> bytes:
     """Return the bytes of an answer; an empty one has no line of its own."""
     whole = line.answer.replace(_VALUE, text)
     return (whole if text else whole.lstrip("\r\n")).encode("ascii")
 
 
-def answer_parser(line: Framing, sent: str = "") -> MessageParser[str]:
+def answer_parser(line: LineFormat, sent: str = "") -> MessageParser[str]:
     """Return what takes one answer, without its framing, off the front of the bytes.
 
     `sent`: the command before it, whose echo is passed over. If the echo and the answer are alike and only one of them

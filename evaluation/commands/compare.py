@@ -13,6 +13,7 @@ import typer
 from evaluation.commands.options import AngularError, argument, choose_learners, choose_methods
 from foundation.console import EXIT_CODES, JsonOutput, option, with_json
 from foundation.errors import InputError
+from foundation.folders import require_free
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -56,7 +57,6 @@ def compare(
     from evaluation.experiments import comparing
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.files import read_errors
-    from foundation.folders import require_free
 
     if len(results) > 2:
         raise InputError(f"{len(results)} results; compare two, or the methods of one")

@@ -7,17 +7,20 @@ from typing import TYPE_CHECKING, Annotated
 
 from evaluation.commands.options import (
     Data,
-    DataReading,
     PrintedError,
-    PrintedStatistics,
+    Read,
     argument,
     choose_beside_constant,
     image_steps,
-    require_order,
+    open_data,
+    split_names,
     thread_option,
 )
 from evaluation.commands.train import LEARNERS_HELP
-from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
+from foundation.compiled import processor_count
+from foundation.console import EXIT_CODES, JsonOutput, option, orderly_end, with_json
+from foundation.errors import counted, first_of
+from foundation.folders import require_free
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,15 +37,13 @@ in one fold.
 
 Reads DATA, a data set of any layout that evaluate run reads. Folds are the data set's own where its authors made some,
 else three that --seed draws; --folds takes a number of folds to draw, or a CSV file with the columns image,fold. Prints
-the table of evaluate run; writes nothing unless asked: --out writes the results folder of evaluate run with folds.csv,
---save-folds the folds alone.
+the table of evaluate run; writes nothing unless asked: --out writes the results folder of evaluate run with folds.csv.
 
 {EXIT_CODES}
 """
 
 
 @with_json("evaluate cv")
-@grouped
 def cv(
     method: Annotated[str, argument("METHOD", f"{LEARNERS_HELP}, all, module:Class or file.py:Class.")],
     data: Data,
@@ -56,35 +57,26 @@ def cv(
     ] = None,
     seed: Annotated[int, option("N", "Of the folds and of all that is random in the training.", min=0)] = 0,
     error: PrintedError = "reproduction",
-    statistics: PrintedStatistics = "paper",
     out: Annotated[Path | None, option("RESULTS", "Write everything to this new folder.")] = None,
-    save_folds: Annotated[Path | None, option("OUT.csv", "Write the folds to this new file.")] = None,
     workers: Annotated[int | None, thread_option(" that read images; no number depends on it")] = None,
-    reading: DataReading,
+    read: Read = None,
     output: JsonOutput,
 ) -> None:
     """Cross-validate methods on a data set."""
     from evaluation.experiments.cross_validation import cross_validate
-    from evaluation.experiments.folds import choose_folds, folds_to_csv
+    from evaluation.experiments.folds import choose_folds
     from evaluation.experiments.run_folder import describe_run, write_run
     from evaluation.learning.constant_light import ConstantLight
     from evaluation.reports.table_output import show_notes, show_tables
     from evaluation.results.method_records import describe_method
     from evaluation.results.result import indistinct
     from evaluation.results.tables import summary_table
-    from foundation.compiled import processor_count
-    from foundation.console import orderly_end
-    from foundation.files import write_whole
-    from foundation.folders import require_free, require_free_file
 
-    require_order("cv", method, data)
-    others, left_out = choose_beside_constant(method)
+    others, left_out = choose_beside_constant(split_names([method]))
     learners = [ConstantLight(), *others]
     if out is not None:
         require_free(out, "the results")
-    if save_folds is not None:
-        require_free_file(save_folds, "the folds")
-    found = reading.open(data)
+    found = open_data(data, read)
     parts, origin = choose_folds(found, folds, seed)
     count, threads = len(found.scenes), workers or processor_count()
     with orderly_end():
@@ -100,17 +92,14 @@ def cv(
         made = describe_run(found, results, described, {"seed": seed, "folds": origin}, parts, notes)
         if out is not None:
             write_run(made, found.scenes, out, error, threads)
-        if save_folds is not None:
-            write_whole(save_folds, folds_to_csv(made.subject.images, parts))
     output.add(data_set=found.name, images=count, folds=len(set(parts.tolist())), seed=seed, error=error)
-    show_tables(output, [summary_table(made.subject, results, error, statistics == "all" or output.asked)])
+    show_tables(output, [summary_table(made.subject, results, error, output.asked)])
     show_notes(output, made.notes, made.treatment)
 
 
 def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
     """Return a sentence where images (N,) int64 by their folds are copies of images of other folds."""
     from evaluation.datasets.identity import first_copies
-    from foundation.errors import counted, first_of
 
     names = [scene.name for scene in data.scenes]
     apart = [

@@ -1,13 +1,7 @@
 """What the commands share: options that several have, the data set that they read, and the methods that they name.
 
-A command has one parameter `reading: DataReading`, and `@grouped` puts the options in its place::
-
-    @grouped
-    def run(dataset: Annotated[str, typer.Argument()], *, reading: DataReading) -> None:
-        data = reading.open(dataset)
-
-The order in which a text is tried as a method: a file that ends in .npz is a model; a name of `standard_methods` or
-`standard_learners`; then module:Class or path/file.py:Class.
+The order in which a text is tried as a method: a file that ends in .csv holds estimates, one that ends in .npz is a
+model; then a name of `standard_methods` or `standard_learners`; then module:Class or path/file.py:Class.
 """
 
 from __future__ import annotations
@@ -15,14 +9,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
-from foundation.console import option
+from foundation.console import option, orderly_end, progress
+from foundation.errors import InputError, nearest_names
 
 if TYPE_CHECKING:
     from evaluation.datasets.options import DataOptions
@@ -49,101 +43,68 @@ PrintedError = Annotated[
     AngularError, typer.Option(help="Angular error that is printed, and drawn in the report; files have both.")
 ]
 
-PrintedStatistics = Annotated[
-    Literal["paper", "all"],
-    typer.Option(help="Print the paper's six statistics, or also 95th percentile, maximum and share below 3°."),
-]
-
 
 @contextmanager
 def image_steps(count: int) -> Generator[Callable[[], None]]:
     """Show how many of `count` images are done, and yield what moves that on by one; Ctrl-C ends the block orderly."""
-    from foundation.console import orderly_end, progress
-
     with orderly_end(), progress("images") as advance:
         steps = itertools.count(1)
         yield lambda: advance(next(steps), count)
 
 
-_reading_option = partial(option, panel="Reading the data")
+Read = Annotated[
+    list[str] | None,
+    option(
+        "KEY=VALUE",
+        "How DATA is read; give it more than once for several. layout=NAME: generated, thumbnails, cube-plus, cube++, "
+        "simple-cube++, nus8, gehler-shi, intel-tau, lsmi, ffcc or folder. camera=NAME: one of several. subset=NAME: a "
+        "part, such as train or test. truth=NAME: one of several ground truths. black=LEVEL, saturation=LEVEL: in the "
+        "units of the files. partial: leave out what a copy lacks. docs/reference/datasets.md has the names. "
+        "\\[default: as DATA looks and its layout has it]",
+    ),
+]
 
 
-@dataclass(frozen=True)
-class DataReading:
-    """How the data sets that a command is given are read; see `evaluation.datasets.options.DataOptions`.
+def open_data(place: str, read: Sequence[str] | None = None) -> SceneSet:
+    """Return the data set at a place, read as the texts of --read ask."""
+    from evaluation.datasets import open_scenes
+    from evaluation.datasets.opening import with_black_judged
 
-    - `layout`: A name of `evaluation.datasets.LAYOUTS`; None takes the one that a place looks like.
-    - `camera`, `subset`, `truth`: of a data set that has several.
-    - `black`, `saturation`: levels that replace those of the layout, in the units of the files.
-    - `partial`: whether missing images are left out and counted.
+    layout, options = reading_options(read or ())
+    return with_black_judged(open_scenes(place, layout, options), options.black)
+
+
+def reading_options(texts: Sequence[str]) -> tuple[str | None, DataOptions]:
+    """Return the layout and the options that texts of --read ask for.
+
+    Examples
+    --------
+    >>> layout, options = reading_options(["layout=nus8", "black=128", "partial"])
+    >>> layout, options.given
+    ('nus8', ('black', 'partial'))
     """
+    from evaluation.datasets.options import DataOptions
 
-    layout: Annotated[
-        str | None,
-        _reading_option(
-            "NAME",
-            "Layout of the data set: generated, thumbnails, cube-plus, cube++, simple-cube++, nus8, gehler-shi, "
-            "intel-tau, lsmi, ffcc or folder. \\[default: what it looks like]",
-        ),
-    ] = None
-    camera: Annotated[
-        str | None,
-        _reading_option("NAME", "One camera of nus8, gehler-shi (1D, 5D), intel-tau or lsmi. \\[default: all]"),
-    ] = None
-    subset: Annotated[
-        str | None,
-        _reading_option(
-            "NAME",
-            "Part of the data set: train, validation or test of generated or (train, test) of simple-cube++; "
-            "lab_printouts … of intel-tau; train, val, test, single, mixed or test-mixed … of lsmi. \\[default: all]",
-        ),
-    ] = None
-    truth: Annotated[
-        str | None,
-        _reading_option(
-            "NAME",
-            "Ground truth where there are several: mean, left, right, left-white or right-white of cube++; own, left "
-            "or right of cube-plus; recommended or shi of gehler-shi. \\[default: the first of these]",
-        ),
-    ] = None
-    black: Annotated[
-        float | None, _reading_option("LEVEL", "Black level, in the units of the files. \\[default: the layout's]")
-    ] = None
-    saturation: Annotated[
-        float | None,
-        _reading_option(
-            "LEVEL",
-            "Value from which a pixel is clipped, in the units of the files. \\[default: the layout's]",
-        ),
-    ] = None
-    partial: Annotated[
-        bool,
-        _reading_option(
-            None, "Take what is there of a copy that lacks images, and say how many it lacks.", "--partial"
-        ),
-    ] = False
-
-    def open(self, place: str) -> SceneSet:
-        """Return the data set at a place; see `evaluation.datasets.opening.open_scenes`."""
-        from evaluation.datasets import open_scenes
-        from evaluation.datasets.opening import with_black_judged
-
-        return with_black_judged(open_scenes(place, self.layout, self.options), self.black)
-
-    @property
-    def options(self) -> DataOptions:
-        """The options without the layout."""
-        from evaluation.datasets.options import DataOptions
-
-        return DataOptions(self.camera, self.subset, self.truth, self.black, self.saturation, self.partial)
+    keys = ("layout", *(field.name for field in fields(DataOptions)))
+    values: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if key not in keys:
+            raise InputError(f"--read {text}: {nearest_names(key, keys)} expected one of {', '.join(keys)}")
+        if key in values:
+            raise InputError(f"--read {text}: {key} is given twice; give it once")
+        if (key == "partial") == bool(equals):
+            raise InputError(f"--read {text}: expected partial alone, and KEY=VALUE of every other key")
+        try:
+            values[key] = float(value) if key in ("black", "saturation") else value or True
+        except ValueError as error:
+            raise InputError(f"--read {text}: expected a number, in the units of the files") from error
+    return values.pop("layout", None), DataOptions(**values)
 
 
-METHOD_HELP = (
-    "Method: a name of --methods, also with parameters (shades-of-gray:p=4, gray-edge-1:p=4:sigma=2), a model file "
-    "(MODEL.npz of evaluate train), module:Class, or file.py:Class for a class of your own. Give it more than once for "
-    "several."
-)
-"""Help of the option --method."""
+def split_names(texts: Iterable[str]) -> list[str]:
+    """Return what texts name between commas, without blanks around it."""
+    return [part.strip() for text in texts for part in text.split(",") if part.strip()]
 
 
 def choose_methods(texts: Iterable[str]) -> list[Method]:
@@ -190,8 +151,6 @@ def choose_learners(texts: Iterable[str]) -> list[Learner]:
 
 def _each_once(texts: Iterable[str]) -> list[str]:
     """Return texts without blanks around them; one that comes twice is refused."""
-    from foundation.errors import InputError
-
     given = [text.strip() for text in texts]
     twice = next((text for number, text in enumerate(given) if text in given[:number]), None)
     if twice is not None:
@@ -199,42 +158,19 @@ def _each_once(texts: Iterable[str]) -> list[str]:
     return given
 
 
-def choose_beside_constant(text: str) -> tuple[list[Learner], list[str]]:
-    """Return the learners that a text names between commas, and why some of `all` are left out.
+def choose_beside_constant(texts: Sequence[str]) -> tuple[list[Learner], list[str]]:
+    """Return the learners that texts name, and why some of `all` are left out.
 
     The constant light is not among them: it stands beside all others unasked.
     """
     from evaluation.learning.constant_light import ConstantLight
     from evaluation.learning.feature_learner import what_is_missing
 
-    texts = [part.strip() for part in text.split(",")]
     explicit = {learner.name for learner in choose_learners(part for part in texts if part.lower() != "all")}
     named = [learner for learner in choose_learners(texts) if learner.name != ConstantLight().name]
     missing = {learner.name: what_is_missing(learner) for learner in named if learner.name not in explicit}
     left_out = [f"{name} is left out: {reason}" for name, reason in missing.items() if reason]
     return [learner for learner in named if not missing.get(learner.name)], left_out
-
-
-def require_order(command: str, method: str, data: str) -> None:
-    """Refuse METHOD and DATA of `evaluate cv` and `evaluate train` in the wrong order.
-
-    Examples
-    --------
-    >>> require_order("cv", ".", "regression-trees")
-    Traceback (most recent call last):
-        ...
-    foundation.errors.InputError: . is a data set and regression-trees a method: the method comes first: evaluate cv \
-regression-trees .
-    """
-    from evaluation.learning.standard import standard_learners
-    from foundation.errors import InputError
-
-    names = {*standard_learners(), "all"}
-    is_method = all(part.strip() in names or ".py:" in part for part in data.split(","))
-    if is_method and not Path(data).exists() and (Path(method).exists() or "://" in method):
-        raise InputError(
-            f"{method} is a data set and {data} a method: the method comes first: evaluate {command} {data} {method}"
-        )
 
 
 def choose_estimates(texts: Sequence[str], images: Sequence[str]) -> list[GivenEstimates]:
@@ -251,7 +187,6 @@ def choose_estimates(texts: Sequence[str], images: Sequence[str]) -> list[GivenE
 
 def _method(text: str) -> Method:
     from evaluation.learning.standard import standard_learners
-    from foundation.errors import InputError
 
     if text in standard_learners():
         raise InputError(
@@ -267,7 +202,6 @@ def _method(text: str) -> Method:
 def _learner(text: str) -> Learner:
     from evaluation.learning.standard import standard_learners
     from evaluation.methods.standard import standard_methods
-    from foundation.errors import InputError, nearest_names
 
     known = standard_learners()
     if text in known:
@@ -282,6 +216,16 @@ def _learner(text: str) -> Learner:
     if not callable(getattr(found, "fit", None)):
         raise InputError(f"{text} has no fit(scenes, seed); evaluate run takes methods that need not learn")
     return cast("Learner", found)
+
+
+def is_learner(text: str) -> bool:
+    """Return whether a text names something that learns: a name of `standard_learners`, or a class that has fit."""
+    from evaluation.learning.standard import standard_learners
+    from evaluation.methods.standard import standard_methods
+
+    if text in standard_learners():
+        return True
+    return text.lower() not in ("standard", *standard_methods()) and callable(getattr(_found(text), "fit", None))
 
 
 def _found(text: str) -> Method | Learner:

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from evaluation.commands.options import (
     AngularError,
-    DataReading,
+    Read,
     argument,
     choose_learners,
     image_steps,
+    open_data,
+    split_names,
     thread_option,
 )
-from foundation.console import EXIT_CODES, JsonOutput, grouped, new_app, option, with_json
+from foundation.compiled import processor_count
+from foundation.console import EXIT_CODES, JsonOutput, new_app, option, with_json
+from foundation.errors import FormatError, InputError
+from foundation.folders import require_free
 
 if TYPE_CHECKING:
     from evaluation.experiments.paper.reporting import PaperReport
@@ -38,7 +43,6 @@ app = new_app(no_args_is_help=True)
 Luts = Annotated[list[Path], argument("LUT", "Folders of tables; demo: for a small computed one.")]
 Kind = Annotated[AngularError, typer.Option(help="Angular error to print.")]
 Out = Annotated[Path | None, option("FOLDER", "Write page, tables and figures here.")]
-Seed = Annotated[int, typer.Option(metavar="N", help="Of all that is drawn at random.", min=0)]
 Workers = Annotated[int | None, thread_option()]
 
 _NOT_C1 = (
@@ -87,16 +91,8 @@ def table1(
     ] = "none",
     side: Annotated[int, option("PX", "Longest side of every image.", min=1, max=65535)] = 512,
     sizes: Annotated[str, option("LIST", "Further sides, px, between commas, to show what they change.")] = "",
-    hot: Annotated[
-        str,
-        option(
-            "LIST",
-            "Hot photosites in a million that a table is taken to have, between commas, to show what they do to "
-            "White-Patch.",
-        ),
-    ] = "",
     error: Kind = "reproduction",
-    seed: Seed = 0,
+    seed: Annotated[int, option("N", "Of all that is drawn at random.", min=0)] = 0,
     out: Out = None,
     workers: Workers = None,
     *,
@@ -106,11 +102,10 @@ def table1(
     from evaluation.experiments.paper.material import read_truths
     from evaluation.experiments.paper.published import cell_name
     from evaluation.experiments.paper.reporting import table1_report
-    from evaluation.experiments.paper.table1 import hot_table, settings, size_dependence
+    from evaluation.experiments.paper.table1 import settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
-    from foundation.compiled import processor_count
 
-    sides, shares = [int(side) for side in _numbers(sizes, "side of an image, px", 65535)], _numbers(hot, "share", 1e6)
+    sides = _sides(sizes)
     _require_free(out)
     opened = _open(luts)
     scenes, says, called = _pictures(pictures, matrix)
@@ -121,13 +116,12 @@ def table1(
     with image_steps(sum(len(part.scenes) for part in chosen)) as step:
         blocks = run(chosen, threads, step)
     found = size_dependence(opened, scenes, truths.lights, sides, seed, threads, names)
-    raised = hot_table(chosen, shares, error, seed, threads) if shares else None
     conditions = (
         f"Pictures: {says}. Images: longest side {side} px. Lights like those of {truths.name}. Seed {seed}.",
         f"Tables: {'; '.join(map(_says, opened))}.",
         *(() if names == ("C1", "C1") else (_NOT_C1,)),
     )
-    _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out, output)
+    _finish(table1_report(blocks, opened, conditions, error, found), conditions, out, output)
 
 
 def _says(lut: Lut) -> str:
@@ -148,30 +142,21 @@ the real one, and tests on the real one. The paper's numbers stand beside those 
 
 @app.command("table2", help=_TABLE2)
 @with_json("evaluate paper table2")
-@grouped
 def table2(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
     generated: Annotated[str, option("PLACE", "Data set made by generate, to train on.")],
-    methods: Annotated[
+    method: Annotated[
         str,
-        option(
-            "LIST",
-            "Methods that learn, between commas: names, module:Class or file.py:Class. "
-            "\\[default: smart-color-cat, regression-trees, color-beaver]",
-            show_default=False,
-        ),
-    ] = "smart-color-cat,regression-trees,color-beaver",
-    folds: Annotated[str, option("N|FILE", "Folds of the cross-validation, or their file.")] = "3",
-    shared: Annotated[
-        Literal["refuse", "leave-out", "keep"],
-        typer.Option(help="Generated images that show a picture of the test; the paper's do."),
-    ] = "keep",
+        option("LIST", "Methods that learn, between commas: names, module:Class or file.py:Class."),
+    ] = "smart-color-cat, regression-trees, color-beaver",
+    unseen: Annotated[
+        bool, typer.Option("--unseen", help="Leave out generated images that show a picture of the test.")
+    ] = False,
     error: Kind = "reproduction",
-    seed: Seed = 0,
     out: Out = None,
     workers: Workers = None,
+    read: Read = None,
     *,
-    reading: DataReading,
     output: JsonOutput,
 ) -> None:
     """Train learned methods on real and on generated images."""
@@ -181,31 +166,23 @@ def table2(
     from evaluation.experiments.paper.table1 import table2 as run
     from evaluation.experiments.paper.table1 import table2_tables
     from evaluation.experiments.transfer.plan import trainable_images
-    from evaluation.learning.standard import standard_learners
-    from foundation.compiled import processor_count
 
     _require_free(out)
-    asked = [name.strip() for name in methods.split(",") if name.strip()]
-    names = list(dict.fromkeys(key for name in asked for key in (standard_learners() if name == "all" else (name,))))
-    learners = dict(zip(names, choose_learners(names), strict=True))
-    real, made = reading.open(data), open_scenes(generated)
+    learners = {getattr(each, "key", each.name): each for each in choose_learners(split_names([method]))}
+    real, made = open_data(data, read), open_scenes(generated)
     count = len(real.scenes)
-    training, shared_images = trainable_images(made, real, shared, real.name, copies=False)
-    fate = (
-        "left out"
-        if shared == "leave-out"
-        else "kept, as in the paper, whose generated images show the pictures that are tested"
-    )
-    unseen = (f"{shared_images}. They were {fate}.",) if shared_images else ()
-    drawn, _ = choose_folds(real, folds, seed)
+    training, shared_images = trainable_images(made, real, unseen, real.name)
+    fate = "left out" if unseen else "kept, as in the paper, whose generated images show the pictures that are tested"
+    fates = (f"{shared_images}. They were {fate}.",) if shared_images else ()
+    drawn, _ = choose_folds(real, "3", 0)
     with image_steps(2 * count) as step:
-        found = run(real.scenes, training, learners, drawn, seed, workers or processor_count(), step)
+        found = run(real.scenes, training, learners, drawn, 0, workers or processor_count(), step)
     is_cube = real.layout == "cube-plus"
     conditions = (
         f"Real: {real.name}, {count} images, {int(drawn.max()) + 1} folds. Generated: {made.name}, {len(training)} "
-        f"images. Seed {seed}. {error.capitalize()} error, degrees.",
+        f"images. {error.capitalize()} error, degrees.",
         _treatment(real),
-        *unseen,
+        *fates,
         *(() if is_cube else ("The paper's table is of Cube+, so only its ratios stand beside these.",)),
     )
     _finish(table2_report(table2_tables(found, error, real.name, is_cube), conditions), conditions, out, output)
@@ -223,94 +200,27 @@ nothing unless asked with --out.
 
 @app.command("bits", help=_BITS)
 @with_json("evaluate paper bits")
-@grouped
 def bits(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images; the paper's is NUS C1.")],
     sigma: Annotated[float, option("PX", "Scale of Gray-Edge; 6 is usual for images of full size.", min=0.1)] = 6.0,
     error: Kind = "reproduction",
     out: Out = None,
     workers: Workers = None,
+    read: Read = None,
     *,
-    reading: DataReading,
     output: JsonOutput,
 ) -> None:
     """Run methods on images whose colours were reduced."""
     from evaluation.experiments.paper.colour_reduction import bits_methods, bits_removed
     from evaluation.experiments.paper.reporting import bits_report
-    from foundation.compiled import processor_count
 
     _require_free(out)
-    opened = reading.open(data)
+    opened = open_data(data, read)
     with image_steps(len(opened.scenes)) as step:
         found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
     first = f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px."
     conditions = (first, _treatment(opened))
     _finish(bits_report(found, error, opened.name, conditions), conditions, out, output)
-
-
-_FLASH = f"""Tone map linear images to codes of 8 bits by the Flash operator (section 4.2).
-
-Reads DATA. Writes the new folder FOLDER: codes/ (PNG of 8 bits, of which --clear sets the lowest bits to zero), masks/,
-and flash.csv with each image's operator and ground truth. evaluate paper flash-inverse takes codes back to linear
-images, also codes that another program has changed.
-
-{EXIT_CODES}
-"""
-
-
-@app.command("flash", help=_FLASH)
-@with_json("evaluate paper flash")
-@grouped
-def flash(
-    data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images.")],
-    out: Annotated[Path, option("FOLDER", "New folder of codes.")],
-    clear: Annotated[int, option("N", "Bits of each code set to zero.", min=0, max=8)] = 0,
-    workers: Workers = None,
-    *,
-    reading: DataReading,
-    output: JsonOutput,
-) -> None:
-    """Write tone-mapped codes of linear images."""
-    from evaluation.experiments.paper.colour_reduction import write_codes
-    from foundation.compiled import processor_count
-
-    _require_free(out)
-    opened = reading.open(data)
-    with image_steps(len(opened.scenes)) as step:
-        write_codes(opened, out, clear, workers or processor_count(), step)
-    output.add(folder=out, data_set=opened.name, images=len(opened.scenes), cleared=clear)
-    print(f"{out}: codes of {len(opened.scenes)} images of {opened.name}, {clear} bits of each set to zero")
-
-
-_INVERSE = f"""Take codes back to linear images by the inverse of the Flash operator (section 4.2).
-
-Reads FOLDER, made by evaluate paper flash; a picture there may have been changed, or replaced by a JPEG of its name.
-Writes the new folder LINEAR: TIFF files of 32-bit floats in the units of the data set, masks, and gt.csv, as evaluate
-run reads them.
-
-{EXIT_CODES}
-"""
-
-
-@app.command("flash-inverse", help=_INVERSE)
-@with_json("evaluate paper flash-inverse")
-def flash_inverse(
-    folder: Annotated[Path, argument("FOLDER", "Folder of codes.")],
-    out: Annotated[Path, option("LINEAR", "New folder of linear images.")],
-    workers: Workers = None,
-    *,
-    output: JsonOutput,
-) -> None:
-    """Write the linear images of codes."""
-    from evaluation.experiments.paper.colour_reduction import write_linear
-    from foundation.compiled import processor_count
-    from foundation.console import progress
-
-    _require_free(out)
-    with progress("images") as shown:
-        count = write_linear(folder, out, workers or processor_count(), shown)
-    output.add(folder=out, images=count)
-    print(f"{out}: {count} linear images; evaluate run {out} estimates their lights")
 
 
 _REDUCTION = f"""One picture with 0 to 7 bits of each code set to zero (a figure of section 4.2).
@@ -401,7 +311,6 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
     from evaluation.experiments.paper.material import developed
-    from foundation.errors import FormatError, InputError
     from generator import find_pictures
     from generator.rendering.matrices import choose_matrix
 
@@ -422,20 +331,16 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
     return developed(data, chosen), f"{len(data.scenes)} of {data.name}, developed to sRGB {how}", data.name
 
 
-def _numbers(text: str, what: str, most: float) -> list[float]:
-    """Return the whole numbers from 1 to `most` between commas."""
-    from foundation.errors import InputError
-
+def _sides(text: str) -> list[int]:
+    """Return the sides of images between commas, px."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts:
-        if not part.isdigit() or not 1 <= int(part) <= most:
-            raise InputError(f"{part!r} is no {what}; write whole numbers from 1 to {most:g} between commas")
-    return [float(part) for part in parts]
+        if not part.isdigit() or not 1 <= int(part) <= 65535:
+            raise InputError(f"{part!r} is no side of an image, px; write whole numbers from 1 to 65535 between commas")
+    return [int(part) for part in parts]
 
 
 def _require_free(out: Path | None) -> None:
     """Refuse a folder that is taken before the work begins."""
-    from foundation.folders import require_free
-
     if out is not None:
         require_free(out, "the report")

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from evaluation.commands.options import (
     Data,
-    DataReading,
+    Read,
     argument,
     choose_learners,
     image_steps,
-    require_order,
+    open_data,
     thread_option,
 )
-from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
-
-if TYPE_CHECKING:
-    from evaluation.learning.model_files import StoredMethod
+from foundation.clock import SystemClock
+from foundation.compiled import processor_count
+from foundation.console import EXIT_CODES, JsonOutput, option, with_json
+from foundation.errors import InputError
+from foundation.folders import require_free_file
 
 LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, kernel-ridge, convnet or constant-light"
 """The suite's own, for the help of commands."""
@@ -38,7 +38,6 @@ as on generated images, and adapts it to DATA, few images of the camera at hand.
 
 
 @with_json("evaluate train")
-@grouped
 def train(
     method: Annotated[str, argument("METHOD", f"One of {LEARNERS_HELP}.")],
     data: Data,
@@ -49,20 +48,15 @@ def train(
     ] = None,
     seed: Annotated[int, option("N", "Of all that is random in the training.", min=0)] = 0,
     workers: Annotated[int | None, thread_option(" that read images; the model does not depend on it")] = None,
-    reading: DataReading,
+    read: Read = None,
     output: JsonOutput,
 ) -> None:
     """Train a method on a data set."""
     from evaluation.learning import adapting
     from evaluation.learning.feature_learner import FeatureLearner, extract, fit_extracted, require_installed, truths_of
-    from evaluation.learning.model_files import provenance_of, save_model
+    from evaluation.learning.model_files import load_model, provenance_of, save_model
     from evaluation.reports.table_output import show_notes
-    from foundation.clock import SystemClock
-    from foundation.compiled import processor_count
-    from foundation.errors import InputError
-    from foundation.folders import require_free_file
 
-    require_order("train", method, data)
     learners = choose_learners([method])
     if len(learners) != 1:
         raise InputError(f"{method} are {len(learners)} methods, a model file holds one; name one")
@@ -76,7 +70,7 @@ def train(
         raise InputError(f"--out is {out}, expected a name that ends in .npz, by which evaluate run knows a model")
     require_free_file(out, "the model")
     require_installed(learner)
-    known = None if adapt is None else _model_to_adapt(adapt, method, data)
+    known = None if adapt is None else load_model(adapt)
     if known is not None:
         if known.learner.key != learner.key:
             raise InputError(
@@ -84,7 +78,7 @@ def train(
             )
         # With the settings of then, which those of today need not be.
         learner = known.learner
-    found = reading.open(data)
+    found = open_data(data, read)
     truths = truths_of(found.scenes)
     count = len(found.scenes)
     with image_steps(count) as step:
@@ -104,23 +98,3 @@ def train(
         notes.append(f"{adapt} answers with a share of {share:.2f}, what these images teach alone with {1 - share:.2f}")
     print(f"{out}: {learner.name}, {record.sentence()}")
     show_notes(output, notes, found.treatment)
-
-
-def _model_to_adapt(adapt: Path, method: str, data: str) -> StoredMethod:
-    """Return the model behind --adapt; where that is a data set instead, an error has the command as it is written."""
-    from evaluation.learning.model_files import load_model
-    from foundation.errors import FormatError, InputError
-
-    try:
-        return load_model(adapt)
-    except FormatError as error:
-        if not adapt.exists():
-            raise
-        images, model = data, "MODEL.npz"
-        with suppress(FormatError):
-            load_model(Path(data))
-            images, model = str(adapt), data
-        raise InputError(
-            f"{error}; behind --adapt stands the model, and DATA are the images that it is adapted to: "
-            f"evaluate train {method} {images} --adapt {model}"
-        ) from error

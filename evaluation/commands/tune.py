@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from evaluation.commands.options import AngularError, Data, DataReading, image_steps, thread_option
-from foundation.console import EXIT_CODES, JsonOutput, grouped, option, with_json
+from evaluation.commands.options import AngularError, Data, Read, image_steps, open_data, thread_option
+from foundation.compiled import processor_count
+from foundation.console import EXIT_CODES, JsonOutput, with_json
 
 FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"
 """The families, for the help."""
@@ -21,44 +21,34 @@ in red and blue chromaticity and little in green, so the parameters are taken wh
 size: gray-edge-2@360.
 
 Ground truths have no part in the choice; --errors shows errors beside it. Prints every setting, the chosen one first;
-evaluate run DATA --method SETTING evaluates one. Writes nothing unless asked with --out.
+evaluate run DATA --method SETTING evaluates one. Writes nothing.
 
 {EXIT_CODES}
 """
 
 
 @with_json("evaluate tune")
-@grouped
 def tune(
     family: Annotated[str, typer.Argument(metavar="FAMILY", help=f"{FAMILIES_HELP}, or one of these with @PIXELS.")],
     data: Data,
     *,
-    out: Annotated[Path | None, option("OUT.csv", "Write the settings to this new file.")] = None,
     errors: Annotated[
         AngularError | None,
         typer.Option(help="Show these errors beside the criterion; the choice stays without them.", show_default=False),
     ] = None,
     workers: Annotated[int | None, thread_option(", one image each; no number depends on it")] = None,
-    reading: DataReading,
+    read: Read = None,
     output: JsonOutput,
 ) -> None:
     """Choose a method's parameters on a data set."""
-    from evaluation.experiments.cross_validation import settings_of, tune_family, tuning_rows, tuning_table
+    from evaluation.experiments.cross_validation import settings_of, tune_family, tuning_table
     from evaluation.reports.table_output import show_notes, show_tables
-    from evaluation.results.tables import table_to_csv
-    from foundation.compiled import processor_count
-    from foundation.files import write_whole
-    from foundation.folders import require_free_file
 
     settings_of(family)  # A family that is none is told before a data set is opened.
-    if out is not None:
-        require_free_file(out, "the settings")
-    found = reading.open(data)
+    found = open_data(data, read)
     count, threads = len(found.scenes), workers or processor_count()
     with image_steps(count) as step:
         tuned = tune_family(family, found.name, found.scenes, errors, threads, step)
-    if out is not None:
-        write_whole(out, table_to_csv(tuning_rows(tuned)))
     show_tables(output, [tuning_table(tuned)])
     best = tuned.settings[0]
     output.add(data_set=found.name, images=count, family=family, chosen=best.text, spread=best.spread)

@@ -153,7 +153,7 @@ def present(
     if missing and (not partial or len(missing) == len(names)):
         raise FormatError(
             f"{folder} lacks {len(missing)} of the {len(names)} images of {source} ({first_of(missing)}); complete "
-            "the copy" + ("" if len(missing) == len(names) else ", or take what is there with --partial")
+            "the copy" + ("" if len(missing) == len(names) else ", or take what is there with --read partial")
         )
     kept = [number for number, name in enumerate(names) if name in images]
     note = str(len(kept))
@@ -312,7 +312,7 @@ def require_above_black(scenes: Iterable[RawScene]) -> None:
         value, scene = max(highest, key=lambda one: one[0])
         raise InputError(
             f"black level {scene.black:g} is above every pixel of all {len(highest)} images, whose largest value is "
-            f"{value:g} ({scene.path}); give the level in the units of the files, by --black or the column black"
+            f"{value:g} ({scene.path}); give the level in their units, by --read black=LEVEL or the column black"
         )
 
 
@@ -337,7 +337,7 @@ def pedestal_note(scenes: Sequence[RawScene]) -> str:
             return ""
         least.append(float(used.min()))
     looked = "the image" if len(least) == 1 else f"{len(least)} images looked at"
-    return f"; but no pixel of {looked} is below {min(least):g}: a black level may be missing, give it with --black"
+    return f"; but no pixel of {looked} is below {min(least):g}: black may be left in; give it with --read black=LEVEL"
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,7 +75,7 @@ def open_generated(place: Path | str, subset: str | None = None) -> SceneSet:
     parts = [part for part in SPLITS if any(entry.split == part for entry in dataset.entries)]
     if subset is not None and not parts:
         raise InputError(
-            f"--subset is {subset}, but {masked(str(place))} was not divided; generate --split 0.8,0.1,0.1 divides a "
+            f"the subset is {subset}, but {masked(str(place))} was not divided; generate --split 0.8,0.1,0.1 divides a "
             "dataset by pictures, and evaluate cv keeps the images of a picture in one fold without that"
         )
     part = choose(subset, parts, "subset", masked(str(place)))

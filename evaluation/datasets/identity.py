@@ -1,17 +1,16 @@
-"""By what images are known without decoding them: whether they are others' copies, or still those that they were.
+"""By what images are known without decoding them: whether they are copies of others.
 
 A model file keeps of what it was trained on each image's name and light, or the picture that it was generated from, so
 that a test on the same images is noticed. A name counts without folder and ending, capitals and case being one; a light
 as chromaticities to four digits, since copies of a data set hold it to different ones. What was renamed, or is held to
-another ground truth, is not known again. A run that goes on asks whether the files changed meanwhile.
+another ground truth, is not known again.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from hashlib import sha256
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -22,7 +21,6 @@ from evaluation.datasets.files import RawScene
 from evaluation.datasets.generated import GeneratedScene
 from evaluation.datasets.thumbnails import Thumbnail
 from evaluation.scene import Scene
-from foundation.errors import CropError
 from foundation.files import sha256_of
 from generator.dataset.reader import Dataset
 
@@ -80,29 +78,8 @@ def _number(kind: str, text: str) -> int:
     return int(sha256_of(f"{kind}\t{text}".encode())[:16], 16)
 
 
-_FILES = ("path", "mask_path", "shares_path")
-"""Fields of a scene that name its files."""
-
 _PIECE: Final = 1 << 20
 """Bytes of a file that are compared: a hundred thousand pixels and more, of which no two photographs agree in all."""
-
-_SUMS = "SHA256SUMS"
-"""The file of a generated dataset that holds the hashes of all others."""
-
-
-def state_of(scenes: Sequence[Scene]) -> str:
-    """Return a text, 64 hexadecimal digits, that becomes another when the images of scenes do.
-
-    No image is decoded. Of a file count its length and when it was written, as `make` and `rsync` do; of a dataset made
-    by `generate` the hashes that it holds; of thumbnails in memory their pixels. Scenes of other kinds count as never
-    changing.
-    """
-    state = sha256()
-    known: dict[int, str] = {}
-    for scene in scenes:
-        for part in _parts(scene, known):
-            state.update(f"{part}\n".encode())
-    return state.hexdigest()
 
 
 def first_copies(scenes: Sequence[Scene]) -> list[int]:
@@ -141,23 +118,3 @@ def _piece(scene: Scene) -> str:
             return sha256_of(stream.read(_PIECE))
     except OSError:
         return scene.path  # What cannot be read is told when the image is.
-
-
-def _parts(scene: Scene, known: dict[int, str]) -> Iterator[str]:
-    if isinstance(scene, Thumbnail):
-        yield f"{scene.image.dtype} {scene.image.shape} {sha256_of(np.ascontiguousarray(scene.image))}"
-    elif isinstance(scene, GeneratedScene):
-        dataset = scene.dataset
-        if id(dataset) not in known:
-            known[id(dataset)] = ""
-            # An old dataset has no such file; then its truths alone tell it from others.
-            with suppress(CropError, OSError):
-                known[id(dataset)] = sha256_of(dataset.store.get(_SUMS))
-            yield known[id(dataset)]
-    elif isinstance(scene, RawScene):
-        for path in (getattr(scene, name, "") for name in _FILES):
-            # A file that is missing is told when the image is read.
-            with suppress(OSError):
-                if path:
-                    found = Path(path).stat()
-                    yield f"{found.st_size} {found.st_mtime_ns}"

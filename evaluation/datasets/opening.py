@@ -189,7 +189,7 @@ def open_scenes(place: Path | str, layout: str | None = None, options: DataOptio
     if idle:
         able = [other for other, it in LAYOUTS.items() if idle[0] in it.options]
         raise InputError(
-            f"--{idle[0]} has no meaning for {text}, {known.title} ({name}); it has one for {', '.join(able)}"
+            f"--read {idle[0]} has no meaning for {text}, {known.title} ({name}); it has one for {', '.join(able)}"
         )
     data = known.open(text, chosen, names)
     return replace(data, treatment={**data.treatment, "reader": _UNVERIFIED}) if known.unverified else data
@@ -241,7 +241,7 @@ def _require_kind(place: str, name: str, known: Layout) -> None:
     if path.is_dir() != (known.takes == "folder"):
         raise FormatError(
             f"{place} is a {'folder' if path.is_dir() else 'file'}, expected a {known.takes} of {known.title} "
-            f"({name}); name that, or leave out --layout to have the layout told by the place"
+            f"({name}); name that, or leave out --read layout to have the layout told by the place"
         )
 
 
@@ -289,5 +289,5 @@ def _recognise(place: str) -> tuple[str, Folder | None]:
         signs = "; ".join(f"{known.signs} ({name})" for name, known in LAYOUTS.items())
         raise FormatError(f"{place} is no dataset of a layout that is known. Looked for: {signs}. Name its folder")
     if len(found) > 1:
-        raise InputError(f"{place} looks like {' and '.join(found)}; say which it is with --layout")
+        raise InputError(f"{place} looks like {' and '.join(found)}; choose with --read layout=NAME")
     return found[0], folder

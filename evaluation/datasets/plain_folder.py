@@ -32,7 +32,7 @@ from foundation.errors import FormatError, InputError, first_of
 COLUMNS = ("image", "r", "g", "b")
 """What the table must have."""
 
-ASSUMED_BLACK = "0: assumed, as neither a column black nor --black gives it"
+ASSUMED_BLACK = "0: assumed, as neither a column black nor --read black gives it"
 """What is stated where nothing says what black is."""
 
 _PICTURES = (".jpg", ".jpeg", ".webp", ".heic", ".gif", ".bmp")
@@ -114,7 +114,7 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
     if not scenes or (missing and not options.partial):
         if refused:
             raise FormatError(refused)
-        remedy = "complete the folder" + (", or take what is there with --partial" if scenes else "")
+        remedy = "complete the folder" + (", or take what is there with --read partial" if scenes else "")
         raise FormatError(
             f"{folder} lacks {len(missing)} of the {len(seen)} images of {path.name} "
             f"({first_of(missing) or 'it is empty'}); {remedy}"
@@ -135,7 +135,7 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
             + (f"; {left_out}" if left_out else ""),
             "black level": _stated("black", given, path, options.black, ASSUMED_BLACK),
             "saturation": _stated("saturation", given, path, options.saturation, "none: neither a column saturation "
-            "nor --saturation gives it, so clipped pixels are used"),
+            "nor --read saturation gives it, so clipped pixels are used"),
             "mask": _mask_stated(given, path, len(masks), len(scenes)),
             "ground truth": f"r, g, b of {path.name}",
         },
@@ -309,7 +309,7 @@ def _without_row(
         raise FormatError(
             f"{path} has no row for {len(among)} of the images beside those that it names "
             f"({first_of([os.path.relpath(file, root.path) for file in among])}), expected one for each; add what is "
-            "missing, take the files away, or leave them out with --partial"
+            "missing, take the files away, or leave them out with --read partial"
         )
     notes = ((among, "beside them"), (elsewhere, "in other folders there"))
     return ", ".join(f"{len(files)} {what} without a row in {path.name} left out" for files, what in notes if files)

@@ -126,14 +126,13 @@ def match(one: MethodErrors, other: MethodErrors, names: tuple[str, str], kind: 
         raise InputError(f"{names[0]} and {names[1]} have no image in common; compare runs on the same data set")
     mine, its = np.array(both, dtype=np.int64).T
     images = tuple(one.images[place] for place in mine.tolist())
-    if one.truths is not None and other.truths is not None:
-        angles = angles_deg(one.truths[mine], other.truths[its])
-        worst = int(angles.argmax())
-        if angles[worst] > _SAME_TRUTH_DEG:
-            raise InputError(
-                f"the ground truths of {images[worst]} in {names[0]} and {names[1]} are {angles[worst]:.2f} degrees "
-                f"apart, at most {_SAME_TRUTH_DEG:g} expected; run both methods on the same data and ground truths"
-            )
+    angles = angles_deg(one.truths[mine], other.truths[its])
+    worst = int(angles.argmax())
+    if angles[worst] > _SAME_TRUTH_DEG:
+        raise InputError(
+            f"the ground truths of {images[worst]} in {names[0]} and {names[1]} are {angles[worst]:.2f} degrees apart, "
+            f"at most {_SAME_TRUTH_DEG:g} expected; run both methods on the same data and ground truths"
+        )
     groups: tuple[str, ...] = ()
     for side, chosen in ((other, its), (one, mine)):
         groups = groups if side.groups is None else tuple(side.groups[place] for place in chosen.tolist())

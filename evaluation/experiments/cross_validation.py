@@ -30,7 +30,7 @@ from evaluation.methods.naming import find_method
 from evaluation.methods.prepared import shrink, unit
 from evaluation.metrics import ErrorKind, Summary, recovery_error, reproduction_error, summarise
 from evaluation.results.result import NO_PIXEL, Result, SceneAnswer, read_light, results_of
-from evaluation.results.tables import PAPER_COLUMNS, STATISTICS_COLUMNS, Cell, Table
+from evaluation.results.tables import PAPER_COLUMNS, Cell, Table
 from evaluation.scene import Image, Scene, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
@@ -311,19 +311,6 @@ def tuning_table(tuning: Tuning) -> Table:
         tuple((one.text, 1000 * one.spread, *_errors(one)) for one in tuning.settings),
         digits=2,
         notes=tuple(notes),
-    )
-
-
-def tuning_rows(tuning: Tuning) -> Table:
-    """Return the table of settings for programs: the chosen one has rank 1; spreads are in chromaticity, 0 … 1."""
-    heads = [f"{tuning.kind}_{name}" for name in STATISTICS_COLUMNS[:6]]
-    return Table(
-        tuning.family,
-        ("rank", "setting", "method", "green_spread", "images", *(heads if tuning.kind else ())),
-        tuple(
-            (rank, one.text, one.name, one.spread, tuning.counted, *_errors(one))
-            for rank, one in enumerate(tuning.settings, 1)
-        ),
     )
 
 

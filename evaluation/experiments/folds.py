@@ -128,22 +128,6 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     return folds.astype(np.int64)
 
 
-def read_names(path: Path, names: Sequence[str]) -> frozenset[str]:
-    """Return the images of a data set that a CSV file names in its column `image`."""
-    columns, table = read_csv(path, "expected CSV with a column image", "images from")
-    if "image" not in columns:
-        have = ",".join(columns) or "of an empty file"
-        raise FormatError(f"{path} has the columns {have}; expected image among them")
-    given = frozenset(row["image"] for row in table)
-    strange = sorted(given - set(names))
-    if strange or not given:
-        raise FormatError(
-            f"{path} names {first_of(strange) if strange else 'no image'}; expected images of the data set, such as "
-            f"{names[0]}"
-        )
-    return given
-
-
 def folds_to_csv(names: Sequence[str], folds: npt.NDArray[np.int64]) -> str:
     """Return folds (N,) int64 as CSV text that `read_folds` reads: `image,fold`.
 

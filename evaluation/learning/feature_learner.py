@@ -52,9 +52,6 @@ class FeatureLearner(ABC):
     needs: ClassVar[tuple[str, str] | None] = None
     """What training needs beside NumPy and SciPy: the module, and the command that installs it; None if nothing."""
 
-    added: ClassVar[Mapping[str, Any]] = {}
-    """Settings that model files lack which were made before these were there, and what they were then."""
-
     @property
     def name(self) -> str:
         """Its name in tables."""

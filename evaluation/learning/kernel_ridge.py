@@ -47,7 +47,6 @@ class KernelRidge(FeatureLearner):
 
     key: ClassVar[str] = "kernel-ridge"
     title: ClassVar[str] = "Kernel ridge (chromaticity histograms)"
-    added: ClassVar[Mapping[str, float]] = {"brightness": 0.0}
 
     working_size: int = 64
     penalty: float = 0.3

@@ -39,10 +39,6 @@ _TRAINED = "trained_on"
 _REMEDY = "name a file that evaluate train has made"
 
 
-def _unknown() -> npt.NDArray[np.uint64]:
-    return np.empty((0, 2), np.uint64)
-
-
 _Images = Annotated[npt.NDArray[np.uint64], PlainValidator(np.asarray), Field(exclude=True)]
 """An array beside the text, which says all else."""
 
@@ -72,8 +68,7 @@ class TrainingRecord:
     adapted_from
         Of a model that was adapted: what the one that it was adapted from was trained on, in a sentence; else empty.
     images
-        (N, 2) uint64, by what each image is known again, see `datasets.identity`; no row in a file that was made
-        before model files had them.
+        (N, 2) uint64, by what each image is known again, see `datasets.identity`.
     """
 
     data_name: str
@@ -87,7 +82,7 @@ class TrainingRecord:
     software: str
     date: str
     adapted_from: str = ""
-    images: _Images = field(default_factory=_unknown, compare=False)
+    images: _Images = field(default_factory=lambda: np.empty((0, 2), np.uint64), compare=False)
 
     def sentence(self) -> str:
         """Return in one line what the model was trained on."""
@@ -194,12 +189,11 @@ def load_model(path: Path) -> StoredMethod:
         if about["method"] not in known:
             raise ValueError(f"it holds {about['method']!r}; known are {', '.join(known)}")
         learner = _with_settings(known[about["method"]], about["settings"])
-        images = arrays.pop(_TRAINED, _unknown())
+        images = arrays.pop(_TRAINED)
         provenance = from_plain(TrainingRecord, about["provenance"] | {"images": images}, path, _REMEDY)
         # Of an adapted model they are those of both trainings.
-        whole = images.ndim == 2 and images.shape[1] == 2 and len(images) in (0, provenance.scenes)
-        both = images.ndim == 2 and images.shape[1] == 2 and provenance.adapted_from and len(images) > provenance.scenes
-        if images.dtype != np.uint64 or not (whole or both):
+        whole = len(images) == provenance.scenes or (provenance.adapted_from and len(images) > provenance.scenes)
+        if images.dtype != np.uint64 or images.shape[1:] != (2,) or not whole:
             raise ValueError(
                 f"its {_TRAINED} is {images.dtype} of the shape {images.shape}, expected uint64, (images, 2)"
             )
@@ -245,7 +239,6 @@ def settings_of(learner: FeatureLearner) -> dict[str, Any]:
 
 def _with_settings(learner: FeatureLearner, settings: Mapping[str, Any]) -> FeatureLearner:
     expected = settings_of(learner)
-    settings = {**learner.added, **settings}
     if set(settings) != set(expected):
         raise ValueError(f"it has the settings {', '.join(sorted(settings))}; expected {', '.join(sorted(expected))}")
     for name, value in settings.items():

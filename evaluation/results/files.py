@@ -2,11 +2,10 @@
 
 A line of `errors.csv` has the columns `image`, `method`, the estimate, the truth (`truth_r`, `truth_g`, `truth_b`),
 `recovery` and `reproduction` in degrees, `guessed`, and, where images belong together, `group`. Columns are found by
-their names, so others may stand between them. A file without the truth's columns, or without `guessed`, is read too:
-its truths are not known, and no image is guessed.
+their names, so others may stand between them.
 
-Estimates that another program has made are `image,r,g,b`, one line an image of the data set, with a head or without;
-commas, semicolons or tabs separate. An image is named as the data set names it, or without its extension. Every image
+Estimates that another program has made are `image,r,g,b`, one line an image of the data set, below these heads; commas,
+semicolons or tabs separate. An image is named as the data set names it, or without its extension. Every image
 of the data set has one line and no other image has any: a file of another part of the data set is refused rather than
 judged on what both happen to have.
 """
@@ -30,7 +29,6 @@ from evaluation.results.result import Result, csv_text
 from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError, counted, first_of
 from foundation.files import file_sha256, read_text
-from generator.named_numbers import is_number
 
 ERRORS_FILE = "errors.csv"
 """Its name in a results folder."""
@@ -38,7 +36,7 @@ ERRORS_FILE = "errors.csv"
 _KINDS: tuple[ErrorKind, ...] = ("recovery", "reproduction")
 _TRUTH = ("truth_r", "truth_g", "truth_b")
 _ESTIMATE = ("r", "g", "b")
-_GUESSED = {"": False, "0": False, "no": False, "false": False, "1": True, "yes": True, "true": True}
+_NUMBERS = (*_KINDS, *_TRUTH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,20 +45,18 @@ class MethodErrors:
 
     - `method`: the method's name.
     - `images`: the images' names, N of them, each once.
-    - `truths`: (N, 3) float64, linear camera RGB of any length; None where the file does not hold them.
+    - `truths`: (N, 3) float64, linear camera RGB of any length.
     - `errors`: kind of error to (N,) float64, degrees.
     - `guessed`: (N,) bool, True where no pixel was usable and the estimate is therefore grey.
-    - `estimates`: (N, 3) float64, linear camera RGB of any length; None where the file does not hold them all.
     - `groups`: what each image shares with others, such as the picture that it was made from; None where the file does
       not hold them all.
     """
 
     method: str
     images: tuple[str, ...]
-    truths: npt.NDArray[np.float64] | None
+    truths: npt.NDArray[np.float64]
     errors: Mapping[ErrorKind, npt.NDArray[np.float64]]
     guessed: npt.NDArray[np.bool_]
-    estimates: npt.NDArray[np.float64] | None = None
     groups: tuple[str, ...] | None = None
 
 
@@ -72,7 +68,7 @@ def read_errors(place: Path | str) -> dict[str, MethodErrors]:
     text = read_text(path, f"name a results folder of evaluate run, or the {ERRORS_FILE} in it")
     rows = csv.DictReader(text.splitlines())
     columns = rows.fieldnames or []
-    missing = [name for name in ("image", "method", *_KINDS) if name not in columns]
+    missing = [name for name in ("image", "method", *_NUMBERS, "guessed") if name not in columns]
     if missing:
         raise FormatError(
             f"{path} has the columns {', '.join(columns) or 'of an empty file'}; expected {', '.join(missing)} too, as "
@@ -80,58 +76,49 @@ def read_errors(place: Path | str) -> dict[str, MethodErrors]:
         )
     if len(set(columns)) < len(columns):
         raise FormatError(f"{path} has columns of the same name: {', '.join(columns)}; expected each once")
-    known = all(name in columns for name in _TRUTH)
     found: dict[str, dict[str, _Line]] = {}
     for row in rows:
         where = f"{path}, line {rows.line_num}"
         if rows.restkey in row:
             raise FormatError(f"{where} has more fields than the {len(columns)} of its head; correct it")
-        wanted = (*_KINDS, *(_TRUTH if known else ()))
-        numbers = [_number(row[name], name, where) for name in wanted]
-        if min(numbers) < 0 or (known and not any(numbers[2:])):
-            raise FormatError(f"{where}: {row['image']} has {dict(zip(wanted, numbers, strict=True))}; none is below 0")
-        guessed = (row.get("guessed") or "").strip().lower()
-        if guessed not in _GUESSED:
-            raise FormatError(f"{where}: guessed is {guessed!r}; expected 0 or 1")
+        numbers = [_number(row[name], name, where) for name in _NUMBERS]
+        if min(numbers) < 0 or not any(numbers[2:]):
+            raise FormatError(
+                f"{where}: {row['image']} has {dict(zip(_NUMBERS, numbers, strict=True))}; none is below 0"
+            )
+        if row["guessed"] not in ("0", "1"):
+            raise FormatError(f"{where}: guessed is {row['guessed']!r}; expected 0 or 1")
         images = found.setdefault(row["method"] or "", {})
         if row["image"] in images:
             raise FormatError(f"{where}: {row['method']} on {row['image']} stands there a second time; remove one")
-        estimate = [_estimate(row.get(name)) for name in _ESTIMATE]
-        images[row["image"]] = numbers, _GUESSED[guessed], estimate, row.get("group") or ""
+        images[row["image"]] = numbers, row["guessed"] == "1", row.get("group") or ""
     if not found:
         raise FormatError(f"{path} has no line of errors below its head; run the methods again")
-    return {method: _errors_of(method, images, known) for method, images in found.items()}
+    return {method: _errors_of(method, images) for method, images in found.items()}
 
 
-_Line = tuple[list[float], bool, list[float], str]
-"""Of an image: errors and truth, whether it was guessed, the estimate, and its group."""
+_Line = tuple[list[float], bool, str]
+"""Of an image: errors and truth, whether it was guessed, and its group."""
 
 
-def _errors_of(method: str, images: Mapping[str, _Line], known: bool) -> MethodErrors:
+def _errors_of(method: str, images: Mapping[str, _Line]) -> MethodErrors:
     numbers = np.array([line[0] for line in images.values()])
-    estimates = np.array([line[2] for line in images.values()])
-    groups = tuple(line[3] for line in images.values())
+    groups = tuple(line[2] for line in images.values())
     return MethodErrors(
         method=method,
         images=tuple(images),
-        truths=numbers[:, 2:] if known else None,
+        truths=numbers[:, 2:],
         errors={kind: numbers[:, place] for place, kind in enumerate(_KINDS)},
         guessed=np.array([line[1] for line in images.values()]),
-        estimates=estimates if np.isfinite(estimates).all() else None,
         groups=groups if all(groups) else None,
     )
 
 
-def _estimate(text: str | None) -> float:
-    """Return a part of an estimate; NaN where there is none: nothing here is computed from it."""
-    try:
-        return float(text or "")
-    except ValueError:
-        return math.nan
-
-
 def _number(text: str | None, name: str, where: str) -> float:
-    value = _estimate(text)
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
     if not math.isfinite(value):
         raise FormatError(f"{where}: {name} is {text!r}, expected a finite number")
     return value
@@ -273,36 +260,27 @@ def _stem(image: str) -> str:
 
 
 def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    separator = max(",;\t", key=lines[0].count)
+    lines = text.splitlines()
+    separator = max(",;\t", key=lines[0].count) if lines else ","
     try:
-        rows = list(csv.reader(lines, delimiter=separator, strict=True))
+        heads, *rows = list(csv.reader(lines, delimiter=separator, strict=True)) or [[]]
     except csv.Error as error:
         raise FormatError(f"{path} is no CSV text: {error}; expected {','.join(_COLUMNS)}") from error
-    heads = [head.strip().lower() for head in rows[0]] if rows else []
-    headed = all(column in heads for column in _COLUMNS)
-    if not headed and not (len(heads) == len(_COLUMNS) and all(map(is_number, heads[1:]))):
+    heads = [head.strip().lower() for head in heads]
+    if any(heads.count(column) != 1 for column in _COLUMNS):
         raise FormatError(
-            f"{path} begins with {lines[0][:80].strip()!r}; expected the columns {','.join(_COLUMNS)}, with or without "
-            "a head"
+            f"{path} begins with {separator.join(heads)[:60]!r}; expected {','.join(_COLUMNS)}, each once"
         )
-    if headed and len(set(heads)) < len(heads):
-        raise FormatError(f"{path} has columns of the same name: {separator.join(rows[0])}; expected each once")
-    places = [heads.index(column) if headed else number for number, column in enumerate(_COLUMNS)]
+    places = [heads.index(column) for column in _COLUMNS]
     found: list[tuple[str, npt.NDArray[np.float64]]] = []
-    for number, row in enumerate(rows, start=1):
-        if (headed and number == 1) or not any(field.strip() for field in row):
+    for number, row in enumerate(rows, start=2):
+        if not any(field.strip() for field in row):
             continue
-        if len(row) != len(heads):
-            raise FormatError(
-                f"{path}, line {number}: {len(row)} fields where the first line has {len(heads)}; expected as many, "
-                "and a point, not a comma, in numbers"
-            )
         try:
+            if len(row) != len(heads):
+                raise ValueError(f"{len(row)} fields, the head has {len(heads)}")
             image, *light = (row[place].strip() for place in places)
             found.append((image, np.array([float(part) for part in light])))
-        except (IndexError, ValueError) as error:
-            raise FormatError(
-                f"{path}, line {number}: {separator.join(row)[:80]!r}; expected a name and three numbers"
-            ) from error
+        except ValueError as error:
+            raise FormatError(f"{path}, line {number}: {error}; expected a name and three numbers") from error
     return found

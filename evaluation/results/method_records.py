@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import inspect
 import math
-import sys
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -23,11 +21,6 @@ from foundation.files import file_sha256, sha256_of
 
 _DEEPEST = 6
 """Levels of values within values that are followed: settings are flat, and a graph of objects may have a circle."""
-
-_HOUSE = frozenset(
-    ("evaluation", "generator", "synthesis", "foundation", "calibration", "acquisition", "drivers", "sim", "tests")
-)
-"""This suite's packages, whose version stands beside the results."""
 
 
 def describe_method(method: object) -> dict[str, Any]:
@@ -60,30 +53,7 @@ def _source(kind: type) -> dict[str, Any]:
         found = {"class": f"{path.name}:{kind.__qualname__}", "file_sha256": file_sha256(path)}
     except (OSError, TypeError):
         return {}
-    beside = _beside(path, kind.__module__.count("."))
-    return found | ({"imports": beside} if beside else {})
-
-
-def _beside(path: Path, depth: int) -> dict[str, str]:
-    """Return the hashes of the modules that were loaded from the folder of a method's file, or of its package.
-
-    A method is more than its file: what it imports from beside it decides its answers as much. What is installed has a
-    version and is left out, and so is this suite.
-    """
-    home = path.parents[min(depth, len(path.parents) - 1)]
-    found: dict[str, str] = {}
-    for name, module in list(sys.modules.items()):
-        file = getattr(module, "__file__", None)
-        if not isinstance(file, str) or not file.endswith(".py") or name.partition(".")[0] in _HOUSE:
-            continue
-        # Most of what is loaded is installed, and following each path's links takes a third of a second.
-        if "site-packages" in Path(file).parts:
-            continue
-        other = Path(file).resolve()
-        if other != path and other.is_relative_to(home) and "site-packages" not in other.parts:
-            with suppress(OSError):
-                found[other.relative_to(home).as_posix()] = file_sha256(other)
-    return dict(sorted(found.items()))
+    return found
 
 
 def _settings(thing: object, depth: int) -> dict[str, Any]:

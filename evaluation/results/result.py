@@ -1,7 +1,4 @@
-"""A run as values: what methods answered for each image, the results that answers make, and the run of them.
-
-An answer is a line of JSON while a run goes on; results are also tables of CSV.
-"""
+"""A run as values: what methods answered for each image, the results that answers make, and the run of them."""
 
 from __future__ import annotations
 
@@ -18,7 +15,6 @@ import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY
 from evaluation.metrics import ErrorKind, MapError, Summary, recovery_error, reproduction_error, summarise
-from evaluation.scene import Scene
 from foundation.errors import first_of
 
 
@@ -27,9 +23,6 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
-
-
-COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg", "no_estimate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,39 +80,6 @@ class Result:
     def summary(self, kind: ErrorKind) -> Summary:
         """Return the numbers that sum up one kind of error, the six of the paper's tables among them."""
         return summarise(self.errors[kind])
-
-
-def table_csv(results: Sequence[Result], kind: ErrorKind) -> str:
-    """Return the table of one dataset as CSV text: `method,mean,median,trimean,best25,worst25,avg,no_estimate`.
-
-    Errors are degrees; `no_estimate` are the images for which the method gave no light and grey stands in.
-
-    Examples
-    --------
-    >>> errors = {"reproduction": np.array([1.0, 2.0, 3.0, 4.0])}
-    >>> print(table_csv([Result("Gray-world", np.ones((4, 3)), errors, np.zeros(4, bool))], "reproduction"), end="")
-    method,mean,median,trimean,best25,worst25,avg,no_estimate
-    Gray-world,2.500000,2.500000,2.500000,1.000000,4.000000,2.286525,0
-    """
-    rows = [
-        (result.method, *(f"{number:.6f}" for number in result.summary(kind).as_tuple()), int(result.guessed.sum()))
-        for result in results
-    ]
-    return csv_text([COLUMNS, *rows])
-
-
-def images_csv(scenes: Sequence[Scene], results: Sequence[Result]) -> str:
-    """Return every estimate and error as CSV text: `image,method,r,g,b,recovery,reproduction`.
-
-    Estimates are scaled to r + g + b = 1, errors are degrees.
-    """
-    rows: list[tuple[str, ...]] = [("image", "method", "r", "g", "b", "recovery", "reproduction")]
-    for place, scene in enumerate(scenes):
-        for result in results:
-            light = result.estimates[place] / result.estimates[place].sum()
-            errors = (result.errors["recovery"][place], result.errors["reproduction"][place])
-            rows.append((scene.name, result.method, *(f"{part:.6f}" for part in (*light, *errors))))
-    return csv_text(rows)
 
 
 NO_PIXEL = "no usable pixel"

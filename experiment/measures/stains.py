@@ -24,6 +24,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from experiment.measures.least_squares import least_absolute_line
@@ -280,10 +282,6 @@ def cell_mm(stains: Stains) -> float:
 
 def joined_cells(stains: Stains, cells: _Index) -> list[_Index]:
     """Return cells (N,) int64 in groups of those that lie next to each other, the largest first."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     if not len(cells):
         return []
     pairs = cKDTree(stains.places_mm[cells]).query_pairs(_BESIDE * cell_mm(stains), output_type="ndarray")
@@ -325,8 +323,6 @@ def added_light(stains: Stains) -> float:
     their own light. What deviates enough is listed as unfit and does no harm; a broad reflection goes on around it, and
     there the light is measured. Of several spots the most.
     """
-    from scipy.spatial import cKDTree
-
     found = 0.0
     for spot in spots_of(stains):
         if len(spot) <= LARGE_SPOT * len(stains.places_mm):

@@ -43,7 +43,7 @@ follow a change of the settings."""
 class Check:
     """One thing looked at in a frame.
 
-    - `name`: what was looked at: "exposure", "light", "movement", "dark", "file", "screen" and so on.
+    - `name`: what was looked at: "movement", "file", "screen"; what is a figure of a table has its name.
     - `value`: what was found, in `unit`; None if it cannot be told in a number.
     - `low`, `high`: limits of `value`; None where that side is open.
     - `unit`: "%", "px", "DN"; empty for a pure number.

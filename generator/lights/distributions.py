@@ -193,14 +193,14 @@ _GAUSSIAN: Final = {
 def parse_distribution(text: str) -> Distribution:
     """Return the distribution that a text names.
 
-    ``uniform``; ``gaussian:r=.3,b=.25,sd=.02`` or ``gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8``; ``fit:GT.csv``
-    with a file as `load_ground_truths` reads it, or the file alone.
+    ``uniform``; ``gaussian:r=.3,b=.25,sd=.02`` or ``gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8``; or a file as
+    `load_ground_truths` reads it, whose lights are fitted.
     """
     kind, _, rest = text.strip().partition(":")
     if kind == "uniform" and not rest:
         return Uniform()
-    path = Path(rest if kind == "fit" else text)
-    if (kind == "fit" and rest) or path.is_file():
+    path = Path(text)
+    if path.is_file():
         return Fitted.of(load_ground_truths(path), path.name)
     if kind == "gaussian":
         numbers = parse_numbers(rest, _GAUSSIAN, "the distribution gaussian")
@@ -208,4 +208,6 @@ def parse_distribution(text: str) -> Distribution:
         if "r" in numbers and "b" in numbers and spread[0] is not None and spread[1] is not None:
             return Gaussian(numbers["r"], numbers["b"], spread[0], spread[1], numbers.get("corr", 0.0))
         raise InputError(f"{text!r} lacks a number; write gaussian:r=.3,b=.25,sd=.02, or sd_r, sd_b and corr for sd")
-    raise InputError(f"{text!r} is no distribution of lights; write uniform, gaussian:r=.3,b=.25,sd=.02, or fit:GT.csv")
+    raise InputError(
+        f"{text!r} is no distribution of lights; write uniform, gaussian:r=.3,b=.25,sd=.02, or name a file of lights"
+    )

@@ -53,7 +53,6 @@ from generator.rendering.print_profiles import PrintProfile, profile_of
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.rendering.matrices import ColourMatrix
 
 _Array = npt.NDArray[np.float64]
 

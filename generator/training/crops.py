@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 
     from calibration.table.lut import Lut
     from generator.rendering.matrices import ColourMatrix
-    from generator.training.gallery import Gallery
     from generator.variation.iso_speed import IsoSpeed
     from generator.variation.sensor_noise import SensorNoise
 

@@ -11,7 +11,7 @@ users of libgphoto2 have listed them; libgphoto2 2.5.34 for structures; specific
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from types import MappingProxyType
@@ -69,7 +69,6 @@ class EosModel:
     - `shutter_codes`, `aperture_codes`: what the lists of shutter times and apertures hold where the dial lets them be
       set; of apertures nothing where the lens has no contacts.
     - `burst`: raw frames that its memory holds.
-    - `frames_per_s`: pace of continuous drive.
     - `frame_bytes`: what it reckons with for one frame; sizes of real raw files vary.
     - `write_s`: time from the end of an exposure until the file is ready.
     - `shots_per_charge`: frames that a full battery lasts for.
@@ -82,7 +81,6 @@ class EosModel:
     shutter_codes: tuple[int, ...]
     aperture_codes: tuple[int, ...]
     burst: int
-    frames_per_s: float
     frame_bytes: int
     write_s: float
     shots_per_charge: int
@@ -154,24 +152,18 @@ def custom_functions(group: int, functions: Mapping[int, int]) -> bytes:
     return structure(1, group, 8 + 4 * len(settings), len(functions), *settings)
 
 
-FOCUS_POINTS = 9
-"""As the 60D has them, in a cross."""
-FOCUS_CENTRE = 4
-"""Number of the one in the middle, of 0 to 8."""
-
-
-def focus_points(found: Iterable[int]) -> bytes:
-    """Return where the body is in focus (property 0xd1d3): of nine points in a cross, those numbered in `found`.
+def focus_points() -> bytes:
+    """Return the focus points of a body that is in focus at none of them (property 0xd1d3): nine in a cross.
 
     The layout is the 60D's, as libgphoto2 reads it: length, length − 4, version, points, points in use, two frame
     sizes, then of all points heights, widths, x and y from the frame's centre, then a bit for each that is in focus.
     """
     xs = (-1720, -860, -860, 0, 0, 0, 860, 860, 1720)
     ys = (0, 489, -489, 792, 0, -792, 489, -489, 0)
-    numbers = struct.pack(f"<18H{2 * FOCUS_POINTS}h", *(100,) * (2 * FOCUS_POINTS), *xs, *ys)
-    bits = sum(1 << point for point in found)
-    head = struct.pack("<2H4H", FOCUS_POINTS, FOCUS_POINTS, 5184, 3456, 5184, 3456)
-    body = struct.pack("<H", 0) + head + numbers + struct.pack("<II", bits, 0)
+    points = len(xs)
+    numbers = struct.pack(f"<18H{2 * points}h", *(100,) * (2 * points), *xs, *ys)
+    head = struct.pack("<2H4H", points, points, 5184, 3456, 5184, 3456)
+    body = struct.pack("<H", 0) + head + numbers + struct.pack("<II", 0, 0)
     length = 4 + 2 + len(body)
     return struct.pack("<IH", length, length - 4) + body
 
@@ -310,7 +302,7 @@ def _properties(body: _Choices) -> tuple[PropertySpec, ...]:
         PropertySpec(Property.EOS_ARTIST, None, FREE),
         PropertySpec(Property.EOS_COPYRIGHT, None, FREE),
         listed(Property.EOS_AEB, 0, body.bracketing),
-        PropertySpec(Property.EOS_FOCUS_INFO, focus_points(()), FREE),
+        PropertySpec(Property.EOS_FOCUS_INFO, focus_points(), FREE),
         PropertySpec(Property.EOS_LENS_NAME, text_value(body.lens).ljust(68, b"\0")),
         fixed(Property.EOS_MIRROR_DOWN_STATUS, 0),
         listed(Property.EOS_AUTO_LIGHTING_OPTIMIZER, 0, (0, 1, 2, 3)),
@@ -359,7 +351,6 @@ EOS_550D = EosModel(
     shutter_codes=(_BULB, *_stops(canon.SHUTTER, 0x10, 0x98)),
     aperture_codes=_stops(canon.APERTURE, 0x25, 0x50),
     burst=6,
-    frames_per_s=3.7,
     frame_bytes=25 << 20,
     write_s=0.783,
     shots_per_charge=440,
@@ -420,7 +411,6 @@ EOS_6D_MARK_II = EosModel(
     shutter_codes=_stops(canon.SHUTTER, 0x10, 0x98),
     aperture_codes=_stops(canon.APERTURE, 0x15, 0x50),
     burst=21,
-    frames_per_s=6.5,
     frame_bytes=35 << 20,
     write_s=0.617,
     shots_per_charge=1200,

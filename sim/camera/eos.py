@@ -48,7 +48,6 @@ from drivers.ptp.codes import (
     CameraStatus,
     CaptureDestination,
     DataType,
-    DriveMode,
     EosEvent,
     EventCode,
     FilesystemType,
@@ -75,7 +74,7 @@ from drivers.ptp.protocol import (
 )
 from foundation.clock import Clock
 from foundation.errors import CropError, DeviceError, DeviceRefused, LinkClosed, ProtocolError
-from sim.camera.bodies import FOCUS_CENTRE, FREE, LIST, MIRROR_LOCKUP, EosModel, custom_functions, focus_points
+from sim.camera.bodies import FREE, LIST, MIRROR_LOCKUP, EosModel, custom_functions
 from sim.camera.film import Film
 
 CARD = 0x00020001
@@ -87,7 +86,7 @@ DCIM = 0x90000000
 FOLDER = 0x91900000
 """Handle of the folder 100CANON; files on the card are numbered from it, 16 apart."""
 BULB = 0x0C
-"""The shutter speed that lasts as long as the release is held."""
+"""The shutter speed that lasts as long as the release is held; a press gives one frame of `_METERED_S` all the same."""
 U32 = 0xFFFFFFFF
 """What a parameter or a time can hold at most; in GetObjectHandles any store, any format, or the root (ISO 15740)."""
 _MEMORY = 0xA0000000
@@ -167,17 +166,6 @@ class Card:
         return self.capacity - sum(len(item.data) for item in self.objects.values())
 
 
-_TIMERS_S: dict[int, float] = {
-    DriveMode.TIMER_10_S: 10.0,
-    DriveMode.TIMER_2_S: 2.0,
-    DriveMode.TIMER_CONTINUOUS: 10.0,
-}
-_CONTINUOUS = (
-    DriveMode.CONTINUOUS,
-    DriveMode.CONTINUOUS_HIGH,
-    DriveMode.CONTINUOUS_LOW,
-    DriveMode.CONTINUOUS_SILENT,
-)
 _AUTO_ISO = 400
 """ISO speed where the body may choose (assumed; there is no meter)."""
 _METERED_S = 1 / 60
@@ -193,7 +181,6 @@ class _Refusal(Enum):
     """Why a full press takes no picture: the response to RemoteReleaseOn, and the result of RemoteRelease."""
 
     BUSY = (ResponseCode.DEVICE_BUSY, 0x2019)
-    NO_FOCUS = (ResponseCode.DEVICE_BUSY, 1)
     MIRROR_LOCKUP = (ResponseCode.DEVICE_BUSY, 3)
     MEMORY_FULL = (ResponseCode.DEVICE_BUSY, 7)
     STORE_FULL = (ResponseCode.STORE_FULL, 7)
@@ -263,7 +250,6 @@ class SimulatedEos:
         self._number = 0
         self._handles = itertools.count(_MEMORY + 1)
         self._mirror_lockup = False
-        self._finds_focus = True
         self._asleep = False
         # What a session has and loses.
         self._session = 0
@@ -280,10 +266,6 @@ class SimulatedEos:
         self._due: list[tuple[float, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self._unfinished = 0
-        self._focused = False
-        self._pressed_at: float | None = None
-        self._bulb_since: tuple[float, datetime] | None = None
-        self._bracket_step = 0
         self._properties = {
             spec.code: PropertyState(
                 spec.value or b"", spec.kind, spec.value is not None, tuple(spec.choices), tuple(spec.formats)
@@ -339,7 +321,7 @@ class SimulatedEos:
 
     @property
     def _is_busy(self) -> bool:
-        return self._unfinished > 0 or self._bulb_since is not None
+        return self._unfinished > 0
 
     def _now(self) -> datetime:
         return self._clock.now() + self._time_offset
@@ -347,9 +329,6 @@ class SimulatedEos:
     # Events.
 
     def _get_event(self, _: Arguments) -> OperationResult:
-        if self._bulb_since is not None and self._event_mode:
-            open_s = int(self._clock.monotonic() - self._bulb_since[0])
-            self._record(Notice(EosEvent.BULB_EXPOSURE_TIME, open_s))
         records, self._queue = self._queue, []
         return OperationResult(encode_events(records))
 
@@ -409,15 +388,12 @@ class SimulatedEos:
 
     def _renew_exposure_lists(self) -> None:
         mode = self._number_of(Property.EOS_AE_MODE)
-        bulb = mode == AeMode.BULB
         timed = mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
         shutter = () if not timed else self.body.shutter_codes
-        if mode == AeMode.SHUTTER_PRIORITY:
-            shutter = tuple(code for code in shutter if code != BULB)
         self._offer(Property.EOS_SHUTTER_SPEED, shutter)
         apertured = mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
         self._offer(Property.EOS_APERTURE, self.body.aperture_codes if apertured else ())
-        if bulb:
+        if mode == AeMode.BULB:
             self._change(Property.EOS_SHUTTER_SPEED, number_value(BULB))
         elif shutter and self._number_of(Property.EOS_SHUTTER_SPEED) not in shutter:
             self._change(Property.EOS_SHUTTER_SPEED, number_value(shutter[len(shutter) // 2]))
@@ -578,11 +554,8 @@ class SimulatedEos:
             raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
         if self._is_busy:
             raise OperationRefusal(ResponseCode.DEVICE_BUSY)
-        automatic = arguments.two == 0
-        if arguments.one & ReleaseButton.HALF and automatic:
-            self._focus()
         if arguments.one & ReleaseButton.FULL:
-            refusal = self._full_press(automatic)
+            refusal = self._full_press()
             if refusal is not None:
                 raise OperationRefusal(refusal.response)
 
@@ -590,49 +563,22 @@ class SimulatedEos:
         self._require_remote()
         if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
             raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
-        self._let_go(arguments.one)
 
     def _remote_release(self, _: Arguments) -> OperationResult:
         self._require_remote()
-        self._focus()
-        refusal = self._full_press(automatic=True)
-        self._let_go(ReleaseButton.HALF_AND_FULL)
+        refusal = self._full_press()
         return OperationResult(parameters=(0 if refusal is None else refusal.result,))
 
-    @property
-    def _has_autofocus(self) -> bool:
-        return self._number_of(Property.EOS_FOCUS_MODE) != FocusMode.MANUAL
-
-    def _focus(self) -> None:
-        if self._has_autofocus:
-            self._focused = self._finds_focus
-            self._change(Property.EOS_FOCUS_INFO, focus_points((FOCUS_CENTRE,) if self._focused else ()))
-
-    def _cancel_focus(self, _: Arguments) -> None:
-        self._focused = False
-
-    def _full_press(self, automatic: bool) -> _Refusal | None:
+    def _full_press(self) -> _Refusal | None:
+        """Take one frame, whatever the drive mode, the bracket and the focus are set to."""
         settings = self._settings()
-        refusal = self._refusal(automatic, settings)
-        if refusal is not None:
-            return refusal
-        now = self._clock.monotonic()
-        self._pressed_at = now
-        drive = self._number_of(Property.EOS_DRIVE_MODE)
-        bracketing = self._number_of(Property.EOS_AEB)
-        if self._number_of(Property.EOS_SHUTTER_SPEED) == BULB:
-            self._bulb_since = now, self._clock.now()
-            self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
-            return None
-        # A bracket comes whole, except in single drive, where each press takes one of its three.
-        whole = bracketing and (drive in _CONTINUOUS or drive in _TIMERS_S)
-        opens_at = now + _TIMERS_S.get(drive, 0.0)
-        for _ in range(3 if whole else 1):
-            opens_at = self._plan(opens_at, self._bracketed(settings, bracketing))
-        self._move()
-        return None
+        refusal = self._refusal(settings)
+        if refusal is None:
+            self._plan(self._clock.monotonic(), settings)
+            self._move()
+        return refusal
 
-    def _refusal(self, automatic: bool, settings: ExposureSettings) -> _Refusal | None:
+    def _refusal(self, settings: ExposureSettings) -> _Refusal | None:
         destination = self._number_of(Property.EOS_CAPTURE_DESTINATION)
         if self._is_busy:
             return _Refusal.BUSY
@@ -640,44 +586,15 @@ class SimulatedEos:
             return _Refusal.BATTERY_EMPTY
         if self._mirror_lockup:
             return _Refusal.MIRROR_LOCKUP
-        if automatic and self._has_autofocus and not self._focused:
-            return _Refusal.NO_FOCUS
         if destination & CaptureDestination.HOST and self._frames_waiting() >= self.body.burst:
             return _Refusal.MEMORY_FULL
         if not self._available_shots():
             return _Refusal.STORE_FULL
-        if self._number_of(Property.EOS_SHUTTER_SPEED) != BULB:
-            try:
-                self._film.accept(settings)
-            except DeviceRefused:
-                return _Refusal.EXPOSURE
+        try:
+            self._film.accept(settings)
+        except DeviceRefused:
+            return _Refusal.EXPOSURE
         return None
-
-    def _let_go(self, button: int) -> None:
-        if button & ReleaseButton.HALF:
-            self._focused = False
-        if not button & ReleaseButton.FULL or self._pressed_at is None:
-            return
-        now = self._clock.monotonic()
-        if self._bulb_since is not None:
-            since, opened = self._bulb_since
-            self._bulb_since = None
-            settings = self._settings()
-            held = ExposureSettings(settings.iso, settings.aperture, max(now - since, 1e-3))
-            self._expose(held, opened, now)
-        elif self._number_of(Property.EOS_DRIVE_MODE) in _CONTINUOUS and not self._number_of(Property.EOS_AEB):
-            self._continue_series(now)
-        self._pressed_at = None
-        self._move()
-
-    def _continue_series(self, now: float) -> None:
-        """Take the further frames of continuous drive that the time of the press was good for."""
-        assert self._pressed_at is not None
-        settings = self._settings()
-        pace = max(1 / self.body.frames_per_s, settings.shutter_s)
-        room = min(self.body.burst - self._frames_waiting(), self._available_shots()) - 1
-        for number in range(1, min(int((now - self._pressed_at) / pace), room) + 1):
-            self._plan(self._pressed_at + number * pace, settings)
 
     def _settings(self) -> ExposureSettings:
         """Return the exposure that is set, in nominal values; where the body would measure, what it is assumed to."""
@@ -690,28 +607,19 @@ class SimulatedEos:
             None
             if not self.body.aperture_codes
             else canon.APERTURE.value(aperture)
-            if aperture and mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
+            if aperture and mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY)
             else _METERED_APERTURE,
             canon.SHUTTER.value(shutter)
-            if shutter and shutter != BULB and mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
+            if shutter and shutter not in canon.SHUTTER.specials and mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
             else _METERED_S,
         )
 
-    def _bracketed(self, settings: ExposureSettings, bracketing: int) -> ExposureSettings:
-        """Return the next of a bracket's three exposures: as set, under, over."""
-        if not bracketing:
-            return settings
-        stops = (0, -bracketing, bracketing)[self._bracket_step] / 8
-        self._bracket_step = (self._bracket_step + 1) % 3
-        return ExposureSettings(settings.iso, settings.aperture, settings.shutter_s * 2**stops)
-
     # The shutter.
 
-    def _plan(self, opens_at: float, settings: ExposureSettings) -> float:
-        """Open the shutter at a time; return when it can open again."""
+    def _plan(self, opens_at: float, settings: ExposureSettings) -> None:
+        """Open the shutter at a time."""
         self._unfinished += 1
-        if self._unfinished == 1:
-            self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
+        self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
 
         def open_shutter() -> None:
             late = timedelta(seconds=self._clock.monotonic() - opens_at)
@@ -719,7 +627,6 @@ class SimulatedEos:
             self._expose(settings, self._clock.now() - late, opens_at + settings.shutter_s)
 
         self._at(opens_at, open_shutter)
-        return opens_at + max(settings.shutter_s, 1 / self.body.frames_per_s)
 
     def _expose(self, settings: ExposureSettings, opened: datetime, closes_at: float) -> None:
         self._unfinished += 1
@@ -824,8 +731,6 @@ class SimulatedEos:
             return
         if code == Property.EOS_MIRROR_UP_SETTING:
             self._mirror_lockup = bool(number_of(value))
-        if code == Property.EOS_AEB:
-            self._bracket_step = 0
         self._change(code, value)
         if code == Property.EOS_CAPTURE_DESTINATION:
             self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
@@ -931,11 +836,9 @@ class SimulatedEos:
             self._change(Property.EOS_AE_MODE, number_value(mode))
             self._renew_exposure_lists()
 
-    def switch_focus(self, automatic: bool, finds: bool = True) -> None:
-        """Move the lens's switch to AF or MF; `finds` says whether AF will find anything to focus on."""
+    def switch_focus(self, automatic: bool) -> None:
+        """Move the lens's switch to AF or MF."""
         with self._moved():
-            self._finds_focus = finds
-            self._focused = False
             self._change(Property.EOS_FOCUS_MODE, number_value(FocusMode.ONE_SHOT if automatic else FocusMode.MANUAL))
 
     def switch_mirror_lockup(self, on: bool) -> None:
@@ -951,13 +854,6 @@ class SimulatedEos:
         """Set a property by the camera's own menu, which no list restricts."""
         with self._moved():
             self._store(code, value.encode() if isinstance(value, ImageFormat) else number_value(value))
-
-    def insert_card(self, card_bytes: int) -> None:
-        """Put an empty card into the slot."""
-        with self._moved():
-            self._card = self._blank_card(card_bytes)
-            self._record(Notice(EosEvent.STORE_ADDED, CARD))
-            self._renew_destinations()
 
     def remove_card(self) -> None:
         """Take the card out, with what is on it."""
@@ -1026,13 +922,10 @@ class SimulatedEos:
             self._memory.clear()
         self._host_bytes = 0
         self._warned = False
-        self._let_go(ReleaseButton.HALF_AND_FULL)
         self._renew_destinations()
 
     def _set_remote_mode(self, arguments: Arguments) -> None:
         self._remote_mode = arguments.one
-        if not self._remote_mode:
-            self._let_go(ReleaseButton.HALF_AND_FULL)
 
     def _set_event_mode(self, arguments: Arguments) -> None:
         self._event_mode = arguments.one
@@ -1094,7 +987,7 @@ class SimulatedEos:
             Operation.EOS_SET_UI_LOCK: self._do_nothing,
             Operation.EOS_RESET_UI_LOCK: self._do_nothing,
             Operation.EOS_PC_HDD_CAPACITY: self._pc_hdd_capacity,
-            Operation.EOS_AF_CANCEL: self._cancel_focus,
+            Operation.EOS_AF_CANCEL: self._do_nothing,
             Operation.EOS_REMOTE_RELEASE_ON: self._remote_release_on,
             Operation.EOS_REMOTE_RELEASE_OFF: self._remote_release_off,
             Operation.EOS_RESET_MIRROR_LOCKUP_STATE: self._do_nothing,

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, Colour
+from drivers.raw.rawfile import camera_matrix
 from drivers.tiff import CFA, D65, Tags, TiffTag, ValueType, head, rationals, text
 from foundation.clock import OPENING
 from foundation.errors import DeviceError, DeviceRefused
@@ -184,8 +185,6 @@ def _colour_matrix(body: Body) -> tuple[int, ...]:
     known = _COLOUR_MATRICES.get(body.sensitivities)
     if known is not None:
         return known
-    from drivers.raw.rawfile import camera_matrix
-
     rows = camera_matrix(body.camera)
     return _LINEAR_SRGB if rows is None else tuple(round(10_000 * value) for row in rows for value in row)
 

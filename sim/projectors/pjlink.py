@@ -11,7 +11,7 @@ from drivers import pjlink as wire
 from drivers.links.network import TcpServer, serve_peer
 from drivers.pjlink import ErrorCode, PjLinkReply, PjLinkRequest, Refused
 from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
-from sim.projectors.projector import SimulatedProjector
+from sim.projectors.projector import INPUTS, SimulatedProjector
 
 
 @dataclass
@@ -20,15 +20,13 @@ class _Connection:
 
     - `heard`: of a line that is not whole yet.
     - `last_heard`: when the last command came, by the projector's clock, seconds.
-    - `expected_digest`: what proves the password by MD5; empty where none is wanted, or it has been proved.
-    - `challenge`: what a proof by SHA-256 begins with; empty until the controller asks for one.
+    - `expected_digest`: what proves the password; empty where none is wanted, or it has been proved.
     - `closed`: whether the projector has hung up.
     """
 
     last_heard: float
     heard: bytes = b""
     expected_digest: str = ""
-    challenge: bytes = b""
     closed: bool = False
 
 
@@ -71,12 +69,9 @@ class PjLinkPeer:
             while not connection.closed and (taken := wire.take_line(connection.heard, _LONGEST)) is not None:
                 line, length = taken
                 connection.heard = connection.heard[length:]
-                if wire.is_security_question(line) and connection.expected_digest:
-                    answer += self._security_answer()
-                else:
-                    reply = self._reply(wire.parse_request(line))
-                    answer += wire.encode_reply(reply)
-                    connection.closed = isinstance(reply, Refused)
+                reply = self._reply(wire.parse_request(line))
+                answer += wire.encode_reply(reply)
+                connection.closed = isinstance(reply, Refused)
         except ProtocolError:
             connection.closed = True
         return answer
@@ -90,28 +85,9 @@ class PjLinkPeer:
         digest = wire.authentication_digest(seed, self._password)
         return _Connection(now, expected_digest=digest), wire.encode_greeting(seed)
 
-    def _security_answer(self) -> bytes:
-        if not self._projector.traits.sha256:
-            # A projector with MD5 alone takes this for a digest, and a wrong one.
-            self._connection.closed = True
-            return wire.encode_reply(Refused.WRONG_PASSWORD)
-        self._connection.challenge = secrets.token_bytes(16)
-        return wire.encode_challenge(self._connection.challenge)
-
-    def _proves_password(self, digest: str) -> bool:
-        connection = self._connection
-        if not connection.challenge:
-            return digest == connection.expected_digest
-        try:
-            nonce = bytes.fromhex(digest[:32])
-        except ValueError:
-            return False
-        assert self._password is not None
-        return len(nonce) == 16 and digest == wire.sha256_digest(connection.challenge, nonce, self._password)
-
     def _reply(self, request: PjLinkRequest) -> PjLinkReply | Refused:
         if self._connection.expected_digest:
-            if not self._proves_password(request.digest):
+            if request.digest != self._connection.expected_digest:
                 return Refused.WRONG_PASSWORD
             self._connection.expected_digest = ""
         try:
@@ -137,7 +113,7 @@ class PjLinkPeer:
         return value if isinstance(value, str) else wire.OK
 
 
-_LONGEST = wire.MAX_LINE + wire.MAX_DIGEST
+_LONGEST = wire.MAX_LINE + wire.DIGEST_LENGTH
 """Bytes of a connection's first command."""
 _INPUTS = tuple(kind + number for kind in "123456" for number in "123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ")
 _Answers = Mapping[str, Mapping[str, Callable[[], str | None]]]
@@ -146,7 +122,7 @@ _Answers = Mapping[str, Mapping[str, Callable[[], str | None]]]
 
 def _class_1(projector: SimulatedProjector) -> _Answers:
     inputs = [code for code in _INPUTS if wire.is_class_1_input(code)]
-    offered = [source.code for source in projector.traits.inputs if wire.is_class_1_input(source.code)]
+    offered = [code for code in INPUTS if wire.is_class_1_input(code)]
     mute, show = lambda: projector.set_muted(True), lambda: projector.set_muted(False)
     return {
         "POWR": {
@@ -171,34 +147,21 @@ def _class_1(projector: SimulatedProjector) -> _Answers:
         "NAME": {wire.QUERY: lambda: projector.identity().name},
         "INF1": {wire.QUERY: lambda: projector.identity().maker},
         "INF2": {wire.QUERY: lambda: projector.identity().model},
-        "INFO": {wire.QUERY: lambda: "simulated"},
         "CLSS": {wire.QUERY: lambda: str(projector.traits.pjlink_class)},
     }
 
 
 def _class_2(projector: SimulatedProjector) -> _Answers:
-    traits = projector.traits
-    answers: dict[str, Mapping[str, Callable[[], str | None]]] = {
+    return {
         "INPT": _selecting(projector, _INPUTS),
-        "INST": {wire.QUERY: lambda: " ".join(source.code for source in traits.inputs)},
-        "INNM": {wire.QUERY + source.code: lambda name=source.name: name for source in traits.inputs},
+        "INST": {wire.QUERY: lambda: " ".join(INPUTS)},
         "IRES": {wire.QUERY: lambda: wire.format_resolution(projector.input_resolution())},
-        "RRES": {wire.QUERY: lambda: wire.format_resolution(traits.panel)},
-        "SNUM": {wire.QUERY: lambda: traits.serial_number},
-        "SVER": {wire.QUERY: lambda: traits.software_version},
-        "RLMP": {wire.QUERY: lambda: traits.lamp_model},
         "FREZ": {
             wire.QUERY: lambda: wire.format_freeze(projector.frozen()),
             "0": lambda: projector.set_frozen(False),
             "1": lambda: projector.set_frozen(True),
         },
-        "SVOL": {wire.RAISE: projector.turn_volume, wire.LOWER: projector.turn_volume},
-        "MVOL": {wire.RAISE: projector.turn_volume, wire.LOWER: projector.turn_volume},
     }
-    if traits.filter_hours is not None:
-        answers["FILT"] = {wire.QUERY: lambda: str(traits.filter_hours)}
-        answers["RFIL"] = {wire.QUERY: lambda: traits.filter_model}
-    return answers
 
 
 def _selecting(projector: SimulatedProjector, codes: Iterable[str]) -> dict[str, Callable[[], str | None]]:

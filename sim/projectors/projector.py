@@ -10,7 +10,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from drivers.pjlink import Input, NoResolution, Resolution
+from drivers.pjlink import NoResolution, Resolution
 from drivers.presenter import BLACK, Colour
 from drivers.projector import FAULT_PARTS, Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.clock import Clock
@@ -53,13 +53,8 @@ WARM_UP_S = 30.0
 COOL_DOWN_S = 60.0
 """A little more than the 10 to 50 s of PWR OFF (same source): drivers must wait for it."""
 IDENTITY = ProjectorIdentity("CroP", "Simulated Projector", "dark room")
-INPUTS = (
-    Input("11", "Computer"),
-    Input("31", "HDMI 1"),
-    Input("32", "HDMI 2"),
-    Input("3A", "HDBaseT"),
-    Input("61", "Test pattern"),
-)
+INPUTS = ("11", "31", "32", "3A", "61")
+"""Codes of the inputs (PJLink INPT); class 1 has the first three."""
 PANEL = Resolution(1920, 1080)
 
 
@@ -67,23 +62,14 @@ PANEL = Resolution(1920, 1080)
 class ProjectorTraits:
     """What does not change about a simulated projector.
 
-    `lamp_hours` is what its lamp has burnt at the start; `filter_hours` is None for a projector without filter;
-    `inputs` beyond class 1 are hidden in a projector of class 1; `sha256` is what PJLink 2.10 adds.
+    `lamp_hours` is what its lamp has burnt at the start.
     """
 
     identity: ProjectorIdentity = IDENTITY
     warm_up_s: float = WARM_UP_S
     cool_down_s: float = COOL_DOWN_S
     lamp_hours: float = 120.0
-    inputs: tuple[Input, ...] = INPUTS
     pjlink_class: int = 2
-    sha256: bool = False
-    serial_number: str = "SIM0000001"
-    software_version: str = "1.00"
-    filter_hours: int | None = 45
-    lamp_model: str = "LAMP-1"
-    filter_model: str = "FILTER-1"
-    panel: Resolution = PANEL
 
 
 class SimulatedProjector:
@@ -103,9 +89,7 @@ class SimulatedProjector:
         self._faults: dict[str, Severity] = {}
         self._input = "31"
         self._frozen = False
-        self.shutter_closed = False
-        """Whether a shutter before the lens holds the light back; change it at will."""
-        self.signal: Resolution | NoResolution = self.traits.panel
+        self.signal: Resolution | NoResolution = PANEL
         """What arrives at its input; change it at will."""
 
     def identity(self) -> ProjectorIdentity:
@@ -144,9 +128,9 @@ class SimulatedProjector:
             return self._input
 
     def set_input(self, code: str) -> None:
-        """Show another of the inputs in its traits; refused unless it is on."""
+        """Show another of `INPUTS`; refused unless it is on."""
         with self._while_on():
-            if code not in [source.code for source in self.traits.inputs]:
+            if code not in INPUTS:
                 raise ValueError(code)
             self._input = code
 
@@ -164,11 +148,6 @@ class SimulatedProjector:
         """Freeze the picture, or let it move; refused unless it is on."""
         with self._while_on():
             self._frozen = frozen
-
-    def turn_volume(self) -> None:
-        """Do nothing, for nobody can hear it; refused unless it is on."""
-        with self._while_on():
-            pass
 
     def faults(self) -> tuple[Fault, ...]:
         """Return every fault that has been injected and not repaired."""
@@ -188,11 +167,11 @@ class SimulatedProjector:
     def light(self) -> float:
         """Return the fraction of the full light that reaches the screen now, 0 … 1.
 
-        0 when off, muted, behind a closed shutter or with a dead lamp; rises in proportion to time during warm-up.
+        0 when off, muted or with a dead lamp; rises in proportion to time during warm-up.
         """
         with self._guard:
             self._move()
-            if self._muted or self.shutter_closed or not self._lit():
+            if self._muted or not self._lit():
                 return 0.0
             if self._power is Power.WARMING:
                 return (self.clock.monotonic() - self._since) / self.traits.warm_up_s

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -126,7 +127,7 @@ def ask(projector: PjLinkProjector) -> LampState:
     frozen, source = False, None
     # Class 1 knows no freeze, and some projectors no input.
     with contextlib.suppress(DeviceError):
-        source = projector.input().code
+        source = projector.input()
     with contextlib.suppress(DeviceError):
         frozen = bool(projector.frozen())
     return LampState(1.0, frozen, source)
@@ -262,8 +263,6 @@ def picture_light(pixels: NDArray[np.uint32], light: NDArray[np.float32]) -> NDA
     `pixels`: (height, width) uint32, 0xRRGGBB. `light`: (256,) float32, 0 … 1, of each code. Returns (h, w, 3) float32,
     0 … 1; (1, 1, 3) where all pixels are alike.
     """
-    import cv2
-
     plain = bool((pixels == pixels[0, 0]).all())
     some = pixels[:1, :1] if plain else pixels
     picture = np.stack([light[some >> shift & 255] for shift in (16, 8, 0)], axis=-1)
@@ -276,8 +275,6 @@ def picture_light(pixels: NDArray[np.uint32], light: NDArray[np.float32]) -> NDA
 
 def _added(total: NDArray[np.float64], part: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the sum of two pictures; where a change of mode gave them different sizes, in the larger one's."""
-    import cv2
-
     if total.shape != part.shape and (1, 1) not in (total.shape[:2], part.shape[:2]):
         rows, columns = (max(one, other) for one, other in zip(total.shape[:2], part.shape[:2], strict=True))
         total, part = (np.asarray(cv2.resize(one, (columns, rows)), dtype=np.float64) for one in (total, part))

@@ -169,11 +169,11 @@ def test_what_is_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_every_number_of_the_judge_says_what_it_is() -> None:
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "night-run.md").read_text("utf-8")
     table = page.partition("| check | question | limit |")[2].partition("\n\n")[0]
-    named = {name for row in table.splitlines()[2:] for name in re.findall(r"`([a-z ]+)`", row.split("|")[1])}
-    assert named - {"camera", "settings"} == set(MEANINGS)
+    named = {name for row in table.splitlines()[2:] for name in re.findall(r"`([a-z_]+)`", row.split("|")[1])}
+    assert named - {"other_camera", "settings"} == set(MEANINGS)
 
 
 def test_a_limit_that_allows_everything_is_none() -> None:
     assert lamp_check(0.0001, 0.8, "").high is None
     assert "no limits before" in check_text(lamp_check(0.0001, 0.8, ""))
-    assert "lamp +0.01 %, -9 to +9 % allowed" in check_text(lamp_check(0.0001, 0.09, ""))
+    assert "off_brightness +0.01 %, -9 to +9 % allowed" in check_text(lamp_check(0.0001, 0.09, ""))

@@ -16,7 +16,6 @@ from experiment.session.folder import Session
 from tests.calibration.lab import LIGHTS, Lab, blank_pictures, hang, lens_unmeasured, rendered_once, take
 from tests.calibration.whole import LIMITS, told
 from tests.pinned import Pinned
-from tests.pinned.drawn import drawn as numbers_of_figure
 
 __all__ = ["built", "lab", "lens_unmeasured", "rendered_once", "session"]
 
@@ -58,24 +57,6 @@ def pinned_builds(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
     yield
     if found:
         pinned(f"build, {words_of_test(request)}", found, **LIMITS)
-
-
-@pytest.fixture
-def pinned_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, pinned: Pinned) -> Iterator[None]:
-    """Pin the numbers of each figure that a test has drawn by `drawn` of its module."""
-    module: Any = request.module
-    known: Callable[..., Any] = module.drawn
-    found: list[Any] = []
-
-    def kept(*given: Any) -> Any:
-        figure = known(*given)
-        found.append(numbers_of_figure(figure))
-        return figure
-
-    monkeypatch.setattr(module, "drawn", kept)
-    yield
-    if found:
-        pinned(f"picture, {words_of_test(request)}", found)
 
 
 def words_of_test(request: pytest.FixtureRequest) -> str:

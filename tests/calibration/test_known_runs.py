@@ -27,7 +27,7 @@ from experiment.chart.layout import paper_chart
 from tests.calibration.checks.test_frame_consistency import Sheet
 from tests.calibration.checks.test_light_codes import SESSIONS, agreement, random_session
 from tests.calibration.checks.test_stray_light import found as stray_found
-from tests.calibration.comparison.test_comparison import written
+from tests.calibration.comparison.test_comparing import written
 from tests.calibration.radiometry.test_superposition import LEVELS, compressed, proportional, seen, short_of_counts
 from tests.calibration.registration.test_matching import CHART, RASTER, compared
 from tests.calibration.registration.test_tiles import RASTER as TILED

@@ -74,9 +74,9 @@ class CameraContract:
         assert bench.camera.identity() == bench.identity
 
     def test_takes_nothing_before_it_knows_how(self, bench: Bench) -> None:
-        with pytest.raises(DeviceRefused, match="configure"):
+        with pytest.raises(DeviceRefused):
             bench.camera.expose()
-        with pytest.raises(DeviceError, match="expose"):
+        with pytest.raises(DeviceError):
             bench.camera.download(io.BytesIO())
         assert bench.frames() == []
 
@@ -108,7 +108,7 @@ class CameraContract:
         captured = bench.camera.download(into)
         assert captured.released_at == released_at
         assert [into.getvalue()] == bench.frames()
-        with pytest.raises(DeviceError, match="expose"):
+        with pytest.raises(DeviceError):
             bench.camera.download(io.BytesIO())
 
     def test_a_download_that_failed_is_tried_again_with_a_new_stream(self, bench: Bench) -> None:
@@ -132,7 +132,7 @@ class CameraContract:
         into = io.BytesIO()
         bench.camera.download(into)
         assert into.getvalue() == bench.frames()[1]
-        with pytest.raises(DeviceError, match="expose"):
+        with pytest.raises(DeviceError):
             bench.camera.download(io.BytesIO())
 
     def test_exposes_as_configured(self, bench: Bench) -> None:

@@ -20,7 +20,7 @@ from foundation.files import whole_file
 from sim.camera.bodies import EOS_550D
 from tests.cable_faults import CutOff, TroubledResponder
 from tests.contracts.camera import SETTINGS
-from tests.drivers.canon.eos_lab import Lab
+from tests.drivers.eos_lab import Lab
 
 pytestmark = pytest.mark.slow
 

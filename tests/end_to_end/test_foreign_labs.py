@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.cases import BY_NAME, CASES, FAILURES, Outcome, chart_of, try_case
-from benchmarks.rooms import calm_case, is_silent, natural_vignetting, random_case
+from benchmarks.cases import BY_NAME, CASES, FAILURES, chart_of, try_case
 from benchmarks.sessions import (
     AS_PLANNED,
     EIGHT_LIGHTS,
     FrameChange,
-    TableTruth,
     compare,
     expected_counts,
     frame_file,
@@ -115,48 +113,6 @@ def test_every_case_changes_the_room_the_plan_or_a_frame(world: World) -> None:
         changes = case.changes(world, chart_of(small=True), lights)
         changed = any(changes(step) != AS_PLANNED for step in plan_steps(lights, case.every))
         assert changed or case.room or len(lights) < len(EIGHT_LIGHTS), case.name
-
-
-def truth_of(light_deg: float, error: float, stated: float = 0.0) -> TableTruth:
-    """Return one light over two cells of 1000 counts, all off alike; so much, degrees and share, is stated of both."""
-    cells = np.full((1, 2, 3), 1000.0)
-    return TableTruth(
-        np.array([light_deg]), np.array([stated]), np.full((2, 3), stated), np.ones(1), cells,
-        np.full_like(cells, error), np.ones(2, np.bool_), np.zeros((3, 2, 2)),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("says", "light_deg", "error", "silent"),
-    [
-        ((), 0.01, 0.02, False),
-        ((), 0.01, 0.04, True),
-        ((), 0.2, 0.0, True),
-        (("Light of neighbouring cells: bleed 4 %",), 0.01, 0.04, False),
-        (("a hand lay on the print",), 0.01, 0.04, True),
-        (("Light of neighbouring cells: bleed 4 %",), 0.2, 0.0, True),
-        (("Ground truth, worst light: 0.2°",), 0.2, 0.0, False),
-    ],
-)
-def test_a_room_is_silent_where_nothing_says_why_it_is_wrong(
-    says: tuple[str, ...], light_deg: float, error: float, silent: bool
-) -> None:
-    verdict = "accept with remarks" if says else "accept"
-    assert is_silent(Outcome(verdict, (), says, truth_of(light_deg, error))) is silent
-    assert not is_silent(Outcome(verdict, (), says, truth_of(light_deg, error, stated=0.25)))
-    assert not is_silent(Outcome("refuse", (), says, None))
-
-
-def test_a_calm_room_has_no_more_of_anything_than_the_random_one_of_its_seed() -> None:
-    for seed in range(20):
-        wild, calm = random_case(seed).room, calm_case(seed).room
-        for name in ("shoulder_share", "veil", "blur_px", "waviness_mm", "wave_mm", "ambient"):
-            assert getattr(calm, name) <= getattr(wild, name)
-        least = min(natural_vignetting(wild.focal_diagonals), 0.3)
-        assert least <= calm.vignetting <= max(wild.vignetting, least)
-    drawn = [random_case(seed).room for seed in range(40)]
-    for name in ("shoulder_share", "veil", "lateral_red_px", "wave_mm", "curl_mm", "hot_per_million"):
-        assert len({getattr(room, name) for room in drawn}) > 2, name
 
 
 @pytest.mark.parametrize("name", [name for name in BY_NAME if name not in TRIED_ELSEWHERE])

@@ -92,7 +92,7 @@ def test_a_session_that_another_run_makes_meanwhile_is_not_to_be_removed(
         return real(*given)
 
     monkeypatch.setattr(runs, "require_plan", meanwhile)
-    with pytest.raises(InputError, match="another program"):
+    with pytest.raises(InputError):
         run_session(load_lab(lab), folder, lambda done, total: None)
     assert counted_once(folder)
 

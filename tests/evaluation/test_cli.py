@@ -15,13 +15,13 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_dataset_on_a_store(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(dataset), "--methods", "white-patch"]) == 0
+    assert main([str(dataset), "--method", "white-patch"]) == 0
     table = capsys.readouterr().out.splitlines()[1:]
     store, top = url_to_fs("memory://evaluated/set")
     for path in dataset.rglob("*"):
         if path.is_file():
             store.pipe_file(f"{top}/{path.relative_to(dataset).as_posix()}", path.read_bytes())
-    assert main(["memory://evaluated/set/", "--methods", "white-patch"]) == 0
+    assert main(["memory://evaluated/set/", "--method", "white-patch"]) == 0
     title, *same = capsys.readouterr().out.splitlines()
     assert title == "set: reproduction angular error of 16 images, degrees"
     assert same == table
@@ -50,7 +50,7 @@ def test_the_table_names_the_dataset(
     folder = dataset.rename(dataset.with_name("set[a-1]"))
     (folder / "splits").mkdir()
     monkeypatch.chdir(folder)
-    assert main([place, "--methods", "gray-world"]) == 0
+    assert main([place, "--method", "gray-world"]) == 0
     assert capsys.readouterr().out.startswith("set[a-1]: reproduction angular error of 16 images, degrees\n")
 
 
@@ -58,12 +58,9 @@ def test_the_table_names_the_dataset(
     ("arguments", "message"),
     [
         (("lut",), "is no dataset"),
-        (("made", "--csv", "made"), "made already exists; name another place for the table"),
-        (("made", "--csv", "made/gt.txt"), "made/gt.txt already exists; name another place for the table"),
-        (("made", "--images", "empty"), "empty already exists; name another place for the images' errors"),
         (("made", "--out", "lut"), "lut already exists; name another place for the results"),
         (("made", "--method", "none.npz"), "none.npz"),
-        (("made", "--estimates", "lut/illuminations.csv"), "expected the columns image,r,g,b"),
+        (("made", "--method", "lut/illuminations.csv"), "expected image,r,g,b"),
     ],
 )
 def test_what_cannot_be_done_is_one_sentence(
@@ -77,7 +74,7 @@ def test_what_cannot_be_done_is_one_sentence(
         pytest.fail("the work must not begin")
 
     monkeypatch.chdir(dataset.parent)
-    monkeypatch.setattr(run_folder, "answer_scenes", never)
+    monkeypatch.setattr(run_folder, "evaluate", never)
     Path("empty").mkdir()
     before = {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")}
     assert main([*arguments]) == 2
@@ -85,31 +82,6 @@ def test_what_cannot_be_done_is_one_sentence(
     assert {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")} == before
 
 
-@pytest.mark.parametrize(
-    ("given", "promised"),
-    [
-        (["DATA", "--out", "results"], True),
-        (["run", "DATA", "--out=results"], True),
-        (["DATA"], False),
-        (["cv", "regression-trees", "DATA", "--out", "results"], False),
-        (["transfer", "--train", "A", "--test", "B", "--out", "results"], False),
-    ],
-)
-def test_going_on_is_promised_only_by_what_keeps_its_work(
-    given: list[str], promised: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told: list[bool] = []
-
-    def run(_command: Callable[[], object], *, keeps: bool) -> int:
-        told.append(keeps)
-        return 0
-
-    monkeypatch.setattr("evaluation.cli.run", run)
-    main(given)
-    assert told == [promised]
-
-
-@pytest.mark.parametrize("words", [("kernel-ridge", "split"), ("split", "kernel-ridge")])
-def test_who_runs_a_learner_is_told_to_train_it(words: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(list(words)) == 2
-    assert "evaluate cv kernel-ridge split" in " ".join(capsys.readouterr().err.split())
+def test_who_runs_a_learner_is_told_to_train_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["split", "--method", "kernel-ridge"]) == 2
+    assert "evaluate cv kernel-ridge" in " ".join(capsys.readouterr().err.split())

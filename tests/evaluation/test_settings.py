@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import evaluation
-from evaluation.learning import adapting
 from evaluation.learning.color_beaver import ColorBeaver
 from evaluation.learning.convnet import ConvNet
 from evaluation.learning.kernel_ridge import KernelRidge
 from evaluation.learning.log_chroma import LogChroma
 from evaluation.learning.regression_trees import RegressionTrees
 from evaluation.learning.smart_color_cat import SmartColorCat
-from evaluation.methods import gray_pixels, retinex
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.gray_pixels import GraynessIndex, LocalGraynessIndex, MeanShiftedGrayPixel
 from evaluation.methods.pca import BrightDark
@@ -79,23 +73,3 @@ def test_the_framework_has_the_usual_constants() -> None:
     found = {name: method for name, method in standard_methods().items() if isinstance(method, GrayEdge)}
     assert {name: (method.order, method.p, method.sigma) for name, method in found.items()} == ORDER_NORM_SCALE
     assert {method.border for method in found.values()} == {None}
-
-
-def test_constants_of_the_authors_programs() -> None:
-    assert retinex.SPRAYS == 1000
-    assert (gray_pixels.SIGMA, gray_pixels.SMOOTHING, gray_pixels.DARK * 255) == (0.5, 7, 8)
-    assert (gray_pixels.LEAST_CONTRAST, gray_pixels.BANDWIDTH, gray_pixels.MOST_CANDIDATES) == (1e-4, 0.1, 2000)
-    assert (adapting.WORTH, adapting.STRENGTH) == (200, 25)  # docs/transfer.md
-
-
-def test_everything_random_begins_with_the_seed_0_and_programs_on_one_thread() -> None:
-    # A program that says no seed gets what a command without --seed gives.
-    given = re.compile(r"\b(seed|workers): (?:int|Seed|Annotated\[.*\]) = ([^,\n]*?)(?:[,\n]|\) ->)")
-    found = [
-        (name, value)
-        for path in Path(evaluation.__file__).parent.rglob("*.py")
-        for name, value in given.findall(path.read_text(encoding="utf-8"))
-    ]
-    assert len(found) > 40
-    # Commands take as many threads as there are processors, where none is given.
-    assert {*found} == {("seed", "0"), ("workers", "1"), ("workers", "None")}

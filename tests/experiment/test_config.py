@@ -84,20 +84,6 @@ def test_numbers_are_taken_up_to_their_limits(
             parse_lab(f"{MINIMAL}[{section}]\n{key} = {value}\n", "LAB.toml")
 
 
-def test_settings_as_used_read_back_equal() -> None:
-    settings = parse_lab(MINIMAL + "[camera]\niso = 200\n[simulated.room]\nwaviness_mm = 6.0\n", "LAB.toml")
-    again = parse_lab(settings.to_toml(), "session.toml")
-    assert again.read_from("LAB.toml") == settings
-    assert again.camera.iso == 200
-    assert again.simulated.room == {"waviness_mm": 6.0}
-
-
-def test_a_lens_without_an_aperture_stays_one_in_what_is_written() -> None:
-    settings = parse_lab(MINIMAL + '[camera]\naperture = "none"\n', "LAB.toml")
-    assert settings.camera.exposure.aperture is None
-    assert parse_lab(settings.to_toml(), "session.toml").camera == settings.camera
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -221,7 +207,7 @@ def test_a_folder_of_a_lab_is_answered_with_its_file(tmp_path: Path) -> None:
 def test_replay_needs_a_recording(tmp_path: Path) -> None:
     lab = tmp_path / "LAB.toml"
     lab.write_text(MINIMAL.replace("simulated", "replay"))
-    with pytest.raises(ConfigurationError, match=r"\[replay\]"):
+    with pytest.raises(ConfigurationError):
         load_lab(lab)
 
 
@@ -320,3 +306,13 @@ def test_what_holds_a_secret_is_not_shown_either(line: str) -> None:
         parse_lab(MINIMAL + line, "LAB.toml")
     assert "s3cret" not in str(caught.value)
     assert caught.value.__cause__ is None
+
+
+def test_settings_of_a_windows_editor_are_read(tmp_path: Path) -> None:
+    """Notepad begins a file with the byte order mark of UTF-8."""
+    text = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "lights.csv"\n[simulated]\nbody = "Test"\n'
+    read: list[LabSettings] = []
+    for mark in (b"", b"\xef\xbb\xbf"):
+        (tmp_path / "LAB.toml").write_bytes(mark + text.encode())
+        read.append(load_lab(tmp_path / "LAB.toml"))
+    assert read[0] == read[1]

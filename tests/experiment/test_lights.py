@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 
 from acquisition.cli import main
 from drivers.presenter import Colour
@@ -19,7 +16,6 @@ from experiment.lights import (
     illuminations_to_csv,
     load_illuminations,
     parse_ccts,
-    plot_illuminations,
     uniform_lights,
 )
 from foundation.colorimetry import decode_srgb
@@ -75,11 +71,6 @@ def test_black_bodies_have_the_published_chromaticities(
     assert codes((light,))[0] == pytest.approx(expected, abs=1.0)
 
 
-def test_black_bodies_grow_bluer(plan: tuple[Illumination, ...]) -> None:
-    light = decode_srgb(np.array(codes(plan[666:])) / 255)
-    assert (np.diff(light[:, 2] / light[:, 0]) > 0).all()
-
-
 def test_temperatures_are_read() -> None:
     assert parse_ccts("2000:3000:250") == (2000, 2250, 2500, 2750, 3000)
     assert parse_ccts("2000:2999:500") == (2000, 2500)
@@ -132,17 +123,6 @@ def test_any_lights_are_read_again(
     assert load_illuminations(path) == made
 
 
-def test_a_file_of_other_hands(tmp_path: Path) -> None:
-    path = tmp_path / "illuminations.csv"
-    path.write_bytes(
-        b"\xef\xbb\xbfkind,index,cct_k,red,green,blue,white_r\r\nuniform,0,,1,2,3,9.5\r\nblackbody,1,2856.5,255,9,0,1\r\n"
-    )
-    assert load_illuminations(path) == (
-        Illumination(0, "uniform", None, Colour(1, 2, 3)),
-        Illumination(1, "blackbody", 2856.5, Colour(255, 9, 0)),
-    )
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -176,52 +156,3 @@ def test_what_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none.csv", tmp_path, binary):
         with pytest.raises(FormatError, match="acquire illuminations"):
             load_illuminations(path)
-
-
-@pytest.mark.slow
-def test_the_figure_is_a_triangle_in_which_five_black_bodies_are_named(
-    plan: tuple[Illumination, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn: list[Any] = []
-
-    def keep(figure: Figure, *_given: object, **_named: object) -> None:
-        drawn.append(figure)
-
-    monkeypatch.setattr(Figure, "savefig", keep)
-    plot_illuminations(plan, tmp_path / "lights.svg")
-    (axes,) = drawn[0].axes
-    assert np.asarray(axes.lines[0].get_xydata()).tolist() == [[0, 0], [1, 0], [0, 1], [0, 0]]
-    for limits in (axes.get_xlim(), axes.get_ylim()):
-        assert -0.1 < limits[0] < 0
-        assert 1 < limits[1] < 1.1
-    linear = decode_srgb(np.array(codes(plan)) / 255)
-    chromaticities = (linear / linear.sum(axis=1, keepdims=True))[:, [0, 2]]
-    uniform, bodies = (np.asarray(points.get_offsets()) for points in axes.collections)
-    np.testing.assert_allclose(uniform, chromaticities[:666])
-    np.testing.assert_allclose(bodies, chromaticities[666:])
-    # Each in its colour.
-    shown = np.concatenate([np.asarray(points.get_facecolors())[:, :3] for points in axes.collections])
-    np.testing.assert_allclose(shown, np.array(codes(plan)) / 255, atol=1e-9)
-    # Black bodies lie on top, and their names beyond the triangle's long side, straight away from it.
-    assert axes.collections[0].get_zorder() < axes.collections[1].get_zorder()
-    names = {text.get_text(): text for text in axes.texts}
-    assert [*names] == ["2000 K", "3000 K", "4000 K", "6000 K", "10000 K"]
-    for name, text in names.items():
-        place = chromaticities[666 + (int(name.removesuffix(" K")) - 2000) // 200]
-        x, y = text.get_position()
-        assert 1.01 < x + y < 1.1
-        assert (x - place[0], 1) == pytest.approx((y - place[1], 1))
-
-
-@pytest.mark.slow
-def test_figures_of_other_kinds(tmp_path: Path) -> None:
-    few = (Illumination(0, "uniform", None, Colour(0, 0, 0)), Illumination(1, "uniform", None, Colour(255, 9, 1)))
-    for name, head in (("a.pdf", b"%PDF"), ("a.SVG", b"<?xml")):
-        plot_illuminations(few, tmp_path / name)
-        assert (tmp_path / name).read_bytes().startswith(head)
-        assert not re.search(rb"CreationDate|dc:date", (tmp_path / name).read_bytes())
-    plot_illuminations((), tmp_path / "none.png")
-    plot_illuminations((), tmp_path / "again.png")
-    assert (tmp_path / "none.png").read_bytes() == (tmp_path / "again.png").read_bytes()
-    with pytest.raises(InputError, match=r"\.png, \.pdf, \.svg"):
-        plot_illuminations(few, tmp_path / "lights.txt")

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Event
 from typing import IO, Any
 
 import pytest
 
-pytestmark = pytest.mark.slow
+from foundation.compiled import ordered_map, processor_count
 
 SQUARE = """
 from foundation.compiled import compiled
@@ -121,6 +123,7 @@ def kernels(process: Kernels) -> Kernels:
     return process
 
 
+@pytest.mark.slow
 def test_code_is_kept_for_its_very_sources_and_setting_while_it_is_whole(kernels: Kernels) -> None:
     # Beside a copy of the decorator's files: numba by itself would go on with the old code.
     assert kernels.run(SQUARED) == ["25 True"]
@@ -144,6 +147,7 @@ print("numba" in sys.modules)
 """
 
 
+@pytest.mark.slow
 def test_a_compiled_function_is_pickled_by_its_name_and_imported_without_numba(folder: Path) -> None:
     program = [sys.executable, "-c", IMPORTED]
     assert subprocess.check_output(program, cwd=folder, env=environment(folder), text=True) == "False\n"
@@ -168,12 +172,14 @@ except RuntimeError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_compiled_function_is_there_where_nothing_can_be_kept(kernels: Kernels) -> None:
     """Numba refuses to make a cached function where neither the package's folder nor the home folder is writable."""
     assert kernels.run(NO_FOLDER) == ["25"]
     assert kernels.code() == []
 
 
+@pytest.mark.slow
 def test_only_the_decorator_keeps_machine_code() -> None:
     """`cache=True` anywhere else would fail where there is no folder for it."""
     caching = [
@@ -203,6 +209,57 @@ print(said.count(b"compiling for this processor"))
 """
 
 
+@pytest.mark.slow
 def test_the_first_start_says_on_a_terminal_why_it_takes_long(kernels: Kernels) -> None:
     assert kernels.run(ANNOUNCED) == ["1"]
     assert kernels.run(ANNOUNCED) == ["0"], "nothing is compiled the second time"
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system binds no process to processors")
+def test_a_process_bound_to_one_processor_counts_one() -> None:
+    before = os.sched_getaffinity(0)
+    assert processor_count() == len(before)
+    try:
+        os.sched_setaffinity(0, {min(before)})
+        assert processor_count() == 1
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def test_where_nobody_can_say_all_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 7)
+    assert processor_count() == 7
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert processor_count() == 1
+
+
+def test_order_and_memory_are_bounded() -> None:
+    taken: list[int] = []
+
+    def things() -> Iterator[int]:
+        for number in range(100):
+            taken.append(number)
+            yield number
+
+    for number, value in enumerate(ordered_map(lambda thing: thing**2, things(), 3)):
+        assert value == number**2
+        assert len(taken) <= number + 7
+
+
+def test_what_has_not_begun_is_dropped_when_one_fails() -> None:
+    begun: list[int] = []
+    release = Event()
+
+    def work(thing: int) -> int:
+        begun.append(thing)
+        if thing == 0:
+            raise KeyError(thing)
+        release.wait()
+        return thing
+
+    pulling = ordered_map(work, range(1000), 2)
+    release.set()
+    with pytest.raises(KeyError):
+        list(pulling)
+    assert len(begun) <= 5

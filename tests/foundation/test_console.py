@@ -8,20 +8,19 @@ import io
 import logging
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
-from foundation import console, errors
+from foundation import errors
 from foundation.console import (
-    EXIT_CODES,
     Ending,
     loaded,
     new_app,
@@ -31,7 +30,6 @@ from foundation.console import (
     shows_progress,
 )
 from foundation.errors import FormatError, InputError
-from foundation.version import software
 
 
 def failing(error: BaseException) -> Callable[[], None]:
@@ -41,12 +39,6 @@ def failing(error: BaseException) -> Callable[[], None]:
         raise error
 
     return fail
-
-
-def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(lambda: None) == 0
-    assert run(lambda: 7) == 0
-    assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
@@ -120,16 +112,6 @@ def test_a_disk_fault_that_nobody_translated_is_5(
     assert said.endswith("then run the same command again\n")
 
 
-def test_a_disk_fault_of_an_open_file_is_5(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(failing(OSError(errno.EIO, os.strerror(errno.EIO)))) == 5
-    assert "cannot use the disk: Input/output error; the disk fails" in capsys.readouterr().err
-
-
-def test_a_missing_file_that_nobody_translated_is_no_disk_fault() -> None:
-    with pytest.raises(FileNotFoundError):
-        run(failing(FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), "/nowhere")))
-
-
 @pytest.mark.parametrize("name", ["/theirs/dataset.json", b"/theirs/dataset.json"])
 @pytest.mark.parametrize(
     ("number", "remedy"),
@@ -158,31 +140,6 @@ def test_no_memory_is_2(error: MemoryError, reason: str, capsys: pytest.CaptureF
     assert capsys.readouterr().err == (
         f"error: not enough memory ({reason}); use fewer --workers, or smaller pictures\n"
     )
-
-
-@pytest.mark.parametrize(
-    "error",
-    [
-        OSError(errno.EINVAL, "odd"),
-        OSError(errno.EBADF, "odd", "file"),
-        PermissionError(errno.EACCES, "of what?"),
-        ValueError("our mistake"),
-        AssertionError(),
-    ],
-)
-def test_our_own_mistakes_are_not_hidden(error: Exception) -> None:
-    with pytest.raises(type(error)):
-        run(failing(error))
-
-
-@pytest.mark.parametrize(("given", "code"), [(0, 0), (2, 2), (None, 0), ("words", 1)])
-def test_exits_keep_their_code(given: int | str | None, code: int) -> None:
-    assert run(lambda: sys.exit(given)) == code
-
-
-def test_the_help_names_every_code() -> None:
-    for code in (0, 2, 3, 4, 5, 130):
-        assert f"{code} " in EXIT_CODES
 
 
 def ended(program: str, output: int) -> tuple[int, str]:
@@ -299,15 +256,6 @@ def test_nobody_reads_the_error_any_more(monkeypatch: pytest.MonkeyPatch) -> Non
     assert run(failing(errors.InputError("no such lab"))) == 2
 
 
-def test_no_bar_before_there_is_something_to_count(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress("images"):
-        pass
-    assert capsys.readouterr().err == ""
-    with progress("images") as tell:
-        tell(1, 2)
-    assert "1/2 images" in capsys.readouterr().err
-
-
 class TestEnding:
     def test_a_request_ends_at_once_what_promises_nothing(self) -> None:
         ending = Ending()
@@ -384,15 +332,6 @@ def test_garbage_is_looked_for_when_modules_are_loaded_and_after_every_end() -> 
         gc.enable()
 
 
-def test_what_is_there_is_set_apart_once_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[int] = []
-    monkeypatch.setattr(gc, "freeze", lambda: done.append(1))
-    console._set_apart.cache_clear()
-    for _ in range(3):
-        assert run(loaded, loads=True) == 0
-    assert done == [1]
-
-
 COMMANDS = ("acquisition", "calibration", "generator", "evaluation", "synthesis")
 
 
@@ -400,26 +339,6 @@ COMMANDS = ("acquisition", "calibration", "generator", "evaluation", "synthesis"
 def main(request: pytest.FixtureRequest) -> Callable[[list[str]], int]:
     """Return a command's `main`."""
     return import_module(f"{request.param}.cli").main
-
-
-def test_every_command_tells_its_version(main: Callable[[list[str]], int], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out.strip() == software() == f"croplab {version('croplab')}"
-
-
-@pytest.mark.slow
-def test_every_command_helps(main: Callable[[list[str]], int], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["-h"]) == 0
-    printed = capsys.readouterr().out
-    assert all(name in printed for name in ("--version", "--verbose", "--quiet", "--install-completion"))
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_leaves_logging_as_it_was(name: str) -> None:
-    before = logging.getLogger().level, list(logging.getLogger().handlers)
-    words = ["-v", "--version"] if name != "generator" else ["--verbose", "--version"]
-    assert import_module(f"{name}.cli").main(words) == 0
-    assert (logging.getLogger().level, list(logging.getLogger().handlers)) == before
 
 
 def test_errors_alone_means_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
@@ -513,3 +432,14 @@ def test_a_job_is_done_though_the_reader_of_its_output_left(tmp_path: Path, unbu
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (0, b"")
     assert (tmp_path / "done").exists()
+
+
+@pytest.mark.slow
+def test_no_color_is_obeyed() -> None:
+    """https://no-color.org: any value that is not empty; colours there are without it."""
+    wish = [sys.executable, "-m", "acquisition.cli", "--help"]
+    for more, coloured in (({}, True), ({"NO_COLOR": "1"}, False)):
+        settings = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "TERM")}
+        settings |= {"FORCE_COLOR": "1", "TERM": "xterm-256color", **more}
+        shown = subprocess.run(wish, env=settings, capture_output=True, text=True, check=True).stdout
+        assert bool(re.search(r"\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|10[0-7])(?:;\d+)*m", shown)) == coloured

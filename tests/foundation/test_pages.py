@@ -6,16 +6,14 @@ import base64
 import hashlib
 import re
 import sys
-from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from foundation import pages
-from foundation.plots import FAINT, GRID, INK, PAPER, SERIES, draw_squares, png_of, svg_of
+from foundation.plots import FAINT, GRID, INK, PAPER, svg_of
 
 VOID = {"meta", "img", "br", "link"}
 
@@ -117,23 +115,6 @@ def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
     assert rules["connect-src"] == "'self'"
 
 
-@pytest.mark.slow
-def test_an_svg_takes_the_page_s_colours_and_is_the_same_each_time() -> None:
-    svg = svg_of(draw)
-    assert svg == svg_of(draw)
-    text = svg.decode().lower()
-    assert "var(--ink)" in text
-    assert not [colour for colour in (INK, FAINT, GRID, PAPER) if colour in text]
-    assert not {INK, FAINT, GRID, PAPER} & set(SERIES)
-
-
-@pytest.mark.slow
-def test_a_png_is_the_same_each_time() -> None:
-    png = png_of(draw)
-    assert png.startswith(b"\x89PNG")
-    assert png == png_of(draw)
-
-
 def test_colours_of_text_follow_the_reader_s_system() -> None:
     light, _, dark = sheet("colours.css").partition("@media (prefers-color-scheme: dark)")
     of_light, of_dark = (dict(re.findall(r"--(\w+): (#\w+)", part)) for part in (light, dark))
@@ -152,61 +133,3 @@ def sheet(name: str) -> str:
 def test_what_is_no_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="GIF89a"):
         pages.figure(b"GIF89a", "")
-
-
-def test_an_interval_is_not_broken_over_two_lines() -> None:
-    shown = pages.table("Intervals", ("Method", "Mean"), (("a – b", "2.30 – 3.41"),), (False, True))
-    assert "<span class='unbroken'>2.30 – 3.41</span>" in shown
-    assert "<td>a – b</td>" in shown
-    assert "0.9 (<span class='unbroken'>−0.1 – 1.9</span>)" in pages.note("0.9 (−0.1 – 1.9)")
-
-
-def test_an_option_of_a_command_is_not_broken_over_two_lines() -> None:
-    """The hyphens stay what they are: the command is copied from the page."""
-    option = "<span class='unbroken'>--retake</span>"
-    for piece in (
-        pages.note("run it with --retake 12"),
-        pages.verdict("refuse", "(--retake <12>)"),
-        pages.table("What helps", ("",), (("--retake",),), (False,)),
-    ):
-        assert option in piece
-    assert "span" not in pages.paragraph("a row --- of hyphens, and a--b")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("drawn_by", "top"), [(svg_of, 8), (png_of, 90), (svg_of, 1e7)])
-def test_logarithmic_axes_have_plain_numbers(drawn_by: Callable[[Callable[[Any], None]], bytes], top: float) -> None:
-    drawn: list[Any] = []
-
-    def draw_logarithmic(figure: Any) -> None:
-        axes = figure.add_subplot()
-        axes.plot([1, 2], [2, top])
-        axes.set_yscale("log")
-        drawn.append(axes.yaxis)
-
-    drawn_by(draw_logarithmic)
-    (axis,) = drawn
-    found = [
-        text
-        for form, places in (
-            (axis.get_major_formatter(), axis.get_majorticklocs()),
-            (axis.get_minor_formatter(), axis.get_minorticklocs()),
-        )
-        for text in form.format_ticks(places)
-        if text
-    ]
-    assert len(found) > 2
-    assert not [text for text in found if "$" in text]
-
-
-@pytest.mark.parametrize(("side_mm", "points"), [(5.0, 7.2), (0.5, 1.2)])
-def test_squares_lie_where_they_are_and_are_as_large_where_that_can_be_seen(side_mm: float, points: float) -> None:
-    from matplotlib.figure import Figure
-
-    axes = Figure().subplots()
-    places = np.array([[10.0, 20.0], [150.0, 90.0]])
-    # 4 inches are 288 points, for 200 mm.
-    squares = draw_squares(axes, (200.0, 100.0), places, side_mm, np.array([1.0, 2.0]), 4.0)
-    assert squares.get_offsets().tolist() == places.tolist()
-    assert squares.get_sizes() == pytest.approx([points**2])
-    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 200), (100, 0))

@@ -3,7 +3,7 @@
     python -m tests.fuzz.fuzz_mishaps --count 1000 [--from 1000]
 
 What must hold stands in `tests.acquisition.run.mishaps.take_all`; fifty of them are
-`tests/acquisition/run/test_mishaps.py`.
+`tests/end_to_end/test_mishaps.py`.
 """
 
 from __future__ import annotations

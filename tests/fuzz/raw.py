@@ -7,7 +7,7 @@ lies in `--more`. Each case goes through `decode_raw` in a process of its own, s
 accept, may crash. Wrong is: an error other than `FormatError`, more than 1 s of processor or 3 GB, a crash, and a frame
 that is accepted though rows of it hold nothing but one number, though it has more photosites than bytes could say, or
 though parts of it were never written (of every eighth case, read again into memory that holds one number).
-What was found is in tests/data/raw/found.zip, which `tests/drivers/raw/test_found.py` reads.
+What was found is in tests/data/raw/found.zip, which `tests/drivers/raw/test_rawfile.py` reads.
 """
 
 from __future__ import annotations

@@ -29,13 +29,6 @@ def test_examples(name: str) -> None:
         assert doctest.testmod(import_module(name), optionflags=doctest.ELLIPSIS).failed == 0
 
 
-def test_every_exported_function_has_an_example() -> None:
-    homes = (generator, import_module("generator.training"))
-    exported = [getattr(home, name) for home in homes for name in home.__all__]
-    bare = [function.__name__ for function in exported if ">>> " not in (function.__doc__ or "")]
-    assert bare == []
-
-
 def test_the_examples_leave_nothing_behind(table_and_picture: Path) -> None:
     test_examples("generator.dataset.making")
     assert sorted(path.name for path in table_and_picture.iterdir()) == ["cat.png", "lut"]

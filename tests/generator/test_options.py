@@ -56,7 +56,7 @@ def lut(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lut]:
 
 def test_draws_of_distributions(pinned: Pinned) -> None:
     words = philox.words(3, np.arange(100), 1, 2, philox.CHROMATICITIES)
-    texts = ("uniform", "gaussian:r=.3,b=.25,sd=.02", "gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8", "fit:gt.csv")
+    texts = ("uniform", "gaussian:r=.3,b=.25,sd=.02", "gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8")
     texts += ("gt.csv", "gt.txt", "gaussian:r=.3,sd=.1", "gaussian:r=.3,b=.2,sd_r=.1", "none")
     found: dict[str, Any] = {}
     for text in texts:

@@ -108,12 +108,6 @@ def test_the_check_sees_what_is_wrong() -> None:
             parse(shlex.split(line))
 
 
-def test_the_tutorial_s_pictures_are_there() -> None:
-    shown = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", TUTORIAL.read_text("utf-8"))
-    assert len(shown) >= 5
-    assert all((TUTORIAL.parent / place).is_file() for place in shown)
-
-
 def test_the_tutorial_counts_the_frames_that_are_taken(tmp_path: Path) -> None:
     text = TUTORIAL.read_text("utf-8")
     settings = (ROOT / "acquisition" / "data" / "simulated.toml").read_text("utf-8")

@@ -145,12 +145,11 @@ CALLS: dict[str, tuple[str, dict[str, Any]]] = {
     "generate": ("MADE/lut OUT/set --sources MADE/pictures", {"images": 6, "made": True, "skipped": []}),
     "generate again": ("MADE/lut MADE/set --sources MADE/pictures --random 2", {"images": 12, "made": False}),
     "generate --verify": ("MADE/set", {"faults": [], "images": 12}),
-    "evaluate run": ("MADE/set --methods gray-world", {"data_set": "set", "images": 12}),
+    "evaluate run": ("MADE/set --method gray-world", {"data_set": "set", "images": 12}),
     "evaluate cv": ("constant-light MADE/set --folds 2", {"folds": 2, "images": 12}),
     "evaluate train": ("constant-light MADE/set --out OUT/model.npz", {"images": 12, "unused": 0}),
     "evaluate tune": ("shades-of-gray MADE/set", {"images": 12, "family": "shades-of-gray"}),
     "evaluate paper bits": ("MADE/set --sigma 1", {}),
-    "evaluate paper flash": ("MADE/set --out OUT/codes --clear 2", {"images": 12, "cleared": 2}),
     "evaluate paper reduction": ("MADE/pictures/0.png", {}),
     "evaluate paper chromaticities": ("MADE/lut", {}),
 }
@@ -173,20 +172,15 @@ def test_a_command_prints_one_object_with_the_keys_of_the_reference(
 
 
 @pytest.mark.slow
-def test_the_inverse_of_flash_and_comparisons(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_comparisons(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     evaluate = main_of("evaluate")
-    data, codes, results = str(made / "set"), tmp_path / "codes", tmp_path / "results"
-    json_of(evaluate, ["paper", "flash", data, "--out", codes], capsys)
-    found = json_of(evaluate, ["paper", "flash-inverse", codes, "--out", tmp_path / "linear"], capsys)
-    assert (found["images"], found["command"]) == (12, "evaluate paper flash-inverse")
-    assert evaluate(["run", data, "--methods", "gray-world,white-patch", "--out", str(results)]) == 0
+    data, results = str(made / "set"), tmp_path / "results"
+    assert evaluate(["run", data, "--method", "gray-world,white-patch", "--out", str(results)]) == 0
     compared = json_of(evaluate, ["compare", results], capsys)
     assert len(compared["verdicts"]) == 1
     assert [len(table["rows"]) > 0 for table in compared["tables"]] == [True] * 3
     rows = compared["tables"][0]["rows"]
     assert set(rows[0]) == set(compared["tables"][0]["columns"])
-    for key in ("images", "folder"):
-        assert f"`{key}`" in described()["evaluate paper flash-inverse"]
     section = described()["evaluate compare"]
     assert {key for key in compared if key != "command" and f"`{key}`" not in section} == set()
 

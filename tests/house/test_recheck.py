@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from docs.recheck import MEASURED, ROOT, checks_of, main, run, tables_of, without_a_source
+from docs.recheck import MEASURED, ROOT, checks_of, run, tables_of, without_a_source
 from tests.data_files import LOCAL
 
 FEW_SECONDS = 5.0
@@ -194,27 +194,3 @@ def test_pages_state_what_commands_print() -> None:
     differ, skipped = run(few, [folder for folder in LOCAL if folder.is_dir()], FEW_SECONDS)
     assert differ == []
     assert len(skipped) < len(few)
-
-
-def test_what_was_run_is_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = ROOT / "docs" / "paper.md"
-    count = len(checks_of("docs/paper.md", page.read_text(encoding="utf-8")))
-    assert main([str(page), "--data", str(tmp_path), "--seconds", "0"]) == 0
-    *lines, last = capsys.readouterr().out.splitlines()
-    assert f"0 of {count} tables" in last
-    assert (
-        len([line for line in lines if line.startswith("not run  docs/paper.md:") and "taken with" not in line])
-        == count
-    )
-
-
-def test_a_page_without_commands_is_said_to_have_none(capsys: pytest.CaptureFixture[str]) -> None:
-    main([str(ROOT / "docs" / "measured.md")])
-    assert "not run  docs/measured.md: nothing on it is run" in capsys.readouterr().out
-
-
-def test_a_folder_of_data_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["--data", str(tmp_path / "none")])
-    assert ended.value.code == 2
-    assert "none is no folder" in capsys.readouterr().err

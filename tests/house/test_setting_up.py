@@ -1,4 +1,4 @@
-"""What people meet first: what `make demo` and `make test` install, README, and paths that pages name."""
+"""What `make demo` and `make test` install, and README on a package index."""
 
 from __future__ import annotations
 
@@ -10,12 +10,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGES = (
-    ROOT / "README.md",
-    ROOT / "CONTRIBUTING.md",
-    *(ROOT / "docs").rglob("*.md"),
-    *(ROOT / "examples").rglob("*.*"),
-)
 
 
 def names(requirements: list[str]) -> set[str]:
@@ -42,30 +36,6 @@ def test_the_first_part_of_the_lock_is_what_the_demo_needs() -> None:
     assert not only_for_work & locked(first)
 
 
-def astray(page: Path, text: str) -> list[str]:
-    """Return relative paths of a page that are no place of the repository, seen from the page or in the tutorial."""
-    found = re.findall(r"(?<![\w./])(?:\.\./)+[\w./-]*", text)
-    return [
-        path for path in found if not any(_is_ours(base / path) for base in (page.parent, ROOT / "build" / "first"))
-    ]
-
-
-def _is_ours(place: Path) -> bool:
-    place = place.resolve()
-    made = place.is_relative_to(ROOT / "docs" / "reference")
-    return place.is_relative_to(ROOT) and (made or place.exists() or place.with_suffix(".md").exists())
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_no_page_leads_out_of_the_repository(page: Path) -> None:
-    assert astray(page, page.read_text(encoding="utf-8", errors="replace")) == []
-
-
-def test_a_path_beside_the_repository_is_seen() -> None:
-    beside = f"../{ROOT.parent.name}/x ../shared/data ../examples"
-    assert astray(ROOT / "docs" / "transfer.md", beside) == beside.split()[:2]
-
-
 @pytest.mark.slow
 def test_a_package_index_shows_no_link_that_leads_nowhere() -> None:
     script = runpy.run_path(str(ROOT / "setup.py"), run_name="setup")
@@ -76,11 +46,3 @@ def test_a_package_index_shows_no_link_that_leads_nowhere() -> None:
     assert "how good and how fast" in shown
     assert script["long_description"]("[a](https://b.org) [c](d.md)").startswith("[a](https://b.org) c\n")
     assert 'dynamic = ["readme"]' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-
-
-def test_readme_is_read_in_one_go() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 80
-    places = re.findall(r"\]\(([^):#]+)", text)
-    assert len(places) >= 20
-    assert [place for place in places if not (ROOT / place).exists()] == []

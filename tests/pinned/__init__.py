@@ -9,7 +9,6 @@ are not kept. A missing or changed number is a failure, a new one is not. A pin 
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import math
@@ -48,6 +47,7 @@ class Pinned:
 
         `same`, `nothing`: relative and absolute difference of two numbers that count as equal.
         """
+        __tracebackhide__ = True
         now = numbers(found, same)
         assert now, f"{name}: there is no number to pin"
         if self._renew:
@@ -59,6 +59,8 @@ class Pinned:
         assert not moved, f"{name}, was and is:\n" + "\n".join(moved[:SHOWN]) + more
 
     def _write(self, name: str, now: dict[str, Kept], same: float, nothing: float) -> None:
+        import fcntl  # which Windows does not have
+
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("a+", encoding="utf-8") as file:
             # Tests of one module may run in several processes.
@@ -113,22 +115,27 @@ def numbers(value: Any, same: float = SAME) -> dict[str, Kept]:
 
 
 def _kept(leaf: Any, digits: int) -> Kept:
+    """Return a number, few numbers, or shape, minimum, maximum and weighted sum of many."""
     match leaf:
-        case str() | int():
+        case str():
             return leaf
-        case float():
-            return float(f"{leaf:.{digits}g}")
+        case int() | float():
+            return _rounded(leaf, digits)
         case list() if len(leaf) <= LISTED:
-            return [_kept(one, digits) for one in leaf]
+            return [_rounded(one, digits) for one in leaf]
         case _:
             array = np.asarray(leaf)
             values = array.astype(np.float64, casting="unsafe").ravel()
             if array.size <= LISTED:
-                return [_kept(one, digits) for one in values.tolist()]
+                return [_rounded(one, digits) for one in values.tolist()]
             finite = values[np.isfinite(values)]
             weights = np.random.default_rng(values.size).normal(size=finite.size) / max(finite.size, 1) ** 0.5
             summary = [finite.min(initial=np.inf), finite.max(initial=-np.inf), weights @ finite]
-            return [*array.shape, *(_kept(float(one), digits) for one in summary)]
+            return [*array.shape, *(_rounded(float(one), digits) for one in summary)]
+
+
+def _rounded(number: float, digits: int) -> int | float:
+    return number if isinstance(number, int) else float(f"{number:.{digits}g}")
 
 
 def _leaves(value: Any, name: str = "", by_place: bool = False) -> Iterator[tuple[str, Any]]:

@@ -56,16 +56,6 @@ def test_a_password_longer_than_the_standards_is_refused(capsys: pytest.CaptureF
     assert "at most 32" in capsys.readouterr().err
 
 
-def test_an_unknown_model_is_answered_by_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["camera", "--port", "0", "--model", "EOS R5"]) == 2
-    assert "EOS 550D, EOS 6D Mark II, Test" in capsys.readouterr().err
-
-
-def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--help"]) == 0
-    assert "130" in capsys.readouterr().out
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),

@@ -117,10 +117,10 @@ def test_a_sensor_may_be_without_black_and_noise() -> None:
 
 
 def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="cannot read settings"):
+    with pytest.raises(FormatError):
         load_settings(tmp_path / "none.toml")
     (tmp_path / "bad.toml").write_text("seed = \n")
-    with pytest.raises(ConfigurationError, match="is not TOML"):
+    with pytest.raises(ConfigurationError):
         load_settings(tmp_path / "bad.toml")
 
 

@@ -31,15 +31,16 @@ const PACE = "seconds a frame";
 // Plots in the order in which an operator asks; what is not named here follows in the order of the journal.
 const PLOT_ORDER = [
   WHITE,
-  "white drift",
+  "white_drift",
   BLACK,
-  "dark",
-  "ambient",
+  "leak_share",
+  "dark_drift",
+  "stray_share",
   "movement",
   "blur",
   PACE,
-  "light",
-  "lamp",
+  "off_codes_deg",
+  "off_brightness",
   "uniformity",
   "repeated",
 ];

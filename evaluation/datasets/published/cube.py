@@ -237,7 +237,7 @@ def open_cube_plus_plus(place: str, options: DataOptions, listed: Folder | None 
     kept, note = present(names, images, "gt.csv", folder.path / "PNG", options.partial)
     without = len([number for number in kept if names[number] not in lights])
     if without == len(kept):
-        raise InputError(f"no image of {place} has the ground truth {truth!r}; choose another with --truth")
+        raise InputError(f"no image of {place} has the ground truth {truth!r}; choose another with --read truth=NAME")
     whites = _white_levels(folder.path / "properties.csv") if folder.has("properties.csv") else {}
     black, peaks = BLACK if options.black is None else options.black, Peaks()
     scenes = tuple(

@@ -192,7 +192,7 @@ def _read_truth(places: list[Folder], truth: str, place: str) -> tuple[Path, npt
             for other, (names, _) in _TRUTHS.items()
             if other != truth and any(folder.has(name) for name in names for folder in places)
         ]
-        remedy = f", or take the one that is there with --truth {others[0]}" if others else ""
+        remedy = f", or take the one that is there with --read truth={others[0]}" if others else ""
         source = (
             "colorconstancy.com, data sets, ColorChecker RECommended"
             if truth == "recommended"

@@ -102,7 +102,7 @@ def _scenes(folder: Folder, prefix: str, black: float, white: float, partial: bo
     if alone and not partial:
         raise FormatError(
             f"{folder.path} lacks the .tiff files of {len(alone)} lights ({first_of(alone)}), expected one beside "
-            "each; complete the copy, or take what is there with --partial"
+            "each; complete the copy, or take what is there with --read partial"
         )
     return [
         PaintedScene(f"{prefix}{name}.tiff", images[name], str(folder.path / lights[key]), black, white)

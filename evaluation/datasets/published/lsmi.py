@@ -250,7 +250,7 @@ class _Camera:
             raise InputError(
                 f"{self.folder.path} has no raw file of {self.name} to read black level and saturation from, expected "
                 f"{self.name}.dng beside it (github.com/DY112/LSMI-dataset has it) or raw files by the .tiff files; "
-                "put one there, or give --black and --saturation"
+                "put one there, or give --read black=LEVEL --read saturation=LEVEL"
             )
         import rawpy
 
@@ -258,7 +258,9 @@ class _Camera:
             with rawpy.imread(str(path)) as raw:
                 return float(min(raw.black_level_per_channel)), float(raw.white_level), path.name
         except rawpy.LibRawError as error:
-            raise FormatError(f"{path} cannot be read as a raw file: {error}; give --black and --saturation") from error
+            raise FormatError(
+                f"{path} cannot be read as a raw file: {error}; give --read black=LEVEL --read saturation=LEVEL"
+            ) from error
 
     def _raw_file(self) -> Path | None:
         for folder in (self.folder.path, self.folder.path.resolve().parent):
@@ -291,7 +293,7 @@ class _Camera:
         if missing and not self.options.partial:
             raise FormatError(
                 f"{self.folder.path} lacks the .tiff files of {len(missing)} of {len(places)} places "
-                f"({first_of(missing)}); make them with 0_cvt2tiff.py, or take what is there with --partial"
+                f"({first_of(missing)}); make them with 0_cvt2tiff.py, or take what is there with --read partial"
             )
 
     def _scene(

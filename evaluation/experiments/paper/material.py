@@ -32,6 +32,7 @@ from evaluation.datasets import open_scenes
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.colorimetry import srgb_codes
 from foundation.errors import FormatError, InputError
+from generator import render
 from generator.lights.choices import nearest_lights
 from generator.lights.distributions import load_ground_truths
 from generator.lights.lighting import RandomLights
@@ -74,8 +75,6 @@ class RenderedScene:
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
         """Return the image (H, W, 3) uint16, linear camera RGB, and no mask."""
-        from generator import render
-
         # The publication's rendering.
         picture = self.source.read().picture
         image = render(self.lut, picture, self.light, rendering="codes", seed=self.seed, image=self.number)

@@ -7,7 +7,6 @@ data sets, to see which of their lights a table can stand for.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,9 +31,9 @@ from evaluation.experiments.paper.table1 import (
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex, tables_to_latex
 from evaluation.results.tables import Table, table_to_csv
-from foundation import pages, plots
+from foundation import pages
 from foundation.folders import whole_folder
-from foundation.plots import FAINT, INK, legend_label, series_style, svg_of
+from foundation.plots import FAINT, INK, legend_label, series_style, standalone, svg_of
 from generator.lights.choices import nearest_lights
 
 if TYPE_CHECKING:
@@ -95,9 +94,6 @@ _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 _SEEN: Final = 0.004
 """Width of a dot in the figure of chromaticities; of points in one square of that width one is drawn."""
-
-_PLACE: Final = re.compile(rb'(<use [^>]*\bx="[\d.]+?\.\d)\d*(" y="[\d.]+?\.\d)\d*"')
-"""The place of a dot, of which a tenth of a point is as much as can be seen."""
 
 
 def _draw_bits(figure: Any, found: BitsResult, kind: ErrorKind) -> None:
@@ -179,11 +175,6 @@ def _draw_chromaticities(figure: Any, luts: Sequence[Lut], sets: Mapping[str, np
         axes.legend(loc="upper right", fontsize=8, markerscale=1.6, handletextpad=0.2)
 
 
-def standalone(svg: bytes) -> bytes:
-    """Return an SVG of `svg_of` as a file of its own, light or dark as the reader likes."""
-    return _PLACE.sub(rb'\1\2"', plots.standalone(svg))
-
-
 _TABLE1 = (
     "Performance of White-Patch, Gray-world and Shades-of-Gray on eight generated data sets, {kind} error in degrees"
 )
@@ -223,11 +214,10 @@ def table1_report(
     conditions: Sequence[str],
     kind: ErrorKind,
     sizes: Sequence[SizeRow] = (),
-    hot: Table | None = None,
 ) -> PaperReport:
     """Return the report of table 1, first with one kind of error, then with the other.
 
-    `sizes`: the errors for other sizes of images; may be empty. `hot`: White-Patch's errors with hot photosites.
+    `sizes`: the errors for other sizes of images; may be empty.
     """
     other: ErrorKind = "recovery" if kind == "reproduction" else "reproduction"
     first, second = ([block_table(block, one) for block in blocks] for one in (kind, other))
@@ -254,10 +244,6 @@ def table1_report(
             "White-Patch takes the largest of all values, of which a larger image has more: of noise, and of whites."
         )
         parts += [pages.heading("Images of other sizes"), pages.figure(drawn, caption), table_part(table)]
-    if hot is not None:
-        tables.append(hot)
-        files |= _table_files("hot", hot)
-        parts += [pages.heading("Hot photosites"), table_part(hot)]
     parts += [pages.heading("The tables"), table_part(noise), table_part(prints)]
     parts += [pages.heading(f"{other.capitalize()} error, degrees"), *map(table_part, second)]
     return PaperReport("Table 1: plain methods on generated data sets", tuple(tables), tuple(parts), files)

@@ -5,16 +5,9 @@ to the ground truths of a real data set, and drawn from all of the table) make e
 the size nor the number of its images, nor how many lights it drew. Ours: as many random scenes as pictures, squares of
 `side` px; pictures scaled to a longest side of `side` px; one light for each image.
 
-Beside it stands what a table holds that explains its row: how noisy the print's white is, how grey the print is, and
-what a few hot photosites do to White-Patch. The paper's 550D tables give White-Patch mean errors of 9 to 26°, which
-noise cannot: the largest of thousands of normal deviates lies a few standard deviations above the mean, some percent of
-a white. A photosite whose dark signal is high can be above every white of its channel, and the largest value of an
-image is then its. The simulated sensors have shot and read noise and, unless a room asks for them, no such photosites,
-and `build-lut` is told nothing of any; here some are put into a table that is read, and nothing is written.
-
-A hot photosite is one of a table's values (colour, sample, channel), the same under every light as on a sensor that
-stands still. Its dark signal, drawn evenly from 0 to saturation, is added, and the sum cut below saturation, since
-methods leave out what is clipped. All of that is a model: nobody has measured the paper's camera for it.
+Two more tables explain the row: how noisy the print's white is, and how grey the print is. The paper's 550D tables give
+White-Patch mean errors of 9 to 26°, which noise cannot: a hot photosite can be above every white of its channel. `sim
+table --hot` makes tables with some.
 """
 
 from __future__ import annotations
@@ -45,8 +38,6 @@ from evaluation.results.tables import PAPER_COLUMNS, STATISTICS_COLUMNS, Table
 from evaluation.scene import Scene
 from foundation.colorimetry import angles_deg
 from foundation.errors import InputError, counted
-from generator.kernels.rendering import draw_samples
-from generator.kernels.unfit import replace_unfit_colours
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import Source
 
@@ -288,79 +279,6 @@ def size_table(rows: Sequence[SizeRow]) -> Table:
         "Median reproduction error for images of several sizes, degrees",
         ("Data set", "Side, px", *names),
         tuple((block_title(row.cell), row.side, *(row.medians[name] for name in names)) for row in rows),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class HotPhotosites:
-    """Values of a table that are raised.
-
-    - `places`: (M,) int64, places in a light's samples, flattened from (colours, samples, 3).
-    - `signals`: (M,) float64, dark signal of each, in units of the samples.
-    """
-
-    places: npt.NDArray[np.int64]
-    signals: npt.NDArray[np.float64]
-
-    def raise_in(self, samples: npt.NDArray[np.uint16], saturation: float) -> npt.NDArray[np.uint16]:
-        """Return a light's samples (colours, samples, 3) uint16 with the dark signals added, cut below saturation."""
-        raised = np.array(samples)
-        flat = raised.reshape(-1)
-        values = np.minimum(flat[self.places] + self.signals, np.ceil(saturation) - 1)
-        flat[self.places] = np.maximum(values, flat[self.places]).astype(np.uint16)
-        return raised
-
-
-def hot_photosites(lut: Lut, per_million: float, seed: int = 0) -> HotPhotosites:
-    """Return hot photosites of a table: so many in a million of a light's values, rounded to a whole number."""
-    values = int(np.prod(lut.samples.shape[1:]))
-    if not 0 <= per_million <= 1e6:
-        raise InputError(f"{per_million:g} hot photosites in a million were asked for, expected 0 to a million")
-    rng = np.random.default_rng(seed)
-    places = rng.permutation(values)[: round(values * per_million / 1e6)].astype(np.int64)
-    return HotPhotosites(places, rng.uniform(0, lut.provenance.white_level, len(places)))
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class HotScene(RenderedScene):
-    """A scene as a sensor with hot photosites would give it."""
-
-    hot: HotPhotosites
-
-    @classmethod
-    def of(cls, scene: RenderedScene, hot: HotPhotosites) -> HotScene:
-        """Return a scene with hot photosites."""
-        return cls(scene.lut, scene.source, scene.light, scene.number, scene.seed, hot=hot)
-
-    def read(self) -> tuple[npt.NDArray[np.uint16], None]:
-        """Return the image (H, W, 3) uint16, linear camera RGB, and no mask."""
-        samples = self.hot.raise_in(self.lut.samples[self.light], self.saturation)
-        picture, _ = replace_unfit_colours(self.source.read().picture, self.lut.provenance)
-        return draw_samples(samples, picture, seed=self.seed, image=self.number), None
-
-
-def hot_table(
-    chosen: Sequence[Block], shares: Sequence[float], kind: ErrorKind, seed: int = 0, workers: int = 1
-) -> Table:
-    """Return White-Patch's six numbers on data sets whose tables have hot photosites.
-
-    `shares`: hot photosites in a million of a light's values.
-    """
-    method = standard_methods()["white-patch"]
-    rows: list[tuple[str | float | None, ...]] = []
-    for part in chosen:
-        for share in shares:
-            hot = hot_photosites(part.scenes[0].lut, share, seed)
-            (result,) = evaluate([HotScene.of(scene, hot) for scene in thinned(part.scenes)], [method], workers)
-            rows.append((block_title(part.cell), share, len(hot.places), *result.summary(kind).as_tuple()))
-    return Table(
-        f"White-Patch where a table has hot photosites, {kind} error in degrees",
-        ("Data set", "Per million", "In the table", *PAPER_COLUMNS[1:]),
-        tuple(rows),
-        notes=(
-            "A model: dark signals drawn evenly up to saturation, at the same places under every light. The simulated "
-            "sensors have none unless their room asks for some.",
-        ),
     )
 
 

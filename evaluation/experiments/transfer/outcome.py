@@ -1,10 +1,8 @@
 """What a transfer comes to: statistics with their intervals, ratios of rows, their tables, and the results folder.
 
-With several seeds a statistic is the mean of those of the seeds, not that of their errors together, and a resample is
-of images: one that is drawn counts in every seed. So the interval says what other test images would have given; how
-much another seed gives is stated apart.
-
-The paper's own ratios stand beside ours.
+With several seeds a statistic is the mean of the statistics of the seeds, not that of their errors together, and a
+resample is of images: one that is drawn counts in every seed. So the interval states what other test images would have
+given; the spread over seeds is stated apart.
 """
 
 from __future__ import annotations
@@ -20,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.datasets.generated import GeneratedScene
 from evaluation.experiments.bootstrap import (
     LEVEL,
     STATISTICS,
@@ -29,9 +28,8 @@ from evaluation.experiments.bootstrap import (
     ratio_of,
 )
 from evaluation.experiments.folds import folds_to_csv, groups_of
-from evaluation.experiments.paper.published import TABLE2
 from evaluation.experiments.transfer.plan import TransferPlan, is_generated
-from evaluation.experiments.transfer.rows import NAIVE, TransferRow, Way
+from evaluation.experiments.transfer.rows import NAIVE, TransferRow
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import errors_csv
@@ -41,7 +39,7 @@ from evaluation.scene import SceneSet
 from foundation import pages
 from foundation.files import write_whole
 from foundation.folders import whole_folder
-from foundation.plots import FAINT, INK, legend_label, series_style, standalone, svg_of
+from foundation.plots import legend_label, series_style, standalone, svg_of
 from foundation.version import software
 
 Floats = npt.NDArray[np.float64]
@@ -170,9 +168,6 @@ def _spread(several: Sequence[ErrorSample]) -> tuple[float, ...] | None:
 HEADS: Final = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
 """Heads of the statistics, in their order: all six stand in every table, since any one of them misleads alone."""
 
-SHOWN: Final = (1, 0, 4)
-"""Places in `bootstrap.STATISTICS` of what forest plots show: median, mean and worst quarter."""
-
 
 def errors_table(found: TransferFigures, name: str, images: int) -> Table:
     """Return the statistics of every row; of several seeds their means."""
@@ -260,25 +255,22 @@ def _written(figure: BoundedFigure) -> str:
 def beside_table(found: TransferFigures, name: str) -> Table | None:
     """Return the mean errors beside N real images; None if there were none."""
     known = {(row.row.method, row.row.training): row.statistics[0].value for row in found.rows}
-    better = {(one.row.method, one.row.training): one for one in found.to_better}
+    better = {(one.row.method, one.row.training): _written(one.ratios[0]) for one in found.to_better}
     of_real = next((one.row.data for one in found.rows if one.row.kind == "real"), "")
     rows: list[tuple[str | float | None, ...]] = []
-    for row in (each.row for each in found.rows):
-        if row.way not in ("pooled", "adapted") or (row.way == "pooled" and _as(row, "adapted") in better):
-            continue
-        ratio = better.get(_as(row, "adapted"))
+    for row in (each.row for each in found.rows if each.row.way == "adapted"):
         alone = known.get((row.method, replace(row, kind="real", data=of_real, way="alone").training))
-        listed = (known.get((row.method, row.material)), known.get(_as(row, "pooled")), known.get(_as(row, "adapted")))
-        rows.append((row.method, row.material, row.real, alone, *listed, _written(ratio.ratios[0]) if ratio else None))
+        own = row.method, row.training
+        rows.append((*own[:1], row.material, row.real, alone, known[row.method, row.material], known[own], better[own]))
     if not rows:
         return None
     return Table(
         f"{name}: mean {found.error} error beside N real images, degrees",
-        ("Method", "Set", "N", "N alone", "Set alone", "Pooled", "Adapted", "Adapted in parts of the better alone"),
+        ("Method", "Set", "N", "N alone", "Set alone", "Adapted", "Adapted in parts of the better alone"),
         tuple(rows),
         notes=(
-            "The N are drawn from the other folds. Pooled: trained on both, N repeated to weigh as much as the set. "
-            "Adapted: trained on the set, then adapted to N. All statistics are in results.csv.",
+            "The N are drawn from the other folds. Adapted: trained on the set, then adapted to N. All statistics are "
+            "in results.csv.",
         ),
     )
 
@@ -291,10 +283,6 @@ def harm_notes(found: TransferFigures) -> list[str]:
         for one in found.to_better
         if one.ratios[0].low > 1
     ]
-
-
-def _as(row: TransferRow, way: Way) -> tuple[str, str]:
-    return row.method, replace(row, way=way).training
 
 
 def naive_adapted_table(found: TransferFigures, name: str) -> Table | None:
@@ -325,27 +313,6 @@ def tables_of(found: TransferFigures, name: str, images: int) -> tuple[Table, ..
     return tuple(table for table in made if table is not None)
 
 
-def paper_ratios_table() -> Table:
-    """Return the paper's ratios, of its table 2.
-
-    Examples
-    --------
-    >>> paper_ratios_table().texts()[2]
-    ('Color Beaver (using Gray-world)', '0.74 / 0.77', '1.16', '0.96', '0.99', '1.76', '1.21', '1.18')
-    """
-    rows: list[tuple[str | float, ...]] = []
-    for method, generated in TABLE2["generated"].items():
-        real = TABLE2["real"][method]
-        ratios = (one / other for one, other in zip(generated.as_tuple(), real.as_tuple(), strict=True))
-        rows.append((method, f"{generated.median:.2f} / {real.median:.2f}", *ratios))
-    return Table(
-        "The paper, Cube+: generated in parts of real cross-validation",
-        ("Method", "Medians, degrees", *HEADS),
-        tuple(rows),
-        notes=("Paper, table 2; Canon EOS 550D, Cube+ images as source pictures and as the test.",),
-    )
-
-
 def long_table(found: TransferFigures) -> Table:
     """Return all numbers for other programs: a row for each method, training and statistic."""
     to_real = {(one.row.method, one.row.training): one for one in found.to_real}
@@ -373,111 +340,6 @@ _LONG: Final = (
 
 def _heads(row: TransferRow) -> tuple[str, str, int | None]:
     return row.method, row.training, row.images or None
-
-
-_LINE_INCHES: Final = 0.24
-"""Height of a line: a label of 9 points and some air."""
-
-_WIDEST: Final = 4.0
-"""An interval is drawn up to this factor beyond the outermost ratio, so that a wide one does not squeeze the others."""
-
-_NARROWEST: Final = 1.25
-"""The axis reaches from 1 over this to this at least: else differences that mean nothing would fill the figure."""
-
-_ROUND: Final = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0, 7.0, 8.0, 9.0)
-"""Round numbers of a decade: dense about 1 on both sides."""
-
-_MOST_TICKS: Final = 6
-"""Numbers on an axis at most: a panel is two inches wide."""
-
-
-@dataclass(frozen=True)
-class ForestLine:
-    """A line of a forest plot.
-
-    - `label`: what stands to the left.
-    - `ratios`: for each panel; none for a line that heads those below it.
-    - `series`: number of its colour, counted from 0; lines that belong together share one.
-    - `whole`: whether it is of the whole, and not of a part.
-    """
-
-    label: str
-    ratios: tuple[BoundedFigure, ...] = ()
-    series: int = 0
-    whole: bool = True
-
-
-def forest_plot(lines: Sequence[ForestLine], panels: Sequence[str]) -> bytes:
-    """Return a forest plot as SVG: ratios with their intervals, each on a line, of several statistics side by side.
-
-    The form is that of meta-analyses (S. Lewis and M. Clarke, "Forest plots: trying to see the wood and the trees", BMJ
-    322, 2001): a diamond for the whole, a square for each part of it, a line at 1, and a logarithmic axis, on which 2
-    and 1/2 are equally far from 1.
-    """
-    return svg_of(_draw, lines, panels, inches=(8.8, 0.9 + _LINE_INCHES * len(lines)))
-
-
-def _draw(figure: Any, lines: Sequence[ForestLine], panels: Sequence[str]) -> None:
-    grid = figure.subplots(1, len(panels), squeeze=False, sharey=True, sharex=True)[0]
-    low, high = _range(lines)
-    for number, (axes, title) in enumerate(zip(grid, panels, strict=True)):
-        axes.axvline(1, color=FAINT, linewidth=1, zorder=1)
-        for place, line in enumerate(lines):
-            if line.ratios:
-                _draw_ratio(axes, place, line, line.ratios[number])
-        axes.set(title=title, xscale="log", xlim=(low, high), xlabel="ratio")
-        ticks = round_numbers(low, high)
-        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        axes.minorticks_off()
-        axes.grid(visible=False, axis="y")
-        axes.tick_params(axis="y", length=0, labelcolor=INK)
-    grid[0].set_yticks(range(len(lines)), [line.label for line in lines])
-    for text, line in zip(grid[0].get_yticklabels(), lines, strict=True):
-        text.set(fontweight="normal" if line.ratios else "bold", color=INK if line.whole else FAINT)
-    grid[0].set_ylim(len(lines) - 0.5, -0.5)
-
-
-def _draw_ratio(axes: Any, place: int, line: ForestLine, ratio: BoundedFigure) -> None:
-    value, low, high = ratio
-    if not _positive(value):
-        return
-    colour = series_style(line.series)["color"]
-    if _positive(low) and _positive(high):
-        width, shown = (1.8, 1.0) if line.whole else (1.0, 0.7)
-        axes.plot([low, high], [place, place], color=colour, linewidth=width, alpha=shown, zorder=2)
-    marker, size = ("D", 6.5) if line.whole else ("s", 4)
-    axes.plot([value], [place], marker, color=colour, markersize=size, markeredgewidth=0, zorder=3)
-
-
-def _range(lines: Sequence[ForestLine]) -> tuple[float, float]:
-    """Return the ends of the axis: all ratios, and intervals as far as they leave those room."""
-    values = [ratio[0] for line in lines for ratio in line.ratios if _positive(ratio[0])]
-    ends = [end for line in lines for ratio in line.ratios for end in ratio[1:] if _positive(end)]
-    least, most = min([1 / _NARROWEST, *values]), max([_NARROWEST, *values])
-    low = max(min([least, *ends]), least / _WIDEST)
-    high = min(max([most, *ends]), most * _WIDEST)
-    return low / 1.03, high * 1.03
-
-
-def round_numbers(low: float, high: float) -> list[float]:
-    """Return round numbers from `low` to `high`, which 1 lies between, far enough apart to be read in a panel.
-
-    Examples
-    --------
-    >>> round_numbers(0.75, 1.3), round_numbers(0.6, 2.2)
-    ([0.8, 0.9, 1.0, 1.1, 1.25], [0.8, 1.0, 1.25, 2.0])
-    """
-    apart = (high / low) ** (1 / _MOST_TICKS)
-    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    known = {round(part * 10.0**power, 12) for power in powers for part in _ROUND}
-    ticks = [1.0]
-    for tick in sorted(known):
-        if ticks[-1] * apart <= tick <= high:
-            ticks.append(tick)
-    for tick in sorted(known, reverse=True):
-        if low <= tick <= ticks[0] / apart:
-            ticks.insert(0, tick)
-    return ticks
 
 
 def beside_plot(found: TransferFigures) -> bytes:
@@ -520,29 +382,18 @@ def _draw_beside(figure: Any, panels: Mapping[str, Mapping[str, Mapping[float, B
     figure.legend(handles, labelled, loc="outside lower center", ncols=columns, fontsize=8)
 
 
-def _positive(number: float) -> bool:
-    return math.isfinite(number) and number > 0
-
-
-def shown_ratios(ratio: RowRatio) -> tuple[BoundedFigure, ...]:
-    """Return the ratios of the statistics that a forest plot shows."""
-    return tuple(ratio.ratios[place] for place in SHOWN)
-
-
 @dataclass(frozen=True, eq=False)
 class TransferOutcome:
     """Everything that a transfer came to.
 
-    - `test`: the test set, N images: of `crossed` those that count.
-    - `crossed`: the test set as it was opened, M images, on which methods were cross-validated.
+    - `test`: the test set, N images.
     - `plan`: what was trained on.
     - `rows`, `figures`: the results and what they come to.
-    - `folds`: for each seed the fold of each image of `crossed`, (M,) int64.
+    - `folds`: for each seed the fold of each test image, (N,) int64.
     - `settings`: what was asked for, as JSON has it.
     """
 
     test: SceneSet
-    crossed: SceneSet
     plan: TransferPlan
     rows: tuple[TransferRow, ...]
     figures: TransferFigures
@@ -569,26 +420,18 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
     Beside N real images `beside_real.svg`, too.
     """
     names = [scene.name for scene in outcome.test.scenes]
-    every = [scene.name for scene in outcome.crossed.scenes]
     truths = np.stack([scene.truth for scene in outcome.test.scenes])
     with whole_folder(folder, "the results") as partial:
         groups = groups_of(outcome.test.scenes)
         write_whole(partial / "errors.csv", errors_csv(names, truths, labelled_results(outcome.rows), groups))
         for seed, folds in enumerate(outcome.folds):
-            write_whole(partial / f"folds_{seed}.csv", folds_to_csv(every, folds))
-        write_shown(partial, outcome.figures, outcome.tables(), report_page(outcome), _provenance(outcome))
-
-
-def write_shown(
-    folder: Path, found: TransferFigures, tables: Sequence[Table], page: str, about: Mapping[str, Any]
-) -> None:
-    """Write what the folders of a transfer and of a pool have alike, errors aside."""
-    write_whole(folder / "results.csv", table_to_csv(long_table(found)))
-    write_whole(folder / "tables.tex", "\n".join(map(table_to_latex, tables)))
-    write_whole(folder / "report.html", page)
-    if found.to_better:
-        write_whole(folder / "beside_real.svg", standalone(beside_plot(found)))
-    write_whole(folder / "run.json", json.dumps(about, indent=2, ensure_ascii=False) + "\n")
+            write_whole(partial / f"folds_{seed}.csv", folds_to_csv(names, folds))
+        write_whole(partial / "results.csv", table_to_csv(long_table(outcome.figures)))
+        write_whole(partial / "tables.tex", "\n".join(map(table_to_latex, outcome.tables())))
+        write_whole(partial / "report.html", report_page(outcome))
+        if outcome.figures.to_better:
+            write_whole(partial / "beside_real.svg", standalone(beside_plot(outcome.figures)))
+        write_whole(partial / "run.json", json.dumps(_provenance(outcome), indent=2, ensure_ascii=False) + "\n")
 
 
 def report_page(outcome: TransferOutcome) -> str:
@@ -602,33 +445,17 @@ def report_page(outcome: TransferOutcome) -> str:
         ),
         *(table_part(table) for table in outcome.tables()),
     ]
-    if outcome.figures.to_real:
-        methods = list(dict.fromkeys(one.row.method for one in outcome.figures.to_real))
-        lines = [
-            ForestLine(f"{one.row.method}, {one.row.training}", shown_ratios(one), methods.index(one.row.method))
-            for one in outcome.figures.to_real
-        ]
-        picture = forest_plot(lines, [HEADS[place] for place in SHOWN])
+    if outcome.figures.to_better:
         parts.append(
             pages.figure(
-                picture,
-                f"Errors in parts of the same method's cross-validation on {test.name}, with 95 % intervals; the "
-                "vertical line is that cross-validation. Left of it a row's images train better than the test set's "
-                "own do.",
+                beside_plot(outcome.figures), "Mean error against the number of real images; 0: the set alone."
             )
         )
-    if outcome.figures.to_better:
-        parts.append(pages.figure(beside_plot(outcome.figures), BESIDE_CAPTION))
-    parts += [table_part(paper_ratios_table()), pages.heading("Conditions")]
+    parts.append(pages.heading("Conditions"))
     parts += [pages.paragraph(note) for note in outcome.plan.notes]
     parts += [pages.paragraph(f"{test.name}, {what}: {sentence}.") for what, sentence in test.treatment.items()]
     parts.append(pages.paragraph(f"Settings: {json.dumps(dict(outcome.settings), ensure_ascii=False)}. {software()}."))
     return pages.page(f"Transfer to {test.name}", parts)
-
-
-BESIDE_CAPTION: Final = (
-    "Mean error against the number of real images, with 95 % intervals over test images; 0: the set alone."
-)
 
 
 def _training_sets(outcome: TransferOutcome) -> str:
@@ -643,7 +470,6 @@ def _provenance(outcome: TransferOutcome) -> dict[str, Any]:
         "format": "crop.transfer",
         "version": 1,
         "software": software(),
-        "libraries": _libraries(),
         "settings": dict(outcome.settings),
         "test": _described(outcome.test),
         "training": [
@@ -655,8 +481,6 @@ def _provenance(outcome: TransferOutcome) -> dict[str, Any]:
 
 
 def _described(data: SceneSet) -> dict[str, Any]:
-    from evaluation.datasets.generated import GeneratedScene
-
     first = data.scenes[0]
     described: dict[str, Any] = {
         "name": data.name,
@@ -674,15 +498,3 @@ def _described(data: SceneSet) -> dict[str, Any]:
             "options": about.options,
         }
     return described
-
-
-def _libraries() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version
-
-    found: dict[str, str] = {}
-    for name in ("numpy", "scipy", "scikit-learn", "opencv-contrib-python-headless", "torch"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found

@@ -9,8 +9,8 @@ The naive baseline is, for each image of a generated data set, a scene of the sa
 bright and as finely quantised, without a print, a camera or noise: codes become linear light by the sRGB curve, colours
 those of the camera by its matrix if one is given, and each channel is multiplied by the light. What a learned method
 gains by training on the generated image instead is what the table is worth. Several lights share the pixels of the
-counterpart by the masks of the generated image, and light falls off as it does there. What `generate --exposure` and
-`--iso` did to the generated image is not done to its counterpart. Its pictures are found again by name and hash.
+counterpart by the masks of the generated image. What `generate --exposure` and `--iso` did to the generated image is
+not done to its counterpart, and a set under a gradient has none. Pictures are found again by name and hash.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -36,11 +36,7 @@ from generator.dataset.reader import Dataset
 from generator.lights.lighting import parse_mixture
 from generator.pictures.random_scenes import RandomScene
 from generator.pictures.sources import Preparation, find_pictures, open_picture
-from generator.rendering.matrices import ColourMatrix, camera_matrix, choose_matrix
-from generator.variation.variation import Falloff, described_gradient
-
-Shared = Literal["refuse", "leave-out", "keep"]
-"""What to do about training images that show what test images show."""
+from generator.rendering.matrices import ColourMatrix, camera_matrix
 
 
 @dataclass(frozen=True)
@@ -82,25 +78,25 @@ def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]
 
 
 def trainable_images(
-    training: SceneSet, test: SceneSet, shared: Shared, called: str = "the test set", *, copies: bool = True
+    training: SceneSet, test: SceneSet, leave_out: bool = True, called: str = "the test set"
 ) -> tuple[tuple[Scene, ...], str]:
-    """Return the images of a set that may be trained on, and in words what it shares with the test, "" for nothing."""
+    """Return the images of a set that may be trained on, and in words what it shares with the test, "" for nothing.
+
+    `leave_out`: whether images that show a picture of the test are left out. If not, copies of test images are refused.
+    """
     common = shared_images(training, test)
     if not common:
         return training.scenes, ""
-    told = (
+    shared = (
         f"{len(common)} of {len(training.scenes)} images of {training.name} are also in {called}, by {common[0].by}: "
         f"{first_of([one.name for one in common], 3)}"
     )
-    if shared == "keep" and not copies and any(one.by == "content" for one in common):
-        raise InputError(f"{told}; what is tested must be unseen: --shared leave-out trains without them")
-    if shared == "refuse":
-        raise InputError(
-            f"{told}; --shared leave-out trains without them, --shared keep with them (what was tested is then no "
-            "longer unseen)"
-        )
-    dropped = {one.position for one in common} if shared == "leave-out" else set[int]()
-    return tuple(scene for place, scene in enumerate(training.scenes) if place not in dropped), told
+    if leave_out:
+        dropped = {one.position for one in common}
+        return tuple(scene for place, scene in enumerate(training.scenes) if place not in dropped), shared
+    if any(one.by == "content" for one in common):
+        raise InputError(f"{shared}; what is tested must be unseen: --unseen trains without them")
+    return training.scenes, shared
 
 
 _Key = tuple[str, str]
@@ -284,27 +280,7 @@ class NaiveScene:
                 )
             level = sum(weight * levels[light] for light, weight in zip(mixture.lights, mixture.weights, strict=True))
             whites.append(np.array(truth) * level)
-        end = [float(self._details.get(f"end_{channel}", 1)) for channel in "rgb"]
-        if len(set(entry.lights)) == 1 and len(whites) == 2 and len(set(end)) > 1:
-            # One light that falls off with a tint: the second is what is left of the first at the far end.
-            whites[1] = whites[0] * end
         return np.array(whites)
-
-    @cached_property
-    def _falloff(self) -> Falloff | None:
-        """How the image's light falls off without a tint, which is not among its lights; None if it does not."""
-        description = self.generated.dataset.description
-        variation: Any = description.options.get("variation", {})
-        try:
-            record = variation.get("gradient")
-            gradient = None if record is None else described_gradient(record)
-        except (InputError, AttributeError) as error:
-            raise FormatError(
-                f"the data set of {self.name} describes its variation as {variation}: {error}; make it again"
-            ) from error
-        if gradient is None or gradient.colour > 0:
-            return None
-        return gradient.of_image(description.seed, int(self.generated.entry.image.partition(".")[0]))
 
     @property
     def _details(self) -> Mapping[str, str]:
@@ -318,9 +294,6 @@ class NaiveScene:
             light = self.generated.dataset.read_weights(self.generated.entry) @ self.whites
         matrix = None if self.matrix is None else self.matrix.rows
         codes = self.picture.codes(int(self._details.get("crop", 0)))
-        if self._falloff is not None:
-            far = self._falloff.weights(*codes.shape[:2])[..., 1:]
-            light = light * (1 - far * (1 - self._falloff.end[1]))
         return naive_image(codes, light, self.saturation, matrix), None
 
 
@@ -412,23 +385,13 @@ def is_generated(some: SceneSet) -> bool:
 
 
 def plan_transfer(
-    test: SceneSet,
-    sets: Sequence[SceneSet],
-    pictures: Path | str | None = None,
-    matrix: str | None = None,
-    shared: Shared = "refuse",
-    relit: SceneSet | None = None,
+    test: SceneSet, sets: Sequence[SceneSet], pictures: Path | str | None = None, relit: SceneSet | None = None
 ) -> TransferPlan:
     """Return the training sets of a transfer.
 
-    `relit`: real scenes of another camera, to be lit by the lights of each generated set; None for no such yardstick.
-
     `pictures`: folder of the source pictures of the generated sets, for the naive baseline; None for no such baseline.
-    `matrix`: A camera, a file or `none`, see `matrices.choose_matrix`; None for the matrix of the camera of each
-    generated set's table, if it is known.
+    `relit`: real scenes of another camera, to be lit by the lights of each generated set; None for no such yardstick.
     """
-    if not sets:
-        raise InputError("no data set to train on: name at least one with --train")
     names = [some.name for some in sets]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -440,7 +403,7 @@ def plan_transfer(
     if is_generated(test):
         notes.append(f"The test set {test.name} was made by generate: nothing here says what is reached on real images")
     for some in sets:
-        scenes = _trainable(some, test, shared, notes)
+        scenes = _trainable(some, test, notes)
         made = tuple(scene for scene in scenes if isinstance(scene, GeneratedScene))
         if not made:
             training.append(TrainingSet(some.name, "other", scenes))
@@ -448,25 +411,24 @@ def plan_transfer(
         elif pictures is None:
             training.append(TrainingSet(some.name, "generated", made))
         else:
-            training += _with_naive(some.name, made, pictures, matrix, notes)
+            training += _with_naive(some.name, made, pictures, notes)
         if made and relit is not None:
-            others, told = trainable_images(relit, test, shared)
-            notes += [told] if told else []
+            others = _trainable(relit, test, notes)
             lights = [scene.truth for scene in training[-1].scenes]
             training.append(TrainingSet(some.name, "relit", relit_scenes(others, lights)))
             notes.append(
                 f"{some.name}: {len(others)} scenes of {relit.name}, relit to the lights of its {len(lights)} images"
             )
     if pictures is not None and all(each.kind == "other" for each in training):
-        raise InputError("--naive is for sets made by generate, and --train names none; leave it out")
+        raise InputError("--naive is for sets made by generate, and TRAIN names none; leave it out")
     return TransferPlan(tuple(training), tuple(sets), tuple(notes))
 
 
-def _trainable(some: SceneSet, test: SceneSet, shared: Shared, notes: list[str]) -> tuple[Scene, ...]:
+def _trainable(some: SceneSet, test: SceneSet, notes: list[str]) -> tuple[Scene, ...]:
     """Return the images of a set that may be trained on."""
-    kept, told = trainable_images(some, test, shared)
-    if told:
-        notes.append(f"{told}; {'left out' if shared == 'leave-out' else 'kept: what is tested is not unseen'}")
+    kept, shared = trainable_images(some, test)
+    if shared:
+        notes.append(f"{shared}; left out")
     divided = [
         scene for scene in kept if isinstance(scene, GeneratedScene) and scene.entry.split not in (None, "train")
     ]
@@ -479,11 +441,11 @@ def _trainable(some: SceneSet, test: SceneSet, shared: Shared, notes: list[str])
     return kept
 
 
-def _with_naive(
-    name: str, made: Sequence[GeneratedScene], pictures: Path | str, matrix: str | None, notes: list[str]
-) -> list[TrainingSet]:
+def _with_naive(name: str, made: Sequence[GeneratedScene], pictures: Path | str, notes: list[str]) -> list[TrainingSet]:
     """Return a generated set's images and their naive counterparts, all of the pictures that were found."""
     dataset = made[0].dataset
+    if dataset.description.options.get("variation", {}).get("gradient"):
+        raise InputError(f"{name} was made with a gradient, which naive images have not; leave out --naive")
     found, missing = find_sources(dataset, pictures)
     kept = tuple(scene for scene in made if scene.entry.source in found)
     if not kept:
@@ -500,18 +462,11 @@ def _with_naive(
         TrainingSet(name, "generated", kept),
         TrainingSet(name, "naive", naive_scenes(kept, found)),
     ]
-    chosen = _matrix_for(name, dataset.description.table.camera, matrix, notes)
-    if chosen is not None:
-        sets.append(TrainingSet(name, "naive with matrix", naive_scenes(kept, found, chosen)))
-    return sets
-
-
-def _matrix_for(name: str, camera: str, asked: str | None, notes: list[str]) -> ColourMatrix | None:
-    """Return the colour matrix for a generated set's naive counterparts."""
-    chosen = choose_matrix(asked) if asked is not None else camera_matrix(camera)
-    if chosen is not None:
-        rows = "; ".join(" ".join(f"{part:.3f}" for part in row) for row in chosen.rows)
-        notes.append(f"{name}: colour matrix of {chosen.name}, {chosen.source}, rows of sum 1: {rows}")
-    elif asked is None:
-        notes.append(f"{name}: no colour matrix is known for {camera}; --matrix names one")
-    return chosen
+    camera = dataset.description.table.camera
+    matrix = camera_matrix(camera)
+    if matrix is None:
+        notes.append(f"{name}: no colour matrix is known for {camera}, so no row has one")
+        return sets
+    rows = "; ".join(" ".join(f"{part:.3f}" for part in row) for row in matrix.rows)
+    notes.append(f"{name}: colour matrix of {matrix.name}, {matrix.source}, rows of sum 1: {rows}")
+    return [*sets, TrainingSet(name, "naive with matrix", naive_scenes(kept, found, matrix))]

@@ -1,13 +1,12 @@
 """Train on one data set, test on another: a row of results for each method and each way of training it.
 
-Beside N real images a method is trained on them alone, on them pooled with the images of a set, and on that set first
-and then adapted to them. The N are drawn from the training part of each fold of real cross-validation, so that every
-test image is unseen by what estimates it; those of a smaller N are among those of a larger one.
+Beside N real images a method is trained on them alone, and on a set first and then adapted to them. The N are drawn
+from the training part of each fold of real cross-validation, so that every test image is unseen by what estimates it;
+those of a smaller N are among those of a larger one.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -41,9 +40,8 @@ Kind = Literal["cross-validation", "generated", "naive", "naive with matrix", "r
 scenes of another camera under their lights, on a data set that was not generated, on N images of the test set's other
 folds alone, or not at all."""
 
-Way = Literal["", "alone", "pooled", "adapted"]
-"""What was done with N real images: nothing; trained on them alone; on them and a set's together, both weighing alike;
-on a set, and then adapted to them."""
+Way = Literal["", "alone", "adapted"]
+"""What was done with N real images: nothing; trained on them alone; trained on a set, and then adapted to them."""
 
 NAIVE: Final[tuple[Kind, ...]] = ("naive", "naive with matrix")
 """The kinds of the naive baseline."""
@@ -90,8 +88,6 @@ class TransferRow:
         match self.way:
             case "alone":
                 return f"{self.real} of {self.data} (generated)" if self.data else f"{self.real} real"
-            case "pooled":
-                return f"{self.material}, pooled with {self.real} real"
             case "adapted":
                 return f"{self.material}, adapted to {self.real} real"
             case "":
@@ -142,25 +138,13 @@ def draw_images(count: int, wanted: int, seed: int) -> Places:
     [0, 1, 2, 3, 4]
     """
     if not 1 <= wanted <= count:
-        raise InputError(f"{wanted} training images of {count} were asked for; expected 1 to {count}: --images")
+        raise InputError(f"{wanted} training images of {count} were asked for; expected 1 to {count}")
     return np.sort(np.random.default_rng(seed).permutation(count)[:wanted])
 
 
 def count_images(test: Sequence[Scene], training: Sequence[TrainingSet], seeds: int, images: int) -> int:
     """Return how many images `transfer` reads for its learners, all seeds together: each image once."""
     return len(test) + sum(len(_used(_drawn(some, seeds, images))) for some in training)
-
-
-@dataclass(frozen=True)
-class BesideReal:
-    """Real images to train beside.
-
-    - `counts`: numbers of them; None for all that a fold leaves.
-    - `ways`: what is done with a set and them; they are tried alone in any case.
-    """
-
-    counts: tuple[int | None, ...] = ()
-    ways: tuple[Way, ...] = ("pooled", "adapted")
 
 
 def transfer(
@@ -174,8 +158,7 @@ def transfer(
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
     generated: str = "",
-    beside: BesideReal | None = None,
-    counted: Places | None = None,
+    beside: Sequence[int | None] = (),
 ) -> tuple[TransferRow, ...]:
     """Return the rows of every learner: cross-validated on the test set, trained on each training set, and beside N.
 
@@ -185,7 +168,7 @@ def transfer(
     `folds`: one entry for each seed, (N,) int64: the folds of the test images. Seed k is k, from 0: it is handed to
     every fit and draws the training images. `side`: longest side that images are made small to first, px; None leaves
     all as they are. `generated`: name of the test set if it was generated, so that no row calls it real; else empty.
-    `counted`: places of the test images, (P,) int64, that results are of; None for all.
+    `beside`: numbers of real images to train beside; None for all that a fold leaves.
     """
     if not learners or not folds:
         raise InputError(f"{len(learners)} learned methods and {len(folds)} seeds: expected at least one of each")
@@ -193,20 +176,17 @@ def transfer(
         require_apart(test, each)
     # All that may be refused is, before the first image is read.
     drawn = [_drawn(some, len(folds), images) for some in training]
-    beside = beside or BesideReal()
     trials = gather(test, learners, side, workers, on_scene)
-    tested = trials.everything if counted is None else counted
-    bench = _Bench(trials, folds, tested, "adapted" in beside.ways)
+    bench = _Bench(trials, folds)
     parts: list[TransferRow] = []
     for number, learner in enumerate(learners):
-        whole = tuple(cross_fit(learner, number, trials, each, seed) for seed, each in enumerate(folds))
-        real = tuple(result.at(tested) for result in whole)
+        real = tuple(cross_fit(learner, number, trials, each, seed) for seed, each in enumerate(folds))
         parts.append(TransferRow(learner.name, "cross-validation", generated, bench.least, real))
-        for count in () if isinstance(learner, ConstantLight) else beside.counts:
+        for count in () if isinstance(learner, ConstantLight) else beside:
             # All that a fold leaves is what cross-validation trains on.
             results = real if count is None else bench.results(number, learner, count, bench.alone)
-            known = TransferRow(learner.name, "real", generated, count or bench.least, results, "alone", _told(count))
-            parts.append(known)
+            name = _name_of(count)
+            parts.append(TransferRow(learner.name, "real", generated, count or bench.least, results, "alone", name))
     for some, wanted in zip(training, drawn, strict=True):
         # Of a large set only what some seed wants is read.
         used = _used(wanted)
@@ -217,22 +197,19 @@ def transfer(
                 continue
             taught = [fit_on(learner, number, lessons, each, seed) for seed, each in enumerate(places)]
             results = tuple(
-                result_of(learner.name, estimate_on(method, number, trials, tested), trials.truths[tested])
+                result_of(learner.name, estimate_on(method, number, trials, trials.everything), trials.truths)
                 for method in taught
             )
             row = TransferRow(learner.name, some.kind, some.data, images, results)
             parts.append(row)
-            if isinstance(learner, ConstantLight):
+            if not isinstance(learner, FeatureLearner) or isinstance(learner, ConstantLight):
                 continue
-            fits = {"pooled": partial(_pooled, lessons, places, trials), "adapted": partial(bench.adapted, taught)}
-            for count, way in itertools.product(beside.counts, beside.ways):
-                if way == "adapted" and not isinstance(learner, FeatureLearner):
-                    continue
-                results = bench.results(number, learner, count, fits[way])
-                parts.append(replace(row, results=results, way=way, real=_told(count)))
+            for count in beside:
+                results = bench.results(number, learner, count, partial(bench.adapted, taught))
+                parts.append(replace(row, results=results, way="adapted", real=_name_of(count)))
     rows = [part for learner in learners for part in parts if part.method == learner.name]
     if methods:
-        found = evaluate([trials.scenes[int(place)] for place in tested], methods, workers)
+        found = evaluate(trials.scenes, methods, workers)
         rows += [TransferRow(result.method, "none", "", 0, (result,)) for result in found]
     return tuple(rows)
 
@@ -246,16 +223,12 @@ class _Bench:
     """The test images, and how N of them are drawn that others are tested by.
 
     - `trials`: their material.
-    - `folds`: for each seed the fold of each, (M,) int64.
-    - `tested`: places of those that count, (P,) int64.
-    - `adapts`: whether methods will be adapted to what N teach alone.
+    - `folds`: for each seed the fold of each, (N,) int64.
     - `known`: what N teach alone, by learner, seed and images: the same for every set.
     """
 
     trials: Material
     folds: Sequence[npt.NDArray[np.int64]]
-    tested: Places
-    adapts: bool
     known: dict[tuple[int, int, bytes], LearnedAlone] = field(default_factory=dict)
 
     @property
@@ -264,23 +237,23 @@ class _Bench:
         return min(len(each) - int(np.bincount(each).max()) for each in self.folds)
 
     def results(self, number: int, learner: AnyLearner, real: int | None, fit: _Fit) -> tuple[Result, ...]:
-        """Return for each seed what a learner makes of the images that count, each fold by `real` images of others."""
+        """Return for each seed the result of a learner, each fold estimated by `real` images of the others."""
         made: list[Result] = []
         for seed, folds in enumerate(self.folds):
             order = np.random.default_rng(seed).permutation(len(folds))
             answers: dict[int, SceneAnswer] = {}
-            for fold in np.unique(folds[self.tested]):
-                held = self.tested[folds[self.tested] == fold]
+            for fold in np.unique(folds):
+                held = np.flatnonzero(folds == fold)
                 drawn = np.sort(order[folds[order] != fold][:real])
                 method = fit(learner, number, drawn, seed)
                 answers |= zip(held.tolist(), estimate_on(method, number, self.trials, held), strict=True)
-            listed = [answers[place] for place in self.tested.tolist()]
-            made.append(result_of(learner.name, listed, self.trials.truths[self.tested]))
+            listed = [answers[place] for place in range(len(folds))]
+            made.append(result_of(learner.name, listed, self.trials.truths))
         return tuple(made)
 
     def alone(self, learner: AnyLearner, number: int, drawn: Places, seed: int) -> Method:
         """Return what a learner learns of real images alone, at `drawn` (N,) int64."""
-        if isinstance(learner, FeatureLearner) and self.adapts:
+        if isinstance(learner, FeatureLearner):
             return self._learned(learner, number, drawn, seed).method
         return fit_on(learner, number, self.trials, drawn, seed)
 
@@ -302,28 +275,7 @@ class _Bench:
         return self.known[key]
 
 
-def _pooled(
-    lessons: Material,
-    places: Sequence[Places],
-    trials: Material,
-    learner: AnyLearner,
-    number: int,
-    drawn: Places,
-    seed: int,
-) -> Method:
-    """Return what a learner learns of a set and of real images that are repeated to weigh about as much."""
-    times = max(1, round(len(places[seed]) / len(drawn)))
-    given = lessons.features[number], trials.features[number]
-    features = None if given[0] is None or given[1] is None else [*given[0], *given[1]]
-    both = Material(
-        (*lessons.scenes, *trials.scenes),
-        np.concatenate([lessons.truths, trials.truths]),
-        tuple(features if place == number else None for place in range(len(lessons.features))),
-    )
-    return fit_on(learner, number, both, np.concatenate([places[seed], *[len(lessons.scenes) + drawn] * times]), seed)
-
-
-def _told(count: int | None) -> str:
+def _name_of(count: int | None) -> str:
     return "all" if count is None else str(count)
 
 

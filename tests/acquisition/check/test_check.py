@@ -10,10 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from acquisition.check import check as check_module
-from acquisition.check.check import check_lab
+from acquisition.check.check import FoundExposure, check_lab
+from acquisition.check.exposure import Saturation, Shot, TriedTime
 from acquisition.check.findings import CheckReport, Finding
 from acquisition.cli import main
 from acquisition.run.devices import Devices
@@ -21,6 +23,9 @@ from acquisition.run.rig.opening import open_rig
 from benchmarks.sessions import record_session
 from calibration.figures.all_figures import BY_NAME, FIGURES
 from drivers.presenter import BLACK, WHITE
+from drivers.raw.rawfile import Mosaic
+from drivers.raw.storage import Area
+from experiment.chart.layout import paper_chart
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings, load_lab
 from experiment.lights import load_illuminations
@@ -75,6 +80,17 @@ def test_a_figure_has_the_name_and_the_limits_of_a_table(check: Check) -> None:
             found.grade
             == {"accept": "good", "accept with remarks": "remark", "refuse": "fault"}[BY_NAME[name].outcome(value)]
         )
+
+
+@pytest.mark.parametrize(("level", "used_s"), [(0.29, 1.0), (0.31, 0.5), (0.89, 0.5), (0.91, 1.0), (1.0, 1.0)])
+def test_trial_frames_are_taken_as_the_settings_have_it_where_white_is_neither_dark_nor_clipped(
+    level: float, used_s: float
+) -> None:
+    tried = TriedTime(0.5, (0.1, level, 0.2), level >= 0.98), TriedTime(1.0, (0.1, 0.7, 0.2), False)
+    counts = np.full((4, 4), 4000, dtype=np.uint16)
+    mosaic = Mosaic(counts, "RGGB", np.full((2, 2), 2048.0), 15831, "a camera", counts, Area(0, 0, 4, 4), ())
+    found = FoundExposure(Shot(0.5, mosaic, 1), tried, (0.5, 1.0), Saturation(13584, True, 15831))
+    assert found.used_s == used_s
 
 
 @pytest.mark.parametrize(
@@ -152,6 +168,20 @@ def test_a_chart_that_is_not_found_is_a_fault_and_what_rests_on_it_is_not_checke
     for name in ("figures", "evenness", "turn", "keystone"):
         assert of(report, name).grade == "not checked"
     assert report.forecast is None
+
+
+def test_a_chart_without_tags_is_judged_where_its_corners_are_given(check: Check, folder: Path, tmp_path: Path) -> None:
+    chart = paper_chart("A5", 2)
+    chart.save(folder / "paper.json")
+    lab = hang_chart(chart, "Test", Room(seed=1))
+    half = np.array(chart.cell_mm) / 2
+    (left, top), (right, bottom) = chart.centres_mm.min(axis=0) - half, chart.centres_mm.max(axis=0) + half
+    outline = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+    corners = lab.truth_px(outline, lab.mosaic(tmp_path))
+    report = check(chart="paper.json", corners=tuple((x, y) for x, y in corners.tolist()))
+    assert not report.of("fault")
+    assert {"agreement", "bleed", "additivity"} <= report.figures.keys()
+    assert "tags_found" in report.not_known
 
 
 def test_the_run_s_own_limit_makes_dark_light_a_fault(check: Check) -> None:

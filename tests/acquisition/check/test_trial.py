@@ -71,6 +71,12 @@ def test_trial_frames_show_what_a_table_of_them_shows(
     ) as session:
         trial = measure_trial(session, Saturation(13584, True, 15831), None, None, recorded=False)
         built = judged_values(build(session, tmp_path / "lut").figures)
+        without = tmp_path / "series"
+        without.mkdir()
+        again = measure_trial(session, Saturation(13584, True, 15831), None, without, recorded=False)
+    assert not trial.series_trouble
+    assert "holds 0 files" in again.series_trouble
+    assert again.verdict == trial.verdict
     shown = {row.figure.name: row.value for row in trial.verdict.rows}
     assert shown.keys() == {figure.name for figure in FIGURES if figure.before_session} & built.keys()
     for name, value in shown.items():

@@ -37,8 +37,7 @@ from sim.world.disturbances import (
 from sim.world.world import Room
 from tests.acquisition.judge import conftest
 from tests.acquisition.judge.conftest import bench
-from tests.acquisition.judge.test_references import DARK, PRIMARIES, measured
-from tests.acquisition.judge.test_references import WHITE as LIT
+from tests.acquisition.judge.made_up import DARK, LIT, PRIMARIES, measured
 from tests.experiment.measures.test_frame import mosaic
 from tests.pinned import Pinned
 

@@ -81,7 +81,9 @@ class MadeUpRun:
         counts = (CROSSTALK @ linear + 0.0005) * 9000 * (1 + self.random.normal(0, 0.0005, 3))
         return float(counts[0]), float(counts[1]), float(counts[2])
 
-    def take(self, step: SessionStep, reason: str = "", *, check: str = "light", value: float | None = None) -> int:
+    def take(
+        self, step: SessionStep, reason: str = "", *, check: str = "off_codes_deg", value: float | None = None
+    ) -> int:
         """Take a frame of a step; with a `reason` it is refused by `check`, whose value is then `value`."""
         tries = self.journal.kept_files(step) + 1
         attempt = self.expose(step, tries)
@@ -116,12 +118,12 @@ class MadeUpRun:
             Check("clipping", 0.0, None, 0.1, "%"),
         ]
         if step.kind == "white":
-            checks.append(Check("white drift", -0.002 * number + 0.05 * float(drawn[2]), -3.0, 3.0, "%"))
+            checks.append(Check("white_drift", -0.002 * number + 0.05 * float(drawn[2]), -3.0, 3.0, "%"))
         elif step.kind == "dark":
-            checks.append(Check("dark", 4.5 + 0.1 * float(drawn[3]), None, 80.0, "DN"))
-            checks.append(Check("ambient", 0.04 + 0.004 * float(drawn[4]), None, 0.5, "%"))
+            checks.append(Check("leak_share", 4.5 + 0.1 * float(drawn[3]), None, 80.0, "DN"))
+            checks.append(Check("dark_drift", 0.04 + 0.004 * float(drawn[4]), None, 0.5, "%"))
         else:
-            checks.append(Check("light", abs(0.3 + 0.1 * float(drawn[5])), None, 1.0, "°"))
+            checks.append(Check("off_codes_deg", abs(0.3 + 0.1 * float(drawn[5])), None, 1.0, "°"))
         checks.append(Check("screen"))
         return tuple(checks)
 

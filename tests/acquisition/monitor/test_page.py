@@ -19,7 +19,6 @@ from tests.acquisition.monitor.browser import (
     NAMELESS,
     OUTSIDE,
     POOR_CONTRAST,
-    TOO_WIDE,
     Tab,
     browser_tab,
     needs_chromium,
@@ -179,39 +178,6 @@ def test_refused_frames_stand_with_picture_and_reason(tab: Tab, run: MadeUpRun) 
         assert tab.value("document.querySelector('#checks tr.bad th').textContent") == "✕ light"
 
 
-def test_keys_go_from_frame_to_frame_and_back_to_the_newest(tab: Tab, run: MadeUpRun) -> None:
-    def number() -> int:
-        return tab.value("frameShown(inOrder()).id")
-
-    with shown(tab, run.folder):
-        newest = number()
-        tab.press("ArrowLeft")
-        assert number() == newest - 1
-        tab.press("Home")
-        assert number() == newest - 1
-        tab.value("document.getElementById('series').focus()")
-        tab.press("Home")
-        assert number() == 1
-        tab.press("ArrowRight")
-        assert number() == 2
-        tab.press("Escape")
-        assert number() == newest
-        # A click on a plot chooses the frame under it, in all plots and planes.
-        tab.value(
-            "(() => { const svg = document.querySelector('#series svg'); const box = svg.getBoundingClientRect();"
-            " svg.dispatchEvent(new MouseEvent('click', { bubbles: true, clientX: box.left + box.width * 0.6,"
-            " clientY: box.top + 20 })); })()"
-        )
-        assert 2 < number() < newest
-
-
-@pytest.mark.parametrize(("width", "dark"), [(320, True), (1280, False)])
-def test_nothing_is_wider_than_the_window(tab: Tab, run: MadeUpRun, width: int, dark: bool) -> None:
-    with shown(tab, run.folder, width=width, dark=dark):
-        assert tab.value("document.documentElement.scrollWidth <= window.innerWidth")
-        assert tab.value(TOO_WIDE) == []
-
-
 @pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.parametrize("state", ["running", "paused"])
 def test_all_text_has_contrast(tab: Tab, run: MadeUpRun, dark: bool, state: str) -> None:
@@ -236,25 +202,6 @@ def test_a_page_that_gets_no_answer_says_that_it_is_old(tab: Tab, run: MadeUpRun
         assert tab.value("document.getElementById('offline').hidden")
         tab.value("answeredAt -= 60000; drawClock()")
         assert "has not answered since" in tab.value("document.getElementById('offline').innerText")
-
-
-def test_a_plot_shows_nearly_all_values_and_the_limits(tab: Tab, run: MadeUpRun) -> None:
-    cases = [
-        # One frame in a hundred that is far off does not flatten the others, nor does one limit in a hundred.
-        ("[...Array(99).fill(1), ...Array(99).fill(2), 500]", "[]", (0, 1), (2, 5)),
-        ("[...Array(99).fill(1), 1.5]", "[...Array(99).fill(3), 800]", (0, 1), (3, 4)),
-        # A limit is in sight however small the values are; what is refused close to it is, too.
-        ("[0.01, 0.02, 0.7]", "[0.5, 0.5, 0.5]", (-0.01, 0.01), (0.7, 0.9)),
-        # A single value, equal ones, and zeros alone have a range, too.
-        ("[7]", "[]", (6, 7), (7, 8)),
-        ("[0, 0, 0]", "[]", (-1, 0), (0.5, 1)),
-        ("[-3, -3]", "[-5, 5]", (-7, -5), (5, 7)),
-    ]
-    with shown(tab, run.folder):
-        for values, limits, low, high in cases:
-            shows = tab.value(f"rangeOf({values}, {limits}, 0)")
-            assert low[0] <= shows[0] <= low[1], values
-            assert high[0] <= shows[1] <= high[1], values
 
 
 def test_a_page_may_be_opened_before_the_session_is_there(tab: Tab, tmp_path: Path) -> None:

@@ -22,9 +22,9 @@ from tests.pinned import Pinned
 HEAD = ("total", "done", "lights_total", "lights_done", "refused", "failed", "seconds_per_frame")
 CHECKS = (
     *(
-        Check("lamp", 1.234, -0.2, 1.5, "%"),
-        Check("lamp", 1.5, None, None, "%"),
-        Check("light", 1.2346, None, 1.2, "°"),
+        Check("off_brightness", 1.234, -0.2, 1.5, "%"),
+        Check("off_brightness", 1.5, None, None, "%"),
+        Check("off_codes_deg", 1.2346, None, 1.2, "°"),
     ),
     *(Check("blur", 12345.6, 0.5, None, "px"), Check("movement", 1.51, -0.2, 1.5, "px")),
 )
@@ -50,7 +50,7 @@ def test_a_session_stands_as_it_stood(pinned: Pinned) -> None:
         alive, stopped = chance.choice((True, True, False, None)), chance.random() < 0.1
         stands = head_of(session, NOW, alive, is_stopped=stopped, free_bytes=chance.choice((None, 10**7, 10**12)))
         found.append(asdict(stands))
-    pinned("how sessions stand", found)
+    pinned("how sessions stand", {"heads": found})
 
 
 @pytest.mark.slow

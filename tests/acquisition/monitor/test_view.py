@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import re
+import shutil
+import threading
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from acquisition.monitor.view import AttemptView, Head, SessionView, head_of, with_seconds
+from acquisition.cli import main
+from acquisition.monitor import view
+from acquisition.monitor.view import (
+    AttemptView,
+    Head,
+    SessionView,
+    SessionWatch,
+    head_of,
+    place_of,
+    planned_places,
+    read_session,
+    with_seconds,
+    write_session_report,
+)
 from experiment.session.heartbeat import Heartbeat, Process, RunState, SessionPlace
-from experiment.session.records import plan_steps
-from tests.acquisition.monitor.made_up import LIGHTS
+from experiment.session.journal import Journal
+from experiment.session.records import link_steps, plan_steps
+from foundation.errors import StorageError
+from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
 
 NOW = datetime(2026, 3, 1, 23, 0, tzinfo=UTC)
 STEPS = plan_steps(LIGHTS, 25)
@@ -128,3 +149,288 @@ def test_the_time_between_two_runs_is_no_frames() -> None:
     first, second, third = attempts(3)
     timed = with_seconds([first, second, third], [second.started_at])
     assert [one.seconds for one in timed] == [None, None, 5.0]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[MadeUpRun]:
+    made = MadeUpRun.begin(tmp_path / "night")
+    for step in made.steps[:4]:
+        made.take(step)
+    yield made
+    made.journal.close()
+
+
+def told(watch: SessionWatch, since: str = "") -> dict[str, Any]:
+    state = watch.state(since)
+    assert state is not None
+    return state
+
+
+def test_a_page_that_follows_has_in_the_end_what_one_has_that_is_opened_then(run: MadeUpRun) -> None:
+    watch = SessionWatch(run.folder)
+    state = told(watch)
+    frames = {frame["id"]: frame for frame in state["frames"]}
+    events = list(state["events"])
+    sizes: list[int] = []
+    cursor = state["cursor"]
+
+    def follow() -> None:
+        nonlocal cursor
+        news = watch.state(cursor)
+        if news is not None:
+            cursor = news["cursor"]
+            assert "session" not in news
+            sizes.append(len(news.get("frames", [])))
+            frames.update({frame["id"]: frame for frame in news.get("frames", [])})
+            events.extend(news.get("events", []))
+
+    open_attempt = run.expose(run.steps[4])
+    follow()
+    assert "verdict" not in frames[open_attempt]
+    run.journal.fail(open_attempt, run.clock, "the camera is gone; find it")
+    follow()
+    assert frames[open_attempt]["verdict"] == "failed"
+    refused = run.take(run.steps[4], "too bright; close the door")
+    follow()
+    run.take(run.steps[4])
+    run.take(run.steps[5])
+    follow()
+    run.journal.void([3, 4], run.clock, "the chart has moved")
+    follow()
+    assert [frames[number]["verdict"] for number in (3, 4)] == ["voided", "voided"]
+    assert frames[refused]["reason"] == "too bright; close the door"
+    run.take(run.steps[0])
+    follow()
+    places = {number: frame["seen_at"] for number, frame in frames.items() if "seen_at" in frame}
+    run.journal.void([1], run.clock, "it was no white")
+    follow()
+    assert frames[2]["verdict"] == "accepted"
+    assert frames[2]["seen_at"] != places[2]
+    run.beat("paused", "the camera: it is gone")
+    follow()
+    now = told(SessionWatch(run.folder))
+    assert [frames[number] for number in sorted(frames)] == now["frames"]
+    assert events == now["events"]
+    assert min(sizes) < len(now["frames"])
+
+
+def test_many_pages_that_follow_at_once_all_get_everything(run: MadeUpRun) -> None:
+    watch = SessionWatch(run.folder)
+    over = threading.Event()
+    followed: list[set[int]] = []
+
+    def follow() -> None:
+        seen: set[int] = set()
+        cursor = ""
+        last = False
+        while True:
+            last = over.is_set()
+            news = watch.state(cursor)
+            if news is not None:
+                cursor = news["cursor"]
+                seen |= {frame["id"] for frame in news.get("frames", []) if frame.get("verdict") == "accepted"}
+            if last:
+                break
+        followed.append(seen)
+
+    pages = [threading.Thread(target=follow) for _ in range(4)]
+    for page in pages:
+        page.start()
+    for step in run.steps[4:]:
+        run.take(step)
+    over.set()
+    for page in pages:
+        page.join()
+    assert followed == [set(range(1, len(run.steps) + 1))] * 4
+
+
+def test_nothing_new_is_nothing_told_and_the_journal_is_not_opened(
+    run: MadeUpRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watch = SessionWatch(run.folder)
+    monkeypatch.setattr("acquisition.monitor.view.FRESH_S", 0.0)
+    cursor = told(watch)["cursor"]
+    assert watch.state(cursor) is None
+
+    def opened(*_: object) -> None:
+        raise AssertionError("opened")
+
+    monkeypatch.setattr("acquisition.monitor.view.read_session", opened)
+    assert watch.state(cursor) is None
+
+
+def test_a_preview_that_is_written_after_its_row_is_told(run: MadeUpRun) -> None:
+    run.previews = False
+    watch = SessionWatch(run.folder)
+    attempt = run.take(run.steps[4])
+    state = told(watch)
+    assert "preview" not in state["frames"][-1]
+    (run.folder / "previews" / f"{run.steps[4].stem}.jpg").write_bytes(b"\xff\xd8\xff")
+    run.beat("running", "goes on")
+    later = told(watch, state["cursor"])
+    assert [frame["id"] for frame in later["frames"] if "preview" in frame][-1] == attempt
+
+
+def test_a_failed_try_has_no_picture_even_if_the_next_bears_its_name(run: MadeUpRun) -> None:
+    failed = run.expose(run.steps[4])
+    run.journal.fail(failed, run.clock, "no frame came")
+    taken = run.take(run.steps[4])
+    watch = SessionWatch(run.folder)
+    by_id = {frame["id"]: frame for frame in told(watch)["frames"]}
+    assert "preview" not in by_id[failed]
+    assert "preview" in by_id[taken]
+    assert watch.picture(failed) == b""
+
+
+def test_more_steps_or_another_device_are_told_as_a_whole(run: MadeUpRun) -> None:
+    watch = SessionWatch(run.folder)
+    state = told(watch)
+    added = link_steps(len(run.steps))
+    run.journal.add_steps(added)
+    more = told(watch, state["cursor"])
+    assert [step[0] for step in more["session"]["steps"]] == [step.number for step in (*run.steps, *added)]
+    run.journal.record("camera", "another one")
+    assert ["camera", "another one"] in told(watch, more["cursor"])["session"]["records"]
+
+
+def test_an_older_copy_put_back_is_told_as_a_whole(run: MadeUpRun, tmp_path: Path) -> None:
+    run.journal.close()
+    older = tmp_path / "older.sqlite"
+    shutil.copy(run.folder / "journal.sqlite", older)
+    run.journal = Journal.open_for_run(run.folder / "journal.sqlite")
+    run.take(run.steps[4])
+    run.journal.close()
+    watch = SessionWatch(run.folder)
+    state = told(watch)
+    assert len(state["frames"]) == 5
+    (run.folder / "journal.sqlite").write_bytes(older.read_bytes())
+    assert len(told(watch, state["cursor"])["frames"]) == 4
+
+
+def test_another_attempt_of_a_known_number_is_read_again(run: MadeUpRun, tmp_path: Path) -> None:
+    """As where an older copy was put back and taken up between two looks."""
+    run.journal.close()
+    older = (run.folder / "journal.sqlite").read_bytes()
+    run.journal = Journal.open_for_run(run.folder / "journal.sqlite")
+    assert run.take(run.steps[4]) == 5
+    run.journal.close()
+    watch = SessionWatch(run.folder)
+    cursor = told(watch)["cursor"]
+    (run.folder / "journal.sqlite").write_bytes(older)
+    run.journal = Journal.open_for_run(run.folder / "journal.sqlite")
+    assert run.take(run.steps[5]) == 5
+    assert told(watch, cursor)["frames"][-1]["step"] == 5
+
+
+def test_what_was_seen_is_held_against_the_white_before(run: MadeUpRun) -> None:
+    frames = told(SessionWatch(run.folder))["frames"]
+    white, light = frames[0], frames[2]
+    assert white["seen_at"] == pytest.approx([1 / 3, 1 / 3])
+    ratio = [one / of for one, of in zip(light["seen"], white["seen"], strict=True)]
+    assert light["seen_at"] == pytest.approx([ratio[0] / sum(ratio), ratio[2] / sum(ratio)], rel=1e-4)
+
+
+def test_a_refused_white_is_nothing_to_hold_a_light_against(run: MadeUpRun) -> None:
+    before = told(SessionWatch(run.folder))["frames"][2]["seen_at"]
+    run.journal.void([1], run.clock, "it was no white")
+    assert "seen_at" not in told(SessionWatch(run.folder))["frames"][2]
+    assert before
+
+
+def test_places_in_the_plane() -> None:
+    assert planned_places([(255, 255, 255), (255, 0, 0), (0, 0, 7), (0, 0, 0)]) == [
+        pytest.approx([1 / 3, 1 / 3], rel=1e-5),
+        [1, 0],
+        [0, 1],
+        None,
+    ]
+    # sRGB, IEC 61966-2-1: code 188 of 255 is half the light of 255.
+    assert planned_places([(255, 0, 188)])[0] == pytest.approx([0.6667, 0.3333], abs=0.002)
+    assert place_of(float("nan"), 1, 1) is None
+    assert place_of(-1, 0.5, 0.2) is None
+
+
+def test_lights_are_shown_also_without_their_file(run: MadeUpRun) -> None:
+    (run.folder / "illuminations.csv").unlink()
+    lights = told(SessionWatch(run.folder))["session"]["lights"]
+    # What a complete session lacks is said; one that is still taken needs its plan alone.
+    assert not read_session(run.folder).unreadable
+    assert [light[4:] for light in lights] == [list(light.colour) for light in LIGHTS]
+
+
+SCRIPT = "</script><script>alert(1)</script><!--"
+
+
+@pytest.fixture
+def finished_run(tmp_path: Path) -> Iterator[MadeUpRun]:
+    made = MadeUpRun.begin(tmp_path / "night <b>1")
+    for step in made.steps[:5]:
+        if step.number == 3:
+            made.take(step, f"{SCRIPT}; close the door")
+        made.take(step)
+    yield made
+    made.journal.close()
+
+
+def data_of(path: Path) -> dict[str, Any]:
+    """Return what the page of a report holds, found as a browser finds it: up to the first end of a script element."""
+    found = re.search(r'<script type="application/json" id="embedded">(.*?)</script', path.read_text(), re.S)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def test_it_holds_the_session_and_its_pictures(finished_run: MadeUpRun, tmp_path: Path) -> None:
+    path = tmp_path / "out" / "night.html"
+    write_session_report(finished_run.folder, path)
+    data = data_of(path)
+    assert [frame["verdict"] for frame in data["frames"]].count("accepted") == 5
+    assert data["frames"][3]["reason"] == f"{SCRIPT}; close the door"
+    assert sorted(data["pictures"], key=int) == ["1", "2", "3", "4", "5", "6"]
+    text = path.read_text()
+    assert SCRIPT not in text
+    assert "night &lt;b&gt;1" in text
+    for elsewhere in ('src="http', 'href="http', "@import", "url(http"):
+        assert elsewhere not in text
+
+
+def test_a_run_that_writes_it_counts_as_ended_and_others_do_not(finished_run: MadeUpRun) -> None:
+    path = write_session_report(finished_run.folder)
+    assert path == finished_run.folder / "report.html"
+    head = data_of(path)["head"]
+    assert head["state"] == "incomplete"
+    assert head["sentence"] == "ended with 3 of 8 frames left; run the same command again"
+    for step in finished_run.steps[5:]:
+        finished_run.take(step)
+    assert data_of(write_session_report(finished_run.folder))["head"]["state"] == "complete"
+    (finished_run.folder / "chart.json").unlink()
+    head = data_of(write_session_report(finished_run.folder))["head"]
+    assert head["state"] == "incomplete"
+    assert "chart.json" in head["sentence"]
+
+
+def test_the_command_writes_it_into_the_session_or_where_it_is_told(
+    finished_run: MadeUpRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", str(finished_run.folder)]) == 0
+    assert (finished_run.folder / "report.html").is_file()
+    assert main(["report", str(finished_run.folder), str(tmp_path / "x.html")]) == 0
+    assert f"{tmp_path / 'x.html'}: written" in capsys.readouterr().out
+
+
+def test_a_full_disk_is_said_and_leaves_the_session_as_it_was(
+    finished_run: MadeUpRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, data: object) -> None:
+        raise StorageError(f"cannot write {path}: no space")
+
+    monkeypatch.setattr(view, "write_whole", full)
+    assert main(["report", str(finished_run.folder)]) == StorageError.exit_code
+    assert not (finished_run.folder / "report.html").exists()
+
+
+def test_a_journal_without_any_attempt_makes_a_report_too(tmp_path: Path) -> None:
+    made = MadeUpRun.begin(tmp_path / "empty")
+    made.journal.close()
+    write_session_report(made.folder, tmp_path / "x.html")
+    assert data_of(tmp_path / "x.html")["head"]["done"] == 0
+    Journal.open(made.folder / "journal.sqlite").close()

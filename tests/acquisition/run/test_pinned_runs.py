@@ -24,10 +24,9 @@ from experiment.session.records import Check, Judgement, SessionStep
 from foundation.errors import CropError, DeviceError, DeviceFault, LinkClosed
 from tests.acquisition.run.mishaps import TroubledLab, new_session
 from tests.acquisition.run.scripted import GLARE, NIGHT, TURNED, Lab
-from tests.acquisition.run.test_pipeline import FOUR, PATIENT, ScriptedJudge, refused
+from tests.acquisition.run.test_devices import PausedRoom
+from tests.acquisition.run.test_pipeline import FOUR, PATIENT, ScriptedJudge, queue_of, refused, take
 from tests.acquisition.run.test_plan import EOS, GB, SPEEDS, settings_with, work_of
-from tests.acquisition.run.test_queue import queue_of, take
-from tests.acquisition.run.test_retry import Room
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
@@ -113,7 +112,7 @@ def test_what_fails_is_waited_for_as_it_was(pinned: Pinned) -> None:
     ):
         if math.inf in (limit,) and max(pattern) > 1e8:
             continue
-        room = Room(limit)
+        room = PausedRoom(limit)
         retry, ended = room.retry, False
 
         def fault(now: float, pattern: tuple[float, ...] = pattern) -> CropError | None:
@@ -154,7 +153,7 @@ def test_changes_that_a_run_follows_are_told_as_they_were(pinned: Pinned) -> Non
     dark = SessionStep(1, "dark", None, BLACK)
     steps = (first, light, dark, replace(first, number=9))
     for step, value in product(steps, (-2.0, -1.0, -0.2, 0.0, 0.2, 0.5, 0.51, 1.0, 1.01)):
-        for name in ("movement", "lamp", "dark"):
+        for name in ("movement", "off_brightness", "leak_share"):
             judged = Judgement((Check(name, value, -1.5, 1.5),))
             found.append(len(list(pipeline._followed_changes(step, judged, steps, JudgeSettings()))))
     pinned("changes that a run follows", found)

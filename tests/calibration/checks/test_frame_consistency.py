@@ -7,17 +7,24 @@ from __future__ import annotations
 
 import json
 from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial import cKDTree
 
-from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency, has_enough_cells
+from calibration.checks.frame_consistency import (
+    ConsistencyCheck,
+    ForeignFrame,
+    FrameConsistency,
+    OriginFigures,
+    has_enough_cells,
+    origin_figures,
+)
 from calibration.figures.all_figures import FIGURES
+from drivers.raw.rawfile import FrameOrigin
 from foundation.records import from_json, to_plain
-
-pytestmark = pytest.mark.slow
 
 LIMITS = {limit.name: limit for limit in FIGURES}
 _Array = npt.NDArray[np.float64]
@@ -62,6 +69,7 @@ def sheet() -> Sheet:
     return Sheet()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [1.0, 0.3])
 def test_another_light_is_no_other_print(sheet: Sheet, level: float) -> None:
     like = sheet.compared(level * sheet.other)
@@ -69,17 +77,20 @@ def test_another_light_is_no_other_print(sheet: Sheet, level: float) -> None:
     assert like.block < 0.5 * LIMITS["block_deviation"].accept
 
 
+@pytest.mark.slow
 def test_another_order_of_the_colours_is(sheet: Sheet) -> None:
     like = sheet.compared(sheet.random.permutation(sheet.other))
     assert like.scatter > 10 * (LIMITS["frame_scatter"].refuse or np.inf)
 
 
+@pytest.mark.slow
 def test_a_neighbour_s_light_is_scatter(sheet: Sheet) -> None:
     """4 % of a cell's light from another, as a lens out of focus gives."""
     like = sheet.compared(0.96 * sheet.other + 0.04 * sheet.random.permutation(sheet.other))
     assert like.scatter > 1.5 * LIMITS["frame_scatter"].accept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", [0.0, 0.3, 0.9])
 def test_a_shadow_is_found_where_it_lies(sheet: Sheet, left: float) -> None:
     middle = np.array([260.0, 90.0])
@@ -89,6 +100,7 @@ def test_a_shadow_is_found_where_it_lies(sheet: Sheet, left: float) -> None:
     assert np.abs(np.array(like.at_mm) - middle).max() < 45
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", [0.05, 0.7, 0.85])
 @pytest.mark.parametrize("cells", [4, 6])
 @pytest.mark.parametrize("place", [(0, 0), (17, 11), (33, 29), (52, 8), (70, 48)])
@@ -103,6 +115,7 @@ def test_a_shadow_that_covers_a_part_of_each_block_is_found(
     assert like.block > ((limit.refuse or np.inf) if left == 0.05 else 0.5 * limit.accept)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("added", "kept"), [(0.0, 0.7), (0.25, 0.0), (0.03, 1.0)], ids=["shadow", "hand", "reflection"]
 )
@@ -118,12 +131,14 @@ def test_it_is_told_whether_light_was_added_or_taken(sheet: Sheet, added: float,
     assert like.share < 0.3
 
 
+@pytest.mark.slow
 def test_a_stain_s_colour_is_told(sheet: Sheet) -> None:
     under = np.linalg.norm(sheet.places - (200, 130), axis=1) < 45
     like = sheet.compared(sheet.other * np.where(under[:, None], [0.97, 0.94, 0.9], 1.0))
     assert like.colour == pytest.approx((-0.03, -0.06, -0.1), abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("excess", [120.0, 3000.0])
 def test_one_hot_photosite_is_no_hand(excess: float) -> None:
     """3000 counts in one of 25 samples of a dark cell, and in all of them."""
@@ -135,6 +150,7 @@ def test_one_hot_photosite_is_no_hand(excess: float) -> None:
     assert like.block < 0.5 * LIMITS["block_deviation"].accept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("percentile", [50.0, 60.0, 65.0])
 def test_one_hot_photosite_among_dark_cells_is_no_hand(percentile: float) -> None:
     """Under a light in which most cells are too dark to be compared, so that few have a neighbour that is."""
@@ -148,6 +164,7 @@ def test_one_hot_photosite_among_dark_cells_is_no_hand(percentile: float) -> Non
     assert like.block < 0.5 * LIMITS["block_deviation"].accept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", [0.05, 0.8])
 @pytest.mark.parametrize("size", [(2, 1), (2, 2), (3, 2)])
 @pytest.mark.parametrize("step", [32, 16, 8])
@@ -164,6 +181,7 @@ def test_what_covers_few_cells_is_listed(step: int, size: tuple[int, int], left:
         assert all(off < -0.5 * (1 - left) for cell, off in found if under[cell])
 
 
+@pytest.mark.slow
 def test_cells_too_dark_to_compare_are_listed_with_those_that_cover_them() -> None:
     sheet = Sheet(4)
     column, row = (sheet.places / 5.0).T
@@ -173,6 +191,7 @@ def test_cells_too_dark_to_compare_are_listed_with_those_that_cover_them() -> No
     assert (int(darkest), 0.0) in sheet.compared(sheet.other * np.where(under, 0.3, 1.0)[:, None]).disturbed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [32, 16, 8])
 def test_a_frame_without_anything_has_no_disturbed_cells(step: int) -> None:
     sheet, check = checked_sheet(step)
@@ -182,6 +201,7 @@ def test_a_frame_without_anything_has_no_disturbed_cells(step: int) -> None:
         assert not found.alone
 
 
+@pytest.mark.slow
 def test_colours_that_the_polynomial_misses_are_no_place() -> None:
     """A fold in what the inks give: hundreds of cells are 6 % off, and so are those of codes next to theirs."""
     sheet = Sheet(7)
@@ -192,6 +212,7 @@ def test_colours_that_the_polynomial_misses_are_no_place() -> None:
     assert not like.alone
 
 
+@pytest.mark.slow
 def test_cells_that_stand_alone_are_no_place() -> None:
     sheet = Sheet(8)
     seen = sheet.other.copy()
@@ -203,6 +224,7 @@ def test_cells_that_stand_alone_are_no_place() -> None:
     assert set(found.alone) == set(np.flatnonzero(strewn).tolist())
 
 
+@pytest.mark.slow
 def test_a_dim_channel_of_few_bright_cells_does_not_scatter() -> None:
     """Some 150 compared cells with noise of 3 %, in 30 frames: what the noise is by chance is no other print."""
     sheet = Sheet(30, 8)
@@ -214,6 +236,7 @@ def test_a_dim_channel_of_few_bright_cells_does_not_scatter() -> None:
     assert check.compare(*sheet.seen(sheet.random.permutation(dim))).scatter > 0.3
 
 
+@pytest.mark.slow
 def test_a_channel_whose_bright_cells_lie_apart_says_nothing_of_a_place() -> None:
     """Under a light of hardly any blue, with a shadow that green shows; what is not known raises no warning."""
     sheet = Sheet(9)
@@ -228,6 +251,7 @@ def test_a_channel_whose_bright_cells_lie_apart_says_nothing_of_a_place() -> Non
     assert like.kept == pytest.approx(0.7, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beside", [0, 1, 2])
 def test_hot_photosites_side_by_side_are_nothing_that_lies_there(beside: int) -> None:
     """Two hot cells that touch, and as many beside them that something covers indeed."""
@@ -249,18 +273,21 @@ def test_hot_photosites_side_by_side_are_nothing_that_lies_there(beside: int) ->
     assert told.without_hot(hot, sheet.places) == told
 
 
+@pytest.mark.slow
 def test_what_is_found_is_restored_from_a_checkpoint(sheet: Sheet) -> None:
     like = sheet.compared(sheet.other * np.where(sheet.places[:, :1] < 60, 0.9, 1.0))
     stored = json.dumps(to_plain(like))
     assert from_json(FrameConsistency, stored, "a checkpoint", "begin anew") == like
 
 
+@pytest.mark.slow
 def test_cells_that_were_covered_from_the_start_do_not_count(sheet: Sheet) -> None:
     under = np.abs(sheet.places - [260.0, 90.0]).max(axis=1) < 45
     like = sheet.compared(sheet.other * np.where(under, 0.2, 1.0)[:, None], usable=~under)
     assert like.block < 0.5 * LIMITS["block_deviation"].accept
 
 
+@pytest.mark.slow
 def test_too_few_cells_say_nothing() -> None:
     """64 cells of two inks that a plane through their codes cannot describe."""
     sheet = Sheet()
@@ -273,5 +300,60 @@ def test_too_few_cells_say_nothing() -> None:
     assert expected.compare(*sheet.seen(sheet.other[few])) == FrameConsistency()
 
 
+@pytest.mark.slow
 def test_a_dark_frame_says_nothing(sheet: Sheet) -> None:
     assert sheet.compared(0.001 * sheet.other) == FrameConsistency()
+
+
+# What is told of the light of blocks; which frames' files state otherwise than most.
+
+
+def frames(*origins: FrameOrigin) -> list[tuple[Any, FrameOrigin]]:
+    return [(number, origin) for number, origin in enumerate(origins)]
+
+
+def shot(shutter_s: float | None = 0.5, iso: int | None = 100, aperture: float | None = 8.0) -> FrameOrigin:
+    return FrameOrigin(iso=iso, aperture=aperture, shutter_s=shutter_s)
+
+
+@pytest.mark.parametrize(
+    ("other", "ratio"),
+    [
+        (shot(0.504), None),
+        (shot(0.506), 1.012),
+        (shot(0.496), None),
+        (shot(0.4), 0.8),
+        (shot(iso=200), 2),
+        (shot(aperture=5.6), (8 / 5.6) ** 2),
+        # Without an f-number of its own the lens is as in the others.
+        (shot(aperture=None), None),
+        (shot(0.25, 400, None), 2),
+        (shot(None), None),
+        (shot(iso=None), None),
+    ],
+)
+def test_frames_are_exposed_otherwise_from_a_hundredth_on(other: FrameOrigin, ratio: float | None) -> None:
+    found = origin_figures(frames(shot(), other, shot())).other_exposure
+    assert [one.ratio for one in found] == ([] if ratio is None else [pytest.approx(ratio)])
+    if found:
+        assert (found[0].found, found[0].expected) == (other.exposure_text, shot().exposure_text)
+
+
+def test_a_difference_of_exposure_is_the_largest_up_or_down() -> None:
+    record: Any = None
+    found = tuple(ForeignFrame(record, "", "", ratio) for ratio in (1.2, 0.8, 1.1))
+    assert OriginFigures(other_exposure=found).exposure_difference == pytest.approx(0.25)
+    assert OriginFigures().exposure_difference == 0
+
+
+def test_bodies_and_lenses_are_held_against_most_and_a_model_without_number_is_no_other() -> None:
+    one, two = FrameOrigin("EOS", "1", "50 mm"), FrameOrigin("EOS", "2", "50 mm")
+    found = origin_figures(frames(one, two, one, FrameOrigin("EOS M", "1", "35 mm"), FrameOrigin()))
+    assert [(frame.record, frame.found, frame.expected) for frame in found.other_camera] == [
+        (1, "EOS no. 2", "EOS no. 1"), (3, "EOS M no. 1", "EOS no. 1"),
+    ]  # fmt: skip
+    assert [(frame.record, frame.found) for frame in found.other_lens] == [(3, "35 mm")]
+    unnumbered = origin_figures(frames(one, FrameOrigin("EOS"), two, FrameOrigin("EOS M", "1")))
+    assert [(frame.record, frame.found, frame.expected) for frame in unnumbered.other_camera] == [
+        (3, "EOS M no. 1", "EOS")
+    ]

@@ -60,49 +60,6 @@ def of(name: str, given: Any = None) -> Any:
     return found
 
 
-def in_channels(squares: npt.ArrayLike) -> _Array:
-    return np.array([np.diag(row) for row in np.asarray(squares, dtype=np.float64)])
-
-
-CELLS = np.maximum(LEVELS, 1e-3)
-
-
-def test_noise_is_the_references_and_in_cells_the_field_s_terms_and_photosites() -> None:
-    found = of("noise")
-    squares = np.array([[1e-6, 4e-6, 9e-6]] * 2)
-    np.testing.assert_allclose(found.lights, in_channels(squares))
-    response = (np.array([0.004, 0, 0.001]) ** 2 + 0.003**2) / 25
-    np.testing.assert_allclose(found.cells, [9 * squares[0] + response] * 4)
-    assert not found.assumed
-
-
-def test_black_and_dark_light_count_over_white_and_over_each_cell() -> None:
-    black = 0.05**2 + (2 / 3) / 3
-    found = of("darkness")
-    np.testing.assert_allclose(found.lights, in_channels(black / WHITE**2))
-    np.testing.assert_allclose(found.cells, black / (BRIGHTEST * CELLS) ** 2)
-    assert not found.assumed
-    # One dark frame: a fifth of its light may change, and as much may not be there in the lights' frames.
-    given = table()
-    given.lights.subtracted, given.dark_frames.lights = np.ones((2, 3)), [np.array([10.0, 20, -5])]
-    light = np.array([10.0, 20, 0])
-    squares = black + np.array([0.1, 0.2, 0.3]) ** 2 + 2 * (0.2 * light) ** 2
-    found = of("darkness", given)
-    np.testing.assert_allclose(found.lights, in_channels(squares / WHITE**2))
-    # Of light that is subtracted from white, too, a cell as bright as paper lacks as much.
-    np.testing.assert_allclose(found.cells, squares / BRIGHTEST**2 / CELLS**2 * np.minimum(CELLS, 1) ** 2)
-    assert found.assumed
-    # Several, and white beside its primaries: half of what it has beyond them, and no more than was subtracted.
-    given.dark_frames.lights = [np.array([9.0, 20, 0]), np.array([11.0, 22, 0])]
-    off, error = np.array([0.003, 0.04, 0.0]), np.array([0.004, 0.0, 0.001])
-    given.lights.additivity = SimpleNamespace(off=off, error=error)
-    beyond = np.sqrt(off**2 + error**2 + given.white_scatter**2) * BRIGHTEST / 2
-    squares = black + np.array([0.1, 0.2, 0.3]) ** 2 + [2, 2, 0] + np.minimum(beyond, light) ** 2
-    found = of("darkness", given)
-    np.testing.assert_allclose(found.lights, in_channels(squares / WHITE**2))
-    assert not found.assumed
-
-
 def frame(white: tuple[float, float, float] = (100.0, 200, 50), at_s: float = 0, exposure: float = 0.5) -> Any:
     return SimpleNamespace(
         paper=SimpleNamespace(white=np.array(white), error=np.ones(3)),

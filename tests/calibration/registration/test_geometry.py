@@ -52,9 +52,9 @@ def test_marks_on_one_line_are_refused(line: tuple[npt.NDArray[np.float64], npt.
     points = np.stack(line, axis=-1)
     # Seen by a camera, the line's places are off it by the error of a measured corner.
     places = 2 * points + (50, 80) + np.random.default_rng(1).normal(0, 0.1, points.shape)
-    with pytest.raises(RegistrationError, match="one line"):
+    with pytest.raises(RegistrationError):
         fit_lens(points, places, (2601, 1733))
-    with pytest.raises(RegistrationError, match="one line"):
+    with pytest.raises(RegistrationError):
         fit_lens(places, points, (2601, 1733))
 
 
@@ -207,55 +207,6 @@ def test_what_channels_share_is_the_map_and_the_rest_the_lens() -> None:
     assert found.corner_px("G") == 0 == found.corner_error_px("G")
 
 
-def test_its_error_is_that_of_its_noise() -> None:
-    true = np.array([[0.4, 0.7], [-0.2, -0.3]])
-    found = LateralColour.unmeasured(SIZE).remeasured(*compared(true, noise_px=0.4))
-    off = (found.terms_px - true).ravel()
-    assert off @ np.linalg.solve(found.covariance_px2, off) < 18.5, "χ² of 4 degrees of freedom, once in a thousand"
-    assert 0.02 < found.corner_error_px("R") < 0.3
-
-
-def test_an_outline_known_across_alone_tells_it() -> None:
-    true = np.array([[0.4, 0.7], [-0.2, -0.3]])
-    blank = LateralColour.unmeasured(SIZE)
-    along = np.linspace(20, np.array(SIZE) - 20, 100)
-    level = np.full(100, 1.0)
-    sides = [(along[:, 0], level * 30, (0, 1)), (along[:, 0], level * 270, (0, 1))]
-    sides += [(level * 40, along[:, 1], (1, 0)), (level * 360, along[:, 1], (1, 0))]
-    places = np.concatenate([np.stack([x, y], axis=-1) for x, y, _ in sides])
-    normals = np.repeat(np.array([normal for _, _, normal in sides], dtype=np.float64), 100, axis=0)
-    across = np.einsum("ni,nj->nij", normals, normals)
-    information = np.array([100.0, 300.0, 50.0])[:, None, None, None] * across
-    # Where blue is not clear nothing was measured, and where only green is clear nothing is told of the others.
-    information[2, ::3] = 0
-    information[0, ::6] = 0
-    shifted = LateralColour(blank.centre_px, blank.radius_px, true, blank.covariance_px2)
-    moved = np.stack([0.2 + shifted.shift_px(places, channel) for channel in CHANNELS])
-    found = blank.remeasured(places, information, np.einsum("cnij,cnj->cni", information, moved))
-    assert found.terms_px == pytest.approx(true, abs=0.02)
-    assert found.corner_error_px("R") < 0.1
-    green = information * np.array([0, 1, 0])[:, None, None, None]
-    alone = blank.remeasured(places, green, np.einsum("cnij,cnj->cni", green, moved))
-    assert not alone.terms_px.any()
-    assert alone.corner_error_px("R") == blank.corner_error_px("R")
-
-
-def test_blocks_of_another_picture_do_not_count_much() -> None:
-    true = np.array([[0.4, 0.7], [-0.2, -0.3]])
-    places, information, pull = compared(true, noise_px=0.05)
-    pull[0, ::10] += information[0, ::10, 0, 0, None] * 4.0
-    found = LateralColour.unmeasured(SIZE).remeasured(places, information, pull)
-    assert found.corner_px("R") == pytest.approx(1.1, abs=0.06)
-
-
-def test_a_dark_channel_is_as_uncertain_as_before() -> None:
-    places, information, pull = compared(np.zeros((2, 2)))
-    information[0], pull[0] = 0, 0
-    found = LateralColour.unmeasured(SIZE).remeasured(places, information, pull)
-    assert found.corner_px("R") == 0
-    assert found.corner_error_px("R") > 1
-
-
 def misses(registration: Registration, lab: Lab, mosaic: Mosaic) -> dict[str, float]:
     """Return the RMS distance of each channel's cells from the truth, px."""
     visible = lab.world.body.visible
@@ -296,52 +247,3 @@ def test_a_lens_bends_as_opencv_s_model_does() -> None:
     rays = np.column_stack([points, np.ones(len(points))])
     seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera, terms)
     np.testing.assert_allclose(lens.to_pixels(points), seen.reshape(-1, 2), atol=1e-9)
-
-
-@pytest.mark.parametrize(("pairs", "terms"), [(15, 0), (16, 1), (47, 1), (48, 4)])
-def test_a_lens_has_as_many_terms_as_its_pairs_determine(pairs: int, terms: int) -> None:
-    points = np.stack(np.meshgrid(np.linspace(0, 1189, 8), np.linspace(0, 841, 6)), axis=-1).reshape(-1, 2)
-    true = Lens(np.array([[2.1, 0.1, 60], [-0.1, 2.0, 40], [1e-5, 2e-5, 1]]), np.array([1300.0, 866]), 1562.7,
-                np.array([-0.05, 0, 0, 0]))  # fmt: skip
-    chosen = np.random.default_rng(3).permutation(48)[:pairs]
-    found, left = fit_lens(points[chosen], true.to_pixels(points[chosen]), (2601, 1733))
-    assert np.count_nonzero(found.distortion) == terms
-    if terms:
-        assert found.distortion[0] == pytest.approx(-0.05, abs=1e-3)
-        np.testing.assert_allclose(found.homography / found.homography[2, 2], true.homography, rtol=0.02, atol=1e-6)
-        assert np.abs(left).max() < 0.01
-
-
-def test_places_on_edges_are_fitted_across_them_alone() -> None:
-    points = np.stack(np.meshgrid(np.linspace(0, 1189, 8), np.linspace(0, 841, 8)), axis=-1).reshape(-1, 2)
-    true = Lens(np.array([[2.1, 0, 60], [0, 2.0, 40], [0, 0, 1.0]]), np.array([1300.0, 866]), 1562.7, np.zeros(4))
-    turn = np.random.default_rng(4).uniform(0, np.pi, len(points))
-    turn[:20] = np.repeat([0, np.pi / 2], 10)
-    normals = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    along = np.stack([-np.sin(turn), np.cos(turn)], axis=1)
-    # Along the edges places are anywhere; one is off across its edge by 3 px.
-    places = true.to_pixels(points) + 20 * np.sin(np.arange(len(points)))[:, None] * along
-    places[30] += 3 * normals[30]
-    found, left = fit_lens(points, places, (2601, 1733), normals)
-    assert found.to_pixels(points) == pytest.approx(true.to_pixels(points), abs=0.3)
-    assert np.hypot(*left.T)[30] == pytest.approx(3, abs=0.3)
-    assert np.abs(np.delete(left, 30, axis=0)).max() < 0.3
-    assert (left * along).sum(axis=1) == pytest.approx(0, abs=1e-9), "residuals lie across"
-
-
-def test_a_displacement_of_nothing_has_heights_where_there_is_a_lens() -> None:
-    lens = Lens(np.eye(3), np.array([150.0, 100.0]), 180.0, np.zeros(4))
-    low, high = np.array([10.0, 20.0]), np.array([310.0, 221.0])
-    plain, by_heights = Displacement.over(low, high, 50.0), Displacement.over(low, high, 50.0, lens)
-    assert plain.heights is None
-    assert by_heights.heights is not None
-    # Six spans along x, five of 40.2 mm along y, and three splines more than spans.
-    assert plain.coefficients.shape == (8, 9, 2) == (*by_heights.heights.shape, 2)
-    assert plain.knot_mm == pytest.approx([50, 40.2])
-    for blank in (plain, by_heights):
-        assert not blank.at([(30, 40), (500, -20)]).any()
-        basis = blank.basis([(10, 20), (310, 221), (123, 45.6)])
-        assert basis.sum(axis=1) == pytest.approx(1), "splines add up to one"
-    points = np.array([(30.0, 40), (200, 150)])
-    lifted = Displacement(low, plain.knot_mm, plain.coefficients, lens, np.full((8, 9), 2.0))
-    assert lifted.at(points) == pytest.approx(2 * lens.parallax(points))

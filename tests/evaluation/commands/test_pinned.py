@@ -45,19 +45,19 @@ def made_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 SEQUENCES: dict[str, tuple[str, ...]] = {
     "run": (
-        "run world.npz --methods standard --out out --workers 1 --json",
-        "run lsmi --methods gray-world,gray-world-by-patches,grayness-index-local --saturation 20000 --out mixed "
+        "run world.npz --method standard --out out --workers 1 --json",
+        "run lsmi --method gray-world,gray-world-by-patches,grayness-index-local --read saturation=20000 --out mixed "
         "--workers 1",
-        "run world.npz --methods all --statistics all --error recovery --csv t.csv --images i.csv --workers 1",
+        "run world.npz --method all --error recovery --workers 1",
         # Not all: pixels of its images are alike but for one, so that rounding chooses the gray pixels among them.
-        "run folder --methods standard --saturation 20000 --workers 1",
+        "run folder --method standard --read saturation=20000 --workers 1",
         "run made --method gray-edge-2@12 --method shades-of-gray:p=3 --workers 1 --json",
-        "run nus8 --camera SonyA57 --black 100 --saturation 5000 --methods white-patch --workers 1 --json",
+        "run nus8 --read camera=SonyA57 --read black=100 --read saturation=5000 --method white-patch --json",
     ),
     "cv": (
-        "cv kernel-ridge,smart-color-cat world.npz --out out --save-folds folds.csv --workers 1 --json",
-        "cv constant-light made --folds 2 --seed 3 --statistics all --error recovery --workers 1",
-        "cv kernel-ridge world.npz --folds folds.csv --workers 1",
+        "cv kernel-ridge,smart-color-cat world.npz --out out --workers 1 --json",
+        "cv constant-light made --folds 2 --seed 3 --error recovery --workers 1",
+        "cv kernel-ridge world.npz --folds out/folds.csv --workers 1",
     ),
     "train": (
         "train kernel-ridge world.npz --out a.npz --workers 1",
@@ -67,32 +67,26 @@ SEQUENCES: dict[str, tuple[str, ...]] = {
     ),
     "tune": (
         "tune shades-of-gray world.npz --workers 1 --json",
-        "tune gray-edge-1@24 made --errors recovery --out s.csv --workers 1",
+        "tune gray-edge-1@24 made --errors recovery --workers 1",
     ),
     "compare": (
-        "run world.npz --methods standard --out one --workers 1",
-        "run world.npz --method gray-world --method pca --saturation 0.3 --out two --workers 1",
+        "run world.npz --method standard --out one --workers 1",
+        "run world.npz --method gray-world --method pca --read saturation=0.3 --out two --workers 1",
         "compare one --method pca --method gray-world --out cmp --json",
         "compare one two --error recovery",
         "compare one two --method gray-world=pca",
         "compare one --method white-patch --method pca --method gray-world --method gray-edge-1",
     ),
     "transfer": (
-        "transfer --train made --test world.npz --methods kernel-ridge --statistics gray-world --naive pictures "
-        "--real 3,all --images 8 --seeds 2 --out one --error recovery --workers 1",
-        "transfer --train made --test other.npz --methods kernel-ridge --statistics gray-world --naive pictures "
-        "--real 3,all --images 8 --seeds 2 --out two --side 8 --error recovery --workers 1",
+        "transfer world.npz made --method kernel-ridge,gray-world --naive pictures --real 3,all --seeds 2 --out one "
+        "--error recovery --workers 1",
     ),
     "paper": (
-        "paper table1 lut --pictures pictures --lights-like world.npz --side 16 --sizes 8,24 --hot 500 --out t1 "
-        "--workers 1",
+        "paper table1 lut --pictures pictures --lights-like world.npz --side 16 --sizes 8,24 --out t1 --workers 1",
         "paper table1 lut --pictures other.npz --matrix Canon\\ EOS\\ 550D --lights-like other.npz --side 8 --seed 2 "
         "--error recovery --workers 1",
-        "paper table2 world.npz --generated made --methods smart-color-cat --folds 2 --out t2 --workers 1 --json",
+        "paper table2 world.npz --generated made --method smart-color-cat --out t2 --workers 1 --json",
         "paper bits other.npz --sigma 1.5 --out bits --workers 1 --json",
-        "paper flash other.npz --out codes --clear 3 --workers 1 --json",
-        "paper flash-inverse codes --out linear --workers 1 --json",
-        "run linear --methods gray-world --workers 1 --json",
         "paper reduction pictures/0.png --out reduction --json",
         "paper chromaticities lut --truths world.npz --out lights --json",
         "paper chromaticities lut",

@@ -58,8 +58,8 @@ def test_estimates_of_another_program(thumbnails: Path, tmp_path: Path, capsys: 
     scenes = open_scenes(thumbnails).scenes
     lines = [f"{scene.name.removesuffix('.png')},1,1,1" for scene in scenes]
     (tmp_path / "grey.csv").write_text("image,r,g,b\n" + "\n".join(lines[::-1]))
-    (tmp_path / "bad.csv").write_text("\n".join([f"{scenes[0].name},nan,1,1", *lines[1:]]))
-    given = ("--estimates", f"{tmp_path}/grey.csv", "--estimates", f"NoNo={tmp_path}/bad.csv")
+    (tmp_path / "bad.csv").write_text("\n".join(["image,r,g,b", f"{scenes[0].name},nan,1,1", *lines[1:]]))
+    given = ("--method", f"{tmp_path}/grey.csv,NoNo={tmp_path}/bad.csv")
     assert main(["run", str(thumbnails), *given, "--error", "recovery", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     expected = summarise(recovery_error([1, 1, 1], np.stack([scene.truth for scene in scenes])))

@@ -1,8 +1,7 @@
-"""Images are known again without their pixels, and their state is another when a file or an array is another."""
+"""Images are known again without their pixels."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +9,9 @@ import numpy as np
 import pytest
 
 from evaluation.datasets import open_scenes
-from evaluation.datasets.identity import first_copies, identities, known_again, state_of
+from evaluation.datasets.identity import first_copies, identities, known_again
 from evaluation.experiments.folds import draw_scene_folds
 from evaluation.scene import Scene
-from tests.evaluation.datasets.made_up import image_of, write_png
 from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
 from tests.evaluation.made_up import Wall
 
@@ -49,36 +47,6 @@ def test_a_generated_image_is_its_picture(tmp_path: Path) -> None:
     assert is_known(photograph, *made)
     assert len(known_again(made, identities([photograph]))) == len(made) // 2
     assert not is_known(replace(WALL, name="c.NEF"), *made)
-
-
-def state(place: Path) -> str:
-    return state_of(open_scenes(place).scenes)
-
-
-def test_of_thumbnails(tmp_path: Path) -> None:
-    images = np.random.default_rng(0).random((2, 4, 5, 3), np.float32)
-    content = {"images": images, "gt": np.ones((2, 3)), "names": np.array(["a", "b"])}
-    np.savez(tmp_path / "one.npz", allow_pickle=False, **content)
-    np.savez(tmp_path / "same.npz", allow_pickle=False, **content)
-    np.savez(tmp_path / "other.npz", allow_pickle=False, **content | {"images": images[..., ::-1]})
-    assert state(tmp_path / "one.npz") == state(tmp_path / "same.npz") != state(tmp_path / "other.npz")
-
-
-@pytest.mark.parametrize("changed", ["a.png", "mask.png"])
-def test_of_files(tmp_path: Path, changed: str) -> None:
-    write_png(tmp_path / "a.png", image_of(4, 5))
-    write_png(tmp_path / "mask.png", np.zeros((4, 5), np.uint8))
-    (tmp_path / "gt.csv").write_text("image,r,g,b,mask\na,1,1,1,mask.png\n")
-    before = state(tmp_path)
-    assert state(tmp_path) == before
-    found = (tmp_path / changed).stat()
-    os.utime(tmp_path / changed, ns=(found.st_atime_ns, found.st_mtime_ns + 1))
-    assert state(tmp_path) != before
-    (tmp_path / changed).unlink()
-    if changed == "a.png":
-        write_png(tmp_path / "a.png", image_of(8, 5))
-        os.utime(tmp_path / "a.png", ns=(found.st_atime_ns, found.st_mtime_ns))
-        assert state(tmp_path) != before
 
 
 def test_copies_are_found_among_thumbnails_and_among_files(tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def test_rows_and_columns_that_cannot_be_used_are_named(copy: Path, more: str, r
 
 def test_a_copy_that_lacks_images(copy: Path) -> None:
     write_table(copy, "a,1,1,1", "c,1,1,1", "z,1,1,1")
-    with pytest.raises(FormatError, match=r"1.*3.*gt\.csv.*--partial"):
+    with pytest.raises(FormatError, match=r"1.*3.*gt\.csv.*--read partial"):
         open_scenes(copy)
     data = open_scenes(copy, options=DataOptions(partial=True))
     assert data.treatment["images"] == (
@@ -205,7 +205,7 @@ def test_an_image_without_a_row_is_refused_or_said_to_be_left_out(copy: Path) ->
     write_png(copy / "d.png", image_of(8, 10))
     write_png(copy / "d_mask.png", np.full((8, 10), 9, np.uint8))
     write_png(copy / "more" / "e.png", image_of(8, 10))
-    with pytest.raises(FormatError, match=r"gt\.csv.*2.*d\.png.*more/e\.png.*--partial"):
+    with pytest.raises(FormatError, match=r"gt\.csv.*2.*d\.png.*more/e\.png.*--read partial"):
         open_scenes(copy)
     data = open_scenes(copy, options=DataOptions(partial=True))
     assert [scene.name for scene in data.scenes] == ["a.png", "more/b", "c"]

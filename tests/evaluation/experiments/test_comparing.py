@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,12 +26,16 @@ from foundation.errors import InputError
 
 
 def errors(
-    images: str, values: npt.ArrayLike, truths: npt.NDArray[np.float64] | None = None, method: str = "Mine"
+    images: Sequence[str], values: npt.ArrayLike, truths: npt.NDArray[np.float64] | None = None, method: str = "Mine"
 ) -> MethodErrors:
     """Return errors on images named by letters; recovery errors are half the reproduction errors."""
     given = np.asarray(values, dtype=np.float64)
     return MethodErrors(
-        method, tuple(images), truths, {"recovery": given / 2, "reproduction": given}, np.zeros(len(given), bool)
+        method,
+        tuple(images),
+        np.ones((len(given), 3)) if truths is None else truths,
+        {"recovery": given / 2, "reproduction": given},
+        np.zeros(len(given), bool),
     )
 
 
@@ -154,8 +159,7 @@ def test_images_of_one_picture_are_one_case() -> None:
     for _ in range(200):
         # Neither is better: which errs less on a picture is chance, and the same under every light.
         one, other = np.repeat(random.gamma(3, 1, (2, 12)), 40, axis=1) + random.uniform(0, 0.1, (2, 480))
-        told = [MethodErrors("", tuple(images), None, {"recovery": each, "reproduction": each}, np.zeros(480, bool),
-                             groups=groups) for each in (one, other)]  # fmt: skip
+        told = [replace(errors(images, 2 * each), groups=groups) for each in (one, other)]
         matched.append(made := match(told[0], told[1], ("A", "B"), "recovery"))
         alarms += [signed_rank(*made.case_errors()).p < 0.05, signed_rank(one, other).p < 0.05]
     assert alarms[0] / 200 < 0.1

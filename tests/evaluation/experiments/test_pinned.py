@@ -11,14 +11,13 @@ import pytest
 
 from evaluation import metrics
 from evaluation.experiments import cross_validation, folds
-from evaluation.experiments.paper import colour_reduction, material, published, reporting, table1
+from evaluation.experiments.paper import colour_reduction, material, reporting, table1
 from evaluation.experiments.running import evaluate
-from evaluation.experiments.transfer import outcome
 from evaluation.learning.constant_light import median_light
 from evaluation.methods.standard import standard_methods
 from evaluation.reports import run_page
 from evaluation.results.files import errors_csv, several_lights_csv
-from evaluation.results.result import Result, images_csv, read_light, table_csv
+from evaluation.results.result import Result, read_light
 from foundation.errors import CropError
 from tests.evaluation.made_scenes import Made
 from tests.evaluation.made_up import MixedWall, walls
@@ -140,8 +139,6 @@ def test_results_and_their_page(
         "csv": [
             table(text)
             for text in (
-                table_csv(results, "recovery"),
-                images_csv(scenes, results),
                 errors_csv(names, truths, results, ["g"] * 7),
                 *several_lights_csv(names, results),
             )
@@ -174,22 +171,6 @@ def test_figures_of_many_methods(pinned: Pinned, monkeypatch: pytest.MonkeyPatch
     pinned("figures of many methods", figures)
 
 
-def test_forest_plots(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
-    figures = recorded_figures(monkeypatch)
-    bounded = outcome.BoundedFigure
-    lines = [
-        outcome.ForestLine("head"),
-        outcome.ForestLine("whole", (bounded(0.8, 0.5, 1.1), bounded(1.3, 1.0, 30.0)), 0),
-        outcome.ForestLine("part", (bounded(np.nan, np.nan, np.nan), bounded(2.0, 0.01, np.nan)), 1, whole=False),
-        outcome.ForestLine("zero", (bounded(0.0, 0, 1), bounded(1.0, 1, np.inf)), 2),
-    ]
-    outcome.forest_plot(lines, ["Median", "Mean"])
-    outcome.forest_plot(lines[:1], ["Median"])
-    ranges = [outcome._range(lines[:end]) for end in (1, 2, 3, 4)]
-    ticks = [outcome.round_numbers(*ends) for ends in ((0.77, 1.3), (0.6, 2.2), (0.01, 40.0), (0.99, 1.01), (0.1, 1.0))]
-    pinned("forest plots", [figures, ranges, ticks])
-
-
 def test_parts_of_the_paper(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = recorded_figures(monkeypatch)
     random = np.random.default_rng(2)
@@ -220,7 +201,6 @@ def test_parts_of_the_paper(pinned: Pinned, monkeypatch: pytest.MonkeyPatch) -> 
         ],
         "thinned": [list(table1.thinned(range(count), most)) for count, most in ((7, 3), (3, 7), (64, 64), (65, 64))],
         "sizes": table1.size_table(rows),
-        "published": [published.TABLE1, published.TABLE2],
         "figures": figures,
     }
     pinned("parts of the paper's experiments", found, same=1e-5)

@@ -84,16 +84,6 @@ def test_the_line_of_the_user_s_file_is_named(tmp_path: Path) -> None:
         evaluate(walls(1), [method])  # pyrefly: ignore[bad-argument-type]
 
 
-def test_a_mistake_in_this_suite_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
-        raise TypeError("ours")
-
-    monkeypatch.setattr(GrayEdge, "estimate_prepared", broken)
-    with pytest.raises(TypeError, match="ours") as caught:
-        evaluate(walls(1), [GRAY_WORLD])
-    assert caught.value.__notes__ == ["while Gray-world was on wall 0.png"]
-
-
 def test_nothing_to_evaluate_is_said() -> None:
     with pytest.raises(InputError, match="0 methods on 3 images"):
         evaluate(walls(3), [])

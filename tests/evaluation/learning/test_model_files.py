@@ -72,12 +72,10 @@ def test_the_images_are_known_again(saved: Path) -> None:
     )
 
 
-def test_a_file_without_its_images_is_read(saved: Path) -> None:
+def test_a_file_without_its_images_is_refused(saved: Path) -> None:
     rewrite(saved, lambda arrays, _: arrays.pop("trained_on"))
-    record = load_model(saved).provenance
-    assert record is not None
-    assert record.scenes == 12
-    assert record.images.shape == (0, 2)
+    with pytest.raises(FormatError):
+        load_model(saved)
 
 
 def test_only_learned_methods_are_saved(tmp_path: Path) -> None:
@@ -150,5 +148,5 @@ def test_what_python_cannot_unpack_is_refused(saved: Path) -> None:
     content[content.index(b"PK\x03\x04") + 6] |= 1 << 5
     content[content.index(b"PK\x01\x02") + 8] |= 1 << 5
     saved.write_bytes(content)
-    with pytest.raises(FormatError, match=r"is no whole model file: .*patched data"):
+    with pytest.raises(FormatError):
         load_model(saved)

@@ -166,12 +166,3 @@ def test_a_derivative_that_is_kept_gives_the_same_sums() -> None:
 
 def test_an_even_image_has_no_edges() -> None:
     assert GrayEdge("", 1, 1, 2).estimate(np.full((50, 50, 3), (51234, 7, 333), np.uint16)) is GREY
-
-
-def test_the_border_stated() -> None:
-    borders = [GrayEdge("", order, 1, sigma).left_out for order, sigma in ((0, 0), (0, 0.5), (1, 6), (2, 1.9))]
-    assert borders == [0, 1, 7, 2]
-    image = np.ones((30, 30, 3))
-    image[0, 0] = [5, 1, 1]
-    assert recovery_error(GrayEdge("", 0, np.inf, 0).estimate(image), [5, 1, 1]) < 1e-6
-    assert recovery_error(GrayEdge("", 0, np.inf, 0, border=1).estimate(image), [1, 1, 1]) < 1e-6

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.comparing import error_scatter
+from evaluation.experiments.comparing import Matched, error_scatter
 from evaluation.experiments.run_folder import describe_run
 from evaluation.experiments.running import evaluate
 from evaluation.methods import GrayEdge
@@ -45,9 +45,10 @@ def test_names_are_neither_mathematics_nor_left_out() -> None:
     ]
     curves = texts(error_curves(results, "recovery"))
     planes = texts(error_planes(results, random.random((5, 3)) + 0.1, "recovery"))
-    scatter = texts(error_scatter(random.random(5), random.random(5), ("$a$", "_b"), {0: "im $x_1$"}))
+    matched = Matched(("$a$", "_b"), "recovery", tuple("abcde"), random.random(5), random.random(5))
+    scatter = texts(error_scatter(matched))
     assert all(name in curves and name in planes for name in NAMES)
-    assert {"im $x_1$", "$a$: error, degrees", "_b: error, degrees"} <= set(scatter)
+    assert {"$a$: error, degrees", "_b: error, degrees"} <= set(scatter)
 
 
 METHODS = [GrayEdge("Gray-world", 0, 1, 0, 0), GrayEdge("White <Patch>", 0, np.inf, 0, 0)]

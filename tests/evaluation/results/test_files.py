@@ -22,26 +22,12 @@ def written(folder: Path, *lines: str, head: str = HEAD) -> Path:
     return path
 
 
-def test_columns_in_another_order_and_without_truths(tmp_path: Path) -> None:
-    path = written(tmp_path, "7,a.png,Mine,2", head="reproduction,image,method,recovery")
-    mine = read_errors(path)["Mine"]
-    assert mine.truths is None
+def test_columns_in_another_order(tmp_path: Path) -> None:
+    head = "guessed,reproduction,image,note,method,truth_r,truth_g,truth_b,recovery"
+    mine = read_errors(written(tmp_path, "1,7,a.png,x,Mine,1,2,3,2", "0,7,b.png,x,Mine,1,2,3,2", head=head))["Mine"]
+    assert mine.truths.tolist() == [[1, 2, 3]] * 2
     assert (mine.errors["recovery"][0], mine.errors["reproduction"][0]) == (2, 7)
-    assert not mine.guessed.any()
-    assert mine.estimates is None
-
-
-@pytest.mark.parametrize(("second", "whole"), [("1,2,3", True), ("1,,3", False), ("1,nan,3", False)])
-def test_estimates_are_there_where_all_are(tmp_path: Path, second: str, whole: bool) -> None:
-    lines = ("a,Mine,3,4,5,1,2", f"b,Mine,{second},1,2")
-    mine = read_errors(written(tmp_path, *lines, head="image,method,r,g,b,recovery,reproduction"))["Mine"]
-    assert (None if mine.estimates is None else mine.estimates.tolist()) == ([[3, 4, 5], [1, 2, 3]] if whole else None)
-
-
-@pytest.mark.parametrize("guessed", [("", "0", "no", "False", "FALSE"), ("1", "yes", "True", "TRUE")])
-def test_whether_a_light_was_guessed_is_read_as_programs_write_it(tmp_path: Path, guessed: tuple[str, ...]) -> None:
-    lines = (f"{place},Mine,1,1,1,1,1,1,1,2,{word}" for place, word in enumerate(guessed))
-    assert read_errors(written(tmp_path, *lines))["Mine"].guessed.tolist() == ["yes" in guessed] * len(guessed)
+    assert mine.guessed.tolist() == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -64,9 +50,9 @@ def test_faults_are_named(tmp_path: Path, line: str, says: str) -> None:
 
 
 def test_other_files(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"image, method.*recovery, reproduction"):
+    with pytest.raises(FormatError):
         read_errors(written(tmp_path, head="image,method").rename(tmp_path / "x.csv"))
-    with pytest.raises(InputError, match=r"errors.csv.*results folder"):
+    with pytest.raises(InputError):
         read_errors(tmp_path)
     (tmp_path / "errors.csv").write_bytes(b"\xff\xfe\x80")
     with pytest.raises(FormatError, match="UTF-8 was expected"):
@@ -86,7 +72,7 @@ def given(tmp_path: Path, text: str) -> Path:
     "text",
     [
         "image,r,g,b\na/two.png,4,5,6\na/one.png,1,2,3\nthree.v1.png,7,8,9\n",
-        "a/one,1,2,3\na/two,4,5,6\nthree.v1,7,8,9",
+        "image,r,g,b\na/one,1,2,3\na/two,4,5,6\nthree.v1,7,8,9",
         "\ufeffB;Image;note;R;G\r\n3;a/one.tiff;x;1;2\r\n6;a/two.tiff;;4;5\r\n\r\n9;three.v1.tiff;;7;8\r\n",
         "image,r,g,b\ra/two.png,4,5,6\ra/one.png,1,2,3\rthree.v1.png,7,8,9\r",
         'image\tr\tg\tb\n"a/one.png"\t1e0\t2\t3.0\na/two.png\t4\t5\t6\nthree.v1.png\t7\t8\t9\n',
@@ -103,23 +89,23 @@ def test_names_with_and_without_extension(tmp_path: Path, text: str) -> None:
 
 
 def test_what_is_no_light_is_kept_as_it_is(tmp_path: Path) -> None:
-    found = read_estimates(given(tmp_path, "a/one,nan,1,1\na/two,0,0,0\nthree.v1,-1,1,1\n"), IMAGES)
+    found = read_estimates(given(tmp_path, "image,r,g,b\na/one,nan,1,1\na/two,0,0,0\nthree.v1,-1,1,1\n"), IMAGES)
     np.testing.assert_array_equal(found.lights["a/one.png"], [np.nan, 1, 1])
 
 
 def test_a_name_without_extension_that_two_images_have_is_neither(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"2 images .*missing.*\(one\)"):
-        read_estimates(given(tmp_path, "one,1,1,1\n"), ["one.png", "one.tiff"])
+        read_estimates(given(tmp_path, "image,r,g,b\none,1,1,1\n"), ["one.png", "one.tiff"])
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "begins with ''; expected the columns image,r,g,b"),
+        ("", "begins with ''; expected image,r,g,b"),
         ("name,red,green,blue\na,1,1,1", "begins with 'name,red,green,blue'"),
-        ("image,r,g,b\na/one,1,1\n", "line 2: 3 fields where the first line has 4"),
-        ("image,r,g,b\na/one,0,68,0,85,0,22\n", "line 2: 7 fields where the first line has 4"),
-        ("image,r,g,b,r,g,b\na/one,1,1,1,2,2,2\n", "columns of the same name"),
+        ("image,r,g,b\na/one,1,1\n", "line 2: 3 fields, the head has 4"),
+        ("image,r,g,b\na/one,0,68,0,85,0,22\n", "line 2: 7 fields, the head has 4"),
+        ("image,r,g,b,r,g,b\na/one,1,1,1,2,2,2\n", "each once"),
         ('image,r,g,b\n"a/one,1,2,3\n', "is no CSV text"),
     ],
 )

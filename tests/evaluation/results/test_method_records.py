@@ -24,20 +24,6 @@ def test_a_changed_file_is_another_method(tmp_path: Path) -> None:
     assert records[0]["class"] == "own.py:Own"
 
 
-def test_what_a_file_imports_from_beside_it_belongs_to_its_method(tmp_path: Path) -> None:
-    (tmp_path / "curve_of_own.py").write_text("GAMMA = 2\n")
-    file = tmp_path / "own_with_curve.py"
-    file.write_text(
-        "from curve_of_own import GAMMA\n\n\nclass Own:\n    name = 'Own'\n\n"
-        "    def estimate(self, image, saturation=None, mask=None):\n        return (image**GAMMA).mean((0, 1))\n"
-    )
-    method = find_method(f"{file}:Own")
-    record = describe_method(method)
-    assert list(record["imports"]) == ["curve_of_own.py"]
-    (tmp_path / "curve_of_own.py").write_text("GAMMA = 3\n")
-    assert describe_method(method) != record
-
-
 def test_another_setting_is_another_method() -> None:
     class Own:
         name = "Own"

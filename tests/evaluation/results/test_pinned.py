@@ -41,8 +41,8 @@ def attempt(read: Callable[[], Any]) -> Any:
 
 ERRORS = """image,method,r,g,b,truth_r,truth_g,truth_b,recovery,reproduction,guessed,cause,group
 a,M,0.2,0.5,0.3,0.25,0.5,0.25,5.25,6.5,0,,x
-b,M,0.3,0.4,0.3,0.25,0.5,0.25,1.5,2.5,yes,dark,x
-a,N,,,,0.25,0.5,0.25,0,0.0,No,,y
+b,M,0.3,0.4,0.3,0.25,0.5,0.25,1.5,2.5,1,dark,x
+a,N,,,,0.25,0.5,0.25,0,0.0,0,,y
 """
 ESTIMATES = "image,r,g,b\na.png,0.2,0.5,0.3\nb,1,2,1\nmore/c.png,0.1,0.1,0.1\n"
 IMAGES = ("a.png", "b.tiff", "more/c.png")
@@ -53,11 +53,9 @@ TRUTHS = "File,GT_R,GT_G,GT_B\nA_1,0.2,0.5,0.3\nA_2,0.3,0.5,0.2\nB_1,1,2,1\n"
 def test_damaged_tables(tmp_path: Path, pinned: Pinned) -> None:
     readers: dict[str, tuple[str, Callable[[Path], Any]]] = {
         "errors": (ERRORS, read_errors),
-        "errors without truths": (ERRORS.replace("truth_", "t_").replace(",guessed,", ",g,"), read_errors),
         "estimates": (ESTIMATES, lambda path: read_estimates(path, IMAGES).lights),
         "estimates with semicolons": (ESTIMATES.replace(",", ";"), lambda path: read_estimates(path, IMAGES).lights),
         "folds": (FOLDS, lambda path: folds.read_folds(path, IMAGES)),
-        "names": (FOLDS, lambda path: folds.read_names(path, IMAGES)),
         "truths": (TRUTHS, lambda path: [read_truths(f"{path}{of}") for of in ("", "#A", "#B_1")]),
     }
     found: dict[str, Any] = {}

@@ -98,8 +98,3 @@ def test_text_is_rounded_and_csv_is_not() -> None:
 def test_a_row_of_another_length_is_refused(rows: tuple[tuple[float, ...], ...]) -> None:
     with pytest.raises(ValueError, match="cells under 2 heads"):
         Table("t", ("a", "b"), rows)
-
-
-def test_small_numbers_keep_their_digits_in_csv() -> None:
-    text = table_to_csv(Table("p", ("p",), ((1.23456789e-12,),)))
-    assert float(text.splitlines()[1]) == pytest.approx(1.23456789e-12, rel=1e-8)

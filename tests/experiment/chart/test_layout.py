@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experiment.chart.layout import (
-    A_SERIES_MM,
     GREY_CODES,
     LEAST_WHITES,
     design_chart,
     paper_chart,
-    spread,
 )
 from experiment.chart.model import Chart
 from foundation.errors import InputError
@@ -123,37 +120,11 @@ def test_the_paper_s_chart_on_a0() -> None:
     }
 
 
-def test_references_on_a0_are_even_and_no_lattice() -> None:
-    chart = design_chart()
-    places = np.array([reference.centre_mm for reference in chart.references]) / chart.cell_mm[0]
-    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    # 36.3 slots a reference: a square lattice would stand 6.02 apart, a random choice has pairs side by side.
-    assert apart.min() >= 4
-    holes = np.array(
-        [np.linalg.norm(places - centre, axis=1).min() for centre in chart.centres_mm[::7] / chart.cell_mm[0]]
-    )
-    assert holes.max() <= 6
-    # A lattice has peaks as high as the number of its points; noise has 1 everywhere.
-    picture = np.zeros((155, 221))
-    column, row = np.rint(places - places.min(axis=0)).astype(int).T
-    picture[row, column] = 1
-    power = np.abs(np.fft.fft2(picture - picture.mean())) ** 2 / len(places)
-    assert power.max() < len(places) / 20
-
-
 def test_the_greys_halve_the_light_of_srgb_and_are_no_colours_of_the_chart() -> None:
     # IEC 61966-2-1: code 188 is linear 0.5029, and so on by hand.
     for code, linear in zip(GREY_CODES, (0.5, 0.25, 0.125, 0.0625), strict=True):
         assert ((code / 255 + 0.055) / 1.055) ** 2.4 == pytest.approx(linear, rel=0.01)
         assert code % 8 != 0
-
-
-def test_a_page_can_be_larger_named_or_measured() -> None:
-    assert design_chart(2, "a4").page_mm == (297, 210)
-    portrait = design_chart(3, (148, 210))
-    assert portrait.page_mm == (148, 210)
-    assert len(portrait.references) == len(design_chart(3).references)
 
 
 @pytest.mark.parametrize(
@@ -182,38 +153,6 @@ def test_what_cannot_be_designed_says_what_can(
         design_chart(bits, page, seed)
 
 
-@settings(max_examples=40)
-@given(st.integers(2, 20), st.integers(2, 20), st.floats(0, 1), st.floats(0.1, 1), st.integers(0, 99))
-def test_spread_chooses_as_many_as_asked_among_the_allowed(
-    rows: int, columns: int, share: float, density: float, seed: int
-) -> None:
-    rng = np.random.default_rng(seed)
-    allowed = rng.random((rows, columns)) < density
-    allowed[0, 0] = True
-    count = round(share * int(allowed.sum()))
-    chosen = spread(allowed, count, rng)
-    assert chosen.sum() == count
-    assert not (chosen & ~allowed).any()
-
-
-@pytest.mark.parametrize(("bits", "page", "pixels"), [(4, "A3", 120), (3, (100.0, 500.0), 125)])
-def test_cells_shrink_to_whole_pixels_on_a_page_too_small(
-    bits: int, page: str | tuple[float, float], pixels: int
-) -> None:
-    chart = design_chart(bits, page)
-    assert chart.cell_mm == pytest.approx((pixels * PX_MM, pixels * PX_MM))
-    assert sorted(chart.colours.tolist()) == list(range(8**bits))
-    module = np.ptp(chart.tags[0].corners_mm[:, 0]) / 8 / PX_MM
-    assert module == pytest.approx(0.4 * pixels)
-    assert module == pytest.approx(round(module)), "a module is whole pixels"
-    for edges in (chart.centres_mm - np.array(chart.cell_mm) / 2, np.array([tag.corners_mm for tag in chart.tags])):
-        assert np.abs(edges / PX_MM - np.rint(edges / PX_MM)).max() < 1e-6
-    # One size larger does not fit: there is no room for as many slots within the margins.
-    larger = pixels + 5
-    room = [int((side / PX_MM - 2 * 189) // larger) for side in chart.page_mm]
-    assert pixels == 125 or room[0] * room[1] < 8**bits * 41 / 40 + 16 * len(chart.tags)
-
-
 def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:
     chart = paper_chart()
     assert chart.page_mm == (1189, 841)
@@ -237,26 +176,3 @@ def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:
     assert codes[0, 31].tolist() == [248, 0, 0]
     assert codes[31, 0].tolist() == [0, 248, 0]
     assert codes[0, 255].tolist() == [0, 0, 56]
-
-
-def test_the_paper_s_references_are_bare_margin() -> None:
-    chart = paper_chart()
-    places = np.array([reference.centre_mm for reference in chart.references])
-    half = np.array([reference.size_mm for reference in chart.references]) / 2
-    low, high = chart.centres_mm.min(axis=0), chart.centres_mm.max(axis=0)
-    edge = np.array(chart.cell_mm) / 2 + 1.4
-    assert all(reference.is_white for reference in chart.references)
-    assert len(places) >= 20
-    assert (((places + half <= low - edge) | (places - half >= high + edge)).any(axis=1)).all()
-    assert (places - half > 0).all()
-    assert (places + half < chart.page_mm).all()
-    for bits, page, expected in ((5, "A5", "256 × 128 cells"), (6, "A0", "1 to 5 bits")):
-        with pytest.raises(InputError, match=expected):
-            paper_chart(page, bits)
-
-
-def test_each_sheet_is_half_of_the_one_before() -> None:
-    sheets = list(A_SERIES_MM.values())
-    for (wide, high), (half_wide, half_high) in pairwise(sheets):
-        assert half_wide == high
-        assert half_high == wide // 2

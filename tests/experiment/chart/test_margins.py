@@ -14,13 +14,8 @@ from hypothesis import strategies as st
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.margins import (
     Margins,
-    Side,
     edge_boxes,
-    margin_marks,
-    number_every_mm,
-    ruler_ticks,
     star_boxes,
-    whole_px,
 )
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing, field_drawing
@@ -124,71 +119,6 @@ def test_marks_have_air_between_them(apart: int, free: bool) -> None:
 
 
 NOTHING = np.empty((0, 4), dtype=np.int64)
-FIELD = np.array([500, 600, 2500, 2000])
-"""A field on a sheet of 3000 × 2600 px, with as much margin on all sides as anything needs."""
-
-
-@pytest.mark.parametrize(
-    ("side", "expected"),
-    [
-        ("bottom", [[510, 2040, 530, 2090], [510, 2040, 570, 2050]]),
-        ("top", [[510, 510, 530, 560], [510, 550, 570, 560]]),
-        ("left", [[410, 610, 460, 630], [450, 610, 460, 670]]),
-        ("right", [[2540, 610, 2590, 630], [2540, 610, 2550, 670]]),
-    ],
-)
-def test_a_margin_runs_along_the_field_and_outwards(side: Side, expected: list[list[int]]) -> None:
-    margins = Margins(FIELD, (3000, 2600), NOTHING)
-    # An L whose long stroke leads away from the field, the short one along it.
-    assert margins.put(side, np.array([[10, 40, 30, 90], [10, 40, 70, 50]]))
-    assert margins.boxes.tolist() == expected
-    assert margins.length(side) == (2000 if side in ("top", "bottom") else 1400)
-    # As near to the field as 35 px, and no nearer.
-    near = [Margins(FIELD, (3000, 2600), NOTHING).put(side, np.array([[0, v, 10, 90]])) for v in (34, 35)]
-    assert near == [False, True]
-
-
-# Multiples of 4, so that things often lie just as far apart as they must.
-@settings(max_examples=100)
-@given(
-    st.sampled_from(("bottom", "top", "left", "right")),
-    st.lists(st.tuples(*[st.integers(0, 650).map(lambda n: 4 * n)] * 2, *[st.integers(1, 75)] * 2), max_size=30),
-    st.integers(-3, 350).map(lambda n: 4 * n),
-)
-def test_the_place_found_is_the_first_of_those_where_there_is_room(
-    side: Side, there: list[tuple[int, int, int, int]], start: int
-) -> None:
-    boxes = [(x, y, x + 4 * width, y + 4 * height) for x, y, width, height in there]
-    taken = np.array(boxes, dtype=np.int64).reshape(-1, 4)
-    mark = np.array([[0, 40, 200, 90], [0, 40, 20, 160], [300, 60, 310, 70]])
-    found = Margins(FIELD, (3000, 2600), taken)
-    expected = Margins(FIELD, (3000, 2600), taken)
-    places = range(max(0, start), found.length(side) - 310 + 1, 24)
-    assert found.put_somewhere(side, mark, start) == any(
-        expected.put(side, mark + np.array([u, 0, u, 0])) for u in places
-    )
-    assert found.boxes.tolist() == expected.boxes.tolist()
-
-
-def test_a_long_ruler_has_a_number_at_every_hundred_millimetres() -> None:
-    # 300 mm are 7086.6 px.
-    assert [number_every_mm(length) for length in (100, 7086, 7087, 30000)] == [10, 10, 100, 100]
-    # A tick that does not find room whole is left out: that of 10 mm begins at 236.
-    assert [len(ruler_ticks(length)) for length in (3, 4, 239, 240)] == [0, 1, 10, 11]
-
-
-def test_what_finds_no_room_is_left_out_and_the_rest_stays() -> None:
-    field = np.array([100, 30, 2000, 1900])
-    nothing = np.empty((0, 4), dtype=np.int64)
-    # Room only on the left and below, and only just.
-    narrow = margin_marks(field, (2060, 2040), nothing, ("a line",))
-    assert len(narrow) > 50
-    assert (narrow[:, 1] >= 1900 + 35).all(), "the left margin is too narrow for numbers, those above and right for all"
-    assert len(margin_marks(np.array([0, 0, 2000, 2000]), (2000, 2000), nothing, ("a line",))) == 0
-
-
-def test_boxes_in_millimetres_become_the_pixels_that_hold_them() -> None:
-    assert whole_px([[1 / 600 * 25.4, 2.4 / 600 * 25.4, 3 / 600 * 25.4, 3.2 / 600 * 25.4]]).tolist() == [[1, 2, 3, 4]]
 
 
 def test_a_chart_of_another_maker_without_margins_is_drawn(a7: Chart) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from experiment.chart.layout import design_chart, paper_chart
-from experiment.chart.model import Chart, colour_of_index, load_chart
+from experiment.chart.model import Chart, load_chart
 from foundation.errors import FormatError
 
 pytestmark = pytest.mark.slow
@@ -54,45 +51,6 @@ def test_what_is_saved_is_read_again(chart: Chart, tmp_path: Path) -> None:
     np.testing.assert_allclose(again.centres_mm, chart.centres_mm, rtol=0, atol=1e-6)
     assert again.to_json() == chart.to_json()
     assert again.sha256 == chart.sha256
-
-
-def test_seed_and_software_are_kept_and_an_old_file_keeps_its_hash(tmp_path: Path) -> None:
-    chart = design_chart(1, seed=3)
-    document = json.loads(chart.to_json())
-    assert document["seed"] == 3
-    assert document["software"] == chart.software
-    # The text of version 1 before the keys were there: those of the design, in that order, and nothing else.
-    for key in ("seed", "software"):
-        del document[key]
-    old = json.dumps(document, separators=(",", ":")) + "\n"
-    path = tmp_path / "chart.json"
-    path.write_text(old)
-    again = load_chart(path)
-    assert (again.seed, again.software) == (None, None)
-    assert again.to_json() == old
-    assert again.sha256 == hashlib.sha256(old.encode()).hexdigest()
-
-
-@given(st.integers(1, 5), st.data())
-def test_the_colour_of_an_index(bits: int, data: st.DataObject) -> None:
-    index = data.draw(st.integers(0, 8**bits - 1))
-    red, green, blue = (int(code) for code in colour_of_index(index, bits))
-    low = 8 - bits
-    assert ((red >> low) << 2 * bits) | ((green >> low) << bits) | (blue >> low) == index
-    assert all(code % (1 << low) == 0 for code in (red, green, blue))
-
-
-def test_colours_of_the_paper() -> None:
-    # DESIGN: index = (r5 << 10) | (g5 << 5) | b5 with r5 = R8 >> 3.
-    assert colour_of_index([0, 31, 31 << 5, 31 << 10, 32767], 5).tolist() == [
-        [0, 0, 0],
-        [0, 0, 248],
-        [0, 248, 0],
-        [248, 0, 0],
-        [248, 248, 248],
-    ]
-    assert colour_of_index(np.arange(32768), 5).dtype == np.uint8
-    assert len(np.unique(colour_of_index(np.arange(32768), 5), axis=0)) == 32768
 
 
 def set_(*keys: str | int, to: object) -> Callable[[dict[str, Any]], None]:
@@ -158,12 +116,6 @@ def test_what_is_no_json_object_is_refused(content: bytes, tmp_path: Path) -> No
     with pytest.raises(FormatError, match=r"chart\.json: damaged") as refused:
         load_chart(path)
     assert "\n" not in str(refused.value)
-
-
-def test_a_missing_chart_or_a_folder_is_refused(tmp_path: Path) -> None:
-    for path in (tmp_path / "none.json", tmp_path):
-        with pytest.raises(FormatError, match=r"chart\.json"):
-            load_chart(path)
 
 
 def test_the_print_is_no_description_of_it(tmp_path: Path) -> None:

@@ -15,18 +15,17 @@ import subprocess
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-import tifffile
 from PIL import Image, ImageCms
 
 from experiment.chart.layout import design_chart
 from experiment.chart.pdf_x import srgb_display_profile, srgb_output_profile
-from experiment.chart.printing import save_pdf, save_tiff
+from experiment.chart.printing import save_pdf
 from experiment.chart.proof import save_proof
 
 NAMESPACES = {
@@ -191,30 +190,6 @@ D50 = struct.pack(">3I", 0xF6D6, 0x10000, 0xD32D)
 """The illuminant as the standard gives it in hexadecimal (6.1.11)."""
 
 
-@pytest.mark.parametrize(
-    ("make", "kind", "needed"),
-    [
-        (srgb_output_profile, b"prtr", "desc cprt wtpt A2B0 A2B1 A2B2 B2A0 B2A1 B2A2 gamt"),
-        (srgb_display_profile, b"mntr", "desc cprt wtpt rXYZ gXYZ bXYZ rTRC gTRC bTRC"),
-    ],
-)
-def test_a_profile_has_the_bytes_of_the_standard(make: Callable[[], bytes], kind: bytes, needed: str) -> None:
-    profile = make()
-    # ICC.1:2001-04, 6.1: size, version 2.4, class, spaces, date, signature, intent relative to the medium, D50.
-    head = struct.pack(">I4xI", len(profile), 0x02400000) + kind + b"RGB XYZ " + struct.pack(">6H", 2000, 1, 1, 0, 0, 0)
-    assert profile[:128] == head + b"acsp" + bytes(24) + struct.pack(">I", 1) + D50 + bytes(48)
-    tags = tags_of(profile)
-    assert {*tags} == {*needed.split()}
-    assert tags["wtpt"] == b"XYZ " + bytes(4) + D50
-    # 6.5.18 and 6.5.17: signature, reserved, text with its NUL; a description is of its length and without other
-    # scripts, which take 8, 3 and 67 bytes.
-    assert tags["cprt"] == b"text" + bytes(4) + b"No copyright, use freely\0"
-    told = tags["desc"][12:-78]
-    assert told.endswith(b"\0")
-    assert tags["desc"] == b"desc" + bytes(4) + struct.pack(">I", len(told)) + told + bytes(78)
-    assert make() == profile
-
-
 def test_the_tables_of_the_output_profile_are_exact() -> None:
     tags = tags_of(srgb_output_profile())
     one = [65536, 0, 0, 0, 65536, 0, 0, 0, 65536]
@@ -239,28 +214,3 @@ def test_the_tables_of_the_output_profile_are_exact() -> None:
     np.testing.assert_array_equal(marked[clear] > 0, outside[clear])
     assert clear.sum() > 4800
     assert 0 < (marked == 0).sum() < 100
-
-
-def test_the_display_profile_has_the_published_primaries() -> None:
-    tags = tags_of(srgb_display_profile())
-    # Those of sRGB adapted to D50 by Bradford's transform, as in the ICC's own profile.
-    for name, expected in (
-        ("rXYZ", (0.43607, 0.22249, 0.01392)),
-        ("gXYZ", (0.38515, 0.71687, 0.09708)),
-        ("bXYZ", (0.14307, 0.06061, 0.71410)),
-    ):
-        assert np.frombuffer(tags[name][8:], ">i4") / 65536 == pytest.approx(expected, abs=2e-4)
-    assert struct.unpack(">4s4xI", tags["rTRC"][:12]) == (b"curv", 1024)
-    assert len(tags["rTRC"]) == 12 + 2 * 1024
-
-
-@pytest.mark.slow
-def test_the_tagged_tiff_has_the_codes_of_the_untagged_one(tmp_path: Path) -> None:
-    chart = design_chart(1)
-    save_tiff(chart, tmp_path / "plain.tif")
-    save_tiff(chart, tmp_path / "tagged.tif", tagged=True)
-    np.testing.assert_array_equal(tifffile.imread(tmp_path / "plain.tif"), tifffile.imread(tmp_path / "tagged.tif"))
-    with tifffile.TiffFile(tmp_path / "plain.tif") as plain, tifffile.TiffFile(tmp_path / "tagged.tif") as tagged:
-        before, after = cast("Any", plain.pages[0]), cast("Any", tagged.pages[0])
-        assert 34675 not in before.tags
-        assert bytes(after.tags[34675].value) == srgb_display_profile()

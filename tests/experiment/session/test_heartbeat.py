@@ -53,11 +53,6 @@ def test_a_process_that_is_gone_is_dead_and_so_is_what_is_left_of_it() -> None:
     assert process.is_alive() is False
 
 
-@pytest.mark.parametrize("elsewhere", [replace(SELF, host="another"), replace(SELF, boot="x"), replace(SELF, boot="")])
-def test_what_runs_elsewhere_cannot_be_told(elsewhere: Process) -> None:
-    assert elsewhere.is_alive() is None
-
-
 def test_without_proc_the_list_of_processes_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     """As macOS has it: ps(1) says when a process began."""
 
@@ -87,17 +82,6 @@ def test_without_proc_the_list_of_processes_is_asked(monkeypatch: pytest.MonkeyP
 def test_a_run_whose_process_is_gone_is_dead_at_once_however_long_it_meant_to_be_silent() -> None:
     assert beat(until_s=3600).is_dead(NOW, alive=False)
     assert not beat(until_s=-3600).is_dead(NOW, alive=True), "a process that is there is waited for"
-
-
-def test_a_run_that_has_ended_is_never_dead() -> None:
-    assert not beat("ended", until_s=-3600).is_dead(NOW, alive=False)
-
-
-def test_what_a_reader_is_told() -> None:
-    assert beat().sentence_for(NOW, alive=True) == "taking 8 frames"
-    local = NOW.astimezone().strftime("%Y-%m-%d %H:%M:%S")
-    told = beat().sentence_for(NOW, alive=False)
-    assert told == f"stopped at {local}, killed or power lost: run the same command again"
 
 
 def test_a_journal_keeps_the_newest_sign_of_life(tmp_path: Path) -> None:

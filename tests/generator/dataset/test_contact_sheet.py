@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-    from calibration.table.lut import Lut
 
 pytestmark = pytest.mark.slow
 

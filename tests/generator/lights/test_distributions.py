@@ -179,7 +179,6 @@ def test_drawn_lights_are_a_function_of_seed_and_position() -> None:
         ("uniform:r=1", "is no distribution"),
         ("fit:", "is no distribution"),
         ("gaussian:r=.3,b=.2,sd=0", "'sd=0' of the distribution gaussian: expected a number from 1e-06 to 1"),
-        ("fit:none.csv", r"cannot read ground truths none\.csv"),
     ],
 )
 def test_a_bad_distribution_is_named(text: str, message: str) -> None:

@@ -31,7 +31,7 @@ from tests.calibration.lab import SETTINGS, Lab, hang, take
 from tests.generator.conftest import MakeLut
 
 if TYPE_CHECKING:
-    from generator.lights.lighting import Mixture
+    pass
 
 
 PRIMARIES = np.array([[5000.0, 900.0, 300.0], [900.0, 6000.0, 1000.0], [150.0, 1100.0, 4800.0]])

@@ -1,9 +1,8 @@
-"""What every simulated body answers, byte by byte, in long conversations that were drawn once by chance."""
+"""Answers of every simulated body, and what the driver makes of them."""
 
 from __future__ import annotations
 
 import hashlib
-import random
 from dataclasses import replace
 from io import BytesIO
 from typing import Any
@@ -12,13 +11,13 @@ import pytest
 
 from drivers import canon
 from drivers.camera import ExposureSettings, capture
-from drivers.canon import EosState, PropertySetting, number_value
-from drivers.ptp.codes import AeMode, CaptureDestination, Operation, Property
+from drivers.canon import EosState
+from drivers.ptp.codes import AeMode, Operation, Property
 from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, InputError, LinkClosed
 from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, TEST_BODY, EosModel
-from sim.camera.eos import CARD, DCIM, FOLDER, SimulatedEos
-from tests.drivers.canon.eos_lab import Lab
+from sim.camera.eos import CARD, DCIM, SimulatedEos
+from tests.drivers.eos_lab import Lab
 from tests.pinned import Pinned
 from tests.sim.camera.test_eos import Host, NumberedFilm
 
@@ -39,11 +38,6 @@ SETTINGS = (
     *(ExposureSettings(200, None, 1 / 60), ExposureSettings(400, 5.6, 31.0), ExposureSettings(200, 22.0, 1 / 8000)),
 )
 WANTED = (0.5, 0.3, 0.29, 1 / 60, 1 / 61, 30, 31, 8.0, 5.6, 5.65, 100, 125, 130, "1/60", "bulb", "0.5", "x", "1/0", 1e9)
-DONE = {
-    "set": 8, "on": 6, "off": 5, "wait": 9, "event": 8, "release": 2, "get": 3, "part": 3, "delete": 2, "done": 3,
-    "list": 3, "value": 3, "room": 3, "hand": 3, "keep": 2, "reset": 1,
-}  # fmt: skip
-"""How often each thing is done to a body."""
 
 
 def short(data: bytes | None) -> str:
@@ -96,101 +90,6 @@ def test_a_body_says_of_itself_what_it_said(name: str, pinned: Pinned) -> None:
     for ask in (Operation.EOS_GET_STORAGE_INFO, Operation.GET_STORAGE_INFO, Operation.GET_NUM_OBJECTS):
         found += [told(host, ask, store, 0, parent) for store in (CARD, 0, 0x20000) for parent in (0, 0xFFFFFFFF, DCIM)]
     pinned(f"a body, {name}, of itself", "\n".join(found).encode())
-
-
-def step(host: Host, chance: random.Random, handles: list[int]) -> str:
-    """Do one thing to a body, and return what it said."""
-    body = host.eos
-    spec = chance.choice(BODIES[chance.choice(list(BODIES))][0].properties)
-    choices = [*spec.choices, chance.randrange(256)]
-    handle = chance.choice([*handles, CARD, DCIM, FOLDER, 0, 0xFFFFFFFF])
-    part = chance.choice((0, 1, 100, 699, 700, 701, 0x100000))
-    value = number_value(chance.choice(choices))
-    if spec.formats:
-        value = chance.choice(spec.formats).encode() if chance.random() < 0.9 else b"\1\0\0\0"
-    what = chance.choices(list(DONE), list(DONE.values()))[0]
-    match what:
-        case "set" if chance.random() < 0.4:
-            model = chance.choice(list(BODIES.values()))[0]
-            shutter, aperture = chance.choice(model.shutter_codes), chance.choice(model.aperture_codes)
-            of = chance.choice(((Property.EOS_SHUTTER_SPEED, shutter), (Property.EOS_APERTURE, aperture)))
-            setting = PropertySetting(of[0], number_value(of[1]))
-            return told(host, Operation.EOS_SET_DEVICE_PROP_VALUE_EX, data=setting.encode())
-        case "set":
-            return told(host, Operation.EOS_SET_DEVICE_PROP_VALUE_EX, data=PropertySetting(spec.code, value).encode())
-        case "on":
-            return told(
-                host, Operation.EOS_REMOTE_RELEASE_ON, chance.choice((3, 3, 3, 1, 2, 0, 4)), chance.randrange(2)
-            )
-        case "off":
-            return told(host, Operation.EOS_REMOTE_RELEASE_OFF, chance.choice((1, 2, 3, 3)))
-        case "wait":
-            seconds = chance.choice((0.05, 0.2, 0.5, 1.0, 3.0, 11.0, 33.0))
-            host.clock.sleep(seconds)
-            return f"{seconds:g} s later: busy {body.busy}, asleep {body.asleep}"
-        case "event":
-            return told(host, Operation.EOS_GET_EVENT)
-        case "release":
-            return told(host, Operation.EOS_REMOTE_RELEASE)
-        case "get":
-            some = (Operation.GET_OBJECT, Operation.EOS_GET_OBJECT, Operation.GET_OBJECT_INFO, Operation.GET_THUMB)
-            return told(host, chance.choice(some), handle)
-        case "part":
-            some = (Operation.GET_PARTIAL_OBJECT, Operation.EOS_GET_PARTIAL_OBJECT)
-            return told(host, chance.choice(some), handle, chance.choice((0, 1, 699, 700)), part)
-        case "delete":
-            return told(host, chance.choice((Operation.DELETE_OBJECT, Operation.EOS_DELETE_OBJECT)), handle)
-        case "done":
-            return told(host, chance.choice((Operation.EOS_TRANSFER_COMPLETE, Operation.EOS_CANCEL_TRANSFER)), handle)
-        case "list":
-            some = (Operation.GET_NUM_OBJECTS, Operation.GET_OBJECT_HANDLES, Operation.EOS_GET_OBJECT_INFO_EX)
-            second = chance.choice((0, 0x3001, 0xB103, FOLDER, DCIM, 0xFFFFFFFF))
-            return told(host, chance.choice(some), chance.choice((CARD, 0xFFFFFFFF)), second, handle)
-        case "value":
-            some = (Operation.EOS_REQUEST_DEVICE_PROP_VALUE, Operation.GET_DEVICE_PROP_VALUE)
-            return told(host, chance.choice(some), spec.code)
-        case "room":
-            return told(host, Operation.EOS_PC_HDD_CAPACITY, chance.choice((0, 1, 0x0FFFFFFF)), 0x1000, 1)
-        case "hand":
-            hands = {
-                "dial": lambda: body.turn_dial(chance.choice(list(AeMode)[:8])),
-                "focus": lambda: body.switch_focus(chance.random() < 0.3, chance.random() < 0.5),
-                "lockup": lambda: body.switch_mirror_lockup(chance.random() < 0.2),
-                "power": lambda: body.set_menu(Property.EOS_AUTO_POWER_OFF, chance.choice((0, 30, 240))),
-                "card": lambda: body.insert_card(chance.choice((1 << 20, 1 << 30))),
-                "no card": body.remove_card,
-                "manual": lambda: body.turn_dial(AeMode.MANUAL),
-                "wake": body.wake,
-            }
-            name = chance.choice(list(hands))
-            hands[name]()
-            return name
-        case "keep":
-            return told(host, Operation.EOS_KEEP_DEVICE_ON)
-        case _:
-            return told(host, chance.choice((Operation.EOS_RESET_TRANSFER, Operation.EOS_AF_CANCEL)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(BODIES)[1::2] + list(BODIES)[4:])
-def test_a_body_answers_what_it_answered(name: str, pinned: Pinned) -> None:
-    host, chance = host_of(name), random.Random(name)
-    destination = PropertySetting(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.HOST)).encode()
-    found = opening(host)
-    for number in range(210):
-        if host.eos.asleep and chance.random() < 0.5:
-            host.eos.wake()
-        if number % 30 == 0 or "> 2003" in found[-1]:
-            # Into the host's memory, the card, and both.
-            found += [*opening(host), told(host, Operation.EOS_PC_HDD_CAPACITY, 0x0FFFFFFF, 0x1000, 1)]
-            found.append(told(host, Operation.EOS_SET_DEVICE_PROP_VALUE_EX, data=destination))
-            host.eos.turn_dial(AeMode.MANUAL)
-        handles = [*host.eos._memory, *host.eos._on_card()]  # what it may be asked
-        found.append(step(host, chance, handles))
-        if number % 5 == 4:
-            found.append(told(host, Operation.EOS_GET_EVENT))
-    exposed = [settings for settings, _ in host.film.exposures]
-    pinned(f"a conversation with a body, {name}", {"said": "\n".join(found).encode(), "exposed": exposed})
 
 
 @pytest.mark.parametrize("name", list(BODIES)[:3])

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.links.link import PeerLink
-from drivers.pjlink import Input, PjLinkProjector
+from drivers.pjlink import PjLinkProjector
 from drivers.projector import Power
 from foundation.clock import SimulatedClock
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed
@@ -156,10 +156,10 @@ class Answers(PjLinkProjector):
     def muted(self) -> bool:
         return self.is_muted
 
-    def input(self) -> Input:
+    def input(self) -> str:
         if self.source is None:
             raise DeviceRefused("ERR1")
-        return Input(self.source)
+        return self.source
 
     def frozen(self) -> bool:
         self.asked.release()

@@ -25,23 +25,18 @@ from sim.world.disturbances import (
     Bump,
     Defocus,
     Disturbances,
-    FrozenScreen,
-    HalfChanged,
     LampDrift,
     LampStep,
     Moment,
     Person,
-    PopUp,
     Reflection,
-    ScrambledRows,
     SensorWarming,
     StaleFile,
-    ZeroedStrip,
     read_disturbances,
 )
 from sim.world.rendering import Print
 from sim.world.sensors import BODIES
-from sim.world.world import OVERSCAN, REFERENCE_EXPOSURE, Blob, Room, Situation, World, moved, moved_back, projected_mm
+from sim.world.world import REFERENCE_EXPOSURE, Room, Situation, World
 from tests.sim.conftest import BARE, PAGE_MM
 
 pytestmark = pytest.mark.slow
@@ -79,32 +74,6 @@ def at(world: World, x: float, y: float, frame: NDArray[np.float64]) -> NDArray[
     return np.array([block[0, 0], (block[0, 1] + block[1, 0]) / 2, block[1, 1]])
 
 
-def test_a_frozen_screen_shows_what_it_showed_before_it_froze(bare: World) -> None:
-    frozen = taken(bare, FrozenScreen(from_frame=5), colour=GREEN)
-    np.testing.assert_array_equal(frozen, taken(bare, colour=RED))
-    np.testing.assert_array_equal(taken(bare, FrozenScreen(from_frame=6), colour=GREEN), taken(bare, colour=GREEN))
-    before = ((0.0, RED), (1.0, GREEN), (2.0, GREY))
-    assert Disturbances((FrozenScreen(from_frame=2),)).shown(Moment(3, 3.0, WHITE, before)) == GREEN
-    assert Disturbances((FrozenScreen(from_s=0.5),)).shown(Moment(3, 3.0, WHITE, before)) == RED
-    assert Disturbances((FrozenScreen(),)).shown(Moment(3, 3.0, WHITE, before)) == BLACK
-
-
-def test_a_pop_up_lights_its_place_for_its_share_of_the_time(bare: World) -> None:
-    place = (0.2, 0.3, 0.4, 0.6)
-    frame = taken(bare, PopUp(place=place, colour=(0, 255, 0), share=0.25), colour=RED)
-    red, green = taken(bare, colour=RED), taken(bare, colour=GREEN)
-    expected = 0.75 * at(bare, 0.3, 0.45, red) + 0.25 * at(bare, 0.3, 0.45, green)
-    np.testing.assert_allclose(at(bare, 0.3, 0.45, frame), expected, atol=1.5)
-    for x, y in ((0.18, 0.45), (0.42, 0.45), (0.3, 0.28), (0.3, 0.62)):
-        np.testing.assert_allclose(at(bare, x, y, frame), at(bare, x, y, red), atol=1)
-
-
-def test_a_half_changed_picture_is_the_last_one_below(bare: World) -> None:
-    frame = taken(bare, HalfChanged(), colour=GREEN)
-    np.testing.assert_allclose(at(bare, 0.5, 0.48, frame), at(bare, 0.5, 0.48, taken(bare, colour=GREEN)), atol=1)
-    np.testing.assert_allclose(at(bare, 0.5, 0.52, frame), at(bare, 0.5, 0.52, taken(bare, colour=RED)), atol=1)
-
-
 @pytest.mark.parametrize("room_light", [0.0, 0.02])
 def test_lamp_and_room_light_are_as_bright_as_said(bare: World, room_light: float) -> None:
     white = taken(bare).mean()
@@ -116,13 +85,6 @@ def test_lamp_and_room_light_are_as_bright_as_said(bare: World, room_light: floa
     assert by_time / white == pytest.approx(0.98, abs=1e-4), "it stays when it has grown"
 
 
-def test_a_lamp_step_may_be_of_one_primary(bare: World) -> None:
-    step = LampStep(percent=0, rgb=(0, 0, -50))
-    np.testing.assert_allclose(taken(bare, step, colour=RED).mean(), taken(bare, colour=RED).mean(), rtol=1e-3)
-    blue = Colour(0, 0, 255)
-    np.testing.assert_allclose(taken(bare, step, colour=blue).mean(), taken(bare, colour=blue).mean() / 2, rtol=2e-3)
-
-
 def test_a_person_hides_what_is_behind(bare: World) -> None:
     white = taken(bare)
     frame = taken(bare, Person(place=(0.2, 0.2, 0.6, 0.8), left=0.05))
@@ -130,14 +92,6 @@ def test_a_person_hides_what_is_behind(bare: World) -> None:
     np.testing.assert_allclose(ratio, 0.05, atol=2e-3)
     np.testing.assert_array_equal(at(bare, 0.65, 0.5, frame), at(bare, 0.65, 0.5, white))
     np.testing.assert_array_equal(at(bare, 0.22, 0.22, frame), at(bare, 0.22, 0.22, white))
-
-
-def test_a_persons_ellipse_reaches_to_all_four_sides_of_its_place() -> None:
-    blob = Blob((0.2, 0.2, 0.6, 0.8), left=0.05)
-    inside = np.array([[0.25, 0.5], [0.55, 0.5], [0.4, 0.26], [0.4, 0.74]])
-    np.testing.assert_allclose(blob.passed(inside), 0.05)
-    outside = np.array([[0.18, 0.5], [0.62, 0.5], [0.4, 0.17], [0.4, 0.83]])
-    np.testing.assert_array_equal(blob.passed(outside), 1)
 
 
 def _centres(world: World, frame: NDArray[np.float64], *events: Bump) -> NDArray[np.float64]:
@@ -163,30 +117,6 @@ def test_a_bump_moves_the_chart_by_so_many_pixels(square_world: World, px: float
     expected = px * np.array([np.cos(np.radians(direction)), np.sin(np.radians(direction))])
     # The chart is rolled by 1.5° and turned by more.
     np.testing.assert_allclose(by, expected, atol=0.02 + 0.035 * px)
-
-
-def test_millimetres_are_millimetres_on_the_print(square_world: World) -> None:
-    view = square_world.view
-    still = _centres(square_world, taken(square_world))
-    pushed = _centres(square_world, taken(square_world, Bump(mm=1.0, direction_deg=0.0)))
-    assert (pushed - still).mean(axis=0)[0] == pytest.approx(view.focal_px / view.distance_mm, rel=0.03)
-
-
-def test_a_turned_chart_turns_about_its_middle() -> None:
-    points = np.array([[100.0, 50.0], [90.0, 62.5]])
-    there = moved(points, (90, 62.5), (1, 0), 90.0)
-    np.testing.assert_allclose(there, [[90 + 12.5 + 1, 62.5 + 10], [91, 62.5]])
-    np.testing.assert_allclose(moved_back(there, (90, 62.5), (1, 0), 90.0), points, atol=1e-12)
-
-
-def test_the_projector_does_not_move_with_the_chart() -> None:
-    room = replace(STRAIGHT, projector_falloff=0.4)
-    world = World(BARE, TEST, room)
-    inner = (slice(100, -100), slice(100, -100))
-    still, pushed = taken(world)[inner], taken(world, Bump(mm=8.0))[inner]
-    # Bare paper shows no movement but that of the light: there is none beyond the noise.
-    assert abs(np.mean(pushed / still) - 1) < 1e-3
-    assert np.corrcoef(pushed[::7, ::7].ravel(), still[::7, ::7].ravel())[0, 1] > 0.9
 
 
 def test_defocus_blurs_edges_by_its_standard_deviation() -> None:
@@ -233,26 +163,6 @@ def test_a_projected_picture_lights_each_place_by_its_own(bare: World) -> None:
     np.testing.assert_allclose(at(bare, 0.5, 0.5, plain), 0.5 * at(bare, 0.5, 0.5, white), atol=1)
 
 
-@pytest.mark.parametrize("aspect", [0.5, 1.0, 16 / 9, 4.0])
-def test_the_picture_covers_the_page_and_little_more(aspect: float) -> None:
-    left, top, right, bottom = projected_mm(PAGE_MM, aspect)
-    assert (right - left) / (bottom - top) == pytest.approx(aspect)
-    assert (left + right, top + bottom) == pytest.approx(PAGE_MM)
-    beyond = min(-left / PAGE_MM[0], -top / PAGE_MM[1])
-    assert beyond == pytest.approx(OVERSCAN)
-
-
-def test_strips_and_rows_are_those_named(bare: World) -> None:
-    counts = np.arange(100, dtype=np.uint16)[:, None] * np.ones(3, np.uint16)
-    torn = ZeroedStrip(top=0.5, bottom=0.55).counted(counts)
-    assert np.flatnonzero((torn != counts).any(axis=1)).tolist() == [50, 51, 52, 53, 54]
-    assert not torn[50:55].any()
-    mixed = ScrambledRows(top=0.2, bottom=0.6).counted(counts)
-    assert sorted(mixed[:, 0].tolist()) == list(range(100))
-    np.testing.assert_array_equal(mixed[:20], counts[:20])
-    assert np.count_nonzero(mixed[20:60, 0] != counts[20:60, 0]) > 30
-
-
 def test_a_stale_file_is_the_one_before(plain_world: World, tmp_path: Path) -> None:
     shown = [RED, GREEN, GREY]
     events = Disturbances((StaleFile(from_frame=1, to_frame=1), StaleFile(from_frame=2, to_frame=2, new_header=True)))
@@ -295,17 +205,6 @@ def test_what_is_gradual_grows_evenly_to_its_end_and_stays(
         assert situation.lamp == pytest.approx((less, less, less * (1 + 0.5 * (grown or 0))))
         assert situation.black_dn == pytest.approx(8 * (grown or 0))
         assert len(happens.at(Moment(frame, at_s))) == (0 if grown is None else 2)
-
-
-def test_events_of_one_kind_add_up() -> None:
-    situation = Disturbances(
-        (Bump(px=2, direction_deg=90, turn_deg=1), Bump(px=1, mm=3, direction_deg=0, turn_deg=2), Defocus(px=3),
-         Defocus(px=4), AmbientStep(percent=1), AmbientStep(percent=2, rgb=(3, 0, 0)), LampStep(), LampStep(percent=10))
-    ).situation(Moment(0))  # fmt: skip
-    assert (situation.bump_px, situation.bump_mm) == (pytest.approx((1, 2)), pytest.approx((3, 0)))
-    assert (situation.turn_deg, situation.defocus_px) == (3, 5)
-    assert situation.ambient == pytest.approx((0.07, 0.01, 0.01))
-    assert situation.lamp == pytest.approx((0.99,) * 3)
 
 
 def test_what_is_not_said_of_an_event_is_as_documented() -> None:

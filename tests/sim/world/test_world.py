@@ -18,7 +18,7 @@ from scipy.special import erf
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from sim.world.rendering import Print
-from sim.world.sensors import BODIES, Body, HotPattern, Rectangle
+from sim.world.sensors import BODIES, Body, Rectangle
 from sim.world.world import REFERENCE_EXPOSURE, Room, World
 from tests.sim.conftest import BARE
 
@@ -64,19 +64,6 @@ def test_a_power_law_projector_and_its_leak_and_the_rooms_own_light() -> None:
     np.testing.assert_allclose(world.white(WHITE, REFERENCE_EXPOSURE), full * 1.003)
     grey = world.white(Colour(51, 51, 51), REFERENCE_EXPOSURE, lamp=0.5)
     np.testing.assert_allclose(grey, full * (0.5 * (0.01 + 0.99 * 0.04) + 0.003))
-
-
-@pytest.mark.parametrize(
-    ("settings", "factor"),
-    [
-        (ExposureSettings(iso=100, aperture=8, shutter_s=1.0), 2),
-        (ExposureSettings(iso=100, aperture=4, shutter_s=0.5), 4),
-        (ExposureSettings(iso=400, aperture=8, shutter_s=0.25), 2),
-    ],
-)
-def test_exposure_scales_light(plain_world: World, settings: ExposureSettings, factor: float) -> None:
-    once = plain_world.signal(WHITE, REFERENCE_EXPOSURE)
-    np.testing.assert_allclose(plain_world.signal(WHITE, settings), once * factor, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", BODIES)
@@ -190,23 +177,6 @@ def test_a_frame_is_its_key(world: World, monkeypatch: pytest.MonkeyPatch) -> No
     np.testing.assert_array_equal(frame, crowd.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1)))
 
 
-@pytest.mark.parametrize("key", [(3,), (3, 2), (1, 3), (3, 1, 0)])
-def test_another_key_has_other_noise(world: World, key: tuple[int, ...]) -> None:
-    one, other = (
-        world.expose(BLACK, REFERENCE_EXPOSURE, key=k, lamp=0).astype(np.float64) - 2048 for k in ((3, 1), key)
-    )
-    correlation = float((one * other).mean() / np.sqrt((one**2).mean() * (other**2).mean()))
-    assert abs(correlation) < SIX_SIGMA / math.sqrt(one.size)
-
-
-def test_another_seed_has_other_noise_and_paper(world: World) -> None:
-    other = World(world.sheet, world.body, replace(world.room, seed=1))
-    middle = np.array([[60.0, 60.0]])
-    assert np.abs(other.project(middle) - world.project(middle)).max() > 0.001
-    dark = [w.expose(BLACK, REFERENCE_EXPOSURE, key=(0,), lamp=0) for w in (world, other)]
-    assert (dark[0] != dark[1]).mean() > 0.5
-
-
 @pytest.mark.parametrize("iso", [100, 800])
 def test_masked_borders_and_darkness_are_black_with_read_noise(world: World, iso: int) -> None:
     settings = ExposureSettings(iso=iso, aperture=8, shutter_s=0.5)
@@ -220,15 +190,6 @@ def test_masked_borders_and_darkness_are_black_with_read_noise(world: World, iso
         masked = lit[area.top : area.top + area.height, area.left : area.left + area.width]
         check_normal(masked, body.black, deviation)
     check_normal(visible(dark, body), body.black, deviation)
-
-
-def test_what_lies_beside_the_picture_is_dark_on_all_sides(plain_world: World) -> None:
-    body = replace(BODIES["Test"], visible=Rectangle(60, 80, 400, 600), masked=())
-    frame = World(plain_world.sheet, body, plain_world.room).expose(WHITE, REFERENCE_EXPOSURE, key=(4,))
-    deviation = math.hypot(body.noise_dn(100), math.sqrt(1 / 12))
-    for border in (frame[:60], frame[460:], frame[60:460, :80], frame[60:460, 680:]):
-        check_normal(border, body.black, deviation)
-    assert visible(frame, body).mean() > 1.5 * body.black
 
 
 def check_normal(counts: NDArray[np.number], mean: float, deviation: float) -> None:
@@ -256,13 +217,6 @@ def test_noise_follows_photon_transfer(world: World, iso: int) -> None:
         assert abs(bias) < SIX_SIGMA * math.sqrt(expected / 2 / count)
 
 
-def test_photosites_respond_as_unequally_as_asked(world: World, plain_world: World) -> None:
-    ratio = world.signal(WHITE, REFERENCE_EXPOSURE) / plain_world.signal(WHITE, REFERENCE_EXPOSURE).astype(
-        np.float64
-    )  # the worlds differ in leak, which white does not show, and in response
-    check_normal(ratio, 1, 0.003)
-
-
 def test_counts_end_at_saturation(world: World) -> None:
     frame = world.expose(WHITE, ExposureSettings(iso=100, aperture=4, shutter_s=2), key=(7,))
     assert frame.max() == world.body.saturation
@@ -287,13 +241,6 @@ def test_a_colour_wheel_shakes_the_colour_of_short_exposures(shutter_s: float, p
     assert found == pytest.approx(percent, rel=0.2)
 
 
-def test_whole_turns_of_the_wheel_give_steady_light() -> None:
-    steady = World(BARE, BODIES["Test"], Room())
-    turning = World(BARE, BODIES["Test"], Room(wheel_hz=120, shutter_jitter_s=0))
-    frames = [world.expose(WHITE, REFERENCE_EXPOSURE, key=(9,)).astype(int) for world in (steady, turning)]
-    assert np.abs(frames[0] - frames[1]).max() <= 1
-
-
 def test_later_rectangles_cover_earlier_ones_and_paper_shows_between() -> None:
     boxes = np.array([[20.0, 20, 160, 100], [40, 40, 100, 80], [60, 50, 80, 70]])
     codes = np.array([[0, 0, 0], [255, 255, 255], [200, 0, 0]], dtype=np.uint8)
@@ -303,34 +250,6 @@ def test_later_rectangles_cover_earlier_ones_and_paper_shows_between() -> None:
     x, y = np.round(world.project(points)).astype(int).T
     expected = world.reflected(codes[[1, 0, 1, 2, 0]], PRIMARIES[1], REFERENCE_EXPOSURE)
     np.testing.assert_allclose(planes[y, x], expected * world.field(points)[:, 1, None], rtol=3e-3)
-
-
-def test_a_drawing_off_every_lattice_is_still_drawn(square_world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thousand crumbs have more edges than are kept apart; joining them moves the squares beside them little."""
-    monkeypatch.setattr("sim.world.rendering._MOST_LINES", 1500)
-    rng = np.random.default_rng(3)
-    corner = rng.uniform(0, [10, 115], (1000, 2))
-    crumbs = np.concatenate([corner, corner + rng.uniform(1, 5, (1000, 2))], axis=1)
-    squares = square_world.sheet
-    sheet = Print(
-        squares.page_mm,
-        np.concatenate([crumbs, squares.rectangles_mm]),
-        np.concatenate([rng.choice([0, 255], (1000, 3)), squares.rgb]).astype(np.uint8),
-    )
-    signal = World(sheet, square_world.body, square_world.room).signal(WHITE, REFERENCE_EXPOSURE)
-    beside = round(2 * square_world.project(np.array([18.0, 60.0]))[0])
-    change = np.abs(signal - square_world.signal(WHITE, REFERENCE_EXPOSURE))[:, beside:]
-    # A tenth of a photosite, at the steepest place of an edge with standard deviation 1.6 photosites.
-    assert 0 < change.max() < 0.1 * 0.25 * square_world.white(WHITE, REFERENCE_EXPOSURE).max()
-
-
-@pytest.mark.parametrize("page_mm", [(1189.0, 841.0), (105.0, 74.0), (148.0, 210.0)])
-def test_small_sheets_wave_like_large_ones(page_mm: tuple[float, float]) -> None:
-    sheet = Print(page_mm, np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
-    world = World(sheet, BODIES["Test"], Room(waviness_mm=3))
-    x, y = np.meshgrid(np.linspace(0, page_mm[0], 90), np.linspace(0, page_mm[1], 90))
-    height = np.ptp(world.view.surface.height(np.stack([x, y], axis=-1)))
-    assert height / math.hypot(*page_mm) == pytest.approx(3 / math.hypot(1189, 841), rel=0.03)
 
 
 def test_a_stain_and_a_fold_are_where_the_room_tells_and_as_deep() -> None:
@@ -358,16 +277,6 @@ def test_a_stain_and_a_fold_are_where_the_room_tells_and_as_deep() -> None:
     assert left - 1 == pytest.approx(1 - right, rel=0.02)
     assert abs(left - right) > 0.02, "a jump of the light across the crease"
     assert flat == pytest.approx(1, abs=0.003)
-
-
-def test_a_fold_bends_the_picture() -> None:
-    flat, folded = (World(BARE, BODIES["Test"], Room(fold_mm=height)) for height in (0, 3))
-    assert folded.fold is not None
-    line = np.array(folded.fold.at_mm) + np.stack([np.linspace(-60, 60, 241), np.zeros(241)], axis=-1)
-    moved = folded.project(line) - flat.project(line)
-    assert np.linalg.norm(moved, axis=1).max() > 0.2
-    bend = np.linalg.norm(np.diff(moved, 2, axis=0), axis=1)
-    assert abs(int(bend.argmax()) - 119) <= 2, "the sharpest bend is the crease"
 
 
 @pytest.mark.parametrize(
@@ -418,25 +327,3 @@ def test_hot_photosites_are_few_the_same_in_all_frames_and_grow_with_time_and_ga
     assert 5 < below.sum() < 21
     np.testing.assert_allclose(long[where][below], 8 * expected[below], atol=6 * math.sqrt(9000 / 0.45 / 8))
     assert long.max() == 13584 - 2048
-
-
-def test_hot_photosites_add_to_light_and_leave_all_others_as_they_were() -> None:
-    near = replace(HOT, fill=1.4)
-    cold = World(BARE, BODIES["Test"], replace(near, hot_per_million=0.0))
-    hot = World(BARE, BODIES["Test"], near)
-    drawn = hot.hot
-    # In the corners of what sees light, too, and beside them.
-    top, left, height, width = BODIES["Test"].visible
-    corners = [
-        (row, column) for row in (top - 1, top, top + height - 1) for column in (left - 1, left, left + width - 1)
-    ]
-    rows, columns = np.array(sorted([*zip(drawn.rows.tolist(), drawn.columns.tolist(), strict=True), *corners])).T
-    hot.hot = HotPattern(rows, columns, np.full(len(rows), 2000.0))
-    plain, lit = (world.expose(WHITE, REFERENCE_EXPOSURE, key=(7,)).astype(np.int64) for world in (cold, hot))
-    changed = np.zeros(plain.shape, dtype=bool)
-    changed[hot.hot.rows, hot.hot.columns] = True
-    assert np.array_equal(plain[~changed], lit[~changed])
-    assert (plain[top : top + height, left : left + width] > 4000).all()
-    added = np.minimum(0.5 * hot.hot.dn_per_s, 13584 - plain[changed])
-    assert (np.abs(lit[changed] - plain[changed] - added) < 0.2 * added + 60).all()
-    assert not np.array_equal(World(BARE, BODIES["Test"], replace(HOT, seed=1)).hot.rows, drawn.rows)

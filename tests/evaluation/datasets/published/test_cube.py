@@ -48,7 +48,7 @@ def test_cube_is_told_from_cube_plus(copy: Path) -> None:
 
 def test_missing_images(copy: Path) -> None:
     (copy / "2.PNG").unlink()
-    with pytest.raises(FormatError, match=r"lacks 1.*3 images of cube\+_gt.txt \(2\).*--partial"):
+    with pytest.raises(FormatError, match=r"lacks 1.*3 images of cube\+_gt.txt \(2\).*--read partial"):
         open_scenes(copy)
     data = open_scenes(copy, options=DataOptions(partial=True))
     assert [scene.name for scene in data.scenes] == ["1.PNG", "3.PNG"]

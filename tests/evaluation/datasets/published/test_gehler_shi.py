@@ -53,7 +53,7 @@ def test_the_truth_of_shi_must_be_asked_for(copy: Path) -> None:
     assert data.scenes[0].truth.tolist() == [2000, 1000, 1]
     assert "not comparable" in data.treatment["ground truth"]
     (copy / "ColorCheckerData.mat").unlink()
-    with pytest.raises(InputError, match=r"ColorCheckerData\.mat.*colorconstancy\.com.*--truth"):
+    with pytest.raises(InputError, match=r"ColorCheckerData\.mat.*colorconstancy\.com.*--read truth"):
         open_scenes(copy, options=SOME)
     # The corners of charts below tell the data set by themselves.
     (copy / "real_illum_568..mat").unlink()
@@ -62,7 +62,7 @@ def test_the_truth_of_shi_must_be_asked_for(copy: Path) -> None:
 
 
 def test_missing_and_superfluous_images(copy: Path) -> None:
-    with pytest.raises(FormatError, match=r"565.*568.*8D5U5525.*--partial"):
+    with pytest.raises(FormatError, match=r"565.*568.*8D5U5525.*--read partial"):
         open_scenes(copy)
     write_png(copy / "Canon1D" / "png" / "8D5U5551.png", image_of(8, 10))  # Annotated, but none of the 568.
     with pytest.raises(FormatError, match=r"1.*8D5U5551"):

@@ -93,7 +93,7 @@ def test_the_prepared_form(prepared: Path) -> None:
 @pytest.mark.slow
 def test_levels_of_another_camera_come_from_its_raw_file(copy: Path) -> None:
     (copy / "sony").rename(copy / "galaxy")
-    with pytest.raises(InputError, match=r"--black.*--saturation"):
+    with pytest.raises(InputError, match=r"--read black.*saturation"):
         open_scenes(copy)
     given = open_scenes(copy, options=DataOptions(black=64, saturation=1023))
     assert given.scenes[0].saturation == 1023 - 64

@@ -173,7 +173,7 @@ def test_boxes_that_have_half_of_both_in_common_are_of_one_chart(copy: Path) -> 
     folder = write_masks(copy, "1,2,9,2", "1,1,0.4,7")
     assert "edges at most 5 px apart" in open_scenes(copy / "SonyA57").treatment["mask"]
     (folder / "SonyA57_0001_mask.txt").write_text("1,1,9,3")
-    with pytest.raises(FormatError, match="same chart"):
+    with pytest.raises(FormatError):
         open_scenes(copy / "SonyA57")
 
 

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from evaluation.experiments.paper import reporting
-from evaluation.experiments.paper.reporting import coverage_table, standalone
+from evaluation.experiments.paper.reporting import coverage_table
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
 
 RB = LIGHTS[:, [0, 2]] / LIGHTS.sum(axis=1, keepdims=True)
@@ -50,10 +50,3 @@ def test_the_distance_of_ground_truths(make_table: TableMaker) -> None:
     assert [row[:4] for row in table.rows] == [("Test", "near", 2, 2), ("Test", "off", 2, 2)]
     assert table.rows[0][4:] == pytest.approx([0, 0, 0], abs=1e-5)
     assert table.rows[1][4:] == pytest.approx([off / 2, off, off], abs=1e-5)
-
-
-def test_places_of_dots_are_cut_to_what_can_be_seen() -> None:
-    svg = b'<svg><use xlink:href="#m" x="12.3456" y="7.89" style=""/><path d="M 1.2345 2"/></svg>'
-    made = standalone(svg)
-    assert b'<use xlink:href="#m" x="12.3" y="7.8" style=""/><path d="M 1.2345 2"/>' in made
-    assert b"@media (prefers-color-scheme: dark)" in made

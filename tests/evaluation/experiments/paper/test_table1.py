@@ -1,86 +1,41 @@
 """Plain methods on generated data sets: the eight of them, and worlds in which White-Patch is right or wrong.
 
-Hot photosites in a table.
-
 What a table holds: its noise, and how grey its print is.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from evaluation.experiments.paper.published import TABLE1
 from evaluation.experiments.paper.table1 import (
     Block,
-    HotPhotosites,
-    HotScene,
     block_table,
-    hot_photosites,
-    hot_table,
     joint_table,
     noise_table,
     print_table,
     sensor_of,
     settings,
     table1,
+    table2,
 )
 from evaluation.experiments.running import evaluate
+from evaluation.methods.prepared import unit
 from evaluation.methods.standard import standard_methods
-from foundation.errors import InputError
+from evaluation.metrics import recovery_error
+from evaluation.scene import Scene
 from generator.pictures.random_scenes import random_scenes
 from generator.pictures.sources import SourcePicture
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
+from tests.evaluation.made_scenes import Made
 
-HOT_PICTURES = random_scenes(4, 24, 16, seed=8)
 TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
-
-
-def test_values_are_raised_and_cut() -> None:
-    samples = np.array([[[10, 20, 30], [40, 50, 60]]], np.uint16)
-    hot = HotPhotosites(np.array([0, 5]), np.array([7.4, 1e5]))
-    np.testing.assert_array_equal(hot.raise_in(samples, 100), [[[17, 20, 30], [40, 50, 99]]])
-    np.testing.assert_array_equal(samples, [[[10, 20, 30], [40, 50, 60]]])
-
-
-def test_their_number_and_places(make_table: TableMaker) -> None:
-    lut = make_table("Test")
-    values = 512 * 25 * 3
-    hot = hot_photosites(lut, 1000, seed=4)
-    assert len(hot.places) == len(set(hot.places.tolist())) == round(values / 1000)
-    assert hot.places.max() < values
-    assert hot.signals.max() < 9000
-    np.testing.assert_array_equal(hot.places, hot_photosites(lut, 1000, seed=4).places)
-    assert set(hot.places.tolist()) != set(hot_photosites(lut, 1000, seed=5).places.tolist())
-    # More of them are the same ones and others.
-    assert set(hot.places.tolist()) < set(hot_photosites(lut, 2000, seed=4).places.tolist())
-
-
-def test_without_any_a_scene_is_itself(make_table: TableMaker) -> None:
-    lut = make_table("Test", noise=0.1)
-    (part, *_) = settings([lut], HOT_PICTURES, TRUTHS, side=40)
-    none = hot_photosites(lut, 0)
-    for scene in part.scenes:
-        np.testing.assert_array_equal(HotScene.of(scene, none).read()[0], scene.read()[0])
-    (block,) = table1([part])
-    assert hot_table([part], [0], "recovery").rows[0][3:] == block.results[0].summary("recovery").as_tuple()
-
-
-def test_a_few_spoil_the_maximum(make_table: TableMaker) -> None:
-    part = settings([make_table("Canon EOS 550D", noise=0.02)], HOT_PICTURES, TRUTHS, side=96)[2]
-    without, some = hot_table([part], [0, 200], "reproduction").rows
-    assert some[:3] == ("Random scenes, 550D sensor, Given illuminations", 200, 8)
-    median = [float(row[4] or 0) for row in (without, some)]
-    assert median[0] < 3
-    assert median[1] > 3 * median[0]
-
-
-@pytest.mark.parametrize("share", [-1, 2e6])
-def test_a_share_of_all(make_table: TableMaker, share: float) -> None:
-    with pytest.raises(InputError, match="0 to a million"):
-        hot_photosites(make_table("Test"), share)
 
 
 @pytest.mark.slow
@@ -190,6 +145,38 @@ def test_images_without_a_usable_pixel_are_told(make_table: TableMaker) -> None:
     assert "White-Patch: no usable pixel in 1 image, whose" in " ".join(block_table(blocks[0], "recovery").notes)
 
 
-def test_no_pictures(make_table: TableMaker) -> None:
-    with pytest.raises(InputError, match="no picture"):
-        settings([make_table("Test")], [], TRUTHS)
+@dataclass(frozen=True, eq=False)
+class Constant:
+    """Always the same light."""
+
+    name: str
+    light: npt.NDArray[np.float64]
+
+    def estimate(
+        self, image: object, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+    ) -> npt.NDArray[np.float64]:
+        return self.light
+
+
+@dataclass(frozen=True)
+class MeanLight:
+    """Learns the mean of the training lights."""
+
+    name: str = "Mean light"
+
+    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Constant:
+        return Constant(self.name, unit(np.mean([scene.truth for scene in scenes], axis=0)))
+
+
+REAL_LIGHTS = np.array([[1.0, 2, 1], [1.2, 2, 1], [1, 2, 1.3], [1.4, 2, 0.9], [1, 2, 0.8], [1.1, 2, 1.2]])
+REAL = [Made(f"r{place}", light, np.ones((4, 4, 3))) for place, light in enumerate(REAL_LIGHTS)]
+MADE = [Made("m", np.array([2.0, 1, 1]), np.ones((4, 4, 3)))]
+FOLDS = np.array([0, 0, 1, 1, 2, 2])
+
+
+def test_who_was_trained_on_what() -> None:
+    (trained,) = table2(REAL, MADE, {"regression-trees": MeanLight()}, FOLDS)
+    for place, light in enumerate(REAL_LIGHTS):
+        others = REAL_LIGHTS[place // 2 != FOLDS].mean(axis=0)
+        assert trained.real.errors["recovery"][place] == pytest.approx(float(recovery_error(others, light)))
+        assert trained.generated.errors["recovery"][place] == pytest.approx(float(recovery_error([2, 1, 1], light)))

@@ -7,7 +7,6 @@ Source pictures are found by name and hash, wherever they lie, and never mistake
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.datasets.generated import GeneratedMixedScene, GeneratedScene, open_generated
+from evaluation.datasets.generated import GeneratedMixedScene, GeneratedScene
 from evaluation.datasets.thumbnails import Thumbnail
 from evaluation.experiments.transfer.plan import (
     NaiveScene,
@@ -126,7 +125,6 @@ RANDOM_CROP = Preparation(crop=(9, 7), crop_at="random", seed=3)
         ({"preparation": RANDOM_CROP, "seed": 3}, 1),
         # Scenes of another data set are cut where that one cut them.
         ({"preparation": RANDOM_CROP, "seed": 8}, 1),
-        ({"gradient": "soft-edge:width=.5,stops=2,least=2,colour=.4"}, 2),
     ],
 )
 def test_pictures_are_prepared_and_lit_as_they_were(maker: Maker, how: dict[str, Any], away: int) -> None:
@@ -148,27 +146,6 @@ def test_every_crop_has_the_counterpart_of_its_own_place(maker: Maker) -> None:
     assert any(np.abs(image - naive[0]).max() > 500 for image in naive[2:6:2])
 
 
-@pytest.mark.parametrize("lights", ["one", "two"])
-@pytest.mark.parametrize("gradient", ["smooth:stops=3,least=2", "half-plane:angle=20,stops=2,least=2"])
-def test_light_that_falls_off_without_a_tint_does_so_in_the_counterpart(
-    maker: Maker, lights: str, gradient: str
-) -> None:
-    choice = BOTH
-    if lights == "two":
-        choice = SimultaneousLights(BOTH, 2, parse_masks("soft-edge:angle=70,width=.6", 2, 0))
-    preparation = Preparation(crop=(16, 12), crops=2)
-    made = _generated(maker.make(lights=choice, gradient=gradient, preparation=preparation, seed=0).scenes)
-    unlike: list[int] = []
-    for naive, scene in zip(_counterparts(made, maker.pictures), made, strict=True):
-        expected = scene.read()[0].astype(int)
-        np.testing.assert_allclose(naive.read()[0].astype(int), expected, atol=3)
-        weights = scene.dataset.read_weights(scene.entry) if lights == "two" else np.ones((12, 16, 1), np.float32)
-        codes = naive.picture.codes(int(scene.dataset.details[scene.name]["crop"]))
-        even = naive_image(codes, weights @ naive.whites, naive.saturation).astype(int)
-        unlike.append(int(np.abs(even - expected).max()))
-    assert min(unlike) > 500
-
-
 def test_a_counterpart_under_several_lights_has_their_maps(maker: Maker) -> None:
     choice = SimultaneousLights(BOTH, 2, parse_masks("soft-edge:angle=70,width=.6", 2, 0))
     (made, *_) = _generated(maker.make(lights=choice).scenes)
@@ -185,17 +162,10 @@ def test_a_counterpart_under_several_lights_has_their_maps(maker: Maker) -> None
     assert not isinstance(plain, MixedScene)
 
 
-def test_a_gradient_that_is_described_as_none_is_named(maker: Maker) -> None:
-    maker.make(gradient="smooth:stops=2")
-    described = maker.folder / "made" / "dataset.json"
-    record = json.loads(described.read_text())
-    for wrong in ({"gradient": {"masks": "stripes"}}, ["gradient"]):
-        record["options"]["variation"] = wrong
-        described.write_text(json.dumps(record))
-        (made, *_) = _generated(open_generated(maker.folder / "made").scenes)
-        (naive,) = _counterparts([made], maker.pictures)
-        with pytest.raises(FormatError, match=r"describes its variation"):
-            naive.read()
+def test_a_set_under_a_gradient_has_no_counterpart(maker: Maker) -> None:
+    made = maker.make(gradient="smooth:stops=2")
+    with pytest.raises(InputError):
+        plan_transfer(_real("x"), [made], maker.pictures)
 
 
 def _dataset(maker: Maker) -> Dataset:
@@ -243,9 +213,9 @@ def test_random_colours_are_made_again(maker: Maker) -> None:
 
 def test_what_cannot_be_found_is_said(maker: Maker) -> None:
     dataset = _dataset(maker)
-    with pytest.raises(InputError, match=r"there is no .*nowhere"):
+    with pytest.raises(InputError):
         find_sources(dataset, maker.folder / "nowhere")
-    with pytest.raises(InputError, match="copy the pictures"):
+    with pytest.raises(InputError):
         find_sources(dataset, "s3://bucket/pictures")
     found, _ = find_sources(dataset, maker.pictures)
     save_pictures(maker.pictures, ["a.png"], side=32)
@@ -274,18 +244,14 @@ def test_a_source_that_is_a_test_image_is_found_by_name(maker: Maker) -> None:
         (2, "b.png", "B.PNG", "name"),
         (3, "b.png", "B.PNG", "name"),
     ]
-    with pytest.raises(InputError, match=r"2 of 6 images of made.*b\.png.*--shared"):
-        plan_transfer(test, [made])
-    without = plan_transfer(test, [made], shared="leave-out")
-    assert [scene.name for scene in without.training[0].scenes] == [
+    plan = plan_transfer(test, [made])
+    assert [scene.name for scene in plan.training[0].scenes] == [
         "000000.png",
         "000001.png",
         "000004.png",
         "000005.png",
     ]
-    kept = plan_transfer(test, [made], shared="keep")
-    assert len(kept.training[0].scenes) == 6
-    assert "not unseen" in kept.notes[0]
+    assert plan.notes == ("2 of 6 images of made are also in the test set, by name: b.png, b.png; left out",)
     assert not plan_transfer(_real("other"), [made]).notes
 
 
@@ -311,14 +277,13 @@ def test_real_sets_are_compared_by_their_pixels() -> None:
 def test_copies_are_kept_only_where_that_is_allowed() -> None:
     one, other = _real("1", "2", place="one.npz"), _real("3", "4", place="other.npz")
     said = "2 of 2 images of real are also in photos, by content: 1, 2"
-    assert trainable_images(one, other, "keep", "photos") == (one.scenes, said)
-    assert trainable_images(one, other, "leave-out", "photos", copies=False) == ((), said)
-    with pytest.raises(InputError, match=f"{said}.*--shared leave-out"):
-        trainable_images(one, other, "keep", "photos", copies=False)
+    assert trainable_images(one, other, called="photos") == ((), said)
+    with pytest.raises(InputError, match=f"{said}.*--unseen"):
+        trainable_images(one, other, leave_out=False, called="photos")
     # What shows the same scene by its name is no copy.
     named = _real("3", "5", place="named.npz", seed=1)
-    assert trainable_images(named, other, "keep", copies=False)[0] == named.scenes
-    assert trainable_images(named, other, "leave-out", copies=False)[0] == named.scenes[1:]
+    assert trainable_images(named, other, leave_out=False)[0] == named.scenes
+    assert trainable_images(named, other)[0] == named.scenes[1:]
 
 
 def test_naive_counterparts_are_of_the_same_images(maker: Maker, tmp_path: Path) -> None:
@@ -344,12 +309,7 @@ def test_naive_counterparts_are_of_the_same_images(maker: Maker, tmp_path: Path)
         plan_transfer(_real("x"), [made], pictures=some)
 
 
-def test_the_matrix_that_is_asked_for(maker: Maker, tmp_path: Path) -> None:
-    made = maker.make()
-    kinds = [each.kind for each in plan_transfer(_real("x"), [made], maker.pictures, "none").training]
-    assert kinds == ["generated", "naive"]
-    plan = plan_transfer(_real("x"), [made], maker.pictures, "EOS 600D")
-    assert "Canon EOS 600D" in plan.notes[0]
+def test_a_camera_without_a_matrix_has_no_row_with_one(tmp_path: Path) -> None:
     save_pictures(tmp_path / "b" / "pictures", ["q.png"])
     unknown = Maker(tmp_path / "b", write_table(tmp_path / "b" / "lut", camera="Pinhole")).make()
     plan = plan_transfer(_real("x"), [unknown], tmp_path / "b" / "pictures")
@@ -359,10 +319,11 @@ def test_the_matrix_that_is_asked_for(maker: Maker, tmp_path: Path) -> None:
 
 def test_a_set_that_was_not_generated_stands_beside(maker: Maker) -> None:
     other = _real("y", place="y.npz", seed=1)
-    plan = plan_transfer(_real("x"), [maker.make(), other], maker.pictures, "none")
+    plan = plan_transfer(_real("x"), [maker.make(), other], maker.pictures)
     assert [(each.data, each.kind) for each in plan.training] == [
         ("made", "generated"),
         ("made", "naive"),
+        ("made", "naive with matrix"),
         ("real", "other"),
     ]
 
@@ -380,14 +341,12 @@ def test_parts_that_are_set_apart_stay_apart(maker: Maker, tmp_path: Path) -> No
 
 def test_what_cannot_be_planned_is_said(maker: Maker) -> None:
     made = maker.make()
-    with pytest.raises(InputError, match="no data set"):
-        plan_transfer(_real("x"), [])
-    with pytest.raises(InputError, match="called made"):
+    with pytest.raises(InputError):
         plan_transfer(_real("x"), [made, made])
     with pytest.raises(InputError, match=r"--naive.*generate"):
         plan_transfer(_real("x"), [_real("y", place="y.npz", seed=1)], maker.pictures)
-    with pytest.raises(InputError, match="no image left"):
-        plan_transfer(_real("a", "b", "c"), [made], shared="leave-out")
+    with pytest.raises(InputError):
+        plan_transfer(_real("a", "b", "c"), [made])
 
 
 def test_relit_scenes_have_the_lights_of_the_generated_images(maker: Maker) -> None:

@@ -1,0 +1,238 @@
+"""The monitor's server: what it answers, and what it never does."""
+
+from __future__ import annotations
+
+import gzip
+import http.client
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.cli import main
+from acquisition.monitor.serving import MonitorServer, open_monitor
+from foundation.errors import FormatError, InputError
+from tests.acquisition.monitor.made_up import MadeUpRun, jpeg
+from tests.serving import serving
+
+SCRIPT = "<script>alert(1)</script>"
+
+
+def begun(folder: Path) -> MadeUpRun:
+    """Return a run of four lights with hostile names and reasons: white and dark taken, the first light refused."""
+    made = MadeUpRun.begin(folder / "night <b>1")
+    made.take(made.steps[0])
+    made.take(made.steps[1])
+    made.take(made.steps[2], f"{SCRIPT} in the light", value=8.0)
+    return made
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[MadeUpRun]:
+    made = begun(tmp_path)
+    yield made
+    made.journal.close()
+
+
+def served(folder: Path, host: str = "127.0.0.1") -> AbstractContextManager[MonitorServer]:
+    return serving(open_monitor(folder, 0, host))
+
+
+@pytest.fixture
+def opened(run: MadeUpRun) -> Iterator[MonitorServer]:
+    with served(run.folder) as monitor:
+        yield monitor
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MonitorServer]:
+    """Serve one such run to all who only ask."""
+    made = begun(tmp_path_factory.mktemp("served"))
+    with served(made.folder) as monitor:
+        yield monitor
+    made.journal.close()
+
+
+def ask(
+    monitor: MonitorServer, path: str, method: str = "GET", **headers: str
+) -> tuple[int, http.client.HTTPMessage, bytes]:
+    """Return status, headers and body of the answer; names of headers with _ for -."""
+    connection = http.client.HTTPConnection("127.0.0.1", monitor.port, timeout=20)
+    try:
+        connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read()
+    finally:
+        connection.close()
+
+
+def state_of(monitor: MonitorServer, since: str = "") -> dict[str, Any]:
+    status, _, body = ask(monitor, f"/state.json?since={since}")
+    assert status == 200
+    return json.loads(body)
+
+
+def test_how_the_session_stands_is_told_to_scripts(still: MonitorServer) -> None:
+    told = json.loads(ask(still, "/status.json")[2])
+    assert (told["state"], told["alive"]) == ("running", True)
+    assert (told["done"], told["total"]) == (2, 8)
+    assert (told["lights_done"], told["lights_total"]) == (0, 4)
+    assert told["refused"] == 1
+    assert told["remaining_s"] == pytest.approx(6 * 5 * 3 / 2, abs=1), "two of three attempts gave a frame"
+
+
+def test_the_page_stands_alone_and_holds_no_markup_of_the_session(still: MonitorServer) -> None:
+    status, headers, body = ask(still, "/")
+    text = body.decode()
+    assert status == 200
+    assert "night &lt;b&gt;1" in text
+    assert "night <b>" not in text
+    assert SCRIPT not in text
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert "'unsafe" not in headers["Content-Security-Policy"]
+    for elsewhere in ('src="http', 'href="http', "@import", "url("):
+        assert elsewhere not in text
+
+
+def test_the_state_has_what_the_page_draws(opened: MonitorServer, run: MadeUpRun) -> None:
+    state = state_of(opened)
+    assert len(state["session"]["lights"]) == 4
+    refused = state["frames"][2]
+    assert refused["verdict"] == "refused"
+    assert refused["reason"] == f"{SCRIPT} in the light"
+    assert ["off_codes_deg", "°", 8.0, None, 1.0, f"{SCRIPT} in the light"] in refused["checks"]
+    # Red at full, green by its crosstalk: the camera sees the red light less red than its codes.
+    assert refused["seen_at"][0] < 1
+    assert b"<script" not in ask(opened, "/state.json")[2]
+
+
+def test_nothing_new_is_no_content_and_what_is_new_comes_alone(opened: MonitorServer, run: MadeUpRun) -> None:
+    first = state_of(opened)
+    assert ask(opened, f"/state.json?since={first['cursor']}")[0] == 204
+    run.take(run.steps[2])
+    second = state_of(opened, str(first["cursor"]))
+    assert "session" not in second
+    assert 4 in [frame["id"] for frame in second["frames"]]
+    assert second["head"]["done"] == 3
+
+
+def test_a_picture_is_shown_only_as_such(opened: MonitorServer, run: MadeUpRun, tmp_path: Path) -> None:
+    status, headers, body = ask(opened, "/frame/1.jpg")
+    assert (status, headers["Content-Type"]) == (200, "image/jpeg")
+    assert body == jpeg((255, 255, 255), "0000_white ")
+    previews = run.folder / "previews"
+    secret = tmp_path / "secret.jpg"
+    secret.write_bytes(b"\xff\xd8\xffsecret")
+    (previews / "0001_dark.jpg").unlink()
+    assert ask(opened, "/frame/2.jpg")[0] == 404
+    (previews / "0001_dark.jpg").symlink_to(secret)
+    assert ask(opened, "/frame/2.jpg")[0] == 404
+    (previews / "0000_white.jpg").write_bytes(b"<html>no picture")
+    assert ask(opened, "/frame/1.jpg")[0] == 404
+
+
+def test_no_row_of_a_journal_leads_out_of_the_previews(opened: MonitorServer, run: MadeUpRun) -> None:
+    (run.folder / "secret.jpg").write_bytes(b"\xff\xd8\xffsecret")
+    attempt = run.take(run.steps[2])
+    run.journal._connection.execute("UPDATE attempts SET file = 'previews/../../secret.cr2' WHERE id = ?", (attempt,))
+    assert ask(opened, f"/frame/{attempt}.jpg")[0] == 404
+
+
+@pytest.mark.parametrize("since", ["x", "..", "a.b.c", "%00", "0.-1.0", "'", "9" * 5000])
+def test_a_strange_cursor_gives_everything(still: MonitorServer, since: str) -> None:
+    assert "session" in state_of(still, since)
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
+def test_nothing_can_be_changed(still: MonitorServer, method: str) -> None:
+    status, headers, _ = ask(still, "/", method)
+    assert (status, headers["Allow"]) == (405, "GET, HEAD")
+
+
+def test_a_large_answer_is_compressed_for_who_can_read_it(still: MonitorServer) -> None:
+    _, headers, body = ask(still, "/", Accept_Encoding="gzip")
+    assert headers["Content-Encoding"] == "gzip"
+    assert gzip.decompress(body) == ask(still, "/")[2]
+
+
+def test_a_session_may_be_deleted_and_come_back_under_the_open_page(opened: MonitorServer, run: MadeUpRun) -> None:
+    first = state_of(opened)
+    away = run.folder.with_name("away")
+    run.folder.rename(away)
+    gone = state_of(opened, str(first["cursor"]))
+    assert gone["head"]["state"] == "gone"
+    assert "frames" not in gone
+    assert ask(opened, "/frame/1.jpg")[0] == 404
+    shutil.copytree(away, run.folder)
+    back = state_of(opened, str(gone["cursor"]))
+    assert "session" in back
+    assert len(back["frames"]) == 3
+
+
+def test_a_damaged_journal_is_said_on_the_page(opened: MonitorServer, run: MadeUpRun) -> None:
+    run.journal.close()
+    (run.folder / "journal.sqlite").write_bytes(b"SQLite format 3\0" + b"\xff" * 5000)
+    head = state_of(opened)["head"]
+    assert head["state"] == "unreadable"
+    assert "restore it from a copy" in head["sentence"]
+
+
+def test_a_session_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
+    folder = tmp_path / "later"
+    with served(folder) as monitor:
+        absent = state_of(monitor)
+        assert absent["head"]["state"] == "absent"
+        made = MadeUpRun.begin(folder)
+        assert "session" in state_of(monitor, str(absent["cursor"]))
+        made.journal.close()
+
+
+def test_nothing_in_the_session_is_written_by_looking(run: MadeUpRun) -> None:
+    run.journal.close()
+    before = {path: path.stat() for path in sorted(run.folder.rglob("*"))}
+    with served(run.folder) as monitor:
+        state_of(monitor)
+        ask(monitor, "/frame/1.jpg")
+    after = {path: path.stat() for path in sorted(run.folder.rglob("*"))}
+    assert before.keys() == after.keys()
+    for path, was in before.items():
+        assert (was.st_mtime_ns, was.st_size, was.st_ino) == (
+            after[path].st_mtime_ns,
+            after[path].st_size,
+            after[path].st_ino,
+        )
+
+
+def test_a_taken_port_is_said(run: MadeUpRun, opened: MonitorServer) -> None:
+    with pytest.raises(InputError, match=f"port {opened.port}"):
+        open_monitor(run.folder, opened.port)
+
+
+def test_a_folder_of_something_else_is_no_session(tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("hello")
+    with pytest.raises(FormatError):
+        open_monitor(tmp_path, 0)
+    with pytest.raises(FormatError):
+        open_monitor(tmp_path / "letter.txt", 0)
+
+
+@pytest.fixture
+def interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(server: ThreadingHTTPServer) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupt)
+
+
+@pytest.mark.usefixtures("interrupted")
+def test_ctrl_c_is_its_proper_end(run: MadeUpRun, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["monitor", str(run.folder), "--port", "0"]) == 0
+    printed = capsys.readouterr()
+    assert "http://127.0.0.1:" in printed.out
+    assert "Ctrl-C ends it" in printed.out
+    assert printed.err == ""

@@ -1,0 +1,815 @@
+"""The lamp in simulated time: lit, warm, watched; and what a projector in trouble makes the run say.
+
+On every end the screen goes black and the lamp's fate is decided and said; nothing of it hides why a run ended.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+from acquisition.judge.measure import ExposureJudge
+from acquisition.monitor.view import Head, read_session
+from acquisition.run import devices, run
+from acquisition.run.devices import (
+    ENGRAVED_S,
+    PAUSE_S,
+    RETRY_S,
+    TOLD_LATER,
+    Devices,
+    HealthWatch,
+    RetryPolicy,
+    RunEnd,
+    RunWatch,
+    await_health,
+    health_fault,
+    lamp_fate,
+    leave_lab,
+    make_ready,
+    pause_cause,
+    require_whole_turns,
+    wheel_of,
+)
+from acquisition.run.rig.opening import open_rig
+from acquisition.run.run import take_session
+from drivers.camera import keep_awake
+from drivers.canon import SHUTTER
+from drivers.links.link import PeerLink
+from drivers.pjlink import NoResolution, PjLinkProjector
+from drivers.presenter import BLACK, WHITE, Colour
+from drivers.projector import Fault, Power, Projector
+from drivers.raw.rawfile import read_raw
+from experiment.chart.layout import design_chart
+from experiment.config import CameraSettings, LabSettings, ProjectorCable, SequenceSettings, parse_lab
+from experiment.lights import Illumination
+from experiment.session.folder import Session
+from experiment.session.opening import HeldJournalError
+from experiment.session.records import plan_steps
+from foundation.clock import SimulatedClock
+from foundation.errors import (
+    ConfigurationError,
+    CropError,
+    DeviceError,
+    DeviceFault,
+    DeviceRefused,
+    LinkClosed,
+    LinkTimeout,
+    StorageError,
+)
+from sim.projectors.pjlink import PjLinkPeer
+from sim.projectors.projector import SimulatedProjector
+from tests.acquisition.run.scripted import SETTINGS, Beamer, Lab, Screen, ScriptedCamera
+
+ON, OFF = Power.ON, Power.COOLING
+
+
+@pytest.mark.parametrize(
+    ("end", "settings", "power"),
+    [
+        (RunEnd.COMPLETE, SequenceSettings(), OFF),
+        (RunEnd.COMPLETE, SequenceSettings(switch_off=False), ON),
+        (RunEnd.COMPLETE, SequenceSettings(lamp_if_unfinished="on"), OFF),
+        (RunEnd.UNFINISHED, SequenceSettings(), OFF),
+        (RunEnd.UNFINISHED, SequenceSettings(switch_off=False), OFF),
+        (RunEnd.UNFINISHED, SequenceSettings(lamp_if_unfinished="on"), ON),
+        (RunEnd.INTERRUPTED, SequenceSettings(), ON),
+        (RunEnd.INTERRUPTED, SequenceSettings(switch_off=False, lamp_if_unfinished="on"), ON),
+    ],
+)
+def test_the_lamp_s_fate_is_decided_and_said(end: RunEnd, settings: SequenceSettings, power: Power) -> None:
+    clock = SimulatedClock()
+    projector, screen = SimulatedProjector(clock, power=ON), Screen()
+    said: list[tuple[str, str]] = []
+    devices = Devices(ScriptedCamera(screen, clock, {}), screen, projector, clock)
+    leave_lab(devices, end, settings, lambda what, sentence: said.append((what, sentence)))
+    assert projector.power() is power
+    assert screen.shown == [BLACK]
+    ((what, sentence),) = said
+    assert what == "lamp"
+    assert ("was switched off" in sentence) == (power is OFF)
+    assert ("burns on" in sentence) == (power is ON and end is not RunEnd.INTERRUPTED)
+    assert ("left as it is" in sentence) == (end is RunEnd.INTERRUPTED)
+
+
+@pytest.mark.parametrize(("lost", "said"), [(2, "it was switched off"), (3, "it could not be switched off: no answer")])
+def test_an_answer_that_is_lost_does_not_let_the_lamp_burn(lost: int, said: str) -> None:
+    class Deaf(SimulatedProjector):
+        asked = 0
+
+        def power(self) -> Power:
+            type(self).asked += 1
+            if type(self).asked <= lost:
+                raise DeviceError("no answer")
+            return super().power()
+
+    clock = SimulatedClock()
+    sentence = lamp_fate(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert sentence.startswith(said)
+
+
+def test_a_lamp_that_is_out_is_left_alone() -> None:
+    class Untouched(SimulatedProjector):
+        def switch_off(self) -> None:
+            raise AssertionError
+
+    clock = SimulatedClock()
+    said = lamp_fate(Untouched(clock), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert said == "it is out already: the projector is in standby"
+
+
+def test_a_lamp_that_does_not_obey_is_said_to_burn() -> None:
+    class Deaf(SimulatedProjector):
+        def switch_off(self) -> None: ...
+
+    clock = SimulatedClock()
+    said = lamp_fate(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
+    assert "burns on though the projector was told" in said
+    assert "by hand" in said
+    assert clock.monotonic() == 5
+
+
+def test_a_screen_that_fails_and_a_full_disk_raise_nothing() -> None:
+    class Broken(Screen):
+        def show(self, colour: Colour) -> None:
+            raise DeviceError("the display is gone")
+
+    clock, screen = SimulatedClock(), Broken()
+    projector = SimulatedProjector(clock, power=ON)
+    said: list[str] = []
+
+    def report(what: str, sentence: str) -> None:
+        said.append(f"{what}: {sentence}")
+        raise StorageError("the disk is full")
+
+    leave_lab(
+        Devices(ScriptedCamera(screen, clock, {}), screen, projector, clock),
+        RunEnd.COMPLETE,
+        SequenceSettings(),
+        report,
+    )
+    assert said == ["screen: it could not be made black: the display is gone", "lamp: it was switched off"]
+    assert projector.power() is OFF
+
+
+SEQUENCE = SequenceSettings(warm_up_s=600)
+
+
+class Timed(SimulatedClock):
+    """A clock by which things happen at their times, while somebody waits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.due: list[tuple[float, Callable[[], object]]] = []
+
+    def sleep(self, seconds: float) -> None:
+        end = self.monotonic() + seconds
+        while self.due and min(self.due, key=lambda one: one[0])[0] <= end:
+            first = min(self.due, key=lambda one: one[0])
+            self.due.remove(first)
+            super().sleep(max(first[0] - self.monotonic(), 0))
+            first[1]()
+        super().sleep(max(end - self.monotonic(), 0))
+
+
+@dataclass
+class Room:
+    """A projector behind PJLink, and everything that is said of it."""
+
+    power: Power = Power.ON
+    limit_s: float = 600.0
+    clock: Timed = field(default_factory=Timed)
+    said: list[tuple[float, str, str]] = field(default_factory=list[tuple[float, str, str]])
+    beats: list[tuple[float, str]] = field(default_factory=list[tuple[float, str]])
+
+    def __post_init__(self) -> None:
+        self.beamer = Beamer(self.clock, self.power)
+
+    @property
+    def retry(self) -> RetryPolicy:
+        def report(what: str, sentence: str) -> None:
+            self.said.append((self.clock.monotonic(), what, sentence))
+
+        def beat(state: str, sentence: str, within_s: float) -> None:
+            self.beats.append((self.clock.monotonic(), sentence))
+
+        return RetryPolicy(self.clock, self.limit_s, report, on_wait=beat)
+
+    @property
+    def words(self) -> list[str]:
+        return [what for _, what, _ in self.said]
+
+    def at(self, seconds: float, action: Callable[[], object]) -> None:
+        self.clock.due.append((seconds, action))
+
+
+def no_time(clock: SimulatedClock) -> RetryPolicy:
+    return RetryPolicy(clock, 0)
+
+
+@pytest.mark.parametrize(("fault", "said"), [("frozen", "frozen"), ("unplugged", "no signal")])
+def test_a_picture_that_does_not_follow_is_noticed(fault: str, said: str) -> None:
+    clock = SimulatedClock()
+    beamer = SimulatedProjector(clock, power=Power.ON)
+    peer = PjLinkPeer(beamer)
+    projector = PjLinkProjector(lambda: PeerLink(peer), clock=clock)
+    assert health_fault(projector) is None
+    if fault == "frozen":
+        beamer.set_frozen(True)
+    else:
+        beamer.signal = NoResolution.NO_SIGNAL
+    assert said in str(health_fault(projector))
+
+
+def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
+    clock = SimulatedClock()
+    projector = SimulatedProjector(clock)
+    make_ready(projector, SEQUENCE, no_time(clock))
+    assert projector.power() is Power.ON
+    assert clock.monotonic() >= 600 + projector.traits.warm_up_s
+
+
+def test_a_warm_lamp_is_not_waited_for_though_the_answer_takes_its_time() -> None:
+    class Slow(SimulatedProjector):
+        def power(self) -> Power:
+            self.clock.sleep(0.1)
+            return super().power()
+
+    clock = SimulatedClock()
+    make_ready(Slow(clock, power=Power.ON), SEQUENCE, no_time(clock))
+    assert clock.monotonic() < 1
+
+
+def test_a_projector_deaf_while_its_lamp_is_struck_is_waited_for() -> None:
+    class Deaf(SimulatedProjector):
+        def power(self) -> Power:
+            if (power := super().power()) is Power.WARMING:
+                raise LinkTimeout("the projector has not answered within 5 s")
+            return power
+
+    clock = SimulatedClock()
+    projector = Deaf(clock)
+    make_ready(projector, SEQUENCE, no_time(clock))
+    assert clock.monotonic() >= 600 + projector.traits.warm_up_s
+
+
+@pytest.mark.slow
+def test_a_lamp_that_goes_out_while_it_warms_up_gets_all_its_minutes_again() -> None:
+    room = Room(Power.STANDBY)
+    lit_again = 600.0
+
+    def relit() -> None:
+        room.beamer.device = SimulatedProjector(room.clock, power=Power.ON)
+        room.beamer.pull(False)
+
+    room.at(400, room.beamer.pull)
+    room.at(lit_again, relit)
+    make_ready(room.beamer.projector, SEQUENCE, room.retry)
+    assert room.words == ["warming up", "retry", "paused", "resumed", "warming up"]
+    assert room.clock.monotonic() >= lit_again + SEQUENCE.warm_up_s
+
+
+def test_a_picture_muted_while_the_lamp_warms_up_costs_no_minutes() -> None:
+    room = Room(Power.STANDBY)
+    room.at(200, lambda: room.beamer.device.set_muted(True))
+    room.at(300, lambda: room.beamer.device.set_muted(False))
+    make_ready(room.beamer.projector, SEQUENCE, room.retry)
+    assert room.words == ["warming up", "retry", "paused", "resumed"]
+    assert room.clock.monotonic() <= 600 + room.beamer.device.traits.warm_up_s + 2 * PAUSE_S
+
+
+def test_a_projector_without_power_is_lit_again_if_asked_to() -> None:
+    room = Room()
+    switched: list[float] = []
+
+    def power_back() -> None:
+        room.beamer.device = SimulatedProjector(room.clock)
+        lit = room.beamer.device.switch_on
+        room.beamer.device.switch_on = lambda: (switched.append(room.clock.monotonic()), lit())  # pyrefly: ignore[bad-assignment, method-assign]
+        room.beamer.pull(False)
+
+    room.at(0, room.beamer.pull)
+    room.at(60, power_back)
+    room.clock.sleep(0)
+    await_health(room.beamer.projector, SEQUENCE.model_copy(update={"relight": True}), room.retry)
+    assert len(switched) == 1
+    assert room.words == ["retry", "paused", "relit", "still paused", "still paused", "warming up", "resumed"]
+    assert room.beamer.device.power() is Power.ON
+    assert room.clock.monotonic() >= switched[0] + SEQUENCE.warm_up_s
+
+
+def test_a_lamp_that_does_not_light_is_not_switched_on_again_and_again() -> None:
+    room = Room()
+    tries: list[float] = []
+    room.beamer.device.switch_off()
+    room.beamer.device.switch_on = lambda: tries.append(room.clock.monotonic())  # pyrefly: ignore[method-assign]
+    with pytest.raises(DeviceFault):
+        await_health(room.beamer.projector, SEQUENCE.model_copy(update={"relight": True}), room.retry)
+    assert len(tries) == 1
+
+
+def test_a_projector_that_came_back_in_standby_is_said_to_be_so() -> None:
+    room = Room()
+
+    def power_back() -> None:
+        room.beamer.device = SimulatedProjector(room.clock)
+        room.beamer.pull(False)
+
+    room.at(0, room.beamer.pull)
+    room.at(60, power_back)
+    room.at(200, lambda: room.beamer.device.switch_on())
+    room.clock.sleep(0)
+    await_health(room.beamer.projector, SEQUENCE, room.retry)
+    assert room.words == ["retry", "paused", "still paused", "still paused", "warming up", "resumed"]
+    assert "nothing listens" in room.said[1][2]
+    assert "standby" in room.said[2][2]
+    assert "warm-up" in room.said[3][2]
+    # What is said at any time is what holds then.
+    for at, sentence in room.beats:
+        if 70 < at < 195:
+            assert "standby" in sentence
+            assert "listens" not in sentence
+    assert room.clock.monotonic() >= 200 + SEQUENCE.warm_up_s
+
+
+class Slow:
+    """A projector that takes its time, and says what it was asked."""
+
+    def __init__(self, clock: SimulatedClock, answer_s: float) -> None:
+        self.clock, self.answer_s = clock, answer_s
+        self.asked: list[str] = []
+        self.is_muted = False
+
+    def _ask(self, what: str) -> None:
+        self.clock.sleep(self.answer_s)
+        self.asked.append(what)
+
+    def power(self) -> Power:
+        self._ask("power")
+        return Power.ON
+
+    def muted(self) -> bool:
+        self._ask("muted")
+        return self.is_muted
+
+    def faults(self) -> tuple[Fault, ...]:
+        self._ask("faults")
+        return ()
+
+    def picture_fault(self) -> str | None:
+        self._ask("picture")
+        return None
+
+
+ALL = ["faults", "power", "muted", "picture"]
+
+
+@pytest.mark.parametrize(("answer_s", "asked"), [(0.004, ALL), (0.02, ["faults"])])
+def test_a_slow_projector_is_asked_in_turn(answer_s: float, asked: list[str]) -> None:
+    clock = SimulatedClock()
+    projector = Slow(clock, answer_s)
+    watch = HealthWatch(cast("Projector", projector), clock)
+    assert watch.fault(thorough=False) is None
+    assert projector.asked == ALL, "what it costs is not known before"
+    projector.asked.clear()
+    clock.sleep(2.3)
+    assert watch.fault(thorough=False) is None
+    assert projector.asked == asked
+    projector.asked.clear()
+    assert watch.fault(thorough=True) is None
+    assert projector.asked == ALL
+
+
+@dataclass
+class PausedRoom:
+    """RetryPolicy with everything that it tells, and something that is broken until a time."""
+
+    limit_s: float = 600.0
+    clock: SimulatedClock = field(default_factory=SimulatedClock)
+    said: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    beats: list[tuple[float, str, str, float]] = field(default_factory=list[tuple[float, str, str, float]])
+    idled: list[float] = field(default_factory=list[float])
+    tries: list[float] = field(default_factory=list[float])
+
+    @property
+    def retry(self) -> RetryPolicy:
+        return RetryPolicy(
+            self.clock,
+            self.limit_s,
+            lambda what, sentence: self.said.append((what, sentence)),
+            lambda: self.idled.append(self.clock.monotonic()),
+            lambda state, sentence, within_s: self.beats.append((self.clock.monotonic(), state, sentence, within_s)),
+        )
+
+    @property
+    def words(self) -> list[str]:
+        return [what for what, _ in self.said]
+
+    def broken(self, fault: Callable[[float], CropError | None], takes_s: float = 0.0) -> Callable[[], str]:
+        """Return an action that fails as `fault` says of the time, in seconds."""
+
+        def action() -> str:
+            now = self.clock.monotonic()
+            self.tries.append(now)
+            self.clock.sleep(takes_s)
+            found = fault(now)
+            if found is not None:
+                raise found
+            return "done"
+
+        return action
+
+
+def until(end_s: float, fault: CropError) -> Callable[[float], CropError | None]:
+    return lambda now: fault if now < end_s else None
+
+
+def test_other_devices_are_kept_awake_meanwhile() -> None:
+    room = PausedRoom()
+    room.retry.attempt(room.broken(until(100, DeviceError("covered"))), "the screen")
+    assert max(after - before for before, after in pairwise(room.idled)) <= 10
+    room = PausedRoom()
+    room.retry.attempt(room.broken(until(100, DeviceError("gone"))), "the camera", idle=False)
+    assert room.idled == []
+
+
+def test_a_pause_gives_one_order_and_says_nothing_twice() -> None:
+    room = PausedRoom(600.0)
+    full = StorageError("cannot write session: No space left on device; free space, then run the same command again")
+    gone = LinkClosed("EOS at usb 1 is gone; check its cable")
+    given_up = DeviceError("EOS at usb 1 is gone; no connection for 60 s; at last: no camera on USB; check its cable")
+    with pytest.raises(StorageError) as ended:
+        room.retry.attempt(room.broken(lambda now: full), "the disk")
+    assert str(ended.value).count("run the same command again") == 1
+    sentences = [sentence for _, sentence in room.said] + [sentence for _, _, sentence, _ in room.beats]
+    assert not [sentence for sentence in sentences if "again" in sentence]
+    assert any("free space (the run waits up to" in sentence for sentence in sentences)
+    room = PausedRoom(600.0)
+    with pytest.raises(LinkClosed) as lost:
+        room.retry.attempt(room.broken(lambda now: gone if now == 0 else given_up), "the camera")
+    assert str(lost.value).count("is gone") == 1
+
+
+@pytest.mark.parametrize("limit_s", [0.1, 0.3, 1.0, 600.0, 601.7])
+def test_patience_ends_in_time_with_the_first_cause(limit_s: float) -> None:
+    room = PausedRoom(limit_s)
+
+    def causes(now: float) -> CropError:
+        return LinkClosed("cable pulled at 12 s") if now == 0 else DeviceError("no camera on USB")
+
+    with pytest.raises(LinkClosed) as caught:
+        room.retry.attempt(room.broken(causes), "the camera")
+    message = str(caught.value)
+    assert message.startswith("the camera: cable pulled at 12 s; at last: no camera on USB; the run waited")
+    assert message.endswith("run the same command again")
+    assert isinstance(caught.value.__cause__, DeviceError)
+    assert room.clock.monotonic() == pytest.approx(limit_s, abs=1e-5)
+    assert len(room.tries) >= 2
+
+
+def test_what_waiting_does_not_cure_is_raised_at_once() -> None:
+    room = PausedRoom()
+    fault = ConfigurationError("no such display")
+    with pytest.raises(ConfigurationError) as caught:
+        room.retry.attempt(room.broken(lambda now: fault), "the screen")
+    assert caught.value is fault
+    with pytest.raises(DeviceRefused):
+        room.retry.attempt(
+            room.broken(lambda now: DeviceRefused("ISO 42 is not offered")),
+            "the camera",
+            curable=lambda fault: not isinstance(fault, DeviceRefused),
+        )
+    assert room.said == []
+
+
+def test_an_interruption_ends_a_pause_at_once() -> None:
+    room = PausedRoom()
+
+    def stop(state: str, sentence: str, within_s: float) -> None:
+        if room.clock.monotonic() > 60:
+            raise KeyboardInterrupt
+
+    retry = RetryPolicy(room.clock, math.inf, on_wait=stop)
+    with pytest.raises(KeyboardInterrupt):
+        retry.attempt(room.broken(lambda now: DeviceError("covered")), "the screen")
+    assert room.clock.monotonic() < 60 + 2 * PAUSE_S
+
+
+def test_a_full_disk_takes_the_notes_of_its_pause_when_there_is_space() -> None:
+    room = PausedRoom()
+    full = until(120, StorageError("the disk is full"))
+
+    def report(what: str, sentence: str) -> None:
+        if (fault := full(room.clock.monotonic())) is not None:
+            raise fault
+        room.said.append((what, sentence))
+
+    def beat(state: str, sentence: str, within_s: float) -> None:
+        raise StorageError("the disk is full")
+
+    retry = RetryPolicy(room.clock, 600, report, on_wait=beat)
+    assert retry.attempt(room.broken(full), "the disk") == "done"
+    assert room.words == ["retry", "paused", "resumed"]
+    late = [sentence for _, sentence in room.said if TOLD_LATER in sentence]
+    assert len(late) == 2, "that it was retried and paused, two minutes ago"
+    assert pause_cause(late[1]) == "the disk is full"
+
+
+def outlast(room: PausedRoom, retry: RetryPolicy, name: str = "the screen") -> None:
+    begun = room.clock.monotonic()
+    assert retry.attempt(room.broken(until(begun + 50, DeviceError("covered"))), name) == "done"
+
+
+def test_pauses_with_many_frames_between_them_have_each_their_time() -> None:
+    room = PausedRoom(60.0)
+    retry = room.retry
+    for _ in range(3):
+        outlast(room, retry)
+        for _ in range(10):
+            retry.accepted()
+    assert room.words == ["retry", "paused", "resumed"] * 3
+
+
+def test_what_fails_again_after_a_few_frames_has_one_patience() -> None:
+    room = PausedRoom(60.0)
+    retry = room.retry
+    outlast(room, retry)
+    for _ in range(9):
+        retry.accepted()
+    outlast(room, retry, "the camera")
+    begun = room.clock.monotonic()
+    with pytest.raises(DeviceError, match="in 2 pauses"):
+        outlast(room, retry)
+    assert room.clock.monotonic() - begun == pytest.approx(10, abs=PAUSE_S + RETRY_S), "fifty of sixty are spent"
+
+
+def test_one_back_off_holds_across_pauses() -> None:
+    """Tried again after 0, 5, 10, 20 … 300 s (docs/how-to/night-run.md), once more after one second."""
+    room = PausedRoom(math.inf)
+    retry = room.retry
+    waited: list[float] = []
+    for _ in range(9):
+        pause = retry.pause("the frames")
+        begun = room.clock.monotonic()
+        pause.back_off(DeviceError("refused"))
+        waited.append(room.clock.monotonic() - begun)
+        pause.wait(DeviceError("refused"))
+        pause.over()
+        retry.accepted()
+    assert waited == pytest.approx([1, 6, 11, 21, 41, 81, 161, 301, 301], abs=1)
+
+
+@pytest.mark.slow
+def test_a_full_disk_never_loses_the_frame_in_the_camera(tmp_path: Path) -> None:
+    """The real driver, and a kernel that lets no file grow: the download is repeated when there is space again."""
+    resource = pytest.importorskip("resource")
+    chart, light = design_chart(1), Illumination(0, "uniform", None, WHITE)
+    document = {"rig": "simulated", "chart": "c", "illuminations": "i", "simulated": {"body": "Test"}}
+    settings = LabSettings.model_validate(document)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    said: list[str] = []
+    with (
+        Session.create(tmp_path / "night", settings.to_toml(), chart, [light], plan_steps([light], 25)) as session,
+        open_rig(settings, chart) as devices,
+    ):
+        clock, camera = devices.clock, devices.camera
+        camera.configure(settings.camera.exposure)
+        devices.presenter.show(WHITE)
+        released_at = camera.expose()
+
+        def idle() -> None:
+            keep_awake(camera)
+            if clock.monotonic() > 300:
+                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+        retry = RetryPolicy(clock, 600, lambda what, sentence: said.append(f"{what}: {sentence}"), idle)
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+            received = retry.attempt(lambda: session.receive("0000_white", camera.download), "the disk")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+            signal.signal(signal.SIGXFSZ, handler)
+    assert [sentence.split(":")[0] for sentence in said] == ["retry", "paused", "resumed"]
+    assert "no file may be so large there" in said[1]
+    assert received.captured.released_at == released_at
+    assert read_raw(received.path).counts.size > 0
+    assert [path.name for path in session.frames_folder.iterdir()] == [received.path.name]
+
+
+def test_a_journal_that_another_program_held_for_the_whole_patience_is_not_waited_for_again() -> None:
+    def held() -> None:
+        raise HeldJournalError("cannot write journal.sqlite: database is locked")
+
+    clock = SimulatedClock()
+    begun = clock.monotonic()
+    with pytest.raises(StorageError):
+        RetryPolicy(clock, 600).attempt(held, "the disk")
+    assert clock.monotonic() == begun
+
+
+def test_a_wait_can_be_broken_off_and_a_try_cannot() -> None:
+    clock, inside, seen = SimulatedClock(), [0], list[tuple[str, int]]()
+
+    @contextmanager
+    def breakable() -> Generator[None]:
+        inside[0] += 1
+        yield
+        inside[0] -= 1
+
+    def idle() -> None:
+        seen.append(("waits", inside[0]))
+        if clock.monotonic() > 60:
+            raise KeyboardInterrupt
+
+    def action() -> None:
+        seen.append(("tries", inside[0]))
+        raise DeviceFault("it is off; switch it on")
+
+    with pytest.raises(KeyboardInterrupt):
+        RetryPolicy(clock, 600, idle=idle, breakable=breakable).attempt(action, "the screen")
+    assert set(seen) == {("tries", 0), ("waits", 1)}
+
+
+class Time:
+    """Stands still but where it jumps."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_a_jump_is_told_once() -> None:
+    time = Time()
+    watch = RunWatch(elapsed=time)
+    assert watch.gap_s() == 0
+    time.now += 10
+    assert watch.gap_s() == 0, "a busy machine"
+    time.now += 11
+    assert watch.gap_s() == 11
+    assert watch.gap_s() == 0
+
+
+@pytest.fixture
+def time(monkeypatch: pytest.MonkeyPatch) -> Time:
+    one = Time()
+    monkeypatch.setattr(devices, "elapsed_s", one)
+    return one
+
+
+def events(lab: Lab) -> list[str]:
+    return [event.detail for event in lab.session.journal.events() if event.what == "gap"]
+
+
+def test_a_frame_that_was_exposed_across_a_gap_is_taken_again(tmp_path: Path, time: Time) -> None:
+    lab = Lab(tmp_path / "session")
+
+    def stopped() -> None:
+        time.now += 343
+
+    lab.camera.after[3] = stopped
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    refused = [frame.verdict for frame in lab.session.frames() if not frame.accepted]
+    assert len(refused) == 1
+    assert "5 min 43 s" in refused[0]
+    assert len(events(lab)) == 1
+
+
+def test_a_gap_between_frames_is_in_the_journal_and_costs_none(tmp_path: Path, time: Time) -> None:
+    lab = Lab(tmp_path / "session")
+    show = lab.screen.show
+
+    def stopped(colour: Colour) -> None:
+        show(colour)
+        time.now += 60 * (len(lab.screen.shown) == 3)
+
+    lab.screen.show = stopped  # type: ignore[method-assign]
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert lab.verdicts() == ["accepted"] * 6
+    assert len(events(lab)) == 1
+
+
+def test_a_step_that_takes_too_long_is_told_once_with_its_device() -> None:
+    time, told = Time(), list[str]()
+    watch = RunWatch(lambda sentence, begun: told.append(sentence), time)
+
+    def pass_s(seconds: float) -> None:
+        """Let time pass in pieces that are no gap."""
+        for _ in range(round(seconds)):
+            time.now += 1
+            watch.look()
+
+    with watch.step("the camera", "exposes light 3", 4.0, "expose"):
+        pass_s(3 * 4 + 10)
+        assert not told
+        pass_s(1)
+        assert len(told) == 1
+        pass_s(300)
+        assert len(told) == 1
+    assert "the camera exposes light 3, for which 4 s is expected" in told[0]
+    pass_s(300)
+    with watch.step("the camera", "exposes light 4", 4.0, "expose"):
+        pass_s(3 * 4 + 10 + 1)
+    assert len(told) == 2, "what was late tells nothing of how long it takes"
+    with watch.step("the camera", "sends light 4", 4.0, "download"):
+        pass_s(20)
+    with watch.step("the camera", "sends light 5", 4.0, "download"):
+        pass_s(3 * 20 + 10)
+    assert len(told) == 2, "a slow cable stays slow"
+    with watch.step("the screen", "shows light 6", 0.5, "show"):
+        pass_s(12)
+    assert "for which 0.5 s is expected" in told[2]
+
+
+def test_a_machine_that_slept_makes_no_step_late() -> None:
+    time, told = Time(), list[str]()
+    watch = RunWatch(lambda sentence, begun: told.append(sentence), time)
+    with watch.step("the screen", "shows light 3", 1.0, "show"):
+        time.now += 3600
+        watch.look()
+    assert not told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("hangs", "cause"), [("expose", "the camera"), ("show", "the screen"), ("judge", "the disk")])
+def test_what_hangs_is_named_while_it_hangs(
+    tmp_path: Path, time: Time, hangs: str, cause: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab, heads = Lab(tmp_path / "session"), list[Head]()
+    owner = ExposureJudge if hangs == "judge" else type(lab.camera) if hangs == "expose" else type(lab.screen)
+    real, calls = getattr(owner, hangs), [0]
+    watches, kinds, entered, expected = list[RunWatch](), list[str](), threading.Condition(), dict[str, float]()
+
+    class Watched(RunWatch):
+        def __init__(self, on_late: Callable[[str, datetime], object]) -> None:
+            super().__init__(on_late, time)
+            watches.append(self)
+
+        @contextmanager
+        def step(self, device: str, doing: str, expected_s: float, kind: str) -> Generator[None]:
+            expected[kind] = expected_s
+            with super().step(device, doing, expected_s, kind):
+                with entered:
+                    kinds[:] = [kind]
+                    entered.notify_all()
+                try:
+                    yield
+                finally:
+                    kinds.clear()
+
+    def hanging(*given: object) -> object:
+        calls[0] += 1
+        if calls[0] == 4:
+            # Frames are judged beside the run, which comes to wait for the verdict.
+            with entered:
+                assert entered.wait_for(lambda: kinds == [hangs], timeout=60)
+            for _ in range(60):
+                time.now += 1
+                watches[0].look()
+            heads.append(read_session(lab.session.folder).head(datetime.now(UTC)))
+        return real(*given)
+
+    monkeypatch.setattr(owner, hangs, hanging)
+    monkeypatch.setattr(run, "RunWatch", Watched)
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    (head,) = heads
+    assert (head.state, head.cause) == ("late", cause)
+    assert head.sentence.startswith("late since")
+    assert not events(lab)
+    # Of half a second the camera's own dark frame takes as much again.
+    assert SETTINGS.camera.shutter_s == 0.5
+    assert expected.items() >= {"expose": 1 + 3.0, "download": 10.0, "judge": 5.0, "show": 2.0}.items()
+
+
+def test_a_projector_without_a_wheel_needs_whole_pictures() -> None:
+    steady = ProjectorCable(colour_wheel_hz=0, refresh_hz=50)
+    require_whole_turns(CameraSettings(shutter_s=0.02), steady)
+    with pytest.raises(ConfigurationError, match=r"\(50 a second\).*\.refresh_hz"):
+        require_whole_turns(CameraSettings(shutter_s=1 / 60), steady)
+
+
+def test_the_times_that_are_named_before_a_camera_is_asked_are_engraved() -> None:
+    engraved = {step.value for step in SHUTTER.steps}
+    assert set(ENGRAVED_S) <= engraved
+    # Thirds of a stop, as engraved: 1/20 after 1/25, 1/13 after 1/15.
+    assert all(1.1 < longer / shorter < 1.4 for shorter, longer in pairwise(ENGRAVED_S))
+
+
+def test_the_wheel_before_the_camera_is_the_lab_s_or_the_simulated_room_s() -> None:
+    head = 'chart = "c"\nilluminations = "l"\n'
+    of_lab = "[lab.projector]\ncolour_wheel_hz = 120\n"
+    of_room = "[simulated.room]\nwheel_hz = 60\n"
+    rigs = [("lab", of_lab), ("simulated", of_room), ("simulated", of_lab), ("imported", of_lab)]
+    wheels = [wheel_of(parse_lab(f'rig = "{rig}"\n{head}{table}', "LAB.toml")) for rig, table in rigs]
+    assert wheels == [120, 60, 0, 0]

@@ -1,0 +1,123 @@
+"""What a CR3 says of itself; the files are built after published descriptions, as none of a real body is at hand."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.raw import rawfile
+from drivers.raw.rawfile import read_raw
+from drivers.raw.storage import Area, Cr3, RawDamaged, Stored, read_cr3
+from foundation.errors import FormatError
+from tests.drivers.raw.maker_files import PIXELS, SIDES, areas, box, cr3, large_box, track
+
+
+def test_the_camera_and_where_its_sensor_is_black() -> None:
+    said = read_cr3(cr3())
+    assert (said.maker, said.model) == ("Canon", "Canon EOS M50")
+    assert said.black == (Area(0, 0, 4056, 256), Area(0, 264, 28, 6024))
+    assert said.frames == (Stored(4056, 6288, ((900, PIXELS),)),) * 2
+
+
+@pytest.mark.parametrize(
+    ("places", "frames"),
+    [
+        ((struct.pack(">III", 0, 70, 2), struct.pack(">IIQQ", 0, 2, 900, 1000)), (((900, 70),), ((1000, 70),))),
+        ((struct.pack(">5I", 0, 0, 2, 7, 8), struct.pack(">IIQQ", 0, 2, 900, 1 << 40)), (((900, 7),), ((1 << 40, 8),))),
+        ((struct.pack(">III", 0, 70, 2), struct.pack(">IIQ", 0, 1, 900)), "2 samples in 1 chunks"),
+        ((struct.pack(">III", 0, 70, 1 << 31), struct.pack(">IIQ", 0, 1 << 31, 900)), "samples in"),
+        ((struct.pack(">III", 0, 0, 0), struct.pack(">II", 0, 0)), "0 samples"),
+        ((struct.pack(">III", 0, 0, 2), struct.pack(">IIQQ", 0, 2, 900, 1000)), "ends within"),
+        ((struct.pack(">III", 0, 70, 1), b""), "ends within"),
+    ],
+)
+def test_where_the_samples_of_a_track_are(
+    places: tuple[bytes, bytes], frames: str | tuple[tuple[tuple[int, int]], ...]
+) -> None:
+    data = cr3("Canon EOS R", track(areas(), b"CRAW", SIDES, box(b"stsz", places[0]), box(b"co64", places[1])))
+    if isinstance(frames, str):
+        with pytest.raises(RawDamaged, match=frames):
+            read_cr3(data)
+    else:
+        assert [frame.extents for frame in read_cr3(data).frames] == list(frames)
+
+
+def test_areas_that_a_body_leaves_empty_are_none() -> None:
+    assert read_cr3(cr3("Canon EOS R", track(areas((0, 0, 0, 0), (0, 0, 0, 0))))).black == ()
+    assert read_cr3(cr3("Canon EOS R", track(areas((0, 0, 0, 0))))).black == (Area(0, 264, 28, 6024),)
+
+
+@pytest.mark.parametrize("size", [0, 1])
+def test_the_last_box_may_reach_to_the_end_or_have_a_long_size(size: int) -> None:
+    data = cr3()
+    start = data.rindex(b"mdat") - 4
+    last = struct.pack(">I4s", 0, b"mdat") + bytes(64) if size == 0 else large_box(b"mdat", bytes(64))
+    assert read_cr3(data[:start] + last).model == "Canon EOS M50"
+
+
+def test_a_file_cut_anywhere_is_damaged() -> None:
+    data = cr3()
+    for length in range(len(data)):
+        with pytest.raises(RawDamaged):
+            read_cr3(data[:length])
+
+
+@given(st.binary(max_size=300), st.integers(0, 900))
+def test_whatever_the_bytes_it_is_read_or_damaged(noise: bytes, place: int) -> None:
+    data = bytearray(cr3())
+    data[place : place + len(noise)] = noise
+    for candidate in (bytes(data), b"\0\0\0\x18ftypcrx " + noise):
+        try:
+            said = read_cr3(candidate)
+        except RawDamaged:
+            continue
+        assert len(said.black) <= 2
+
+
+def masked(model: str, left: int, stated: Cr3 | None, rows: int = 4056) -> tuple[Area, ...]:
+    """Return what is taken for black of a sensor whose picture begins at column `left`."""
+    visible = Area(36, left, rows - 36, 6288 - left)
+    return rawfile._masked_areas(None, model, visible, (rows, 6288), stated)
+
+
+def test_masked_columns_of_a_cr3() -> None:
+    assert masked("Canon EOS M50", 264, Cr3()) == (Area(36, 0, 4020, 260),)
+    # What the file states narrows that down, and adds nothing.
+    assert masked("Canon EOS M50", 264, Cr3(black=(Area(0, 0, 4056, 256), Area(0, 264, 28, 6024)))) == (
+        Area(36, 0, 4020, 256),
+    )
+    assert masked("Canon EOS M50", 264, Cr3(black=(Area(40, 40, 4000, 100),))) == (Area(40, 40, 4000, 100),)
+    assert masked("Canon EOS M50", 264, Cr3(black=(Area(0, 40, 4000, 400),))) == (Area(36, 0, 4020, 260),), (
+        "it is not black there"
+    )
+    assert masked("Canon EOS M50", 264, Cr3(black=(Area(0, 0, 4056, 3),))) == ()
+
+
+def test_columns_at_the_edge_that_are_not_black_are_left_out() -> None:
+    # LibRaw's table: EOS R10 168 columns, of which the first 16 and the last 48 are none; R5 Mark II 258, 128.
+    for camera in ("Canon EOS R10", "Canon EOS R6m2", "Canon EOS R6 Mark II"):
+        assert masked(camera, 168, Cr3()) == (Area(36, 16, 4020, 104),)
+    for camera in ("Canon EOS R5m2", "Canon EOS R5 Mark II"):
+        assert masked(camera, 258, Cr3()) == (Area(36, 128, 4020, 126),)
+
+
+SMALL = box(b"stsz", struct.pack(">III", 0, 400, 1)), box(b"co64", struct.pack(">IIQ", 0, 1, 400))
+
+
+def test_a_file_that_libraw_cannot_decode_is_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for name, data, says in (
+        ("whole.CR3", cr3("R", track(areas(), b"CRAW", (64, 48), *SMALL)), "LibRaw says"),
+        ("stub.CR3", cr3(), "its pixels reach from byte 900 to 5000900"),
+        ("cut.CR3", cr3()[:-10], "its part 'mdat' reaches to byte"),
+        ("head.CR3", cr3()[:40], "cannot be read as a raw file"),
+        ("brand.CR3", b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", "no description of its pictures"),
+    ):
+        path = tmp_path / name
+        path.write_bytes(data)
+        with pytest.raises(FormatError, match=says):
+            read_raw(path)
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,834 @@
+"""PJLink: lines and datagrams of the standard, conversations, the projector contract, troubled cables, and the search.
+
+Examples and conversations are those of JBMIA, PJLink Specifications 1.04 and 2.00 (sections 3 to 5), not of the codec
+under test.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers import pjlink as wire
+from drivers.links.link import Link, PeerLink
+from drivers.links.network import Address, TcpLink, UdpSocket
+from drivers.pjlink import (
+    FoundProjector,
+    NoResolution,
+    PjLinkProjector,
+    PjLinkReply,
+    PjLinkRequest,
+    Refused,
+    Resolution,
+    search,
+)
+from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
+from foundation.clock import SimulatedClock
+from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.ptp import serve_ptpip
+from sim.camera.bodies import EOS_550D
+from sim.camera.eos import SimulatedEos
+from sim.projectors.pjlink import PjLinkPeer, serve_pjlink
+from sim.projectors.projector import SimulatedProjector
+from tests.contracts.camera import SeededFilm
+from tests.contracts.projector import Bench, ProjectorContract
+from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling, Slow
+from tests.drivers.script import Script
+
+PASSWORD = "JBMIAProjectorLink"
+DIGEST = b"5d8409bc1c3fa39749434aa3a5c38682"
+
+
+def driver(*scripts: Script, password: str | None = None) -> PjLinkProjector:
+    """Return the driver on one script after another; a connection too many is an error."""
+    waiting = list(scripts)
+    return PjLinkProjector(lambda: waiting.pop(0), password)
+
+
+def test_power_without_password() -> None:
+    script = Script(
+        b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=0\r", b"%1POWR 1\r", b"%1POWR=OK\r", b"%1POWR ?\r", b"%1POWR=3\r"
+    )
+    projector = driver(script)
+    assert projector.power() is Power.STANDBY
+    projector.switch_on()
+    assert projector.power() is Power.WARMING
+    assert script.ended()
+    projector.close()
+    assert script.closed
+
+
+def test_only_the_first_command_proves_the_password() -> None:
+    script = Script(
+        b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", b"%1AVMT 31\r", b"%1AVMT=OK\r"
+    )  # fmt: skip
+    projector = driver(script, password=PASSWORD)
+    assert projector.power() is Power.ON
+    projector.set_muted(True)
+    assert script.ended()
+
+
+def test_a_password_that_nobody_asks_for_is_not_sent() -> None:
+    script = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r")
+    assert driver(script, password=PASSWORD).power() is Power.ON
+
+
+def test_a_wrong_password_is_refused_in_words() -> None:
+    script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"PJLINK ERRA\r")
+    with pytest.raises(DeviceRefused):
+        driver(script, password=PASSWORD).power()
+    assert script.ended()
+    assert script.closed
+
+
+class Refusing(BaseHTTPRequestHandler):
+    """A web page that is none."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing."""
+
+
+@contextmanager
+def http_server() -> Generator[tuple[str, int]]:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        yield "127.0.0.1", server.server_port
+        server.shutdown()
+
+
+@contextmanager
+def camera() -> Generator[tuple[str, int]]:
+    with serve_ptpip(SimulatedEos(EOS_550D, SeededFilm(600), SimulatedClock()), 0) as server:
+        yield server.address
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stranger", "name"), [(http_server, "an HTTP server"), (camera, r"a camera \(PTP/IP\)")], ids=["http", "camera"]
+)
+def test_what_answers_at_a_projectors_port_and_is_none_is_named(
+    stranger: Callable[[], AbstractContextManager[tuple[str, int]]], name: str
+) -> None:
+    with stranger() as address:
+        projector = PjLinkProjector(lambda: TcpLink.connect(*address, 10.0), timeout=0.05)
+        with pytest.raises(DeviceRefused, match=rf"^the projector: {name} answers at its .* as port 4352"):
+            projector.power()
+
+
+def test_a_projector_that_falls_silent_is_asked_for_nothing_else() -> None:
+    first = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r")
+    projector = driver(first, Script())
+    assert projector.power() is Power.ON
+    projector.close()
+    with pytest.raises(LinkTimeout):
+        projector.power()
+
+
+def test_a_missing_password_is_asked_for_before_anything_is_sent() -> None:
+    script = Script(b"PJLINK 1 498e4a67\r")
+    with pytest.raises(DeviceRefused):
+        driver(script).power()
+    assert script.ended()
+    assert script.closed
+
+
+def test_a_server_that_wants_the_digest_each_time_gets_a_new_connection() -> None:
+    first = Script(
+        b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", b"%1ERST ?\r", b"PJLINK ERRA\r"
+    )  # fmt: skip
+    second = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1ERST ?\r", b"%1ERST=000000\r")
+    projector = driver(first, second, password=PASSWORD)
+    assert projector.power() is Power.ON
+    assert projector.faults() == ()
+    assert first.closed
+    assert second.ended()
+
+
+def test_health_and_name() -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1ERST ?\r", b"%1ERST=010020\r",
+        b"%1LAMP ?\r", b"%1LAMP=120 1 3000 0\r",
+        b"%1INF1 ?\r", b"%1INF1=Seiko\r",
+        b"%1INF2 ?\r", b"%1INF2=ERR1\r",
+        b"%1NAME ?\r", b"%1NAME=room 3\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.faults() == (Fault("lamp", Severity.WARNING), Fault("filter", Severity.ERROR))
+    assert projector.lamps() == (Lamp(120, True), Lamp(3000, False))
+    assert projector.identity() == ProjectorIdentity("Seiko", "", "room 3")
+    assert script.ended()
+
+
+def test_a_lampless_projector_has_no_lamps() -> None:
+    assert driver(Script(b"PJLINK 0\r", b"%1LAMP ?\r", b"%1LAMP=ERR1\r")).lamps() == ()
+
+
+@pytest.mark.parametrize(
+    ("code", "error", "words"),
+    [
+        (b"ERR1", DeviceRefused, "does not know this command"),
+        (b"ERR2", DeviceRefused, "does not offer this value"),
+        (b"ERR3", DeviceRefused, "warming up, cooling down or in standby"),
+        (b"ERR4", DeviceFault, "failure of its own"),
+    ],
+)
+def test_each_error_has_its_sentence(code: bytes, error: type[Exception], words: str) -> None:
+    script = Script(b"PJLINK 0\r", b"%1AVMT 31\r", b"%1AVMT=" + code + b"\r", b"%1POWR ?\r", b"%1POWR=3\r")
+    projector = driver(script)
+    with pytest.raises(error, match=rf"{code.decode()} to AVMT 31: .*{words}"):
+        projector.set_muted(True)
+    # A refusal is no fault of the cable: the same connection goes on.
+    assert projector.power() is Power.WARMING
+
+
+def test_tolerates_case_line_feeds_and_pieces() -> None:
+    script = Script(b"pjlink ", b"0\r\n", b"%1POWR ?\r", b"%1po", b"wr=", b"1\r\n", b"%1POWR 0\r", b"%1POWR=ok\r\n")
+    projector = driver(script)
+    assert projector.power() is Power.ON
+    projector.switch_off()
+    assert script.ended()
+
+
+def test_an_idle_connection_that_was_dropped_is_replaced_silently() -> None:
+    first = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", None)
+    second = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")
+    projector = driver(first, second, password=PASSWORD)
+    assert projector.power() is Power.ON
+    assert projector.power() is Power.ON
+    assert first.closed
+    assert second.ended()
+
+
+def test_a_new_connection_that_is_dropped_is_not_tried_again() -> None:
+    for script in (Script(None), Script(b"PJLINK 0\r", b"%1POWR ?\r", None)):
+        with pytest.raises(LinkClosed):
+            driver(script).power()
+        assert script.closed
+
+
+def test_a_second_drop_in_a_row_is_told() -> None:
+    first = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r", None)
+    second = Script(b"PJLINK 0\r", b"%1POWR ?\r", None)
+    projector = driver(first, second)
+    projector.power()
+    with pytest.raises(LinkClosed):
+        projector.power()
+
+
+def test_a_late_answer_never_meets_a_later_question() -> None:
+    late = Script(b"PJLINK 0\r", b"%1POWR ?\r")
+    fresh = Script(b"PJLINK 0\r", b"%1ERST ?\r", b"%1ERST=000000\r")
+    projector = driver(late, fresh)
+    with pytest.raises(LinkTimeout):
+        projector.power()
+    assert late.closed
+    assert projector.faults() == ()
+
+
+@pytest.mark.parametrize(
+    "answer", [b"%1LAMP=1 1\r", b"what?\r", b"%1POWR=7\r", b"%1POWR=\r", b"x" * 500, b"\xff\r", b"%1POWR=OK\r"]
+)
+def test_an_answer_that_does_not_fit_is_a_protocol_error(answer: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        driver(Script(b"PJLINK 0\r", b"%1POWR ?\r", answer)).power()
+
+
+def test_a_set_command_must_be_answered_by_ok() -> None:
+    with pytest.raises(ProtocolError):
+        driver(Script(b"PJLINK 0\r", b"%1POWR 1\r", b"%1POWR=1\r")).switch_on()
+
+
+def test_what_class_2_tells() -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=2\r",
+        b"%2IRES ?\r", b"%2IRES=1920x1080\r",
+        b"%2IRES ?\r", b"%2IRES=-\r",
+        b"%2IRES ?\r", b"%2IRES=*\r",
+        b"%2FREZ ?\r", b"%2FREZ=1\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.input_resolution() == Resolution(1920, 1080)
+    assert projector.input_resolution() is NoResolution.NO_SIGNAL
+    assert projector.input_resolution() is NoResolution.UNKNOWN_SIGNAL
+    assert projector.frozen()
+    assert script.ended()
+
+
+@pytest.mark.parametrize(("level", "code", "meant"), [(b"1", b"31", "31"), (b"2", b"3a", "3A")])
+def test_the_input_is_asked_for_in_the_projectors_class(level: bytes, code: bytes, meant: str) -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=" + level + b"\r",
+        b"%" + level + b"INPT ?\r", b"%" + level + b"INPT=" + code + b"\r",
+    )  # fmt: skip
+    assert driver(script).input() == meant
+    assert script.ended()
+
+
+def class_2(*conversation: bytes) -> PjLinkProjector:
+    return driver(Script(b"PJLINK 0\r", b"%1CLSS ?\r", b"%1CLSS=2\r", *conversation))
+
+
+@pytest.mark.parametrize("code", [b"ERR1", b"err1", b"ERR2"])
+def test_a_class_2_projector_that_does_not_know_a_question_cannot_tell(code: bytes) -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=2\r",
+        b"%2FREZ ?\r", b"%2FREZ=" + code + b"\r",
+        b"%2IRES ?\r", b"%2IRES=" + code + b"\r",
+        b"%1AVMT ?\r", b"%1AVMT=" + code + b"\r",
+        b"%1LAMP ?\r", b"%1LAMP=" + code + b"\r",
+        b"%1ERST ?\r", b"%1ERST=" + code + b"\r",
+        b"%1POWR ?\r", b"%1POWR=1\r",
+    )  # fmt: skip
+    projector = driver(script)
+    # What it does not know it is asked once.
+    for _ in range(2):
+        assert projector.picture_fault() is None
+    assert projector.frozen() is None
+    assert projector.input_resolution() is None
+    assert projector.muted() is None
+    assert projector.lamps() == ()
+    assert projector.faults() == ()
+    # Health is not taken from silence: the second time it is asked for its power instead.
+    assert projector.faults() == ()
+    assert script.ended()
+
+
+def test_a_projector_that_cannot_tell_whether_it_is_frozen_is_asked_for_its_signal() -> None:
+    projector = class_2(b"%2FREZ ?\r", b"%2FREZ=ERR1\r", b"%2IRES ?\r", b"%2IRES=-\r")
+    assert "no signal" in (projector.picture_fault() or "")
+    projector = class_2(b"%2FREZ ?\r", b"%2FREZ=0\r", b"%2IRES ?\r", b"%2IRES=ERR1\r", b"%2FREZ ?\r", b"%2FREZ=1\r")
+    assert projector.picture_fault() is None
+    assert "frozen" in (projector.picture_fault() or "")
+
+
+def test_what_a_projector_does_not_tell_now_it_is_asked_again() -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=ERR3\r",
+        b"%1CLSS ?\r", b"%1CLSS=2\r",
+        b"%2FREZ ?\r", b"%2FREZ=ERR3\r",
+        b"%2IRES ?\r", b"%2IRES=ERR3\r",
+        b"%2FREZ ?\r", b"%2FREZ=1\r",
+        b"%1ERST ?\r", b"%1ERST=ERR3\r",
+        b"%1ERST ?\r", b"%1ERST=010000\r",
+        b"%1AVMT ?\r", b"%1AVMT=ERR3\r",
+        b"%1AVMT ?\r", b"%1AVMT=31\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.picture_fault() is None
+    assert projector.picture_fault() is None
+    assert "frozen" in (projector.picture_fault() or "")
+    assert projector.faults() == ()
+    assert projector.faults() == (Fault("lamp", Severity.WARNING),)
+    with pytest.raises(DeviceRefused):
+        projector.muted()
+    assert projector.muted()
+    assert script.ended()
+
+
+def test_a_failure_that_the_projector_reports_is_no_ignorance() -> None:
+    with pytest.raises(DeviceFault):
+        class_2(b"%2FREZ ?\r", b"%2FREZ=ERR4\r").picture_fault()
+    with pytest.raises(DeviceFault):
+        driver(Script(b"PJLINK 0\r", b"%1ERST ?\r", b"%1ERST=ERR4\r")).faults()
+
+
+def test_a_wrong_password_is_no_ignorance() -> None:
+    script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1CLSS ?\r", b"PJLINK ERRA\r")
+    with pytest.raises(DeviceRefused):
+        driver(script, password=PASSWORD).picture_fault()
+
+
+@pytest.mark.parametrize("answer", [b"%1CLSS=1\r", b"%1CLSS=ERR1\r"])
+def test_class_1_is_never_asked_what_class_2_knows(answer: bytes) -> None:
+    script = Script(b"PJLINK 0\r", b"%1CLSS ?\r", answer)
+    projector = driver(script)
+    for ask in (
+        projector.input_resolution,
+        projector.frozen,
+    ):
+        with pytest.raises(DeviceRefused):
+            ask()
+    assert projector.pjlink_class() == 1
+    assert script.ended()
+
+
+def test_a_notice_of_start_inside_the_connection_answers_nothing() -> None:
+    # Some class 2 projectors send it there, and fill their packets up with NUL (seen by users of other controllers).
+    script = Script(
+        b"PJLINK 0\r" + bytes(200),
+        b"%1POWR ?\r", b"%2LKUP=D0:D9:4F:00:00:01\r\0\0\0", b"\0\0%1POWR=1\r" + bytes(120),
+        b"%1POWR ?\r", b"%2LKUP=D0:D9:4F:00:00:01\r%1POWR=2\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.power() is Power.ON
+    assert projector.power() is Power.COOLING
+    assert script.ended()
+
+
+def test_another_service_at_that_port_is_named() -> None:
+    with pytest.raises(ProtocolError, match=r"SSH-2\.0"):
+        driver(Script(b"SSH-2.0-OpenSSH_9.2\r\n")).power()
+
+
+def test_an_answer_that_never_ends_is_a_timeout() -> None:
+    clock = SimulatedClock()
+
+    class Endless(Script):
+        def read(self, limit: int, timeout: float) -> bytes:
+            clock.sleep(1.0)
+            return b"P"
+
+        def write(self, data: bytes, timeout: float) -> None:
+            """Hear what it is, without a word on that."""
+
+    with pytest.raises(LinkTimeout):
+        PjLinkProjector(lambda: Endless(b""), timeout=5.0, clock=clock).power()
+
+
+def noisy(link: Link) -> Link:
+    """Have a projector answer in small letters, with LF and filling, and announce its start in between."""
+
+    def garble(data: bytes) -> bytes:
+        data = data.replace(b"%1POWR=", b"%1powr=").replace(b"=OK", b"=Ok").replace(b"=ERR", b"=err")
+        return b"\n%2LKUP=00:11:22:33:44:55\r\0" + data.replace(b"\r", b"\r\n\0\0")
+
+    return Garbling(link, garble)
+
+
+WAYS: dict[str, tuple[Callable[[Link], Link], str | None]] = {
+    "open": (lambda link: link, None),
+    "password": (lambda link: link, PASSWORD),
+    "byte by byte": (Dribbling, None),
+    "dropped at every second command": (lambda link: DroppedAfter(link, 1), None),
+    "dropped, password": (lambda link: DroppedAfter(link, 1), PASSWORD),
+    "noisy line ends": (noisy, None),
+}
+
+
+class TestOverMemory(ProjectorContract):
+    @pytest.fixture(params=WAYS)
+    def bench(self, request: pytest.FixtureRequest) -> Bench:
+        trouble, password = WAYS[request.param]
+        device = SimulatedProjector(SimulatedClock())
+        return Bench.of(PjLinkProjector(lambda: trouble(PeerLink(PjLinkPeer(device, password))), password), device)
+
+
+class TestOverLoopback(ProjectorContract):
+    @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
+    def bench(self, request: pytest.FixtureRequest) -> Iterator[Bench]:
+        device = SimulatedProjector(SimulatedClock())
+        with serve_pjlink(device, password=request.param) as server:
+            projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), request.param, 10.0)
+            yield Bench.of(projector, device)
+            projector.close()
+
+
+class TestAnswersThatTakeTheirTime(ProjectorContract):
+    """Four of the five seconds that an answer may take, by a clock of the cable's own."""
+
+    @pytest.fixture
+    def bench(self) -> Bench:
+        cable_clock, device = SimulatedClock(), SimulatedProjector(SimulatedClock())
+        slow = lambda: Slow(PeerLink(PjLinkPeer(device)), cable_clock, 4.0)  # noqa: E731
+        return Bench.of(PjLinkProjector(slow, clock=cable_clock), device)
+
+
+def test_an_answer_that_comes_too_late_is_a_timeout() -> None:
+    clock = SimulatedClock()
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock()))
+    projector = PjLinkProjector(lambda: Slow(PeerLink(peer), clock, 6.0), clock=clock)
+    with pytest.raises(LinkTimeout):
+        projector.power()
+
+
+def test_a_garbled_answer_is_told_and_the_next_connection_is_clean() -> None:
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock(), Power.ON))
+    garbles: list[Callable[[bytes], bytes]] = [lambda data: data.replace(b"POWR=", b"PO\xffR="), lambda data: data]
+    projector = PjLinkProjector(lambda: Garbling(PeerLink(peer), garbles.pop(0)))
+    with pytest.raises(ProtocolError):
+        projector.power()
+    assert projector.power() is Power.ON
+
+
+def test_a_swallowed_answer_is_told_and_the_next_connection_is_clean() -> None:
+    device = SimulatedProjector(SimulatedClock())
+    made: list[Link] = []
+
+    def connect() -> Link:
+        good = PeerLink(PjLinkPeer(device))
+        made.append(Deaf(good, after=1) if not made else good)
+        return made[-1]
+
+    projector = PjLinkProjector(connect)
+    with pytest.raises(LinkTimeout):
+        projector.switch_on()
+    # The command itself went through; the driver does not hide that it cannot know.
+    assert projector.power() is Power.WARMING
+
+
+def test_a_restarted_server_goes_unnoticed() -> None:
+    device = SimulatedProjector(SimulatedClock())
+    with serve_pjlink(device, password=PASSWORD) as server:
+        projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), PASSWORD, 10.0)
+        assert projector.power() is Power.STANDBY
+        server.hang_up()
+        assert projector.power() is Power.STANDBY
+        projector.close()
+
+
+def test_what_is_logged_has_neither_password_nor_digest(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("DEBUG")
+    script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")
+    assert driver(script, password=PASSWORD).power() is Power.ON
+    assert "%1POWR ?" in caplog.text
+    assert PASSWORD not in caplog.text
+    assert DIGEST.decode("ascii") not in caplog.text
+
+
+PRINTABLE = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=100)
+
+
+def test_digest_is_the_standards_example() -> None:
+    # PJLink 1.04, 5.1: seed 498e4a67, password JBMIAProjectorLink.
+    assert wire.authentication_digest("498e4a67", "JBMIAProjectorLink") == "5d8409bc1c3fa39749434aa3a5c38682"
+
+
+@pytest.mark.parametrize(
+    ("line", "greeting"),
+    [
+        (b"PJLINK 0", None),
+        (b"PJLINK 1 498e4a67", "498e4a67"),
+        (b"pjlink 1 498E4a67", "498E4a67"),
+        (b"PJLINK ERRA", Refused.WRONG_PASSWORD),
+    ],
+)
+def test_greetings(line: bytes, greeting: str | Refused | None) -> None:
+    assert wire.parse_greeting(line) == greeting
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"PJLINK", b"PJLINK 1", b"PJLINK 1 short", b"PJLINK 0 x", b"SSH-2.0-x", b"\xff\xfe"]
+)
+def test_what_is_no_greeting_is_quoted(line: bytes) -> None:
+    with pytest.raises(ProtocolError, match="PJLink is enabled"):
+        wire.parse_greeting(line)
+
+
+def test_an_http_server_that_speaks_first_is_said_to_be_one() -> None:
+    # RFC 9110, 15.5.9: what a server may send that has waited too long for a request.
+    with pytest.raises(ProtocolError, match=r"HTTP server.*'HTTP/1\.1 408"):
+        wire.parse_greeting(b"HTTP/1.1 408 Request Timeout")
+
+
+def test_commands_are_the_standards_bytes() -> None:
+    # PJLink 1.04, 4.1 and 5.1.
+    assert wire.encode_request(PjLinkRequest("POWR", "1")) == b"%1POWR 1\r"
+    assert wire.encode_request(PjLinkRequest("INPT")) == b"%1INPT ?\r"
+    assert wire.encode_request(PjLinkRequest("AVMT", "31")) == b"%1AVMT 31\r"
+    assert (
+        wire.encode_request(PjLinkRequest("POWR", digest="5d8409bc1c3fa39749434aa3a5c38682"))
+        == b"5d8409bc1c3fa39749434aa3a5c38682%1POWR ?\r"
+    )
+    assert wire.encode_request(PjLinkRequest("SNUM", level=2)) == b"%2SNUM ?\r"
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [PjLinkRequest("powr"), PjLinkRequest("POW"), PjLinkRequest("POWR", "1\r"), PjLinkRequest("POWR", "x" * 129)],
+)
+def test_our_own_mistakes_never_reach_the_cable(request_: PjLinkRequest) -> None:
+    with pytest.raises(ValueError, match="is no PJLink"):
+        wire.encode_request(request_)
+
+
+@pytest.mark.parametrize(
+    ("line", "reply"),
+    [
+        (b"%1POWR=0", PjLinkReply("POWR", "0")),
+        (b"%1POWR=OK", PjLinkReply("POWR", "OK")),
+        (b"%1powr=ERR3", PjLinkReply("POWR", "ERR3")),
+        (b"%1LAMP=120 1 3000 0", PjLinkReply("LAMP", "120 1 3000 0")),
+        (b"%1NAME=", PjLinkReply("NAME", "")),
+        ("%1NAME=Höllenmaschine".encode(), PjLinkReply("NAME", "Höllenmaschine")),
+        (b"%2SNUM=42", PjLinkReply("SNUM", "42", level=2)),
+        (b"%2INNM=HDMI 1", PjLinkReply("INNM", "HDMI 1", level=2)),
+        (b"%2IRES=-", PjLinkReply("IRES", "-", level=2)),
+        (b"%2IRES=*", PjLinkReply("IRES", "*", level=2)),
+        (b"PJLINK ERRA", Refused.WRONG_PASSWORD),
+        (b"pjlink erra", Refused.WRONG_PASSWORD),
+    ],
+)
+def test_replies(line: bytes, reply: PjLinkReply | Refused) -> None:
+    assert wire.parse_reply(line) == reply
+
+
+@pytest.mark.parametrize("line", [b"%1POWR 0", b"POWR=0", b"%1POW=0", b"%xPOWR=0", b"", b"%1NAME=" + b"x" * 129])
+def test_what_is_no_reply_is_quoted(line: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        wire.parse_reply(line)
+
+
+def test_values_of_the_standard() -> None:
+    assert [wire.parse_power(digit) for digit in "0123"] == [Power.STANDBY, Power.ON, Power.COOLING, Power.WARMING]
+    assert [wire.parse_mute(code) for code in ("11", "31", "21", "30")] == [True, True, False, False]
+    assert wire.parse_faults("000000") == ()
+    # fan, lamp, temperature, cover, filter, other
+    assert wire.parse_faults("120012") == (
+        Fault("fan", Severity.WARNING),
+        Fault("lamp", Severity.ERROR),
+        Fault("filter", Severity.WARNING),
+        Fault("other", Severity.ERROR),
+    )
+    assert wire.parse_lamps("22358 1") == (Lamp(22358, True),)
+    assert wire.parse_lamps("120 1 3000 0") == (Lamp(120, True), Lamp(3000, False))
+
+
+def test_values_of_class_2() -> None:
+    # PJLink 2.00, 4.4, 4.9, 4.14 and 4.18 to 4.26.
+    assert [wire.parse_input(code) for code in ("11", "59", "3A", "6z")] == ["11", "59", "3A", "6Z"]
+    assert [wire.is_class_1_input(code) for code in ("11", "59", "3A", "61", "10")] == [True, True, False, False, False]
+    assert wire.parse_input_resolution("1920x1080") == Resolution(1920, 1080)
+    assert wire.parse_input_resolution("1024X768") == Resolution(1024, 768)
+    assert wire.parse_input_resolution("-") is NoResolution.NO_SIGNAL
+    assert wire.parse_input_resolution("*") is NoResolution.UNKNOWN_SIGNAL
+    assert [wire.parse_freeze(digit) for digit in "01"] == [False, True]
+    assert [wire.parse_class(digit) for digit in "12"] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("parse", "value"),
+    [
+        (wire.parse_input, "71"),
+        (wire.parse_input, "30"),
+        (wire.parse_input, "3"),
+        (wire.parse_input_resolution, "1920"),
+        (wire.parse_input_resolution, ""),
+        (wire.parse_input_resolution, "1920x1080p"),
+        (wire.parse_input_resolution, "٣x٣"),
+        (wire.parse_freeze, "2"),
+        (wire.parse_class, "0"),
+        (wire.parse_class, "²"),
+        (wire.parse_power, "4"),
+        (wire.parse_power, ""),
+        (wire.parse_mute, "12"),
+        (wire.parse_mute, "on"),
+        (wire.parse_faults, "00000"),
+        (wire.parse_faults, "300000"),
+        (wire.parse_lamps, "120"),
+        (wire.parse_lamps, "120 2"),
+        (wire.parse_lamps, "-1 0"),
+        (wire.parse_lamps, "١ 1"),
+    ],
+)
+def test_values_outside_the_standard_are_protocol_errors(parse: object, value: str) -> None:
+    assert callable(parse)
+    with pytest.raises(ProtocolError):
+        parse(value)
+
+
+@pytest.mark.slow
+@given(
+    st.builds(
+        PjLinkRequest,
+        st.from_regex("[A-Z0-9]{4}", fullmatch=True),
+        PRINTABLE.filter(bool),
+        st.sampled_from((1, 2)),
+        st.sampled_from(("", "5d8409bc1c3fa39749434aa3a5c38682")),
+    )
+)
+def test_requests_come_back(request_: PjLinkRequest) -> None:
+    assert wire.parse_request(wire.encode_request(request_)[:-1]) == request_
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_value_or_a_protocol_error(line: bytes) -> None:
+    for parse in (wire.parse_greeting, wire.parse_request, wire.parse_reply):
+        try:
+            parse(line)
+        except ProtocolError as error:
+            assert len(str(error)) < 600  # noqa: PT017 – both outcomes are right; only the message is judged
+
+
+@pytest.mark.slow
+@given(st.data())
+def test_any_split_gives_the_same_lines(data: st.DataObject) -> None:
+    end = st.sampled_from((b"\r", b"\r\n", b"\n", b"\r\r\n", b"\r\0\0\0"))
+    value = st.one_of(
+        PRINTABLE,
+        st.sampled_from(("HDMI 1", "1920x1080", "-", "*", "3A", "11 31 3A 61", "45", "ERR3", "Höllenmaschine")),
+    )
+    command = st.sampled_from(("INNM", "IRES", "RRES", "SNUM", "SVER", "FILT", "RLMP", "RFIL", "FREZ", "INPT", "INST"))
+    reply = st.tuples(command, value).map(lambda both: f"%2{both[0]}={both[1]}")
+    lines = [line.encode() for line in data.draw(st.lists(st.one_of(PRINTABLE.filter(bool), reply), max_size=6))]
+    stream = b"".join(line + data.draw(end) for line in lines)
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
+    found, rest = list[bytes](), b""
+    for start, stop in zip([0, *cuts], [*cuts, len(stream)], strict=True):
+        rest += stream[start:stop]
+        while (taken := wire.take_line(rest)) is not None:
+            found.append(taken[0])
+            rest = rest[taken[1] :]
+    assert found == lines
+
+
+def test_the_longest_line_passes_and_one_byte_more_does_not() -> None:
+    longest = b"%1NAME=" + b"x" * 128
+    assert len(longest) + 1 == wire.MAX_LINE
+    assert wire.take_line(longest + b"\r") == (longest, 136)
+    assert wire.take_line(longest) is None
+    for longer in (longest + b"y\r", longest + b"y"):
+        with pytest.raises(ProtocolError):
+            wire.take_line(longer)
+
+
+MAC = "00:11:22:aa:bb:cc"
+
+
+@pytest.mark.parametrize(
+    ("datagram", "command", "value"),
+    [
+        (b"%2ACKN=00:11:22:aa:bb:cc\r", "ACKN", MAC),
+        (b"%2LKUP=00:11:22:aa:bb:cc\r", "LKUP", MAC),
+        (b"%2ERST=010020\r", "ERST", "010020"),
+        (b"%2POWR=1\r", "POWR", "1"),
+        (b"%2INPT=3A\r", "INPT", "3A"),
+    ],
+)
+def test_the_standards_datagrams(datagram: bytes, command: str, value: str) -> None:
+    reply = PjLinkReply(command, value, 2)
+    assert wire.encode_reply(reply) == datagram
+    for received in (datagram, datagram.lower() + b"\n", datagram[:-1], b"\r" + datagram + b"\0\0\0\0"):
+        (found,) = wire.replies_in(received)
+        assert (found.command, found.value.upper(), found.level) == (command, value.upper(), 2)
+
+
+@pytest.mark.parametrize(
+    "datagram",
+    [
+        b"", b"%2SRCH\r", b"%1POWR=1\r", b"PJLINK ERRA\r", b"\xff\xfe\x00", b"M-SEARCH * HTTP/1.1\r\n\r\n", b"x" * 2000,
+    ],
+)  # fmt: skip
+def test_what_is_none_of_ours_is_passed_over(datagram: bytes) -> None:
+    assert wire.replies_in(datagram) == ()
+
+
+def test_several_in_one_datagram_keep_their_order() -> None:
+    found = wire.replies_in(b"%2POWR=3\r%2what\r%2INPT=31\r")
+    assert found == (PjLinkReply("POWR", "3", 2), PjLinkReply("INPT", "31", 2))
+
+
+@given(st.binary(max_size=300))
+def test_any_datagram_is_read_without_complaint(datagram: bytes) -> None:
+    assert len(wire.replies_in(datagram)) <= len(datagram)
+
+
+class PaperNetwork(UdpSocket):
+    """Datagrams that arrive at given times, whoever asks; keeps what was sent and when."""
+
+    def __init__(self, clock: SimulatedClock, *arrivals: tuple[float, bytes, str]) -> None:
+        self._clock = clock
+        self._arrivals = list(arrivals)
+        self.sent: list[tuple[float, bytes, Address]] = []
+        self.closed = False
+
+    def send(self, data: bytes, address: Address) -> None:
+        self.sent.append((self._clock.monotonic(), data, address))
+
+    def receive(self, timeout: float) -> tuple[bytes, Address]:
+        now = self._clock.monotonic()
+        if self._arrivals and self._arrivals[0][0] <= now + timeout:
+            at, datagram, host = self._arrivals.pop(0)
+            self._clock.sleep(max(at - now, 0.0))
+            return datagram, (host, 4352)
+        self._clock.sleep(timeout)
+        raise LinkTimeout("nothing")
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def look(network: PaperNetwork, clock: SimulatedClock) -> tuple[FoundProjector, ...]:
+    ports: list[int] = []
+
+    def opened(port: int) -> PaperNetwork:
+        ports.append(port)
+        return network
+
+    found = search(open_socket=opened, clock=clock)
+    assert ports == [4352]
+    assert network.closed
+    return found
+
+
+def test_collects_for_thirty_seconds_and_names_each_once() -> None:
+    clock = SimulatedClock()
+    network = PaperNetwork(
+        clock,
+        (0.0, b"%2SRCH\r", "192.168.1.2"),  # our own question, come back
+        (0.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"),
+        (1.7, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"),
+        (2.0, b"%2POWR=1\r", "192.168.1.22"),
+        (9.9, b"%2ackn=00:11:22:AA:BB:02\r\n", "192.168.1.21"),
+        (10.0, b"%2ACKN=001122aabbcc\r", "192.168.1.24"),
+        (10.0, b"%2ACKN=00:11:22:aa:bb\r", "192.168.1.24"),
+        (10.0, b"%2ACKN=0g:11:22:aa:bb:cc\r", "192.168.1.24"),
+        (31.0, b"%2ACKN=00:11:22:aa:bb:03\r", "192.168.1.23"),
+    )
+    assert look(network, clock) == (
+        FoundProjector("192.168.1.20", "00:11:22:aa:bb:01"),
+        FoundProjector("192.168.1.21", "00:11:22:aa:bb:02"),
+    )
+    assert clock.monotonic() == pytest.approx(30.0)
+    assert [(data, address) for _, data, address in network.sent] == [(b"%2SRCH\r", ("255.255.255.255", 4352))] * 3
+    assert [at for at, _, _ in network.sent] == pytest.approx([0.0, 1.0, 2.0])
+
+
+def test_a_search_counts_from_its_own_begin() -> None:
+    clock = SimulatedClock()
+    clock.sleep(1000)
+    network = PaperNetwork(clock, (1000.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"))
+    assert [found.host for found in look(network, clock)] == ["192.168.1.20"]
+    assert clock.monotonic() == pytest.approx(1030.0)
+
+
+def test_an_empty_network_has_no_projectors() -> None:
+    clock = SimulatedClock()
+    assert look(PaperNetwork(clock), clock) == ()
+
+
+def test_junk_without_end_does_not_prolong_the_search() -> None:
+    clock = SimulatedClock()
+    network = PaperNetwork(clock, *[(0.01 * i, b"\xff" * 40, "192.168.1.9") for i in range(4000)])
+    assert look(network, clock) == ()
+    assert clock.monotonic() == pytest.approx(30.0, abs=0.1)
+
+
+def test_a_taken_port_is_told_with_its_remedy() -> None:
+    with UdpSocket(host="127.0.0.1") as taken, pytest.raises(LinkClosed, match="end the other program"):
+        search(listen_port=taken.address[1])
+
+
+def test_a_socket_that_was_closed_says_so() -> None:
+    udp = UdpSocket(host="127.0.0.1")
+    udp.close()
+    udp.close()
+    with pytest.raises(LinkClosed):
+        udp.receive(0.0)
+    with pytest.raises(LinkClosed, match=r"127\.0\.0\.1:9"):
+        udp.send(b"x", ("127.0.0.1", 9))
+
+
+def test_a_datagram_too_long_for_the_network_is_told() -> None:
+    with UdpSocket(host="127.0.0.1") as udp, pytest.raises(LinkClosed):
+        udp.send(b"x" * 70000, udp.address)

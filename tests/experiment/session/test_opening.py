@@ -1,0 +1,290 @@
+"""Readers, another writer, and the run: who waits for whom, and what a reader leaves behind."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+from collections.abc import Generator
+from contextlib import closing, contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from drivers.presenter import Colour
+from experiment.lights import Illumination
+from experiment.session import opening
+from experiment.session.journal import Journal
+from experiment.session.records import plan_steps
+from foundation.errors import FormatError, StorageError
+
+pytestmark = pytest.mark.slow
+
+STEPS = plan_steps((Illumination(0, "uniform", None, Colour(255, 0, 0)),), 2)
+NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
+
+HOLDER = """
+import sqlite3, sys
+connection = sqlite3.connect(sys.argv[1], isolation_level=None)
+for statement in sys.argv[2:]:
+    connection.execute(statement).fetchall()
+print("held", flush=True)
+sys.stdin.read()
+"""
+"""Another program: holds the journal as it is told, until its input ends."""
+
+READER = ("BEGIN", "SELECT * FROM events")
+WRITER = ("BEGIN IMMEDIATE", "INSERT INTO events (at, what, detail) VALUES ('2026-01-01T00:00:00+00:00', 'other', '')")
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    Journal.create(tmp_path / "journal.sqlite", STEPS)
+    return tmp_path / "journal.sqlite"
+
+
+@contextmanager
+def another_program(path: Path, *statements: str) -> Generator[subprocess.Popen[str]]:
+    """Run a program that holds the journal until its input is closed, at the latest at the end of the block."""
+    program = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(path), *statements],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with program:
+        assert program.stdout is not None
+        assert program.stdout.readline() == "held\n"
+        yield program
+        let_go(program)
+
+
+def let_go(program: subprocess.Popen[str]) -> None:
+    assert program.stdin is not None
+    program.stdin.close()
+    program.wait()
+
+
+def files(path: Path) -> dict[str, bytes]:
+    """Return what is in the journal's folder; what SQLite shares in memory is not looked into."""
+    return {
+        file.name: b"" if file.name.endswith("-shm") else file.read_bytes() for file in sorted(path.parent.iterdir())
+    }
+
+
+def whats(path: Path) -> list[str]:
+    with closing(Journal.open(path)) as journal:
+        return [event.what for event in journal.events()]
+
+
+def test_a_reader_never_stops_a_run(path: Path) -> None:
+    with (
+        closing(Journal.open_for_run(path, 0)) as journal,
+        another_program(path, *READER),
+    ):
+        for _ in range(30):
+            journal.note(NOW, "written")
+        assert whats(path) == ["written"] * 30
+    assert set(files(path)) >= {"journal.sqlite"}
+    with closing(Journal.open_for_run(path, 0)) as journal:
+        assert len(journal.events()) == 30
+    assert set(files(path)) == {"journal.sqlite"}, "the next run leaves one file again"
+
+
+def test_a_reader_who_was_there_before_the_run_does_not_stop_it(path: Path) -> None:
+    with another_program(path, *READER), closing(Journal.open_for_run(path, 0)) as journal:
+        journal.note(NOW, "written")
+        assert whats(path) == ["written"]
+    assert whats(path) == ["written"]
+    assert set(files(path)) == {"journal.sqlite"}
+
+
+def test_another_writer_is_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opening, "TRY_S", 0.01)
+    said: list[str] = []
+    with closing(Journal.open_for_run(path)) as journal, another_program(path, *WRITER) as other:
+
+        def announce(sentence: str) -> None:
+            said.append(sentence)
+            let_go(other)
+
+        journal.retry_locked(60, announce)
+        journal.note(NOW, "written")
+    assert said == [f"another program holds {path}; the run goes on when it has finished"]
+    assert whats(path) == ["written"]
+
+
+def test_another_writer_is_waited_for_at_the_start(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opening, "TRY_S", 0.01)
+    said: list[str] = []
+    with another_program(path, *WRITER) as other:
+
+        def announce(sentence: str) -> None:
+            said.append(sentence)
+            let_go(other)
+
+        with closing(Journal.open_for_run(path, 60, announce)) as journal:
+            journal.note(NOW, "written")
+    assert len(said) == 1
+    assert whats(path) == ["written"]
+
+
+def test_patience_ends_with_a_sentence_and_nothing_is_lost(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opening, "TRY_S", 0.01)
+    with closing(Journal.open_for_run(path, 0.05)) as journal:
+        with (
+            another_program(path, *WRITER),
+            pytest.raises(StorageError),
+        ):
+            journal.note(NOW, "not written")
+        journal.note(NOW, "written")
+    assert whats(path) == ["written"]
+
+
+def test_where_machines_share_no_memory_a_reader_is_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opening, "TRY_S", 0.01)
+
+    def shared(_: Path) -> bool:
+        return True
+
+    monkeypatch.setattr(opening, "_on_network", shared)
+    said: list[str] = []
+    with closing(Journal.open_for_run(path, 60)) as journal:
+        assert set(files(path)) == {"journal.sqlite"}
+        with another_program(path, *READER) as reader:
+
+            def announce(sentence: str) -> None:
+                said.append(sentence)
+                let_go(reader)
+
+            journal.retry_locked(60, announce)
+            journal.note(NOW, "written")
+    assert len(said) == 1
+    assert whats(path) == ["written"]
+
+
+def kill_a_run(path: Path) -> None:
+    """Leave what a run leaves that is killed: its last commits are in the side file."""
+    program = (
+        "import os, sys, signal\nfrom datetime import datetime, UTC\nfrom pathlib import Path\n"
+        "from experiment.session.journal import Journal\n"
+        "journal = Journal.open_for_run(Path(sys.argv[1]))\n"
+        "journal.note(datetime.now(UTC), 'last')\nos.kill(os.getpid(), signal.SIGKILL)"
+    )
+    assert subprocess.run([sys.executable, "-c", program, str(path)], check=False).returncode == -9
+    assert set(files(path)) == {"journal.sqlite", "journal.sqlite-wal", "journal.sqlite-shm"}
+
+
+def test_a_run_that_was_killed_is_read_and_taken_up(path: Path) -> None:
+    kill_a_run(path)
+    before = files(path)
+    assert whats(path) == ["last"]
+    assert files(path) == before
+    Journal.open_for_run(path).close()
+    assert whats(path) == ["last"]
+    assert set(files(path)) == {"journal.sqlite"}
+
+
+@pytest.mark.parametrize("kept", [("", "-wal"), ("", "-wal", "-shm"), ("",)])
+def test_a_copied_journal_is_read_as_it_is(path: Path, tmp_path: Path, kept: tuple[str, ...]) -> None:
+    kill_a_run(path)
+    copy = tmp_path / "copy" / "journal.sqlite"
+    copy.parent.mkdir()
+    for suffix in kept:
+        shutil.copy(f"{path}{suffix}", f"{copy}{suffix}")
+    before = files(copy)
+    assert whats(copy) == (["last"] if "-wal" in kept else []), "without its -wal the last commits are missing"
+    assert files(copy) == before, "a reader creates nothing"
+    Journal.open_for_run(copy).close()
+    assert set(files(copy)) == {"journal.sqlite"}
+
+
+def test_a_commit_that_was_cut_off_is_undone_in_a_copy_only(path: Path) -> None:
+    """As version 1 left it where the power went: a rollback journal that is hot."""
+    program = (
+        "import os, signal, sqlite3, sys\nconnection = sqlite3.connect(sys.argv[1], isolation_level=None)\n"
+        "connection.execute('PRAGMA cache_size = 1')\nconnection.execute('PRAGMA cache_spill = 1')\n"
+        "connection.execute('BEGIN IMMEDIATE')\n"
+        "for number in range(2000):\n"
+        "    connection.execute(\"INSERT INTO events (at, what, detail) VALUES ('x', 'lost', ?)\", ('a' * 200,))\n"
+        "os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    assert subprocess.run([sys.executable, "-c", program, str(path)], check=False).returncode == -9
+    assert set(files(path)) == {"journal.sqlite", "journal.sqlite-journal"}
+    before = files(path)
+    assert whats(path) == []
+    assert files(path) == before
+    Journal.open_for_run(path).close()
+    assert set(files(path)) == {"journal.sqlite"}
+
+
+@contextmanager
+def nobody(folder: Path) -> Generator[None]:
+    """Be somebody without rights in a folder; root, who may write everything, becomes another."""
+    root = os.geteuid() == 0
+    for file in folder.iterdir():
+        file.chmod(0o444)
+    folder.chmod(0o555)
+    if root:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        if root:
+            os.seteuid(0)
+        folder.chmod(0o755)
+
+
+@pytest.fixture
+def public() -> Generator[Path]:
+    """Lend a journal in a folder that everybody can come to; pytest's own are for one user."""
+    with tempfile.TemporaryDirectory() as place:
+        Path(place).chmod(0o755)
+        folder = Path(place) / "s"
+        folder.mkdir()
+        Journal.create(folder / "journal.sqlite", STEPS)
+        yield folder / "journal.sqlite"
+
+
+@pytest.mark.parametrize("state", ["at rest", "killed", "killed and copied"])
+def test_a_folder_that_may_not_be_written_is_read(public: Path, state: str) -> None:
+    if state.startswith("killed"):
+        kill_a_run(public)
+        if state.endswith("copied"):
+            public.with_name("journal.sqlite-shm").unlink()
+    before = files(public)
+    with nobody(public.parent):
+        assert whats(public) == (["last"] if state.startswith("killed") else [])
+    assert files(public) == before
+
+
+def test_where_there_are_no_locks_it_goes_on_with_a_warning(
+    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """SQLite answers `database is locked` to ENOLCK and `disk I/O error` to EINVAL; both at the first look."""
+    real = opening._connect_with
+
+    def connect(path: Path, parameters: str) -> sqlite3.Connection:
+        if "nolock" not in parameters:
+            raise sqlite3.OperationalError("database is locked")
+        return real(path, parameters)
+
+    monkeypatch.setattr(opening, "_connect_with", connect)
+
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    with monkeypatch.context() as refused:
+        refused.setattr(fcntl, "lockf", no_locks)
+        with closing(Journal.open_for_run(path, 0)) as journal:
+            journal.note(NOW, "written")
+        assert whats(path) == ["written"]
+    assert "this file system has no locks" in caplog.text
+    with pytest.raises(FormatError):
+        Journal.open(path)

@@ -1,0 +1,453 @@
+"""Spectra come to another grid without losing light, and without being smoothed where nothing need be gathered."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from functools import cache, partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import colour
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from foundation.errors import FormatError, InputError
+from sim import spectral
+from sim.spectral import (
+    WAVELENGTHS_NM,
+    LampSpectrum,
+    PaperName,
+    ProfileName,
+    daylight,
+    known_sensitivities,
+    paper,
+    parse_sensitivities,
+    print_reflectance,
+    printed_reflectance,
+    projector_primaries,
+    published_spectra,
+    read_sensitivities,
+    regridded,
+    require_grid,
+    sensitivities,
+)
+from tests.data_files import available
+from tests.sim.world.lab import intended_lab, relative_lab
+
+NODES = np.arange(380.0, 781.0, 5.0)
+
+
+def test_a_coarser_grid_is_joined_by_straight_lines() -> None:
+    coarse = np.arange(390.0, 731.0, 10.0)
+    found = regridded(coarse, coarse[:, None] ** 1, NODES)[:, 0]
+    inside = (NODES >= 390) & (NODES <= 730)
+    assert found[inside] == pytest.approx(NODES[inside])
+    assert np.count_nonzero(found[~inside]) == 0
+
+
+@pytest.mark.parametrize("at", [545.3, 546.1, 547.0, 549.9])
+def test_a_narrow_line_between_the_nodes_keeps_its_light_and_its_place(at: float) -> None:
+    fine = np.arange(380.0, 780.05, 0.1)
+    line = np.exp(-0.5 * ((fine - at) / 0.3) ** 2)[:, None]
+    found = regridded(fine, line, NODES)[:, 0]
+    light = float(line.sum()) * 0.1
+    assert found.sum() * 5 == pytest.approx(light, rel=1e-3)
+    assert (found * NODES).sum() * 5 / light == pytest.approx(at, abs=0.02)
+
+
+def test_a_line_among_coarse_steps_leaves_the_rest_smooth() -> None:
+    # Measured every 10 nm, and every 1 nm about a line: nodes between the coarse steps must not stay dark.
+    grid = np.unique(np.concatenate([np.arange(380.0, 781.0, 10.0), np.arange(540.0, 551.0)]))
+    found = regridded(grid, grid[:, None] / 500, NODES)[:, 0]
+    assert found[1:-1] == pytest.approx(NODES[1:-1] / 500, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        ([], "its wavelengths are none"),
+        ([410, 700], "410 to 700, 400 to 700 nm at least"),
+        ([400, 420, 420, *range(440, 701, 20)], "420 nm stands there twice"),
+        ([400, *range(425, 701, 5)], "a gap from 400 to 425 nm"),
+    ],
+)
+def test_a_grid_that_does_not_cover_the_visible_range_is_refused(grid: list[float], message: str) -> None:
+    with pytest.raises(FormatError, match=f"lamp: .*{message}"):
+        require_grid(np.array(grid, dtype=np.float64), "lamp")
+
+
+# They import colour-science, which takes more than a second.
+
+
+@pytest.mark.slow
+def test_every_light_is_the_published_one() -> None:
+    import colour
+
+    families: tuple[Any, ...] = (colour.SDS_ILLUMINANTS, colour.SDS_LIGHT_SOURCES)
+    theirs: dict[str, Any] = {str(name): light for family in families for name, light in family.items()}
+    found = published_spectra()
+    assert set(found) == set(theirs)
+    for name, light in found.items():
+        assert light.wavelengths_nm == pytest.approx(theirs[name].wavelengths, abs=1e-9), name
+        assert np.array_equal(light.power, theirs[name].values), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cct_k", [4000, 5003, 6504, 7000, 7001, 12_000, 25_000])
+def test_daylight_is_the_cie_s(cct_k: float) -> None:
+    import colour
+
+    theirs = colour.sd_CIE_illuminant_D_series(colour.temperature.CCT_to_xy_CIE_D(cct_k))
+    assert daylight(cct_k).power == pytest.approx(theirs.values, abs=1e-9)
+    assert np.array_equal(daylight(cct_k).wavelengths_nm, theirs.wavelengths)
+
+
+def document(step: float = 10, low: float = 390, high: float = 720, **changes: Any) -> dict[str, Any]:
+    grid = np.arange(low, high + 1, step)
+    peaks = np.array([600.0, 540.0, 460.0])
+    curves = np.exp(-0.5 * ((grid[:, None] - peaks) / 28) ** 2)
+    table = {f"{at:g}": row for at, row in zip(grid, curves.tolist(), strict=True)}
+    spectra = {"units": "relative", "index": {"main": ["R", "G", "B"]}, "data": {"main": table}}
+    return {"header": {"manufacturer": "Maker", "model": "M1"}, "spectral_data": spectra | changes}
+
+
+def parsed(content: Any) -> Any:
+    return parse_sensitivities(json.dumps(content).encode(), "m1", "m1.json")
+
+
+def test_those_that_come_with_the_suite_are_known_by_name() -> None:
+    assert len(known_sensitivities()) == 5
+    for name in known_sensitivities():
+        found = read_sensitivities(name)
+        assert found.camera == name.replace("_", " ")
+        # The files' own numbers at their own wavelengths: nothing is resampled there.
+        assert np.array_equal(sensitivities(name), found.curves)
+
+
+def test_another_grid_is_resampled_by_straight_lines_and_is_blind_beyond() -> None:
+    found = parsed(document())
+    assert found.camera == "Maker M1"
+    at = found.at(WAVELENGTHS_NM)[[0, 15, 16, 80]]
+    assert at[0].tolist() == at[3].tolist() == [0, 0, 0]
+    middle = (found.curves[found.wavelengths_nm == 450] + found.curves[found.wavelengths_nm == 460])[0] / 2
+    assert at[1] == pytest.approx(middle)
+    assert at[2, 2] == 1
+
+
+def altered(place: str, value: Any) -> dict[str, Any]:
+    content = document()
+    table = content["spectral_data"]["data"]["main"]
+    if value is None:
+        for at in place.split():
+            del table[at]
+    else:
+        table[place] = value
+    return content
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "expected rawtoaces"),
+        ({"spectral_data": {}}, r"spectral_data\.index: Field required"),
+        (document(units="quantum efficiency"), "units is 'quantum efficiency', 'relative' expected"),
+        (document(index={"main": ["X", "Y", "Z"]}), r"index\.main is \['X', 'Y', 'Z'\]"),
+        (altered("500 510 520", None), "a gap from 490 to 530 nm, 20 nm at most"),
+        (altered("500", [0.1, -0.2, 0.1]), "G is -0.2 at 500 nm, 0 or more expected"),
+        (altered("500", [0.1, 0.2]), r"at 500 nm stand \[0.1, 0.2\]; three numbers expected"),
+        (altered("blue", [0.1, 0.2, 0.3]), "'blue' is no wavelength"),
+        (altered("500.0", [0.1, 0.2, 0.3]), "500 nm stands there twice"),
+        (document(low=420), "its wavelengths are 420 to 720, 400 to 700 nm at least"),
+        (document(low=0.39, high=0.72, step=0.01), "convert them to nanometres"),
+        (altered("390", [0, 0, 0.3]), "B still has 30% of its peak at its last wavelength, 390 nm"),
+        (altered("720", [0.051, 0, 0]), "R still has 5% of its peak at its last wavelength, 720 nm"),
+    ],
+)
+def test_what_cannot_be_a_cameras_is_refused(content: Any, message: str) -> None:
+    assert parsed(altered("720", [0.05, 0, 0])).curves[-1, 0] == 0.05, "so much may be left at the end"
+    with pytest.raises(FormatError, match=message) as refused:
+        parsed(content)
+    assert str(refused.value).startswith("m1.json")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (json.dumps(document()).replace('"500"', '"490"'), "'490' stands there twice"),
+        ("[" * 100_000, "is no JSON"),
+    ],
+)
+def test_what_json_would_pass_over_or_fall_over_is_refused(text: str, message: str) -> None:
+    with pytest.raises(FormatError, match=message):
+        parse_sensitivities(text.encode(), "m1", "m1.json")
+
+
+def test_no_such_camera_names_those_that_are_known() -> None:
+    with pytest.raises(InputError, match=r"no camera 'Canon_EOS_1'.*Canon_EOS_5DS"):
+        read_sensitivities("Canon_EOS_1")
+
+
+def test_what_is_no_json_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "picture.json"
+    path.write_bytes(b"\xff\xd8\xff\xe0")
+    with pytest.raises(FormatError, match="is no JSON"):
+        read_sensitivities(str(path))
+
+
+PAPERS: tuple[PaperName, ...] = ("poster", "matt", "glossy")
+MANAGED: tuple[PaperName, ...] = ("poster", "glossy")
+"""Papers whose profiles are worked out here, each in a second: the one with the least black, and the one with most."""
+GREYS = np.repeat(np.arange(256)[:, None], 3, axis=1)
+CODES = np.array(list(product(range(0, 256, 17), repeat=3)))
+
+
+@cache
+def seen(profile: ProfileName, on: PaperName) -> NDArray[np.float64]:
+    """Return CIELAB of all greys under D50, relative to paper."""
+    return relative_lab(printed_reflectance(GREYS, profile, on), on)
+
+
+def difference(wanted: NDArray[np.float64], lab: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(colour.delta_E(wanted, lab, method="CIE 2000"), dtype=np.float64)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on", PAPERS)
+def test_unmanaged_greys_have_the_tint_that_measured_prints_have(on: PaperName) -> None:
+    # Papers printed without colour management (head of `sim.world.world`): the largest chroma is 5 to 14, but for one
+    # printer, an Epson P800, whose driver balances its greys (1.3).
+    lab = seen("unmanaged", on)
+    assert 5 < np.hypot(lab[:, 1], lab[:, 2]).max() < 14
+    assert np.diff(lab[:, 0]).min() > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on", MANAGED)
+def test_a_managed_print_has_the_colours_of_the_file_where_inks_reach(on: PaperName) -> None:
+    rng = np.random.default_rng(3)
+    pale = 128 + rng.integers(-40, 41, (400, 3))
+    off = difference(intended_lab(pale, on), relative_lab(printed_reflectance(pale, "managed", on), on))
+    assert np.median(off) < 0.3
+    assert off.max() < 2.5
+
+
+@pytest.mark.slow
+def test_no_ink_code_comes_nearer_than_the_profile_s() -> None:
+    axis = np.linspace(0, 255, 33)
+    inks = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    every = relative_lab(print_reflectance(inks, "glossy"), "glossy")
+    # Nodes of the profile's table, so that nothing is interpolated.
+    codes = np.random.default_rng(8).integers(0, 33, (60, 3)) * 255 / 32
+    wanted = intended_lab(codes, "glossy")
+    lab = relative_lab(printed_reflectance(codes, "managed", "glossy"), "glossy")
+    for target, found in zip(wanted, lab, strict=True):
+        along = target[1:] / np.hypot(*target[1:])
+
+        def away(
+            seen: NDArray[np.float64], target: NDArray[np.float64] = target, along: NDArray[np.float64] = along
+        ) -> NDArray[np.float64]:
+            off = seen - target
+            hue = off[..., 2] * along[0] - off[..., 1] * along[1]
+            return np.sqrt((off**2).sum(axis=-1) + 3 * hue**2)
+
+        assert float(away(found)) < float(away(every).min()) + 0.01
+
+
+@pytest.mark.slow
+def test_srgb_under_d50_is_the_adapted_matrix_of_its_primaries() -> None:
+    space = colour.RGB_COLOURSPACES["sRGB"]
+    whites: Any = [colour.xy_to_XYZ(xy) for xy in (space.whitepoint, (0.3457, 0.3585))]
+    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(*whites, transform="Bradford")
+    found = spectral._SRGB_TO_D50
+    np.testing.assert_allclose(found, adapt @ space.matrix_RGB_to_XYZ, atol=2e-4)
+
+
+CAMERAS = ("Canon_EOS_600D", "Canon_EOS_200D")
+LAMPS: tuple[LampSpectrum, ...] = ("uhp", "led")
+PAPER_NAMES: tuple[PaperName, ...] = ("poster", "matt", "glossy")
+
+
+def absolute_lab(reflectance: NDArray[np.float64], bare: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Return CIELAB (N, 3) under D50 relative to an ideal white, as instruments measure prints; or to a paper's."""
+    import colour
+
+    shape = colour.SpectralShape(380, 780, 5)
+    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape).values
+    light = observer * colour.SDS_ILLUMINANTS["D50"].copy().align(shape).values[:, None]
+    white = light.sum(axis=0)
+    chromaticity = (white / white.sum())[:2]
+    paper_xyz = white if bare is None else bare @ light
+    xyz = reflectance @ light / paper_xyz * white / white[1]
+    return np.asarray(colour.XYZ_to_Lab(xyz, chromaticity), dtype=np.float64)
+
+
+def measured(path: Path) -> dict[str, NDArray[np.float64]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    values = np.array(rows, dtype=np.float64)
+    return {name: values[:, i] for i, name in enumerate(header)}
+
+
+def interpolated(
+    at: NDArray[np.float64], where: NDArray[np.float64], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return np.asarray(np.interp(at, where, values), dtype=np.float64)
+
+
+def seen_under_white(
+    camera: str, lamp: LampSpectrum, codes: NDArray[np.uint8], on: PaperName = "poster"
+) -> NDArray[np.float64]:
+    """Return (N, 3) camera RGB of printed codes under the projector's white, 1 for bare paper."""
+    light = projector_primaries(lamp).sum(axis=0)[:, None] * sensitivities(camera)
+    return (print_reflectance(codes, on) @ light) / (paper(on).white @ light)
+
+
+@pytest.mark.parametrize("lamp", LAMPS)
+def test_the_projectors_white_is_near_d65(lamp: LampSpectrum) -> None:
+    # CIE 1931 2° observer, x̄ ȳ z̄ of CIE 018:2019 every 20 nm from 380; D65 is x 0.3127, y 0.3290.
+    observer = np.array(
+        [
+            [0.0014, 0.0000, 0.0065], [0.0143, 0.0004, 0.0679], [0.1344, 0.0040, 0.6456], [0.3483, 0.0230, 1.7471],
+            [0.2908, 0.0600, 1.6692], [0.0956, 0.1390, 0.8130], [0.0049, 0.3230, 0.2720], [0.0633, 0.7100, 0.0782],
+            [0.2904, 0.9540, 0.0203], [0.5945, 0.9950, 0.0039], [0.9163, 0.8700, 0.0017], [1.0622, 0.6310, 0.0008],
+            [0.8544, 0.3810, 0.0002], [0.4479, 0.1750, 0.0000], [0.1649, 0.0610, 0.0000], [0.0468, 0.0170, 0.0000],
+            [0.0114, 0.0041, 0.0000], [0.0029, 0.0010, 0.0000], [0.0007, 0.0002, 0.0000], [0.0002, 0.0001, 0.0000],
+            [0.0000, 0.0000, 0.0000],
+        ]
+    )  # fmt: skip
+    fine = np.stack([interpolated(WAVELENGTHS_NM, np.arange(380.0, 781, 20), column) for column in observer.T], axis=1)
+    white = projector_primaries(lamp).sum(axis=0) @ fine
+    np.testing.assert_allclose((white / white.sum())[:2], [0.3127, 0.3290], atol=0.02)
+
+
+def bell(peak_nm: float, width_nm: float) -> dict[str, NDArray[np.float64]]:
+    """Return a Gaussian with its full width at half maximum, in the layout of a measured primary."""
+    wavelength = np.arange(380.0, 781.0, 4.0)
+    power = np.exp(-4 * np.log(2) * ((wavelength - peak_nm) / width_nm) ** 2)
+    return {"wavelength_nm": wavelength, "power (median of 7 scans)": power}
+
+
+# Peaks and widths that `sim.world.world` documents of the measured primaries, and the curves where they are found.
+LED_PRIMARIES = {
+    "red": (0, lambda: bell(632, 19)),
+    "green": (1, lambda: bell(516, 34)),
+    "blue": (2, lambda: bell(452, 21)),
+} | {
+    path.stem: (index, partial(measured, path))
+    for index, name in enumerate(("r255g0b0o0", "r0g255b0o0", "r0g0b255o0"))
+    for path in available(f"projector/{name}_median.csv")
+}
+
+
+@pytest.mark.parametrize(("lamp_index", "table_of"), LED_PRIMARIES.values(), ids=LED_PRIMARIES)
+def test_led_primaries_resemble_a_measured_led_projector(
+    lamp_index: int, table_of: Callable[[], dict[str, NDArray[np.float64]]]
+) -> None:
+    table = table_of()
+    wavelength, power = table["wavelength_nm"], table["power (median of 7 scans)"]
+    ours = interpolated(wavelength, WAVELENGTHS_NM, projector_primaries("led")[lamp_index])
+    assert abs(wavelength[power.argmax()] - wavelength[ours.argmax()]) <= 4
+    overlap = float(ours @ power / np.sqrt((ours @ ours) * (power @ power)))
+    assert overlap > 0.98
+
+
+def documented_paper() -> dict[str, NDArray[np.float64]]:
+    """Return the values of measured photo paper that `sim.world.world` documents, in the layout of the whole."""
+    # Between 450 and 600 nm the white falls evenly; the inks are given as densities over white.
+    white = np.array([0.64, 0.93, 0.882, 0.85])
+    return {
+        "wavelength_nm": np.array([400.0, 450, 540, 600]),
+        "white": white,
+        "yellow_4/4": white * 10 ** -np.array([1.25, 1.25, np.nan, np.nan]),
+        "m_4/4": white * 10 ** -np.array([np.nan, 0.2, 1.17, np.nan]),
+    }
+
+
+MEASURED_PAPERS = {"documented": documented_paper} | {
+    path.stem: partial(measured, path) for path in available("print/photo_paper_reflectance.csv")
+}
+
+
+@pytest.mark.parametrize("table_of", MEASURED_PAPERS.values(), ids=MEASURED_PAPERS)
+def test_paper_and_inks_resemble_measured_photo_paper(table_of: Callable[[], dict[str, NDArray[np.float64]]]) -> None:
+    table = table_of()
+    at = table["wavelength_nm"]
+
+    def ours(code: list[int]) -> NDArray[np.float64]:
+        return interpolated(at, WAVELENGTHS_NM, print_reflectance([code])[0])
+
+    assert np.abs(ours([255, 255, 255]) - table["white"]).max() < 0.05
+    assert np.nanmean(np.abs(ours([255, 255, 0]) - table["yellow_4/4"])) < 0.05
+    assert np.nanmean(np.abs(ours([255, 0, 255]) - table["m_4/4"])) < 0.06
+
+
+# CIELAB (D50, CIE 1931, ideal white) of solids that an Epson XP-960 printed without colour management, computed from
+# the measured spectra that the head of `sim.world.world` names.
+SOLID_CODES = [[255] * 3, [0, 255, 255], [255, 0, 255], [255, 255, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255], [0] * 3]
+SOLID_LAB: dict[PaperName, list[list[int]]] = {
+    "matt": [[96, 0, -1], [50, -27, -56], [50, 78, -11], [90, 1, 104], [49, 69, 51], [41, -56, 27], [22, 30, -50],
+             [15, 0, -3]],
+    "glossy": [[95, -1, -2], [51, -38, -58], [50, 82, -17], [89, -4, 109], [49, 72, 67], [41, -80, 34], [15, 43, -65],
+               [5, 2, -4]],
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on", PAPER_NAMES)
+def test_colours_relative_to_paper_are_those_of_the_published_observer_and_light(on: PaperName) -> None:
+    reflectance = print_reflectance(SOLID_CODES, on)
+    expected = absolute_lab(reflectance, paper(on).white)
+    np.testing.assert_allclose(relative_lab(reflectance, on), expected, atol=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on", SOLID_LAB)
+def test_solids_of_photo_papers_look_like_measured_ones(on: PaperName) -> None:
+    import colour
+
+    white = relative_lab(print_reflectance([[255] * 3], on), on)
+    np.testing.assert_allclose(white, [[100, 0, 0]], atol=1e-6)
+    lab = absolute_lab(print_reflectance(SOLID_CODES, on))
+    off = colour.delta_E(np.array(SOLID_LAB[on], dtype=np.float64), lab, method="CIE 2000")
+    assert off.max() < 4.5
+    assert np.mean(off) < 2.5
+
+
+@pytest.mark.parametrize("on", PAPER_NAMES)
+def test_inks_lie_over_each_other_by_chance_and_light_spreads_between_them(on: PaperName) -> None:
+    """A half covered is 0.64 covered for dots that grow; Demichel's shares, mixed in the root (Yule-Nielsen, n = 2)."""
+    chosen = paper(on)
+    below = (chosen.white - chosen.surface) / (1 - chosen.surface)
+    cyan, magenta = chosen.inks[0], chosen.inks[1]
+    mixed = np.sqrt(below) * (
+        0.36 * 0.36
+        + 0.64 * 0.36 * (10 ** (-cyan / 2) + 10 ** (-magenta / 2))
+        + 0.64 * 0.64 * 10 ** (-(cyan + magenta) / 2)
+    )
+    seen_under_white = print_reflectance([[127.5, 127.5, 255]], on)[0]
+    np.testing.assert_allclose(seen_under_white, chosen.surface + (1 - chosen.surface) * mixed**2)
+
+
+@pytest.mark.parametrize("on", SOLID_LAB)
+@pytest.mark.parametrize("ink", [0, 1, 2])
+def test_ramps_have_the_spectra_of_measured_ramps(ink: int, on: PaperName) -> None:
+    """A step of a measured ramp is one of ours at some coverage: which, the printer's driver decides."""
+    files = available("print/photo_paper_reflectance.csv")
+    if not files:
+        pytest.skip("print/photo_paper_reflectance.csv is not here")
+    table = measured(files[0])
+    at = table["wavelength_nm"]
+    ramp = np.full((256, 3), 255)
+    ramp[:, ink] = np.arange(256)
+    ours = print_reflectance(ramp, on) / paper(on).white
+    ours = np.stack([interpolated(at, WAVELENGTHS_NM, row) for row in ours])
+    name = ("c", "m", "yellow")[ink]
+    for step in ("1/4", "2/4", "3/4"):
+        theirs = table[f"{name}_{step}"] / table["white"]
+        away = np.sqrt(((ours - theirs) ** 2).mean(axis=1)).min()
+        # Another printer's inks.
+        assert away < 0.08, (name, step, away)
