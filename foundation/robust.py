@@ -25,6 +25,16 @@ def sigma_of(residual: npt.NDArray[np.floating]) -> float:
     return MAD_TO_SIGMA * float(np.median(np.abs(residual)))
 
 
+def sigma_by_level(
+    residual: npt.NDArray[np.float64], level: npt.NDArray[np.float64], groups: int
+) -> npt.NDArray[np.float64]:
+    """Return `sigma_of` residuals (N,) in groups of like levels (N,), (N,) float64."""
+    found = np.empty(len(residual))
+    for part in np.array_split(np.argsort(level, kind="stable"), groups):
+        found[part] = sigma_of(residual[part])
+    return found
+
+
 def huber_weights(size: npt.NDArray[np.float64], sigma: float) -> npt.NDArray[np.float64]:
     """Return Huber's weights 0 … 1, of the shape of `size`.
 

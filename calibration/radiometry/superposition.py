@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from experiment.measures.least_squares import code_polynomial
-from foundation.robust import huber_weights, sigma_of
+from foundation.robust import huber_weights, sigma_by_level
 
 NODES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0)
 """Shares of saturation between which the deviation is interpolated; it is 0 at black."""
@@ -189,7 +189,7 @@ def superposition(
             design = np.zeros((len(value), size))
             design[:, :3], design[:, own], design[:, _AMOUNTS:] = parts, parts, bend
             left = value - design @ solution
-            sigma = _scatter(left, value)
+            sigma = sigma_by_level(left, value, _GROUPS) + 1e-9
             root = huber_weights(np.abs(left) / sigma, 1.0) / sigma
             # The primaries' frames have noise, too; what the print gives of them has not (two-stage least squares).
             rows, told = root[:, None] * known, root[:, None] * design
@@ -273,14 +273,6 @@ def _hats(share: _Array) -> _Array:
     np.put_along_axis(weights, right[..., None], part[..., None], axis=-1)
     np.put_along_axis(weights, right[..., None] - 1, 1 - part[..., None], axis=-1)
     return weights[..., 1:]
-
-
-def _scatter(left: _Array, level: _Array) -> _Array:
-    """Return the usual scatter (P,) of what is left, by groups of like levels."""
-    found = np.empty(len(left))
-    for part in np.array_split(np.argsort(level, kind="stable"), _GROUPS):
-        found[part] = sigma_of(left[part]) + 1e-9
-    return found
 
 
 def _misfit(known: _Array, left: _Array) -> float:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from calibration.spread.predicting import LevelModel
 from experiment.measures.least_squares import page_polynomial
-from foundation.robust import biweight, sigma_of
+from foundation.robust import biweight, sigma_by_level
 
 _KNOTS = 9
 """Places along the page's longer side at which added light is known; between them it is smooth: a spot of an eighth of
@@ -99,7 +99,9 @@ def added_light(
         left = model.residual_of(known)
         expected = model.predicted
         rows = model.known & usable
-        sigma = np.sqrt(_scatter(left[rows], expected[rows]) ** 2 + variance[rows, channel])
+        groups = max(min(20, int(rows.sum()) // 20), 1)
+        scatter = sigma_by_level(left[rows], expected[rows], groups)
+        sigma = np.sqrt(scatter**2 + variance[rows, channel])
         value = left[rows] / sigma
         design = model.residual(np.column_stack([bumps, factor * expected[:, None]]))[rows] / sigma[:, None]
         solution, covariance = _likeliest(value, design, bumps.shape[1])
@@ -135,11 +137,3 @@ def _likeliest(value: _Array, design: _Array, bumps: int) -> tuple[_Array, _Arra
         if evidence > best:
             best, heights, spread = evidence, solution[:bumps], covariance[:bumps, :bumps]
     return heights, spread
-
-
-def _scatter(left: _Array, level: _Array) -> _Array:
-    """Return the usual size (N,) of what is left, by groups of like levels."""
-    found = np.empty(len(left))
-    for part in np.array_split(np.argsort(level, kind="stable"), max(min(20, len(left) // 20), 1)):
-        found[part] = sigma_of(left[part])
-    return found

@@ -30,7 +30,7 @@ from scipy.optimize import nnls
 
 from calibration.spread.predicting import VARYING_BITS, LevelModel
 from experiment.measures.least_squares import page_polynomial, page_powers
-from foundation.robust import MAD_TO_SIGMA
+from foundation.robust import sigma_by_level
 
 NEAR_PX = (1.5, 3.0, 6.0)
 """σ of the near kernels, half-size px: from where a window of 25 pixels begins to see its neighbours to a slot's width;
@@ -679,11 +679,8 @@ def _reference_rows(one: ReferenceData, page_mm: tuple[float, float]) -> _Rows:
 
 def _weights(left: _Array, level: _Array) -> _Array:
     """Return the weight (N,) of each row from what is left of it: over the usual variance of its level, Huber's."""
-    variance = np.empty(len(left), dtype=np.float64)
     groups = min(_LEVELS, len(left) // 8) if float(np.ptp(level)) > 0 else 1
-    parts: list[npt.NDArray[np.int64]] = np.array_split(np.argsort(level, kind="stable"), groups)
-    for part in parts:
-        variance[part] = (MAD_TO_SIGMA * float(np.median(np.abs(left[part])))) ** 2 + 1e-12
+    variance = sigma_by_level(left, level, groups) ** 2 + 1e-12
     far = np.abs(left) / np.sqrt(variance)
     weights: _Array = np.minimum(1.0, _HUBER / np.maximum(far, 1e-9)) / variance
     return weights
