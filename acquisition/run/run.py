@@ -263,7 +263,7 @@ def verdict_line(taken: Taken) -> str:
 
 
 def _number_text(check: Check) -> str:
-    """Return a check's name and number, as in ``light 0.21°``."""
+    """Return a check's name and number, as in ``off_codes_deg 0.21°``."""
     unit = "" if not check.unit else check.unit if check.unit.startswith("°") else f" {check.unit}"
     return f"{check.name} {check.value:.3g}{unit}{' (beyond its limit)' if check.is_beyond else ''}"
 

@@ -796,8 +796,10 @@ STEP = SessionStep(7, "light", 5, Colour(1, 2, 3))
 
 
 def test_the_verdict_has_its_numbers() -> None:
-    checks = (Check("file"), Check("movement", 0.031, None, 0.2, "px"), Check("light", 0.2134, None, 0.5, "°"))
-    assert verdict_line(Taken(STEP, Judgement(checks), 3)) == "light 5 accepted, light 0.213°, movement 0.031 px"
+    checks = (Check("file"), Check("movement", 0.031, None, 0.2, "px"), Check("off_codes_deg", 0.2134, None, 0.5, "°"))
+    assert (
+        verdict_line(Taken(STEP, Judgement(checks), 3)) == "light 5 accepted, off_codes_deg 0.213°, movement 0.031 px"
+    )
     followed = Judgement((Check("lamp", -4.0, -1.0, 1.0, "%"), Check("light", 0.7, None, 0.5, "°")))
     assert verdict_line(Taken(STEP, followed, 3)) == "light 5 accepted, light 0.7° (beyond its limit)"
     dark = Judgement((Check("exposure", 0.4, None, None, "%", "too dark"),))
@@ -842,12 +844,12 @@ def test_a_run_into_a_file_has_a_line_now_and_then(capsys: pytest.CaptureFixture
         terminal.progress(0, 200)
         for done in range(1, 201):
             now[0] += 2.0
-            terminal.taken(Taken(STEP, Judgement((Check("light", 0.2, None, 0.5, "°"),)), 200 - done))
+            terminal.taken(Taken(STEP, Judgement((Check("off_codes_deg", 0.2, None, 0.5, "°"),)), 200 - done))
             terminal.progress(done, 200)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 + int(400 // PLAIN_S) + 1
     assert "0 of 200 frames" in lines[0]
-    assert "90 of 200 frames, left 3 min 40 s, light 5 accepted, light 0.2°" in lines[6]
+    assert "90 of 200 frames, left 3 min 40 s, light 5 accepted, off_codes_deg 0.2°" in lines[6]
     assert "200 of 200 frames, light 5 accepted" in lines[-1]
     assert "━" not in "".join(lines)
 
