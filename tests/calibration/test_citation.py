@@ -154,7 +154,7 @@ def test_an_origin_is_carried_by_the_file_unchanged() -> None:
     text = json.dumps(
         {
             "format": "crop.lut", "version": 1, "camera": "C", "bits": 1, "white_level": 9, "session_sha256": "",
-            "chart_sha256": "", "software": "", "origin": origin.model_dump(mode="json"),
+            "chart_sha256": "", "software": "", "has_sums": True, "origin": origin.model_dump(mode="json"),
         }
     )  # fmt: skip
     known = parse_provenance(text.encode(), Path("lut.json"))
