@@ -800,8 +800,8 @@ def test_the_verdict_has_its_numbers() -> None:
     assert (
         verdict_line(Taken(STEP, Judgement(checks), 3)) == "light 5 accepted, off_codes_deg 0.213°, movement 0.031 px"
     )
-    followed = Judgement((Check("lamp", -4.0, -1.0, 1.0, "%"), Check("light", 0.7, None, 0.5, "°")))
-    assert verdict_line(Taken(STEP, followed, 3)) == "light 5 accepted, light 0.7° (beyond its limit)"
+    followed = Judgement((Check("off_brightness", -4.0, -1.0, 1.0, "%"), Check("off_codes_deg", 0.7, None, 0.5, "°")))
+    assert verdict_line(Taken(STEP, followed, 3)) == "light 5 accepted, off_codes_deg 0.7° (beyond its limit)"
     dark = Judgement((Check("exposure", 0.4, None, None, "%", "too dark"),))
     assert verdict_line(Taken(STEP, dark, 3)) == "light 5 refused, exposure 0.4 %"
 
