@@ -203,13 +203,6 @@ class TestWholeFolder:
             raise error
         assert names(tmp_path) == []
 
-    def test_a_disk_that_takes_no_more_is_one_sentence_and_leaves_nothing(self, tmp_path: Path) -> None:
-        path = tmp_path / "lut"
-        with pytest.raises(StorageError), small_disk(1000):  # noqa: SIM117
-            with whole_folder(path, "the table") as folder:
-                (folder / "samples.npy").write_bytes(bytes(5000))
-        assert names(tmp_path) == []
-
     def test_a_leftover_is_cleared(self, tmp_path: Path) -> None:
         leftover = partial_path(tmp_path / "lut")
         leftover.mkdir()
@@ -348,11 +341,6 @@ def test_a_file_may_have_holes_of_a_gibibyte_together(tmp_path: Path, blocks: li
 ABC = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 """Of the bytes abc (FIPS 180-4, NIST's example values)."""
 NOTHING = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
-
-
-def test_an_array_that_does_not_lie_in_one_piece_is_refused() -> None:
-    with pytest.raises(ValueError, match="contiguous"):
-        sha256_of(np.arange(10, dtype=np.uint8)[::2])
 
 
 def test_a_file_of_several_blocks(tmp_path: Path) -> None:

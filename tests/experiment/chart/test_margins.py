@@ -118,9 +118,6 @@ def test_marks_have_air_between_them(apart: int, free: bool) -> None:
     assert margins.put("bottom", mark) is free
 
 
-NOTHING = np.empty((0, 4), dtype=np.int64)
-
-
 def test_a_chart_of_another_maker_without_margins_is_drawn(a7: Chart) -> None:
     high = a7.tags[-1].corners_mm[2] + 50 * PX_MM
     tight = replace(a7, page_mm=(float(high[0]) + 0.5, float(high[1]) + 0.5))
