@@ -540,10 +540,10 @@ def test_records_that_nobody_knows_and_a_queue_that_never_ends(lab: Lab) -> None
 
 
 HINTS: dict[str, Callable[[Responder], Responder]] = {
-    "lost": faults.LosingEvents,
+    "lost": lambda good: faults.ChangingEvents(good, lambda events: ()),
     "late": lambda good: faults.DelayingEvents(good, 5),
-    "flooding": lambda good: faults.RepeatingEvents(good, 400),
-    "unknown": lambda good: faults.UnknownEvents(good, PtpEvent(0xC1FE, 7, (1, 2, 3))),
+    "flooding": lambda good: faults.ChangingEvents(good, lambda events: events * 400),
+    "unknown": lambda good: faults.ChangingEvents(good, lambda events: (PtpEvent(0xC1FE, 7, (1, 2, 3)), *events)),
 }
 
 
@@ -611,22 +611,6 @@ def test_a_full_memory_is_emptied(lab: Lab) -> None:
     assert lab.waiting() == EOS_550D.burst
     lab.take()
     assert lab.waiting() == 0
-
-
-def test_a_body_that_went_to_sleep_is_waited_for(lab: Lab) -> None:
-    asleep: list[bool] = []
-
-    class Sleepy(faults.TroubledResponder):
-        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-            if asleep:
-                asleep.pop()
-                raise LinkClosed("it sleeps")
-            return super().answer(request, data)
-
-    lab.device = Sleepy(lab.eos)
-    lab.camera.configure(SETTINGS)
-    asleep.extend([True] * 4)
-    lab.take()
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from foundation import files as storage
@@ -26,7 +25,6 @@ from foundation.files import (
     partial_path,
     read_csv,
     read_whole,
-    sha256_of,
     whole_file,
     write_whole,
 )
@@ -212,13 +210,6 @@ class TestWholeFolder:
         assert names(tmp_path / "lut") == ["fresh"]
 
 
-def test_partial_names_are_told_from_others() -> None:
-    assert partial_path(Path("frames/a.CR2")) == Path("frames/.a.CR2.partial")
-    assert is_partial(".a.CR2.partial")
-    assert not is_partial("a.CR2.partial")
-    assert not is_partial(".hidden")
-
-
 def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
     require_free_file(tmp_path / "new", "the lights")
     require_free_file(tmp_path / "no" / "such" / "new", "the lights")
@@ -358,12 +349,3 @@ def test_what_is_written_is_hashed_counted_and_passed_on() -> None:
     writer = HashingWriter(stream)
     assert (writer.write(b"a"), writer.write(memoryview(b"bc"))) == (1, 2)
     assert (writer.tell(), writer.sha256, stream.getvalue()) == (3, ABC, b"abc")
-
-
-def test_an_array_counts_by_its_bytes() -> None:
-    stream = io.BytesIO()
-    writer = HashingWriter(stream)
-    numbers = np.arange(6, dtype="<u2").reshape(2, 3)
-    assert writer.write(numbers) == 12
-    assert (writer.tell(), stream.getvalue()) == (12, numbers.tobytes())
-    assert writer.sha256 == sha256_of(numbers)

@@ -115,10 +115,6 @@ def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
     assert rules["connect-src"] == "'self'"
 
 
-def sheet(name: str) -> str:
-    return (Path(pages.__file__).parent / "templates" / name).read_text(encoding="utf-8")
-
-
 def test_what_is_no_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="GIF89a"):
         pages.figure(b"GIF89a", "")

@@ -6,7 +6,6 @@ import csv
 import json
 from collections.abc import Callable
 from functools import cache, partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,6 @@ from sim.spectral import (
     read_sensitivities,
     regridded,
     require_grid,
-    sensitivities,
 )
 from tests.data_files import available
 from tests.sim.world.lab import intended_lab, relative_lab
@@ -181,7 +179,6 @@ PAPERS: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 MANAGED: tuple[PaperName, ...] = ("poster", "glossy")
 """Papers whose profiles are worked out here, each in a second: the one with the least black, and the one with most."""
 GREYS = np.repeat(np.arange(256)[:, None], 3, axis=1)
-CODES = np.array(list(product(range(0, 256, 17), repeat=3)))
 
 
 @cache
@@ -223,9 +220,7 @@ def test_srgb_under_d50_is_the_adapted_matrix_of_its_primaries() -> None:
     np.testing.assert_allclose(found, adapt @ space.matrix_RGB_to_XYZ, atol=2e-4)
 
 
-CAMERAS = ("Canon_EOS_600D", "Canon_EOS_200D")
 LAMPS: tuple[LampSpectrum, ...] = ("uhp", "led")
-PAPER_NAMES: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 
 
 def absolute_lab(reflectance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -250,14 +245,6 @@ def interpolated(
     at: NDArray[np.float64], where: NDArray[np.float64], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     return np.asarray(np.interp(at, where, values), dtype=np.float64)
-
-
-def seen_under_white(
-    camera: str, lamp: LampSpectrum, codes: NDArray[np.uint8], on: PaperName = "poster"
-) -> NDArray[np.float64]:
-    """Return (N, 3) camera RGB of printed codes under the projector's white, 1 for bare paper."""
-    light = projector_primaries(lamp).sum(axis=0)[:, None] * sensitivities(camera)
-    return (print_reflectance(codes, on) @ light) / (paper(on).white @ light)
 
 
 @pytest.mark.parametrize("lamp", LAMPS)
@@ -350,7 +337,7 @@ def test_solids_of_photo_papers_look_like_measured_ones(on: PaperName) -> None:
     assert np.mean(off) < 2.5
 
 
-@pytest.mark.parametrize("on", PAPER_NAMES)
+@pytest.mark.parametrize("on", PAPERS)
 def test_inks_lie_over_each_other_by_chance_and_light_spreads_between_them(on: PaperName) -> None:
     """A half covered is 0.64 covered for dots that grow; Demichel's shares, mixed in the root (Yule-Nielsen, n = 2)."""
     chosen = paper(on)

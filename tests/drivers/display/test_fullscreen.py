@@ -380,16 +380,6 @@ def test_the_display_that_was_named_lights_up_and_the_other_does_not(outputs: st
         assert np.array_equal(after[:, :640], before)
 
 
-def test_two_displays_at_once(outputs: str) -> None:
-    with contextlib.closing(FullScreen("left")) as left, contextlib.closing(FullScreen("right")) as right:
-        left.show(Colour(255, 0, 0))
-        right.show(Colour(0, 0, 255))
-        left.show(Colour(0, 255, 0))
-        picture = screenshot(outputs, 1120, 360)
-        assert plain(picture[:, :640]) == Colour(0, 255, 0)
-        assert plain(picture[:270, 640:]) == Colour(0, 0, 255)
-
-
 def test_tells_the_displays_apart(outputs: str) -> None:
     class Onlooker(SimulatedClock):
         picture: Picture | None = None

@@ -153,17 +153,6 @@ def test_a_chart_with_tags_needs_no_corners(white: Mosaic) -> None:
         find_chart(white, design_chart(1), corners=truth(UPRIGHT, white, field_mm(CHART)))
 
 
-def test_marks_in_the_margin_do_not_draw_the_refined_edge(white: Mosaic) -> None:
-    field = found_in(UPRIGHT, white)
-    places, heights = refine_edges(planes_of(white), field.outline_px, field.normals, 0.58)
-    off = ((places - truth(UPRIGHT, white, field.outline_mm)) * field.normals).sum(axis=2)
-    assert (heights > 0).any(axis=0).mean() > 0.7
-    for side in ((0, -1), (1, 0), (0, 1), (-1, 0)):
-        of_side = (heights > 0) & (field.normals @ np.array(side) > 0.9)
-        assert abs(np.median(off[of_side])) < 0.05
-        assert np.percentile(np.abs(off[of_side]), 80) < 0.12
-
-
 def test_each_colour_s_edge_is_where_the_lens_shows_it(tmp_path: Path) -> None:
     room = Room(waviness_mm=0.5, lateral_red_px=1.0, lateral_blue_px=-1.0)
     mosaic = lab_of(room).mosaic(tmp_path)

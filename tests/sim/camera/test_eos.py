@@ -18,7 +18,6 @@ from drivers.canon import (
     AvailableFormats,
     AvailableValues,
     DeviceInfoEx,
-    ImageFormat,
     Notice,
     PropertyChanged,
     PropertySetting,
@@ -26,7 +25,6 @@ from drivers.canon import (
     TransferRequest,
     decode_events,
     number_value,
-    text_value,
 )
 from drivers.ptp.codes import (
     AeMode,
@@ -107,27 +105,21 @@ class Host:
     def events(self) -> tuple[Record, ...]:
         return decode_events(self.ok(Operation.EOS_GET_EVENT))
 
-    def set(self, code: int, value: int | ImageFormat | str) -> int:
-        octets = (
-            value.encode()
-            if isinstance(value, ImageFormat)
-            else text_value(value)
-            if isinstance(value, str)
-            else number_value(value)
-        )
-        return self.code(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, data=PropertySetting(code, octets).encode())
+    def set(self, code: int, number: int) -> int:
+        setting = PropertySetting(code, number_value(number))
+        return self.code(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, data=setting.encode())
 
-    def take_control(self, destination: int = CaptureDestination.HOST) -> Host:
+    def take_control(self) -> Host:
         self.ok(Operation.OPEN_SESSION, 1)
         self.ok(Operation.EOS_SET_REMOTE_MODE, 1)
         self.ok(Operation.EOS_SET_EVENT_MODE, 1)
-        assert self.set(Property.EOS_CAPTURE_DESTINATION, destination) == ResponseCode.OK
+        assert self.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.HOST) == ResponseCode.OK
         self.ok(Operation.EOS_PC_HDD_CAPACITY, 0x0FFFFFFF, 0x1000, 1)
         self.events()
         return self
 
-    def press(self, autofocus: bool = False) -> int:
-        code = self.code(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, int(not autofocus))
+    def press(self) -> int:
+        code = self.code(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, 1)
         self.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
         return code
 

@@ -11,13 +11,12 @@ import pytest
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from sim import spectral
-from sim.spectral import daylight, paper, projector_primaries
+from sim.spectral import daylight, projector_primaries
 from sim.world.disturbances import AnyDisturbance, Disturbances, Moment
 from sim.world.sensors import BODIES, FACTS, Body, Rectangle, find_body
 from sim.world.world import REFERENCE_EXPOSURE, UNDISTURBED, Blob, Glare, Patch, Room, Situation, World
 from tests.pinned import Pinned
 from tests.sim.conftest import patches
-from tests.sim.world.lab import relative_lab
 
 TINY = replace(
     BODIES["Test"], sensor=(131, 187), visible=Rectangle(11, 16, 117, 166), masked=(Rectangle(0, 0, 131, 14),)
@@ -146,28 +145,6 @@ def test_several_things_at_once_show_what_they_showed(pinned: Pinned) -> None:
     for name, room in (("stain", Room(stain_mm=40)), ("fold", Room(fold_mm=4)), ("curl", Room(curl_mm=9, wave_mm=90))):
         found[name] = World(patches(), TINY, room).signal(WHITE, REFERENCE_EXPOSURE)
     pinned("a room's situations", [found, world.project(PLACES, "R", situations["all"])], same=SINGLE)
-
-
-@pytest.mark.parametrize("name", get_args(spectral.PaperName))
-def test_inks_are_what_they_were(name: spectral.PaperName, pinned: Pinned) -> None:
-    rgb = np.random.default_rng(3).uniform(0, 255, (40, 3)).round(1)
-    rgb[:3] = [[0, 0, 0], [255, 255, 255], [255, 0, 0]]
-    inks = spectral._Inks(name)
-    # Colours that inks reach, and some that they do not; a neutral one has no hue.
-    lab = np.array([[50.0, 0, 0], [60, 30, 20], [90, 80, -70], [20, -60, 40], [75, 5, 60], [100, 0, 0], [5, 5, -5]])
-    matching = inks.matching(lab)
-    found = {
-        "coverage": spectral.ink_coverage(rgb, name),
-        "reflectance": spectral.print_reflectance(rgb, name),
-        "lab": relative_lab(spectral.print_reflectance(rgb, name), name),
-        "paper": paper(name),
-        "overprints": paper(name).overprints(),
-        "intended": spectral._lab(spectral._wanted(rgb / 255, 0.02)),
-        "xyz": inks.xyz(rgb / 255),
-    }
-    pinned(f"inks on {name} paper", found)
-    # An inversion ends where its steps are small, not where they are nothing.
-    pinned(f"inks that look like colours, on {name} paper", [matching, inks.xyz(matching)], same=1e-3, nothing=1e-4)
 
 
 def test_lights_and_cameras_are_what_they_were(pinned: Pinned) -> None:
