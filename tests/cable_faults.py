@@ -124,13 +124,16 @@ class Falsifying(TroubledResponder):
         return answer
 
 
-class LosingEvents(TroubledResponder):
-    """Has no events, ever."""
+class ChangingEvents(TroubledResponder):
+    """Reports other events than the good device: none, each several times, unknown ones between."""
+
+    def __init__(self, good: Responder, change: Callable[[tuple[PtpEvent, ...]], tuple[PtpEvent, ...]]) -> None:
+        super().__init__(good)
+        self._change = change
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Take the good device's events, and lose them."""
-        super().events()
-        return ()
+        """Take the good device's events, and change them."""
+        return self._change(super().events())
 
 
 class DelayingEvents(TroubledResponder):
@@ -144,30 +147,6 @@ class DelayingEvents(TroubledResponder):
         """Return what came up some calls ago."""
         self._under_way.append(super().events())
         return self._under_way.pop(0)
-
-
-class RepeatingEvents(TroubledResponder):
-    """Reports each event `times` times: 2 is a device that stutters, many thousands one that floods."""
-
-    def __init__(self, good: Responder, times: int = 2) -> None:
-        super().__init__(good)
-        self._times = times
-
-    def events(self) -> tuple[PtpEvent, ...]:
-        """Return the good device's events, each several times."""
-        return tuple(event for event in super().events() for _ in range(self._times))
-
-
-class UnknownEvents(TroubledResponder):
-    """Sends `unknown`, an event of an undefined code, before each real one."""
-
-    def __init__(self, good: Responder, unknown: PtpEvent) -> None:
-        super().__init__(good)
-        self._unknown = unknown
-
-    def events(self) -> tuple[PtpEvent, ...]:
-        """Return the good device's events, each behind an unknown one."""
-        return tuple(event for real in super().events() for event in (self._unknown, real))
 
 
 class TroubledPipes:

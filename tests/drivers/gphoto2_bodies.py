@@ -184,7 +184,6 @@ class FakeBody:
     stubborn: frozenset[str] = frozenset()
     fails: list[int] = field(default_factory=list[int])
     files: dict[str, bytes] = field(default_factory=dict[str, bytes])
-    set_to: list[tuple[str, object]] = field(default_factory=list[tuple[str, object]])
     pending: dict[str, tuple[int, BodySetting]] = field(default_factory=dict[str, tuple[int, BodySetting]])
     number: int = 0
     openings: int = 0
@@ -214,7 +213,6 @@ class FakeBody:
         assert not setting.fixed, f"{name} is read-only"
         value = f"{widget.value:.9g}" if isinstance(widget.value, float) else str(widget.value)
         assert not setting.choices or value in setting.choices, f"{value} is not offered for {name}"
-        self.set_to.append((name, widget.value))
         if name not in self.stubborn:
             self.pending[name] = self.settles_after, replace(setting, value=value)
 

@@ -1,6 +1,6 @@
 """A simulated EOS in a process of its own, for an initiator that keeps the interpreter of its process to itself.
 
-``python -m tests.drivers.gphoto2_server`` takes lines ``PORT MODE``, for each of which it prints the address of a body,
+``python -m tests.drivers.gphoto2_server`` takes numbers of ports, for each of which it prints the address of a body,
 then a line for each exposure, until the line ``end``, which it answers by ``ended``. Each body is a fork, since the
 imports take half a second.
 """
@@ -16,7 +16,6 @@ from datetime import datetime
 from typing import BinaryIO
 
 from drivers.camera import ExposureSettings
-from drivers.ptp.codes import AeMode
 from foundation.clock import SystemClock
 from sim.buses.ptp import serve_ptpip
 from sim.camera.bodies import EOS_550D
@@ -39,16 +38,11 @@ def _end(number: int, frame: object) -> None:
     sys.exit()
 
 
-def serve(port: int, mode: str) -> None:
+def serve(port: int) -> None:
     """Serve one body until SIGTERM comes."""
     signal.signal(signal.SIGTERM, _end)
     body = replace(EOS_550D, write_s=0.02)
-    if mode == "no contacts":
-        body = replace(body, aperture_codes=())
     eos = SimulatedEos(body, ReportedFilm(FILM_BYTES), SystemClock(), auto_power_off_s=0)
-    if mode == "unprepared":
-        eos.turn_dial(AeMode.APERTURE_PRIORITY)
-        eos.switch_focus(automatic=True)
     with serve_ptpip(eos, port) as server:
         host, number = server.address
         print(f"ptpip:{host}:{number}:{number}", flush=True)
@@ -65,8 +59,7 @@ def main() -> None:
             os.waitpid(pid, 0)
             print("ended", flush=True)
         elif not (pid := os.fork()):
-            port, _, mode = line.strip().partition(" ")
-            serve(int(port), mode)
+            serve(int(line))
 
 
 if __name__ == "__main__":

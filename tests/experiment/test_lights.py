@@ -50,27 +50,6 @@ def test_uniform_lights_hold_the_primaries_and_stand_on_the_grid(plan: tuple[Ill
     np.testing.assert_allclose(light / light.sum(axis=1, keepdims=True), linear, atol=0.002)
 
 
-# CIE 1931 xy of Planckian radiators, c2 = 1.4388e-2 m K, as tables of the Planckian locus give them.
-@pytest.mark.parametrize(
-    ("cct_k", "x", "y"),
-    [(2000, 0.5267, 0.4133), (4000, 0.3805, 0.3768), (10000, 0.2807, 0.2884)],
-)
-def test_black_bodies_have_the_published_chromaticities(
-    cct_k: int, x: float, y: float, plan: tuple[Illumination, ...]
-) -> None:
-    # XYZ to linear sRGB and the transfer function, IEC 61966-2-1, spelt out here.
-    red = 3.2406 * x - 1.5372 * y - 0.4986 * (1 - x - y)
-    green = -0.9689 * x + 1.8758 * y + 0.0415 * (1 - x - y)
-    blue = 0.0557 * x - 0.2040 * y + 1.0570 * (1 - x - y)
-    brightest = max(red, green, blue)
-    expected: list[float] = []
-    for value in (red, green, blue):
-        linear = value / brightest
-        expected.append(255 * (1.055 * linear ** (1 / 2.4) - 0.055) if linear > 0.0031308 else 255 * 12.92 * linear)
-    (light,) = (light for light in plan if light.cct_k == cct_k)
-    assert codes((light,))[0] == pytest.approx(expected, abs=1.0)
-
-
 def test_temperatures_are_read() -> None:
     assert parse_ccts("2000:3000:250") == (2000, 2250, 2500, 2750, 3000)
     assert parse_ccts("2000:2999:500") == (2000, 2500)

@@ -92,10 +92,6 @@ def test_every_code_comes_back() -> None:
     np.testing.assert_array_equal(back, codes)
 
 
-Colour = tuple[float, float, float]
-COLOURS = st.tuples(*[st.floats(1e-3, 1e3)] * 3)
-
-
 def test_known_angles() -> None:
     assert angles_deg([1, 0, 0], [0, 1, 0]) == pytest.approx(90)
     assert angles_deg([1, 0, 0], [1, 1, 0]) == pytest.approx(45)

@@ -179,42 +179,6 @@ def test_a_compiled_function_is_there_where_nothing_can_be_kept(kernels: Kernels
     assert kernels.code() == []
 
 
-@pytest.mark.slow
-def test_only_the_decorator_keeps_machine_code() -> None:
-    """`cache=True` anywhere else would fail where there is no folder for it."""
-    caching = [
-        str(path.relative_to(ROOT))
-        for package in ("drivers", "sim", "acquisition", "calibration", "synthesis", "generator", "evaluation")
-        for path in (ROOT / package).rglob("*.py")
-        if "cache=True" in path.read_text()
-    ]
-    assert caching == []
-
-
-ANNOUNCED = """
-import pty, os, sys
-pid, terminal = pty.fork()
-if pid == 0:
-    from kernels.square import square
-    square(5), square(2.5)
-    os._exit(0)
-said = b""
-while True:
-    try:
-        said += os.read(terminal, 1000)
-    except OSError:
-        break
-os.waitpid(pid, 0)
-print(said.count(b"compiling for this processor"))
-"""
-
-
-@pytest.mark.slow
-def test_the_first_start_says_on_a_terminal_why_it_takes_long(kernels: Kernels) -> None:
-    assert kernels.run(ANNOUNCED) == ["1"]
-    assert kernels.run(ANNOUNCED) == ["0"], "nothing is compiled the second time"
-
-
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system binds no process to processors")
 def test_a_process_bound_to_one_processor_counts_one() -> None:
     before = os.sched_getaffinity(0)

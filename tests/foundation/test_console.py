@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import errno
-import gc
 import io
 import logging
 import os
 import pickle
-import re
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -22,14 +19,13 @@ import pytest
 from foundation import errors
 from foundation.console import (
     Ending,
-    loaded,
     new_app,
     orderly_end,
     progress,
     run,
     shows_progress,
 )
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError
 
 
 def failing(error: BaseException) -> Callable[[], None]:
@@ -191,33 +187,6 @@ def test_a_full_device_under_stdout_is_5(lines: int) -> None:
     assert "cannot write standard output: " in error or "cannot print: " in error
 
 
-MEANWHILE = """
-from foundation.console import progress
-with progress("files") as told:
-    told(1, 2)
-    print("found")
-"""
-
-
-@pytest.mark.slow
-def test_what_is_printed_beside_a_bar_on_the_terminal_goes_where_standard_output_goes() -> None:
-    pty = pytest.importorskip("pty")
-    terminal, end = pty.openpty()
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", MEANWHILE],
-            env={**os.environ, "TERM": "xterm"},
-            stdout=subprocess.PIPE,
-            stderr=end,
-            check=True,
-        )
-        os.close(end)
-        assert b"1/2" in os.read(terminal, 1 << 16)
-    finally:
-        os.close(terminal)
-    assert done.stdout.splitlines() == [b"found"]
-
-
 @pytest.mark.usefixtures("hang_up")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_hang_up_that_is_ignored_stays_ignored(number: int) -> None:
@@ -309,38 +278,6 @@ def test_a_working_folder_that_is_gone_is_said(
     monkeypatch.chdir(tmp_path)
 
 
-def test_garbage_is_looked_for_when_modules_are_loaded_and_after_every_end() -> None:
-    seen: list[bool] = []
-
-    def work() -> None:
-        seen.append(gc.isenabled())
-        loaded()
-        seen.append(gc.isenabled())
-
-    def fail() -> None:
-        raise InputError("no such file")
-
-    assert (run(work, loads=True), gc.isenabled(), seen) == (0, True, [False, True])
-    assert (run(fail, loads=True), gc.isenabled()) == (2, True)
-    assert run(lambda: seen.append(gc.isenabled())) == 0
-    assert seen[-1], "what does not say that it loads modules is left alone"
-    gc.disable()
-    try:
-        run(fail, loads=True)
-        assert not gc.isenabled(), "whoever has it off keeps it off"
-    finally:
-        gc.enable()
-
-
-COMMANDS = ("acquisition", "calibration", "generator", "evaluation", "synthesis")
-
-
-@pytest.fixture(params=COMMANDS)
-def main(request: pytest.FixtureRequest) -> Callable[[list[str]], int]:
-    """Return a command's `main`."""
-    return import_module(f"{request.param}.cli").main
-
-
 def test_errors_alone_means_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
     from foundation import console as command_line
 
@@ -390,13 +327,6 @@ def test_a_flag_before_and_behind_the_command_prints_a_record_once(capsys: pytes
     assert capsys.readouterr().out.startswith("croplab ")
 
 
-def test_the_short_form_of_evaluate_takes_them_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from evaluation.cli import main
-
-    assert main(["-q", str(tmp_path / "none")]) == 2
-    assert str(tmp_path / "none") in capsys.readouterr().err
-
-
 PRINTING = "from foundation.console import run; import sys; sys.exit(run(lambda: print('30 \u00b0 \u2026')))"
 
 
@@ -432,14 +362,3 @@ def test_a_job_is_done_though_the_reader_of_its_output_left(tmp_path: Path, unbu
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (0, b"")
     assert (tmp_path / "done").exists()
-
-
-@pytest.mark.slow
-def test_no_color_is_obeyed() -> None:
-    """https://no-color.org: any value that is not empty; colours there are without it."""
-    wish = [sys.executable, "-m", "acquisition.cli", "--help"]
-    for more, coloured in (({}, True), ({"NO_COLOR": "1"}, False)):
-        settings = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "TERM")}
-        settings |= {"FORCE_COLOR": "1", "TERM": "xterm-256color", **more}
-        shown = subprocess.run(wish, env=settings, capture_output=True, text=True, check=True).stdout
-        assert bool(re.search(r"\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|10[0-7])(?:;\d+)*m", shown)) == coloured

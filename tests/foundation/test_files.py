@@ -13,7 +13,6 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from foundation import files as storage
@@ -26,7 +25,6 @@ from foundation.files import (
     partial_path,
     read_csv,
     read_whole,
-    sha256_of,
     whole_file,
     write_whole,
 )
@@ -203,13 +201,6 @@ class TestWholeFolder:
             raise error
         assert names(tmp_path) == []
 
-    def test_a_disk_that_takes_no_more_is_one_sentence_and_leaves_nothing(self, tmp_path: Path) -> None:
-        path = tmp_path / "lut"
-        with pytest.raises(StorageError), small_disk(1000):  # noqa: SIM117
-            with whole_folder(path, "the table") as folder:
-                (folder / "samples.npy").write_bytes(bytes(5000))
-        assert names(tmp_path) == []
-
     def test_a_leftover_is_cleared(self, tmp_path: Path) -> None:
         leftover = partial_path(tmp_path / "lut")
         leftover.mkdir()
@@ -217,13 +208,6 @@ class TestWholeFolder:
         with whole_folder(tmp_path / "lut", "the table") as folder:
             write_whole(folder / "fresh", "x")
         assert names(tmp_path / "lut") == ["fresh"]
-
-
-def test_partial_names_are_told_from_others() -> None:
-    assert partial_path(Path("frames/a.CR2")) == Path("frames/.a.CR2.partial")
-    assert is_partial(".a.CR2.partial")
-    assert not is_partial("a.CR2.partial")
-    assert not is_partial(".hidden")
 
 
 def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
@@ -350,11 +334,6 @@ ABC = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 NOTHING = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
 
 
-def test_an_array_that_does_not_lie_in_one_piece_is_refused() -> None:
-    with pytest.raises(ValueError, match="contiguous"):
-        sha256_of(np.arange(10, dtype=np.uint8)[::2])
-
-
 def test_a_file_of_several_blocks(tmp_path: Path) -> None:
     data = bytes(range(256)) * 10_000
     (tmp_path / "a").write_bytes(data)
@@ -370,12 +349,3 @@ def test_what_is_written_is_hashed_counted_and_passed_on() -> None:
     writer = HashingWriter(stream)
     assert (writer.write(b"a"), writer.write(memoryview(b"bc"))) == (1, 2)
     assert (writer.tell(), writer.sha256, stream.getvalue()) == (3, ABC, b"abc")
-
-
-def test_an_array_counts_by_its_bytes() -> None:
-    stream = io.BytesIO()
-    writer = HashingWriter(stream)
-    numbers = np.arange(6, dtype="<u2").reshape(2, 3)
-    assert writer.write(numbers) == 12
-    assert (writer.tell(), stream.getvalue()) == (12, numbers.tobytes())
-    assert writer.sha256 == sha256_of(numbers)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import http.client
-import io
 import ipaddress
 import re
 import socket
-import sys
 import threading
 from contextlib import AbstractContextManager, ExitStack, suppress
 from typing import Any
@@ -19,9 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.local_server import (
-    ANSWER_S,
     Access,
-    Connections,
     LocalServer,
     Refusal,
     Request,
@@ -117,30 +113,6 @@ def test_a_reader_finds_the_address_in_what_is_printed() -> None:
     assert len(rows) - 1 - down.max() == 4 + (down.max() - down.min() + 1) % 2
 
 
-@pytest.mark.parametrize(
-    ("host", "terminal", "encoding", "is_shown"),
-    [
-        ("0.0.0.0", True, "UTF-8", True),
-        ("0.0.0.0", True, "latin-1", False),
-        ("0.0.0.0", False, "utf-8", False),
-        ("127.0.0.1", True, "utf-8", False),
-    ],
-)
-def test_a_terminal_that_has_the_characters_shows_others_the_code(
-    monkeypatch: pytest.MonkeyPatch, host: str, terminal: bool, encoding: str, is_shown: bool
-) -> None:
-    shown = io.TextIOWrapper(io.BytesIO(), encoding, errors="replace")
-    monkeypatch.setattr(shown, "isatty", lambda: terminal)
-    monkeypatch.setattr(sys, "stdout", shown)
-    with Echo(host, 0) as server:
-        monkeypatch.setattr(server, "serve_forever", lambda: None)
-        server.serve("nothing", "can look")
-    shown.seek(0)
-    lines = shown.read().splitlines()
-    assert (len(lines) > 9) is is_shown
-    assert lines[0].endswith(" shows nothing; Ctrl-C ends it")
-
-
 class Echo(LocalServer):
     command = "echo"
 
@@ -201,14 +173,6 @@ def test_a_page_that_asks_now_and_then_keeps_its_connection() -> None:
         assert link.recv(1) == b"", "an idle one ends"
 
 
-class Time:
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 def is_closed(far: socket.socket) -> bool:
     try:
         return far.recv(1) == b""
@@ -216,53 +180,6 @@ def is_closed(far: socket.socket) -> bool:
         return False
     except ConnectionError:
         return True
-
-
-def crowd(stack: ExitStack, *addresses: str) -> list[tuple[socket.socket, socket.socket, str]]:
-    """Return both ends of a connection from each address."""
-    made = [(*socket.socketpair(), address) for address in addresses]
-    for near, far, _ in made:
-        stack.enter_context(near)
-        stack.enter_context(far).settimeout(0.01)
-    return made
-
-
-@pytest.mark.slow
-def test_who_gives_way_to_a_new_connection() -> None:
-    time = Time()
-    connections = Connections(4, time)
-    with ExitStack() as stack:
-        made = crowd(stack, "viewer", "many", "many", "many", "new", "new", "new", "new", "new")
-        for near, _, address in made[:4]:
-            time.now += 1
-            assert connections.admit(near, address)
-        connections.mark(made[0][0], "idle")
-        connections.mark(made[1][0], "idle")
-        # Of the address with the most, first who never asked, the oldest of them.
-        gone: list[int] = []
-        for near, _, address in made[4:7]:
-            time.now += 1
-            assert connections.admit(near, address)
-            gone += [number for number, (_, far, _) in enumerate(made) if number not in gone and is_closed(far)]
-        assert gone == [2, 3, 4]
-
-
-def test_nobody_gives_way_who_is_being_answered_unless_he_is_slow() -> None:
-    time = Time()
-    connections = Connections(2, time)
-    with ExitStack() as stack:
-        (one, far, _), (two, _, _), (three, _, _) = crowd(stack, "a", "a", "b")
-        for near in (one, two):
-            assert connections.admit(near, "a")
-            connections.mark(near, "answered")
-        assert not connections.admit(three, "b")
-        time.now += ANSWER_S / 2
-        connections.mark(two, "answered")
-        time.now += ANSWER_S * 0.6
-        assert connections.admit(three, "b")
-        assert is_closed(far)
-        connections.forget(two)
-        assert connections.admit(one, "a"), "there is room"
 
 
 def test_a_viewer_who_takes_nothing_loses_the_place() -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from foundation import pages
-from foundation.plots import FAINT, GRID, INK, PAPER, svg_of
+from foundation.plots import INK, svg_of
 
 VOID = {"meta", "img", "br", "link"}
 
@@ -113,21 +113,6 @@ def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
         assert rules[name] == f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
     assert rules["default-src"] == "'none'"
     assert rules["connect-src"] == "'self'"
-
-
-def test_colours_of_text_follow_the_reader_s_system() -> None:
-    light, _, dark = sheet("colours.css").partition("@media (prefers-color-scheme: dark)")
-    of_light, of_dark = (dict(re.findall(r"--(\w+): (#\w+)", part)) for part in (light, dark))
-    assert of_light.keys() == of_dark.keys()
-    assert [of_light[name] for name in ("ink", "faint", "grid", "paper")] == [INK, FAINT, GRID, PAPER]
-    # No rule names a colour of text or ground by itself; pictures keep their white one.
-    assert "#" not in sheet("style.css").replace("background: #fff", "")
-    used = set(re.findall(r"var\(--(\w+)\)", sheet("style.css")))
-    assert used <= of_light.keys()
-
-
-def sheet(name: str) -> str:
-    return (Path(pages.__file__).parent / "templates" / name).read_text(encoding="utf-8")
 
 
 def test_what_is_no_picture_is_refused() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from foundation.console import run
 from foundation.errors import InputError, StorageError
-from foundation.secret_texts import is_webhook, masked, masked_values, printable, target_label
+from foundation.secret_texts import masked, masked_values, printable
 
 
 @pytest.mark.parametrize(
@@ -35,19 +35,6 @@ def test_addresses_lose_their_secrets(text: str, shown: str) -> None:
 def test_values_for_json_keep_their_shape() -> None:
     value = {"a": ["ftp://u:p@h/x", 3, None], "b": ("ftp://u:p@h/x",), "ftp://u:p@h": True}
     assert masked_values(value) == {"a": ["ftp://…@h/x", 3, None], "b": ["ftp://…@h/x"], "ftp://u:p@h": True}
-
-
-@pytest.mark.parametrize(
-    ("target", "shown"),
-    [
-        ("HTTPS://user:s3cret@ntfy.example/s3cret", "https://ntfy.example/…"),
-        ("curl -H s3cret", "curl …"),
-        ("notify-me", "notify-me"),
-    ],
-)
-def test_of_a_target_its_host_or_first_word_is_shown(target: str, shown: str) -> None:
-    assert target_label(target) == shown
-    assert is_webhook(target) is target.startswith("HTTPS")
 
 
 @pytest.mark.parametrize("sign", ["\u2028", "\u202e", "\u2066", "\u2069", "\x9b", "\x7f"])

@@ -37,47 +37,6 @@ def test_a_taken_port_is_one_line(capsys: pytest.CaptureFixture[str], arguments:
     assert error.count("\n") == 1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["projector"],
-        ["projector", "--pjlink", "x"],
-        ["projector", "--pjlink", "70000"],
-        ["toaster"],
-    ],
-)
-def test_wrong_arguments_end_with_2(arguments: list[str]) -> None:
-    assert main([*arguments]) == 2
-
-
-def test_a_password_longer_than_the_standards_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["projector", "--pjlink", "0", "--password", "x" * 33]) == 2
-    assert "at most 32" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--room", "wavy=1"], "the command line: unknown key '--room.wavy'"),
-        (["--room", "fill"], "--room 'fill': NAME=VALUE expected"),
-        (["--room", "profile=shiny"], "--room.profile"),
-        (["--watch-projector", "127.0.0.1:4352"], "--watch-projector needs --watch-screen"),
-        (["--watch-screen", "HDMI-1"], "'HDMI-1' is no screen"),
-        (["--chart", "chart.json"], "charts are read by the program sim"),
-    ],
-)
-def test_a_camera_that_cannot_be_is_one_sentence(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
-) -> None:
-    assert main(["camera", "--port", "0", "--model", "Test", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1
-    assert words in error
-
-
 def test_a_screen_or_projector_that_is_not_there_ends_with_3(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

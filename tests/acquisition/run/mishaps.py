@@ -201,11 +201,11 @@ def delays_events(lab: TroubledLab) -> None:
 
 
 def repeats_events(lab: TroubledLab) -> None:
-    lab.device = faults.RepeatingEvents(lab.device)
+    lab.device = faults.ChangingEvents(lab.device, lambda events: events * 2)
 
 
 def loses_events(lab: TroubledLab) -> None:
-    lab.device = faults.LosingEvents(lab.device)
+    lab.device = faults.ChangingEvents(lab.device, lambda events: ())
 
 
 def stalls(lab: TroubledLab) -> None:

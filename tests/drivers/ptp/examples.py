@@ -14,8 +14,6 @@ from drivers import canon
 from drivers.ptp import ip as ptpip
 from drivers.ptp import usb as container
 from drivers.ptp.protocol import (
-    MAX_DATASET,
-    Cursor,
     DeviceInfo,
     ObjectInfo,
     StorageInfo,
@@ -63,16 +61,6 @@ STATE = bytes.fromhex(
     "02000000 10000000 06000000 00000000 04000000 10000000 01000000 00000000 03000000"
     "0c000000 8bc10000 01000000  0a000000 fec10000 abcd  08000000 00000000"
 )
-# libgphoto2's ptp.h: GetObjectInfoEx on a body of 2006, a folder; and its ptp-pack.c: a picture.
-FOLDER_ENTRY = bytes.fromhex(
-    "38000000 00000030 01000000 01300000 01000000 10000000 00000000 00000020 00000030"
-    "4443494d000000000000000000000000 ccc30146"
-)
-PICTURE_ENTRY = bytes.fromhex(
-    "38000000 720c7492 01000200 01380000 00000000 21000000 19d52100 00007492 700c7492"
-    "494d475f303139392e4a504700000000 107c984d"
-)
-OBJECT_ENTRIES = b"\x02\0\0\0" + FOLDER_ENTRY + PICTURE_ENTRY
 DEVICE_INFO_EX = bytes.fromhex("20000000 02000000 81c10000 89c10000 01000000 01d10000 01000000 04000000")
 SETTING = bytes.fromhex("0c000000 1cd10000 04000000")
 RAW_FORMAT = bytes.fromhex("01000000 10000000 06000000 00000000 04000000")
@@ -117,19 +105,6 @@ def read_ip(data: bytes) -> object:
     return ptpip.PacketCutter().feed(data)
 
 
-def decode_object_entries(data: bytes) -> tuple[canon.ObjectEntry, ...]:
-    """Return the objects that GetObjectInfoEx (0x9109) answers, for which the driver never asks."""
-    cursor = Cursor(data, "GetObjectInfoEx", MAX_DATASET)
-    count = cursor.u32("the count of objects")
-    entries: list[canon.ObjectEntry] = []
-    # A record takes at least four bytes, so that the bytes left bound the loop whatever the count says.
-    for number in range(count):
-        length = cursor.u32("the length of a record")
-        body = cursor.take(max(length - 4, 0), f"record {number} of {count}")
-        entries.append(canon.ObjectEntry.read(Cursor(body, f"GetObjectInfoEx, record {number}")))
-    return tuple(entries)
-
-
 READERS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
     ("DeviceInfo", DeviceInfo.decode, DEVICE_INFO),
     ("ObjectInfo", ObjectInfo.decode, OBJECT_INFO),
@@ -140,7 +115,6 @@ READERS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
     ("GetEvent, shot", canon.decode_events, EOS_400D_SHOT[12:]),
     ("GetEvent, transfer", canon.decode_events, TRANSFER_REQUEST),
     ("GetEvent, state", canon.decode_events, STATE),
-    ("GetObjectInfoEx", decode_object_entries, OBJECT_ENTRIES),
     ("DeviceInfoEx", canon.DeviceInfoEx.decode, DEVICE_INFO_EX),
     ("setting", canon.PropertySetting.decode, SETTING),
     ("image format", canon.ImageFormat.decode, RAW_FORMAT),

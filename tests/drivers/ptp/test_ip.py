@@ -130,22 +130,6 @@ def test_what_is_no_packet_is_named(octets: str, says: str) -> None:
         cutter.feed(ptpip.encode(Ping()))
 
 
-@pytest.mark.parametrize(
-    "packet",
-    [
-        InitCommandRequest(bytes(15), "lab"),
-        InitCommandRequest(bytes(16), "a\0b"),
-        InitCommandRequest(bytes(16), "x" * 256),
-        InitEventRequest(1 << 32),
-        OperationRequest(sends_data=False, request=PtpRequest(0x1002, 0, (0,) * 6)),
-        StartData(5, 1 << 64),
-    ],
-)
-def test_what_the_wire_cannot_hold_is_our_own_mistake(packet: Packet) -> None:
-    with pytest.raises(ValueError, match=r"."):
-        ptpip.encode(packet)
-
-
 GUID = bytes(range(16))
 
 
@@ -376,20 +360,6 @@ def test_a_garbled_byte_never_ends_in_anything_but_our_errors(at: int, value: in
         return
     assert done.response.transaction == 5
     assert len(done.data) == 100 or not done.response.ok
-
-
-def test_reset_is_a_new_connection() -> None:
-    first, second = FarEnd(), FarEnd()
-    ends = [second, first]
-    transport = IpTransport(
-        lambda: ends[-1].open_command(), lambda: ends[-1].open_event(), guid=GUID, name="Cr", clock=SimulatedClock()
-    )
-    ends.pop()
-    transport.reset()
-    with pytest.raises(LinkClosed):
-        first.command.write(b"x", PATIENCE_S)
-    second.command.write(DONE, PATIENCE_S)
-    assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).response.ok
 
 
 @pytest.mark.parametrize("taken_up_before", [True, False])

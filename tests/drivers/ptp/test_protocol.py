@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import tracemalloc
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pytest
 from hypothesis import example, given, settings
@@ -13,20 +12,12 @@ from hypothesis import strategies as st
 
 from drivers import canon
 from drivers.canon import (
-    APERTURE,
-    ISO,
-    AvailableValues,
     DeviceInfoEx,
-    ImageFormat,
-    Notice,
-    PropertyChanged,
     PropertySetting,
-    number_of,
 )
 from drivers.ptp import protocol
 from drivers.ptp import usb as container
 from drivers.ptp.codes import DataType, ObjectFormat, Operation, Property, ResponseCode
-from drivers.ptp.ip import EndData, OperationRequest, PacketCutter, StartData, encode
 from drivers.ptp.protocol import (
     OPEN_TRIES,
     PASSING_LIMIT_S,
@@ -44,7 +35,6 @@ from drivers.ptp.protocol import (
     decode_u32_array,
     encode_u32_array,
 )
-from drivers.ptp.usb import ContainerReader, DataPiece, DataStart
 from foundation.clock import SimulatedClock
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from tests.drivers.ptp import examples
@@ -132,33 +122,6 @@ def test_properties_are_the_standards_bytes() -> None:
 def test_values_are_the_standards_bytes(data_type: int, value: Value, octets: str) -> None:
     assert protocol.encode_value(data_type, value) == bytes.fromhex(octets)
     assert protocol.decode_value(data_type, bytes.fromhex(octets)) == value
-
-
-@pytest.mark.parametrize(
-    ("data_type", "value"),
-    [
-        (DataType.UINT8, 256),
-        (DataType.INT8, 128),
-        (DataType.UINT16, -1),
-        (DataType.STRING, "x" * 255),
-        (DataType.STRING, "a\0b"),
-        (DataType.STRING, "\ud800"),
-        (DataType.STRING, 5),
-        (DataType.UINT8, "5"),
-        (DataType.UINT8, (5,)),
-        (0x4002, 5),
-        (0x4002, (256,)),
-        (0x000B, 5),
-        (0xBFFF, "x"),
-    ],
-)
-def test_what_the_wire_cannot_hold_is_our_own_mistake(data_type: int, value: Value) -> None:
-    with pytest.raises(ValueError, match=r"."):
-        protocol.encode_value(data_type, value)
-
-
-# ISO 15740:2013, clauses 10 to 13; Canon's as libgphoto2 2.5 has them in camlibs/ptp2/ptp.h. Hexadecimal, first-last
-# where they follow each other, in the order in which their names stand.
 
 
 def test_more_than_the_bound_is_refused_unread() -> None:
@@ -360,20 +323,6 @@ def test_any_bytes(read: Read) -> None:
 
 @pytest.mark.slow
 @EVERY
-def test_pieces_of_others(read: Read, octets: bytes) -> None:
-    pieces = [octets, *(row[2] for row in ALL)]
-    places = st.integers(0, 100)
-
-    @settings(max_examples=40)
-    @given(st.lists(st.tuples(st.sampled_from(pieces), places, places), max_size=4), places)
-    def check(cuts: list[tuple[bytes, int, int]], kept: int) -> None:
-        outcome(read, octets[:kept] + b"".join(piece[start : start + length] for piece, start, length in cuts))
-
-    check()
-
-
-@pytest.mark.slow
-@EVERY
 def test_no_count_makes_memory(read: Read, octets: bytes) -> None:
     damaged = [octets[:place] + b"\xff\xff\xff\x0f" + octets[place + 4 :] for place in range(len(octets) - 3)]
     tracemalloc.start()
@@ -397,33 +346,8 @@ REBUILT: dict[int, Callable[[bytes], bytes]] = {
 }
 
 
-@dataclass(frozen=True)
-class Facts:
-    """What a body is and how it stands: of the 60D as other programs read the recording, of the 550D as listed."""
-
-    version: str
-    model_id: int
-    properties: int
-    values: int
-    lists: int
-    iso: float
-    aperture: float
-    image_format: str
-    battery_percent: int
-
-
-FACTS = {
-    "EOS 60D": Facts("3-1.1.0", 0x80000287, 87, 77, 84, 1600, 4, "JPEG L fine", 50),
-    "EOS 550D": Facts("3-1.0.9", 0x80000270, 63, 56, 61, 100, 8, "RAW", 100),
-}
-
-
 def payload(transaction: Recorded) -> bytes:
     return bytes.fromhex(transaction["data"] or "")
-
-
-def first(recording: list[Recorded], operation: Operation) -> bytes:
-    return next(payload(entry) for entry in recording if int(entry["code"], 16) == operation)
 
 
 def test_every_dataset_is_rebuilt_to_the_byte(recording: list[Recorded]) -> None:
@@ -434,23 +358,6 @@ def test_every_dataset_is_rebuilt_to_the_byte(recording: list[Recorded]) -> None
             assert REBUILT[int(entry["code"], 16)](data) == data, number
             rebuilt += 1
     assert (len(recording), rebuilt) == (70, 48)
-
-
-def test_every_transaction_crosses_both_cables(recording: list[Recorded]) -> None:
-    for entry in recording:
-        code, tid, data = int(entry["code"], 16), entry["tid"], payload(entry)
-        request, response = PtpRequest(code, tid, tuple(entry["params"])), PtpResponse(int(entry["rc"], 16), tid)
-        phase = b"" if entry["data"] is None else container.encode_data_header(code, tid, len(data)) + data
-        stream = container.encode(request) + phase + container.encode(response)
-        pieces = (stream[at : at + 64] for at in range(0, len(stream), 64))
-        reader = ContainerReader(64)
-        messages = [message for piece in pieces for message in reader.feed(piece)]
-        assert (messages[0], messages[-1]) == (request, response)
-        assert b"".join(m.data for m in messages if isinstance(m, DataPiece)) == data
-        if entry["data"] is not None:
-            assert messages[1] == DataStart(code, tid, len(data))
-        packets = [OperationRequest(entry["dir"] == "out", request), StartData(tid, len(data)), EndData(tid, data)]
-        assert PacketCutter().feed(b"".join(map(encode, packets))) == packets
 
 
 def test_commands_are_the_bytes_that_the_host_sent(recording: list[Recorded]) -> None:
@@ -464,27 +371,3 @@ def test_commands_are_the_bytes_that_the_host_sent(recording: list[Recorded]) ->
     destination, aperture = Property.EOS_CAPTURE_DESTINATION, Property.EOS_APERTURE
     sent = [(destination, 4), (aperture, 0x24), (destination, 2), (destination, 4), (aperture, 0x24), (destination, 1)]
     assert [PropertySetting(code, canon.number_value(value)).encode() for code, value in sent] == settings
-
-
-def test_the_state_dump(body: str, recording: list[Recorded]) -> None:
-    facts = FACTS[body]
-    records = canon.decode_events(first(recording, Operation.EOS_GET_EVENT))
-    # The values, then one notice, then the lists.
-    assert Counter(type(record).__name__ for record in records) == {
-        "PropertyChanged": facts.values,
-        "AvailableValues": facts.lists,
-        "AvailableFormats": 2,
-        "Notice": 1,
-    }
-    assert isinstance(records[facts.values], Notice)
-    state = {record.code: record for record in records if isinstance(record, PropertyChanged)}
-    assert number_of(state[Property.EOS_MODEL_ID].value) == facts.model_id
-    assert ISO.value(number_of(state[Property.EOS_ISO_SPEED].value)) == facts.iso
-    assert APERTURE.value(number_of(state[Property.EOS_APERTURE].value)) == facts.aperture
-    assert str(ImageFormat.decode(state[Property.EOS_IMAGE_FORMAT].value)) == facts.image_format
-    lists = {record.code: record.values for record in records if isinstance(record, AvailableValues)}
-    assert lists[Property.EOS_CAPTURE_DESTINATION] == (2, 4, 6)
-    # Both wear a lens of f/3.5 and offer third stops.
-    labels = [APERTURE.label(code) for code in lists[Property.EOS_APERTURE]]
-    assert labels[:6] == ["3.5", "4", "4.5", "5", "5.6", "6.3"]
-    assert lists[Property.EOS_SHUTTER_SPEED] == ()

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import random
 import struct
 from collections.abc import Callable
-from dataclasses import fields, replace
-from datetime import UTC, datetime
-from fractions import Fraction
+from dataclasses import fields
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,19 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers import tiff
-from drivers.camera import ExposureSettings
 from drivers.raw import rawfile
-from drivers.raw.lossless_jpeg import jpeg_size, lossless_fault
-from drivers.raw.rawfile import CHANNELS, FrameOrigin, Mosaic, decode_raw, filled_fault, frame_black, plane_of
-from drivers.raw.storage import Area, Cr3, Stored, ciff_entries, read_cr3
-from drivers.tiff import TiffDamaged, TiffTag, ValueType, read_directories
+from drivers.raw.rawfile import CHANNELS, Mosaic, decode_raw, filled_fault, frame_black, plane_of
+from drivers.raw.storage import Stored
+from drivers.tiff import TiffDamaged, TiffTag, read_directories
 from foundation.errors import FormatError
-from sim.camera.film import write_dng
-from sim.world.sensors import BODIES, FACTS, Rectangle
 from tests.data_files import shipped
-from tests.drivers.raw.maker_files import areas, box, counts_of, cr3, maker_files, packed, track
-from tests.drivers.raw.raw_files import Tags, cr2_bytes, dng_bytes, longs, lossless_jpeg, ratios, shorts, text
+from tests.drivers.raw.maker_files import areas, box, counts_of, cr3, maker_files, track
+from tests.drivers.raw.raw_files import cr2_bytes, dng_bytes, longs, ratios, shorts, text
 from tests.fuzz.raw import changed, entries
 from tests.pinned import Pinned
 
@@ -122,96 +114,6 @@ def test_damaged_files_are_told_as_before(pinned: Pinned) -> None:
     pinned("raw files with damage", found)
 
 
-@pytest.mark.slow
-def test_tags_at_their_limits_are_told_as_before(pinned: Pinned) -> None:
-    strip, size = lossless_jpeg(FULL), 2 * TONES.size
-    packed_dng = {bits: {258: shorts(bits), 279: longs(48 * 80 * bits // 8)} for bits in (8, 12, 14)}
-    changes: list[tuple[Tags, bytes | None]] = [({}, None)]
-    changes += [(dict(one), packed(TONES % (1 << bits), bits)) for bits, one in packed_dng.items()]
-    changes += [
-        ({tag: longs(value)}, None) for tag in (256, 257, 278) for value in (0, 1, 2, 47, 48, 49, 80, 81, 65535, 65536)
-    ]
-    changes += [({258: shorts(bits)}, None) for bits in (0, 7, 8, 15, 16, 17)]
-    changes += [({259: shorts(one)}, None) for one in (0, 6, 8, 9, 32767, 32946, 34892, 52546)]
-    changes += [({277: shorts(one)}, None) for one in (0, 2)] + [({339: shorts(one)}, None) for one in (1, 2)]
-    changes += [({262: shorts(one), 254: longs(kind)}, None) for one, kind in product((1, 2, 32803, 34892), (0, 1))]
-    changes += [({279: longs(one)}, None) for one in (0, size - 1, size, size + 1)]
-    changes += [({50706: (1, 4, version)}, None) for version in (b"\0\0\0\0", b"\1\0\0\0")]
-    changes += [({50712: shorts(*tones)}, None) for tones in ((0, 1), (1, 1), (2, 1), (5,), (1, 2, 2))]
-    changes += [({33422: (1, 4, bytes(one))}, None) for one in ((0, 1, 1, 2), (2, 1, 1, 0), (0, 0, 1, 2), (1, 3, 2, 1))]
-    changes += [
-        ({50714: shorts(one), 50717: longs(white)}, None)
-        for one, white in ((0, 1), (64, 64), (63, 64), (9, 65536), (9, 65535), (9, 0))
-    ]
-    changes += [
-        ({50715: ratios((3, 1)), 50716: ratios((1, 4)), 50713: shorts(*of)}, None) for of in ((1, 1), (2, 1), (3, 1))
-    ]
-    changes += [
-        ({50829: longs(*of)}, None)
-        for of in ((0, 0, 48, 80), (0, 0, 1, 80), (5, 7, 49, 80), (1, 1, 3, 3), (9, 9, 9, 80))
-    ]
-    lossless: Tags = {259: shorts(7), 258: shorts(14), 279: longs(len(strip)), 50717: longs(16383)}
-    changes += [
-        ({**lossless, **more}, strip)
-        for more in ({}, {257: longs(49)}, {256: longs(78)}, {278: longs(24)}, {258: shorts(8)})
-    ]
-    changes += [
-        ({**lossless, 324: longs(0), 325: longs(len(strip)), 322: longs(wide), 323: longs(high)}, strip)
-        for wide, high in ((80, 48), (96, 48), (80, 64), (0, 48))
-    ]
-    found: list[Any] = []
-    for more, pixels in changes:
-        data = dng_bytes(TONES, {50829: longs(2, 4, 48, 80), **more}, pixels)
-        mosaic = said(
-            lambda data=data: rawfile._plain_mosaic(Path("case"), data, rawfile._examined(Path("case"), data))
-        )
-        told = (
-            [mosaic.black, mosaic.white_level, mosaic.pattern, mosaic.visible] if isinstance(mosaic, Mosaic) else mosaic
-        )
-        found.append([contents(data), told])
-    pinned(
-        "raw files with tags at their limits",
-        {
-            "refused": ["refused" in one for one, _ in found],
-            "read": found,
-        },
-    )
-
-
-def test_boxes_and_heaps_are_read_as_before(pinned: Pinned) -> None:
-    def record(data: bytes) -> Any:
-        found: Cr3 = read_cr3(data)
-        return {"black": found.black, "frames": [stored(one) for one in found.frames]}
-
-    sizes, places = struct.pack(">III3I", 0, 0, 3, 9, 8, 7), struct.pack(">II3Q", 0, 3, 10, 30, 50)
-    many = box(b"stsz", sizes), box(b"co64", places)
-    tracks = {
-        "two": cr3(),
-        "one": BOXES,
-        "of many samples": cr3("Canon EOS R", track(areas((0, 0, 0, 0), (1, 2, 3, 4)), b"CRAW", (64, 64), *many)),
-    }
-    pinned(
-        "boxes of raw files",
-        {**{name: record(data) for name, data in tracks.items()}, "heap": ciff_entries(REAL["canon_powershot_g2.crw"])},
-    )
-
-
-def test_lossless_jpegs_are_told_as_before(pinned: Pinned) -> None:
-    counts = (2048 + np.random.default_rng(3).poisson(900, (12, 16))).astype(np.uint16)
-    stream = lossless_jpeg(counts)
-    begin = stream.index(b"\xff\xda") + 14
-    flipped = [bytes([*stream[:at], stream[at] ^ bit, *stream[at + 1 :]]) for at in range(begin) for bit in (1, 16)]
-    damaged = [stream[:at] + stream[at + 1 :] for at in range(begin, len(stream), 9)]
-    more = (b"", bytes(4), bytes(5), b"\1\1\1\1\1\1", b"\1\1\1\1\2", bytes(17) + b"\xff\xd9")
-    behind = [stream[:-2] + one for one in (*more, b"\1\1\1\1\1\1\1\1\2", b"\1\2\3")]
-    every = [stream, *flipped, *damaged, *behind]
-    found = {
-        "faulty": [lossless_fault(one) is not None for one in every],
-        "sizes": [[*(jpeg_size(one) or ())] for one in every],
-    }
-    pinned("streams of lossless JPEG", found)
-
-
 def test_directories_of_all_types_are_read_as_before(pinned: Pinned) -> None:
     def one(order: str, tag: int, kind: int, count: int, value: bytes) -> bytes:
         place = value.ljust(4, b"\0") if len(value) <= 4 else struct.pack(order + "I", 26)
@@ -229,84 +131,3 @@ def test_directories_of_all_types_are_read_as_before(pinned: Pinned) -> None:
         read = said(lambda data=data: [list(one.values.values()) for one in read_directories(data)])
         found.setdefault(f"{order}{tag.name}", []).append(read)
     pinned("directories of all types", found)
-
-
-@pytest.mark.slow
-def test_bytes_of_raw_files_are_what_they_were(pinned: Pinned) -> None:
-    tiny = {
-        "sensor": (30, 44),
-        "visible": Rectangle(4, 8, 25, 33),
-        "masked": (Rectangle(0, 0, 30, 6), Rectangle(0, 8, 2, 33)),
-    }
-    found: dict[str, Any] = {}
-    for name, body in (*BODIES.items(), *FACTS.items(), ("unknown", replace(BODIES["Test"], sensitivities="nobody's"))):
-        stream = io.BytesIO()
-        counts = np.arange(30 * 44, dtype=np.uint16).reshape(30, 44) + np.uint16(body.black)
-        settings = ExposureSettings(400, None if name == "Test" else 5.6, 1 / 60)
-        write_dng(
-            stream, counts, replace(body, **tiny), settings=settings, taken_at=datetime(2026, 5, 6, 7, 8, 9, tzinfo=UTC)
-        )  # names from above
-        data = stream.getvalue()
-        found[name] = [data, seen(decode_raw(data, Path("case")))["masked black"], rawfile.camera_matrix(body.camera)]
-    tags: tiff.Tags = {
-        TiffTag.MODEL: tiff.text("né"),
-        TiffTag.WHITE_LEVEL: (ValueType.LONG, [1, 2]),
-        TiffTag.COLOR_MATRIX_1: (ValueType.SRATIONAL, [-1, 3]),
-        TiffTag.CFA_PATTERN: (ValueType.BYTE, [1, 2, 3]),
-    }
-    heads = [tiff.head(tags, 10), tiff.head(tags, 10, {}), tiff.head({}, 0, tags)]
-    found["heads"] = heads
-    found["rationals"] = tiff.rationals(1 / 3, 0.1, Fraction(2, 7), 3.14159265, 0)
-    pinned("bytes of raw files", found)
-
-
-def test_what_is_known_of_sensors_is_as_before(pinned: Pinned) -> None:
-    frames = [(size, frame) for size, frame in sorted(rawfile._ONE_ROW_MORE, key=str)]
-    cameras = (
-        "Canon EOS 550D", "Canon EOS 6D Mark II", "Canon EOS R10", "Canon EOS R5 Mark II", "Canon EOS 5D", "Nikon D3",
-        "",
-    )  # fmt: skip
-    sizes = ((3516, 5344), (4224, 6384), (100, 200))
-    masked = {
-        camera: [
-            [size, left, *rawfile._masked_areas(None, camera, Area(3, left, 90, 90), size)]
-            for size, left in product(sizes, (0, 9, 10, 69, 70, 140))
-        ]
-        for camera in cameras
-    }
-    origins = [
-        FrameOrigin(iso=iso, aperture=aperture, shutter_s=shutter)
-        for iso, aperture, shutter in product((None, 100, 640), (None, 5.6), (None, 0.3, 0.299, 1 / 60, 0.0, 2.0))
-    ]
-    whole = np.full((70, 520), 4000, np.uint16)
-    holes: list[Any] = []
-    for place, value in product(
-        (
-            (slice(3, 4), slice(None)),
-            (slice(32, 64), slice(256, 512)),
-            (slice(0, 32), slice(0, 256)),
-            (slice(0, 31), slice(0, 256)),
-        ),
-        (0, 7, 8, 1023, 1024, 65535),
-    ):
-        for black, white in ((2048.0, 15000), (15.0, 15000), (16.0, 40000), (0.0, 32767), (0.0, 32768)):
-            counts = whole.copy()
-            counts[place] = value
-            holes.append(None is not filled_fault(counts, np.full((2, 2), black), white))
-    for rows, columns, part in product((32, 64, 65), (256, 512, 513), (1, 33)):
-        counts = np.full((rows, columns), 4000, np.uint16)
-        counts[-part:, -256:] = 3
-        holes.append(None is not filled_fault(counts, np.full((2, 2), 2048.0), 15000))
-    common = [
-        rawfile._common(Area(2, 3, 10, 20), other)
-        for other in (Area(0, 0, 5, 5), Area(4, 5, 3, 30), Area(50, 50, 2, 2))
-    ]
-    found = {
-        "frames": [rawfile._dcraw_frame(*frame) for frame in frames],
-        "masked": masked,
-        "origins": [one.exposure for one in origins],
-        "holes": holes,
-        "common": common,
-        "offsets": [rawfile.channel_offset_px(one) for one in (((0, 0),), ((0, 1), (1, 0)), ((1, 1),))],
-    }
-    pinned("what is known of sensors", found)

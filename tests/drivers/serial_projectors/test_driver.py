@@ -483,16 +483,6 @@ def test_whatever_is_answered_is_understood_or_refused(name: str, data: bytes) -
 
 
 @pytest.mark.parametrize("name", NAMES)
-@given(noise=st.binary(min_size=1, max_size=60))
-def test_whatever_is_said_to_a_simulated_one_it_goes_on_answering(name: str, noise: bytes) -> None:
-    language = LANGUAGES[name]
-    peer = LinePeer(SimulatedProjector(SimulatedClock()), language)
-    peer.receive(noise)
-    # A new connection ends what was half-said.
-    assert LineProjector(language, lambda: SerialPeerLink(peer)).power() in Power
-
-
-@pytest.mark.parametrize("name", NAMES)
 @given(key=st.binary(min_size=4, max_size=4).filter(any))
 def test_the_wrong_speed_never_looks_like_an_answer(name: str, key: bytes) -> None:
     # At the wrong speed bytes come with some bits set wrongly and the highest one mostly set.

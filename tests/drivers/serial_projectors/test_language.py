@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.projector import FAULT_PARTS, Power
+from drivers.projector import FAULT_PARTS
 from drivers.serial_projectors.language import (
     answer_parser,
     built_in_languages,
@@ -16,8 +16,6 @@ from drivers.serial_projectors.language import (
     handshake_parser,
     load_language,
     parse_language,
-    refusal_in,
-    value_in,
 )
 from foundation.errors import ConfigurationError, InputError, ProtocolError
 from tests.drivers.serial_projectors.made_up import MADE_UP, TEXT
@@ -98,20 +96,6 @@ def test_a_state_behind_the_end_of_the_answer_is_refused() -> None:
         parse_language(TEXT.replace("[refusals]", f"{handshake}[refusals]"), "lantern.toml")
 
 
-def test_templates_give_their_value_and_refuse_other_texts() -> None:
-    assert value_in(("PWR={}",), "pwr= 01 ") == "01"
-    assert value_in(("MODELNAME={}", "{}"), "W1070") == "W1070"
-    assert value_in(("",), "") == ""
-    assert value_in(("POWER.{}",), "POWERX1") is None
-
-
-def test_refusals_are_told_apart_in_any_case() -> None:
-    assert refusal_in(BENQ.refusals, "block ITEM") == "busy"
-    assert refusal_in(BENQ.refusals, "Illegal format") == "unknown"
-    assert refusal_in(EPSON.refusals, "ERR") == "unclear"
-    assert refusal_in(EPSON.refusals, "ERR=00") is None
-
-
 def test_an_answer_survives_both_ends() -> None:
     for language in (EPSON, BENQ, OPTOMA, MADE_UP):
         data = encode_answer(language.line, "Answer 1")
@@ -132,9 +116,3 @@ def test_whatever_comes_is_taken_waited_for_or_refused(data: bytes) -> None:
         except ProtocolError:
             continue
         assert taken is None or 1 <= taken[1] <= len(data)
-
-
-def test_every_state_has_a_value_only_where_the_language_has_one() -> None:
-    assert EPSON.power.value_of(Power.WARMING) == "02"
-    assert BENQ.power.value_of(Power.WARMING) is None
-    assert (BENQ.mute.value_of(True), BENQ.mute.value_of(False)) == ("ON", "OFF")

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from experiment.chart.layout import design_chart, paper_chart
 from experiment.chart.margins import (
-    Margins,
     edge_boxes,
     star_boxes,
 )
@@ -107,18 +106,6 @@ def test_the_edge_falls_by_one_in_twelve_and_the_star_has_twelve_spokes() -> Non
     ring = picture[np.rint(59.5 + 45 * np.sin(angle)).astype(int), np.rint(59.5 + 45 * np.cos(angle)).astype(int)]
     assert np.count_nonzero(np.diff(ring, append=ring[:1]) == 1) == 12
     assert picture.mean() == pytest.approx(np.pi / 8, abs=0.02)
-
-
-@pytest.mark.parametrize(("apart", "free"), [(19, False), (20, True)])
-def test_marks_have_air_between_them(apart: int, free: bool) -> None:
-    """Of .85 mm, 20 px, also where what is there lies beside the box about all that is to be put."""
-    mark = np.array([[0, 40, 10, 60]])
-    there = np.array([[110 + apart, 1940, 150, 1960]])
-    margins = Margins(np.array([100, 100, 1900, 1900]), (2000, 2000), there)
-    assert margins.put("bottom", mark) is free
-
-
-NOTHING = np.empty((0, 4), dtype=np.int64)
 
 
 def test_a_chart_of_another_maker_without_margins_is_drawn(a7: Chart) -> None:

@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.special import ndtr
 
 from drivers.presenter import BLACK, Colour
 from drivers.raw.rawfile import CHANNELS, Mosaic, Plane, plane_of
 from experiment.chart.layout import design_chart, paper_chart
-from experiment.framing import field
 from experiment.framing.field import FoundField, corners_text, field_mm, find_field, parse_corners, refine_edges
 from experiment.framing.finding import find_chart
 from experiment.framing.sharpness import blur_px
@@ -155,17 +153,6 @@ def test_a_chart_with_tags_needs_no_corners(white: Mosaic) -> None:
         find_chart(white, design_chart(1), corners=truth(UPRIGHT, white, field_mm(CHART)))
 
 
-def test_marks_in_the_margin_do_not_draw_the_refined_edge(white: Mosaic) -> None:
-    field = found_in(UPRIGHT, white)
-    places, heights = refine_edges(planes_of(white), field.outline_px, field.normals, 0.58)
-    off = ((places - truth(UPRIGHT, white, field.outline_mm)) * field.normals).sum(axis=2)
-    assert (heights > 0).any(axis=0).mean() > 0.7
-    for side in ((0, -1), (1, 0), (0, 1), (-1, 0)):
-        of_side = (heights > 0) & (field.normals @ np.array(side) > 0.9)
-        assert abs(np.median(off[of_side])) < 0.05
-        assert np.percentile(np.abs(off[of_side]), 80) < 0.12
-
-
 def test_each_colour_s_edge_is_where_the_lens_shows_it(tmp_path: Path) -> None:
     room = Room(waviness_mm=0.5, lateral_red_px=1.0, lateral_blue_px=-1.0)
     mosaic = lab_of(room).mosaic(tmp_path)
@@ -194,22 +181,6 @@ def test_an_edge_that_is_not_clear_is_not_refined(white: Mosaic) -> None:
     assert (places == field.outline_px).all()
 
 
-def test_a_curled_corner_is_of_the_outline_and_marks_in_the_margin_are_not() -> None:
-    along = (np.arange(160) + 0.5) / 160
-    top = np.stack([along * 1170, np.zeros(160)], axis=-1)
-    bottom = np.stack([along * 1170, np.full(160, 824.0)], axis=-1)
-    normals = np.repeat([(0.0, -1.0), (0.0, 1.0)], 160, axis=0)
-    outline = np.concatenate([top, bottom])
-    field = FoundField(np.zeros((4, 2)), np.eye(3), outline, outline, normals, 1.0)
-    across = np.concatenate([6 * (2 * along - 1) ** 6, np.random.default_rng(1).normal(0, 0.02, 160)])
-    marks = np.zeros(320, dtype=bool)
-    marks[[*range(60, 72), *range(200, 212)]] = True
-    across[marks] += 3
-    off = field.off_run_px(across[:, None] * normals)
-    assert off[~marks].max() < 0.2
-    assert off[marks].min() > 2.5
-
-
 GOOD = ("101,51", "3000.5,60", "2990,1900", "95,1890")
 
 
@@ -235,61 +206,3 @@ def test_raw_pixels_become_half_size_ones() -> None:
 def test_what_cannot_be_corners_is_refused(given: Sequence[str], message: str) -> None:
     with pytest.raises(InputError, match=message):
         parse_corners(given)
-
-
-@pytest.mark.parametrize(("side", "is_taken"), [(190, False), (194, True)])
-def test_corners_by_hand_are_192_raw_pixels_apart(side: int, is_taken: bool) -> None:
-    texts = ["100,100", f"{100 + side},100", f"{100 + side},400", "100,400"]
-    if is_taken:
-        assert field.parse_corners(texts)[0] == (49.75, 49.75)
-    else:
-        with pytest.raises(InputError, match=f"{side} pixels.*192"):
-            field.parse_corners(texts)
-
-
-QUAD = np.array([[61.0, 52], [341, 40], [352, 262], [50, 250]])
-"""Corners of a dark field on white paper, px."""
-
-
-def painted(level: float = 1000, offset: tuple[float, float] = (0, 0), moved: float = 0) -> Plane:
-    """Return a picture of that field, blurred by a pixel, as a plane shows it; its edge lies `moved` px further out."""
-    y, x = np.mgrid[:300, :400].astype(np.float64)
-    away = np.full(x.shape, -np.inf)
-    for start, end in zip(QUAD, np.roll(QUAD, -1, axis=0), strict=True):
-        normal = field._outwards(start, end)
-        away = np.maximum(away, (x + offset[0] - start[0]) * normal[0] + (y + offset[1] - start[1]) * normal[1])
-    return Plane("G", (level * (0.4 + 0.6 * ndtr(away - moved))).astype(np.float32), offset)
-
-
-@pytest.mark.parametrize(("small", "factor"), [(640, 1), (200, 2)])
-def test_the_outline_of_a_field_is_traced_from_a_guess(
-    small: int, factor: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(field, "_SMALL_WIDTH_PX", small)
-    picture = field.PreparedPicture.of([painted(), painted(600, (0.25, -0.25)), painted(29)])
-    # The third colour carries too little light to be looked at.
-    assert (picture.channels, picture.bright, picture.factor) == ((0, 1), (True, True), factor)
-    assert picture.levels[0].shape == (300 // factor, 400 // factor)
-    # Paper is 1, and cells near it four tenths; a place keeps its place on the small raster.
-    pale = picture.pale_at(np.array([[[30.0, 20]], [[200, 56]], [[380, 280]]])).ravel()
-    np.testing.assert_allclose(pale, [1, 0.4, 1], atol=0.06)
-    np.testing.assert_allclose(picture.small(np.array([[0.5, 0.5], [10, 20]])) * factor + (factor - 1) / 2,
-                               [[0.5, 0.5], [10, 20]])  # fmt: skip
-    found = field.trace_outline(picture, QUAD + np.array([[9, -7], [-8, 10], [6, 6], [10, 9]]))
-    assert found is not None
-    np.testing.assert_allclose(found.corners_px, QUAD, atol=0.2)
-    for side, (start, end) in enumerate(zip(QUAD, np.roll(QUAD, -1, axis=0), strict=True)):
-        normal = field._outwards(start, end)
-        assert len(found.sides_px[side]) == len(found.normals[side]) > 120
-        np.testing.assert_allclose(found.normals[side], np.tile(normal, (len(found.normals[side]), 1)), atol=0.01)
-        # At its ends a side is blurred with its neighbours.
-        off = np.abs((found.sides_px[side] - start) @ normal)
-        assert off.max() < 0.5
-        assert off[5:-5].max() < 0.1
-        along = (found.sides_px[side] - start) @ (end - start) / float((end - start) @ (end - start))
-        assert along.min() < 0.05
-        assert along.max() > 0.95
-        assert (np.diff(along) > 0).all()
-    # None where a side has no edge, or is too short for what is looked at around it.
-    assert field.trace_outline(picture, QUAD + np.array([60, 0])) is None
-    assert field.trace_outline(picture, QUAD[0] + (QUAD - QUAD[0]) * 0.25) is None

@@ -14,7 +14,6 @@ from drivers.raw.rawfile import Mosaic, Plane, channel_offset_px, phases, plane_
 from experiment.chart.model import Chart
 from experiment.framing.finding import find_chart
 from experiment.framing.homography import project, robust_homography
-from experiment.framing.pictures import shift_between
 from experiment.framing.sharpness import blur_px
 from foundation.errors import RegistrationError
 from sim.world.world import Room
@@ -89,22 +88,6 @@ def test_blur_is_measured(chart: Chart, tmp_path: Path, blur: float, roll_deg: f
     # A photosite is half a pixel wide (σ = 0.5/√12) and the two greens lie 0.25 px to either side.
     expected = float(np.sqrt(blur**2 + 0.25 / 12 + 0.25**2))
     assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=0.02)
-
-
-@pytest.mark.parametrize("moved", [(0.3, -0.2), (-2.2, 1.7)])
-def test_a_movement_is_measured(chart: Chart, white: Mosaic, moved: tuple[float, float]) -> None:
-    framing = find_chart(white, chart)
-    plane = plane_of(white, "G")
-    matrix = np.array([[1, 0, moved[0]], [0, 1, moved[1]]])
-    values = cv2.warpAffine(plane.values, matrix, plane.values.shape[::-1], flags=cv2.INTER_CUBIC)
-    shift = shift_between(plane, framing, Plane("G", np.asarray(values, dtype=np.float32), plane.offset_px))
-    assert (shift.dx, shift.dy) == pytest.approx(moved, abs=0.03)
-
-
-def test_a_leap_is_not_measured_as_a_step(chart: Chart, white: Mosaic) -> None:
-    plane = plane_of(white, "G")
-    values = np.roll(plane.values, 40, axis=1)
-    assert shift_between(plane, find_chart(white, chart), Plane("G", values, plane.offset_px)).gauges == 0
 
 
 def test_a_dark_frame_is_called_dark(chart: Chart, lab: Lab, tmp_path: Path) -> None:

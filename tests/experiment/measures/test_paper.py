@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.radiometry.drift import corrections
-from experiment.measures import paper as papers
 from experiment.measures.least_squares import order_of
 from experiment.measures.paper import MAX_ORDER_AROUND, FlatField, Paper, PaperReader
 from foundation.errors import QualityError
@@ -193,21 +192,6 @@ def test_a_hand_in_a_corner_is_no_fall_off() -> None:
     assert np.linalg.norm(np.array(found.left.at_mm) - PAGE) < 115
     assert found.left.deviation == pytest.approx((-0.8, -0.8, -0.8), abs=0.02)
     assert 0.03 < found.left.share < 0.15
-
-
-def test_what_a_field_leaves_is_told_by_share_rim_and_rings() -> None:
-    residual = papers._residual
-    noise = np.random.default_rng(2).normal(0, 0.001, (len(PLACES), 3))
-    noise[:4] = 0.008  # between five and ten usual deviations
-    left = residual(noise, PLACES, PAGE, 1)
-    assert left.share == 4 / len(PLACES)
-    assert left.at_mm in {(x, y) for x, y in PLACES[:4].tolist()}
-    assert left.radial < 0.15
-    away = np.linalg.norm(PLACES - np.array(PAGE) / 2, axis=1)
-    fall_off = -0.03 * (away / away.max()) ** 2
-    left = residual(np.stack([fall_off] * 3, axis=1), PLACES, PAGE, 1)
-    assert left.rim == pytest.approx(fall_off[np.argsort(away)[-40:]].mean())
-    assert 0.95 < left.radial <= 1
 
 
 def test_references_in_the_margin_give_no_shape_that_vanishes_there() -> None:

@@ -18,9 +18,6 @@ from sim.world.world import Room
 from tests.calibration.lab import Lab, hang
 
 pytestmark = pytest.mark.slow
-
-
-_Array = npt.NDArray[np.float64]
 SIDE = 16
 
 
@@ -79,52 +76,6 @@ def test_light_and_what_is_kept_are_told_apart(added: float) -> None:
     found, kept = light_of_spot(stains, spots_of(stains)[0], 1)
     assert found == pytest.approx(added, rel=0.15)
     assert kept == pytest.approx(0.95, abs=0.02)
-
-
-def reflected(cells: int, kept: float, added: float) -> Stains:
-    """Return 64 × 64 cells, of which so many and two rings about them show `kept` of their light and some more."""
-    random = np.random.default_rng(1)
-    own = random.uniform(0.2, 1, 4096)
-    own[:100] = 1  # Paper white is the 99th percentile.
-    places = np.column_stack(np.divmod(np.arange(4096), 64)) * 5.0
-    spot = np.zeros(4096, bool)
-    spot[30 * 64 + 20 : 30 * 64 + 20 + cells] = True
-    away = np.linalg.norm(places[:, None] - places[spot], axis=2).min(axis=1)
-    seen = np.where(away < 13, kept * own + added, own)
-    alone = np.repeat((seen / own - 1)[:, None], 3, axis=1)
-    error = np.full((4096, 3), 1e-3)
-    return Stains(np.where(spot[:, None], alone, 0), error, alone, spot, np.repeat(1000 * seen[:, None], 3, 1), places)
-
-
-@pytest.mark.parametrize(
-    ("cells", "kept", "is_counted"), [(20, 1, False), (21, 1, True), (30, 0.86, True), (30, 0.84, False)]
-)
-def test_a_reflection_is_of_half_a_per_cent_of_the_cells_which_keep_their_own(
-    cells: int, kept: float, is_counted: bool
-) -> None:
-    assert added_light(reflected(cells, kept, 0.2)) == pytest.approx(0.2 if is_counted else 0, abs=1e-6)
-
-
-def test_a_line_is_through_six_cells_that_are_not_black() -> None:
-    stains = reflected(30, 0.9, 0.05)
-    there = np.flatnonzero(stains.stained)
-    for count, expected in ((6, (0.05, 0.9)), (5, (np.nan, np.nan))):
-        assert light_of_spot(stains, there[:count], 2) == pytest.approx(expected, nan_ok=True, abs=1e-6)
-    stains.alone[there[:25]] = np.nan
-    stains.alone[there[20:25]] = -0.99
-    assert np.isnan(light_of_spot(stains, there, 0)).all()
-    stains.alone[there[0]] = stains.alone[there[25]]
-    stains.level[there[0]] = stains.level[there[25]]
-    assert light_of_spot(stains, there, 0) == pytest.approx((0.05, 0.9), abs=1e-6)
-
-
-def test_what_deviates_is_large_and_significant() -> None:
-    deviation = np.array([[0, -0.0101, 0], [0, 0.0099, 0], [0.0101, 0, 0], [0.0101, 0, 0], [np.nan, 0.03, 0]])
-    error = np.array([1e-3, 1e-3, 0.0017, 0.00168, 1e-3])[:, None] * np.ones(3)
-    made = Stains(deviation, error, 2 * deviation, np.zeros(5, bool), np.ones((5, 3)), np.zeros((5, 2)))
-    assert made.doubtful.tolist() == [True, False, False, True, True]
-    assert made.largest_deviation().tolist() == [-0.0101, 0.0099, 0.0101, 0.0101, 0.03]
-    assert [made.deviation_of(cell) for cell in (0, 4)] == [-0.0202, 0.06]
 
 
 def test_charts_of_four_levels_are_not_judged() -> None:
@@ -203,17 +154,6 @@ def test_a_shadow_counts_as_doubtful_and_no_more() -> None:
     assert stains.doubtful[away < 15].mean() > 0.6
     assert not stains.doubtful[away > 36].any()
     assert stains.deviation[away < 15].mean() == pytest.approx(-0.015, abs=0.003)
-
-
-def test_a_stain_is_found_to_its_rim() -> None:
-    level, places = drawn(4, 4)
-    away = np.linalg.norm(places - places.mean(axis=0), axis=1)
-    under = away < 12.5
-    stains = find_stains(level * np.where(under[:, None], [0.97, 0.94, 0.9], 1.0), places, 4)
-    assert stains.stained[under].mean() > 0.95
-    assert not stains.stained[away > 12.5 + 15].any()
-    assert stains.stained[~under].sum() <= 3
-    assert (np.sign(stains.largest_deviation()[under]) == -1).all()
 
 
 def test_cells_that_cannot_be_used_are_no_evidence() -> None:

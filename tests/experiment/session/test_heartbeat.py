@@ -199,20 +199,6 @@ class TestPlace:
             assert SessionPlace.from_text(text) is None
         assert SessionPlace.from_text(here.to_text()) == here
 
-    def test_what_a_reader_of_a_copy_is_told(self, run: Path) -> None:
-        told, here = self.of(run)
-        copy, at = replace(here, folder="/backup/night", inode=1), told.at.astimezone().strftime("%Y-%m-%d %H:%M:%S")
-        elsewhere = replace(told, process=replace(SELF, host="lab"))
-        assert elsewhere.sentence_of_copy(copy, None) == (
-            f"copied from lab:{run} at {at} or later, and it is not known from here whether the run there goes on; ask "
-            "acquire status there"
-        )
-        assert "and the run there goes on; look there" in told.sentence_of_copy(copy, alive=True)
-        assert "which is over now; acquire status" in told.sentence_of_copy(copy, alive=False)
-        assert told.sentence_of_copy(here, alive=False) == (
-            f"restored from a copy of {at} or later, made while a run was at work; run the same command again"
-        )
-
 
 def test_a_frame_is_a_sign_of_life(tmp_path: Path) -> None:
     Journal.create(tmp_path / "journal.sqlite", ())

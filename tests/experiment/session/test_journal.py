@@ -28,13 +28,9 @@ from experiment.session import opening
 from experiment.session.journal import Journal, ReceivedFile, time_text
 from experiment.session.opening import create_file, require_sound_rows
 from experiment.session.records import (
-    ACCEPTED,
-    FAILED,
-    AcceptedFile,
     AttemptDetails,
     Check,
     Judgement,
-    SessionEvent,
     SessionStep,
     link_steps,
     plan_steps,
@@ -113,25 +109,6 @@ def commit(journal: Journal, attempt: int, reason: str = "") -> None:
     )
     judgement = Judgement.of_reason("exposure", reason or None)
     journal.commit(attempt, received, judgement, exposure_s=0.5, ended_at=NOW + timedelta(seconds=2))
-
-
-def test_what_is_written_is_read_again(path: Path) -> None:
-    with closing(Journal.open_for_run(path)) as journal:
-        white, dark = (journal.begin(step, f"frames/{step.stem}", NOW) for step in STEPS[:2])
-        commit(journal, white)
-        journal.fail(dark, NOW, "the cable came off")
-        journal.note(NOW, "start", "4 of 4 frames to take")
-    with closing(Journal.open_for_run(path)) as journal:
-        assert journal.steps() == STEPS
-        attempts = journal.attempts()
-        assert [(attempt.step, attempt.verdict, attempt.has_frame) for attempt in attempts] == [
-            (0, ACCEPTED, True),
-            (1, FAILED, False),
-        ]
-        assert attempts[0].ended_at == NOW + timedelta(seconds=2)
-        assert attempts[1].reason == "the cable came off"
-        assert journal.accepted_files() == [AcceptedFile(1, 0, None, "frames/1.cr2", 10, "00")]
-        assert journal.events() == [SessionEvent(NOW, "start", "4 of 4 frames to take", 1)]
 
 
 def test_what_is_read_at_one_moment_fits_together(path: Path) -> None:

@@ -105,33 +105,23 @@ def test_a_reader_who_was_there_before_the_run_does_not_stop_it(path: Path) -> N
     assert set(files(path)) == {"journal.sqlite"}
 
 
-def test_another_writer_is_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("at_start", [True, False])
+def test_another_writer_is_waited_for(path: Path, at_start: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opening, "TRY_S", 0.01)
     said: list[str] = []
-    with closing(Journal.open_for_run(path)) as journal, another_program(path, *WRITER) as other:
 
-        def announce(sentence: str) -> None:
-            said.append(sentence)
-            let_go(other)
+    def announce(sentence: str) -> None:
+        said.append(sentence)
+        let_go(other)
 
-        journal.retry_locked(60, announce)
-        journal.note(NOW, "written")
-    assert said == [f"another program holds {path}; the run goes on when it has finished"]
-    assert whats(path) == ["written"]
-
-
-def test_another_writer_is_waited_for_at_the_start(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opening, "TRY_S", 0.01)
-    said: list[str] = []
+    running = None if at_start else Journal.open_for_run(path)
     with another_program(path, *WRITER) as other:
-
-        def announce(sentence: str) -> None:
-            said.append(sentence)
-            let_go(other)
-
-        with closing(Journal.open_for_run(path, 60, announce)) as journal:
+        journal = running or Journal.open_for_run(path, 60, announce)
+        with closing(journal):
+            if running:
+                journal.retry_locked(60, announce)
             journal.note(NOW, "written")
-    assert len(said) == 1
+    assert said == [f"another program holds {path}; the run goes on when it has finished"]
     assert whats(path) == ["written"]
 
 

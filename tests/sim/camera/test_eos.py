@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from datetime import datetime
-from io import BytesIO
 from threading import Event as ThreadEvent
 from typing import BinaryIO
 
@@ -15,29 +13,23 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers import canon
-from drivers.camera import ExposureSettings, capture
+from drivers.camera import ExposureSettings
 from drivers.canon import (
     AvailableFormats,
     AvailableValues,
-    CanonEos,
     DeviceInfoEx,
-    ImageFormat,
     Notice,
-    ObjectEvent,
     PropertyChanged,
     PropertySetting,
     Record,
     TransferRequest,
     decode_events,
-    number_of,
     number_value,
-    text_value,
 )
 from drivers.ptp.codes import (
     AeMode,
     CaptureDestination,
     EosEvent,
-    ObjectFormat,
     Operation,
     Property,
     ReleaseButton,
@@ -46,18 +38,15 @@ from drivers.ptp.codes import (
 from drivers.ptp.protocol import (
     Answer,
     DeviceInfo,
-    ObjectInfo,
     PtpRequest,
     StorageInfo,
     decode_u32_array,
 )
-from foundation.clock import OPENING, SimulatedClock
+from foundation.clock import SimulatedClock
 from foundation.errors import DeviceRefused, LinkClosed
-from sim.buses.usb import MemoryTransport
-from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, EOS_BODIES, TEST_BODY, EosModel
+from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, TEST_BODY, EosModel
 from sim.camera.eos import CARD, DCIM, FOLDER, SimulatedEos
 from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, conversations, read_description, transcript
-from tests.drivers.ptp.examples import decode_object_entries
 
 REAL = {"the transcript": transcript} | {name: make for name, make in conversations().items() if name == "EOS 60D"}
 """Conversations of the real EOS 60D: without the bytes that it sent, and whole where the recording is found."""
@@ -72,15 +61,12 @@ class NumberedFilm:
         self.size = size
         self.exposures: list[tuple[ExposureSettings, datetime]] = []
         self.frames: list[bytes] = []
-        self.broken = False
 
     def accept(self, settings: ExposureSettings) -> None:
         if settings.shutter_s > 30:
             raise DeviceRefused("the film takes 30 s at most")
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
-        if self.broken:
-            raise DeviceRefused("the film is torn")
         frame = f"frame {len(self.frames)} ".encode().ljust(self.size, b"\xa5")
         self.exposures.append((settings, released_at))
         self.frames.append(frame)
@@ -119,27 +105,21 @@ class Host:
     def events(self) -> tuple[Record, ...]:
         return decode_events(self.ok(Operation.EOS_GET_EVENT))
 
-    def set(self, code: int, value: int | ImageFormat | str) -> int:
-        octets = (
-            value.encode()
-            if isinstance(value, ImageFormat)
-            else text_value(value)
-            if isinstance(value, str)
-            else number_value(value)
-        )
-        return self.code(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, data=PropertySetting(code, octets).encode())
+    def set(self, code: int, number: int) -> int:
+        setting = PropertySetting(code, number_value(number))
+        return self.code(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, data=setting.encode())
 
-    def take_control(self, destination: int = CaptureDestination.HOST) -> Host:
+    def take_control(self) -> Host:
         self.ok(Operation.OPEN_SESSION, 1)
         self.ok(Operation.EOS_SET_REMOTE_MODE, 1)
         self.ok(Operation.EOS_SET_EVENT_MODE, 1)
-        assert self.set(Property.EOS_CAPTURE_DESTINATION, destination) == ResponseCode.OK
+        assert self.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.HOST) == ResponseCode.OK
         self.ok(Operation.EOS_PC_HDD_CAPACITY, 0x0FFFFFFF, 0x1000, 1)
         self.events()
         return self
 
-    def press(self, autofocus: bool = False) -> int:
-        code = self.code(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, int(not autofocus))
+    def press(self) -> int:
+        code = self.code(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, 1)
         self.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
         return code
 
@@ -148,10 +128,6 @@ class Host:
         assert self.press() == ResponseCode.OK
         self.clock.sleep(60)
         return self.events()
-
-    def number(self, code: int) -> int:
-        self.ok(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, code)
-        return number_of([e for e in self.events() if isinstance(e, PropertyChanged) and e.code == code][-1].value)
 
 
 def transfers(records: tuple[Record, ...]) -> list[TransferRequest]:
@@ -170,11 +146,9 @@ def statuses(records: tuple[Record, ...]) -> list[int]:
     return [r.number for r in records if isinstance(r, Notice) and r.type == EosEvent.CAMERA_STATUS_CHANGED]
 
 
-def host_of(body: EosModel = TEST_BODY, *, card_bytes: int | None = 8 << 30, battery: float = 1.0) -> Host:
+def host_of(body: EosModel = TEST_BODY) -> Host:
     clock, film = SimulatedClock(), NumberedFilm()
-    return Host(
-        SimulatedEos(body, film, clock, card_bytes=card_bytes, battery=battery, auto_power_off_s=0), clock, film
-    )
+    return Host(SimulatedEos(body, film, clock, card_bytes=8 << 30, auto_power_off_s=0), clock, film)
 
 
 @pytest.fixture
@@ -289,30 +263,6 @@ def test_a_6d_mark_ii_is_the_one_that_was_listed() -> None:
 # Sessions.
 
 
-def test_one_session_at_a_time() -> None:
-    host = host_of()
-    host.ok(Operation.OPEN_SESSION, 7)
-    answer = host.ask(Operation.OPEN_SESSION, 8)
-    assert (answer.response.code, answer.response.parameters) == (ResponseCode.SESSION_ALREADY_OPEN, (7,))
-    host.ok(Operation.CLOSE_SESSION)
-    assert host.code(Operation.CLOSE_SESSION) == ResponseCode.SESSION_NOT_OPEN
-    host.ok(Operation.OPEN_SESSION, 8)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("body", EOS_BODIES.values(), ids=lambda body: body.model)
-def test_carries_out_all_that_it_lists_and_nothing_else(body: EosModel) -> None:
-    host = host_of(body)
-    listed = DeviceInfo.decode(host.ok(Operation.GET_DEVICE_INFO)).operations
-    assert len(listed) == 40
-    # All that there are, of one body; of the others what any of them lists.
-    for code in range(0x1000, 0x10000) if body is TEST_BODY else Operation:
-        if code in (Operation.OPEN_SESSION, Operation.CLOSE_SESSION):
-            continue
-        known = host.code(code, 1) != ResponseCode.OPERATION_NOT_SUPPORTED
-        assert known == (code in listed), f"0x{code:04x}"
-
-
 @pytest.mark.slow
 @example(Operation.EOS_PC_HDD_CAPACITY, [0xFFFFFFFF, 0xFFFFFFFF], None)
 @example(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, [], PropertySetting(Property.EOS_CAMERA_TIME, b"\xff" * 4).encode())
@@ -332,48 +282,10 @@ def test_answers_whatever_is_asked(code: int, parameters: list[int], data: bytes
     host.events()
 
 
-def test_a_body_without_a_master_takes_no_orders() -> None:
-    host = host_of()
-    host.ok(Operation.OPEN_SESSION, 1)
-    assert host.set(Property.EOS_ISO_SPEED, 0x50) == ResponseCode.EOS_OPERATION_REFUSED
-    assert host.code(Operation.EOS_REMOTE_RELEASE_ON, 3, 1) == ResponseCode.EOS_OPERATION_REFUSED
-    assert host.film.exposures == []
-
-
 # Properties.
 
 
-def test_the_dial_decides_what_can_be_set(host: Host) -> None:
-    offered: dict[AeMode, tuple[bool, bool]] = {}
-    for mode in (AeMode.APERTURE_PRIORITY, AeMode.SHUTTER_PRIORITY, AeMode.PROGRAM, AeMode.BULB, AeMode.MANUAL):
-        host.eos.turn_dial(mode)
-        host.events()
-        shutter = host.set(Property.EOS_SHUTTER_SPEED, 0x65) == ResponseCode.OK
-        aperture = host.set(Property.EOS_APERTURE, 0x40) == ResponseCode.OK
-        offered[mode] = shutter, aperture
-    assert offered == {
-        AeMode.APERTURE_PRIORITY: (False, True),
-        AeMode.SHUTTER_PRIORITY: (True, False),
-        AeMode.PROGRAM: (False, False),
-        AeMode.BULB: (False, True),
-        AeMode.MANUAL: (True, True),
-    }
-
-
 # Taking pictures.
-
-
-def test_a_frame_arrives_as_the_film_made_it(host: Host) -> None:
-    for code, value in ((0xD103, 0x50), (0xD101, 0x40), (0xD102, 0x65)):
-        assert host.set(code, value) == ResponseCode.OK
-    host.events()
-    (request,) = transfers(host.shoot())
-    assert host.film.exposures == [(ExposureSettings(200, 11.0, 1 / 50), OPENING)]
-    assert (request.name, request.format, request.size) == ("IMG_0001.DNG", ObjectFormat.CR2, 3000)
-    assert host.ok(Operation.GET_OBJECT, request.handle) == host.film.frames[0]
-    info = ObjectInfo.decode(host.ok(Operation.GET_OBJECT_INFO, request.handle))
-    assert (info.filename, info.size, info.storage) == ("IMG_0001.DNG", 3000, 0)
-    assert host.code(Operation.GET_THUMB, request.handle) == ResponseCode.NO_THUMBNAIL_PRESENT
 
 
 def test_is_busy_until_the_frame_is_written(host: Host) -> None:
@@ -392,40 +304,6 @@ def test_is_busy_until_the_frame_is_written(host: Host) -> None:
     assert statuses(records) == [0]
     assert host.set(Property.EOS_ISO_SPEED, 0x58) == ResponseCode.OK
     assert len(host.film.frames) == 1
-
-
-def test_memory_is_full_until_frames_are_fetched(host: Host) -> None:
-    waiting = [transfers(host.shoot())[0] for _ in range(TEST_BODY.burst)]
-    assert host.press() == ResponseCode.DEVICE_BUSY
-    assert host.ask(Operation.EOS_REMOTE_RELEASE).response.parameters == (7,)
-    host.ok(Operation.EOS_TRANSFER_COMPLETE, waiting[2].handle)
-    assert host.code(Operation.EOS_TRANSFER_COMPLETE, waiting[2].handle) == ResponseCode.INVALID_OBJECT_HANDLE
-    assert host.code(Operation.GET_OBJECT, waiting[2].handle) == ResponseCode.INVALID_OBJECT_HANDLE
-    assert len(transfers(host.shoot())) == 1
-    assert host.press() == ResponseCode.DEVICE_BUSY
-    host.ok(Operation.EOS_RESET_TRANSFER)
-    assert len(transfers(host.shoot())) == 1
-
-
-def test_takes_nothing_for_a_host_that_has_not_told_its_room() -> None:
-    host = host_of()
-    host.ok(Operation.OPEN_SESSION, 1)
-    host.ok(Operation.EOS_SET_REMOTE_MODE, 1)
-    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
-    host.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.HOST)
-    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 0
-    assert host.press() == ResponseCode.STORE_FULL
-    host.ok(Operation.EOS_PC_HDD_CAPACITY, TEST_BODY.frame_bytes // 0x1000 * 3, 0x1000, 1)
-    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 3
-    assert len(transfers(host.shoot())) == 1
-    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 2
-
-
-def test_film_that_fails_is_a_frame_that_never_comes(host: Host) -> None:
-    host.film.broken = True
-    records = host.shoot()
-    assert transfers(records) == []
-    assert statuses(records) == [1, 0]
 
 
 def test_film_is_developed_beside_the_answers() -> None:
@@ -451,35 +329,6 @@ def test_film_is_developed_beside_the_answers() -> None:
 
 
 # Card.
-
-
-def test_frames_on_the_card_can_be_listed_fetched_and_deleted() -> None:
-    host = host_of(card_bytes=10 << 20).take_control(CaptureDestination.CARD)
-    records = host.shoot()
-    (added,) = (record for record in records if isinstance(record, ObjectEvent))
-    entry = added.entry
-    assert transfers(records) == []
-    assert (added.type, entry.storage, entry.parent, entry.name) == (
-        EosEvent.OBJECT_ADDED,
-        CARD,
-        FOLDER,
-        "IMG_0001.DNG",
-    )
-    assert decode_u32_array(host.ok(Operation.EOS_GET_STORAGE_IDS)) == (CARD,)
-    root = decode_object_entries(host.ok(Operation.EOS_GET_OBJECT_INFO_EX, CARD, 0xFFFFFFFF, 0x100000))
-    assert [(item.handle, item.name) for item in root] == [(DCIM, "DCIM")]
-    files = decode_object_entries(host.ok(Operation.EOS_GET_OBJECT_INFO_EX, CARD, FOLDER, 0x100000))
-    assert [(item.handle, item.name, item.size) for item in files] == [(entry.handle, "IMG_0001.DNG", 3000)]
-    assert decode_u32_array(host.ok(Operation.GET_OBJECT_HANDLES, 0xFFFFFFFF, 0, 0)) == (DCIM, FOLDER, entry.handle)
-    assert decode_u32_array(host.ok(Operation.GET_OBJECT_HANDLES, CARD, ObjectFormat.CR2, FOLDER)) == (entry.handle,)
-    assert host.ask(Operation.GET_NUM_OBJECTS, CARD, 0, 0xFFFFFFFF).response.parameters == (1,)
-    assert host.code(Operation.GET_OBJECT_HANDLES, 0x00030001) == ResponseCode.INVALID_STORAGE_ID
-    assert host.ok(Operation.EOS_GET_OBJECT, entry.handle) == host.film.frames[0]
-    assert StorageInfo.decode(host.ok(Operation.EOS_GET_STORAGE_INFO, CARD)).free == (10 << 20) - 3000
-    assert host.code(Operation.EOS_DELETE_OBJECT, FOLDER) == ResponseCode.OBJECT_WRITE_PROTECTED
-    host.ok(Operation.EOS_DELETE_OBJECT, entry.handle)
-    assert Notice(EosEvent.OBJECT_REMOVED, entry.handle) in host.events()
-    assert host.code(Operation.EOS_GET_OBJECT, entry.handle) == ResponseCode.INVALID_OBJECT_HANDLE
 
 
 # What spoils a series.
@@ -514,44 +363,4 @@ def test_goes_to_sleep_unless_kept_awake(host: Host) -> None:
 # The end of a session.
 
 
-def test_a_frame_that_nobody_fetched_is_offered_to_the_next(host: Host) -> None:
-    (request,) = transfers(host.shoot())
-    host.eos.unplugged()
-    assert host.code(Operation.EOS_GET_EVENT) == ResponseCode.SESSION_NOT_OPEN
-    host.ok(Operation.OPEN_SESSION, 2)
-    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
-    records = host.events()
-    assert transfers(records) == [request]
-    assert changes(records)[Property.EOS_CAPTURE_DESTINATION] == number_value(CaptureDestination.CARD)
-    assert host.ok(Operation.GET_OBJECT, request.handle) == host.film.frames[0]
-    # The next has not told yet what room it has.
-    host.ok(Operation.EOS_SET_REMOTE_MODE, 1)
-    assert host.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.HOST) == ResponseCode.OK
-    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 0
-
-
 # With our own driver.
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("body", "without"),
-    [
-        (EOS_550D, ()),
-        (EOS_6D_MARK_II, (Operation.EOS_REMOTE_RELEASE_ON,)),
-        (replace(EOS_6D_MARK_II, wide_objects=True), ()),
-    ],
-    ids=["550D", "6D2 without a press", "wide"],
-)
-def test_our_driver_takes_a_series(body: EosModel, without: tuple[int, ...]) -> None:
-    clock, film = SimulatedClock(), NumberedFilm()
-    eos = SimulatedEos(body, film, clock, auto_power_off_s=0, without=without)
-    camera = CanonEos(lambda: MemoryTransport(eos), clock)
-    camera.configure(ExposureSettings(100, 8.0, 0.5))
-    for number in range(2 * body.burst):
-        into = BytesIO()
-        frame = capture(camera, into)
-        assert into.getvalue() == film.frames[number]
-        assert (frame.name, frame.released_at) == (f"IMG_{number + 1:04d}.DNG", film.exposures[number][1])
-    camera.close()
-    assert {settings for settings, _ in film.exposures} == {ExposureSettings(100, 8.0, 0.5)}

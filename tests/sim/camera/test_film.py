@@ -164,11 +164,3 @@ def test_dcraw_sees_the_whole_visible_frame(file: Path, body: Body, counts: NDAr
     assert "Shutter: 1/2.0 sec" in told
     assert "Aperture: f/5.6" in told
     assert "Filter pattern: RG/GB" in told
-
-
-def test_counts_of_another_shape_and_times_without_zone_are_refused() -> None:
-    body = BODIES["Test"]
-    with pytest.raises(ValueError, match=r"\(609, 846\)"):
-        dng(body, counts=np.zeros((609, 845), dtype=np.uint16))
-    with pytest.raises(ValueError, match="timezone"):
-        dng(body, taken_at=datetime(2021, 3, 14))

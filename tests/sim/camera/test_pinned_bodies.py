@@ -9,12 +9,10 @@ from typing import Any
 
 import pytest
 
-from drivers import canon
 from drivers.camera import ExposureSettings, capture
-from drivers.canon import EosState
-from drivers.ptp.codes import AeMode, Operation, Property
+from drivers.ptp.codes import Operation
 from foundation.clock import SimulatedClock
-from foundation.errors import DeviceError, InputError, LinkClosed
+from foundation.errors import DeviceError, LinkClosed
 from sim.camera.bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, TEST_BODY, EosModel
 from sim.camera.eos import CARD, DCIM, SimulatedEos
 from tests.drivers.eos_lab import Lab
@@ -31,13 +29,6 @@ BODIES: dict[str, tuple[EosModel, dict[str, Any]]] = {
     ),
     "Test": (TEST_BODY, {"card_bytes": 3 << 20, "battery": 4.5 / 440, "forgetful": True, "auto_power_off_s": None}),
 }
-
-
-SETTINGS = (
-    *(ExposureSettings(100, 8.0, 0.5), ExposureSettings(110, 8.0, 0.4), ExposureSettings(6400, 1.8, 30.0)),
-    *(ExposureSettings(200, None, 1 / 60), ExposureSettings(400, 5.6, 31.0), ExposureSettings(200, 22.0, 1 / 8000)),
-)
-WANTED = (0.5, 0.3, 0.29, 1 / 60, 1 / 61, 30, 31, 8.0, 5.6, 5.65, 100, 125, 130, "1/60", "bulb", "0.5", "x", "1/0", 1e9)
 
 
 def short(data: bytes | None) -> str:
@@ -90,57 +81,6 @@ def test_a_body_says_of_itself_what_it_said(name: str, pinned: Pinned) -> None:
     for ask in (Operation.EOS_GET_STORAGE_INFO, Operation.GET_STORAGE_INFO, Operation.GET_NUM_OBJECTS):
         found += [told(host, ask, store, 0, parent) for store in (CARD, 0, 0x20000) for parent in (0, 0xFFFFFFFF, DCIM)]
     pinned(f"a body, {name}, of itself", "\n".join(found).encode())
-
-
-@pytest.mark.parametrize("name", list(BODIES)[:3])
-def test_the_driver_plans_what_it_planned(name: str, pinned: Pinned) -> None:
-    """Every exposure of a body, set or refused, in two states of its dials."""
-    found: dict[str, Any] = {}
-    for mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB):
-        host = host_of(name)
-        host.eos.turn_dial(mode)
-        if mode is AeMode.BULB:
-            host.eos.switch_focus(automatic=True)
-            host.eos.switch_mirror_lockup(True)
-            host.eos.set_menu(Property.EOS_AEB, 8)
-        opening(host)
-        state = EosState()
-        state.take(host.events())
-        plans: dict[str, Any] = {}
-        for settings in SETTINGS:
-            title = f"{settings.iso} {settings.aperture} {settings.shutter_s:g}"
-            try:
-                plan = canon.plan(state, settings)
-                plans[title] = b"".join(plan.values())
-            except DeviceError:
-                plans[title] = {"refused": 1}
-        functions = [
-            canon.custom_functions(one) for code, one in state.values.items() if code == Property.EOS_CUSTOM_FUNCTIONS
-        ]
-        found[mode.name] = [
-            plans, len(canon.problems(state)), canon.shutter_speeds(state), canon.host_destination(state), functions,
-            canon.battery_level(state),
-        ]  # fmt: skip
-    pinned(f"exposures that a body is set to, {name}", found)
-
-
-def test_scales_are_what_they_were(pinned: Pinned) -> None:
-    found: dict[str, Any] = {}
-    for scale in (canon.SHUTTER, canon.APERTURE, canon.ISO):
-        values: list[float] = []
-        for code in range(256):
-            try:
-                values += [code, scale.value(code)]
-            except (InputError, DeviceError, KeyError, ValueError):
-                continue
-        codes: dict[str, int] = {}
-        for wanted in WANTED:
-            try:
-                codes[str(wanted)] = scale.code(wanted)
-            except (InputError, DeviceError):
-                codes[str(wanted)] = -1
-        found[scale.name] = {"values": values, "codes": list(codes.values())}
-    pinned("scales of a camera", found)
 
 
 @pytest.mark.slow

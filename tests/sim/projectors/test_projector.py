@@ -40,19 +40,6 @@ def test_light_follows_the_lamp_and_the_mute() -> None:
     assert device.light() == 0.0
 
 
-def test_neither_mute_nor_freeze_outlasts_standby() -> None:
-    clock = SimulatedClock()
-    device = SimulatedProjector(clock, Power.ON)
-    device.set_muted(True)
-    device.set_frozen(True)
-    device.switch_off()
-    clock.sleep(60)
-    device.switch_on()
-    clock.sleep(30)
-    assert device.light() == 1.0
-    assert not device.frozen()
-
-
 def test_a_dead_lamp_goes_out_and_is_not_struck_again() -> None:
     clock = SimulatedClock()
     device = SimulatedProjector(clock, Power.ON)
@@ -65,11 +52,6 @@ def test_a_dead_lamp_goes_out_and_is_not_struck_again() -> None:
     device.repair()
     device.switch_on()
     assert device.power() is Power.WARMING
-
-
-def test_a_part_that_cannot_be_reported_is_our_mistake() -> None:
-    with pytest.raises(ValueError, match="fan, lamp"):
-        SimulatedProjector(SimulatedClock()).break_part("wheel", Severity.ERROR)
 
 
 class TestSimulatedPresenter(presenter.PresenterContract):

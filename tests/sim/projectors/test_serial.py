@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from benqprojector import BenQProjectorSerial
 from epson_projector import Projector
 
-from drivers.links.network import TcpLink, serve_peer
 from drivers.links.serial import SerialLink
 from drivers.projector import Power, ProjectorIdentity
 from drivers.serial_projectors.driver import LineProjector
@@ -80,71 +77,6 @@ def test_epson_projector_drives_the_simulated_epson(device: SimulatedProjector) 
         asyncio.run(talk(terminal.path))
     assert device.power() is Power.ON
     assert device.muted()
-
-
-def test_epson_accepts_nothing_until_it_has_switched_on() -> None:
-    clock = SimulatedClock()
-    peer = LinePeer(SimulatedProjector(clock), EPSON)
-    assert peer.receive(b"PWR ON\r") == b""
-    assert peer.receive(b"PWR?\r") == b""
-    clock.sleep(29)
-    assert peer.receive(b"") == b""
-    clock.sleep(1)
-    assert peer.receive(b"") == b":"
-    assert peer.receive(b"PWR?\r\r") == b"PWR=01\r::"
-
-
-def test_epson_warming_up_by_remote_control_tells_its_power_only() -> None:
-    device = SimulatedProjector(SimulatedClock())
-    peer = LinePeer(device, EPSON)
-    device.switch_on()
-    assert peer.receive(b"PWR?\rLAMP?\r") == b"PWR=02\r:ERR\r:"
-
-
-@pytest.fixture(params=[BENQ, EPSON], ids=lambda language: language.maker)
-def served(request: pytest.FixtureRequest, device: SimulatedProjector) -> Iterator[LineProjector]:
-    with serve_peer(lambda: LinePeer(device, request.param, network=True)) as server:
-        yield LineProjector(request.param, lambda: TcpLink.connect(*server.address, 10.0), network=True)
-
-
-def test_serves_the_network_as_well(served: LineProjector) -> None:
-    served.switch_on()
-    assert served.power() is Power.ON
-    served.set_muted(True)
-    assert served.muted()
-    served.close()
-    assert served.muted()
-    served.close()
-
-
-def test_a_controller_that_greets_wrongly_is_refused(device: SimulatedProjector) -> None:
-    peer = LinePeer(device, EPSON, network=True)
-    answer = peer.receive(b"GET / HTTP/1.0\r\n")
-    assert (answer[:10], len(answer), answer[14]) == (b"ESC/VP.net", 16, 0x40)
-
-
-def test_answers_what_no_driver_sends(device: SimulatedProjector) -> None:
-    assert LinePeer(device, EPSON).receive(b"PWR 01\rCMODE?\r") == b"ERR\r:ERR\r:"
-    assert LinePeer(device, BENQ).receive(b"*3d=?#\r") == b"*3d=?#\r\n*Unsupported item#\r\n>"
-    assert LinePeer(device, load_language("optoma")).receive(b"hello\r~00999 1\r") == b"F\rF\r"
-
-
-def test_a_pseudo_terminal_leaves_no_thread_and_no_port(device: SimulatedProjector) -> None:
-    before = threading.active_count()
-    with PseudoTerminal(LinePeer(device, EPSON)) as terminal:
-        assert threading.active_count() == before + 1
-    terminal.close()
-    assert threading.active_count() == before
-
-
-@pytest.mark.slow
-def test_a_pseudo_terminal_that_nobody_reads_can_be_closed(device: SimulatedProjector) -> None:
-    with PseudoTerminal(LinePeer(device, BENQ)) as terminal:
-        link = SerialLink.open(terminal.path, 115200)
-        for _ in range(5):
-            link.write(b"*modelname=?#\r" * 100, 10.0)
-            terminal.catch_up()
-        link.close()
 
 
 @pytest.mark.slow

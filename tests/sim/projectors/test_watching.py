@@ -26,7 +26,6 @@ from sim.projectors.watching import (
     LampState,
     ScreenPlace,
     Screenshots,
-    ThrownLight,
     ask,
     picture_light,
 )
@@ -229,19 +228,6 @@ def test_a_frozen_picture_stays_and_another_input_is_black() -> None:
         assert seen() == [1.0, 1.0, 1.0]
 
 
-@pytest.mark.parametrize(
-    ("text", "place"),
-    [
-        (":1", ScreenPlace(":1")),
-        ("lab:1.0", ScreenPlace("lab:1.0")),
-        ("640x360+10+20", ScreenPlace(None, (10, 20, 640, 360))),
-        (":1,640x360+0+0", ScreenPlace(":1", (0, 0, 640, 360))),
-    ],
-)
-def test_a_screen_is_named(text: str, place: ScreenPlace) -> None:
-    assert ScreenPlace.parse(text) == place
-
-
 @pytest.mark.parametrize("text", ["", "1", ":", "640x360", ":1,640x360", ":1;640x360+0+0", "HDMI-1"])
 def test_what_names_no_screen_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="DISPLAY"):
@@ -264,17 +250,3 @@ def test_screenshots_are_of_the_place_and_come_back_with_the_server(tmp_path: Pa
             whole.take()
         with pytest.raises(DeviceError, match=f"check {server.display}"):
             whole.take()
-
-
-@pytest.mark.parametrize(
-    ("rows", "said"),
-    [
-        ([[0.25]], "plain picture, mean light 0.250 0.250 0.250, lamp 0.70"),
-        ([[0.25, 0.2509]], "plain picture, mean light 0.250 0.250 0.250, lamp 0.70"),
-        ([[0.2], [0.6]], "not plain picture, mean light 0.400 0.400 0.400, lamp 0.70"),
-        ([[0.2, 0.2, 0.8]], "not plain picture, mean light 0.400 0.400 0.400, lamp 0.70"),
-    ],
-)
-def test_light_is_told_as_plain_where_its_picture_is_alike_everywhere(rows: list[list[float]], said: str) -> None:
-    picture = np.repeat(np.array(rows, dtype=np.float32)[..., None], 3, axis=2)
-    assert str(ThrownLight(picture, 0.7)) == said

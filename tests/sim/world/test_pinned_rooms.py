@@ -11,16 +11,12 @@ import pytest
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from sim import spectral
-from sim.optics import PhotographicLens
-from sim.spectral import WAVELENGTHS_NM, daylight, paper, projector_primaries
-from sim.world import rendering
+from sim.spectral import daylight, projector_primaries
 from sim.world.disturbances import AnyDisturbance, Disturbances, Moment
-from sim.world.rendering import Fold, Print, Waviness, label_map
 from sim.world.sensors import BODIES, FACTS, Body, Rectangle, find_body
-from sim.world.world import REFERENCE_EXPOSURE, UNDISTURBED, Blob, Glare, Patch, Room, Situation, World, moved
+from sim.world.world import REFERENCE_EXPOSURE, UNDISTURBED, Blob, Glare, Patch, Room, Situation, World
 from tests.pinned import Pinned
-from tests.sim.conftest import PAGE_MM, patches
-from tests.sim.world.lab import relative_lab
+from tests.sim.conftest import patches
 
 TINY = replace(
     BODIES["Test"], sensor=(131, 187), visible=Rectangle(11, 16, 117, 166), masked=(Rectangle(0, 0, 131, 14),)
@@ -151,28 +147,6 @@ def test_several_things_at_once_show_what_they_showed(pinned: Pinned) -> None:
     pinned("a room's situations", [found, world.project(PLACES, "R", situations["all"])], same=SINGLE)
 
 
-@pytest.mark.parametrize("name", get_args(spectral.PaperName))
-def test_inks_are_what_they_were(name: spectral.PaperName, pinned: Pinned) -> None:
-    rgb = np.random.default_rng(3).uniform(0, 255, (40, 3)).round(1)
-    rgb[:3] = [[0, 0, 0], [255, 255, 255], [255, 0, 0]]
-    inks = spectral._Inks(name)
-    # Colours that inks reach, and some that they do not; a neutral one has no hue.
-    lab = np.array([[50.0, 0, 0], [60, 30, 20], [90, 80, -70], [20, -60, 40], [75, 5, 60], [100, 0, 0], [5, 5, -5]])
-    matching = inks.matching(lab)
-    found = {
-        "coverage": spectral.ink_coverage(rgb, name),
-        "reflectance": spectral.print_reflectance(rgb, name),
-        "lab": relative_lab(spectral.print_reflectance(rgb, name), name),
-        "paper": paper(name),
-        "overprints": paper(name).overprints(),
-        "intended": spectral._lab(spectral._wanted(rgb / 255, 0.02)),
-        "xyz": inks.xyz(rgb / 255),
-    }
-    pinned(f"inks on {name} paper", found)
-    # An inversion ends where its steps are small, not where they are nothing.
-    pinned(f"inks that look like colours, on {name} paper", [matching, inks.xyz(matching)], same=1e-3, nothing=1e-4)
-
-
 def test_lights_and_cameras_are_what_they_were(pinned: Pinned) -> None:
     found = {
         "lamps": {lamp: projector_primaries(lamp) for lamp in get_args(spectral.LampSpectrum)},
@@ -186,45 +160,3 @@ def test_lights_and_cameras_are_what_they_were(pinned: Pinned) -> None:
         "observer": spectral._observer(),
     }
     pinned("lights and cameras", found)
-
-
-def test_grids_are_what_they_were(pinned: Pinned) -> None:
-    random = np.random.default_rng(6)
-    grids = {
-        "same": WAVELENGTHS_NM,
-        "coarse": np.arange(395.0, 740.0, 7.3),
-        "as fine": np.arange(380.0, 781.0, 4.996),
-        "finer": np.arange(380.0, 781.0, 4.99),
-        "fine": np.arange(390.0, 720.0, 1.0),
-        "uneven": np.sort(random.uniform(380, 780, 90)),
-    }
-    pinned(
-        "spectra on another grid",
-        {
-            name: spectral.regridded(grid, random.uniform(size=(len(grid), 2)), WAVELENGTHS_NM)
-            for name, grid in grids.items()
-        },
-    )
-
-
-def test_shapes_of_paper_and_of_a_drawing_are_what_they_were(pinned: Pinned) -> None:
-    fold = Fold((90.0, 60.0), (0.0998334, 0.9950042), 3.0, 0.8)
-    random = np.random.default_rng(4)
-    ends = np.sort(random.uniform(0, 0.5, (9000, 2)).round(5), axis=1)
-    lines, begins, stops = rendering._lines(ends)
-    over = Print(
-        PAGE_MM,
-        np.array([[-5.0, 10, 50, 60], [20, 20.0004, 200, 20.0004], [40, 30, 90, 99]]),
-        np.array([[9, 9, 9], [0, 0, 0], [9, 9, 9]], np.uint8),
-    )
-    found = {
-        "waves": [Waviness.random(seed, 4.0, PAGE_MM, modes, wave) for seed, modes, wave in ((0, 7, 0), (5, 3, 40.0))],
-        "heights": Waviness.random(1, 5.0, PAGE_MM).height(PLACES),
-        "fold": [fold.height(PLACES), fold.shade(PLACES)],
-        "label map": label_map(over),
-        "labels of patches": label_map(patches()),
-        "many lines": [len(lines), lines, begins, stops],
-        "moved": moved(PLACES, np.array([90.0, 60]), np.array([2.0, -1]), 13.0),
-        "lens": PhotographicLens((58, 83), 0.1, 0.4, 0.0, 1.0, 0.0).kernel(),
-    }
-    pinned("shapes of a sheet", found)
