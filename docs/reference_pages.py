@@ -1,6 +1,6 @@
 """Two pages of the documentation, written from the code: `docs/reference/figures.md` and `docs/reference/causes.md`.
 
-`python -m calibration.reference` writes both anew; a test compares them.
+`python -m docs.reference_pages` writes both anew; a test compares them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import QUESTIONS, Figure, Limit
 from calibration.figures.single_frames import FRAME_LIMITS, RIG_LIMITS
 
-_PAGES = Path(__file__).parents[1] / "docs" / "reference"
+_PAGES = Path(__file__).parent / "reference"
 
 _FIGURES_HEAD = """# Figures
 
@@ -24,7 +24,7 @@ beyond what is *refused* there is no table. `acquire check` judges most of them 
 `build-lut check` reads one frame, and judges those that this tells; what more frames can only make worse it judges
 where it is *beyond* already. The names are those of `report.json`.
 
-*Written by `python -m calibration.reference` from `calibration/figures`.*
+*Written by `python -m docs.reference_pages` from `calibration/figures`.*
 """
 
 _CAUSES_HEAD = """# Causes
@@ -34,7 +34,7 @@ The cause is decided by the table below, from evidence that stands in `report.js
 beside each cause. The first rule that holds decides; what was not measured lies in no interval. Where no rule holds,
 the cause is said to be unknown: look at the place in the report, where it is circled.
 
-*Written by `python -m calibration.reference` from `calibration/causes`.*
+*Written by `python -m docs.reference_pages` from `calibration/causes`.*
 """
 
 _AGAIN = {
