@@ -392,13 +392,12 @@ _QUIET = Annotated[
         help="No progress bars and no warnings: errors alone.",
     ),
 ]  # fmt: skip
-AsJson = Annotated[
+_AS_JSON = Annotated[
     bool,
     typer.Option(
         "--json", rich_help_panel=_COMMON_PANEL, help="Print one JSON object, for programs; all else goes to stderr."
     ),
 ]
-"""The option ``--json``."""
 
 COMMON = {"verbose": (_VERBOSE, 0), "quiet": (_QUIET, False), "version": (_VERSION, False)}
 """The options of every command and their defaults, by the names of their parameters. Each acts by its callback."""
@@ -676,7 +675,7 @@ def with_json(command: str) -> Callable[[Callable[..., None]], Callable[..., Non
         output_name = next((name for name, kind in hints.items() if kind is JsonOutput), None)
         if output_name is None:
             raise ValueError(f"{command} has no parameter of type JsonOutput to put the option in the place of")
-        option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
+        option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_AS_JSON)
         others = [
             parameter.replace(annotation=hints[name])
             for name, parameter in inspect.signature(function).parameters.items()

@@ -362,19 +362,6 @@ def open_inside(root: Path, name: str) -> Generator[BinaryIO]:
         yield stream
 
 
-def read_inside(root: Path, name: str, most_bytes: int) -> bytes:
-    """Return the bytes of a file below a folder, as `open_inside`; a FormatError if it has more than `most_bytes`."""
-    with open_inside(root, name) as stream:
-        size = os.fstat(stream.fileno()).st_size
-        data = stream.read(most_bytes + 1) if size <= most_bytes else b""
-        if size > most_bytes or len(data) > most_bytes:
-            raise FormatError(
-                f"{root / name} has {max(size, len(data))} bytes, at most {most_bytes} expected; it is not what it is "
-                "called, or damaged"
-            )
-    return data
-
-
 def require_plain_folder(
     folder: Path, most_bytes: Mapping[str, int] | None = None, below: tuple[str, ...] = ()
 ) -> None:

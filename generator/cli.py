@@ -18,17 +18,16 @@ from foundation.console import (
     JsonOutput,
     MainCommand,
     grouped,
-    json_output,
     loaded,
     new_app,
     orderly_end,
     progress,
     run,
+    with_json,
 )
 from foundation.errors import InputError, QualityError, StorageError
 from foundation.secret_texts import masked, printable
 from generator.options import (
-    CommonOptions,
     ImageOptions,
     LightOptions,
     PictureOptions,
@@ -83,8 +82,10 @@ class _Generate(MainCommand):
 
 
 @app.command(help=_HELP, cls=_Generate)
+@with_json("generate")
 @grouped
 def generate(
+    output: JsonOutput,
     places: Places,
     pictures: PictureOptions,
     light: LightOptions,
@@ -92,7 +93,6 @@ def generate(
     variation: VariationOptions,
     images: ImageOptions,
     work: WorkOptions,
-    common: CommonOptions,
 ) -> None:
     """Make a dataset, or one share of it; or verify one that is there."""
     if work.verify is not None and places.lut is not None:
@@ -100,32 +100,31 @@ def generate(
     sheet = images.contact_sheet
     if sheet is not None:
         _check_sheet(sheet, work.verify or places.out, work.shard, again=work.verify is None)
-    with json_output("generate", common.as_json) as output:
-        if work.verify is not None:
-            loaded()
-            _draw_sheet(_verify(work.verify, work.workers, output), work.verify, sheet)
-        else:
-            if places.lut is None or places.out is None:
-                raise InputError(_missing_place(places.lut))
-            if _is_table(places.out) and not _is_table(str(places.lut)):
-                raise InputError(
-                    f"{places.out} is a table and {places.lut} none: the table comes first, then the place of the "
-                    f"dataset: generate {places.out} {places.lut}"
-                )
-            from generator.dataset.making import made_before
+    if work.verify is not None:
+        loaded()
+        _draw_sheet(_verify(work.verify, work.workers, output), work.verify, sheet)
+    else:
+        if places.lut is None or places.out is None:
+            raise InputError(_missing_place(places.lut))
+        if _is_table(places.out) and not _is_table(str(places.lut)):
+            raise InputError(
+                f"{places.out} is a table and {places.lut} none: the table comes first, then the place of the "
+                f"dataset: generate {places.out} {places.lut}"
+            )
+        from generator.dataset.making import made_before
 
-            loaded()
-            workers = work.makers()
-            plan = _plan(places.lut, places.out, pictures, light, rendering, variation, images, work)
-            there = made_before(plan, places.out)
-            if there is not None:
-                _print_summary(there, places.out, output, was_there=True)
-                _draw_sheet(there, places.out, sheet)
-            elif work.shard is not None:
-                _make_share(plan, places.out, work.shard, workers, output)
-            else:
-                dataset = _make_whole(plan, places.out, workers, output)
-                _draw_sheet(dataset, places.out, sheet)
+        loaded()
+        workers = work.makers()
+        plan = _plan(places.lut, places.out, pictures, light, rendering, variation, images, work)
+        there = made_before(plan, places.out)
+        if there is not None:
+            _print_summary(there, places.out, output, was_there=True)
+            _draw_sheet(there, places.out, sheet)
+        elif work.shard is not None:
+            _make_share(plan, places.out, work.shard, workers, output)
+        else:
+            dataset = _make_whole(plan, places.out, workers, output)
+            _draw_sheet(dataset, places.out, sheet)
 
 
 @_explore_app.command(epilog=EXIT_CODES)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from foundation.compiled import processor_count
-from foundation.console import AsJson, option
+from foundation.console import option
 from foundation.errors import InputError
 
 if TYPE_CHECKING:
@@ -432,13 +432,6 @@ class WorkOptions:
         from generator.dataset.making import Workers
 
         return Workers(self.engine, processor_count() if self.workers is None else self.workers)
-
-
-@dataclass(frozen=True)
-class CommonOptions:
-    """What commands with figures take."""
-
-    as_json: AsJson = False
 
 
 def _size(text: str, name: str) -> tuple[int, int]:

@@ -48,8 +48,6 @@ GRADIENTS: Final = 13
 """Purpose of the words that shape how the light of an image falls off."""
 NOISE: Final = 14
 """Purpose of the words that are the keys of the noise that is added to an image's rows."""
-PICTURES: Final = 15
-"""Purpose of the words that draw source pictures by their weights."""
 
 _WORD: Final = 0xFFFFFFFF
 """Mask of the lower 32 bits, a word."""

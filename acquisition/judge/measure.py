@@ -1,7 +1,7 @@
 """What is kept of a frame: its measurements (`experiment.measures.frame`), and where the chart lay.
 
 `Anchor` is the chart's place in the first white frame, from which later
-frames tell how far it has moved, and blurred: its gauges are the chart's tags, or the outline of its field, or, where
+frames tell how far it has moved, and blurred: its gauges are the chart's tags or, where
 no chart is looked for, the places of most texture (`experiment.framing.pictures`); the frame is kept around them alone.
 `Frame` is both, and the bytes that the journal keeps of it.
 
@@ -40,7 +40,6 @@ from drivers.raw.rawfile import (
 )
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, LimitSettings
-from experiment.framing.field import FoundField
 from experiment.framing.finding import FoundTag, Framing, find_chart, find_tags
 from experiment.framing.homography import project
 from experiment.framing.pictures import Shift, gauge_boxes, gauges_of, shift_between
@@ -75,7 +74,7 @@ _MOST_PAPER = 300
 class Anchor:
     """The chart's place in a white frame.
 
-    - `framing`: its tags, or its field, or places of texture that stand for tags.
+    - `framing`: its tags, or places of texture that stand for tags.
     - `gauges`: the frame around them, of each channel, counts above black; 0 elsewhere.
     - `paper`: (N, 2) int64, columns and rows of blocks in the middle of bare paper.
     - `of_chart`: whether the chart was found; else the places are just textured ones.
@@ -146,11 +145,10 @@ class Anchor:
 
     @property
     def outlines(self) -> tuple[_Array, ...]:
-        """(K, 2) float64 each, px: outlines of the tags, or of the field; none where no chart is looked for."""
+        """(K, 2) float64 each, px: outlines of the tags; none where no chart is looked for."""
         if not self.of_chart:
             return ()
-        field = self.framing.field
-        return tuple(tag.corners_px for tag in self.framing.tags) if field is None else (field.corners_px,)
+        return tuple(tag.corners_px for tag in self.framing.tags)
 
     def boxes(self) -> list[tuple[int, int, int, int]]:
         """Return what of the gauges' planes is not 0: left, top, right, bottom (exclusive)."""
@@ -312,25 +310,10 @@ def _anchor_arrays(anchor: Anchor) -> dict[str, npt.NDArray[Any]]:
         values = anchor.gauges[channel].values
         crops = [values[y0:y1, x0:x1].ravel() for x0, y0, x1, y1 in anchor.boxes()]
         arrays[f"anchor_{channel}"] = np.concatenate(crops) if crops else np.empty(0, dtype=np.float32)
-    if framing.field is not None:
-        field = framing.field
-        arrays |= {
-            "anchor_field": field.homography,
-            "anchor_field_corners": field.corners_px,
-            "anchor_outline": np.stack([field.outline_mm, field.outline_px, field.normals]),
-            "anchor_explained": np.array([field.explained]),
-        }
     return arrays
 
 
 def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
-    field: FoundField | None = None
-    if "anchor_field" in arrays:
-        outline_mm, outline_px, normals = arrays["anchor_outline"]
-        field = FoundField(
-            arrays["anchor_field_corners"], arrays["anchor_field"], outline_mm, outline_px, normals,
-            float(arrays["anchor_explained"][0]),
-        )  # fmt: skip
     tags = tuple(
         FoundTag(int(number), corners, 0.0)
         for number, corners in zip(arrays["anchor_ids"], arrays["anchor_corners"], strict=True)
@@ -343,7 +326,7 @@ def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
     }
     framing = Framing(
         gauges[searched], tags, (), arrays["anchor_homography"], residual, module, fill,
-        bool(arrays["anchor_inside"][0]), turned, field,
+        bool(arrays["anchor_inside"][0]), turned,
     )  # fmt: skip
     anchor = Anchor(framing, gauges, arrays["anchor_paper"], of_chart)
     for channel in CHANNELS:

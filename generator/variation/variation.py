@@ -23,7 +23,6 @@ level.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import NormalDist
@@ -99,16 +98,6 @@ class Gradient:
     def describe(self) -> dict[str, Any]:
         """Return the shape and the numbers as plain values."""
         return {**self.shape.describe(), "stops": self.stops, "least": self.least, "colour": self.colour}
-
-
-def described_gradient(record: Mapping[str, Any]) -> Gradient:
-    """Return the gradient that `Gradient.describe` described."""
-    kind = str(record.get("masks"))
-    # A half plane is a soft edge of no width, which only its name says.
-    given = {name: value for name, value in record.items() if name != "masks" and value is not None}
-    if kind == "half-plane":
-        given.pop("width", None)
-    return parse_gradient(f"{kind}:{','.join(f'{name}={value}' for name, value in given.items())}")
 
 
 def parse_gradient(text: str) -> Gradient:

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import errno
 import struct
-from abc import ABC, abstractmethod
 from array import array
 from collections import deque
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import ClassVar
+from typing import Final
 
 import usb.core
 from usb.backend import IBackend
@@ -120,36 +119,18 @@ def endpoint_descriptor(address: int, kind: int, packet: int, interval: int = 0)
     return struct.pack("<BBBBHB", 7, _ENDPOINT, address, kind, packet, interval)
 
 
-class SimulatedUsbDevice(ABC):
-    """A device of one configuration and one interface: its descriptors and standard requests, and its pipes."""
+class PtpUsbDevice:
+    """A still image device, at high speed: its descriptors and standard requests, and its pipes."""
 
-    pipes: ClassVar[frozenset[int]]
+    pipes: Final = frozenset({BULK_IN, BULK_OUT, INTERRUPT_IN})
     """Addresses of its endpoints."""
 
-    def __init__(self, identity: UsbIdentity) -> None:
-        self.identity = identity
+    def __init__(self, responder: Responder, identity: UsbIdentity | None = None) -> None:
+        self.identity = identity or UsbIdentity()
+        self._responder = responder
+        self._exchange = _Exchange()
         self._halted: set[int] = set()
         self._configuration = 1
-
-    @abstractmethod
-    def interface_descriptors(self) -> bytes:
-        """Return the descriptors of the interface and its endpoints."""
-
-    @abstractmethod
-    def write(self, endpoint: int, data: bytes) -> None:
-        """Take packets from the host: `data` in full packets, the last perhaps short or, for b"", empty."""
-
-    @abstractmethod
-    def read(self, endpoint: int, limit: int) -> bytes | None:
-        """Return up to `limit` bytes of a transfer to the host, None where there is nothing yet."""
-
-    @abstractmethod
-    def unplugged(self) -> None:
-        """Forget everything: the cable was pulled, or the bus was reset."""
-
-    def class_request(self, setup: Setup, data: bytes) -> bytes:
-        """Carry out a request of the interface's class and return its data, if it goes to the host."""
-        raise Stalled
 
     def device_descriptor(self) -> bytes:
         """Return the 18 bytes that name the device."""
@@ -160,7 +141,7 @@ class SimulatedUsbDevice(ABC):
 
     def configuration_descriptor(self) -> bytes:
         """Return the descriptors of the configuration, its interface and its endpoints."""
-        body = self.interface_descriptors()
+        body = self._interface_descriptors()
         return struct.pack("<BBHBBBBB", 9, _CONFIGURATION, 9 + len(body), 1, 1, 0, 0xC0, 1) + body
 
     def control(self, setup: Setup, data: bytes = b"") -> bytes:
@@ -169,7 +150,7 @@ class SimulatedUsbDevice(ABC):
             case 0x00, recipient:
                 answer = self._standard(setup, recipient)
             case 0x20, 1:
-                answer = self.class_request(setup, data)
+                answer = self._class_request(setup, data)
             case _:
                 raise Stalled
         return answer[: setup.length]
@@ -217,25 +198,14 @@ class SimulatedUsbDevice(ABC):
             raise Stalled
         return bytes([2 + len(body), _STRING]) + body
 
-
-class PtpUsbDevice(SimulatedUsbDevice):
-    """A still image device, at high speed."""
-
-    pipes = frozenset({BULK_IN, BULK_OUT, INTERRUPT_IN})
-
-    def __init__(self, responder: Responder, identity: UsbIdentity | None = None) -> None:
-        super().__init__(identity or UsbIdentity())
-        self._responder = responder
-        self._exchange = _Exchange()
-
-    def interface_descriptors(self) -> bytes:
+    def _interface_descriptors(self) -> bytes:
         """Return the descriptors of the interface and the three endpoints."""
         interface = struct.pack("<BBBBBBBBB", 9, _INTERFACE, 0, 0, 3, *STILL_IMAGE_CLASS, 0)
         bulk = endpoint_descriptor(BULK_IN, _BULK, PACKET) + endpoint_descriptor(BULK_OUT, _BULK, PACKET)
         return interface + bulk + endpoint_descriptor(INTERRUPT_IN, _INTERRUPT, INTERRUPT_PACKET, 6)
 
     def write(self, endpoint: int, data: bytes) -> None:
-        """Take packets from the host."""
+        """Take packets from the host: `data` in full packets, the last perhaps short or, for b"", empty."""
         if BULK_OUT in self._halted:
             raise Stalled
         exchange = self._exchange
@@ -322,7 +292,7 @@ class PtpUsbDevice(SimulatedUsbDevice):
                 break
         return b"".join(taken)
 
-    def class_request(self, setup: Setup, data: bytes) -> bytes:
+    def _class_request(self, setup: Setup, data: bytes) -> bytes:
         """Carry out a request of the still image class and return its data, if it goes to the host."""
         match setup.request:
             case ControlRequest.CANCEL:
@@ -372,7 +342,7 @@ _FIELDS = {
 class Place:
     """Where a device is plugged in, and since when: two places of one device differ in their address."""
 
-    device: SimulatedUsbDevice
+    device: PtpUsbDevice
     port: int
     address: int
 
@@ -388,51 +358,51 @@ class Handle:
 class SimulatedBus(IBackend):
     """A bus with devices that can be plugged in and pulled out."""
 
-    def __init__(self, *devices: SimulatedUsbDevice) -> None:
+    def __init__(self, *devices: PtpUsbDevice) -> None:
         self._places: list[Place] = []
         self._addresses = 1
         self._claims: dict[Place, Handle] = {}
-        self._held: set[SimulatedUsbDevice] = set()
-        self._locked: set[SimulatedUsbDevice] = set()
-        self._kernel: set[SimulatedUsbDevice] = set()
+        self._held: set[PtpUsbDevice] = set()
+        self._locked: set[PtpUsbDevice] = set()
+        self._kernel: set[PtpUsbDevice] = set()
         for port, device in enumerate(devices, 1):
             self.plug(device, port)
 
-    def plug(self, device: SimulatedUsbDevice, port: int = 1) -> None:
+    def plug(self, device: PtpUsbDevice, port: int = 1) -> None:
         """Plug a device in."""
         self._addresses += 1
         self._places.append(Place(device, port, self._addresses))
 
-    def unplug(self, device: SimulatedUsbDevice) -> None:
+    def unplug(self, device: PtpUsbDevice) -> None:
         """Pull a device out; does nothing if it is not plugged in."""
         for place in [place for place in self._places if place.device is device]:
             self._places.remove(place)
             self._claims.pop(place, None)
             device.unplugged()
 
-    def replug(self, device: SimulatedUsbDevice) -> None:
+    def replug(self, device: PtpUsbDevice) -> None:
         """Pull a device out and plug it in again at its port, as it does itself when it restarts."""
         port = next((place.port for place in self._places if place.device is device), 1)
         self.unplug(device)
         self.plug(device, port)
 
-    def hold(self, device: SimulatedUsbDevice, held: bool = True) -> None:
+    def hold(self, device: PtpUsbDevice, held: bool = True) -> None:
         """Have another program hold the device's interface, or let go of it."""
         (self._held.add if held else self._held.discard)(device)
 
-    def lock(self, device: SimulatedUsbDevice, locked: bool = True) -> None:
+    def lock(self, device: PtpUsbDevice, locked: bool = True) -> None:
         """Take away the permission to open the device, or give it."""
         (self._locked.add if locked else self._locked.discard)(device)
 
-    def bind_kernel_driver(self, device: SimulatedUsbDevice) -> None:
+    def bind_kernel_driver(self, device: PtpUsbDevice) -> None:
         """Have the system's own driver sit on the interface."""
         self._kernel.add(device)
 
-    def kernel_driver_sits_on(self, device: SimulatedUsbDevice) -> bool:
+    def kernel_driver_sits_on(self, device: PtpUsbDevice) -> bool:
         """Return whether the system's own driver sits on the interface."""
         return device in self._kernel
 
-    def is_claimed(self, device: SimulatedUsbDevice) -> bool:
+    def is_claimed(self, device: PtpUsbDevice) -> bool:
         """Return whether the interface is claimed on this bus."""
         return any(place.device is device for place in self._claims)
 
