@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +15,9 @@ class Made:
 
     name: str
     truth: npt.NDArray[np.float64]
-    image: npt.NDArray[np.float64] | npt.NDArray[np.uint16]
+    image: npt.NDArray[Any]
     saturation: float | None = None
     mask: npt.NDArray[np.bool_] | None = None
 
-    def read(
-        self,
-    ) -> tuple[npt.NDArray[np.float64] | npt.NDArray[np.uint16], npt.NDArray[np.bool_] | None]:
+    def read(self) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_] | None]:
         return self.image, self.mask

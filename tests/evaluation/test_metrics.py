@@ -147,21 +147,17 @@ def test_an_estimate_without_a_channel() -> None:
     assert np.isfinite(error.rgb)
 
 
-def test_the_summary_of_eight_errors() -> None:
+def test_summaries_by_hand() -> None:
     # By MATLAB's prctile the errors stand at 6.25, 18.75, 31.25 ... percent: Q1 = 2.5, Q2 = 4.5, Q3 = 6.5.
     summary = summarise([8, 1, 7, 2, 6, 3, 5, 4])
     assert summary.as_tuple() == pytest.approx((4.5, 4.5, 4.5, 1.5, 7.5, (4.5**3 * 1.5 * 7.5) ** 0.2))
     assert summary.maximum == 8
     assert summary.below3 == 2 / 8  # 3 itself is not below 3.
 
-
-def test_the_summary_of_five_errors() -> None:
     # At 10, 30, 50, 70, 90 percent: Q1 = 1 + 0.75 = 1.75, Q3 = 4 + 0.25 * 6 = 5.5; with 1, 2, 3, 4, 10.
     summary = summarise([1, 2, 3, 4, 10])
     assert summary.as_tuple()[:5] == pytest.approx((4, 3, (1.75 + 6 + 5.5) / 4, 1, 10))
 
-
-def test_the_95th_percentile_of_twenty_errors() -> None:
     # The 19th of 20 stands at 92.5 percent, the 20th at 97.5: half-way.
     assert summarise(np.arange(1, 21)).p95 == pytest.approx(19.5)
 

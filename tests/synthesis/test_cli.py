@@ -57,11 +57,6 @@ def test_a_table_says_what_it_is_told_of_itself(
     assert "for a course" in capsys.readouterr().out
 
 
-def test_a_table_that_is_told_nothing_has_no_origin(settings: str, tmp_path: Path) -> None:
-    assert main(["table", str(tmp_path / "lut"), "--settings", settings, "--lights", "D65"]) == 0
-    assert '"origin"' not in (tmp_path / "lut" / "lut.json").read_text()
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from foundation.errors import ConfigurationError, FormatError
+from foundation.errors import ConfigurationError
 from sim.world.sensors import FACTS, find_body
 from synthesis.settings import TableSettings, load_settings, origin_of, parse_settings, room_of
 
@@ -42,12 +42,6 @@ def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
     assert body.sensitivities == "Canon_EOS_5DS"
 
 
-def test_without_a_file_all_is_as_in_the_simulated_lab() -> None:
-    usual = load_settings(None)
-    assert usual == TableSettings()
-    assert (usual.seed, usual.window, usual.chart.bits, usual.chart.seed, usual.exposure.iso) == (1, 5, 5, 1, 100)
-
-
 @pytest.mark.parametrize(
     ("section", "name", "least", "most"),
     [("exposure", "iso", 50, 25600), ("chart", "bits", 1, 5), ("chart", "seed", 0, None), ("", "seed", 0, None)],
@@ -77,20 +71,6 @@ def test_what_cannot_be_set_is_refused(document: dict[str, Any], message: str) -
 
 
 @pytest.mark.parametrize(
-    ("room", "message"),
-    [
-        ({"vignetin": 0.1}, r"unknown key 'room\.vignetin'; did you mean 'vignetting'"),
-        ({"vignetting": 2.0}, "vignetting is 2.0; 0 … below 1 is expected"),
-        ({"paper": "silk"}, r"room\.paper: "),
-        ({"seed": 5}, r"unknown key 'room\.seed'"),
-    ],
-)
-def test_what_a_room_has_not_is_refused(room: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        room_of(parse_settings({"room": room}, "here"), "here")
-
-
-@pytest.mark.parametrize(
     ("camera", "message"),
     [
         ({"modell": "x"}, r"unknown key 'camera\.modell'; did you mean 'model'"),
@@ -109,19 +89,6 @@ def test_what_a_room_has_not_is_refused(room: dict[str, Any], message: str) -> N
 def test_what_no_sensor_has_is_refused(camera: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         find_body("Canon_EOS_600D", camera, "here")
-
-
-def test_a_sensor_may_be_without_black_and_noise() -> None:
-    quiet = {"black": 0, "read_noise_dn": 0.0, "sensor_noise_e": 0.0}
-    assert find_body("Canon_EOS_600D", quiet, "here").black == 0
-
-
-def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError):
-        load_settings(tmp_path / "none.toml")
-    (tmp_path / "bad.toml").write_text("seed = \n")
-    with pytest.raises(ConfigurationError):
-        load_settings(tmp_path / "bad.toml")
 
 
 def test_a_citation_is_recorded_and_devices_have_no_place_in_it() -> None:

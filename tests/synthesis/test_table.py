@@ -8,6 +8,7 @@ from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import numpy.typing as npt
@@ -18,19 +19,17 @@ from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
 from evaluation.datasets.generated import open_generated
-from experiment.lights import load_illuminations, plan_illuminations
+from experiment.lights import load_illuminations
 from foundation.errors import FormatError, InputError, QualityError, StorageError
 from generator.cli import main as generate
-from generator.lights.choices import parse_light
 from sim.spectral import print_reflectance, printed_reflectance, sensitivities
 from sim.world.sensors import BODIES
 from sim.world.world import Room
-from synthesis.lamps import LightSpectra, illuminations_of, parse_spectra, read_lights
-from synthesis.settings import TableSettings, parse_settings, table_task
+from synthesis.lamps import LightSpectra, read_lights
+from synthesis.settings import parse_settings, table_task
 from synthesis.table import TableTask, compute_table
 from tests.calibration.lab import LIGHTS, SETTINGS, designed, hang, take
 from tests.generator.dataset.known import rows_of
-from tests.generator.said import said
 from tests.pinned import Pinned
 
 ROOM = Room(waviness_mm=0.5, vignetting=0.08, projector_falloff=0.05)
@@ -121,11 +120,6 @@ def test_a_computed_table_is_whole_and_says_that_it_was_computed(computed: Lut) 
 
 
 @pytest.mark.slow
-def test_a_photographed_table_does_not_say_so(photographed: Lut) -> None:
-    assert "computed" not in json.loads((photographed.folder / "lut.json").read_text())
-
-
-@pytest.mark.slow
 def test_threads_do_not_change_the_bytes_and_the_seed_does(computed: Lut, tmp_path: Path) -> None:
     alone = compute_table(task_of(), tmp_path / "alone", threads=1)
     assert open_lut(alone.folder).sha256 == computed.sha256
@@ -149,29 +143,16 @@ def test_overexposed_cells_are_unfit_and_overexposed_paper_is_refused(tmp_path: 
     assert not (tmp_path / "over").exists()
 
 
-def small_disk(path: Path) -> SimpleNamespace:
-    return SimpleNamespace(free=1 << 20)
-
-
 @pytest.mark.slow
 def test_a_taken_place_and_a_small_disk_are_refused_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "file").touch()
     with pytest.raises(InputError):
         compute_table(task_of(), tmp_path / "taken", threads=1)
-    monkeypatch.setattr("shutil.disk_usage", small_disk)
+    monkeypatch.setattr("shutil.disk_usage", Mock(return_value=SimpleNamespace(free=1 << 20)))
     with pytest.raises(StorageError, match=r"0\.02 GB, the disk has 0\.00 GB"):
         compute_table(task_of(), tmp_path / "new", threads=1)
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.slow
-def test_the_usual_task_is_the_projectors_707_lights_under_which_a_session_is_taken() -> None:
-    task = table_task("Canon_EOS_5DS", parse_settings({"chart": {"bits": 1}}, "here"), "here")
-    assert task.illuminations == plan_illuminations()
-    assert task.body.model == "Canon EOS 5DS"
-    assert task.exposure == SETTINGS
-    assert task.room == Room(seed=TableSettings().seed, lamp_drift_per_hour=0)
 
 
 @pytest.mark.slow
@@ -244,16 +225,6 @@ def test_every_cell_is_what_the_camera_sees_of_its_ink(lut: Lut, lights: LightSp
 def test_every_light_is_exposed_alike(lut: Lut) -> None:
     brightest = lut.white.max(axis=1)
     assert float(brightest.max() / brightest.min()) == pytest.approx(1, abs=3e-3)
-
-
-@pytest.mark.slow
-def test_lights_have_names_on_disk_and_in_use(lut: Lut, lights: LightSpectra) -> None:
-    assert [light.name for light in lut.illuminations] == [light.name for light in lights.lights]
-    assert parse_light("FL2", lut).lights == (1,)
-    assert parse_light("3000K", lut).lights == (4,)
-    assert set(parse_light("4200K", lut).lights) == {4, 5}
-    with pytest.raises(InputError):
-        parse_light("FL3", lut)
 
 
 @pytest.mark.slow
@@ -349,36 +320,3 @@ def test_a_table_under_the_projector(tmp_path: Path, pinned: Pinned) -> None:
     task = task_of(bits=1, page="A6", hot_per_million=200.0)
     done = compute_table(replace(task, illuminations=task.illuminations[:3]), tmp_path / "lut", 1)
     pinned("computed table, the projector", held_by(done.folder))
-
-
-@pytest.mark.slow
-def test_spectra_of_lights(pinned: Pinned) -> None:
-    named = (
-        "cie",
-        "cie-d,cie-hp",
-        "CIE-FL",
-        "iso7589",
-        "2000:5000:1000K",
-        "daylight:4000:25000:7000K",
-        "E",
-        "D66",
-        "5600",
-    )
-    named += ("2000-9000K", "daylight:3999", "daylight:25001", "A, D65 ,FL2", "A,A", "", "nothing", "1000K", "999K")
-    found: dict[str, Any] = {}
-    for name in named:
-        lights = said(read_lights, name)
-        found[name] = lights if isinstance(lights, str) else [
-            lights.source,
-            [[one.name, one.cct_k] for one in lights.lights],
-            np.array([one.power for one in lights.lights]),
-            [[one.kind, one.cct_k, one.colour] for one in illuminations_of(lights.lights)],
-        ]  # fmt: skip
-    grid = np.arange(390, 731, 17)
-    rows = "".join(f"{at},{1 + np.sin(at / 40):.5f}, {max(0.0, at - 600):.3f}\n" for at in grid[::-1])
-    texts = {"unordered": f"Wavelength (nm),hall,cellar\n\n{rows}", "none": "wavelength,a\n"}
-    texts["name"] = "wavelength,1.5\n400,1\n"
-    for name, text in texts.items():
-        lights = said(parse_spectra, text.encode(), "lamps.csv")
-        found[name] = lights if isinstance(lights, str) else [[one.name, one.power] for one in lights]
-    pinned("spectra of lights", found)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Generator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -32,9 +32,10 @@ from experiment.lights import load_illuminations
 from experiment.session.journal import Journal
 from experiment.session.records import plan_steps
 from foundation.console import plain
-from foundation.errors import DeviceError, LinkClosed
+from foundation.errors import DeviceError
 from sim.world.world import Room
 from tests.acquisition.check.conftest import Check, lab_toml
+from tests.acquisition.run.scripted import DEVICES, FAULTY, SAYS, Broken
 from tests.calibration.lab import hang_chart
 
 pytestmark = pytest.mark.slow
@@ -213,10 +214,7 @@ def test_the_command_says_it_in_json(
 ) -> None:
     found = CheckReport((), (Finding("disk", "good", "seen"), Finding("turn", "remark", "seen")))
 
-    def checked(*_: object, **named: object) -> CheckReport:
-        return found
-
-    monkeypatch.setattr(check_module, "check_lab", checked)
+    monkeypatch.setattr(check_module, "check_lab", Mock(return_value=found))
     lab = folder / "json.toml"
     lab.write_text(lab_toml("chart2.json"))
     assert main(["check", str(lab), "--json"]) == 0
@@ -244,32 +242,6 @@ def test_a_recording_is_judged_as_it_was_taken(folder: Path, tmp_path: Path) -> 
     assert "cannot be exposed anew" in found.remedy
     assert {"white_drift", "additivity"} <= set(report.not_known)
     assert of(report, "bleed").grade == of(report, "evenness").grade == "good"
-
-
-DEVICES = ("camera", "display", "projector")
-FAULTY = [chosen for count in (1, 2, 3) for chosen in itertools.combinations(DEVICES, count)]
-
-SAYS = {
-    "camera": "the camera is asleep; wake it up",
-    "display": "HDMI-1 is covered; close what covers it",
-    "projector": "nobody answers at 192.0.2.7; look at its cable",
-}
-
-
-class Broken:
-    """A device all of whose verbs fail but that it can be closed."""
-
-    def __init__(self, says: str) -> None:
-        self._says = says
-
-    def close(self) -> None:
-        """Do nothing."""
-
-    def __getattr__(self, name: str) -> Any:
-        def fail(*_: object) -> None:
-            raise LinkClosed(self._says)
-
-        return fail
 
 
 @pytest.mark.parametrize("faulty", FAULTY, ids="+".join)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acquisition.check.findings import CheckReport, Finding, judged, not_checked
+from acquisition.check.findings import CheckReport, judged, not_checked
 from calibration.figures.figure import Limit
 from foundation.console import plain
 
@@ -39,7 +39,3 @@ def test_json_holds_every_finding_and_no_number_that_is_none() -> None:
     assert found["value"] is None
     assert found["details"] == {"each": [1.0, None]}
     assert (found["good"], found["tolerable"]) == ([0.2, None], [0.1, None])
-
-
-def test_a_finding_has_a_whole_sentence() -> None:
-    assert Finding("a", "good", "seen").sentence() == "seen"

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import BinaryIO
+from unittest.mock import Mock
 
 import pytest
 
 from acquisition.check.findings import Finding
 from acquisition.check.supplies import judge_disk, judge_noise_reduction, judge_supplies
-from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
+from drivers.camera import Supplies
 from foundation.errors import LinkTimeout
 
 
@@ -36,36 +34,6 @@ def test_the_disk_is_asked_where_the_session_will_be(tmp_path: Path) -> None:
     assert judge_disk(tmp_path, 10**9, 25_000_000).grade == "fault"
 
 
-@dataclass
-class Body:
-    """A camera of which only the supplies are asked."""
-
-    left: Supplies | None
-
-    def identity(self) -> CameraIdentity:
-        return CameraIdentity("A", "B", "1")
-
-    def configure(self, settings: ExposureSettings) -> None:
-        raise NotImplementedError
-
-    def shutter_speeds(self) -> tuple[float, ...]:
-        return ()
-
-    def expose(self) -> datetime:
-        return datetime.now(UTC)
-
-    def download(self, into: BinaryIO) -> CapturedFrame:
-        raise NotImplementedError
-
-    def close(self) -> None:
-        pass
-
-    def supplies(self) -> Supplies:
-        if self.left is None:
-            raise LinkTimeout("the camera does not answer")
-        return self.left
-
-
 @pytest.mark.parametrize(
     ("left", "frames", "battery", "card"),
     [
@@ -85,4 +53,6 @@ class Body:
 def test_battery_and_card_are_judged_as_far_as_the_body_tells(
     left: Supplies | None, frames: int, battery: str, card: str
 ) -> None:
-    assert [found.grade for found in judge_supplies(Body(left), frames, 25 * 10**6)] == [battery, card]
+    body = Mock()
+    body.supplies.side_effect = [LinkTimeout("the camera does not answer") if left is None else left]
+    assert [found.grade for found in judge_supplies(body, frames, 25 * 10**6)] == [battery, card]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -13,7 +14,6 @@ from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
 from calibration.verdict import judge, judged_values
 from drivers.presenter import Colour
-from experiment.chart.model import Chart
 from experiment.lights import Illumination
 from sim.world.world import Room
 from tests.calibration.lab import hang
@@ -56,11 +56,8 @@ def test_figures_are_those_at_the_shutter_time_of_the_settings() -> None:
 def test_trial_frames_show_what_a_table_of_them_shows(
     room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def unsuitable(chart: Chart) -> str:
-        return "not measured in this test"
-
     # A trial does not measure the lens.
-    monkeypatch.setattr("calibration.pipeline.baseline.unsuitable", unsuitable)
+    monkeypatch.setattr("calibration.pipeline.baseline.unsuitable", Mock(return_value="not measured in this test"))
     lab, lights = hang(3, room=room), trial_lights(PLAN)
     with record_session(
         tmp_path / "session",

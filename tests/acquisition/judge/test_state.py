@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.judge import state
-from acquisition.judge.state import LAMP_STEP, ProjectorModel, combined
+from acquisition.judge.state import LAMP_STEP, ProjectorModel
 from experiment.session.records import TOP
 
 NODES = len(state._NODES)
@@ -109,44 +109,6 @@ def test_a_frame_of_one_primary_moves_its_level_and_the_lamp_by_their_share_of_t
     )
 
 
-def test_two_primaries_tell_how_they_scatter_against_each_other() -> None:
-    model = known()
-    learnt = model.learn(np.array([1.01, 0.99, 0]), (TOP, TOP, 0))
-    faint = ABSOLUTE**2 / np.array([1.01, 0.99]) ** 2
-    # The mean of the variances less that of all entries: what differs between the two, half of each one's own.
-    weight = (CHROMA**2 / 2) / ((CHROMA**2 + faint.mean()) / 2)
-    squares = (np.log(1.01) - np.log(0.99)) ** 2 / 2
-    assert learnt.chroma == pytest.approx((12 * CHROMA**2 + weight * squares, 12 + weight), rel=1e-4)
-    assert known().learn(np.array([1.5, 0.5, 0]), (TOP, TOP, 0)).chroma[0] == pytest.approx(
-        12 * CHROMA**2 + (weight * (8 * CHROMA) ** 2), rel=2e-2
-    )
-
-
-@pytest.mark.parametrize(("amount", "is_learnt"), [(0.00149, False), (0.00151, True)])
-def test_an_amount_below_five_deviations_of_no_light_teaches_nothing_but_that_time_went_by(
-    amount: float, is_learnt: bool
-) -> None:
-    learnt = UNKNOWN.learn(np.array([amount, 0, 0]), (16, 0, 0))
-    assert bool(learnt.state.any()) is is_learnt
-    if not is_learnt:
-        expected = UNKNOWN.covariance.copy()
-        expected[-1, -1] += LAMP_STEP**2
-        np.testing.assert_array_equal(learnt.covariance, expected)
-
-
-def test_after_a_pause_or_a_step_the_lamp_is_less_known() -> None:
-    more = np.diag(UNKNOWN.rested().covariance - UNKNOWN.covariance)
-    np.testing.assert_allclose(more[LEVELS:], [0.01**2] * 3 + [0] * 9 + [0.05**2], atol=1e-15)
-    stepped = UNKNOWN.stepped(0.03)
-    np.testing.assert_allclose(np.diag(stepped.covariance - UNKNOWN.covariance)[LEVELS:], [0] * 12 + [0.05**2])
-    assert stepped.brightness == pytest.approx((12 * BRIGHTNESS**2 + 0.03**2, 13))
-
-
-def test_scatter_is_never_less_than_tiles_and_curves_are_known() -> None:
-    steady = replace(UNKNOWN, chroma=(0.0, 50.0), brightness=(0.0, 50.0))
-    assert (steady.chroma_sd, steady.brightness_sd) == (0.0006, 0.0006)
-
-
 @pytest.mark.parametrize(
     ("amounts", "angle_deg", "brightness"),
     [((1.05, 1.05, 1.05), 0.0, np.log(1.05)), ((1.0, 1.0, 0.0), np.degrees(np.arccos(2 / np.sqrt(6))), np.log(2 / 3))],
@@ -163,8 +125,3 @@ def test_amounts_are_held_against_codes_by_angle_and_level(
     # Their mean is known three times as well; the lamp scatters besides, and drifts.
     assert fit.brightness_sd == pytest.approx(np.sqrt(sd**2 / 3 + BRIGHTNESS**2 + LAMP_STEP**2))
     assert fit.angle_limit(5.5) == pytest.approx(fit.angle_deg * 5.5 / max(fit.distance, 1e-3))
-
-
-def test_values_are_combined_by_their_weights() -> None:
-    assert combined([(1.0, 0.1), (2.0, 0.2)]) == pytest.approx((1.2, (100 + 25) ** -0.5))
-    assert combined([]) == (0.0, float("inf"))

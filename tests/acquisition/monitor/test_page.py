@@ -175,7 +175,7 @@ def test_refused_frames_stand_with_picture_and_reason(tab: Tab, run: MadeUpRun) 
         assert "taken again since and accepted" in tab.value(f"{card}.innerText")
         tab.value(f"{card}.querySelector('button').click()")
         assert tab.value("document.getElementById('frame-title').textContent") == "Chosen frame"
-        assert tab.value("document.querySelector('#checks tr.bad th').textContent") == "✕ light"
+        assert tab.value("document.querySelector('#checks tr.bad th').textContent") == "✕ off_codes_deg"
 
 
 @pytest.mark.parametrize("dark", [False, True])

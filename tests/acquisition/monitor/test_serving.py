@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -221,16 +222,10 @@ def test_a_folder_of_something_else_is_no_session(tmp_path: Path) -> None:
         open_monitor(tmp_path / "letter.txt", 0)
 
 
-@pytest.fixture
-def interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(server: ThreadingHTTPServer) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupt)
-
-
-@pytest.mark.usefixtures("interrupted")
-def test_ctrl_c_is_its_proper_end(run: MadeUpRun, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_is_its_proper_end(
+    run: MadeUpRun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", Mock(side_effect=KeyboardInterrupt))
     assert main(["monitor", str(run.folder), "--port", "0"]) == 0
     printed = capsys.readouterr()
     assert "http://127.0.0.1:" in printed.out

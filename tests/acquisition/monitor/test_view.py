@@ -11,6 +11,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -131,11 +132,6 @@ def test_all_frames_there_and_nobody_at_work_is_complete_and_says_what_comes_nex
     assert head(attempts(8), heartbeat("running")).state == "running"
 
 
-def test_a_frame_of_a_step_that_the_plan_does_not_have_does_not_count() -> None:
-    stray = replace(attempts(1)[0], step=99)
-    assert head([stray], heartbeat("running")).done == 0
-
-
 def test_a_clock_that_was_set_back_makes_no_time() -> None:
     views = [*attempts(4), replace(attempts(1)[0], id=5, step=4, started_at=NOW - timedelta(hours=1))]
     timed = with_seconds([replace(view, seconds=None) for view in views], [])
@@ -143,12 +139,6 @@ def test_a_clock_that_was_set_back_makes_no_time() -> None:
     stands = head(timed, heartbeat("running"))
     assert stands.remaining_s == 15.0
     assert stands.eta is None, "the lab's clock is not the wall's"
-
-
-def test_the_time_between_two_runs_is_no_frames() -> None:
-    first, second, third = attempts(3)
-    timed = with_seconds([first, second, third], [second.started_at])
-    assert [one.seconds for one in timed] == [None, None, 5.0]
 
 
 @pytest.fixture
@@ -244,21 +234,6 @@ def test_many_pages_that_follow_at_once_all_get_everything(run: MadeUpRun) -> No
     assert followed == [set(range(1, len(run.steps) + 1))] * 4
 
 
-def test_nothing_new_is_nothing_told_and_the_journal_is_not_opened(
-    run: MadeUpRun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    watch = SessionWatch(run.folder)
-    monkeypatch.setattr("acquisition.monitor.view.FRESH_S", 0.0)
-    cursor = told(watch)["cursor"]
-    assert watch.state(cursor) is None
-
-    def opened(*_: object) -> None:
-        raise AssertionError("opened")
-
-    monkeypatch.setattr("acquisition.monitor.view.read_session", opened)
-    assert watch.state(cursor) is None
-
-
 def test_a_preview_that_is_written_after_its_row_is_told(run: MadeUpRun) -> None:
     run.previews = False
     watch = SessionWatch(run.folder)
@@ -328,13 +303,6 @@ def test_what_was_seen_is_held_against_the_white_before(run: MadeUpRun) -> None:
     assert white["seen_at"] == pytest.approx([1 / 3, 1 / 3])
     ratio = [one / of for one, of in zip(light["seen"], white["seen"], strict=True)]
     assert light["seen_at"] == pytest.approx([ratio[0] / sum(ratio), ratio[2] / sum(ratio)], rel=1e-4)
-
-
-def test_a_refused_white_is_nothing_to_hold_a_light_against(run: MadeUpRun) -> None:
-    before = told(SessionWatch(run.folder))["frames"][2]["seen_at"]
-    run.journal.void([1], run.clock, "it was no white")
-    assert "seen_at" not in told(SessionWatch(run.folder))["frames"][2]
-    assert before
 
 
 def test_places_in_the_plane() -> None:
@@ -408,29 +376,9 @@ def test_a_run_that_writes_it_counts_as_ended_and_others_do_not(finished_run: Ma
     assert "chart.json" in head["sentence"]
 
 
-def test_the_command_writes_it_into_the_session_or_where_it_is_told(
-    finished_run: MadeUpRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["report", str(finished_run.folder)]) == 0
-    assert (finished_run.folder / "report.html").is_file()
-    assert main(["report", str(finished_run.folder), str(tmp_path / "x.html")]) == 0
-    assert f"{tmp_path / 'x.html'}: written" in capsys.readouterr().out
-
-
 def test_a_full_disk_is_said_and_leaves_the_session_as_it_was(
     finished_run: MadeUpRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, data: object) -> None:
-        raise StorageError(f"cannot write {path}: no space")
-
-    monkeypatch.setattr(view, "write_whole", full)
+    monkeypatch.setattr(view, "write_whole", Mock(side_effect=StorageError("no space")))
     assert main(["report", str(finished_run.folder)]) == StorageError.exit_code
     assert not (finished_run.folder / "report.html").exists()
-
-
-def test_a_journal_without_any_attempt_makes_a_report_too(tmp_path: Path) -> None:
-    made = MadeUpRun.begin(tmp_path / "empty")
-    made.journal.close()
-    write_session_report(made.folder, tmp_path / "x.html")
-    assert data_of(tmp_path / "x.html")["head"]["done"] == 0
-    Journal.open(made.folder / "journal.sqlite").close()

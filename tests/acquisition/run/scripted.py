@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -174,6 +175,32 @@ class Lab:
     def taken(self) -> list[tuple[str, str | None]]:
         """Return the steps of the attempts in their order, ``w0``, ``d1``, ``l2``, with their verdicts."""
         return [(f"{attempt.kind[0]}{attempt.step}", attempt.verdict) for attempt in self.session.journal.attempts()]
+
+
+DEVICES = ("camera", "display", "projector")
+FAULTY = [chosen for count in (1, 2, 3) for chosen in itertools.combinations(DEVICES, count)]
+
+SAYS = {
+    "camera": "the camera is asleep; wake it up",
+    "display": "HDMI-1 is covered; close what covers it",
+    "projector": "nobody answers at 192.0.2.7; look at its cable",
+}
+
+
+class Broken:
+    """A device all of whose verbs fail but that it can be closed."""
+
+    def __init__(self, says: str) -> None:
+        self._says = says
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def __getattr__(self, name: str) -> Any:
+        def fail(*_: object) -> None:
+            raise LinkClosed(self._says)
+
+        return fail
 
 
 class Beamer:

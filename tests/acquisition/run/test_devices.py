@@ -12,9 +12,9 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from itertools import pairwise
+from functools import partial
 from pathlib import Path
-from typing import cast
+from unittest.mock import Mock
 
 import pytest
 
@@ -22,7 +22,6 @@ from acquisition.judge.measure import ExposureJudge
 from acquisition.monitor.view import Head, read_session
 from acquisition.run import devices, run
 from acquisition.run.devices import (
-    ENGRAVED_S,
     PAUSE_S,
     RETRY_S,
     TOLD_LATER,
@@ -37,20 +36,16 @@ from acquisition.run.devices import (
     leave_lab,
     make_ready,
     pause_cause,
-    require_whole_turns,
-    wheel_of,
 )
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.run import take_session
 from drivers.camera import keep_awake
-from drivers.canon import SHUTTER
-from drivers.links.link import PeerLink
-from drivers.pjlink import NoResolution, PjLinkProjector
+from drivers.pjlink import NoResolution
 from drivers.presenter import BLACK, WHITE, Colour
-from drivers.projector import Fault, Power, Projector
+from drivers.projector import Power
 from drivers.raw.rawfile import read_raw
 from experiment.chart.layout import design_chart
-from experiment.config import CameraSettings, LabSettings, ProjectorCable, SequenceSettings, parse_lab
+from experiment.config import LabSettings, SequenceSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.opening import HeldJournalError
@@ -66,7 +61,6 @@ from foundation.errors import (
     LinkTimeout,
     StorageError,
 )
-from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import SimulatedProjector
 from tests.acquisition.run.scripted import SETTINGS, Beamer, Lab, Screen, ScriptedCamera
 
@@ -182,31 +176,53 @@ class Timed(SimulatedClock):
 
 
 @dataclass
-class Room:
-    """A projector behind PJLink, and everything that is said of it."""
+class PausedRoom:
+    """RetryPolicy with everything that it tells, and something that is broken until a time."""
 
-    power: Power = Power.ON
     limit_s: float = 600.0
     clock: Timed = field(default_factory=Timed)
-    said: list[tuple[float, str, str]] = field(default_factory=list[tuple[float, str, str]])
-    beats: list[tuple[float, str]] = field(default_factory=list[tuple[float, str]])
-
-    def __post_init__(self) -> None:
-        self.beamer = Beamer(self.clock, self.power)
+    said: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    beats: list[tuple[float, str, str, float]] = field(default_factory=list[tuple[float, str, str, float]])
+    idled: list[float] = field(default_factory=list[float])
+    tries: list[float] = field(default_factory=list[float])
 
     @property
     def retry(self) -> RetryPolicy:
-        def report(what: str, sentence: str) -> None:
-            self.said.append((self.clock.monotonic(), what, sentence))
-
-        def beat(state: str, sentence: str, within_s: float) -> None:
-            self.beats.append((self.clock.monotonic(), sentence))
-
-        return RetryPolicy(self.clock, self.limit_s, report, on_wait=beat)
+        return RetryPolicy(
+            self.clock,
+            self.limit_s,
+            lambda what, sentence: self.said.append((what, sentence)),
+            lambda: self.idled.append(self.clock.monotonic()),
+            lambda state, sentence, within_s: self.beats.append((self.clock.monotonic(), state, sentence, within_s)),
+        )
 
     @property
     def words(self) -> list[str]:
-        return [what for _, what, _ in self.said]
+        return [what for what, _ in self.said]
+
+    def broken(self, fault: Callable[[float], CropError | None], takes_s: float = 0.0) -> Callable[[], str]:
+        """Return an action that fails as `fault` says of the time, in seconds."""
+
+        def action() -> str:
+            now = self.clock.monotonic()
+            self.tries.append(now)
+            self.clock.sleep(takes_s)
+            found = fault(now)
+            if found is not None:
+                raise found
+            return "done"
+
+        return action
+
+
+@dataclass
+class Room(PausedRoom):
+    """A projector behind PJLink, and everything that is said of it."""
+
+    power: Power = Power.ON
+
+    def __post_init__(self) -> None:
+        self.beamer = Beamer(self.clock, self.power)
 
     def at(self, seconds: float, action: Callable[[], object]) -> None:
         self.clock.due.append((seconds, action))
@@ -218,16 +234,13 @@ def no_time(clock: SimulatedClock) -> RetryPolicy:
 
 @pytest.mark.parametrize(("fault", "said"), [("frozen", "frozen"), ("unplugged", "no signal")])
 def test_a_picture_that_does_not_follow_is_noticed(fault: str, said: str) -> None:
-    clock = SimulatedClock()
-    beamer = SimulatedProjector(clock, power=Power.ON)
-    peer = PjLinkPeer(beamer)
-    projector = PjLinkProjector(lambda: PeerLink(peer), clock=clock)
-    assert health_fault(projector) is None
+    beamer = Beamer(SimulatedClock())
+    assert health_fault(beamer.projector) is None
     if fault == "frozen":
-        beamer.set_frozen(True)
+        beamer.device.set_frozen(True)
     else:
-        beamer.signal = NoResolution.NO_SIGNAL
-    assert said in str(health_fault(projector))
+        beamer.device.signal = NoResolution.NO_SIGNAL
+    assert said in str(health_fault(beamer.projector))
 
 
 def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
@@ -264,7 +277,7 @@ def test_a_projector_deaf_while_its_lamp_is_struck_is_waited_for() -> None:
 
 @pytest.mark.slow
 def test_a_lamp_that_goes_out_while_it_warms_up_gets_all_its_minutes_again() -> None:
-    room = Room(Power.STANDBY)
+    room = Room(power=Power.STANDBY)
     lit_again = 600.0
 
     def relit() -> None:
@@ -279,7 +292,7 @@ def test_a_lamp_that_goes_out_while_it_warms_up_gets_all_its_minutes_again() -> 
 
 
 def test_a_picture_muted_while_the_lamp_warms_up_costs_no_minutes() -> None:
-    room = Room(Power.STANDBY)
+    room = Room(power=Power.STANDBY)
     room.at(200, lambda: room.beamer.device.set_muted(True))
     room.at(300, lambda: room.beamer.device.set_muted(False))
     make_ready(room.beamer.projector, SEQUENCE, room.retry)
@@ -330,133 +343,45 @@ def test_a_projector_that_came_back_in_standby_is_said_to_be_so() -> None:
     room.clock.sleep(0)
     await_health(room.beamer.projector, SEQUENCE, room.retry)
     assert room.words == ["retry", "paused", "still paused", "still paused", "warming up", "resumed"]
-    assert "nothing listens" in room.said[1][2]
-    assert "standby" in room.said[2][2]
-    assert "warm-up" in room.said[3][2]
+    assert "nothing listens" in room.said[1][1]
+    assert "standby" in room.said[2][1]
+    assert "warm-up" in room.said[3][1]
     # What is said at any time is what holds then.
-    for at, sentence in room.beats:
+    for at, _, sentence, _ in room.beats:
         if 70 < at < 195:
             assert "standby" in sentence
             assert "listens" not in sentence
     assert room.clock.monotonic() >= 200 + SEQUENCE.warm_up_s
 
 
-class Slow:
-    """A projector that takes its time, and says what it was asked."""
-
-    def __init__(self, clock: SimulatedClock, answer_s: float) -> None:
-        self.clock, self.answer_s = clock, answer_s
-        self.asked: list[str] = []
-        self.is_muted = False
-
-    def _ask(self, what: str) -> None:
-        self.clock.sleep(self.answer_s)
-        self.asked.append(what)
-
-    def power(self) -> Power:
-        self._ask("power")
-        return Power.ON
-
-    def muted(self) -> bool:
-        self._ask("muted")
-        return self.is_muted
-
-    def faults(self) -> tuple[Fault, ...]:
-        self._ask("faults")
-        return ()
-
-    def picture_fault(self) -> str | None:
-        self._ask("picture")
-        return None
-
-
-ALL = ["faults", "power", "muted", "picture"]
+ALL = ["faults", "power", "muted", "picture_fault"]
 
 
 @pytest.mark.parametrize(("answer_s", "asked"), [(0.004, ALL), (0.02, ["faults"])])
 def test_a_slow_projector_is_asked_in_turn(answer_s: float, asked: list[str]) -> None:
-    clock = SimulatedClock()
-    projector = Slow(clock, answer_s)
-    watch = HealthWatch(cast("Projector", projector), clock)
+    clock, projector, seen = SimulatedClock(), Mock(), list[str]()
+
+    def answers(what: str, value: object) -> object:
+        clock.sleep(answer_s)
+        seen.append(what)
+        return value
+
+    for what, value in (("power", Power.ON), ("muted", False), ("faults", ()), ("picture_fault", None)):
+        getattr(projector, what).side_effect = partial(answers, what, value)
+    watch = HealthWatch(projector, clock)
     assert watch.fault(thorough=False) is None
-    assert projector.asked == ALL, "what it costs is not known before"
-    projector.asked.clear()
+    assert seen == ALL, "what it costs is not known before"
+    seen.clear()
     clock.sleep(2.3)
     assert watch.fault(thorough=False) is None
-    assert projector.asked == asked
-    projector.asked.clear()
+    assert seen == asked
+    seen.clear()
     assert watch.fault(thorough=True) is None
-    assert projector.asked == ALL
-
-
-@dataclass
-class PausedRoom:
-    """RetryPolicy with everything that it tells, and something that is broken until a time."""
-
-    limit_s: float = 600.0
-    clock: SimulatedClock = field(default_factory=SimulatedClock)
-    said: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    beats: list[tuple[float, str, str, float]] = field(default_factory=list[tuple[float, str, str, float]])
-    idled: list[float] = field(default_factory=list[float])
-    tries: list[float] = field(default_factory=list[float])
-
-    @property
-    def retry(self) -> RetryPolicy:
-        return RetryPolicy(
-            self.clock,
-            self.limit_s,
-            lambda what, sentence: self.said.append((what, sentence)),
-            lambda: self.idled.append(self.clock.monotonic()),
-            lambda state, sentence, within_s: self.beats.append((self.clock.monotonic(), state, sentence, within_s)),
-        )
-
-    @property
-    def words(self) -> list[str]:
-        return [what for what, _ in self.said]
-
-    def broken(self, fault: Callable[[float], CropError | None], takes_s: float = 0.0) -> Callable[[], str]:
-        """Return an action that fails as `fault` says of the time, in seconds."""
-
-        def action() -> str:
-            now = self.clock.monotonic()
-            self.tries.append(now)
-            self.clock.sleep(takes_s)
-            found = fault(now)
-            if found is not None:
-                raise found
-            return "done"
-
-        return action
+    assert seen == ALL
 
 
 def until(end_s: float, fault: CropError) -> Callable[[float], CropError | None]:
     return lambda now: fault if now < end_s else None
-
-
-def test_other_devices_are_kept_awake_meanwhile() -> None:
-    room = PausedRoom()
-    room.retry.attempt(room.broken(until(100, DeviceError("covered"))), "the screen")
-    assert max(after - before for before, after in pairwise(room.idled)) <= 10
-    room = PausedRoom()
-    room.retry.attempt(room.broken(until(100, DeviceError("gone"))), "the camera", idle=False)
-    assert room.idled == []
-
-
-def test_a_pause_gives_one_order_and_says_nothing_twice() -> None:
-    room = PausedRoom(600.0)
-    full = StorageError("cannot write session: No space left on device; free space, then run the same command again")
-    gone = LinkClosed("EOS at usb 1 is gone; check its cable")
-    given_up = DeviceError("EOS at usb 1 is gone; no connection for 60 s; at last: no camera on USB; check its cable")
-    with pytest.raises(StorageError) as ended:
-        room.retry.attempt(room.broken(lambda now: full), "the disk")
-    assert str(ended.value).count("run the same command again") == 1
-    sentences = [sentence for _, sentence in room.said] + [sentence for _, _, sentence, _ in room.beats]
-    assert not [sentence for sentence in sentences if "again" in sentence]
-    assert any("free space (the run waits up to" in sentence for sentence in sentences)
-    room = PausedRoom(600.0)
-    with pytest.raises(LinkClosed) as lost:
-        room.retry.attempt(room.broken(lambda now: gone if now == 0 else given_up), "the camera")
-    assert str(lost.value).count("is gone") == 1
 
 
 @pytest.mark.parametrize("limit_s", [0.1, 0.3, 1.0, 600.0, 601.7])
@@ -650,17 +575,6 @@ class Time:
         return self.now
 
 
-def test_a_jump_is_told_once() -> None:
-    time = Time()
-    watch = RunWatch(elapsed=time)
-    assert watch.gap_s() == 0
-    time.now += 10
-    assert watch.gap_s() == 0, "a busy machine"
-    time.now += 11
-    assert watch.gap_s() == 11
-    assert watch.gap_s() == 0
-
-
 @pytest.fixture
 def time(monkeypatch: pytest.MonkeyPatch) -> Time:
     one = Time()
@@ -732,15 +646,6 @@ def test_a_step_that_takes_too_long_is_told_once_with_its_device() -> None:
     assert "for which 0.5 s is expected" in told[2]
 
 
-def test_a_machine_that_slept_makes_no_step_late() -> None:
-    time, told = Time(), list[str]()
-    watch = RunWatch(lambda sentence, begun: told.append(sentence), time)
-    with watch.step("the screen", "shows light 3", 1.0, "show"):
-        time.now += 3600
-        watch.look()
-    assert not told
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("hangs", "cause"), [("expose", "the camera"), ("show", "the screen"), ("judge", "the disk")])
 def test_what_hangs_is_named_while_it_hangs(
@@ -790,26 +695,3 @@ def test_what_hangs_is_named_while_it_hangs(
     # Of half a second the camera's own dark frame takes as much again.
     assert SETTINGS.camera.shutter_s == 0.5
     assert expected.items() >= {"expose": 1 + 3.0, "download": 10.0, "judge": 5.0, "show": 2.0}.items()
-
-
-def test_a_projector_without_a_wheel_needs_whole_pictures() -> None:
-    steady = ProjectorCable(colour_wheel_hz=0, refresh_hz=50)
-    require_whole_turns(CameraSettings(shutter_s=0.02), steady)
-    with pytest.raises(ConfigurationError, match=r"\(50 a second\).*\.refresh_hz"):
-        require_whole_turns(CameraSettings(shutter_s=1 / 60), steady)
-
-
-def test_the_times_that_are_named_before_a_camera_is_asked_are_engraved() -> None:
-    engraved = {step.value for step in SHUTTER.steps}
-    assert set(ENGRAVED_S) <= engraved
-    # Thirds of a stop, as engraved: 1/20 after 1/25, 1/13 after 1/15.
-    assert all(1.1 < longer / shorter < 1.4 for shorter, longer in pairwise(ENGRAVED_S))
-
-
-def test_the_wheel_before_the_camera_is_the_lab_s_or_the_simulated_room_s() -> None:
-    head = 'chart = "c"\nilluminations = "l"\n'
-    of_lab = "[lab.projector]\ncolour_wheel_hz = 120\n"
-    of_room = "[simulated.room]\nwheel_hz = 60\n"
-    rigs = [("lab", of_lab), ("simulated", of_room), ("simulated", of_lab), ("imported", of_lab)]
-    wheels = [wheel_of(parse_lab(f'rig = "{rig}"\n{head}{table}', "LAB.toml")) for rig, table in rigs]
-    assert wheels == [120, 60, 0, 0]

@@ -7,7 +7,6 @@ import contextlib
 import errno
 import http.server
 import io
-import itertools
 import json
 import os
 import shlex
@@ -21,7 +20,6 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -44,12 +42,10 @@ from acquisition.run.run import (
     SignOfLife,
     Terminal,
     clock_note,
-    killed_note,
     require_same_devices,
     run_session,
     signs_of_life,
     take_session,
-    verdict_line,
 )
 from drivers.camera import CameraIdentity, CapturedFrame
 from drivers.presenter import Colour
@@ -61,7 +57,7 @@ from experiment.session.journal import Journal
 from experiment.session.records import ACCEPTED, REFUSED, Check, Judgement, SessionStep, link_steps, plan_steps
 from foundation.clock import SimulatedClock
 from foundation.console import Ending
-from foundation.errors import DeviceError, DeviceRefused, QualityError, StorageError
+from foundation.errors import DeviceError, DeviceRefused, QualityError
 from sim.projectors.projector import SimulatedProjector
 from tests.acquisition.run.scripted import EXPOSE_S, LIGHTS, SETTINGS, WELL, Hurried, Lab, ScriptedCamera
 
@@ -128,16 +124,6 @@ def test_ties_that_were_interrupted_are_taken_anew(folder: Path) -> None:
     interrupt_after(lab, 7, again)
     assert lab.camera.exposed[:6] == TIES, "those that were taken are taken again: the chart may have moved since"
     assert link_runs(lab.session, lab.clock.now()) == (14, 15, 16, 17, 18, 19), "behind another light they are new"
-
-
-def test_the_journal_says_that_the_run_before_was_killed(folder: Path) -> None:
-    journal = Lab(folder).session.journal
-    until = datetime.now(UTC) + timedelta(seconds=60)
-    assert killed_note(Session.open(folder)) == ""
-    journal.beat("running", "frames are taken", until)
-    assert "was killed, or power was lost" in killed_note(Session.open(folder))
-    journal.beat("ended", "interrupted", until)
-    assert killed_note(Session.open(folder)) == ""
 
 
 def test_a_run_that_begins_again_says_so_before_its_devices_are_open(
@@ -369,21 +355,9 @@ def test_a_picture_that_was_late_for_a_while_lets_the_run_go_on(night: Night, un
     night.require_each_step_once()
 
 
-class Flapping(Seen):
-    """Refuses three frames of each light for something lasting, and then accepts `good` frames."""
-
-    good = 0
-
-    def judge(self, file: Path, step: SessionStep) -> Judgement:
-        self.judged += 1
-        if self.judged > 8 and (self.judged - 8) % (self.good + 4) < 4:
-            return Judgement((Check("light", reason=f"flash {self.judged}"),), lasting=True)
-        return Judgement((Check("light"),))
-
-
 @pytest.mark.slow
 def test_refused_files_have_a_budget_of_disk(night: Night) -> None:
-    class EachSecond(Flapping):
+    class EachSecond(Seen):
         def judge(self, file: Path, step: SessionStep) -> Judgement:
             self.judged += 1
             return Judgement((Check("light", reason="dust" if self.judged % 2 else ""),))
@@ -665,21 +639,6 @@ def test_a_service_manager_is_fed_within_half_of_its_time(manager: Manager, addr
     assert manager.got() == ["STOPPING=1\nSTATUS=complete: 0 of 6 frames left"]
 
 
-def test_a_dead_mans_switch_hears_each_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, told = SimulatedClock(), list[float]()
-
-    def tell(*_: object) -> None:
-        told.append(clock.monotonic() - begun)
-
-    monkeypatch.setattr(Notices, "tell", tell)
-    one, begun = Life("switch", "night", lambda sentence: None, clock, {}), clock.monotonic()
-    for _ in range(7):
-        one.sign("takes frames")
-        clock.sleep(ALIVE_S / 2)
-    assert told == [0, ALIVE_S, 2 * ALIVE_S, 3 * ALIVE_S]
-    one.close()
-
-
 def test_a_run_tells_a_service_manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     manager = Manager(str(tmp_path / "notify"))
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
@@ -692,14 +651,19 @@ def test_a_run_tells_a_service_manager(tmp_path: Path, monkeypatch: pytest.Monke
     assert got[-1].startswith("STOPPING=1\nSTATUS=complete")
 
 
+def covered_lab(folder: Path) -> Lab:
+    """Return a lab whose run pauses once."""
+    lab = Lab(folder)
+    lab.screen.fails = dict.fromkeys(range(2, 40), DeviceError("a screen saver covers the picture"))
+    return lab
+
+
 @pytest.mark.slow
 def test_who_could_not_be_told_is_noted_while_the_run_goes_on(tmp_path: Path) -> None:
     gone = str(tmp_path / "gone")
     sequence = SETTINGS.sequence.model_copy(update={"notify": f"{gone} s3cret"})
     settings = SETTINGS.model_copy(update={"sequence": sequence, "notify": NotifySettings(alive=f"{gone} s3cret")})
-    lights = tuple(Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(2))
-    lab = Lab(tmp_path / "session", lights=lights)
-    lab.screen.fails = dict.fromkeys(range(2, 40), DeviceError("a screen saver covers the picture"))
+    lab = covered_lab(tmp_path / "session")
     assert take_session(lab.session, lab.devices, settings).complete
     events = lab.session.journal.events()
     doubts = [event.detail for event in events if event.what == "doubt"]
@@ -713,9 +677,7 @@ def test_a_dead_mans_switch_hears_of_frames_and_pauses_and_of_the_end(tmp_path: 
     program = f"import sys; open({str(heard)!r}, 'a').write(sys.stdin.read() + chr(10))"
     target = shlex.join([sys.executable, "-S", "-c", program])
     settings = SETTINGS.model_copy(update={"notify": NotifySettings(alive=target)})
-    lights = tuple(Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(2))
-    lab = Lab(tmp_path / "session", lights=lights)
-    lab.screen.fails = dict.fromkeys(range(2, 40), DeviceError("a screen saver covers the picture"))
+    lab = covered_lab(tmp_path / "session")
     assert take_session(lab.session, lab.devices, settings).complete
     told: list[dict[str, Any]] = [json.loads(line) for line in heard.read_text().splitlines()]
     assert [one["event"] for one in told] == ["alive"] * (len(told) - 1) + ["complete"]
@@ -758,18 +720,6 @@ def test_what_ended_it_is_told() -> None:
     assert "mistake of the program" in last_words(mistaken)[-1][1]
 
 
-def test_a_frame_a_second_is_no_write_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    seconds = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: float(next(seconds)))
-    monkeypatch.setattr(run, "time", clock)
-
-    def twelve_frames(alive: SignOfLife) -> None:
-        for _ in range(12):
-            alive("")
-
-    assert len(last_words(twelve_frames)) < 8
-
-
 def test_after_a_wait_the_first_frame_says_that_it_is_over(tmp_path: Path) -> None:
     Journal.create(tmp_path / "journal.sqlite", ())
     with closing(Journal.open_for_run(tmp_path / "journal.sqlite")) as journal:
@@ -784,26 +734,7 @@ def test_after_a_wait_the_first_frame_says_that_it_is_over(tmp_path: Path) -> No
         assert last.state == "ended"
 
 
-def test_a_full_disk_does_not_end_the_run() -> None:
-    def full(state: str, sentence: str, until: datetime) -> None:
-        raise StorageError("no space")
-
-    with signs_of_life(full, lambda: None, 60.0) as alive:
-        alive("")
-
-
 STEP = SessionStep(7, "light", 5, Colour(1, 2, 3))
-
-
-def test_the_verdict_has_its_numbers() -> None:
-    checks = (Check("file"), Check("movement", 0.031, None, 0.2, "px"), Check("off_codes_deg", 0.2134, None, 0.5, "°"))
-    assert (
-        verdict_line(Taken(STEP, Judgement(checks), 3)) == "light 5 accepted, off_codes_deg 0.213°, movement 0.031 px"
-    )
-    followed = Judgement((Check("off_brightness", -4.0, -1.0, 1.0, "%"), Check("off_codes_deg", 0.7, None, 0.5, "°")))
-    assert verdict_line(Taken(STEP, followed, 3)) == "light 5 accepted, off_codes_deg 0.7° (beyond its limit)"
-    dark = Judgement((Check("exposure", 0.4, None, None, "%", "too dark"),))
-    assert verdict_line(Taken(STEP, dark, 3)) == "light 5 refused, exposure 0.4 %"
 
 
 def test_the_time_left_is_that_of_the_last_frames_without_pauses(
@@ -829,27 +760,20 @@ def test_the_time_left_is_that_of_the_last_frames_without_pauses(
         assert "left 40 s" in left(*[2] * 6, reason="too dark")
 
 
-def test_lines_stay_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    with Terminal() as terminal:
-        terminal.progress(0, 2)
-        terminal.taken(Taken(STEP, Judgement((Check("file"),)), 1))
-        terminal.announce("refused: light 5: too dark")
-        terminal.state("the lamp warms up, 3 min 00 s left")
-    assert "refused: light 5: too dark\n" in capsys.readouterr().err
-
-
 def test_a_run_into_a_file_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
     now = [0.0]
     with Terminal(lambda: now[0]) as terminal:
         terminal.progress(0, 200)
         for done in range(1, 201):
             now[0] += 2.0
-            terminal.taken(Taken(STEP, Judgement((Check("off_codes_deg", 0.2, None, 0.5, "°"),)), 200 - done))
+            checks = Check("movement", 0.031, None, 0.2, "px"), Check("off_codes_deg", 0.7, None, 0.5, "°")
+            terminal.taken(Taken(STEP, Judgement(checks), 200 - done))
             terminal.progress(done, 200)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 + int(400 // PLAIN_S) + 1
     assert "0 of 200 frames" in lines[0]
-    assert "90 of 200 frames, left 3 min 40 s, light 5 accepted, off_codes_deg 0.2°" in lines[6]
+    numbers = "off_codes_deg 0.7° (beyond its limit), movement 0.031 px"
+    assert f"90 of 200 frames, left 3 min 40 s, light 5 accepted, {numbers}" in lines[6]
     assert "200 of 200 frames, light 5 accepted" in lines[-1]
     assert "━" not in "".join(lines)
 

@@ -56,11 +56,6 @@ def test_methods_by_their_short_names(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "PCA bright and dark errs less than Shades-of-Gray (p=4) on 9 of 9 images" in chosen
 
 
-def test_a_method_alone_is_not_compared(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["compare", runs[0], "--method", "A"]) == 2
-    assert "name two methods to compare" in " ".join(capsys.readouterr().err.split())
-
-
 def test_runs_without_a_common_method(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     path = Path(runs[1]) / "errors.csv"
     path.write_text(path.read_text().replace(",A,", ",C,").replace(",B <i>,", ",D,"))
@@ -69,14 +64,6 @@ def test_runs_without_a_common_method(runs: tuple[str, str], capsys: pytest.Capt
     path.write_text(path.read_text().replace(",1,2,1,", ",1,1,1,"))
     assert main(["compare", *runs, "--method", "A=C"]) == 2
     assert f"im 0 in A ({runs[0]}) and C ({runs[1]}) are 19.47 degrees apart" in capsys.readouterr().err
-
-
-def test_runs_of_one_method_each_are_compared_by_it(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    for folder, left_out in zip(runs, (",A,", ",B <i>,"), strict=True):
-        path = Path(folder) / "errors.csv"
-        path.write_text("\n".join(line for line in path.read_text().splitlines() if left_out not in line) + "\n")
-    assert main(["compare", *runs]) == 0
-    assert f"B <i> ({runs[0]}) errs less than A ({runs[1]}) on 0 of 29 images" in capsys.readouterr().out
 
 
 def test_runs_of_the_command_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

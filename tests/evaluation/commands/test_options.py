@@ -13,17 +13,14 @@ import pytest
 
 from evaluation.cli import main
 from evaluation.commands.options import (
-    choose_estimates,
     choose_learners,
     choose_methods,
-    is_learner,
     reading_options,
 )
-from evaluation.datasets import LAYOUTS, DataOptions
 from evaluation.learning.standard import standard_learners
 from evaluation.methods import standard_methods
 from evaluation.methods.standard import STANDARD
-from foundation.errors import FormatError, InputError
+from foundation.errors import InputError
 
 pytestmark = pytest.mark.slow
 
@@ -80,19 +77,6 @@ def test_what_learns_is_no_method_and_what_does_not_is_no_learner(tmp_path: Path
         choose_learners(["magic"])
 
 
-def test_a_file_that_is_no_model(tmp_path: Path) -> None:
-    (tmp_path / "model.npz").write_bytes(b"nothing")
-    with pytest.raises(FormatError, match=r"model\.npz"):
-        choose_methods([str(tmp_path / "model.npz")])
-
-
-def test_names_of_estimates(tmp_path: Path) -> None:
-    for name in ("a.csv", "b=c.csv"):
-        (tmp_path / name).write_text("image,r,g,b\none,1,1,1\n")
-    given = [f"{tmp_path}/a.csv", f"My own={tmp_path}/a.csv", f"{tmp_path}/b=c.csv"]
-    assert [found.name for found in choose_estimates(given, ["one"])] == ["a", "My own", "b=c"]
-
-
 def test_a_class_that_has_to_learn_before_it_estimates_is_sent_to_cv(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -105,12 +89,6 @@ def test_a_class_that_has_to_learn_before_it_estimates_is_sent_to_cv(
     said = capsys.readouterr().err
     assert "AttributeError" in said
     assert "give it to evaluate cv" in said
-
-
-def test_what_is_given_arrives() -> None:
-    texts = ["layout=nus8", "camera=SonyA57", "black=128", "saturation=4000.5", "subset=test", "truth=left", "partial"]
-    assert reading_options(texts) == ("nus8", DataOptions("SonyA57", "test", "left", 128.0, 4000.5, True))
-    assert reading_options([]) == (None, DataOptions())
 
 
 @pytest.mark.parametrize(
@@ -127,20 +105,3 @@ def test_what_is_given_arrives() -> None:
 def test_what_cannot_be_read_so_is_refused(texts: list[str], words: str) -> None:
     with pytest.raises(InputError, match=re.escape(words)):
         reading_options(texts)
-
-
-def test_the_help_names_every_layout_and_key(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "1000")
-    assert main(["run", "--help"]) == 0
-    printed = capsys.readouterr().out.partition("--read")[2]
-    keys = ("layout=", "camera=", "subset=", "truth=", "black=", "saturation=", "partial:")
-    assert [name for name in (*LAYOUTS, *keys) if name not in printed] == []
-
-
-def test_a_learner_is_told_from_what_does_not_learn(tmp_path: Path) -> None:
-    file = tmp_path / "own.py"
-    file.write_text(LEARNER)
-    names = ["kernel-ridge", f"{file}:Learns", "gray-world", "gray-edge-1:p=4", "standard", f"{file}:Estimates"]
-    assert [is_learner(name) for name in names] == [True, True, False, False, False, False]

@@ -7,27 +7,16 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from evaluation.cli import main
 from tests.evaluation.datasets.made_up import COPIES
 from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
-from tests.evaluation.learning.made_up_world import world
+from tests.evaluation.learning.made_up_world import save_world
 from tests.evaluation.shown import contents, recorded_figures
 from tests.pinned import Pinned
 
 pytestmark = pytest.mark.slow
-
-
-def save_world(path: Path, count: int, seed: int, first: int = 0) -> None:
-    scenes = world(count, seed, size=24)
-    np.savez(
-        path,
-        images=np.stack([scene.image for scene in scenes]),
-        gt=np.stack([scene.truth for scene in scenes]),
-        names=np.array([f"{path.stem} {number + first}" for number in range(count)]),
-    )
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +25,8 @@ def made_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("place")
     save_pictures(folder / "pictures", [f"{number}.png" for number in range(6)])
     Maker(folder, write_table(folder / "lut")).make()
-    save_world(folder / "world.npz", 14, 0)
-    save_world(folder / "other.npz", 9, 5)
+    save_world(folder / "world.npz", 14, 0, size=24)
+    save_world(folder / "other.npz", 9, 5, size=24)
     for layout in ("lsmi", "folder", "nus8"):
         COPIES[layout].make(folder / layout)
     return folder

@@ -11,20 +11,14 @@ import pytest
 
 from evaluation.cli import main
 from evaluation.learning.model_files import load_model
-from tests.evaluation.learning.made_up_world import world
+from tests.evaluation.learning.made_up_world import save_world
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    scenes = world(12)
-    np.savez(
-        tmp_path / "world.npz",
-        images=np.stack([scene.image for scene in scenes]),
-        gt=np.stack([scene.truth for scene in scenes]),
-        names=np.array([scene.name for scene in scenes]),
-    )
+    save_world(tmp_path / "world.npz", 12)
     return tmp_path / "world.npz"
 
 

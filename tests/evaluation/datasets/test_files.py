@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from evaluation.datasets.files import Folder, chart_mask, decode_image, natural, present, read_rows, subtract_black
+from evaluation.datasets.files import chart_mask, decode_image, natural, read_rows, subtract_black
 from foundation.errors import FormatError
 from tests.data_files import shipped
 from tests.evaluation.datasets.made_up import image_of, write_png, write_tiff
@@ -104,17 +104,6 @@ def test_numbers_in_names_sort_by_value() -> None:
     assert sorted(names, key=natural) == ["1a9", "1a10", "9.png", "10.png", "IMG_9.png", "IMG_0010.png", "a"]
 
 
-def test_a_name_twice_in_a_list_is_told(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="gt names b twice"):
-        present(["a", "b", "b"], {"a": "a.png", "b": "b.png"}, "gt", tmp_path, partial=False)
-
-
-def test_a_file_for_a_folder_is_told(tmp_path: Path) -> None:
-    (tmp_path / "a").write_text("")
-    with pytest.raises(FormatError):
-        _ = Folder(tmp_path / "a").files
-
-
 def test_the_advice_for_a_picture_of_eight_bits_gives_the_colours_of_the_mosaic(tmp_path: Path) -> None:
     # Without -D the same program writes white-balanced sRGB of 16 bits, which nothing tells from camera RGB afterwards.
     write_png(tmp_path / "eight.png", image_of(4, 4).astype(np.uint8))
@@ -136,12 +125,6 @@ def test_the_advice_for_a_picture_of_eight_bits_gives_the_colours_of_the_mosaic(
         red, green, blue, second = (np.maximum(levels[colours == colour], 0).mean() for colour in range(4))
     expected = np.array([red, (green + second) / 2, blue])
     np.testing.assert_allclose(means / means.sum(), expected / expected.sum(), atol=1e-3)
-
-
-def test_a_black_level_is_subtracted_from_planes_as_from_pixels() -> None:
-    planes = np.arange(60, dtype=np.uint16).reshape(3, 4, 5)
-    expected = np.maximum(np.moveaxis(planes.astype(np.int64), 0, 2) - 30, 0)
-    np.testing.assert_array_equal(subtract_black(np.moveaxis(planes, 0, 2), 30.0), expected)
 
 
 @pytest.mark.parametrize(

@@ -47,16 +47,6 @@ def test_values(copy: Path) -> None:
     assert data.folds == (1, 0, 1)
 
 
-def test_what_is_not_given_is_stated(copy: Path) -> None:
-    write_table(copy, "a,0.2,0.5,0.3")
-    (copy / "a_mask.png").unlink()
-    data = open_scenes(copy, options=DataOptions(partial=True))
-    assert data.treatment["black level"].startswith("0: assumed")
-    assert data.treatment["saturation"].startswith("none: neither")
-    assert data.treatment["mask"] == "none"
-    assert data.folds is None
-
-
 def three_images(folder: Path, least: int) -> Path:
     """Fill a folder with images of 200 to 4000 counts over `least`, and the table of them."""
     folder.mkdir()
@@ -219,14 +209,3 @@ def test_images_of_a_folder_that_the_table_does_not_name_are_counted(
     monkeypatch.chdir(copy)
     for place in (".", str(copy), "gt.csv"):
         assert open_scenes(place).treatment["images"] == "3; 1 in other folders there without a row in gt.csv left out"
-
-
-@pytest.mark.parametrize(
-    ("ending", "why"), [("jpg", r"a\.jpg: JPEG, a picture for the eye"), ("CR2", r"a\.CR2: a raw file")]
-)
-def test_names_without_ending_of_files_that_are_refused_say_why(tmp_path: Path, ending: str, why: str) -> None:
-    for name in "ab":
-        (tmp_path / f"{name}.{ending}").write_bytes(b"")
-    write_table(tmp_path, "a,1,1,1", "b,1,1,1")
-    with pytest.raises(FormatError, match=rf"gt\.csv, line 2.*{why}"):
-        open_scenes(tmp_path)

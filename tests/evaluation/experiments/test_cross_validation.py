@@ -5,7 +5,6 @@ Images made small keep the colours of their areas, and nothing of what is clippe
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,22 +14,18 @@ import numpy.typing as npt
 import pytest
 
 from evaluation.experiments.cross_validation import (
-    SmallScene,
     cross_validate,
-    make_small,
-    settings_of,
     shrink_image,
     tune_family,
     tuning_table,
 )
 from evaluation.experiments.folds import draw_folds
-from evaluation.experiments.running import evaluate
 from evaluation.learning.regression_trees import RegressionTrees
-from evaluation.methods.method import Method
 from evaluation.methods.prepared import GREY, unit
 from evaluation.scene import Image, Scene
 from foundation.errors import InputError
-from tests.evaluation.learning.made_up_world import MadeUp, world
+from tests.evaluation.learning.made_up_world import world
+from tests.evaluation.made_scenes import Made
 
 
 def test_areas_are_averaged_by_hand() -> None:
@@ -39,9 +34,7 @@ def test_areas_are_averaged_by_hand() -> None:
     assert not mask.any()
     np.testing.assert_array_equal(small[0, 0], [7.5, 8.5, 9.5])
     np.testing.assert_array_equal(small[1, 1], [37.5, 38.5, 39.5])
-
-
-def test_areas_that_cut_pixels_are_averaged_by_their_shares() -> None:
+    # Pixels that are cut count by their shares.
     image = np.repeat(np.array([[[10.0], [20.0], [60.0]]]), 3, axis=2)
     small, _ = shrink_image(image, side=2)
     # 1.5 px each: 10 and half of 20, half of 20 and 60.
@@ -66,21 +59,6 @@ def test_what_is_clipped_or_masked_does_not_show() -> None:
     assert not small[empty].any()
 
 
-def test_scenes_in_memory() -> None:
-    image = np.ones((6, 8, 3), np.float32)
-    scenes = [SmallScene(name, np.ones(3), image, None, 900.0) for name in ("a", "b")]
-    counted: list[int] = []
-    small = make_small(scenes, 4, workers=2, on_scene=lambda: counted.append(1))
-    assert [(scene.name, scene.read()[0].shape, scene.saturation) for scene in small] == [
-        ("a", (3, 4, 3), None),
-        ("b", (3, 4, 3), None),
-    ]
-    assert len(counted) == 2
-    untouched = make_small(scenes, 8)
-    assert untouched[0].saturation == 900
-    assert untouched[0].image is image
-
-
 pytestmark = pytest.mark.slow
 
 
@@ -100,7 +78,7 @@ class Memory:
 
 
 @dataclass(frozen=True, eq=False)
-class Counted(MadeUp):
+class Counted(Made):
     """A scene that says when it is read."""
 
     log: list[str] = field(default_factory=list[str])
@@ -281,42 +259,6 @@ def test_wrong_ground_truths_change_the_errors_and_not_the_choice() -> None:
     assert good.settings[0].errors is not None
     assert bad.settings[0].errors is not None
     assert good.settings[0].errors.median < bad.settings[0].errors.median - 20
-
-
-def methods_of(family: str) -> list[Method]:
-    return [method for _, method in settings_of(family)]
-
-
-def test_errors_are_those_of_a_run() -> None:
-    scenes = [Shop(scene.number, tuple(scene.light.tolist())) for scene in BLIND]
-    tuned = tune_family("shades-of-gray", "shops", scenes, "reproduction", workers=2)
-    runs = {result.method: result.summary("reproduction") for result in evaluate(scenes, methods_of("shades-of-gray"))}
-    for one in tuned.settings:
-        assert one.errors is not None
-        np.testing.assert_allclose(one.errors.as_tuple(), runs[one.name].as_tuple(), rtol=1e-9)
-
-
-def test_workers_change_no_number() -> None:
-    assert tune_family("general-gray-world", "shops", BLIND, workers=3) == tune_family(
-        "general-gray-world", "shops", BLIND
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Pair(Shop):
-    """One of two shops that are read at the same time, or not at all."""
-
-    both: threading.Barrier = field(kw_only=True)
-
-    def read(self) -> tuple[Image, None]:
-        self.both.wait()
-        return super().read()
-
-
-def test_as_many_images_are_read_at_once_as_there_are_workers() -> None:
-    both = threading.Barrier(2, timeout=30)
-    scenes = [Pair(number, both=both) for number in range(4)]
-    assert tune_family("shades-of-gray", "shops", scenes, workers=2).counted == 4
 
 
 def test_images_without_a_light_are_left_out_and_told() -> None:

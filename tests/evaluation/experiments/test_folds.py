@@ -79,11 +79,6 @@ def test_a_bad_file_of_folds_is_refused(tmp_path: Path, text: str, why: str) -> 
         read_folds(path, NAMES)
 
 
-def test_a_missing_file_of_folds_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"none\.csv.*expected CSV"):
-        read_folds(tmp_path / "none.csv", NAMES)
-
-
 def test_folds_that_leak_are_refused() -> None:
     scenes: Any = [SimpleNamespace(name=f"{number}.png", group=f"picture {number // 2}") for number in range(4)]
     require_apart(scenes, np.array([0, 0, 1, 1]))

@@ -83,11 +83,6 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
     assert list(content(tmp_path / "out")) == ["mine"]
 
 
-def test_two_methods_of_one_name_are_refused() -> None:
-    with pytest.raises(InputError, match="'Gray-world'"):
-        run_methods(mixed_set(), [METHODS[0], GrayEdge("Gray-world", 0, 2, 0)])
-
-
 class Flat:
     """A model that always sees the same light."""
 

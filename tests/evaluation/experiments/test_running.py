@@ -17,7 +17,7 @@ from evaluation.methods.naming import find_method
 from evaluation.methods.prepared import GREY
 from evaluation.metrics import recovery_error
 from evaluation.scene import Scene
-from foundation.errors import FormatError, InputError
+from foundation.errors import InputError
 from tests.evaluation.made_up import MixedWall, Wall, walls
 
 GRAY_WORLD = GrayEdge("Gray-world", 0, 1, 0, 0)
@@ -220,26 +220,3 @@ def test_pixels_without_a_light_are_counted_and_grey(monkeypatch: pytest.MonkeyP
     assert not result.guessed.any()
     # Two of 192 pixels are grey now, where the light is red.
     assert (result.maps or {})[0].recovery == pytest.approx(float(recovery_error(*LIGHTS)) * 2 / 192, rel=1e-3)
-
-
-def test_a_map_of_another_size_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def small(_: object) -> npt.NDArray[np.float32]:
-        return np.ones((3, 4, 2), np.float32)
-
-    monkeypatch.setattr(MixedWall, "read_weights", small)
-    monkeypatch.setattr(MixedWall, "truth", LIGHTS[0])
-    whole = np.ones((12, 16, 3), np.float32)
-
-    def large(_: object) -> npt.NDArray[np.float32]:
-        return whole
-
-    monkeypatch.setattr(MixedWall, "read_truth_map", large)
-    with pytest.raises(FormatError, match=r"mixed is 16x12.*16x12.*4x3"):
-        evaluate([InMemoryMixed("mixed", LIGHTS)], [HalfRight()])
-
-
-class InMemoryMixed(MixedWall):
-    """A wall under two lights whose image does not come from its map."""
-
-    def read(self) -> tuple[npt.NDArray[np.float32], None]:
-        return np.ones((12, 16, 3), np.float32), None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ from evaluation.learning.feature_learner import FeatureLearner
 from evaluation.learning.log_chroma import LogChroma
 from evaluation.learning.regression_trees import RegressionTrees
 from evaluation.learning.standard import standard_learners
+from tests.evaluation.made_scenes import Made
 
 SIZE = 32
 """Width and height of scenes, px."""
@@ -35,43 +36,40 @@ QUICK: dict[str, FeatureLearner] = {
 """All methods, trained for so little that what they answer is the same again, but need not be right."""
 
 
-@dataclass(frozen=True, eq=False)
-class MadeUp:
-    """A scene in memory."""
-
-    name: str
-    truth: npt.NDArray[np.float64]
-    image: npt.NDArray[np.float32]
-    mask: npt.NDArray[np.bool_] | None = None
-    saturation: float | None = None
-
-    def read(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_] | None]:
-        return self.image, self.mask
-
-
 def lights_on_a_line(count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
     """Return lights (N, 3) float64 from tungsten to shade: g fixed, r falls as b rises."""
     red = rng.uniform(0.18, 0.42, count)
     return np.stack([red, np.full(count, 0.42), 0.58 - red], axis=1)
 
 
-def world(count: int, seed: int = 0, size: int = SIZE, cast: float = 0.25) -> list[MadeUp]:
+def world(count: int, seed: int = 0, size: int = SIZE, cast: float = 0.25) -> list[Made]:
     """Return scenes of 4 px tiles whose surfaces are near grey, each scene with a cast of its own.
 
     The cast is what keeps Gray-world from being right: log-normal with a standard deviation of `cast` in the red and
     blue of each surface, and a tenth of it common to the scene.
     """
     rng = np.random.default_rng(seed)
-    scenes: list[MadeUp] = []
+    scenes: list[Made] = []
     for number, light in enumerate(lights_on_a_line(count, rng)):
         tiles = rng.uniform(0.05, 1, (size // 4, size // 4, 1)) * np.exp(
             rng.normal(0, cast, (size // 4, size // 4, 3)) * [1, 0.2, 1] + rng.normal(0, cast / 10, 3)
         )
         image = np.kron(tiles, np.ones((4, 4, 1))) * light * np.exp(rng.normal(0, 0.02, (size, size, 3)))
-        scenes.append(MadeUp(f"scene {number}", light, image.astype(np.float32)))
+        scenes.append(Made(f"scene {number}", light, image.astype(np.float32)))
     return scenes
 
 
-def constant_light(scenes: Sequence[MadeUp]) -> npt.NDArray[np.float64]:
+def save_world(path: Path, count: int, seed: int = 0, size: int = SIZE) -> None:
+    """Save scenes as thumbnails, named after the file."""
+    scenes = world(count, seed, size)
+    np.savez(
+        path,
+        images=np.stack([scene.image for scene in scenes]),
+        gt=np.stack([scene.truth for scene in scenes]),
+        names=np.array([f"{path.stem} {number}" for number in range(count)]),
+    )
+
+
+def constant_light(scenes: Sequence[Made]) -> npt.NDArray[np.float64]:
     """Return the median light (3,) float64 of scenes, which a method must beat to have learned anything."""
     return np.median([scene.truth for scene in scenes], axis=0)

@@ -8,18 +8,18 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.learning.adapting import BlendedModel, adapt, learn_alone, stacked_share
+from evaluation.learning.adapting import adapt, learn_alone
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod, extract, truths_of
 from evaluation.learning.model_files import load_model, save_model
 from evaluation.metrics import recovery_error
-from foundation.errors import FormatError
-from tests.evaluation.learning.made_up_world import LEARNERS, QUICK, MadeUp, world
+from tests.evaluation.learning.made_up_world import LEARNERS, QUICK, world
 from tests.evaluation.learning.stories import story
+from tests.evaluation.made_scenes import Made
 
 ELSEWHERE, HERE, TEST = world(40, cast=0.4), world(8, seed=2), world(8, seed=1)
 
 
-def of(scenes: list[MadeUp], method: LearnedMethod) -> npt.NDArray[np.float64]:
+def of(scenes: list[Made], method: LearnedMethod) -> npt.NDArray[np.float64]:
     return np.stack([method.estimate(scene.image) for scene in scenes])
 
 
@@ -35,7 +35,7 @@ def taught(learner: FeatureLearner) -> LearnedMethod:
     return learner.fit(ELSEWHERE)
 
 
-def adapted(taught: LearnedMethod, scenes: list[MadeUp], worth: float | None = None) -> LearnedMethod:
+def adapted(taught: LearnedMethod, scenes: list[Made], worth: float | None = None) -> LearnedMethod:
     (features,) = extract(scenes, [taught.learner])
     alone = learn_alone(taught.learner, features, truths_of(scenes))
     return adapt(taught, alone) if worth is None else adapt(taught, alone, worth)
@@ -83,37 +83,10 @@ def test_one_image_leaves_it_near_what_it_was(taught: LearnedMethod) -> None:
 @pytest.mark.slow
 def test_many_images_overrule_what_was_learned_wrongly() -> None:
     learner = LEARNERS["kernel-ridge"]
-    wrong = learner.fit([MadeUp(one.name, one.truth[::-1].copy(), one.image) for one in world(60)])
+    wrong = learner.fit([Made(one.name, one.truth[::-1].copy(), one.image) for one in world(60)])
     many = world(200, seed=3)
     truths = np.stack([scene.truth for scene in TEST])
     found = np.mean(recovery_error(of(TEST, adapted(wrong, many)), truths))
     alone = np.mean(recovery_error(of(TEST, learner.fit(many)), truths))
     before = np.mean(recovery_error(of(TEST, wrong), truths))
     assert found < 1.15 * alone < 0.5 * before
-
-
-def test_the_share_is_the_prior_where_the_two_agree_and_within_0_and_1() -> None:
-    truths = np.tile([0.3, 0.4, 0.3], (9, 1))
-    beyond, far = np.tile([0.25, 0.4, 0.35], (9, 1)), np.tile([0.2, 0.4, 0.4], (9, 1))
-    assert stacked_share(far, far, truths, 0.7) == 0.7
-    assert stacked_share(beyond, far, truths, 1.0) == 1
-    assert stacked_share(far, beyond, truths, 0.0) == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "expected"), [("kernel-ridge", 1.0), ("constant-light", 200 / 202)])
-def test_what_was_tuned_knows_the_images_already(name: str, expected: float) -> None:
-    # Two images are too few to choose: the opinion stands, less what falls with their number.
-    found = adapted(LEARNERS[name].fit(ELSEWHERE), HERE[:2]).model
-    assert isinstance(found, BlendedModel)
-    assert found.share == pytest.approx(expected * 200**4 / (200**4 + 2**4), rel=1e-12)
-
-
-def test_a_damaged_share_is_refused(tmp_path: Path) -> None:
-    learner = LEARNERS["kernel-ridge"]
-    method = adapted(learner.fit(ELSEWHERE[:5]), HERE)
-    assert isinstance(method.model, BlendedModel)
-    broken = LearnedMethod(learner, BlendedModel(method.model.elsewhere, method.model.here, np.array(1.5)))
-    save_model(tmp_path / "model.npz", broken, story(HERE))
-    with pytest.raises(FormatError, match=r"a share of 1.5"):
-        load_model(tmp_path / "model.npz")

@@ -73,62 +73,8 @@ def test_what_is_smaller_than_the_square_is_framed_by_what_is_not_usable() -> No
     assert not framed[:, 40:].any()
 
 
-def test_images_are_lit_anew_by_a_tenth_and_flipped_half_the_time() -> None:
-    generator = torch.Generator().manual_seed(0)
-    plain = torch.rand((400, 4, 2, 3), generator=generator) + 0.1
-    plain[:, 3] = 1
-    lights = torch.ones((400, 3))
-    flipped: list[bool] = []
-    for _ in range(40):
-        seen, wanted = convnet._lit_anew(torch, plain, lights, generator)
-        gains = wanted.numpy()
-        assert 0.9 <= gains.min() < 0.901
-        assert 1.099 < gains.max() <= 1.1
-        assert abs(gains.mean() - 1) < 0.01
-        parts = (seen / plain).numpy(), (seen / plain.flip(3)).numpy()
-        expected = np.concatenate([gains, np.ones((400, 1))], axis=1)[:, :, None, None]
-        same = [bool(np.allclose(part, expected, rtol=1e-5)) for part in parts]
-        assert sum(same) == 1
-        flipped.append(same[1])
-    assert 8 < sum(flipped) < 32
-
-
-def test_the_network_begins_as_he_draws_it() -> None:
-    weights = convnet._initial(torch, 16, torch.Generator().manual_seed(0))
-    for name, inputs, part in (
-        ("weight1", 4 * 25, 1),
-        ("weight2", 16 * 9, 1),
-        ("weight3", 32 * 9, 1),
-        ("weight4", 32, 0.1),
-    ):
-        drawn = weights[name].detach().numpy()
-        assert drawn[0].size == inputs
-        assert drawn.std() == pytest.approx(part * (2 / inputs) ** 0.5, rel=0.2)
-    assert [name for name in weights if not weights[name].detach().numpy().any()] == [
-        "bias1",
-        "bias2",
-        "bias3",
-        "bias4",
-    ]
-    assert [weights[f"weight{number}"].shape[0] for number in (1, 2, 3, 4)] == [16, 32, 32, 4]
-
-
 def test_the_loss_is_the_angle() -> None:
     found = torch.tensor([[1.0, 0, 0], [2**-0.5, 2**-0.5, 0], [0, 0, 1]])
     wanted = torch.tensor([[0, 3.0, 0], [5, 0, 0], [0, 0, 2]])
     angles = convnet._angle(torch, found, wanted).numpy()
     np.testing.assert_allclose(angles, [np.pi / 2, np.pi / 4, 0], atol=1e-5)
-
-
-def test_tuning_has_a_quarter_of_the_epochs_and_of_the_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[int, float]] = []
-
-    def keep(_self: object, _weights: object, _features: object, _truths: object, *rest: Any) -> None:
-        asked.append(rest[:2])
-
-    monkeypatch.setattr(ConvNet, "_trained", keep)
-    images, lights, model = np.ones((2, 8, 8, 4), np.float16), np.ones((2, 3)), ConvNetModel(random_weights(0.1))
-    for epochs in (40, 3):
-        ConvNet(epochs=epochs, rate=0.004).fit_features(images, lights)
-        ConvNet(epochs=epochs, rate=0.004).tune(model, images, lights, worth=1)
-    assert asked == [(40, 0.004), (10, 0.001), (3, 0.004), (1, 0.001)]

@@ -11,7 +11,6 @@ import pytest
 
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod
 from evaluation.learning.model_files import load_model, save_model
-from evaluation.learning.standard import standard_learners
 from evaluation.methods.prepared import GREY
 from evaluation.metrics import recovery_error
 from foundation.errors import InputError
@@ -47,19 +46,6 @@ def errors(method: LearnedMethod) -> np.ndarray:
     estimates = np.stack([method.estimate(scene.image) for scene in TEST])
     np.testing.assert_allclose(np.linalg.norm(estimates, axis=1), 1, rtol=1e-9)
     return recovery_error(estimates, np.stack([scene.truth for scene in TEST]))
-
-
-def test_tables_and_results_name_them_so() -> None:
-    """Rows of different runs are joined by these names, also of results that are years old."""
-    assert {key: one.name for key, one in standard_learners().items()} == {
-        "regression-trees": "Regression trees (simple features)",
-        "smart-color-cat": "Smart Color Cat",
-        "color-beaver": "Color Beaver (using Gray-world)",
-        "log-chroma": "Log-chroma (FFCC family)",
-        "kernel-ridge": "Kernel ridge (chromaticity histograms)",
-        "convnet": "Convolutional network",
-        "constant-light": "Constant light",
-    }
 
 
 def test_it_learns_what_a_constant_light_does_not(fitted: LearnedMethod) -> None:

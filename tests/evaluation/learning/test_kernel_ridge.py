@@ -10,14 +10,15 @@ import pytest
 
 from evaluation.learning.kernel_ridge import KernelRidge
 from evaluation.learning.log_chroma import LogChroma
-from tests.evaluation.learning.made_up_world import MadeUp, world
+from tests.evaluation.learning.made_up_world import world
+from tests.evaluation.made_scenes import Made
 
 pytestmark = pytest.mark.slow
 
 RED, GREY = (0.8, 0.1, 0.1), (0.2, 0.2, 0.2)
 
 
-def counts_of(scenes: list[MadeUp]) -> npt.NDArray[np.uint16]:
+def counts_of(scenes: list[Made]) -> npt.NDArray[np.uint16]:
     found: list[Any] = [KernelRidge().features(scene.image) for scene in scenes]
     return np.stack(found)
 

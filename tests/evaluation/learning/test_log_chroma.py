@@ -13,7 +13,8 @@ from evaluation.learning import log_chroma
 from evaluation.learning.log_chroma import BINS, LogChroma, crossentropy, likelihood, moments
 from evaluation.metrics import recovery_error
 from foundation.errors import InputError
-from tests.evaluation.learning.made_up_world import MadeUp, world
+from tests.evaluation.learning.made_up_world import world
+from tests.evaluation.made_scenes import Made
 
 pytestmark = pytest.mark.slow
 
@@ -26,7 +27,7 @@ def extracted(image: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
     return found
 
 
-def taught_by(scenes: list[MadeUp]) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float64]]:
+def taught_by(scenes: list[Made]) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float64]]:
     lights = np.stack([scene.truth for scene in scenes])
     return np.stack([extracted(scene.image) for scene in scenes]), lights / lights.sum(axis=1, keepdims=True)
 
@@ -179,19 +180,3 @@ def test_an_image_that_stands_for_three_is_as_three() -> None:
     tuned = learner.tune(learner.fit_features(known, lights), few, their_lights, worth=4)
     both = learner.fit_features(np.concatenate([known, *[few] * 3]), np.concatenate([lights, *[their_lights] * 3]))
     assert recovery_error(tuned.lights(known), both.lights(known)).max() < 0.1
-
-
-def test_images_of_a_file_that_cannot_be_are_refused() -> None:
-    scenes = world(3)
-    arrays: dict[str, Any] = dict(LEARNER.fit_features(*taught_by(scenes)).arrays())
-    shown = LEARNER.restore(arrays).lessons
-    assert shown is not None
-    np.testing.assert_array_equal(shown.histograms()[0], extracted(scenes[0].image))
-    places = arrays["learned_places"][1:]
-    assert LEARNER.restore({**arrays, "learned_places": np.append(0, places)}).lessons is not None
-    for name, damage in (
-        ("learned_places", np.append(-1, places)),
-        ("learned_places", arrays["learned_places"][::-1]),
-    ):
-        with pytest.raises(ValueError, match="images"):
-            LEARNER.restore({**arrays, name: damage})

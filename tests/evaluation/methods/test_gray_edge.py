@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from evaluation.methods import GrayEdge, gaussian
 from evaluation.methods.gaussian import gaussian_kernel
-from evaluation.methods.prepared import GREY, PreparedImage
+from evaluation.methods.prepared import PreparedImage
 from evaluation.metrics import recovery_error
 
 pytestmark = pytest.mark.slow
@@ -155,14 +155,3 @@ def test_what_is_left_out_of_tiles_is_what_is_left_out_of_the_whole(p: float) ->
         expected = numpy_norm(scipy_derivative(image, 1, 2.0)[inner][~mask[inner]], p)
         method = GrayEdge("", 1, p, 2.0, border)
         np.testing.assert_allclose(method.estimate(image, mask=mask), expected, rtol=1e-6)
-
-
-def test_a_derivative_that_is_kept_gives_the_same_sums() -> None:
-    prepared = PreparedImage(photograph(300, 310))
-    norms = [prepared.norm(1, 2.0, p, 3) for p in (1, 2, 4)]
-    alone = [PreparedImage(prepared.image).norm(1, 2.0, p, 3) for p in (1, 2, 4)]
-    np.testing.assert_allclose(norms, alone, rtol=1e-12)
-
-
-def test_an_even_image_has_no_edges() -> None:
-    assert GrayEdge("", 1, 1, 2).estimate(np.full((50, 50, 3), (51234, 7, 333), np.uint16)) is GREY

@@ -13,7 +13,6 @@ from evaluation.methods.gray_pixels import (
     grayness,
     greyest,
     index_map,
-    logarithm,
     slope,
 )
 from evaluation.methods.prepared import PreparedImage
@@ -27,11 +26,6 @@ def test_a_ramp_of_one_a_pixel_has_the_authors_slope() -> None:
     expected = 2 * (np.exp(-2) + 4 * np.exp(-8)) * 4 / np.pi * (1 + 2 * np.exp(-2) + 2 * np.exp(-8))
     for ramp, factor in ((x, 1), (3 * x + 4 * y, 5)):
         np.testing.assert_allclose(slope(ramp)[2:-2, 2:-2], factor * expected, rtol=1e-5)
-
-
-def test_zeros_have_the_logarithm_of_the_smallest_part_of_one() -> None:
-    found = logarithm(np.array([0, 1, 0.5], np.float32))
-    np.testing.assert_allclose(found, [-52 * np.log(2), 0, -np.log(2)], rtol=1e-6)
 
 
 def test_the_grayness_index_is_that_of_equations_9_and_10() -> None:

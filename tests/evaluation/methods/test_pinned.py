@@ -8,18 +8,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.cross_validation import settings_of
-from evaluation.methods import gray_pixels, pixel_loops, prepared
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.gray_pixels import GraynessIndex, LocalGraynessIndex, MeanShiftedGrayPixel, largest_cluster
-from evaluation.methods.green_stability import tune
+from evaluation.methods.gray_pixels import GraynessIndex, LocalGraynessIndex, MeanShiftedGrayPixel
 from evaluation.methods.method import LocalMethod, Method
 from evaluation.methods.pca import BrightDark
-from evaluation.methods.prepared import PreparedImage
 from evaluation.methods.retinex import ColorSparrow, ImprovedWhitePatch, SurfaceReflectance
 from evaluation.methods.standard import local_methods, standard_methods
 from evaluation.methods.wrapped import PatchwiseMethod, ResizedMethod, fill_unknown
-from tests.evaluation.made_up import Wall
 from tests.pinned import Pinned
 
 # Parts of a method are pinned as well, since its estimate may not show them.
@@ -136,106 +131,3 @@ def test_maps_of_lights(pinned: Pinned) -> None:
     pinned(
         "lights of patches where some are unknown", [fill_unknown(unknown), fill_unknown(np.full((2, 2, 3), np.nan))]
     )
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_what_methods_share_of_an_image(case: str, pinned: Pinned) -> None:
-    one = PreparedImage(*CASES[case])
-    found = {
-        "peak, scale, white": (one.peak, one.scale / 2.0**60, one.white),
-        "usable": {border: np.asarray(one.usable(border)) for border in (0, 3)},
-        "moments": {border: one.moments(border) / 2.0 ** (border % 2) for border in (0, 1, 2, 5)},
-        "norms": {f"{p} {border}": one.norm(0, 0, p, border) for p in (1, 1.5, 3, 20, np.inf) for border in (0, 2)},
-        "derivatives": {
-            f"{order} {sigma}": np.asarray(one.derivative(order, sigma))
-            for order in (0, 1, 2)
-            for sigma in (0.3, 1.0, 4.6)
-            if order or sigma
-        },
-        "smaller": [
-            [small.image.shape, np.asarray(small.image), np.asarray(small.usable(0))]
-            for small in map(one.at_most, (4, 20, 64))
-        ],
-        "shrunk": [np.asarray(prepared.shrink(one.image, one.usable(1), 5, least)[0]) for least in (0.0, 0.3, 0.75)],
-    }
-    pinned(f"shared parts of an image, {case}", found, same=1e-5, nothing=0 if case == "tiny values" else 1e-6)
-
-
-def test_parts_of_gray_pixels(pinned: Pinned) -> None:
-    strip = (tiles(24, 31, 11) / 3500).astype(np.float32)
-    strip[:9, :9] = 0.25
-    strip[0, 20:], strip[12:, 14:22, 1], strip[5, 15] = 8 / 255 / 3, 0, 0
-    one = PreparedImage(strip, None, None)
-    places = np.argwhere(strip[..., 0] > 0.2).astype(np.float64)
-    cluster = strip[8:16, 8:14].reshape(-1, 3).astype(np.float64)
-    cluster /= cluster.max()
-    angle, missing = gray_pixels.angle_to_grey(strip)
-    mapped = gray_pixels.index_map(one, gray_pixels.angle_to_grey)
-    found = {
-        "slope": gray_pixels.slope(strip),
-        "slope of one channel": gray_pixels.slope(strip[..., 0]),
-        "smooth": gray_pixels.smooth(strip),
-        "logarithm": gray_pixels.logarithm(strip),
-        "grayness": gray_pixels.grayness(strip),
-        # Of flat pixels it is what rounding leaves.
-        "angle": [np.where(missing, 0, angle), missing],
-        "maps": [gray_pixels.index_map(one, gray_pixels.grayness), *mapped],
-        "clusters": [gray_pixels._clusters(places, count) for count in (1, 2, 3, 7)],
-        "largest": largest_cluster(cluster, np.arange(len(cluster), dtype=np.float32)),
-        "steps": [gray_pixels._step(cluster[at], cluster[at + 3]) for at in (0, 5, 20)],
-        "shifts": [
-            gray_pixels._shift(cluster, cluster / np.linalg.norm(cluster, axis=1, keepdims=True), at)
-            for at in (0, 9, 30)
-        ],
-        "greyest": [
-            int(gray_pixels.greyest(strip[..., 2], strip[..., 0] > 0.1, share).sum())
-            for share in (0.0, 0.001, 0.01, 0.3, 1.0)
-        ],
-    }
-    pinned("parts of methods of gray pixels", found, same=1e-4, nothing=1e-6)
-
-
-def test_loops_over_pixels(pinned: Pinned) -> None:
-    image = np.ascontiguousarray(many(3)[:40, :140])
-    single = np.ascontiguousarray(many(4)[:40, :140].astype(np.float32) / 4096)
-    free = np.random.default_rng(0).random(image.shape[:2]) < 0.9
-    free[:, 20:100] = True
-    every: npt.NDArray[np.bool_] = np.zeros((0, 0), bool)
-    direction = np.array([0.3, 0.8, 0.5])
-    found: dict[str, Any] = {}
-    for name, usable in (("every", every), ("free", free)):
-        powers = {}
-        for p in (1.0, 2.0, 2.5, 3.0, 7.0, 64.0, 65.0, np.inf):
-            for border, top, first in ((0, 0, 0), (3, 2, 16), (1, 10, 5)):
-                sums = np.zeros(3)
-                rows = single[top:, first:].reshape(len(single) - top, -1)
-                pixel_loops.sum_powers(rows, usable, border, top, first, 38, 137, p, 0.9, sums)
-                powers[f"{p} {border} {top} {first}"] = sums
-        step = pixel_loops.BINS / float(direction @ image.reshape(-1, 3).max(axis=0))
-        counts = [pixel_loops.count_projections(image, usable, direction, step, every_) for every_ in (1, 2, 16)]
-        bordering = np.zeros((900, 4))
-        outer = pixel_loops.sum_outer_bins(
-            image, usable, direction, step, np.array([300, 900, 1800, 2400], np.int64), bordering
-        )
-        found[name] = [powers, counts, outer, bordering, pixel_loops.whole_moments(image, usable, 2)]
-        found[name].append(pixel_loops.float_moments(single, usable, 1, 0.5))
-    clipped = np.zeros(image.shape[:2], np.uint8)
-    found["clipped"] = [pixel_loops.mark_clipped(image, image.dtype.type(2000), clipped), clipped]
-    found["dilated"] = [prepared.dilate_clipped(given, limit) for given in (image, single) for limit in (0.5, 2000.0)]
-    pinned("loops over pixels", found, same=1e-5)
-
-
-def test_tuning_and_names(pinned: Pinned) -> None:
-    scenes = [Wall(str(at), np.array([0.3 + 0.1 * at, 0.5, 0.9 - 0.1 * at]), seed=at) for at in range(4)]
-    images = [tiles(24, 32, at) * scene.truth for at, scene in enumerate(scenes)]
-
-    class Tiles(Wall):
-        def read(self) -> Any:
-            return images[int(self.name)].astype(np.float32), None
-
-    given = [Tiles(scene.name, scene.truth) for scene in scenes]
-    families = {name: [method for _, method in settings_of(name)] for name in ("shades-of-gray", "gray-edge-1")}
-    found = {name: vars(tune(methods, given)) for name, methods in families.items()}
-    for one in found.values():
-        one["best"], one["candidates"] = one["best"].name, [method.name for method in one["candidates"]]
-    pinned("tuning by green stability", found, same=1e-5)

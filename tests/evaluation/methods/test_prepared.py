@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.prepared import GREY, PreparedImage, shrink, usable
+from evaluation.methods.prepared import shrink, usable
 from evaluation.methods.standard import standard_methods
 from evaluation.methods.wrapped import ResizedMethod
 from evaluation.metrics import recovery_error
@@ -36,13 +36,6 @@ def test_a_smaller_image_is_the_mean_of_usable_pixels() -> None:
     np.testing.assert_array_equal(masked, [[False, True, False], [False, False, True]])
 
 
-def test_an_image_that_is_no_larger_is_left_as_it_is() -> None:
-    image = np.random.default_rng(0).integers(0, 9000, (40, 50, 3)).astype(np.uint16)
-    method = standard_methods()["gray-edge-2"]
-    assert np.array_equal(ResizedMethod(method, 50).estimate(image, 8000), method.estimate(image, 8000))
-    assert PreparedImage(image).at_most(49) is not PreparedImage(image).at_most(50)
-
-
 @pytest.mark.slow
 def test_independent_noise_misleads_second_derivatives_until_it_is_averaged_away() -> None:
     # Grey things under a warm light, and noise that knows nothing of the light: half of what is bright in blue.
@@ -55,8 +48,3 @@ def test_independent_noise_misleads_second_derivatives_until_it_is_averaged_away
     assert at_80 < 1
     assert recovery_error(GrayEdge("", 2, 1, 6).estimate(image), light) < 2
     assert recovery_error(method.estimate(tiles * light), light) < 0.01
-
-
-def test_no_pixel_left_is_grey() -> None:
-    image = np.full((64, 64, 3), 100, np.uint16)
-    assert ResizedMethod(standard_methods()["gray-world"], 8).estimate(image, 100) is GREY

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,6 @@ from evaluation.learning.model_files import load_model, save_model
 from evaluation.learning.standard import standard_learners
 from evaluation.results.files import read_errors, read_estimates
 from foundation.errors import CropError
-from tests.evaluation.datasets.test_pinned import damages
 from tests.evaluation.learning.made_up_world import world
 from tests.evaluation.learning.stories import story
 from tests.pinned import Pinned
@@ -48,6 +47,22 @@ ESTIMATES = "image,r,g,b\na.png,0.2,0.5,0.3\nb,1,2,1\nmore/c.png,0.1,0.1,0.1\n"
 IMAGES = ("a.png", "b.tiff", "more/c.png")
 FOLDS = "image,fold\na.png,x\nb.tiff,y\nmore/c.png,x\n"
 TRUTHS = "File,GT_R,GT_G,GT_B\nA_1,0.2,0.5,0.3\nA_2,0.3,0.5,0.2\nB_1,1,2,1\n"
+
+
+def damages(text: str) -> Iterator[tuple[str, str]]:
+    """Yield a text, damaged in several ways, each with its name."""
+    lines = text.splitlines(keepends=True)
+    last = lines[-1]
+    yield "empty", ""
+    yield "without its end", "".join(lines[:-1])
+    yield "its end twice", text + ("" if text.endswith("\n") else "\n") + last
+    yield "without its head", "".join(lines[1:])
+    digits = [place for place, mark in enumerate(last) if mark.isdigit() or mark == "."]
+    for instead in ("-", "x", "nan ", "inf ", "0 0 0 ", ",", '"'):
+        if digits:
+            at = digits[len(digits) // 2]
+            yield f"with {instead.strip()}", text[: len(text) - len(last) + at] + instead + last[at:]
+    yield "no number but 0", "".join("0" if mark in "123456789" else mark for mark in text)
 
 
 def test_damaged_tables(tmp_path: Path, pinned: Pinned) -> None:

@@ -92,9 +92,3 @@ def test_text_is_rounded_and_csv_is_not() -> None:
     assert rows[0][0] == 'White, "Patch"\nof two lines'
     assert float(rows[0][1]) == pytest.approx(2 / 3, abs=1e-9)
     assert rows[1] == ["None known", "", "0", "–"]
-
-
-@pytest.mark.parametrize("rows", [((1.0,),), ((1.0, 2.0), (1.0, 2.0, 3.0))])
-def test_a_row_of_another_length_is_refused(rows: tuple[tuple[float, ...], ...]) -> None:
-    with pytest.raises(ValueError, match="cells under 2 heads"):
-        Table("t", ("a", "b"), rows)

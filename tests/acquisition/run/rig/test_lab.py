@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 from contextlib import ExitStack
-from typing import Any
+from functools import partial
 from unittest.mock import Mock
 
 import pytest
@@ -12,31 +11,7 @@ import pytest
 from acquisition.run.rig import lab as rig
 from experiment.config import LabSettings, parse_lab
 from foundation.errors import ConfigurationError, DeviceError, LinkClosed
-
-DEVICES = ("camera", "display", "projector")
-FAULTY = [chosen for count in (1, 2, 3) for chosen in itertools.combinations(DEVICES, count)]
-
-SAYS = {
-    "camera": "the camera is asleep; wake it up",
-    "display": "HDMI-1 is covered; close what covers it",
-    "projector": "nobody answers at 192.0.2.7; look at its cable",
-}
-
-
-class Broken:
-    """A device all of whose verbs fail but that it can be closed."""
-
-    def __init__(self, says: str) -> None:
-        self._says = says
-
-    def close(self) -> None:
-        """Do nothing."""
-
-    def __getattr__(self, name: str) -> Any:
-        def fail(*_: object) -> None:
-            raise LinkClosed(self._says)
-
-        return fail
+from tests.acquisition.run.scripted import DEVICES, FAULTY, SAYS, Broken
 
 
 def lab_settings() -> LabSettings:
@@ -54,24 +29,10 @@ def test_every_device_of_a_real_lab_is_opened_though_another_fails(
         places["display"] = "display_warnings"
         monkeypatch.setattr(rig, "FullScreen", None)
 
-    class Sound:
-        def __init__(self, name: str) -> None:
-            self._name = name
-
-        def identity(self) -> str:
-            return self._name
-
-        def close(self) -> None:
-            closed.append(self._name)
-
     for name, place in places.items():
-
-        def opens(*_: object, name: str = name) -> Sound:
-            if name in faulty:
-                raise LinkClosed(SAYS[name])
-            return Sound(name)
-
-        monkeypatch.setattr(rig, place, opens)
+        sound = Mock()
+        sound.close.side_effect = partial(closed.append, name)
+        monkeypatch.setattr(rig, place, Mock(side_effect=[LinkClosed(SAYS[name]) if name in faulty else sound]))
     with pytest.raises(DeviceError) as told, ExitStack() as opened:
         rig.open_lab(lab_settings(), None, opened)
     for name in DEVICES:
@@ -84,23 +45,10 @@ def test_every_device_of_a_real_lab_is_opened_though_another_fails(
 def test_a_device_that_opens_and_does_not_answer_is_told_beside_one_that_does_not_open(
     monkeypatch: pytest.MonkeyPatch, silent: tuple[str, ...]
 ) -> None:
-    def no_display(*_: object) -> None:
-        raise ConfigurationError(SAYS["display"])
-
-    class Sound:
-        def identity(self) -> None:
-            pass
-
-        def close(self) -> None:
-            pass
-
-    monkeypatch.setattr(rig, "display_warnings", no_display)
+    monkeypatch.setattr(rig, "display_warnings", Mock(side_effect=ConfigurationError(SAYS["display"])))
     for name in ("camera", "projector"):
-
-        def opens(*_: object, name: str = name) -> Broken | Sound:
-            return Broken(SAYS[name]) if name in silent else Sound()
-
-        monkeypatch.setattr(rig, f"_lab_{name}", opens)
+        device = Broken(SAYS[name]) if name in silent else Mock()
+        monkeypatch.setattr(rig, f"_lab_{name}", Mock(return_value=device))
     with pytest.raises(DeviceError) as told, ExitStack() as opened:
         rig.open_lab(lab_settings(), None, opened)
     for name in DEVICES:

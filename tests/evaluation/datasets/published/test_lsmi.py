@@ -144,14 +144,3 @@ def test_maps_that_are_none_are_named(copy: Path, shares: np.ndarray[tuple[int, 
     assert isinstance(scene, reader.LsmiMixedScene)
     with pytest.raises(FormatError, match=r"Place1_12\.npy"):
         scene.read_weights()
-
-
-@pytest.mark.parametrize(
-    ("subset", "names"),
-    [
-        ("single", ["sony/Place1_1.tiff", "sony/Place2_1.tiff"]),
-        ("mixed", ["sony/Place1_12.tiff", "sony/Place2_123.tiff"]),
-    ],
-)
-def test_a_number_of_lights_is_a_subset(copy: Path, subset: str, names: list[str]) -> None:
-    assert [scene.name for scene in open_scenes(copy, options=DataOptions(subset=subset)).scenes] == names

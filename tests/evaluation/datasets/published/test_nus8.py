@@ -74,13 +74,6 @@ def test_without_names_the_order_of_files_counts_and_must_be_complete(copy: Path
         open_scenes(copy / "SonyA57", options=DataOptions(partial=True))
 
 
-def test_a_missing_image(copy: Path) -> None:
-    (copy / "SonyA57" / "SonyA57_0003.PNG").unlink()
-    with pytest.raises(FormatError, match=r"1.*2.*SonyA57_gt\.mat.*SonyA57_0003"):
-        open_scenes(copy)
-    assert len(open_scenes(copy, options=DataOptions(partial=True)).scenes) == 3
-
-
 @pytest.mark.parametrize(
     ("variables", "message"),
     [

@@ -18,10 +18,8 @@ from evaluation.experiments.paper.colour_reduction import (
     bits_removed,
     clear_bits,
     reduce_colours,
-    reduction_table,
 )
 from evaluation.experiments.running import evaluate
-from foundation.errors import InputError
 from generator.files import fit_flash
 from tests.evaluation.made_scenes import Made
 
@@ -40,12 +38,6 @@ def photo(seed: int, side: int = 40) -> npt.NDArray[np.float64]:
 def test_cleared_codes_are_whole_steps_below(code: int, bits: int) -> None:
     (cleared,) = clear_bits(np.array([code], np.uint8), bits)
     assert cleared == code // 2**bits * 2**bits
-
-
-@pytest.mark.parametrize("bits", [-1, 9])
-def test_a_code_has_eight_bits(bits: int) -> None:
-    with pytest.raises(InputError, match=f"{bits} bits"):
-        clear_bits(np.zeros(1, np.uint8), bits)
 
 
 @given(seed=st.integers(0, 2**32), scale=st.floats(1e-3, 1e5))
@@ -84,10 +76,6 @@ def test_a_masked_pixel_has_no_say() -> None:
     assert np.abs(without[~mask] - with_mask[~mask]).max() > 1e-3
 
 
-def test_a_black_image_stays_black() -> None:
-    assert all(not reduced.any() for reduced in reduce_colours(np.zeros((4, 4, 3)), (0, 7)))
-
-
 def test_images_as_they_are_give_what_evaluate_gives() -> None:
     mask = np.zeros((40, 40), np.bool_)
     mask[:, :8] = True
@@ -105,13 +93,3 @@ def test_images_as_they_are_give_what_evaluate_gives() -> None:
         near = np.abs(exact.errors["recovery"] - raw.errors["recovery"]).max()
         assert near < 0.15
         assert np.abs(coarse.errors["recovery"] - raw.errors["recovery"]).max() > near
-
-
-def test_what_is_left() -> None:
-    wedge = np.repeat(np.arange(256, dtype=np.uint8)[:, None, None], 3, axis=2)
-    table = reduction_table(wedge)
-    assert [row[1] for row in table.rows] == [256**3 // 8**bits for bits in range(8)]
-    assert [row[2] for row in table.rows] == [256 >> bits for bits in range(8)]
-    assert table.rows[0][3] is None
-    # The mean of 0, 1, 4 … 49.
-    assert table.rows[3][3] == pytest.approx(10 * np.log10(255**2 / 17.5))

@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 
 from evaluation.experiments.paper.material import (
-    DevelopedSource,
-    ScaledSource,
     develop,
     developed,
     lights_at_random,
@@ -24,7 +22,7 @@ from evaluation.experiments.paper.material import (
 )
 from evaluation.scene import SceneSet
 from foundation.colorimetry import decode_srgb, srgb_codes
-from foundation.errors import FormatError, InputError
+from foundation.errors import InputError
 from generator import DatasetOptions, generate_dataset
 from generator.lights.choices import nearest_lights
 from generator.lights.lighting import RandomLights
@@ -85,12 +83,6 @@ def test_a_source_has_no_chart() -> None:
     assert source.to_json() == {"developed": "photo", "matrix": "Canon EOS 550D"}
 
 
-def test_black_stays_black() -> None:
-    assert not develop(np.zeros((4, 4, 3)), np.ones(3)).any()
-    masked = Made("photo", np.ones(3), np.ones((2, 2, 3)), None, np.ones((2, 2), np.bool_))
-    assert not DevelopedSource(masked).read().picture.any()
-
-
 SOURCES = random_scenes(6, 40, 30, seed=3)
 TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0], [1.5, 3.0, 2.4]])
 PLAIN = DatasetOptions(previews=False, rendering="codes")
@@ -126,22 +118,6 @@ def test_near_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: 
         np.testing.assert_array_equal(scene.read()[0], made.read_image(entry))
 
 
-def test_pictures_are_scaled_both_ways() -> None:
-    (scene, *_) = SOURCES
-    small, large = ScaledSource(scene, 20), ScaledSource(scene, 80)
-    assert small.read().picture.shape == (15, 20, 3)
-    assert large.read().picture.shape == (60, 80, 3)
-    assert small.name == scene.name
-    assert large.to_json() == {**scene.to_json(), "side": 80}
-    np.testing.assert_array_equal(ScaledSource(scene, 40).read().picture, scene.read().picture)
-
-
-def test_every_picture_needs_a_light(make_table: TableMaker) -> None:
-    lut = make_table("Test")
-    with pytest.raises(InputError, match="6 pictures have 5 lights"):
-        rendered(lut, SOURCES, lights_at_random(lut, 5, seed=0), seed=0)
-
-
 TEXT = "File,GT_R,GT_G,GT_B\nA/1.png,1,2,3\nB/1.png,4,5,6\n\nA/2.png,7,8,9\n"
 
 
@@ -158,20 +134,3 @@ def test_rows_of_one_camera(tmp_path: Path) -> None:
     assert everything.images == ("A/1.png", "B/1.png", "A/2.png")
     with pytest.raises(InputError, match=r"'C'.*'A/1.png'"):
         read_truths(f"{path}#C")
-
-
-def test_a_file_without_names(tmp_path: Path) -> None:
-    path = tmp_path / "plain.txt"
-    path.write_text("1 2 3\n4 5 6\n")
-    assert read_truths(str(path)).lights.tolist() == [[1, 2, 3], [4, 5, 6]]
-    with pytest.raises(FormatError, match="2 ground truths and 1 names"):
-        read_truths(f"{path}#1")
-
-
-def test_those_of_a_data_set(tmp_path: Path) -> None:
-    path = tmp_path / "set.npz"
-    lights = np.array([[1.0, 2, 1], [2, 2, 1]])
-    np.savez(path, images=np.ones((2, 4, 4, 3), np.float32), gt=lights, names=np.array(["a", "b"]))
-    found = read_truths(str(path))
-    assert found.name == "set"
-    assert found.lights.tolist() == lights.tolist()

@@ -5,34 +5,23 @@ What a table holds: its noise, and how grey its print is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from evaluation.experiments.paper.published import TABLE1
 from evaluation.experiments.paper.table1 import (
     Block,
-    block_table,
-    joint_table,
     noise_table,
     print_table,
-    sensor_of,
     settings,
     table1,
     table2,
 )
-from evaluation.experiments.running import evaluate
 from evaluation.methods.prepared import unit
-from evaluation.methods.standard import standard_methods
 from evaluation.metrics import recovery_error
-from evaluation.scene import Scene
 from generator.pictures.random_scenes import random_scenes
-from generator.pictures.sources import SourcePicture
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
+from tests.evaluation.experiments.transfer.worlds import MeanLearner
 from tests.evaluation.made_scenes import Made
 
 TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
@@ -59,18 +48,6 @@ def test_a_print_that_reflects_as_its_code_is_grey(make_table: TableMaker) -> No
 
 PICTURES = random_scenes(5, 24, 16, seed=8)
 SIX_D, FIVE_FIFTY_D = "Canon EOS 6D Mark II", "Canon EOS 550D"
-
-
-class Black:
-    """A black picture."""
-
-    name = "black"
-
-    def read(self) -> SourcePicture:
-        return SourcePicture(np.zeros((16, 24, 3), np.uint8))
-
-    def to_json(self) -> dict[str, Any]:
-        return {"picture": self.name}
 
 
 def small(make_table: TableMaker, noise: tuple[float, float] = (0.0, 0.0)) -> tuple[Block, ...]:
@@ -110,64 +87,6 @@ def test_the_noisier_table_is_worse_for_the_maximum_and_not_for_means(make_table
         assert abs(medians[1][1] - medians[0][1]) < 1
 
 
-def test_the_numbers_are_evaluate_s(make_table: TableMaker) -> None:
-    chosen = small(make_table, (0.05, 0.05))[:1]
-    (block,) = table1(chosen, workers=2)
-    methods = [standard_methods()[name] for name in ("white-patch", "gray-world", "shades-of-gray")]
-    for ours, usual in zip(block.results, evaluate(chosen[0].scenes, methods), strict=True):
-        np.testing.assert_array_equal(ours.errors["reproduction"], usual.errors["reproduction"])
-
-
-def test_another_camera_has_no_numbers_of_the_paper(make_table: TableMaker) -> None:
-    lut = make_table("Kodak Brownie")
-    assert sensor_of(lut) == "Kodak Brownie"
-    blocks = table1(settings([lut], PICTURES, TRUTHS, side=16))
-    assert len(block_table(blocks[0], "recovery").rows) == 3
-    assert {row[5] for row in joint_table(blocks).rows} == {"reproduction", "recovery"}
-
-
-@pytest.mark.slow
-def test_other_pictures_and_lights_have_no_numbers_of_the_paper(make_table: TableMaker) -> None:
-    luts = [make_table(SIX_D), make_table(FIVE_FIFTY_D)]
-    blocks = table1(settings(luts, PICTURES, TRUTHS, side=16))
-    beside = {block.cell for block in blocks if len(block_table(block, "recovery").rows) > 3}
-    assert beside == {("Random", "6D", "Random"), ("Random", "550D", "Random")}
-    assert not any("C1" in block_table(block, "recovery").title for block in blocks)
-    assert {row[:3] for row in joint_table(blocks).rows if row[5] == "paper"} == beside
-    # Random scenes do not depend on the pictures: of them the lights alone decide.
-    like = table1(settings(luts, PICTURES, TRUTHS, side=16, names=("Given", "C1")))
-    beside = {block.cell for block in like if len(block_table(block, "recovery").rows) > 3}
-    assert beside == {("Random", name, lights) for name in ("6D", "550D") for lights in ("C1", "Random")}
-
-
-def test_images_without_a_usable_pixel_are_told(make_table: TableMaker) -> None:
-    blocks = table1(settings([make_table("Test")], [*PICTURES[:4], Black()], TRUTHS, side=24))
-    assert "White-Patch: no usable pixel in 1 image, whose" in " ".join(block_table(blocks[0], "recovery").notes)
-
-
-@dataclass(frozen=True, eq=False)
-class Constant:
-    """Always the same light."""
-
-    name: str
-    light: npt.NDArray[np.float64]
-
-    def estimate(
-        self, image: object, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        return self.light
-
-
-@dataclass(frozen=True)
-class MeanLight:
-    """Learns the mean of the training lights."""
-
-    name: str = "Mean light"
-
-    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Constant:
-        return Constant(self.name, unit(np.mean([scene.truth for scene in scenes], axis=0)))
-
-
 REAL_LIGHTS = np.array([[1.0, 2, 1], [1.2, 2, 1], [1, 2, 1.3], [1.4, 2, 0.9], [1, 2, 0.8], [1.1, 2, 1.2]])
 REAL = [Made(f"r{place}", light, np.ones((4, 4, 3))) for place, light in enumerate(REAL_LIGHTS)]
 MADE = [Made("m", np.array([2.0, 1, 1]), np.ones((4, 4, 3)))]
@@ -175,8 +94,8 @@ FOLDS = np.array([0, 0, 1, 1, 2, 2])
 
 
 def test_who_was_trained_on_what() -> None:
-    (trained,) = table2(REAL, MADE, {"regression-trees": MeanLight()}, FOLDS)
+    (trained,) = table2(REAL, MADE, {"regression-trees": MeanLearner()}, FOLDS)
     for place, light in enumerate(REAL_LIGHTS):
-        others = REAL_LIGHTS[place // 2 != FOLDS].mean(axis=0)
+        others = np.mean([unit(one) for one in REAL_LIGHTS[place // 2 != FOLDS]], axis=0)
         assert trained.real.errors["recovery"][place] == pytest.approx(float(recovery_error(others, light)))
         assert trained.generated.errors["recovery"][place] == pytest.approx(float(recovery_error([2, 1, 1], light)))

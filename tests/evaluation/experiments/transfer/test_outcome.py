@@ -5,7 +5,6 @@ Statistics, intervals and ratios of rows.
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,6 @@ import pytest
 
 from evaluation.experiments.bootstrap import ErrorSample, bounded_figures, paired
 from evaluation.experiments.transfer.outcome import (
-    beside_plot,
     beside_table,
     errors_table,
     figures_of,
@@ -70,30 +68,6 @@ def test_beside_real_images_a_row_is_held_to_the_better_of_what_it_was_made_of()
     assert table is not None
     assert table.texts()[0] == (*("Trees", "made: generated", "20", "82.00", "41.00", "36.90", "0.90 (0.90 – 0.90)"),)
     assert beside_table(figures_of([_plain_row("generated", 1.0)], "recovery"), "Real") is None
-    drawn = beside_plot(found).decode()
-    for label in ("real alone", "made: generated, adapted", "real images"):
-        assert f">{label}<" in drawn
-    others = [replace(row, method=f"Forest {number}") for number in range(3) for row in rows]
-    assert width_of(beside_plot(figures_of([*rows, *others], "recovery")).decode()) > 2 * width_of(drawn)
-
-
-def width_of(svg: str) -> float:
-    found = re.search(r'viewBox="0 0 ([0-9.]+) ', svg)
-    assert found is not None
-    return float(found[1])
-
-
-def test_what_a_number_hides_is_noted() -> None:
-    found = figures_of(
-        [_plain_row("cross-validation", 1.0, 1.2), _plain_row("none", 1.0, guessed=3, images=0)], "recovery"
-    )
-    table = errors_table(found, "Real", 40)
-    assert table.notes == (
-        "Trees, none: no light in 3 images; grey stands in for it",
-        # Medians 20.5 and 24.6, whose standard deviation is 4.1 / sqrt 2.
-        "Means over seeds; the standard deviation of a median over seeds is up to 2.90 degrees.",
-    )
-    assert table.texts()[1][2] == "–"
 
 
 RANDOM = np.random.default_rng(3)

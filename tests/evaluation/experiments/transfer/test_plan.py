@@ -60,11 +60,6 @@ def test_white_is_the_light_and_what_is_brighter_is_clipped() -> None:
         np.testing.assert_array_equal(naive_image(white, light, 1900.9, matrix)[0, 0], [1000, 1900, 500])
 
 
-def test_no_colour_is_darker_than_black() -> None:
-    red = np.array([[[255, 0, 0]]], np.uint8)
-    np.testing.assert_array_equal(naive_image(red, np.ones(3) * 1000, 5000, MATRIX), [[[600, 100, 0]]])
-
-
 def _generated(maker_scenes: tuple[object, ...]) -> list[GeneratedScene]:
     return [scene for scene in maker_scenes if isinstance(scene, GeneratedScene)]
 
@@ -131,11 +126,6 @@ def test_pictures_are_prepared_and_lit_as_they_were(maker: Maker, how: dict[str,
     made = _generated(maker.make(**how).scenes)
     for naive, scene in zip(_counterparts(made, maker.pictures), made, strict=True):
         np.testing.assert_allclose(naive.read()[0].astype(int), scene.read()[0].astype(int), atol=away)
-
-
-def test_pictures_are_made_as_small_as_they_were(maker: Maker) -> None:
-    made = _generated(maker.make(preparation=Preparation(max_side=12)).scenes)
-    assert _counterparts(made, maker.pictures)[0].read()[0].shape == made[0].read()[0].shape == (12, 12, 3)
 
 
 def test_every_crop_has_the_counterpart_of_its_own_place(maker: Maker) -> None:
@@ -307,25 +297,6 @@ def test_naive_counterparts_are_of_the_same_images(maker: Maker, tmp_path: Path)
     save_pictures(some, ["b.png"], seed=8)
     with pytest.raises(InputError, match="3 pictures of made"):
         plan_transfer(_real("x"), [made], pictures=some)
-
-
-def test_a_camera_without_a_matrix_has_no_row_with_one(tmp_path: Path) -> None:
-    save_pictures(tmp_path / "b" / "pictures", ["q.png"])
-    unknown = Maker(tmp_path / "b", write_table(tmp_path / "b" / "lut", camera="Pinhole")).make()
-    plan = plan_transfer(_real("x"), [unknown], tmp_path / "b" / "pictures")
-    assert [each.kind for each in plan.training] == ["generated", "naive"]
-    assert "no colour matrix is known for Pinhole" in plan.notes[0]
-
-
-def test_a_set_that_was_not_generated_stands_beside(maker: Maker) -> None:
-    other = _real("y", place="y.npz", seed=1)
-    plan = plan_transfer(_real("x"), [maker.make(), other], maker.pictures)
-    assert [(each.data, each.kind) for each in plan.training] == [
-        ("made", "generated"),
-        ("made", "naive"),
-        ("made", "naive with matrix"),
-        ("real", "other"),
-    ]
 
 
 def test_parts_that_are_set_apart_stay_apart(maker: Maker, tmp_path: Path) -> None:

@@ -6,19 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.cross_validation import cross_validate
 from evaluation.experiments.folds import draw_folds
 from evaluation.experiments.transfer.outcome import TransferFigures, figures_of
 from evaluation.experiments.transfer.rows import TrainingSet, TransferRow, draw_images, transfer
 from evaluation.learning.constant_light import ConstantLight
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Method
-from evaluation.scene import Image, Scene
+from evaluation.scene import Scene
 from foundation.errors import InputError
-from tests.evaluation.experiments.transfer.worlds import COOL, MeanColour, world
+from tests.evaluation.experiments.transfer.worlds import COOL, MeanColour, MeanLearner, world
 
 pytestmark = pytest.mark.slow
 
@@ -75,47 +73,6 @@ def test_the_rows_and_their_order() -> None:
     assert (rows[1].results[0].estimates != rows[1].results[1].estimates).any()
 
 
-def test_cross_validation_is_that_of_the_command_of_its_own() -> None:
-    rows = transfer(TEST, [], LEARNERS, FOLDS, 1)
-    for seed, folds in enumerate(FOLDS):
-        for row, result in zip(rows, cross_validate(TEST, LEARNERS, folds, seed), strict=True):
-            np.testing.assert_allclose(row.results[seed].estimates, result.estimates, rtol=1e-12)
-
-
-def test_threads_change_nothing_and_a_run_repeats_itself() -> None:
-    made = [
-        transfer(TEST, [TrainingSet("a", "generated", world(60, seed=2))], LEARNERS, FOLDS, 40, workers=workers)
-        for workers in (1, 3, 3)
-    ]
-    for rows in zip(*made, strict=True):
-        for row in rows[1:]:
-            np.testing.assert_array_equal(row.results[1].estimates, rows[0].results[1].estimates)
-
-
-@dataclass(frozen=True)
-class Mean:
-    light: npt.NDArray[np.float64]
-    name: str = "Mean light"
-
-    def estimate(
-        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.float64]:
-        if not image.any():
-            raise ZeroDivisionError("black")
-        return self.light
-
-
-@dataclass(frozen=True)
-class MeanLearner:
-    """A user's class: no features, only `fit`."""
-
-    name: str = "Mean light"
-
-    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Method:
-        mean = np.mean([scene.truth / np.linalg.norm(scene.truth) for scene in scenes], axis=0)
-        return Mean(mean / np.linalg.norm(mean))
-
-
 def test_a_learner_that_reads_scenes_itself() -> None:
     training = world(30, seed=2)
     rows = transfer(TEST, [TrainingSet("a", "generated", training)], [MeanLearner()], FOLDS, 30)
@@ -138,11 +95,6 @@ def test_images_are_drawn_without_repeats() -> None:
     assert len(np.intersect1d(drawn[0], drawn[2])) < 30
     with pytest.raises(InputError, match="11 training images of 10"):
         draw_images(10, 11, 0)
-
-
-def test_nothing_to_learn_with_is_said() -> None:
-    with pytest.raises(InputError, match=r"0 learned.*2 seeds"):
-        transfer(TEST, [], [], FOLDS, 1)
 
 
 def test_beside_real_images() -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from evaluation.learning.feature_learner import FeatureLearner, Features
-from evaluation.scene import Image
+from evaluation.methods.method import Method
+from evaluation.scene import Image, Scene
 
 WARM = (0.45, 0.38, 0.17)
 COOL = (0.22, 0.42, 0.36)
@@ -77,3 +78,27 @@ class StraightMap:
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
         return {"map": self.map}
+
+
+@dataclass(frozen=True)
+class Mean:
+    light: npt.NDArray[np.float64]
+    name: str = "Mean light"
+
+    def estimate(
+        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+    ) -> npt.NDArray[np.float64]:
+        if not image.any():
+            raise ZeroDivisionError("black")
+        return self.light
+
+
+@dataclass(frozen=True)
+class MeanLearner:
+    """A user's class: no features, only `fit`."""
+
+    name: str = "Mean light"
+
+    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Method:
+        mean = np.mean([scene.truth / np.linalg.norm(scene.truth) for scene in scenes], axis=0)
+        return Mean(mean / np.linalg.norm(mean))
