@@ -784,11 +784,6 @@ def battery_level(state: EosState) -> float | None:
     return None if power is None else _BATTERY_LEVELS.get(power)
 
 
-def power_source(state: EosState) -> bool | None:
-    """Return whether a body runs on mains power; None where that is not known: it reports a battery for both."""
-    return True if state.number(Property.EOS_BATTERY_POWER) == _BATTERY_MAINS else None
-
-
 def _remember(kept: dict[int, _Kept], code: int, value: _Kept) -> None:
     if code in kept or len(kept) < MAX_PROPERTIES:
         kept[code] = value
@@ -1040,7 +1035,8 @@ class EosBody:
         """Return what is left of battery and card, as far as the body tells."""
         self.drain()
         level = self._battery_level()
-        mains = power_source(self.state)
+        # On mains power a battery is reported, too: anything else is not known.
+        mains = True if self.state.number(Property.EOS_BATTERY_POWER) == _BATTERY_MAINS else None
         saves_to_host = self.state.holds(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.HOST))
         return Supplies(level, mains, self._card_free_bytes(), saves_to_host)
 

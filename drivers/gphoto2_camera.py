@@ -212,11 +212,6 @@ def battery_level(text: str) -> float | None:
     return None
 
 
-def is_no_raw_file(name: str) -> bool:
-    """Return whether a file that a camera made is a picture or film, not raw, by its suffix."""
-    return name.lower().endswith(_NOT_RAW_SUFFIXES)
-
-
 def _choose(setting: BodySetting | None, labels: tuple[str, ...], wanted: dict[str, str], refused: list[str]) -> None:
     """Note which of some labels a setting is to have; a body that has it already need not offer it."""
     if setting is None:
@@ -317,7 +312,7 @@ class Gphoto2Camera:
             released_at = self._clock.now()
             path = camera.capture(gp.GP_CAPTURE_IMAGE)
             self._exposed = path, released_at
-            if is_no_raw_file(path.name):
+            if path.name.lower().endswith(_NOT_RAW_SUFFIXES):
                 self._forget(camera)
                 raise DeviceRefused(
                     f"the camera made {path.name}, no raw file, though it was asked for one; set raw alone by hand"

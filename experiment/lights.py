@@ -7,8 +7,6 @@ each scaled to its brightest channel and encoded with the projector's transfer f
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from contextlib import suppress
@@ -22,7 +20,7 @@ import numpy.typing as npt
 from drivers.presenter import Colour
 from foundation.colorimetry import decode_srgb, encode_srgb, linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
-from foundation.files import read_csv, whole_file, write_whole
+from foundation.files import csv_text, read_csv, whole_file, write_whole
 
 Kind = Literal["uniform", "blackbody", "spectrum"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
@@ -100,14 +98,12 @@ def plan_illuminations(grid: int = GRID, ccts_k: Sequence[float] = CCTS_K) -> tu
 
 def illuminations_to_csv(illuminations: Sequence[Illumination]) -> str:
     """Return the text of `illuminations.csv`."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    rows: list[Sequence[object]] = [COLUMNS]
     for light in illuminations:
         # Whole kelvin without a point, anything else with all its digits.
         cct = "" if light.cct_k is None else repr(light.cct_k).removesuffix(".0")
-        writer.writerow([light.index, light.kind, cct, *light.colour])
-    return text.getvalue()
+        rows.append([light.index, light.kind, cct, *light.colour])
+    return csv_text(rows)
 
 
 def save_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:

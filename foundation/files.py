@@ -25,7 +25,7 @@ import hashlib
 import io
 import os
 import stat
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from io import BufferedRandom
@@ -163,6 +163,13 @@ def read_csv(path: Path, remedy: str, what: str = "") -> tuple[list[str], list[d
         return list(table.fieldnames or ()), list(table)
     except csv.Error as error:
         raise FormatError(f"no CSV: {error}", about=path, remedy=remedy) from error
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """Return rows as CSV text, RFC 4180 with lines that end with LF; None is left empty."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def is_about_writing(error: BaseException, path: Path) -> TypeGuard[OSError]:

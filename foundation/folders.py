@@ -16,7 +16,7 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Collection, Generator
+from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
@@ -143,10 +143,10 @@ def _place(line: str) -> Path | None:
     return Path(re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), fields[1]))
 
 
-def clear_folder(folder: Path, kept: Collection[str] = ()) -> None:
-    """Remove what lies in a folder that is held, but for its lock and the names in `kept`."""
+def clear_folder(folder: Path) -> None:
+    """Remove what lies in a folder that is held, but for its lock."""
     for path in folder.iterdir():
-        if path.name == LOCK_FILE or path.name in kept:
+        if path.name == LOCK_FILE:
             continue
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)

@@ -25,7 +25,7 @@ from foundation.console import (
     run,
     with_json,
 )
-from foundation.errors import InputError, QualityError, StorageError
+from foundation.errors import InputError, QualityError, StorageError, counted
 from foundation.secret_texts import masked, printable
 from generator.options import (
     ImageOptions,
@@ -237,7 +237,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
     # A picture that was drawn several times is a source each time; one that was made and not read has no hash.
     different = len({source.sha256 or source.name for source in dataset.sources})
     noted = [source for source in dataset.sources if source.note]
-    pictures = _counted(made.sources, "picture")
+    pictures = counted(made.sources, "picture")
     if different < made.sources:
         pictures += f", {different} of them different,"
     output.add(
@@ -256,7 +256,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
         rendering=None if made.rendering is None else made.rendering.model_dump(mode="json"),
     )
     there = ", complete already; nothing was made" if was_there else ""
-    print(f"{masked(out)}: {_counted(made.images, 'image')} of {pictures} under {_counted(lights, 'light')}{there}")
+    print(f"{masked(out)}: {counted(made.images, 'image')} of {pictures} under {counted(lights, 'light')}{there}")
     if made.splits:
         parts = ", ".join(f"{images} for {part}" for part, images in made.splits.items())
         print(parts if made.splits.get("validation") else f"{parts}: two shares are those of train and test")
@@ -267,7 +267,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
     if noted:
         example = printable(f"{noted[0].name}: {noted[0].note}")
         has = "has a note" if len(noted) == 1 else "have notes"
-        print(f"{_counted(len(noted), 'picture')} {has} in sources.csv, such as {example}")
+        print(f"{counted(len(noted), 'picture')} {has} in sources.csv, such as {example}")
     if made.replaced_pixels:
         share = 100 * made.replaced_pixels / made.pixels
         print(
@@ -293,10 +293,6 @@ def _wider_print(made: Description) -> str:
     )
 
 
-def _counted(number: int, thing: str) -> str:
-    return f"{number} {thing}{'' if number == 1 else 's'}"
-
-
 def _verify(out: str, workers: int | None, output: JsonOutput) -> Dataset:
     """Print every fault of a dataset and return it; a QualityError if there is one."""
     from generator.dataset.making import Workers
@@ -313,12 +309,12 @@ def _verify(out: str, workers: int | None, output: JsonOutput) -> Dataset:
     output.add(dataset=masked(out), faults=faults)
     if faults:
         raise QualityError(
-            f"{out} is not as it was made: {_counted(len(faults), 'fault')}, listed above; make it again, or copy it "
+            f"{out} is not as it was made: {counted(len(faults), 'fault')}, listed above; make it again, or copy it "
             "again"
         )
     dataset = open_dataset(out)
     output.add(images=dataset.description.images)
-    print(f"{masked(out)}: {_counted(dataset.description.images, 'image')}, every file as it was made")
+    print(f"{masked(out)}: {counted(dataset.description.images, 'image')}, every file as it was made")
     return dataset
 
 

@@ -538,7 +538,7 @@ def _usual_shares(bits: int, lens: _Lens) -> _Array:
     """Return the covariance (TERMS, TERMS) of shares before they are measured."""
     usual = np.diag(np.full(TERMS, (lens.near * _PRIOR_SHARE) ** 2))
     if bits < VARYING_BITS:
-        varying = _varying_terms()
+        varying = np.concatenate([group for group in groups_of_terms() if len(group) > _EVEN_TERMS])
         usual[varying, varying] = (lens.near * _SMALL_SHARE) ** 2
     *kernels, veil = (group for group in groups_of_terms() if len(group) <= _EVEN_TERMS)
     if lens.power:
@@ -578,11 +578,6 @@ def _law(power: float) -> _Array:
 def channels_alike(apart: float = CHANNELS_APART) -> _Array:
     """Return the correlation (3, 3) float64 of far shares of R, G and B before they are measured."""
     return (1 - apart**2) + apart**2 * np.eye(3)
-
-
-def _varying_terms() -> npt.NDArray[np.int64]:
-    """Return the unknowns by which shares change over the frame."""
-    return np.concatenate([group for group in groups_of_terms() if len(group) > _EVEN_TERMS])
 
 
 def _of(normal: _Array, right: _Array, prior: _Array, chosen: npt.NDArray[np.int64]) -> tuple[_Array, _Array, _Array]:

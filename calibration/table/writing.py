@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -29,7 +28,7 @@ from calibration.table.lut import (
 )
 from experiment.lights import COLUMNS, NAME, Illumination
 from foundation.errors import StorageError
-from foundation.files import sha256_of, storage_error, write_whole
+from foundation.files import csv_text, sha256_of, storage_error, write_whole
 
 _Array = npt.NDArray[np.float64]
 
@@ -40,14 +39,7 @@ REFERENCE_COLUMNS: Final = ("light", "name", "r", "g", "b", "r_error", "g_error"
 def frames_csv(frames: Sequence[SourceFrame]) -> str:
     """Return the text of `frames.csv`."""
     rows = ([frame.kind, frame.illumination, frame.file, frame.sha256] for frame in frames)
-    return _csv([FRAME_FIELDS, *rows])
-
-
-def _csv(rows: Iterable[Sequence[object]]) -> str:
-    """Return rows as CSV; None is left empty."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
+    return csv_text([FRAME_FIELDS, *rows])
 
 
 class LutWriter:
@@ -159,7 +151,7 @@ def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[
         ]
         for light, values in zip(illuminations, white, strict=True)
     )
-    return _csv([[*COLUMNS, *WHITE_COLUMNS, *([NAME] if named else [])], *rows])
+    return csv_text([[*COLUMNS, *WHITE_COLUMNS, *([NAME] if named else [])], *rows])
 
 
 def references_csv(names: Sequence[str], white: _Array, white_error: _Array, greys: _Array, errors: _Array) -> str:
@@ -175,4 +167,4 @@ def references_csv(names: Sequence[str], white: _Array, white_error: _Array, gre
         for light in range(len(white))
         for name, value, error in zip(("white", *names), values[light], off[light], strict=True)
     )
-    return _csv([REFERENCE_COLUMNS, *rows])
+    return csv_text([REFERENCE_COLUMNS, *rows])

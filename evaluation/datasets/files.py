@@ -346,18 +346,7 @@ class PaintedScene(RawScene):
 
     def mask(self, image: Image) -> Mask:
         """Return (H, W) bool, True where every channel of the image (H, W, 3) is zero."""
-        return zero_pixels(image)
-
-
-def zero_pixels(image: Image) -> Mask:
-    """Return (H, W) bool, True where every channel of an image (H, W, 3) of any dtype is zero.
-
-    Examples
-    --------
-    >>> zero_pixels(np.array([[[0, 0, 0], [0, 1, 0]]], np.uint16))
-    array([[ True, False]])
-    """
-    return np.asarray((image[..., 0] == 0) & (image[..., 1] == 0) & (image[..., 2] == 0))
+        return np.asarray((image[..., 0] == 0) & (image[..., 1] == 0) & (image[..., 2] == 0))
 
 
 def box_mask(shape: tuple[int, int], rows: slice, columns: slice) -> Mask:

@@ -15,10 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.identity import first_copies
-from evaluation.results.result import csv_text
 from evaluation.scene import Scene, SceneSet
 from foundation.errors import FormatError, InputError, counted, first_of
-from foundation.files import read_csv
+from foundation.files import csv_text, read_csv
 from generator.named_numbers import is_number
 
 FOLDS = 3

@@ -25,10 +25,10 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.metrics import ErrorKind
-from evaluation.results.result import Result, csv_text
+from evaluation.results.result import Result
 from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError, counted, first_of
-from foundation.files import file_sha256, read_text
+from foundation.files import csv_text, file_sha256, read_text
 
 ERRORS_FILE = "errors.csv"
 """Its name in a results folder."""

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
@@ -16,13 +14,6 @@ import numpy.typing as npt
 from evaluation.methods.prepared import GREY
 from evaluation.metrics import ErrorKind, MapError, Summary, recovery_error, reproduction_error, summarise
 from foundation.errors import first_of
-
-
-def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Return rows as CSV text, RFC 4180 with lines that end with LF."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
 
 
 @dataclass(frozen=True, eq=False)

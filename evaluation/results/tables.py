@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.metrics import ErrorKind, MapError, summarise
-from evaluation.results.result import NO_PIXEL, Result, Subject, csv_text
+from evaluation.results.result import NO_PIXEL, Result, Subject
 from foundation.errors import first_of
+from foundation.files import csv_text
 
 Cell = str | float | None
 """A name, a number (an `int` stays one), or nothing known."""

@@ -7,8 +7,6 @@ journal is the truth; `frames.csv` is derived from it.
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 import sqlite3
 from collections.abc import Callable, Sequence
@@ -46,7 +44,15 @@ from experiment.session.repair import (
     unsound_files,
 )
 from foundation.errors import FormatError, InputError, StorageError
-from foundation.files import is_partial, read_text, reading_error, require_plain_folder, storage_error, write_whole
+from foundation.files import (
+    csv_text,
+    is_partial,
+    read_text,
+    reading_error,
+    require_plain_folder,
+    storage_error,
+    write_whole,
+)
 from foundation.folders import held_folder, require_free, unmounted_at, whole_folder
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
@@ -258,22 +264,19 @@ class Session:
 
     def write_frames_csv(self) -> None:
         """Derive `frames.csv` anew from the journal."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(FRAME_COLUMNS)
-        for frame in self.frames():
-            writer.writerow(
-                [
-                    frame.kind,
-                    "" if frame.illumination is None else frame.illumination,
-                    frame.file,
-                    frame.sha256,
-                    time_text(frame.taken_at),
-                    f"{frame.exposure_s:.9g}",
-                    frame.verdict,
-                ]
-            )
-        write_whole(self.folder / "frames.csv", text.getvalue())
+        rows = (
+            [
+                frame.kind,
+                frame.illumination,
+                frame.file,
+                frame.sha256,
+                time_text(frame.taken_at),
+                f"{frame.exposure_s:.9g}",
+                frame.verdict,
+            ]
+            for frame in self.frames()
+        )
+        write_whole(self.folder / "frames.csv", csv_text([FRAME_COLUMNS, *rows]))
 
     def set_aside_strays(self) -> list[Path]:
         """Clear what a crash left: hidden partial files go, complete files that no row counts are renamed."""

@@ -365,13 +365,13 @@ def plan_steps(
     return tuple(steps)
 
 
-def link_steps(first_number: int, *, response: bool = True) -> tuple[SessionStep, ...]:
+def link_steps(first_number: int) -> tuple[SessionStep, ...]:
     """Return what a run that is taken up again shows first, to link it to what was taken before.
 
     A grey and the primaries, by which the projector is known again, and a white and a dark frame, so that lights lie
     between references of one level of the lamp.
     """
-    colours = (Colour(TOP, TOP, TOP), *PRIMARIES) if response else ()
+    colours = (Colour(TOP, TOP, TOP), *PRIMARIES)
     shown: list[tuple[FrameKind, Colour]] = [*(("response", colour) for colour in colours), ("white", WHITE)]
     shown.append(("dark", BLACK))
     return tuple(SessionStep(number, kind, None, colour) for number, (kind, colour) in enumerate(shown, first_number))

@@ -14,6 +14,7 @@ from string import Template
 from typing import Any, Final
 
 from calibration.citation import bibtex, origin_lines, table_title
+from foundation.errors import counted
 from generator.dataset.joined import JoinedLayout
 from generator.dataset.layouts import LAYOUTS
 from generator.dataset.records import DATASHEET, Description, one_line, table_cell
@@ -37,12 +38,7 @@ def uncertainty_of(description: Description) -> str:
 
 def name_of(description: Description) -> str:
     """Return what the dataset is called until its makers name it."""
-    return f"CroP images of the {one_line(description.table.camera)}, {counted_images(description)}"
-
-
-def counted_images(description: Description) -> str:
-    """Return the number of images in words."""
-    return f"{description.images} image" + "s" * (description.images != 1)
+    return f"CroP images of the {one_line(description.table.camera)}, {counted(description.images, 'image')}"
 
 
 def kind_of(description: Description) -> str:
@@ -62,7 +58,8 @@ def summary_of(description: Description) -> str:
     """Return what the images are, in two sentences."""
     table = description.table
     return (
-        f"{counted_images(description)} of linear camera RGB as the raw sensor of the {one_line(table.camera)} would "
+        f"{counted(description.images, 'image')} of linear camera RGB as the raw sensor of the "
+        f"{one_line(table.camera)} would "
         "give them, each with the exact colour of its light. Black is 0, saturation "
         f"{table.white_level}; nothing is white balanced. {kind_of(description)}"
     )
@@ -168,7 +165,7 @@ def datasheet(description: Description) -> str:
         if table.computed is not None
         else f"The table's frames: {origin['Dates']}.",
         "format": option(description, "format"),
-        "images": counted_images(description),
+        "images": counted(description.images, "image"),
         "kind": kind_of(description),
         "layout": option(description, "layout"),
         "licence": origin["Licence"],

@@ -23,14 +23,12 @@ masks and maps say how much of either reaches a pixel.
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import math
 import shutil
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -44,7 +42,7 @@ import numpy.typing as npt
 from calibration.table.lut import open_lut
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
-from foundation.files import HashingWriter
+from foundation.files import HashingWriter, csv_text
 from foundation.folders import publish_folder, require_free
 from foundation.pieces import Piece, pieces_of
 from foundation.records import from_json
@@ -101,7 +99,6 @@ from generator.variation.variation import Varied
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.rendering.colorimetric import ColorimetricRendering
 
 
 PLAN: Final = "plan.json"
@@ -214,7 +211,7 @@ def photograph(
     share = None if options.black_point.kind == "keep" else options.black_point.share(seed, number)
     weights = None if lighting.masks is None else lighting.weights_of(*picture.shape[:2])
     if options.rendering == "colorimetric":
-        rendering = rendering_of(lut, options)
+        rendering = rendering_with(lut, options.matrix or matrix_for(lut))
         outside, distance = rendering.map.missed(nearest_nodes(picture))
         counts = rendering.draw(
             picture,
@@ -244,11 +241,6 @@ def _samples(lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: i
     colours = colours_in(picture, lut.provenance.bits) if picture.size < 3 * WHOLE_LIGHT_PIXELS else None
     veil = veil_of(lut, mixture, share)
     return without_veil(samples, veil, lut.provenance.white_level, colours)
-
-
-def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
-    """Return the rendering by colour that the options ask for; it keeps what it has found out of a table."""
-    return rendering_with(lut, options.matrix or matrix_for(lut))
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
@@ -696,8 +688,8 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
         }
         sums = stack.enter_context(place.files.create(SUMS))
         stated = bool(options.get("uncertainty"))
-        table.write(_row((*GROUND_TRUTH_COLUMNS, *([UNCERTAINTY_COLUMN] if stated else []))))
-        listed.write(_row(SOURCE_COLUMNS))
+        table.write(csv_text([[*GROUND_TRUTH_COLUMNS, *([UNCERTAINTY_COLUMN] if stated else [])]]))
+        listed.write(csv_text([SOURCE_COLUMNS]))
         for record, fresh, left_out in _records(place, int(identity["shards"])):
             names = {source.position: source for source in record.sources}
             for source in fresh:
@@ -717,8 +709,8 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
                     rendered.add(image.details, source.width * source.height)
                     if details is None:
                         details = _ListedFile(stack, place.files, IMAGES)
-                        details.write(_row(("image", *image.details)))
-                    details.write(_row((name, *map(_plain, image.details.values()))))
+                        details.write(csv_text([["image", *image.details]]))
+                    details.write(csv_text([[name, *map(_plain, image.details.values())]]))
                 if source.split is not None:
                     parts[source.split].write(f"{name}\n")
                     splits[source.split] += 1
@@ -791,12 +783,6 @@ def _records(place: Workplace, shards: int) -> Iterator[tuple[ShardRecord, list[
         )
 
 
-def _row(fields: Iterable[object]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(fields)
-    return text.getvalue()
-
-
 def _plain(value: float | str) -> str:
     """Return a value of `images.csv`; nine digits give back every float32."""
     return f"{value:.9g}" if isinstance(value, float) else str(value)
@@ -804,21 +790,19 @@ def _plain(value: float | str) -> str:
 
 def _source_row(source: SourceRecord) -> str:
     known = (source.position, source.name, source.sha256 or "", source.width, source.height, source.replaced_pixels)
-    return _row((*known, source.split or "", source.profile or "", source.note or ""))
+    return csv_text([[*known, source.split or "", source.profile or "", source.note or ""]])
 
 
 def _image_rows(name: str, source: str, image: ImageRecord, stated: Mapping[int, Light] | None) -> str:
     """Return the rows of an image's lights, with what each may be off by where the table's lights are given."""
-    return "".join(
-        _row(
-            (
-                name,
-                source,
-                light.illumination,
-                *(f"{part:.9f}" for part in light.truth),
-                *([] if stated is None else [_uncertainty(light.illumination, stated)]),
-            )
-        )
+    return csv_text(
+        [
+            name,
+            source,
+            light.illumination,
+            *(f"{part:.9f}" for part in light.truth),
+            *([] if stated is None else [_uncertainty(light.illumination, stated)]),
+        ]
         for light in image.lights
     )
 

@@ -1,4 +1,4 @@
-"""Serial cables to a simulated device: a pseudo-terminal (Linux and macOS), and one in memory.
+"""A serial cable to a simulated device: a pseudo-terminal (Linux and macOS).
 
 One thread serves a pseudo-terminal's device. To close it is to pull the cable out; what nobody reads is lost when the
 system's buffer is full, as on a cable without flow control.
@@ -13,20 +13,9 @@ import threading
 import tty
 from typing import Final
 
-from drivers.links.link import ClosedAtEnd, Peer, PeerLink
+from drivers.links.link import ClosedAtEnd, Peer
 from drivers.links.network import POLLING_S
 from foundation.errors import LinkClosed
-
-
-class SerialPeerLink(PeerLink):
-    """A cable to a peer in the same thread, which hears before each read what the peer has to say by now."""
-
-    def read(self, limit: int, timeout: float) -> bytes:
-        """Return up to `limit` bytes of what the peer has said."""
-        if self._open:
-            self._incoming += self._peer.receive(b"")
-        return super().read(limit, timeout)
-
 
 _WAKE: Final = b"w"
 _END: Final = b"e"

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.links.link import MAX_MESSAGE, Link
+from drivers.links.link import MAX_MESSAGE, Link, PeerLink
 from drivers.links.serial import SerialLink
 from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
 from drivers.serial_projectors.driver import LineProjector
@@ -28,7 +28,7 @@ from foundation.errors import (
     LinkTimeout,
     ProtocolError,
 )
-from sim.buses.serial import PseudoTerminal, SerialPeerLink
+from sim.buses.serial import PseudoTerminal
 from sim.projectors.projector import IDENTITY, SimulatedProjector
 from sim.projectors.serial import LinePeer
 from tests.contracts.projector import Bench, ProjectorContract
@@ -44,6 +44,16 @@ NAMES = sorted(LANGUAGES)
 EPSON = LANGUAGES["epson"]
 
 OPTOMA_STATE = bytes.fromhex("7E 30 30 31 32 34 20 31 0D")
+
+
+class SerialPeerLink(PeerLink):
+    """A cable to a peer in the same thread, which hears before each read what the peer has to say by now."""
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        """Return up to `limit` bytes of what the peer has said."""
+        if self._open:
+            self._incoming += self._peer.receive(b"")
+        return super().read(limit, timeout)
 
 
 def identity_in(language: Language) -> ProjectorIdentity:
