@@ -149,7 +149,6 @@ def chart(
 
 
 def _page(text: str | None) -> str | tuple[float, float] | None:
-    """Return a paper's name as it is, and WIDTHxHEIGHT as numbers."""
     try:
         width, height = (float(part) for part in (text or "").lower().split("x"))
     except ValueError:

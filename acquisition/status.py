@@ -17,13 +17,13 @@ from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, Check, doubts_of, duration_text
 from foundation.errors import CropError, counted
 
-LAST = 5
-"""Verdicts, and events, that are shown: chosen, a screen has room for them beside the rest."""
+LAST = 5  # Verdicts, and events, that are shown: chosen, a screen has room for them beside the rest
 
 
+# What marks a value outside its limits that refused no frame.
 BEYOND = " (beyond; it follows from another cause, or is followed)"
-"""What marks a value outside its limits that refused no frame."""
 
+# What the numbers of the checks are, for who has not read docs/how-to/night-run.md.
 MEANINGS = {
     "data": "photosites without counts",
     "clipping": "photosites that are clipped",
@@ -42,7 +42,6 @@ MEANINGS = {
     "white_drift": "brightness of white since the first white frame",
     "additivity": "white beyond the sum of the primaries",
 }
-"""What the numbers of the checks are, for who has not read docs/how-to/night-run.md."""
 
 
 def read_status(folder: Path, now: datetime) -> SessionView:
@@ -95,7 +94,6 @@ def status_json(view: SessionView, now: datetime) -> dict[str, Any]:
 
 
 def _state(head: Head) -> str:
-    """Return what the run does, without saying it twice."""
     if head.state == "copy":
         return head.sentence
     if not head.sentence or head.sentence.startswith(head.state):
@@ -126,7 +124,6 @@ def _white_drift(view: SessionView) -> float | None:
 
 
 def _newest_checks(view: SessionView) -> Mapping[str, Check]:
-    """Return the newest check of each name that has a number."""
     return {check.name: check for attempt in view.attempts for check in attempt.checks if check.value is not None}
 
 

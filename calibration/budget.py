@@ -20,8 +20,7 @@ import numpy.typing as npt
 
 from calibration.table.lut import CELL_COLUMNS, EXPANDED
 
-COVERAGE: Final = 2.0
-"""Factor k by which a standard uncertainty is expanded (JCGM 100, 6.2.1)."""
+COVERAGE: Final = 2.0  # Factor k by which a standard uncertainty is expanded (JCGM 100, 6.2.1)
 
 _Array = npt.NDArray[np.float64]
 
@@ -114,7 +113,6 @@ class Budget:
 
 
 def _csv(columns: list[str], rows: Iterable[list[float]]) -> str:
-    """Return numbered rows of numbers with four digits as CSV."""
     lines = [",".join([str(number), *(f"{value:.4g}" for value in row)]) for number, row in enumerate(rows)]
     return "\n".join([",".join(columns), *lines]) + "\n"
 

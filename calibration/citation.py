@@ -27,31 +27,29 @@ from experiment.config import CameraSettings, CitationSettings
 from experiment.session.records import FrameRecord
 from foundation.records import Record
 
+# How the serial number of a body is published (`experiment.config.CitationSettings.camera_serial`).
 SerialForm = Literal["hash", "plain", "withheld"]
-"""How the serial number of a body is published (`experiment.config.CitationSettings.camera_serial`)."""
 
+# scrypt's N, r and p as RFC 7914, section 2, has them for interactive use: 16 MiB, some 40 ms. Changing one changes
+# all hashes, so that bodies are not recognised any longer.
 _COST, _BLOCK, _PARALLEL = 1 << 14, 8, 1
-"""scrypt's N, r and p as RFC 7914, section 2, has them for interactive use: 16 MiB, some 40 ms. Changing one changes
-all hashes, so that bodies are not recognised any longer."""
 
-_BYTES = 16
-"""Of the hash: 128 bits never meet by chance."""
+_BYTES = 16  # Of the hash: 128 bits never meet by chance
 
-NOT_RECORDED: Final = "not recorded"
-"""What stands where a table does not say something."""
+NOT_RECORDED: Final = "not recorded"  # What stands where a table does not say something
 
+# What stood at the end of the cables; see `experiment.config.LabSettings`.
 Rig = Literal["lab", "simulated", "replay", "imported"]
-"""What stood at the end of the cables; see `experiment.config.LabSettings`."""
 
 Line = Annotated[str, Field(max_length=500)]
 Text = Annotated[str, Field(max_length=20_000)]
 
-_SERIAL = ", serial number "
-"""What stands before the number in a journal's name of the camera."""
+_SERIAL = ", serial number "  # What stands before the number in a journal's name of the camera
 
+# Digits of the table's hash in the key of its entry: two tables of one lab never share them by chance.
 KEY_DIGITS: Final = 8
-"""Digits of the table's hash in the key of its entry: two tables of one lab never share them by chance."""
 
+# Characters that TeX reads as commands (D. Knuth, The TeXbook, chapter 7), and how they are printed.
 _SPECIAL: Final = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -60,7 +58,6 @@ _SPECIAL: Final = {
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
 }
-"""Characters that TeX reads as commands (D. Knuth, The TeXbook, chapter 7), and how they are printed."""
 
 
 @lru_cache(maxsize=64)
@@ -184,7 +181,6 @@ def origin_lines(origin: OriginRecord | None) -> list[tuple[str, str]]:
 
 
 def _rig_text(rig: Rig | None) -> str | None:
-    """Return in words what stood at the end of the cables."""
     words = {
         "lab": "a laboratory",
         "simulated": "the simulated laboratory: nothing was photographed",

@@ -365,7 +365,6 @@ def fetch(
 
 
 def _vouched(lut: Lut, expect: str | None) -> str:
-    """Return in words what is known of a table that was fetched."""
     if expect is not None:
         return "it is the table expected, and every file is as it was built"
     return (

@@ -20,15 +20,13 @@ _Count = npt.NDArray[np.uint16]
 _Place = npt.NDArray[np.int64]
 _Slot = npt.NDArray[np.int32]
 
-PARTS = 5
-"""Parts along a slot: a tag's module is two of them, so that every edge printed lies between two parts."""
+PARTS = 5  # Parts along a slot: a tag's module is two of them, so that every edge printed lies between two parts
 
+# Slots on each side of a patch that are looked at one by one, 25 px and more: what comes from further away does not
+# depend on where within its slot a patch is sampled.
 REACH = 2
-"""Slots on each side of a patch that are looked at one by one, 25 px and more: what comes from further away does not
-depend on where within its slot a patch is sampled."""
 
-ACROSS = 2 * REACH + 1
-"""Slots along the neighbourhood of a patch."""
+ACROSS = 2 * REACH + 1  # Slots along the neighbourhood of a patch
 
 
 @compiled

@@ -125,11 +125,10 @@ class SessionMeasurements:
     codes: tuple[tuple[int, int, int], ...]
 
 
+# Standard deviation of a frame's brightness, a share, where white frames do not show it (judgement).
 _USUAL_SCATTER = 0.001
-"""Standard deviation of a frame's brightness, a share, where white frames do not show it (judgement)."""
 
-_SCATTER_FRAMES = 3
-"""White frames from which on they show it."""
+_SCATTER_FRAMES = 3  # White frames from which on they show it
 
 
 @dataclass(frozen=True, eq=False)

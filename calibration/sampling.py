@@ -22,45 +22,39 @@ from drivers.raw.rawfile import CHANNELS, Mosaic, phases
 from experiment.framing.sharpness import MAX_BLUR_PX
 from foundation.compiled import compiled, inlined
 
-UNEVEN_SHARE = 0.01
-"""Difference of rim and middle, as a share of the patch, that matters (judgement)."""
+UNEVEN_SHARE = 0.01  # Difference of rim and middle, as a share of the patch, that matters (judgement)
 
+# Noise alone passes 3 σ in one of 370 comparisons, 265 of a whole chart's 98 304; 5 σ in one of 1.7 million.
 UNEVEN_SIGMA = 5.0
-"""Noise alone passes 3 σ in one of 370 comparisons, 265 of a whole chart's 98 304; 5 σ in one of 1.7 million."""
 
+# Share of its patch's light below which a photosite is taken for dead: even a rim that a dark neighbour blurs into
+# sees more.
 DEAD_SHARE = 0.5
-"""Share of its patch's light below which a photosite is taken for dead: even a rim that a dark neighbour blurs into
-sees more."""
 
+# Counts that a cell must have for a dead photosite to be distinguished from noise: half of it is 21 σ.
 DEAD_LEVEL = 300.0
-"""Counts that a cell must have for a dead photosite to be distinguished from noise: half of it is 21 σ."""
 
-NOISY = 1e-8
-"""Chance that noise alone lists a cell: a variance 3.5 times the model's for 25 samples."""
+NOISY = 1e-8  # Chance that noise alone lists a cell: a variance 3.5 times the model's for 25 samples
 
+# Levels at which noise is read: a full chart has a thousand patches in each, a chart of 512 colours sixteen.
 _NOISE_BINS = 32
-"""Levels at which noise is read: a full chart has a thousand patches in each, a chart of 512 colours sixteen."""
 
-_CURVE_BINS = 48
-"""The same for the photon-transfer curve: seven hundred cells of a full chart in each."""
+_CURVE_BINS = 48  # The same for the photon-transfer curve: seven hundred cells of a full chart in each
 
+# Sides of windows, half-size px: odd, so that a cell has a middle pixel; a cell is about 10 px wide.
 WINDOWS = (3, 5, 7, 9)
-"""Sides of windows, half-size px: odd, so that a cell has a middle pixel; a cell is about 10 px wide."""
 
+# Share of a sample's light from beyond its cell that counts as none: less than half of what the verdict remarks on.
 SAFE_BLEED = 0.002
-"""Share of a sample's light from beyond its cell that counts as none: less than half of what the verdict remarks on."""
 
-MISPLACEMENT_PX = 0.75
-"""How far a sample may lie from its place: 0.5 px of rounding and 0.25 px of registration."""
+MISPLACEMENT_PX = 0.75  # How far a sample may lie from its place: 0.5 px of rounding and 0.25 px of registration
 
+# From a cell's true centre to the outer edge of its 25 pixels: 2.5, rounding 0.5, registration 0.25.
 SAMPLE_REACH_PX = 3.25
-"""From a cell's true centre to the outer edge of its 25 pixels: 2.5, rounding 0.5, registration 0.25."""
 
-_LEAST_BLUR_PX = 1e-3
-"""Keeps a perfectly sharp picture from dividing by 0."""
+_LEAST_BLUR_PX = 1e-3  # Keeps a perfectly sharp picture from dividing by 0
 
-WINDOW = 5
-"""Pixels along the side of a cell's window, where the user names no other: the paper's (section 3.2)."""
+WINDOW = 5  # Pixels along the side of a cell's window, where the user names no other: the paper's (section 3.2)
 
 _Array = npt.NDArray[np.float64]
 _Float = npt.NDArray[np.float32]

@@ -21,8 +21,7 @@ from experiment.session.records import FrameRecord
 from experiment.session.repair import lights_text
 from foundation.errors import counted, first_of
 
-COMMAND = "acquire run LAB.toml SESSION --retake bad"
-"""What takes frames again, as the report names them."""
+COMMAND = "acquire run LAB.toml SESSION --retake bad"  # What takes frames again, as the report names them
 
 _THEN = "what else is refused may follow from these, else take the session anew"
 

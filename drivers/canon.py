@@ -77,21 +77,16 @@ from drivers.ptp.protocol import (
 from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
-_RAW: Final = 6
-"""Kind of a raw file, see `ImageFile`."""
-_LOSSLESS: Final = 4
-"""Compression of a raw file, see `ImageFile`."""
+_RAW: Final = 6  # Kind of a raw file, see `ImageFile`
+_LOSSLESS: Final = 4  # Compression of a raw file, see `ImageFile`
 
 _JPEG_SIZES: Final = {0: "L", 1: "M", 2: "S", 5: "M1", 6: "M2", 14: "S1", 15: "S2", 16: "S3"}
 
-_IMAGE_FILE_LENGTH: Final = 16
-"""Bytes of one file's format: this length, kind, size and compression, 32 bits each."""
+_IMAGE_FILE_LENGTH: Final = 16  # Bytes of one file's format: this length, kind, size and compression, 32 bits each
 
-_MAX_IMAGE_FILES: Final = 2
-"""Files of one release: a raw file and a JPEG."""
+_MAX_IMAGE_FILES: Final = 2  # Files of one release: a raw file and a JPEG
 
-_SETTING_HEADER: Final = 8
-"""Bytes before a new value: length and property."""
+_SETTING_HEADER: Final = 8  # Bytes before a new value: length and property
 
 
 def number_value(number: int) -> bytes:
@@ -183,9 +178,9 @@ class ImageFormat:
         return " + ".join(str(file) for file in self.files)
 
 
-RAW_ONLY = ImageFormat((ImageFile(_RAW, 0, _LOSSLESS),))
-"""One full raw file a release: what a measurement wants."""
+RAW_ONLY = ImageFormat((ImageFile(_RAW, 0, _LOSSLESS),))  # One full raw file a release: what a measurement wants
 
+# Properties whose value is an `ImageFormat`.
 IMAGE_FORMAT_PROPERTIES = frozenset(
     {
         Property.EOS_IMAGE_FORMAT,
@@ -194,7 +189,6 @@ IMAGE_FORMAT_PROPERTIES = frozenset(
         Property.EOS_IMAGE_FORMAT_EXT_HD,
     }
 )
-"""Properties whose value is an `ImageFormat`."""
 
 
 @dataclass(frozen=True)
@@ -218,11 +212,9 @@ class PropertySetting:
         return encode_integer(_SETTING_HEADER + len(self.value), 4) + encode_integer(self.code, 4) + bytes(self.value)
 
 
-_NAME_WIDTH: Final = 16
-"""Bytes of a name's field: 8.3 characters and padding."""
+_NAME_WIDTH: Final = 16  # Bytes of a name's field: 8.3 characters and padding
 
-_TIME_LENGTH: Final = 4
-"""Bytes of a time, seconds since 1970."""
+_TIME_LENGTH: Final = 4  # Bytes of a time, seconds since 1970
 
 
 @dataclass(frozen=True)
@@ -312,18 +304,16 @@ class DeviceInfoEx:
         return encode_integer(4 + len(arrays), 4) + arrays
 
 
+# Bytes of the longest answer to GetEvent that is read; a body left alone for a day queues some 250 kB.
 MAX_EVENTS: Final = 4 << 20
-"""Bytes of the longest answer to GetEvent that is read; a body left alone for a day queues some 250 kB."""
 
+# Records of one answer; a body left alone queues some 8000 in half a day (as users of libgphoto2 report).
 MAX_RECORDS: Final = 1 << 16
-"""Records of one answer; a body left alone queues some 8000 in half a day (as users of libgphoto2 report)."""
 
-_HEADER_LENGTH: Final = 8
-"""Bytes of a record's size and type."""
+_HEADER_LENGTH: Final = 8  # Bytes of a record's size and type
 
 _END: Final = struct.pack("<II", _HEADER_LENGTH, EosEvent.END)
-_LIST: Final = 3
-"""The kind of an available list that has items; 1 and 7 say that there is none."""
+_LIST: Final = 3  # The kind of an available list that has items; 1 and 7 say that there is none
 
 
 @dataclass(frozen=True)
@@ -398,19 +388,19 @@ class OtherRecord:
 
 Record = PropertyChanged | AvailableValues | AvailableFormats | ObjectEvent | TransferRequest | Notice | OtherRecord
 
+# Bytes of the size in each kind of object event.
 _OBJECT_EVENTS: dict[int, int] = {
     EosEvent.OBJECT_ADDED: 4,
     EosEvent.OBJECT_INFO_CHANGED: 4,
     EosEvent.OBJECT_ADDED_64: 8,
     EosEvent.OBJECT_INFO_CHANGED_64: 8,
 }
-"""Bytes of the size in each kind of object event."""
+# Bytes of the size, and numbers between it and the name, in each kind of transfer request.
 _TRANSFER_REQUESTS: dict[int, tuple[int, int]] = {
     EosEvent.REQUEST_OBJECT_TRANSFER: (4, 1),
     EosEvent.REQUEST_OBJECT_TRANSFER_64: (8, 0),
     EosEvent.REQUEST_OBJECT_TRANSFER_64_LFN: (8, 2),
 }
-"""Bytes of the size, and numbers between it and the name, in each kind of transfer request."""
 _NOTICES: frozenset[int] = frozenset(
     {
         EosEvent.OBJECT_REMOVED,
@@ -543,8 +533,8 @@ def _encode_transfer_request(record: TransferRequest) -> bytes:
     )
 
 
+# How far, of one, a wanted value may lie from a nominal one; neighbouring nominal values are 5 % apart or more.
 TOLERANCE = 0.01
-"""How far, of one, a wanted value may lie from a nominal one; neighbouring nominal values are 5 % apart or more."""
 
 
 @dataclass(frozen=True)
@@ -635,6 +625,8 @@ def _scale(name: str, table: str, specials: dict[int, str]) -> Scale:
     return Scale(name, tuple(sorted(steps, key=lambda step: step.code)), specials)
 
 
+# Shutter time in seconds (property 0xd102); beyond 1/8000 s of electronic shutters, as Canon's EDSDK names them up to
+# 1/32000 s. The last three follow the law of eighths of a stop, and 1/64000 s is the shortest that an EOS R3 offers.
 SHUTTER = _scale(
     "shutter time",
     """
@@ -648,9 +640,8 @@ SHUTTER = _scale(
     """,
     {0x00: "auto", 0x0C: "bulb", 0x04: "bulb"},
 )
-"""Shutter time in seconds (property 0xd102); beyond 1/8000 s of electronic shutters, as Canon's EDSDK names them up to
-1/32000 s. The last three follow the law of eighths of a stop, and 1/64000 s is the shortest that an EOS R3 offers."""
 
+# Aperture as f-number (property 0xd101); 0 also where the lens has no contacts.
 APERTURE = _scale(
     "aperture",
     """
@@ -660,8 +651,8 @@ APERTURE = _scale(
     """,
     {0x00: "auto", 0xB0: "auto", 0xFFFF: "auto"},
 )
-"""Aperture as f-number (property 0xd101); 0 also where the lens has no contacts."""
 
+# ISO speed (property 0xd103).
 ISO = _scale(
     "ISO speed",
     """
@@ -672,28 +663,23 @@ ISO = _scale(
     """,
     {0x00: "auto", 0x01: "auto"},
 )
-"""ISO speed (property 0xd103)."""
 
-MIRROR_LOCKUP_FUNCTION = 0x060F
-"""Number of mirror lockup among the custom functions, on bodies that have it there."""
+MIRROR_LOCKUP_FUNCTION = 0x060F  # Number of mirror lockup among the custom functions, on bodies that have it there
 
-MAX_PROPERTIES = 1024
-"""Properties that are remembered; a real body reports 80 to 300."""
+MAX_PROPERTIES = 1024  # Properties that are remembered; a real body reports 80 to 300
+# Bytes of a property's value that are remembered; the longest known, of focus points, has some 5000.
 MAX_VALUE = 1 << 14
-"""Bytes of a property's value that are remembered; the longest known, of focus points, has some 5000."""
+# Values of a property's list that are remembered; the longest known, of image formats, has 31 and of Kelvin 76.
 MAX_LIST = 1024
-"""Values of a property's list that are remembered; the longest known, of image formats, has 31 and of Kelvin 76."""
-_MAX_WAITING = 64
-"""Objects that are remembered; more than a body's memory holds."""
+_MAX_WAITING = 64  # Objects that are remembered; more than a body's memory holds
 _NOT_RAW = (ObjectFormat.EXIF_JPEG, ObjectFormat.JFIF, ObjectFormat.MOV, ObjectFormat.MOV2)
 _NOT_RAW_SUFFIXES = (".jpg", ".jpeg", ".hif", ".mov", ".mp4")
 _SILENT_OR_PLAIN = (DriveMode.SINGLE, DriveMode.SINGLE_SILENT)
-_BATTERY_LOW = 0
-"""Of EOS_BATTERY_POWER: 0 is low, as libgphoto2 reads it."""
+_BATTERY_LOW = 0  # Of EOS_BATTERY_POWER: 0 is low, as libgphoto2 reads it
+# Of EOS_BATTERY_POWER, as libgphoto2 reads it; other numbers are not known.
 _BATTERY_LEVELS = {_BATTERY_LOW: 0.0, 5: 0.25, 1: 0.5, 4: 0.75, 2: 1.0}
-"""Of EOS_BATTERY_POWER, as libgphoto2 reads it; other numbers are not known."""
+# Of EOS_BATTERY_POWER: mains power, as Canon's EDSDK has it of the same state; not seen on the wire.
 _BATTERY_MAINS = 0xFFFFFFFF
-"""Of EOS_BATTERY_POWER: mains power, as Canon's EDSDK has it of the same state; not seen on the wire."""
 
 _Kept = TypeVar("_Kept")
 
@@ -909,54 +895,47 @@ def _named(kind: type[AeMode] | type[DriveMode], value: int) -> str:
         return f"0x{value:02x}"
 
 
-PIECE_BYTES = 1 << 20
-"""Asked for at once; pieces of 5 MiB have crashed newer bodies."""
-MAX_FRAME_BYTES = 256 << 20
-"""No raw file of an EOS body comes near it."""
+PIECE_BYTES = 1 << 20  # Asked for at once; pieces of 5 MiB have crashed newer bodies
+MAX_FRAME_BYTES = 256 << 20  # No raw file of an EOS body comes near it
+# GetEvent answers that one drain takes, at most: a few empty the queue, and some firmware repeats itself.
 MAX_POLLS = 64
-"""GetEvent answers that one drain takes, at most: a few empty the queue, and some firmware repeats itself."""
-KEEP_ALIVE_S = 10.0
-"""After this long a body is asked to stay awake, as libgphoto2 asks it."""
-SETTLE_LIMIT_S = 5.0
-"""How long a body may take to report a value that it was given, or room for a frame."""
+KEEP_ALIVE_S = 10.0  # After this long a body is asked to stay awake, as libgphoto2 asks it
+SETTLE_LIMIT_S = 5.0  # How long a body may take to report a value that it was given, or room for a frame
+# How long a body may be busy after it was connected, or when it is to release, before it is refused: an EOS 2000D is
+# for seconds at either (gphoto2, issue 382).
 BUSY_LIMIT_S = 30.0
-"""How long a body may be busy after it was connected, or when it is to release, before it is refused: an EOS 2000D is
-for seconds at either (gphoto2, issue 382)."""
+# Presses in a row, spread over `PASSING_LIMIT_S`: what keeps a body busy ends by itself or by what is fetched
+# between.
 RELEASE_TRIES = 5
-"""Presses in a row, spread over `PASSING_LIMIT_S`: what keeps a body busy ends by itself or by what is fetched
-between."""
+# Wait for the answer to a release; some bodies expose before they answer. libgphoto2 waits as long.
 CAPTURE_TIMEOUT_S = 100.0
-"""Wait for the answer to a release; some bodies expose before they answer. libgphoto2 waits as long."""
 
-_REMOTE_ON, _REMOTE_OFF = 1, 0
-"""Parameter of SetRemoteMode, as the recorded conversations and libgphoto2 send it."""
+_REMOTE_ON, _REMOTE_OFF = 1, 0  # Parameter of SetRemoteMode, as the recorded conversations and libgphoto2 send it
+# Bodies to which libgphoto2 sends 0x15 or 0x11 as remote mode (`is_canon_eos_m` in its ptp-private.h), with live view
+# on before each frame: EOS M, but for the M6 Mark II, which is as the reflex bodies, and compact cameras. "Canon EOS
+# Kiss M" is the M50's name in Japan.
 _OTHER_REMOTE_MODE = re.compile(r"Canon (?!EOS)|Canon EOS (Kiss )?M(?!6 Mark II\b)")
-"""Bodies to which libgphoto2 sends 0x15 or 0x11 as remote mode (`is_canon_eos_m` in its ptp-private.h), with live view
-on before each frame: EOS M, but for the M6 Mark II, which is as the reflex bodies, and compact cameras. "Canon EOS
-Kiss M" is the M50's name in Japan."""
-_WITHOUT_AF = 1
-"""Second parameter of RemoteReleaseOn: a release without autofocus."""
+_WITHOUT_AF = 1  # Second parameter of RemoteReleaseOn: a release without autofocus
+# Room announced to the body: so many clusters of so many bytes, 320 GiB, more than a session takes.
 _HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
-"""Room announced to the body: so many clusters of so many bytes, 320 GiB, more than a session takes."""
+# Pauses between questions to the body, seconds; short at first, for most answers come at once (as libgphoto2 waits).
 _PAUSES_S = (0.05, 0.1, 0.15, 0.2)
-"""Pauses between questions to the body, seconds; short at first, for most answers come at once (as libgphoto2
-waits)."""
+# Requests of one piece in all, with the longest pause between: a second for a fault that passes, then the frame is
+# retaken.
 _PIECE_TRIES = 5
-"""Requests of one piece in all, with the longest pause between: a second for a fault that passes, then the frame is
-retaken."""
-_FREE_TRIES = 3
-"""Few, as the next `make_ready` tries again."""
+_FREE_TRIES = 3  # Few, as the next `make_ready` tries again
+# Operations that give a part of an object, the preferred one first.
 _IN_PIECES = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
-"""Operations that give a part of an object, the preferred one first."""
+# Responses to an operation that a body has not got, whatever it lists.
 _NOT_GOT = (ResponseCode.OPERATION_NOT_SUPPORTED, ResponseCode.EOS_UNKNOWN_COMMAND)
-"""Responses to an operation that a body has not got, whatever it lists."""
+# Responses to a request for a piece that asking again does not change.
 _LASTING = (
     *_NOT_GOT,
     ResponseCode.INVALID_OBJECT_HANDLE,
     ResponseCode.SESSION_NOT_OPEN,
     ResponseCode.DEVICE_BUSY,
 )
-"""Responses to a request for a piece that asking again does not change."""
+# Responses to a question after something that a body has not got: a card, a property.
 _NOTHING_THERE = (
     ResponseCode.PARAMETER_NOT_SUPPORTED,
     ResponseCode.INVALID_STORAGE_ID,
@@ -965,18 +944,15 @@ _NOTHING_THERE = (
     ResponseCode.STORE_NOT_AVAILABLE,
     ResponseCode.INVALID_PARAMETER,
 )
-"""Responses to a question after something that a body has not got: a card, a property."""
-_SLOT_FILLED = 0xFFFF
-"""Bits of a storage number that are 0 where there is no card in the slot (ISO 15740, 5.2.1)."""
-_MAX_CARDS = 8
-"""Cards that are asked for their room; bodies have one or two."""
+_SLOT_FILLED = 0xFFFF  # Bits of a storage number that are 0 where there is no card in the slot (ISO 15740, 5.2.1)
+_MAX_CARDS = 8  # Cards that are asked for their room; bodies have one or two
+# What RemoteRelease answers as parameter; 0 is success.
 _RELEASE_RESULTS = {
     1: "it finds no focus: set the lens to MF",
     3: "its mirror is up: switch mirror lockup off",
     7: "its card is full: empty it",
     8: "its card is read-only: unlock it",
 }
-"""What RemoteRelease answers as parameter; 0 is success."""
 
 
 class EosBody:
@@ -1219,7 +1195,6 @@ class EosBody:
         )
 
     def _receive_frames(self) -> None:
-        """Have frames sent to the host, and report room for them to the body."""
         host = host_destination(self.state)
         # A body that a killed run left behind stands at the host already; its user wants the card again.
         self._destination = number_value(CaptureDestination.CARD)
@@ -1327,22 +1302,22 @@ class EosBody:
         return operation in self._info.operations and operation not in self._unsupported
 
 
+# How often a call renews the connection: a fault that comes back more often lasts. Chosen, as the next two.
 RECOVERIES = 3
-"""How often a call renews the connection: a fault that comes back more often lasts. Chosen, as the next two."""
+# Time after the first fault of a call in which the connection may be renewed; a body that was switched off and on, or
+# put back on its cable, is there within 10 s.
 RECOVERY_S = 30.0
-"""Time after the first fault of a call in which the connection may be renewed; a body that was switched off and on, or
-put back on its cable, is there within 10 s."""
+# Time after its exposure within which a frame may be announced, beside as much time again as it was exposed: so long
+# a dark frame takes that some bodies subtract.
 FRAME_S = 30.0
-"""Time after its exposure within which a frame may be announced, beside as much time again as it was exposed: so long a
-dark frame takes that some bodies subtract."""
+# Time for a frame to be announced on a new connection, on which the body sends its whole state at once.
 REDISCOVERY_S = 10.0
-"""Time for a frame to be announced on a new connection, on which the body sends its whole state at once."""
 
-_CERTAIN_SHARE = 0.9
-"""Share of the nominal shutter time that passes at least: 1/6 s is really 0.149 s."""
+_CERTAIN_SHARE = 0.9  # Share of the nominal shutter time that passes at least: 1/6 s is really 0.149 s
+# Pauses between attempts to find the camera again, doubled from one to the other: soon for a cable put back, seldom
+# enough that a body which starts is left alone.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 5.0
-"""Pauses between attempts to find the camera again, doubled from one to the other: soon for a cable put back, seldom
-enough that a body which starts is left alone."""
+# Responses that a new session may cure.
 _STUCK = (
     *PASSING,
     ResponseCode.UNDEFINED,
@@ -1352,7 +1327,6 @@ _STUCK = (
     ResponseCode.INCOMPLETE_TRANSFER,
     ResponseCode.TRANSACTION_CANCELLED,
 )
-"""Responses that a new session may cure."""
 _SUFFIXES: dict[int, str] = {ObjectFormat.CRW: ".CRW", ObjectFormat.CR2: ".CR2", ObjectFormat.CR3: ".CR3"}
 _REMEDY = (
     "check its cable and battery, switch it off and on, and end other programs that use it (a desktop's photo importer "
@@ -1646,7 +1620,6 @@ def _apply(body: EosBody, settings: ExposureSettings) -> None:
 
 
 def _curable(error: DeviceError) -> bool:
-    """Return whether a new connection may help."""
     return isinstance(error, LinkError | ProtocolError) or (
         isinstance(error, OperationDeclined) and error.code in _STUCK
     )

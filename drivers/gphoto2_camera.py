@@ -29,25 +29,23 @@ if TYPE_CHECKING:
     import gphoto2
 
 
+# Relative difference allowed between a label and the value wanted: libgphoto2 lists 6.3 s where the dial shows 6.
 TOLERANCE = 0.06
-"""Relative difference allowed between a label and the value wanted: libgphoto2 lists 6.3 s where the dial shows 6."""
+# Relative difference between two labels of one value: a Nikon's 1/60 is listed as 0.0166 s too, cut off there.
 SAME = 0.011
-"""Relative difference between two labels of one value: a Nikon's 1/60 is listed as 0.0166 s too, cut off there."""
-_LISTED = 30
-"""Choices that a message lists, at most."""
+_LISTED = 30  # Choices that a message lists, at most
 
-RAW_FORMAT = ("imageformat", "imagequality")
-"""Canon, Fuji and Olympus have the former, Nikon and Sony the latter."""
+RAW_FORMAT = ("imageformat", "imagequality")  # Canon, Fuji and Olympus have the former, Nikon and Sony the latter
 ISO = ("iso",)
 APERTURE = ("aperture", "f-number")
+# A Nikon has both, and only the former is exact: the latter lists 1/6400 s as 0.0001 s.
 SHUTTER = ("shutterspeed2", "shutterspeed")
-"""A Nikon has both, and only the former is exact: the latter lists 1/6400 s as 0.0001 s."""
 TARGET = ("capturetarget",)
-HOST_TARGETS = ("Internal RAM", "sdram")
-"""Frames go to the host and leave nothing on the card."""
+HOST_TARGETS = ("Internal RAM", "sdram")  # Frames go to the host and leave nothing on the card
 
 _RAW_LABELS = ("RAW", "NEF (Raw)", "Raw", "NEF", "RAW (Uncompressed)", "RAW (Lossless)")
 _NOT_RAW_SUFFIXES = (".jpg", ".jpeg", ".hif", ".heif", ".heic", ".tif", ".tiff", ".mov", ".mp4")
+# Names of a state, labels of which one must be shown, and the remedy; a body may show a state under two names.
 _STATES: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (("autoexposuremode", "expprogram"), ("Manual", "M"), "turn the mode dial to M"),
     (
@@ -61,7 +59,7 @@ _STATES: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
         "set single shooting",
     ),
 )
-"""Names of a state, labels of which one must be shown, and the remedy; a body may show a state under two names."""
+# Names of what must be off, the labels for that, and what it would do.
 _SWITCHES: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("isoauto", ("Off",), "the body would choose the ISO speed"),
     ("autoiso", ("Off",), "the body would choose the ISO speed"),
@@ -70,7 +68,6 @@ _SWITCHES: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("autofocus", ("Off",), "the body would focus before each frame"),
     ("rawcompression", ("Lossless", "Uncompressed"), "raw values would be rounded"),
 )
-"""Names of what must be off, the labels for that, and what it would do."""
 _BATTERY_WORDS = {"low": 0.0, "empty": 0.0, "full": 1.0}
 
 
@@ -104,8 +101,7 @@ class BodySetting:
         return listed or f"nothing (it stands at {self.value or 'nothing'})"
 
 
-Body = Callable[[str], BodySetting | None]
-"""Gives a body's setting of a name, None where it has none."""
+Body = Callable[[str], BodySetting | None]  # Gives a body's setting of a name, None where it has none
 
 
 def first_of(body: Body, names: Iterable[str]) -> BodySetting | None:
@@ -223,16 +219,14 @@ def _choose(setting: BodySetting | None, labels: tuple[str, ...], wanted: dict[s
         refused.append(f"{setting.name} offers {setting.offered()}, none of {', '.join(labels)} that can be set")
 
 
+# How long a body may take to report a value that it was given: a Sony turns its dials step by step.
 SETTLE_LIMIT_S = 5.0
-"""How long a body may take to report a value that it was given: a Sony turns its dials step by step."""
 
+# Requests of a file in all from a body that says that it is busy: a second each, for it may still be writing. Any
+# other fault loses the connection, and the frame with it.
 BUSY_TRIES = 5
-"""Requests of a file in all from a body that says that it is busy: a second each, for it may still be writing. Any
-other fault loses the connection, and the frame with it."""
-BUSY_PAUSE_S = 1.0
-"""Between two of them."""
-_LOOK_AGAIN_S = 0.1
-"""Between two looks at a value that is to settle; each costs an exchange with the body."""
+BUSY_PAUSE_S = 1.0  # Between two of them
+_LOOK_AGAIN_S = 0.1  # Between two looks at a value that is to settle; each costs an exchange with the body
 
 _IDENTITY = {
     "maker": ("manufacturer",),
@@ -400,7 +394,6 @@ class Gphoto2Camera:
             self._set(camera, name, label)
 
     def _set(self, camera: gphoto2.Camera, name: str, label: str) -> None:
-        """Set a setting, and see that the body reports it."""
         gp = library()
         widget = camera.get_single_config(name)
         if is_same(_shown(widget.get_value()), label):

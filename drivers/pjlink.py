@@ -37,16 +37,11 @@ from drivers.projector import FAULT_PARTS, Fault, Lamp, Power, ProjectorIdentity
 from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceFault, DeviceRefused, LinkError, LinkTimeout, ProtocolError
 
-PORT = 4352
-"""TCP and UDP port of PJLink (PJLink Specifications 1.04 and 2.00)."""
-MAX_LINE = 136
-"""Bytes of a command or reply, its CR included."""
-DIGEST_LENGTH = 32
-"""Characters before the first command: the digest by MD5 (PJLink Specifications 1.04, 5.1)."""
-MAX_PASSWORD = 32
-"""Characters of a password (PJLink Specifications 1.04, authentication)."""
-IDLE_LIMIT_S = 30.0
-"""Projectors hang up after about this long without a command."""
+PORT = 4352  # TCP and UDP port of PJLink (PJLink Specifications 1.04 and 2.00)
+MAX_LINE = 136  # Bytes of a command or reply, its CR included
+DIGEST_LENGTH = 32  # Characters before the first command: the digest by MD5 (PJLink Specifications 1.04, 5.1)
+MAX_PASSWORD = 32  # Characters of a password (PJLink Specifications 1.04, authentication)
+IDLE_LIMIT_S = 30.0  # Projectors hang up after about this long without a command
 
 QUERY = "?"
 OK = "OK"
@@ -312,8 +307,7 @@ def _unexpected(command: str, value: str, expected: str) -> ProtocolError:
 
 
 SEARCH = b"%2SRCH\r"
-COLLECT_S = 30.0
-"""So long a controller collects answers, which projectors delay by up to 10 s."""
+COLLECT_S = 30.0  # So long a controller collects answers, which projectors delay by up to 10 s
 
 
 def replies_in(datagram: bytes) -> tuple[PjLinkReply, ...]:
@@ -332,19 +326,18 @@ def is_notice_of_start(line: bytes) -> bool:
     return any(reply.command == "LKUP" for reply in replies_in(line))
 
 
-DEFAULT_TIMEOUT_S = 5.0
-"""The standard asks for an answer within 2 s; real projectors take longer while they warm up."""
+DEFAULT_TIMEOUT_S = 5.0  # The standard asks for an answer within 2 s; real projectors take longer while they warm up
 _SILENT = "check that it is on the network, and that PJLink is enabled on it in standby too"
 _CHECK_PORT = "check that a projector answers at this port"
 
+# How long another server may take to answer its own kind of question; on a local network it takes milliseconds.
 _OTHER_SERVER_S = 2.0
-"""How long another server may take to answer its own kind of question; on a local network it takes milliseconds."""
 _HTTP_QUESTION = b"GET / HTTP/1.0\r\n\r\n"
 _HTTP_ANSWERS = (b"http/", b"rtsp/", b"<!doc", b"<html")
+# InitCommandRequest: length, type, an identifier of zeros, name, version (CIPA DC-005, 2.3.1).
 _PTPIP_QUESTION = struct.pack("<II16s10sI", 38, 1, b"", "CroP".encode("utf-16-le"), 0x10000)
-"""InitCommandRequest: length, type, an identifier of zeros, name, version (CIPA DC-005, 2.3.1)."""
+# Types of packets, behind their length: InitCommandAck and InitFail (same place).
 _PTPIP_ANSWERS = tuple(struct.pack("<I", kind) for kind in (2, 5))
-"""Types of packets, behind their length: InitCommandAck and InitFail (same place)."""
 
 
 _Answer = TypeVar("_Answer")
@@ -585,10 +578,8 @@ class PjLinkProjector:
         return DeviceRefused(f"{self._label} refuses the password; give the one set for PJLink in its menu")
 
 
-ASKED = 3
-"""A datagram may be lost, so the search is sent so often, a second apart; a projector may answer each."""
-ASK_EVERY_S = 1.0
-"""Far enough apart that one disturbance of the network does not swallow two."""
+ASKED = 3  # A datagram may be lost, so the search is sent so often, a second apart; a projector may answer each
+ASK_EVERY_S = 1.0  # Far enough apart that one disturbance of the network does not swallow two
 
 _MAC = re.compile("[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")
 

@@ -28,8 +28,8 @@ class Severity(Enum):
     ERROR = "error"
 
 
+# The parts of which a projector can report faults, in the order of PJLink 1.04, ERST.
 FAULT_PARTS: Final = ("fan", "lamp", "temperature", "cover", "filter", "other")
-"""The parts of which a projector can report faults, in the order of PJLink 1.04, ERST."""
 
 
 @dataclass(frozen=True)

@@ -89,35 +89,30 @@ class TiffTag(IntEnum):
     CR2_SLICES = 50752
 
 
-RGB: Final = 2
-"""PhotometricInterpretation of red, green and blue (TIFF 6.0, section 8)."""
+RGB: Final = 2  # PhotometricInterpretation of red, green and blue (TIFF 6.0, section 8)
 
-CFA: Final = 32803
-"""PhotometricInterpretation of a colour filter array (TIFF/EP)."""
+CFA: Final = 32803  # PhotometricInterpretation of a colour filter array (TIFF/EP)
 
-D65: Final = 21
-"""LightSource of daylight of 6504 K (Exif 2.32, section 4.6.5), as in DNG's CalibrationIlluminant."""
+D65: Final = 21  # LightSource of daylight of 6504 K (Exif 2.32, section 4.6.5), as in DNG's CalibrationIlluminant
 
 
 class TiffDamaged(ValueError):
     """The bytes are no TIFF, or a directory points beyond their end."""
 
 
-_MAX_DIRECTORIES: Final = 64
-"""Directories that are read: a camera's file has under ten, and a damaged chain must end."""
+_MAX_DIRECTORIES: Final = 64  # Directories that are read: a camera's file has under ten, and a damaged chain must end
 
-_MAX_ENTRIES: Final = 512
-"""Entries of a directory, as LibRaw allows; a camera's has under a hundred."""
+_MAX_ENTRIES: Final = 512  # Entries of a directory, as LibRaw allows; a camera's has under a hundred
 
+# Values of a directory's tags: a linearisation table, the longest that is read, has at most 65 536.
 _MAX_VALUES: Final = 1 << 18
-"""Values of a directory's tags: a linearisation table, the longest that is read, has at most 65 536."""
 
+# Numbers of floating point that are believed: larger ones are not exact, and no place, size or level is one.
 _LARGEST: Final = 2.0**53
-"""Numbers of floating point that are believed: larger ones are not exact, and no place, size or level is one."""
 
-_TEXT: Final = 2
-"""Type ASCII (TIFF 6.0, section 2)."""
+_TEXT: Final = 2  # Type ASCII (TIFF 6.0, section 2)
 
+# Letters of `struct` by type (TIFF 6.0, section 2; 13, IFD: TIFF technical note 1); rationals are two numbers.
 _FORMATS: Final = {
     1: "B",
     2: "s",
@@ -133,13 +128,15 @@ _FORMATS: Final = {
     12: "d",
     13: "I",
 }
-"""Letters of `struct` by type (TIFF 6.0, section 2; 13, IFD: TIFF technical note 1); rationals are two numbers."""
 
 _INTEGERS: Final = frozenset({1, 3, 4, 7})
 _PLACES: Final = frozenset({4, 13})
 _NUMBERS: Final = frozenset(_FORMATS) - {_TEXT}
 
 _T = TiffTag
+# Tags that are read, and the types that each may have; a damaged value of any other is no fault of the pixels. A name
+# of another type is left out, as writers differ there and no pixel depends on it; a number of another type is damage.
+# Integers may be UNDEFINED, as colour filters are in Exif.
 _DECODED: Final[dict[int, frozenset[int]]] = {
     tag: types
     for types, tags in (
@@ -177,17 +174,11 @@ _DECODED: Final[dict[int, frozenset[int]]] = {
     )
     for tag in tags
 }  # fmt: skip
-"""Tags that are read, and the types that each may have; a damaged value of any other is no fault of the pixels.
 
-A name of another type is left out, as writers differ there and no pixel depends on it; a number of another type is
-damage. Integers may be UNDEFINED, as colour filters are in Exif.
-"""
-
+# Tags whose zero divided by zero means that the camera does not know.
 _EXPOSURES: Final = frozenset({TiffTag.EXPOSURE_TIME, TiffTag.F_NUMBER, TiffTag.PHOTOGRAPHIC_SENSITIVITY})
-"""Tags whose zero divided by zero means that the camera does not know."""
 
-_POINTERS: Final = (TiffTag.SUB_IFDS, TiffTag.EXIF_IFD_POINTER)
-"""Tags that point to further directories."""
+_POINTERS: Final = (TiffTag.SUB_IFDS, TiffTag.EXIF_IFD_POINTER)  # Tags that point to further directories
 
 ReadValue = str | tuple[float, ...]
 
@@ -307,14 +298,11 @@ class ValueType(IntEnum):
     SRATIONAL = 10
 
 
-Value = tuple[ValueType, Sequence[int]]
-"""A tag's type and its numbers; a rational is two of them, numerator first."""
+Value = tuple[ValueType, Sequence[int]]  # A tag's type and its numbers; a rational is two of them, numerator first
 
-Tags = dict[TiffTag, Value]
-"""Values by tag."""
+Tags = dict[TiffTag, Value]  # Values by tag
 
-LARGEST_FILE: Final = (1 << 32) - 1
-"""Bytes that the 32-bit offsets of TIFF reach."""
+LARGEST_FILE: Final = (1 << 32) - 1  # Bytes that the 32-bit offsets of TIFF reach
 
 _LETTERS: Final = {
     ValueType.BYTE: "B",
@@ -326,8 +314,7 @@ _LETTERS: Final = {
     ValueType.SRATIONAL: "ii",
 }
 _HEADER: Final = struct.pack("<2sHI", b"II", 42, 8)
-_ALIGNMENT: Final = 16
-"""Bytes on whose multiple the pixels begin, so that samples of any type are aligned."""
+_ALIGNMENT: Final = 16  # Bytes on whose multiple the pixels begin, so that samples of any type are aligned
 
 
 def text(value: str) -> Value:

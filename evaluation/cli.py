@@ -41,7 +41,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _with_command(given: Sequence[str]) -> list[str]:
-    """Return the arguments with the command that the short form leaves out."""
     commands = {command.name for command in app.registered_commands} | {group.name for group in app.registered_groups}
     own = ("-h", "--help", "--version", "--install-completion", "--show-completion")
     first = next((at for at, word in enumerate(given) if not is_common(word)), len(given))

@@ -38,8 +38,8 @@ from foundation.errors import InputError
 
 ErrorKind = Literal["reproduction", "recovery"]
 
+# What replaces 0 in an estimate, over its largest channel: the angle is that of the limit to a double's last digit.
 _ZERO: Final = 1e-12
-"""What replaces 0 in an estimate, over its largest channel: the angle is that of the limit to a double's last digit."""
 
 
 def recovery_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -96,11 +96,11 @@ def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDA
 
 _Array = npt.NDArray[np.float64]
 
+# Share of a pixel's light above which the pixel belongs to a light's region: no two lights have the same pixel.
 DOMINANT: Final = 0.5
-"""Share of a pixel's light above which the pixel belongs to a light's region: no two lights have the same pixel."""
 
+# Pixels that are worked on at a time: some 100 MB of intermediate results whatever the image's size.
 _ROWS_OF: Final = 1 << 19
-"""Pixels that are worked on at a time: some 100 MB of intermediate results whatever the image's size."""
 
 
 @dataclass(frozen=True)
@@ -240,8 +240,8 @@ def _gains(lights: _Array) -> _Array:
     return floored[:, 1:2] / floored
 
 
+# Errors below it are counted as small: the limit that many papers of the field take for an acceptable error.
 SMALL_DEG: Final = 3.0
-"""Errors below it are counted as small: the limit that many papers of the field take for an acceptable error."""
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+# (H, W, 3), linear camera RGB ≥ 0 with black subtracted, in any unit.
 Image = npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64]
-"""(H, W, 3), linear camera RGB ≥ 0 with black subtracted, in any unit."""
 
 
 class Scene(Protocol):

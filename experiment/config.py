@@ -429,7 +429,6 @@ def checked(kind: type[_AnySettings], document: dict[str, Any], where: str) -> _
 
 
 def _listed(found: Sequence[str]) -> str:
-    """Return one mistake behind a space, several on lines of their own."""
     several = [f" {len(found)} mistakes:", *(f"\n  {one}" for one in found)]
     return f" {found[0]}" if len(found) == 1 else "".join(several)
 
@@ -478,7 +477,6 @@ _BOUNDS: Final = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of a
 
 
 def _number_expected(key: str, whole: bool) -> str:
-    """Return what number is expected of a key."""
     what = "a whole number" if whole else "a number"
     reason = f"{what} of seconds was expected" if key.endswith("_s") else f"{what} was expected"
     if key == "sequence.patience_s":

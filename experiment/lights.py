@@ -23,27 +23,22 @@ from foundation.errors import FormatError, InputError
 from foundation.files import csv_text, read_csv, whole_file, write_whole
 
 Kind = Literal["uniform", "blackbody", "spectrum"]
-COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
-"""Columns of `illuminations.csv` (docs/formats.md)."""
+COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")  # Columns of `illuminations.csv` (docs/formats.md)
 
-NAME = "name"
-"""A further column where lights have names: those of computed tables under spectra of their own."""
+NAME = "name"  # A further column where lights have names: those of computed tables under spectra of their own
 
+# Steps along an edge of the chromaticity triangle: 666 points, which with 41 black bodies are the paper's 707.
 GRID = 35
-"""Steps along an edge of the chromaticity triangle: 666 points, which with 41 black bodies are the paper's 707."""
 
-CCTS_K = tuple(range(2000, 10001, 200))
-"""Black bodies of the plan, kelvin: from candle light to blue sky."""
+CCTS_K = tuple(range(2000, 10001, 200))  # Black bodies of the plan, kelvin: from candle light to blue sky
 
-MOST_CCTS = 10_000
-"""Most temperatures that a text may name: more are a mistake in the step."""
+MOST_CCTS = 10_000  # Most temperatures that a text may name: more are a mistake in the step
 
 
-FORMATS = ("png", "pdf", "svg")
-"""Endings of a figure's file name, and Matplotlib's names of these formats."""
+FORMATS = ("png", "pdf", "svg")  # Endings of a figure's file name, and Matplotlib's names of these formats
 
+# Temperatures that the figure names, kelvin: few enough for their names not to touch.
 _NAMED_CCTS_K = (2000, 3000, 4000, 6000, 10000)
-"""Temperatures that the figure names, kelvin: few enough for their names not to touch."""
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,7 @@ class SystemClock:
         time.sleep(seconds)
 
 
-SYSTEM_CLOCK: Final = SystemClock()
-"""The clock of whoever is given none."""
+SYSTEM_CLOCK: Final = SystemClock()  # The clock of whoever is given none
 
 
 def elapsed_s() -> float:
@@ -51,8 +50,7 @@ def elapsed_s() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
-SET_S = 10.0
-"""A date that is off by more was set: what keeps clocks right over a network moves them by less in a night."""
+SET_S = 10.0  # A date that is off by more was set: what keeps clocks right over a network moves them by less in a night
 
 
 class SteadyClock:
@@ -97,8 +95,7 @@ class SteadyClock:
         self._clock.sleep(seconds)
 
 
-OPENING = datetime(2026, 1, 1, 8, 0, 0, tzinfo=UTC)
-"""When the simulated lab opens for a session that has not begun."""
+OPENING = datetime(2026, 1, 1, 8, 0, 0, tzinfo=UTC)  # When the simulated lab opens for a session that has not begun
 
 
 class SimulatedClock:

@@ -14,14 +14,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-_C1_W_M2: Final = 3.741771e-16
-"""First radiation constant of Planck's law, W m² (CODATA)."""
+_C1_W_M2: Final = 3.741771e-16  # First radiation constant of Planck's law, W m² (CODATA)
 
+# Second radiation constant as CIE 15:2018 has it for black bodies, m K; CODATA's has more places.
 _C2_M_K: Final = 1.4388e-2
-"""Second radiation constant as CIE 15:2018 has it for black bodies, m K; CODATA's has more places."""
 
+# (3, 3) float64, CIE XYZ to linear sRGB (IEC 61966-2-1:1999, equation 7).
 XYZ_TO_SRGB: Final = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
-"""(3, 3) float64, CIE XYZ to linear sRGB (IEC 61966-2-1:1999, equation 7)."""
 
 _Array = npt.NDArray[np.float64]
 

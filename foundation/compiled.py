@@ -35,8 +35,7 @@ _ROOT: Final = Path(__file__).parents[1]
 _IMPORT: Final = re.compile(r"^from ([a-z_][.\w]*) import (\([^)]*\)|.*)", re.MULTILINE)
 _COMPILING: Final = "compiling for this processor, which is done once and takes half a minute at most …"
 _HASH_BYTES: Final = hashlib.sha256().digest_size
-_making: Final = RLock()
-"""Held where compiled forms are made, so that several threads do so once."""
+_making: Final = RLock()  # Held where compiled forms are made, so that several threads do so once
 
 
 class _Later:

@@ -49,8 +49,8 @@ EXIT_CODES = (
     "5 the disk is full or read-only; 130 interrupted."
 )
 
+# Said in place of what it causes: every path of a user depends on that folder.
 _LOST = "the folder in which this was started is gone; change to one that is there (cd), then run it again"
-"""Said in place of what it causes: every path of a user depends on that folder."""
 _WRITING_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
@@ -101,8 +101,8 @@ def _make_printable() -> None:
                 setattr(sys, name, _patient(stream))
 
 
+# What the descriptors are called where they cannot take what is printed.
 _OUTPUTS = {1: "standard output", 2: "standard error"}
-"""What the descriptors are called where they cannot take what is printed."""
 
 
 class _Output(FileIO):
@@ -123,7 +123,6 @@ class _Output(FileIO):
 
 
 def _patient(stream: Any) -> TextIOWrapper:
-    """Return a stream to the same descriptor whose reader may leave."""
     stream.flush()
     output = _Output(stream.fileno(), "w", closefd=False)
     return TextIOWrapper(
@@ -336,8 +335,8 @@ def progress(unit: str) -> Generator[ReportProgress]:
         yield tell
 
 
+# Of a log record on stderr, with the time to the millisecond: answers of devices are matched with what was asked.
 _FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-"""Of a log record on stderr, with the time to the millisecond: answers of devices are matched with what was asked."""
 
 
 def _print_version(asked: bool) -> None:
@@ -399,8 +398,8 @@ _AS_JSON = Annotated[
     ),
 ]
 
+# The options of every command and their defaults, by the names of their parameters. Each acts by its callback.
 COMMON = {"verbose": (_VERBOSE, 0), "quiet": (_QUIET, False), "version": (_VERSION, False)}
-"""The options of every command and their defaults, by the names of their parameters. Each acts by its callback."""
 
 _COMMON_WORD = re.compile(r"-v+|-q|--verbose|--quiet")
 
@@ -410,8 +409,8 @@ def is_common(word: str) -> bool:
     return _COMMON_WORD.fullmatch(word) is not None
 
 
+# What stands for a value of an option, by its type; an option whose value is of a kind of its own says it itself.
 _METAVARS = {"int": "N", "integer": "N", "float": "X", "str": "TEXT", "text": "TEXT", "path": "PATH"}
-"""What stands for a value of an option, by its type; an option whose value is of a kind of its own says it itself."""
 
 
 def _in_one_style(command: Any) -> None:
@@ -486,7 +485,6 @@ class _StyledTyper(typer.Typer):
 
 
 def _with_common(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a command for typer that takes the common options too."""
     hints = get_type_hints(function, include_extras=True)
     own = [
         parameter.replace(annotation=hints[name]) for name, parameter in inspect.signature(function).parameters.items()
@@ -660,7 +658,6 @@ def grouped(function: Callable[..., None]) -> Callable[..., None]:
 def _declared(
     command: Callable[..., None], function: Callable[..., None], parameters: Sequence[inspect.Parameter]
 ) -> Callable[..., None]:
-    """Return a command that typer takes for a function with other parameters."""
     functools.update_wrapper(command, function)
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {"return": None}

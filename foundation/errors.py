@@ -33,15 +33,14 @@ from typing import Final
 
 from foundation.secret_texts import masked
 
-EXIT_INTERRUPTED = 130
-"""Exit code of a command that Ctrl-C ended; 128 + SIGINT, as shells have it."""
+EXIT_INTERRUPTED = 130  # Exit code of a command that Ctrl-C ended; 128 + SIGINT, as shells have it
 
 
+# What ends a remedy that a command did not wait for; one that waits goes on by itself (`CropError.while_waiting`).
 RUN_AGAIN: Final = "then run the same command again"
-"""What ends a remedy that a command did not wait for; one that waits goes on by itself (`CropError.while_waiting`)."""
 
+# Longest sentence of an error: names and values that stand in it may be a stranger's, and as long as he likes.
 _LONGEST = 8000
-"""Longest sentence of an error: names and values that stand in it may be a stranger's, and as long as he likes."""
 
 
 class CropError(Exception):

@@ -47,6 +47,7 @@ _REMEDIES = {
 }
 _GONE = f"the disk is gone: connect and mount it, {RUN_AGAIN}"
 _SERVER = f"the server of that folder does not answer: see to the network and to the server, {RUN_AGAIN}"
+# What helps against each fault of a disk, by the names of errno(3); not every system knows all of them.
 _DISK_REMEDIES = {
     "ENOSPC": f"free space or choose another disk, {RUN_AGAIN}",
     "EDQUOT": f"what this user may use of the disk is used up: remove files there, or ask for more, {RUN_AGAIN}",
@@ -68,15 +69,14 @@ _DISK_REMEDIES = {
     "EMFILE": f"close other programs, or allow more open files (ulimit -n), {RUN_AGAIN}",
     "ENFILE": f"close other programs, {RUN_AGAIN}",
 }
-"""What helps against each fault of a disk, by the names of errno(3); not every system knows all of them."""
 _DISK_FAULTS = {getattr(errno, name): remedy for name, remedy in _DISK_REMEDIES.items() if hasattr(errno, name)}
+# Faults of a write to an open file, of which the system does not say which one: these cannot be a socket's, nor a
+# file's that somebody reads meanwhile.
 _NAMELESS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT, errno.ENOTCONN}
-"""Faults of a write to an open file, of which the system does not say which one: these cannot be a socket's, nor a
-file's that somebody reads meanwhile."""
 
+# How often a folder is made anew that another program takes away meanwhile: programs do so once or twice, special
+# file systems (/proc) for ever.
 FOLDER_ATTEMPTS = 1000
-"""How often a folder is made anew that another program takes away meanwhile: programs do so once or twice, special file
-systems (/proc) for ever."""
 
 
 def partial_path(path: Path) -> Path:
@@ -264,8 +264,7 @@ def write_whole(path: Path, data: bytes | str) -> None:
         stream.write(data.encode() if isinstance(data, str) else data)
 
 
-_BLOCK: Final = 1 << 20
-"""Bytes read at a time: a block stays in the processor's second cache."""
+_BLOCK: Final = 1 << 20  # Bytes read at a time: a block stays in the processor's second cache
 
 
 def sha256_of(data: Any) -> str:
@@ -320,19 +319,17 @@ class HashingWriter(io.RawIOBase):
         return self._digest.hexdigest()
 
 
+# JSON is read as far as this: the description of a data set of a million pictures, all skipped, is a third of it.
 MOST_JSON_BYTES: Final = 256 << 20
-"""JSON is read as far as this: the description of a data set of a million pictures, all skipped, is a third of it."""
 
+# Longest line of a file that is read by lines: the longest of ours are some hundred bytes, names of files 4096.
 MOST_LINE_BYTES: Final = 1 << 20
-"""Longest line of a file that is read by lines: the longest of ours are some hundred bytes, names of files 4096."""
 
-_MOST_NAME: Final = 4096
-"""Longest name, as PATH_MAX of Linux has it."""
+_MOST_NAME: Final = 4096  # Longest name, as PATH_MAX of Linux has it
 
+# Bytes of a file that its disk need not hold: black pictures are copied with holes, though smaller ones.
 _MOST_HOLES: Final = 1 << 30
-"""Bytes of a file that its disk need not hold: black pictures are copied with holes, though smaller ones."""
-_LOOKED_AT: Final = 4096
-"""Holes of a file that are counted; whoever makes more of them has filled as many blocks."""
+_LOOKED_AT: Final = 4096  # Holes of a file that are counted; whoever makes more of them has filled as many blocks
 
 _COPY_REMEDY: Final = "ask who made the folder for a copy without it, or copy it with its links resolved (cp -rL)"
 

@@ -117,8 +117,7 @@ def whole_folder(path: Path, what: str) -> Generator[Path]:
 
 
 FSTAB: Final = Path("/etc/fstab")
-MOUNTS: Final = Path("/proc/self/mounts")
-"""Tables of disks, and of mounted ones, of Linux."""
+MOUNTS: Final = Path("/proc/self/mounts")  # Tables of disks, and of mounted ones, of Linux
 
 
 def unmounted_at(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
@@ -154,11 +153,10 @@ def clear_folder(folder: Path) -> None:
             path.unlink()
 
 
-LOCK_FILE: Final = ".lock"
-"""Name of the file that is locked where a folder cannot be."""
+LOCK_FILE: Final = ".lock"  # Name of the file that is locked where a folder cannot be
 
+# What a file system answers that cannot lock what it was asked to (flock(2); NFS, Lustre, FUSE, SMB, macOS).
 _NO_LOCKS: Final = {errno.ENOLCK, errno.EBADF, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL}
-"""What a file system answers that cannot lock what it was asked to (flock(2); NFS, Lustre, FUSE, SMB, macOS)."""
 
 _log = logging.getLogger(__name__)
 

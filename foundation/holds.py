@@ -17,8 +17,7 @@ from contextlib import contextmanager, suppress
 
 from foundation.errors import DeviceRefused
 
-_WAITING = 128
-"""Programs that may ask for the holder at a time; one more is not told the process."""
+_WAITING = 128  # Programs that may ask for the holder at a time; one more is not told the process
 
 
 @contextmanager

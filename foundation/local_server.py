@@ -32,36 +32,31 @@ from urllib.parse import parse_qs
 
 from foundation.errors import InputError
 
+# Random bytes of a token: 128 bits cannot be guessed, and still make a QR code that a terminal has room for.
 TOKEN_BYTES = 16
-"""Random bytes of a token: 128 bits cannot be guessed, and still make a QR code that a terminal has room for."""
 
 
-QUIET_MODULES = 4
-"""Light modules around a code, as ISO/IEC 18004 asks for."""
+QUIET_MODULES = 4  # Light modules around a code, as ISO/IEC 18004 asks for
 
 
-MOST_CONNECTIONS = 64
-"""Connections at once; a page holds one or two."""
+MOST_CONNECTIONS = 64  # Connections at once; a page holds one or two
 
+# A request whose head is not whole so long after its first byte, or after the connection was made, is none.
 HEAD_S = 5.0
-"""A request whose head is not whole so long after its first byte, or after the connection was made, is none."""
 
-BODY_S = 30.0
-"""What is sent along must be there in this time behind the head."""
+BODY_S = 30.0  # What is sent along must be there in this time behind the head
 
-ANSWER_S = 2.0
-"""A viewer who has not taken an answer in this time may lose the place to another, in seconds."""
+ANSWER_S = 2.0  # A viewer who has not taken an answer in this time may lose the place to another, in seconds
 
+# A connection on which nothing is asked for so long is closed; a page that is hidden asks every ten seconds.
 IDLE_S = 30.0
-"""A connection on which nothing is asked for so long is closed; a page that is hidden asks every ten seconds."""
 
-GZIP_FROM_BYTES = 2048
-"""A smaller answer is one packet or two either way."""
+GZIP_FROM_BYTES = 2048  # A smaller answer is one packet or two either way
 
 _TEXT = "text/plain; charset=utf-8"
 
+# Kinds of answers that gzip does not make smaller: pictures, and numbers with noise.
 _PICTURES = frozenset({"image/jpeg", "image/png", "application/octet-stream"})
-"""Kinds of answers that gzip does not make smaller: pictures, and numbers with noise."""
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,11 @@ from typing import Any, Final, Literal
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-_LEAST_SVG: Final = "36rem"
-"""Width below which a drawing scrolls in its place, since its letters would be too small."""
+_LEAST_SVG: Final = "36rem"  # Width below which a drawing scrolls in its place, since its letters would be too small
 
+# An option of a command and an interval, in escaped text: browsers break lines behind each hyphen and dash, whatever
+# space follows.
 _UNBROKEN = re.compile(r"(?<![\w-])--[a-z][\w-]*|[-−]?\d[\d.]* – [-−]?\d[\d.]*")
-"""An option of a command and an interval, in escaped text: browsers break lines behind each hyphen and dash, whatever
-space follows."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,6 @@ def fold(summary: str, parts: Sequence[Markup], open_at_first: bool = False) -> 
 
 @cache
 def _environment(package: str) -> Environment:
-    """Return the templates of a package, and those here."""
     packages = dict.fromkeys((package, "foundation"))
     made = Environment(
         loader=ChoiceLoader([PackageLoader(name) for name in packages]),

@@ -18,32 +18,30 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+# Colours of text, of axes and notes, of rules, and of the page itself; an SVG's are exchanged on a dark screen.
 INK, FAINT, GRID, PAPER = "#22262b", "#5b636d", "#e3e6ea", "#fdfdfe"
-"""Colours of text, of axes and notes, of rules, and of the page itself; an SVG's are exchanged on a dark screen."""
 
+# Colour of what is marked in a picture.
 MARK = "#e8502a"
-"""Colour of what is marked in a picture."""
 
+# Colours of lines of R, G and B.
 CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
-"""Colours of lines of R, G and B."""
 
+# Colours of series, in the order of their use.
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f8790")
-"""Colours of series, in the order of their use."""
 
-DASHES = ("-", "--", ":", "-.")
-"""Line styles: the first for the first round of colours, and so on."""
+DASHES = ("-", "--", ":", "-.")  # Line styles: the first for the first round of colours, and so on
 
+# Variables of `templates/colours.css` that the colours of an SVG become.
 _NAMES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
-"""Variables of `templates/colours.css` that the colours of an SVG become."""
 
-_PNG_DPI = 110
-"""Pictures 10 inches wide fill a page's 1100 pixels."""
+_PNG_DPI = 110  # Pictures 10 inches wide fill a page's 1100 pixels
 
+# Photographs are as large as at Matplotlib's own 6, and written in a third of the time.
 _PNG_SETTINGS: Final = (cv2.IMWRITE_PNG_COMPRESSION, 4)
-"""Photographs are as large as at Matplotlib's own 6, and written in a third of the time."""
 
+# Resolution of what is drawn as a picture within an SVG, pixels an inch: sharp on a screen of twice the usual.
 _RASTER_DPI = 180
-"""Resolution of what is drawn as a picture within an SVG, pixels an inch: sharp on a screen of twice the usual."""
 
 _STYLE = {
     "font.size": 9,

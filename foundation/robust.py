@@ -10,14 +10,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+# Standard deviation of a normal distribution over its median absolute deviation: 1 / Φ⁻¹(3/4).
 MAD_TO_SIGMA: Final = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation: 1 / Φ⁻¹(3/4)."""
 
-MEDIAN_ERROR: Final = 1.2533
-"""Standard error of the median of many normal values over that of their mean: √(π/2)."""
+MEDIAN_ERROR: Final = 1.2533  # Standard error of the median of many normal values over that of their mean: √(π/2)
 
-_HUBER_SIGMAS: Final = 2.0
-"""Residuals up to twice their usual size keep full weight; 95 % of normal ones do."""
+_HUBER_SIGMAS: Final = 2.0  # Residuals up to twice their usual size keep full weight; 95 % of normal ones do
 
 
 def sigma_of(residual: npt.NDArray[np.floating]) -> float:

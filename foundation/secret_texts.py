@@ -12,26 +12,25 @@ import shlex
 from typing import Any, Final, cast
 from urllib.parse import urlsplit
 
-MASK: Final = "…"
-"""What stands for a secret."""
+MASK: Final = "…"  # What stands for a secret
 
+# User name and password of a URL (RFC 3986, 3.2.1), the last @ before the path: passwords may hold one.
 _USER = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*://)[^\s/?#'\"<>]+@")
-"""User name and password of a URL (RFC 3986, 3.2.1), the last @ before the path: passwords may hold one."""
 
+# Parameters of a URL that prove who asks: those of signed addresses of object stores (``X-Amz-Signature``, ``sig``,
+# ``X-Goog-Credential``), and what services call their tokens.
 _PARAMETER = re.compile(
     r"(?P<name>[?&;](?:[^=&;\s'\"]*(?:auth|credential|key|passw|secret|sig|token)[^=&;\s'\"]*)=)[^&;\s'\"<>]+",
     re.IGNORECASE,
 )
-"""Parameters of a URL that prove who asks: those of signed addresses of object stores (``X-Amz-Signature``, ``sig``,
-``X-Goog-Credential``), and what services call their tokens."""
 
+# Control characters (Unicode category Cc), separators and marks that reorder a line, and halves of surrogates, as
+# names have them whose bytes are no UTF-8.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
-"""Control characters (Unicode category Cc), separators and marks that reorder a line, and halves of surrogates, as
-names have them whose bytes are no UTF-8."""
 
 
+# A host with a dot and a path or a port: no command has such a name.
 _ADDRESS = re.compile(r"[A-Za-z0-9-]+(?:\.[A-Za-z0-9-]+)+(?::\d+)?/\S*|[A-Za-z0-9.-]+\.[a-z]{2,}:\d+")
-"""A host with a dot and a path or a port: no command has such a name."""
 
 
 def masked(text: str) -> str:

@@ -14,8 +14,7 @@ from typing import Final
 
 from foundation.errors import InputError
 
-DISTRIBUTION = "croplab"
-"""Name of the installed distribution."""
+DISTRIBUTION = "croplab"  # Name of the installed distribution
 
 
 @lru_cache
@@ -24,6 +23,7 @@ def software() -> str:
     return f"{DISTRIBUTION} {version(DISTRIBUTION)}"
 
 
+# From the lowest to the highest.
 PACKAGES: Final = (
     "foundation",
     "drivers",
@@ -35,7 +35,6 @@ PACKAGES: Final = (
     "generator",
     "evaluation",
 )
-"""From the lowest to the highest."""
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 

@@ -50,8 +50,8 @@ if TYPE_CHECKING:
 app = new_app()
 _explore_app = new_app()
 
+# Threads that read the files of an object store: a reader waits for the store most of the time.
 _STORE_READERS: Final = 16
-"""Threads that read the files of an object store: a reader waits for the store most of the time."""
 
 _HELP = f"""Make a dataset of raw linear images with exact ground truth.
 

@@ -32,23 +32,18 @@ from numpy import uint8, uint16, uint32, uint64
 
 from foundation.compiled import compiled
 
-LITERALS: Final = 286
-"""Symbols for literals, the end of a block and lengths (RFC 1951, 3.2.5)."""
-DISTANCES: Final = 30
-"""Symbols for distances (RFC 1951, 3.2.5)."""
-END: Final = 256
-"""The symbol that ends a block (RFC 1951, 3.2.5)."""
+LITERALS: Final = 286  # Symbols for literals, the end of a block and lengths (RFC 1951, 3.2.5)
+DISTANCES: Final = 30  # Symbols for distances (RFC 1951, 3.2.5)
+END: Final = 256  # The symbol that ends a block (RFC 1951, 3.2.5)
+# Bits of the longest code for literals and distances: three codes beside up to seven waiting bits fit into 64.
 LONGEST: Final = 12
-"""Bits of the longest code for literals and distances: three codes beside up to seven waiting bits fit into 64."""
 
+# Bits of the longest code for code lengths: its length is written in three bits (RFC 1951, 3.2.7).
 _LONGEST_OF_LENGTHS: Final = 7
-"""Bits of the longest code for code lengths: its length is written in three bits (RFC 1951, 3.2.7)."""
-_LENGTHS: Final = 19
-"""Symbols of the code for code lengths (RFC 1951, 3.2.7)."""
-_SYMBOL_BITS: Final = 9
-"""Bits of a symbol, below 512: frequency and symbol are sorted as one number."""
+_LENGTHS: Final = 19  # Symbols of the code for code lengths (RFC 1951, 3.2.7)
+_SYMBOL_BITS: Final = 9  # Bits of a symbol, below 512: frequency and symbol are sorted as one number
+# The order in which the lengths of the code for code lengths are written (RFC 1951, 3.2.7).
 _ORDER: Final = np.array([16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15])
-"""The order in which the lengths of the code for code lengths are written (RFC 1951, 3.2.7)."""
 
 
 @compiled
@@ -249,31 +244,24 @@ def put_head(out: Any, writer: Any, literals: Any, distances: Any, last: int) ->
         put(out, writer, tokens[i, 1], tokens[i, 2])
 
 
+# Most pixels of a row: positions of its bytes fit into 31 bits, above the 33 that the hash leaves of a pixel.
 WIDEST: Final = 1 << 28
-"""Most pixels of a row: positions of its bytes fit into 31 bits, above the 33 that the hash leaves of a pixel."""
 
-_WINDOW: Final = 32768
-"""Bytes that deflate looks back at most (RFC 1951, 2)."""
-_WINDOW_PIXELS: Final = _WINDOW // 6
-"""The same in pixels of six bytes."""
-_LONGEST_RUN: Final = 258 // 6
-"""Pixels of the longest match, 258 bytes (RFC 1951, 3.2.5)."""
+_WINDOW: Final = 32768  # Bytes that deflate looks back at most (RFC 1951, 2)
+_WINDOW_PIXELS: Final = _WINDOW // 6  # The same in pixels of six bytes
+_LONGEST_RUN: Final = 258 // 6  # Pixels of the longest match, 258 bytes (RFC 1951, 3.2.5)
+# Entries of the table of pixels, the last one with each hash: 256 KiB, which second-level caches hold.
 _PLACES: Final = 1 << 15
-"""Entries of the table of pixels, the last one with each hash: 256 KiB, which second-level caches hold."""
+# Multiplier of the hash, odd, so that multiplying modulo 2⁴⁸ gives every pixel a number of its own.
 _MIX: Final = 0x9E3779B97F4B
-"""Multiplier of the hash, odd, so that multiplying modulo 2⁴⁸ gives every pixel a number of its own."""
+# Pixels on which both methods are tried: one window that fills the look back, and two that are counted.
 _TRIED: Final = 3 * _WINDOW_PIXELS
-"""Pixels on which both methods are tried: one window that fills the look back, and two that are counted."""
-_STEP: Final = 8
-"""Rows of a large band of which one is counted; the head of this file has the gain and the cost."""
-_FEW_ROWS: Final = 4
-"""Rows that are counted at least, so that no single row decides."""
-_FEW: Final = 1 << 13
-"""Symbols that the counted rows must have to represent all rows; with fewer, all are counted."""
-_ROOMY: Final = 56
-"""Bits that can be added to up to seven waiting ones before a flush, which takes 63 at most."""
+_STEP: Final = 8  # Rows of a large band of which one is counted; the head of this file has the gain and the cost
+_FEW_ROWS: Final = 4  # Rows that are counted at least, so that no single row decides
+_FEW: Final = 1 << 13  # Symbols that the counted rows must have to represent all rows; with fewer, all are counted
+_ROOMY: Final = 56  # Bits that can be added to up to seven waiting ones before a flush, which takes 63 at most
+# Bytes for a block's head and end and what a flush writes beyond it; no byte of a row takes two, see `LONGEST`.
 _ROOM: Final = 1024
-"""Bytes for a block's head and end and what a flush writes beyond it; no byte of a row takes two, see `LONGEST`."""
 
 
 def _distance_symbol(distance: int) -> int:
@@ -290,18 +278,16 @@ def _length_symbol(length: int) -> tuple[int, int, int]:
     return 257 + 4 * bits + ((length - 3) >> bits), bits, (length - 3) & ((1 << bits) - 1)
 
 
+# Symbols of the distances 1 … 256, then of every 128th (RFC 1951, 3.2.5).
 _DISTANCE_SYMBOLS: Final = np.array(
     [_distance_symbol(distance) for distance in (*range(1, 257), *range(1, _WINDOW, 128))], dtype=np.uint8
 )
-"""Symbols of the distances 1 … 256, then of every 128th (RFC 1951, 3.2.5)."""
+# Extra bits of each symbol of a distance (RFC 1951, 3.2.5).
 _DISTANCE_BITS: Final = np.array([max(symbol // 2 - 1, 0) for symbol in range(DISTANCES)], dtype=np.int64)
-"""Extra bits of each symbol of a distance (RFC 1951, 3.2.5)."""
+# Symbol, extra bits and their value of a match of so many pixels.
 _RUNS: Final = np.array([(0, 0, 0), *(_length_symbol(6 * run) for run in range(1, _LONGEST_RUN + 1))], dtype=np.int64)
-"""Symbol, extra bits and their value of a match of so many pixels."""
-_ONE: Final = int(_RUNS[1, 0])
-"""The symbol of a match of one pixel."""
-_LENGTH_BITS: Final = np.zeros(LITERALS, np.int64)
-"""Extra bits of each symbol of a literal or length."""
+_ONE: Final = int(_RUNS[1, 0])  # The symbol of a match of one pixel
+_LENGTH_BITS: Final = np.zeros(LITERALS, np.int64)  # Extra bits of each symbol of a literal or length
 _LENGTH_BITS[_RUNS[:, 0]] = _RUNS[:, 1]
 
 

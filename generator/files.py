@@ -61,8 +61,7 @@ Image = npt.NDArray[np.uint16]
 Format = Literal["png", "tiff", "exr", "jxl", "dng"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
 
-_threads = threading.local()
-"""Each thread's packer of PNG, with its working memory."""
+_threads = threading.local()  # Each thread's packer of PNG, with its working memory
 
 
 @dataclass(frozen=True)
@@ -84,24 +83,19 @@ class ImageMetadata:
         return json.dumps({"format": "crop.image", "values": "linear camera RGB, black 0", **values})
 
 
-FULL: Final = 65535
-"""Largest number of 16 bits, which saturation becomes."""
+FULL: Final = 65535  # Largest number of 16 bits, which saturation becomes
 
 
-SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
-"""The first bytes of every PNG file (clause 5.2)."""
-TALLEST: Final = (1 << 31) - 1
-"""Largest size in the format (clause 11.2.2)."""
+SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"  # The first bytes of every PNG file (clause 5.2)
+TALLEST: Final = (1 << 31) - 1  # Largest size in the format (clause 11.2.2)
+# Most pixels of a band, unless a row has more: 1.5 MiB, so that an image of any size needs little memory.
 BAND: Final = 1 << 18
-"""Most pixels of a band, unless a row has more: 1.5 MiB, so that an image of any size needs little memory."""
-_ZLIB: Final = bytes([0x78, 0x01])
-"""Deflate, a window of 32 KiB, packed fast (RFC 1950, 2.2)."""
+_ZLIB: Final = bytes([0x78, 0x01])  # Deflate, a window of 32 KiB, packed fast (RFC 1950, 2.2)
+# Level of ISA-L's compression, of 0 to 3, for maps and for what OpenEXR's prediction leaves: both are smooth.
 _LEVEL: Final = 1
-"""Level of ISA-L's compression, of 0 to 3, for maps and for what OpenEXR's prediction leaves: both are smooth."""
+# Bytes that are packed before all others; of more than 16 ISA-L would use the loop that is wrong at its start.
 _APART: Final = 8
-"""Bytes that are packed before all others; of more than 16 ISA-L would use the loop that is wrong at its start."""
-_UP: Final = 2
-"""The filter type Up (clause 9.2)."""
+_UP: Final = 2  # The filter type Up (clause 9.2)
 # Colour types (clause 11.2.2).
 _GREY: Final = 0
 _RGB: Final = 2
@@ -128,7 +122,6 @@ def png_pieces(image: Image, metadata: ImageMetadata) -> Iterator[bytes | memory
 
 
 def _packer() -> Packer:
-    """Return the calling thread's own packer."""
     if not hasattr(_threads, "packer"):
         _threads.packer = Packer()
     return _threads.packer
@@ -184,17 +177,14 @@ def decode_png(data: bytes) -> npt.NDArray[np.generic]:
     return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
 
+# Largest number of a signed 32-bit integer, which counts the columns of a window and the bytes of a chunk.
 LARGEST_SIDE: Final = (1 << 31) - 1
-"""Largest number of a signed 32-bit integer, which counts the columns of a window and the bytes of a chunk."""
 
+# First bytes of every OpenEXR file of version 2 with scan lines in one part.
 _MAGIC_AND_VERSION: Final = struct.pack("<ii", 20000630, 2)
-"""First bytes of every OpenEXR file of version 2 with scan lines in one part."""
-_ZIP: Final = 3
-"""Number of the compression ZIP_COMPRESSION."""
-_LINES: Final = 16
-"""Scan lines that ZIP_COMPRESSION packs together."""
-_FLOAT: Final = 2
-"""Number of the pixel type FLOAT."""
+_ZIP: Final = 3  # Number of the compression ZIP_COMPRESSION
+_LINES: Final = 16  # Scan lines that ZIP_COMPRESSION packs together
+_FLOAT: Final = 2  # Number of the pixel type FLOAT
 
 
 def encode_exr(image: Image, metadata: ImageMetadata) -> bytes:
@@ -331,11 +321,10 @@ def decode_tiff(data: bytes) -> npt.NDArray[np.generic]:
         return np.moveaxis(found, 0, -1) if page.axes.startswith("S") and found.ndim == 3 else found
 
 
-SMALLEST_SIDE = 22
-"""Photosites along a side below which LibRaw takes a file for no raw file."""
+SMALLEST_SIDE = 22  # Photosites along a side below which LibRaw takes a file for no raw file
 
+# From XYZ to linear sRGB, IEC 61966-2-1.
 _SRGB: Matrix = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))
-"""From XYZ to linear sRGB, IEC 61966-2-1."""
 
 
 def encode_dng(image: Image, metadata: ImageMetadata) -> bytes:
@@ -413,12 +402,10 @@ def half_size(counts: Image) -> Image:
 
 
 def _whole(encode: Callable[[Image, ImageMetadata], bytes]) -> Callable[[Image, ImageMetadata], tuple[bytes]]:
-    """Return an encoder in pieces, of which there is one."""
     return lambda image, metadata: (encode(image, metadata),)
 
 
 def _neutral(metadata: ImageMetadata) -> tuple[float, float, float]:
-    """Return the light's white over its largest channel, as AsShotNeutral has it."""
     if not 1 <= metadata.white_level <= 65535:
         raise InputError(f"the white level is {metadata.white_level}; DNG expects 1 to 65535")
     largest = max(metadata.white)
@@ -430,15 +417,12 @@ def _neutral(metadata: ImageMetadata) -> tuple[float, float, float]:
     return red, green, blue
 
 
-_JPEG_QUALITY: Final = 92
-"""Of previews, on libjpeg's scale to 100: no blocks are visible."""
+_JPEG_QUALITY: Final = 92  # Of previews, on libjpeg's scale to 100: no blocks are visible
 
 
-_LONGEST_JPEG: Final = 65500
-"""Longest side that libjpeg writes, px (its JPEG_MAX_DIMENSION)."""
+_LONGEST_JPEG: Final = 65500  # Longest side that libjpeg writes, px (its JPEG_MAX_DIMENSION)
 
-_DEFLATE_RATIO: Final = 1032
-"""Bytes that deflate makes of one at most (RFC 1951: 258 of two bits)."""
+_DEFLATE_RATIO: Final = 1032  # Bytes that deflate makes of one at most (RFC 1951: 258 of two bits)
 
 
 @dataclass(frozen=True)
@@ -459,6 +443,7 @@ class FileFormat:
     smallest_side: int = 1
 
 
+# All formats by name.
 FILE_FORMATS: Final[Mapping[Format, FileFormat]] = {
     "png": FileFormat(png_pieces, lambda data, _: decode_png(data)),
     "tiff": FileFormat(_whole(encode_tiff), lambda data, _: decode_tiff(data)),
@@ -475,7 +460,6 @@ FILE_FORMATS: Final[Mapping[Format, FileFormat]] = {
         smallest_side=SMALLEST_SIDE,
     ),
 }
-"""All formats by name."""
 
 
 def suffix_of(form: Format) -> str:
@@ -555,11 +539,10 @@ def require_plausible(data: bytes, what: str) -> None:
         place += size + 12
 
 
+# Replaces brightness 0, which has no logarithm; linear values are 0 … 1, so it is far below any signal.
 DARK: Final = 1e-9
-"""Replaces brightness 0, which has no logarithm; linear values are 0 … 1, so it is far below any signal."""
 
-_BLACK: Final = np.float32(1e-30)
-"""Replaces 0 before a logarithm of float32, and is code 0 afterwards."""
+_BLACK: Final = np.float32(1e-30)  # Replaces 0 before a logarithm of float32, and is code 0 afterwards
 
 
 @dataclass(frozen=True)
@@ -649,14 +632,12 @@ def _brightness(linear: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
     return np.maximum(largest, linear.dtype.type(DARK))
 
 
+# Longest side of a preview, px: enough to judge content and colours by eye, in some tens of kB, and less than that of
+# the images of most datasets, of which a preview of the same size would be a copy.
 PREVIEW_SIDE: Final = 400
-"""Longest side of a preview, px: enough to judge content and colours by eye, in some tens of kB, and less than that of
-the images of most datasets, of which a preview of the same size would be a copy."""
 
-_GAMMA: Final = 2.2
-"""Exponent of a usual display, as in the paper's figure of the generation process."""
-_HALF: Final = np.float32(0.5)
-"""Added before a number is cut to a whole one, which rounds it."""
+_GAMMA: Final = 2.2  # Exponent of a usual display, as in the paper's figure of the generation process
+_HALF: Final = np.float32(0.5)  # Added before a number is cut to a whole one, which rounds it
 
 
 @compiled

@@ -471,7 +471,6 @@ def choose(lut: Lut, pictures: PictureOptions, light: LightOptions, seed: int) -
 
 
 def _same_scenes(lut: Lut, place: str, pictures: PictureOptions, light: LightOptions) -> Chosen:
-    """Return the scenes of another dataset, under its lights."""
     from generator.dataset.reader import open_dataset
     from generator.dataset.same_lights import lights_of, scenes_of
 

@@ -17,40 +17,26 @@ import numpy.typing as npt
 
 from foundation.errors import InputError
 
-MULTIPLIERS: Final = (0xD2511F53, 0xCD9E8D57)
-"""Of a round's two products: table 2 of the source."""
+MULTIPLIERS: Final = (0xD2511F53, 0xCD9E8D57)  # Of a round's two products: table 2 of the source
+# Added to the key words after each round: the golden ratio and √3 − 1 (section 3.3).
 KEY_STEPS: Final = (0x9E3779B9, 0xBB67AE85)
-"""Added to the key words after each round: the golden ratio and √3 − 1 (section 3.3)."""
-ROUNDS: Final = 10
-"""The authors' recommendation: three more than pass every statistical test."""
+ROUNDS: Final = 10  # The authors' recommendation: three more than pass every statistical test
 
+# Purpose of the words that choose which cell of the chart stands for a pixel, and one of the table's samples of it.
 SAMPLES: Final = 0
-"""Purpose of the words that choose which cell of the chart stands for a pixel, and one of the table's samples of it."""
-LIGHTS: Final = 1
-"""Purpose of the words that choose the lights of a source picture."""
-SCENES: Final = 2
-"""Purpose of the words that are the pixels of a random scene."""
-MIXTURES: Final = 3
-"""Purpose of the words that shuffle the samples of mixed lights."""
-CHROMATICITIES: Final = 4
-"""Purpose of the words that draw the chromaticities of lights from a distribution."""
-MASKS: Final = 5
-"""Purpose of the words that shape where each of a picture's lights falls."""
-CROPS: Final = 6
-"""Purpose of the words that choose where pictures are cut."""
-ITEMS: Final = 7
-"""Purpose of the words that choose what a training item shows."""
-VEILS: Final = 9
-"""Purpose of the words that choose which share of the print's veil is taken out of an image."""
-EXPOSURES: Final = 12
-"""Purpose of the words that draw how much light an image is exposed to."""
-GRADIENTS: Final = 13
-"""Purpose of the words that shape how the light of an image falls off."""
-NOISE: Final = 14
-"""Purpose of the words that are the keys of the noise that is added to an image's rows."""
+LIGHTS: Final = 1  # Purpose of the words that choose the lights of a source picture
+SCENES: Final = 2  # Purpose of the words that are the pixels of a random scene
+MIXTURES: Final = 3  # Purpose of the words that shuffle the samples of mixed lights
+CHROMATICITIES: Final = 4  # Purpose of the words that draw the chromaticities of lights from a distribution
+MASKS: Final = 5  # Purpose of the words that shape where each of a picture's lights falls
+CROPS: Final = 6  # Purpose of the words that choose where pictures are cut
+ITEMS: Final = 7  # Purpose of the words that choose what a training item shows
+VEILS: Final = 9  # Purpose of the words that choose which share of the print's veil is taken out of an image
+EXPOSURES: Final = 12  # Purpose of the words that draw how much light an image is exposed to
+GRADIENTS: Final = 13  # Purpose of the words that shape how the light of an image falls off
+NOISE: Final = 14  # Purpose of the words that are the keys of the noise that is added to an image's rows
 
-_WORD: Final = 0xFFFFFFFF
-"""Mask of the lower 32 bits, a word."""
+_WORD: Final = 0xFFFFFFFF  # Mask of the lower 32 bits, a word
 
 Words = npt.NDArray[np.uint32]
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from generator.dataset.shards import Callbacks
 
 
+# Work that is done within so many seconds gets no bar but its last line: what draws bars takes a tenth to load.
 SOON_S: Final = 0.5
-"""Work that is done within so many seconds gets no bar but its last line: what draws bars takes a tenth to load."""
 
 
 @contextmanager

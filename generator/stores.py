@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
 
 
-DESCRIPTION: Final = "dataset.json"
-"""Name of the file that marks a place as a complete dataset; it is written last."""
+DESCRIPTION: Final = "dataset.json"  # Name of the file that marks a place as a complete dataset; it is written last
 
 
 def is_remote(place: str) -> bool:
@@ -79,20 +78,19 @@ def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
         ) from error
 
 
-Pieces = Iterable[bytes | memoryview]
-"""A file's bytes in order; a piece is valid until the next is asked for."""
+Pieces = Iterable[bytes | memoryview]  # A file's bytes in order; a piece is valid until the next is asked for
 
+# Files synchronised at a time: a file system commits its journal once for all that wait, so that sixteen waits cost
+# little more than one.
 _SYNC_THREADS: Final = 16
-"""Files synchronised at a time: a file system commits its journal once for all that wait, so that sixteen waits cost
-little more than one."""
 
+# Bytes that are gathered before they are written; larger pieces are written as they are. Python asks the system twice
+# for a size where none is given, and each question hands the interpreter's lock to another thread.
 _BUFFER: Final = 1 << 16
-"""Bytes that are gathered before they are written; larger pieces are written as they are. Python asks the system twice
-for a size where none is given, and each question hands the interpreter's lock to another thread."""
 
+# Stores by fsspec's names in which a file lies in a folder that has to be there; an object store might make a bucket
+# of it.
 _WITH_FOLDERS: Final = frozenset({"ftp", "sftp", "ssh", "smb", "webdav", "webdavs", "hdfs", "arrow_hdfs"})
-"""Stores by fsspec's names in which a file lies in a folder that has to be there; an object store might make a bucket
-of it."""
 
 
 @dataclass(frozen=True)
@@ -335,8 +333,7 @@ def _require_inside(place: str, name: str) -> None:
         )
 
 
-Store = LocalStore | RemoteStore
-"""Files below one place."""
+Store = LocalStore | RemoteStore  # Files below one place
 
 
 def read_bounded(store: Store, name: str, most_bytes: int) -> bytes:

@@ -58,24 +58,21 @@ def projector_falloff(
     return np.column_stack([spots, shares / (1 - shares) / half_diagonal**2, np.ones(3)])
 
 
+# Settings of a simulated room, chosen so that on an EOS 550D, of 4.29 µm a photosite, the MTF with the photosite's
+# aperture is 0.96 at 10 and 0.73 at 30 lp/mm.
 MILD_SHOULDERS: Final = {"blur_px": 0.46, "shoulder_share": 0.0116, "shoulder_px": 3.0}
-"""Settings of a simulated room, chosen so that on an EOS 550D, of 4.29 µm a photosite, the MTF with the photosite's
-aperture is 0.96 at 10 and 0.73 at 30 lp/mm."""
 
-STRONG_SHOULDERS: Final = {"blur_px": 0.535, "shoulder_share": 0.0452, "shoulder_px": 3.0}
-"""The same for 0.93 and 0.64."""
+STRONG_SHOULDERS: Final = {"blur_px": 0.535, "shoulder_share": 0.0452, "shoulder_px": 3.0}  # The same for 0.93 and 0.64
 
+# Of the shoulder's kernel, in lengths a: 0.12 % of its light lies beyond, and is put back by its normalisation.
 _REACH: Final = 9.0
-"""Of the shoulder's kernel, in lengths a: 0.12 % of its light lies beyond, and is put back by its normalisation."""
 
-_FINER: Final = 7
-"""Points across a pixel at which the kernel is averaged: its cusp is sharper than a pixel."""
+_FINER: Final = 7  # Points across a pixel at which the kernel is averaged: its cusp is sharper than a pixel
 
+# Of the inversion of a shift; each reduces the error by the shift's slope, below 10⁻² for shifts of some pixels.
 _STEPS: Final = 6
-"""Of the inversion of a shift; each reduces the error by the shift's slope, below 10⁻² for shifts of some pixels."""
 
-APERTURE_VARIANCE: Final = 1 / 12
-"""Of a photosite's aperture, uniform over the photosite; photosites²."""
+APERTURE_VARIANCE: Final = 1 / 12  # Of a photosite's aperture, uniform over the photosite; photosites²
 
 
 @dataclass(frozen=True)

@@ -77,12 +77,12 @@ from foundation.errors import FormatError, InputError, nearest_names
 from foundation.files import sha256_of
 from foundation.records import Record
 
+# Wavelengths that must be covered: beyond them a camera with its infrared filter sees under 2 % of its light.
 NEEDED_NM: Final = (400.0, 700.0)
-"""Wavelengths that must be covered: beyond them a camera with its infrared filter sees under 2 % of its light."""
 
+# Distance of two wavelengths that may be bridged by a straight line: filters' edges rise over some 40 nm, and bench
+# measurements are taken every 5 or 10 nm.
 WIDEST_STEP_NM: Final = 20.0
-"""Distance of two wavelengths that may be bridged by a straight line: filters' edges rise over some 40 nm, and bench
-measurements are taken every 5 or 10 nm."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -207,12 +207,12 @@ def _read(name: str) -> dict[str, PublishedSpectrum]:
     return found
 
 
+# What the names of the files in `sim.data` end in: first and last wavelength, and the step (as rawtoaces-data).
 SUFFIX: Final = "_380_780_5.json"
-"""What the names of the files in `sim.data` end in: first and last wavelength, and the step (as rawtoaces-data)."""
 
+# Share of a channel's peak that may be left at the first and the last wavelength of a file, beyond which the channel
+# is taken to be blind (judgement): what is cut off there is below a hundredth of its light.
 EDGE_SHARE: Final = 0.05
-"""Share of a channel's peak that may be left at the first and the last wavelength of a file, beyond which the channel
-is taken to be blind (judgement): what is cut off there is below a hundredth of its light."""
 
 _CHANNELS: Final = ("R", "G", "B")
 
@@ -384,42 +384,36 @@ def describe_sensitivities(found: Sensitivities) -> dict[str, Any]:
     return {"name": found.name, "camera": found.camera, "sha256": found.sha256}
 
 
+# (81,) float64, the wavelengths of every spectrum here.
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 5.0)
-"""(81,) float64, the wavelengths of every spectrum here."""
 
 LampSpectrum = Literal["uhp", "led"]
 
-PaperName = Literal["poster", "matt", "glossy"]
-"""Papers of the simulated print."""
+PaperName = Literal["poster", "matt", "glossy"]  # Papers of the simulated print
 
-SURFACE_REFLECTANCE = 0.03
-"""Light that plain matte paper returns before it meets ink (share of the incident)."""
+SURFACE_REFLECTANCE = 0.03  # Light that plain matte paper returns before it meets ink (share of the incident)
 
+# The same of coated matt photo paper: the measured matt black is 0.016 to 0.026 from 400 to 660 nm.
 MATT_SURFACE = 0.0165
-"""The same of coated matt photo paper: the measured matt black is 0.016 to 0.026 from 400 to 660 nm."""
 
+# The same of glossy paper, lit off the mirror's angle: the measured glossy black falls to 0.0038.
 GLOSSY_SURFACE = 0.0035
-"""The same of glossy paper, lit off the mirror's angle: the measured glossy black falls to 0.0038."""
 
+# Density of solid matt black below the surface, so that the density of black is that of the measured paper.
 MATT_BLACK = 1.8
-"""Density of solid matt black below the surface, so that the density of black is that of the measured paper."""
 
-GLOSSY_BLACK = 2.0
-"""Density of solid photo black below the surface, for the same reason."""
+GLOSSY_BLACK = 2.0  # Density of solid photo black below the surface, for the same reason
 
-YULE_NIELSEN_N = 2.0
-"""Yule-Nielsen factor; 2 is full optical dot gain."""
+YULE_NIELSEN_N = 2.0  # Yule-Nielsen factor; 2 is full optical dot gain
 
-DOT_GAIN = 0.14
-"""Mechanical dot gain: how much a coverage of one half grows."""
+DOT_GAIN = 0.14  # Mechanical dot gain: how much a coverage of one half grows
 
+# Coverage of black on poster paper where all three inks are full; below 1, so that black never hides them wholly
+# (chosen, not measured).
 _BLACK_GENERATION = 0.9
-"""Coverage of black on poster paper where all three inks are full; below 1, so that black never hides them wholly
-(chosen, not measured)."""
 
+# Share of the black by which each of the three inks is reduced; partial, so that dark cells keep their inks (chosen).
 _UNDERCOLOUR_REMOVAL = 0.4
-"""Share of the black by which each of the three inks is reduced; partial, so that dark cells keep their inks
-(chosen)."""
 
 
 def _gauss(centre_nm: float, left_nm: float, right_nm: float | None = None) -> NDArray[np.float64]:
@@ -561,26 +555,22 @@ def sensitivities(name: str) -> NDArray[np.float64]:
     return curves
 
 
-ProfileName = Literal["unmanaged", "managed"]
-"""What is done to codes before they are inks."""
+ProfileName = Literal["unmanaged", "managed"]  # What is done to codes before they are inks
 
-NODES = 33
-"""Nodes a channel of the table, as ICC profiles for output have them."""
+NODES = 33  # Nodes a channel of the table, as ICC profiles for output have them
 
-_HUE_WEIGHT = 2.0
-"""Weight of differences of hue where a colour cannot be printed (chosen)."""
+_HUE_WEIGHT = 2.0  # Weight of differences of hue where a colour cannot be printed (chosen)
 
+# CIELAB units within which a print counts as neutral when its black point is looked for; the eye sees 1. The smaller,
+# the paler the black: all inks together are not neutral, and what makes them so is left out.
 _NEUTRAL = 0.7
-"""CIELAB units within which a print counts as neutral when its black point is looked for; the eye sees 1. The smaller,
-the paler the black: all inks together are not neutral, and what makes them so is left out."""
 
+# Linear sRGB to CIE XYZ under D50, Bradford adapted; its rows' sums are D50.
 _SRGB_TO_D50 = np.array(
     [[0.4360747, 0.3850649, 0.1430804], [0.2225045, 0.7168786, 0.0606169], [0.0139322, 0.0971045, 0.7141733]]
 )
-"""Linear sRGB to CIE XYZ under D50, Bradford adapted; its rows' sums are D50."""
 
-_STEPS = 40
-"""Iterations of the inversion at most; inside the gamut it ends after five to ten."""
+_STEPS = 40  # Iterations of the inversion at most; inside the gamut it ends after five to ten
 
 
 def printed_reflectance(
@@ -710,7 +700,6 @@ class _Inks:
 
 @cache
 def _black(on: PaperName) -> float:
-    """Return the luminance over paper of the darkest neutral that the inks reach."""
     inks = _Inks(on)
     darkest = float(inks.xyz(np.zeros((1, 3)))[0, 1])
     tried = darkest * np.geomspace(1, 2, 41)

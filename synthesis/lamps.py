@@ -50,12 +50,12 @@ from sim.world.rendering import PAPER
 from sim.world.sensors import Body, HotPattern, counts
 from sim.world.world import Room, World
 
-WAVELENGTH: Final = "wavelength"
-"""Head of the column of wavelengths."""
+WAVELENGTH: Final = "wavelength"  # Head of the column of wavelengths
 
+# Correlated colour temperatures between which CIE daylight is defined (CIE 15:2018).
 DAYLIGHT_K: Final = (4000.0, 25_000.0)
-"""Correlated colour temperatures between which CIE daylight is defined (CIE 15:2018)."""
 
+# Sets of published illuminants by the pattern of their names.
 SETS: Final[Mapping[str, str]] = {
     "cie": r"A|B|C|D\d+|E|FL[\d.]+|HP\d|LED-.*|ID\d+",
     "cie-d": r"D\d+|ID\d+",
@@ -64,7 +64,6 @@ SETS: Final[Mapping[str, str]] = {
     "cie-led": r"LED-.*",
     "iso7589": r"ISO 7589 .*",
 }
-"""Sets of published illuminants by the pattern of their names."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -219,7 +218,6 @@ def _named(name: str, known: list[str], given: str) -> list[str]:
 
 
 def _as_light(name: str, spectrum: PublishedSpectrum, cct_k: float | None = None) -> LightSpectrum:
-    """Return a published spectrum as a light."""
     require_grid(spectrum.wavelengths_nm, name)
     if spectrum.power.min() < 0:
         raise FormatError(f"{name!r} as published is no light: it has values below 0; name another")
@@ -234,11 +232,11 @@ def _linear_srgb(power: _Array) -> _Array:
 
 _CHANNELS: Final = "RGB"
 
+# Purposes of the random streams, so that none is drawn from twice; those of `sim.world.world` are below 10.
 _RESPONSE, _NOISE, _BLACK, _HOT = 11, 12, 13, 14
-"""Purposes of the random streams, so that none is drawn from twice; those of `sim.world.world` are below 10."""
 
+# Columns of a masked area that its black level is not read from, as `drivers.raw.rawfile` leaves them out.
 _SKIPPED_COLUMNS: Final = 4
-"""Columns of a masked area that its black level is not read from, as `drivers.raw.rawfile` leaves them out."""
 _Float = npt.NDArray[np.float32]
 
 
@@ -413,5 +411,4 @@ class SpectralLamp:
         return None
 
 
-ChartLamp = ProjectorLamp | SpectralLamp
-"""What lights the chart."""
+ChartLamp = ProjectorLamp | SpectralLamp  # What lights the chart

@@ -26,10 +26,10 @@ from sim.world.world import Room
 from synthesis.lamps import LightSpectra, illuminations_of
 from synthesis.table import TableTask
 
+# What a photographed room may have and a computed table has not: its frames know neither neighbours nor time.
 NOT_COMPUTED: Final = (
     "blur_px", "fold_mm", "lamp_drift_per_hour", "shutter_jitter_s", "stain_depth", "stain_mm", "wheel_hz",
 )  # fmt: skip
-"""What a photographed room may have and a computed table has not: its frames know neither neighbours nor time."""
 
 
 class ComputedExposure(CameraSettings):

@@ -144,11 +144,10 @@ def _require_unclipped(whites: _Array, what: str) -> None:
         )
 
 
-ReportLights = Callable[[int, int], None]
-"""Called with the number of lights computed, and the number of all."""
+ReportLights = Callable[[int, int], None]  # Called with the number of lights computed, and the number of all
 
+# Room for a table's text files: `lut.json` holds 2.2 kB a light (707 lights take 1.6 MB), `references.csv` a third.
 SPARE_BYTES: Final = 16 << 20
-"""Room for a table's text files: `lut.json` holds 2.2 kB a light (707 lights take 1.6 MB), `references.csv` a third."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +251,6 @@ def _measurement(task: TableTask) -> PatchMeasurement:
 
 
 def _clipped_cells(kept: Sequence[ComputedFrame], saturation: int) -> list[Unfit]:
-    """Return the cells of which a photosite came near saturation under a light."""
     allowed = CLIPPING_SHARE * saturation
     highest = np.array([one.highest for one in kept])
     found: list[Unfit] = []

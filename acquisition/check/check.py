@@ -63,8 +63,8 @@ from experiment.session.folder import Session
 from foundation.errors import DeviceError, RegistrationError, counted
 from foundation.files import write_whole
 
+# White at the settings' shutter time, of saturation, at which trial frames are taken so; else with a better time.
 USABLE = (0.3, 0.9)
-"""White at the settings' shutter time, of saturation, at which trial frames are taken so; else with a better time."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -210,7 +210,6 @@ def _exposure_findings(found: FoundExposure, settings: LabSettings, recorded: bo
 
 
 def _figure_findings(verdict: Verdict, trial: Trial, settings: LabSettings) -> list[Finding]:
-    """Return a finding on each figure that trial frames show."""
     if trial.table is None:
         return [Finding("chart", "fault", trial.trouble), not_checked("figures", "the chart cannot be measured")]
     table = trial.table
@@ -309,7 +308,6 @@ def _require_sound(projector: Projector) -> None:
 
 
 def _state(projector: Projector) -> str:
-    """Return in which state the projector was found, and in which it is left."""
     try:
         if projector.power() is not Power.ON:
             return "its lamp was off; it is switched on, and stays on when the check is over"

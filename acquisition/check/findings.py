@@ -13,8 +13,7 @@ from typing import Any, Literal
 from calibration.figures.figure import Limit, Outcome, Range
 
 Grade = Literal["fault", "remark", "not checked", "good"]
-GRADES: tuple[Grade, ...] = ("fault", "remark", "not checked", "good")
-"""In the order in which findings are reported."""
+GRADES: tuple[Grade, ...] = ("fault", "remark", "not checked", "good")  # In the order in which findings are reported
 
 _GRADES: Mapping[Outcome, Grade] = {"accept": "good", "accept with remarks": "remark", "refuse": "fault"}
 

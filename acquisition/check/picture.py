@@ -20,11 +20,10 @@ from experiment.framing.finding import annotated_png
 from experiment.framing.homography import project
 from experiment.framing.sharpness import MAX_BLUR_PX, edge_blurs
 
+# Of the grades: dark enough to be read on white.
 COLOURS = {"fault": "#b42318", "remark": "#b54708", "not checked": "#667085", "good": "#027a48"}
-"""Of the grades: dark enough to be read on white."""
 
-_LINE = 150
-"""Letters to a line of verdicts."""
+_LINE = 150  # Letters to a line of verdicts
 
 
 def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:

@@ -13,8 +13,7 @@ from calibration.figures.single_frames import BATTERY, CARD, DISK, NOISE_REDUCTI
 from drivers.camera import Camera, ReportsSupplies, Supplies
 from foundation.errors import DeviceError, StorageError
 
-CHARGE = 440
-"""Frames to a charge; see the source of `BATTERY`."""
+CHARGE = 440  # Frames to a charge; see the source of `BATTERY`
 
 
 def judge_disk(folder: Path, frames: int, frame_bytes: int) -> Finding:

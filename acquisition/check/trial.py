@@ -27,12 +27,11 @@ from experiment.session.records import MIDDLE, FrameKind, Judgement, SessionStep
 from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError, QualityError, RegistrationError
 
-WHITES = 3
-"""White frames before the lights, and as many after them: their spread is the flicker of the light."""
+WHITES = 3  # White frames before the lights, and as many after them: their spread is the flicker of the light
 
-SERIES = 8
-"""Shutter times of a series of linearity."""
+SERIES = 8  # Shutter times of a series of linearity
 
+# The lights of a trial by name, besides the plan's darkest.
 _COLOURS = {
     "white": WHITE,
     "red": Colour(255, 0, 0),
@@ -40,7 +39,6 @@ _COLOURS = {
     "blue": Colour(0, 0, 255),
     "grey": Colour(MIDDLE, MIDDLE, MIDDLE),
 }
-"""The lights of a trial by name, besides the plan's darkest."""
 
 
 @dataclass(frozen=True, eq=False)

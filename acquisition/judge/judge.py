@@ -287,7 +287,6 @@ def _judge_basis(state: JudgeState, following: JudgeState) -> Check | None:
 def _judge_origin(
     state: JudgeState, mosaic: Mosaic, measured: Measured, settings: LabSettings
 ) -> tuple[Check, Check, Check]:
-    """Return whether the file is of the session's camera, exposed as asked, and whole."""
     first = state.first
     reason = ""
     if first is not None:
@@ -347,7 +346,6 @@ def _independence(one: Measured, other: Measured) -> float | None:
 def _judge_exposure(
     state: JudgeState, measured: Measured, step: SessionStep, settings: LabSettings
 ) -> tuple[Check, Check]:
-    """Return what is said of a frame's clipped photosites and of its brightest counts."""
     exposure = Exposure(measured.clipped, measured.brightest_dn, measured.range_dn)
     # Where white is known, a dark frame is held against it.
     free = step.kind == "dark" and state.white is not None
@@ -360,8 +358,7 @@ def _judge_exposure(
     )
 
 
-UNKNOWN_PLACE: npt.NDArray[np.float64] = np.full(2, np.nan)
-"""Place of a chart in a frame that is too dark to tell."""
+UNKNOWN_PLACE: npt.NDArray[np.float64] = np.full(2, np.nan)  # Place of a chart in a frame that is too dark to tell
 
 _UNRECOGNISED = (
     "the chart is not recognised where it was: it is covered, out of focus, or has moved by more than its tags show; "
@@ -445,24 +442,21 @@ def _moved(by: tuple[float, float]) -> str:
     )
 
 
-_SIGMAS = 6.0
-"""Standard deviations of a mean's noise that no change is made of."""
+_SIGMAS = 6.0  # Standard deviations of a mean's noise that no change is made of
 
-_TILES = 16
-"""Tiles that are averaged before their change in the dark is looked at: a lamp in a corner lights as many."""
+_TILES = 16  # Tiles that are averaged before their change in the dark is looked at: a lamp in a corner lights as many
 
+# How often first frames are taken again at once because others contradict them: what passes does so within a minute,
+# and what comes back for the third time wants somebody who looks.
 MOST_RESTARTS: Final = 2
-"""How often first frames are taken again at once because others contradict them: what passes does so within a minute,
-and what comes back for the third time wants somebody who looks."""
 
+# Checks that hold a frame against those before it.
 _CONTRADICTIONS: Final = (
     "movement", "blur", "rows", "uniformity",
     OFF_CODES_DEG.name, STRAY_SHARE.name, DARK_DRIFT.name, OFF_BRIGHTNESS.name,
 )  # fmt: skip
-"""Checks that hold a frame against those before it."""
 
-_STALE_LEAST = 0.02
-"""Amount of light in a dark frame, of a primary, from which on the frame before may be what is seen."""
+_STALE_LEAST = 0.02  # Amount of light in a dark frame, of a primary, from which on the frame before may be what is seen
 
 
 def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_percent: float) -> tuple[Check, ...]:
@@ -630,13 +624,14 @@ class _FrameCause:
     in_each_light: bool = False
 
 
+# Light from elsewhere: in a light, and in a dark frame against the first one.
 _ELSEWHERE = frozenset({STRAY_SHARE.name, DARK_DRIFT.name})
-"""Light from elsewhere: in a light, and in a dark frame against the first one."""
 
 _AMBIENT = _FrameCause(frozenset({OFF_CODES_DEG.name, OFF_BRIGHTNESS.name, "uniformity"}), is_hidden=True)
 
 _OF_THE_LIGHT = frozenset({"uniformity", "blur", OFF_CODES_DEG.name, OFF_BRIGHTNESS.name, WHITE_DRIFT.name})
 
+# Checks in the order in which they are named as the cause: what comes first explains what comes after.
 CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
     {
         "file": _FrameCause(),
@@ -662,15 +657,14 @@ CAUSES: Mapping[str, _FrameCause] = MappingProxyType(
         ADDITIVITY.name: _FrameCause(),
     }
 )
-"""Checks in the order in which they are named as the cause: what comes first explains what comes after."""
 
+# Deviation of a tile over its limit from which on light is plainly uneven: what little movement or blur is seen with
+# it comes from it. Of charts out of focus by half a px one tile in 16 frames was off at all (simulated).
 _PLAINLY = 2.0
-"""Deviation of a tile over its limit from which on light is plainly uneven: what little movement or blur is seen with
-it comes from it. Of charts out of focus by half a px one tile in 16 frames was off at all (simulated)."""
 
+# Blur, px, below which rows show what belongs into them (simulated: none deviates at 0.75 px): rows that do not are
+# what made edges look softer, and no blur.
 _ROWS_STAND_PX = 0.7
-"""Blur, px, below which rows show what belongs into them (simulated: none deviates at 0.75 px): rows that do not are
-what made edges look softer, and no blur."""
 
 
 def _named_once(checks: Sequence[Check]) -> tuple[Check, ...]:
@@ -718,22 +712,17 @@ def _is_lasting(state: JudgeState, step: SessionStep, cause: str) -> bool:
     return another or overexposed or CAUSES[cause].lasts or state.refused[1] >= limits.LASTING_FRAMES
 
 
-_SAME_SD = 0.0015
-"""Scatter of amounts between two frames of one light that is reckoned with at least, relative."""
+_SAME_SD = 0.0015  # Scatter of amounts between two frames of one light that is reckoned with at least, relative
 
-_SAME_FLOOR = 4e-4
-"""The same of amounts without light, of a full primary."""
+_SAME_FLOOR = 4e-4  # The same of amounts without light, of a full primary
 
-_NEAREST = 12
-"""Lights of the plan that are compared in full with one that is not the one ordered."""
+_NEAREST = 12  # Lights of the plan that are compared in full with one that is not the one ordered
 
 _PRIMARIES = ("red", "green", "blue")
 
-_ASKED_LEAST = 0.005
-"""Light of a primary, of its full light, from which on it can be missed."""
+_ASKED_LEAST = 0.005  # Light of a primary, of its full light, from which on it can be missed
 
-_GONE = 0.05
-"""Share of the ordered light of a primary below which it is missing: a leak of black is less."""
+_GONE = 0.05  # Share of the ordered light of a primary below which it is missing: a leak of black is less
 
 _Array = npt.NDArray[np.float64]
 
@@ -951,7 +940,6 @@ class _SeenLight:
         )
 
     def _near(self, plan: Sequence[Codes]) -> list[Codes]:
-        """Return the codes whose amounts, by the tone curves alone, are nearest."""
         curves = self.model.curves()
         table = np.array(plan)
         predicted = np.stack([curves[primary, table[:, primary]] for primary in range(3)], axis=-1)
@@ -1037,39 +1025,34 @@ def _named(codes: Codes) -> str:
     return "black" if not any(codes) else "({}, {}, {})".format(*codes)
 
 
+# Median relative deviation below which places that deviate are called covered or dark, and not differently lit.
 _DARKER = -0.1
-"""Median relative deviation below which places that deviate are called covered or dark, and not differently lit."""
 
+# Power of the deviation, relative, that the light of the frame before may leave where it is seen: 6° off.
 _OF_BEFORE = 0.01
-"""Power of the deviation, relative, that the light of the frame before may leave where it is seen: 6° off."""
 
-_BOTH_PARTS = 0.5
-"""Share of the tiles off from which on it is the frame that deviates and not a part of it."""
+_BOTH_PARTS = 0.5  # Share of the tiles off from which on it is the frame that deviates and not a part of it
 
+# Blurs σ, half-size px, that rows are compared with where they are not what they were.
 _BLURS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
-"""Blurs σ, half-size px, that rows are compared with where they are not what they were."""
 
-_EXPLAINED = 0.4
-"""Share of the rows' median deviation that a blur may leave if it is the cause."""
+_EXPLAINED = 0.4  # Share of the rows' median deviation that a blur may leave if it is the cause
 
+# Median deviation of rows from which on it is asked for a blur: else it is some rows that deviate, and not all.
 _BLURRED = 0.02
-"""Median deviation of rows from which on it is asked for a blur: else it is some rows that deviate, and not all."""
 
-_CONTRAST = 2.0
-"""Contrast of the chart at a tile's edges, over the mean of the brighter tile: tags, paper, cells."""
+_CONTRAST = 2.0  # Contrast of the chart at a tile's edges, over the mean of the brighter tile: tags, paper, cells
 
-_BY_TURNS = 0.1
-"""Share of deviating rows that are brighter, or darker, from which on they are rows of another place."""
+_BY_TURNS = 0.1  # Share of deviating rows that are brighter, or darker, from which on they are rows of another place
 
+# Median step from row to row, over the median deviation, from which on rows are those of several places: of shadows,
+# windows and parts of a picture it is 0.03 and less, of scrambled rows 0.2 and more (simulated).
 _RAGGED = 0.1
-"""Median step from row to row, over the median deviation, from which on rows are those of several places: of shadows,
-windows and parts of a picture it is 0.03 and less, of scrambled rows 0.2 and more (simulated)."""
 
+# Movement or blur, px, that rows at the print's edges must stand: those are measured where they can be told.
 _UNSEEN_PX = 1.0
-"""Movement or blur, px, that rows at the print's edges must stand: those are measured where they can be told."""
 
-_EDGE = 0.15
-"""Relative deviation of a row for each px that the chart lies sideways: cells at a strip's ends are others."""
+_EDGE = 0.15  # Relative deviation of a row for each px that the chart lies sideways: cells at a strip's ends are others
 
 
 def _judge_evenness(

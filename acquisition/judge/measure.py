@@ -50,24 +50,21 @@ from foundation.errors import FormatError
 
 _Array = npt.NDArray[np.float64]
 
-_TEXTURE_PX = 32
-"""Side of a textured place that stands for a tag."""
+_TEXTURE_PX = 32  # Side of a textured place that stands for a tag
 
-_TEXTURES = (4, 2)
-"""Textured places along the frame's width and height: as many as gauges are measured."""
+_TEXTURES = (4, 2)  # Textured places along the frame's width and height: as many as gauges are measured
 
+# How far from where a plane print would have it a white reference is looked for: lens and waves move it as far.
 _PAPER_REACH_PX = 4
-"""How far from where a plane print would have it a white reference is looked for: lens and waves move it as far."""
 
+# Share of the brightest references' light that a place must have to be paper: the field falls off to about that.
 _PAPER_LEVEL = 0.7
-"""Share of the brightest references' light that a place must have to be paper: the field falls off to about that."""
 
+# Side of the square that is brightest in the middle of a reference of 10 px. Of the 3×3 pixels that are measured the
+# brightest would be those whose noise was high in this frame, and all later frames would seem darker by 0.2 %.
 _PAPER_PX = 7
-"""Side of the square that is brightest in the middle of a reference of 10 px. Of the 3×3 pixels that are measured the
-brightest would be those whose noise was high in this frame, and all later frames would seem darker by 0.2 %."""
 
-_MOST_PAPER = 300
-"""White references that are looked at: their mean is good to 0.1 % where one is to 2 %."""
+_MOST_PAPER = 300  # White references that are looked at: their mean is good to 0.1 % where one is to 2 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,8 +216,7 @@ def _textures(plane: Plane) -> Framing:
     return Framing(plane, tuple(tags), (), np.eye(3), 0.0, float("nan"), 1.0, True, 0.0)
 
 
-VERSION = 1
-"""Of the format of the bytes."""
+VERSION = 1  # Of the format of the bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,10 +334,10 @@ def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
     return anchor
 
 
+# How far a file's exposure may lie from the one asked for. Nominal values are rounded, and files state either: 0.3 s
+# stands for 0.354 s on a dial of half stops, which is 0.24 stops. A dial turned by one third differs by 0.2 to 0.5
+# stops in what the file states, so that most such turns are seen, and every one of more.
 EXPOSURE_TOLERANCE_STOPS = 0.25
-"""How far a file's exposure may lie from the one asked for. Nominal values are rounded, and files state either: 0.3 s
-stands for 0.354 s on a dial of half stops, which is 0.24 stops. A dial turned by one third differs by 0.2 to 0.5 stops
-in what the file states, so that most such turns are seen, and every one of more."""
 
 
 def disagreement(mosaic: Mosaic, asked: ExposureSettings) -> str | None:

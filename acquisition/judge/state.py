@@ -44,73 +44,63 @@ from experiment.measures.frame import SEGMENTS, Measured, Noise, strip_blocks
 from experiment.session.records import PRIMARIES, REFERENCES, TOP, SessionStep
 from foundation.robust import huber_weights, sigma_of
 
+# Codes at which tone curves are known; between them a curve bends by less than a thousandth.
 _NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 184, 200, 216, 232, 255.0])
-"""Codes at which tone curves are known; between them a curve bends by less than a thousandth."""
 
-_POWER = 2.2
-"""Exponent about which tone curves are described: displays have 1.8 to 2.6."""
+_POWER = 2.2  # Exponent about which tone curves are described: displays have 1.8 to 2.6
 
+# Prior standard deviations of a tone curve's exponent and bends (logarithm), and the bends' length in the logarithm
+# of the code: sRGB, S-shaped curves and any exponent from 1.4 to 3 lie within two.
 _SLOPE, _BEND, _LENGTH = 0.4, 0.12, 0.7
-"""Prior standard deviations of a tone curve's exponent and bends (logarithm), and the bends' length in the logarithm of
-the code: sRGB, S-shaped curves and any exponent from 1.4 to 3 lie within two."""
 
+# How much of that a primary may have for itself: the three curves of a projector are much alike, LCDs least.
 _OWN = 0.15
-"""How much of that a primary may have for itself: the three curves of a projector are much alike, LCDs least."""
 
+# Prior standard deviation of a primary's frame at `TOP` about its true level: a colour wheel's ½ %, and the lamp's.
 _LEVEL = 0.01
-"""Prior standard deviation of a primary's frame at `TOP` about its true level: a colour wheel's ½ %, and the
-lamp's."""
 
-_OVERLAP = 0.25
-"""Prior standard deviation of the light added where primaries overlap: white segments add up to half."""
+_OVERLAP = 0.25  # Prior standard deviation of the light added where primaries overlap: white segments add up to half
 
+# Share of that added light by which it may differ from the form assumed: unlike white it need not follow the least
+# code. It widens the limits of mixed lights by as much where light does not add, and by nothing where it does.
 _OVERLAP_SHAPE = 0.15
-"""Share of that added light by which it may differ from the form assumed: unlike white it need not follow the least
-code. It widens the limits of mixed lights by as much where light does not add, and by nothing where it does."""
 
+# Standard deviation of the lamp's drift from frame to frame (logarithm): 1 % in a thousand frames, with room.
 LAMP_STEP = 3e-4
-"""Standard deviation of the lamp's drift from frame to frame (logarithm): 1 % in a thousand frames, with room."""
 
-RESTED = 0.05
-"""Standard deviation of the lamp's level after a pause of the run: it is cold, older, or another one."""
+RESTED = 0.05  # Standard deviation of the lamp's level after a pause of the run: it is cold, older, or another one
 
-RESTED_COLOUR = 0.01
-"""Standard deviation of each primary's level after such a pause."""
+RESTED_COLOUR = 0.01  # Standard deviation of each primary's level after such a pause
 
+# Standard deviation of an amount without any light, of a full primary: drift of black and of stray light.
 _ABSOLUTE = 3e-4
-"""Standard deviation of an amount without any light, of a full primary: drift of black and of stray light."""
 
+# Scatter of an amount against the others, and of all together, from frame to frame, before it is known: a colour
+# wheel with a shutter's jitter of 0.5 ms gives 0.24 % of R/G at half a second, 0.47 % at a quarter.
 _CHROMA, _BRIGHTNESS = 0.004, 0.002
-"""Scatter of an amount against the others, and of all together, from frame to frame, before it is known: a colour wheel
-with a shutter's jitter of 0.5 ms gives 0.24 % of R/G at half a second, 0.47 % at a quarter."""
 
-_TRUST = 12.0
-"""Amounts that this first guess of the scatter weighs as much as."""
+_TRUST = 12.0  # Amounts that this first guess of the scatter weighs as much as
 
+# Scatter that is reckoned with however steady the lights were: tiles and tone curves are not known better.
 _LEAST_CHROMA, _LEAST_BRIGHTNESS = 0.0006, 0.0006
-"""Scatter that is reckoned with however steady the lights were: tiles and tone curves are not known better."""
 
-_ITERATIONS = 6
-"""Solutions of an update in a row; an overlap of 60 % needs four to 0.1 %."""
+_ITERATIONS = 6  # Solutions of an update in a row; an overlap of 60 % needs four to 0.1 %
 
+# Primaries that overlap: each pair, and all three.
 _SUBSETS: tuple[tuple[int, ...], ...] = ((0, 1), (0, 2), (1, 2), (0, 1, 2))
-"""Primaries that overlap: each pair, and all three."""
 
+# What each overlap adds to each of its primaries.
 _TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if primary in subset]
-"""What each overlap adds to each of its primaries."""
 
+# Nodes of a curve; the state holds three curves, three levels, the overlaps, and the lamp's level, in this order.
 _N = len(_NODES)
-"""Nodes of a curve; the state holds three curves, three levels, the overlaps, and the lamp's level, in this order."""
 
-_CURVES = 3 * _N
-"""Entries of the state that are curves."""
+_CURVES = 3 * _N  # Entries of the state that are curves
 
 _OVERLAPS = slice(_CURVES + 3, _CURVES + 3 + len(_TERMS))
-_LAMP = _CURVES + 3 + len(_TERMS)
-"""Entry of the state that is the lamp's level, the last one."""
+_LAMP = _CURVES + 3 + len(_TERMS)  # Entry of the state that is the lamp's level, the last one
 
-_SIZE = _LAMP + 1
-"""Entries of the state."""
+_SIZE = _LAMP + 1  # Entries of the state
 
 _Array = npt.NDArray[np.float64]
 Codes = tuple[int, int, int]
@@ -340,25 +330,21 @@ class ProjectorModel:
         return base + levels + np.log(total) + self.state[_LAMP], slopes, extra
 
 
-_LIT = 0.01
-"""Share of the median tile's white that a tile must have to be looked at: a black backdrop has 4 %."""
+_LIT = 0.01  # Share of the median tile's white that a tile must have to be looked at: a black backdrop has 4 %
 
-_SYSTEMATIC = 0.003
-"""Relative error of a tile's counts besides noise that the fit reckons with."""
+_SYSTEMATIC = 0.003  # Relative error of a tile's counts besides noise that the fit reckons with
 
+# Standard deviation of a frame's black level, counts, each channel for itself: the mean of a masked border is good to
+# 0.1, and what lies under it differs from the picture by some tenths. It matters where white has some hundred counts.
 BLACK_DN = 0.3
-"""Standard deviation of a frame's black level, counts, each channel for itself: the mean of a masked border is good to
-0.1, and what lies under it differs from the picture by some tenths. It matters where white has some hundred counts."""
 
+# Share of the median tile's signal below which deviations are measured against that share: a glint on a dark backdrop
+# is not a fault of the picture.
 _FAINT = 0.1
-"""Share of the median tile's signal below which deviations are measured against that share: a glint on a dark backdrop
-is not a fault of the picture."""
 
-_AT_REST_PX = 0.02
-"""Movement, half-size px, that no picture is moved for: the error of its measurement on a dark frame."""
+_AT_REST_PX = 0.02  # Movement, half-size px, that no picture is moved for: the error of its measurement on a dark frame
 
-_ROUNDS = 6
-"""Reweighted solutions in a row."""
+_ROUNDS = 6  # Reweighted solutions in a row
 
 
 @dataclass(frozen=True, eq=False)
@@ -519,15 +505,13 @@ def _residuals(
     return Residuals(relative, np.sqrt(variance) / against, signed)
 
 
-RECENT = 6
-"""Frames whose noise is compared with the next one's: a camera's memory card hands out none older."""
+RECENT = 6  # Frames whose noise is compared with the next one's: a camera's memory card hands out none older
 
-LEANING = 3
-"""Frames whose small deviations are taken together; more would take a drift that is followed for a step."""
+LEANING = 3  # Frames whose small deviations are taken together; more would take a drift that is followed for a step
 
+# Frames of mixed light from which on white is predicted without its own: the tone curve's value, slope and bend, and
+# one that tells whether they agree.
 _GREYS = 4
-"""Frames of mixed light from which on white is predicted without its own: the tone curve's value, slope and bend, and
-one that tells whether they agree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -751,7 +735,6 @@ class JudgeState:
         )
 
     def _referenced(self, step: SessionStep, frame: Frame) -> JudgeState:
-        """Return what is known with a frame that later ones are compared with."""
         measured = frame.measured
         state = self
         if step.kind in REFERENCES:
@@ -774,7 +757,6 @@ class JudgeState:
         return state._based(step)  # noqa: SLF001 - its own class
 
     def _based(self, step: SessionStep) -> JudgeState:
-        """Return what is known with the best basis that the frames so far give."""
         red, green, blue = self.primaries
         if self.dark is None:
             return self

@@ -60,27 +60,24 @@ from foundation.colorimetry import decode_srgb
 from foundation.errors import CropError, FormatError, first_of
 from foundation.files import write_whole
 
-RUN_STARTS = "start"
-"""The event with which a run begins to take frames."""
+RUN_STARTS = "start"  # The event with which a run begins to take frames
 
+# Times that frames lately took, after which one is late: a download that is tried again takes twice as long.
 LATE_FRAMES = 3
-"""Times that frames lately took, after which one is late: a download that is tried again takes twice as long."""
 
-AT_WORK = ("running", "waiting", "paused", "late")
-"""States of a run that is at work."""
+AT_WORK = ("running", "waiting", "paused", "late")  # States of a run that is at work
 
+# What a run may hang at, or wait for somebody to mend.
 CAUSES = ("the camera", "the screen", "the projector", "the disk", "the frames")
-"""What a run may hang at, or wait for somebody to mend."""
 
+# A disk with less is full, also before the first frame: a row of the journal with what the judge keeps has 100 kB.
 LEAST_FREE_BYTES = 1 << 20
-"""A disk with less is full, also before the first frame: a row of the journal with what the judge keeps has 100 kB."""
 
-LOOK = "look at the camera, its cable and the machine"
-"""What helps where a run says nothing."""
+LOOK = "look at the camera, its cable and the machine"  # What helps where a run says nothing
 
+# How far the lab's clock may be from that of the wall for the end to be told as a time of day; a simulated lab's time
+# passes otherwise, and an attempt that is older than this says nothing of when the run will end.
 LAB_CLOCK_S = 600.0
-"""How far the lab's clock may be from that of the wall for the end to be told as a time of day; a simulated lab's time
-passes otherwise, and an attempt that is older than this says nothing of when the run will end."""
 
 
 @dataclass(frozen=True)
@@ -371,31 +368,29 @@ def _state_of(
     return heartbeat.state, heartbeat.sentence
 
 
-Json = dict[str, Any]
-"""A JSON object."""
+Json = dict[str, Any]  # A JSON object
 
 
+# A file that changed so short a time before it was looked at may change again within the resolution of its time stamp
+# (10 ms at the slowest tick of Linux, more over a network), and is read once more.
 FRESH_S = 0.25
-"""A file that changed so short a time before it was looked at may change again within the resolution of its time stamp
-(10 ms at the slowest tick of Linux, more over a network), and is read once more."""
 
+# After so long a session is read again though its journal is as before: files of its frames may be gone.
 LOOK_AGAIN_S = 10.0
-"""After so long a session is read again though its journal is as before: files of its frames may be gone."""
 
+# Newest attempts that are told again whenever anything is: a preview is written after its row, and a pipeline has two
+# frames in hand beside the one that it shows.
 _TOLD_AGAIN = 3
-"""Newest attempts that are told again whenever anything is: a preview is written after its row, and a pipeline has two
-frames in hand beside the one that it shows."""
 
 
-MOST_PICTURE_BYTES = 4 << 20
-"""Bytes of a preview that is shown: many times what one of 640 pixels has."""
+MOST_PICTURE_BYTES = 4 << 20  # Bytes of a preview that is shown: many times what one of 640 pixels has
 
 _JPEG = b"\xff\xd8\xff"
 
 _REVISION = re.compile("[0-9]{1,9}")
 
+# Inode, time of change in ns and size of the journal and of what is written beside it; empty without a journal.
 _Signature = tuple[tuple[int, int, int], ...]
-"""Inode, time of change in ns and size of the journal and of what is written beside it; empty without a journal."""
 
 
 @dataclass(frozen=True)
@@ -487,7 +482,6 @@ class SessionWatch:
         return {key: value for key, value in changes.items() if value}
 
     def _refresh(self) -> None:
-        """Read what has changed, and number the changes."""
         signature = _signature(self.folder / JOURNAL_FILE)
         now = self._clock()
         if signature == self._signature and not self._unsettled and now < self._read_at + LOOK_AGAIN_S:
@@ -620,7 +614,6 @@ def _event_json(event: SessionEvent) -> list[Any]:
 
 
 def _head_json(head: Head) -> Json:
-    """Return how a session stands."""
     return {
         name: _milliseconds(value) if isinstance(value, datetime) else value for name, value in asdict(head).items()
     }
@@ -664,14 +657,13 @@ def _read_picture(folder: Path, file: str) -> bytes:
     return b""
 
 
-REPORT_FILE = "report.html"
-"""Name of a session's report in its folder."""
+REPORT_FILE = "report.html"  # Name of a session's report in its folder
 
+# Bytes of all pictures in a report: with the third that base64 adds it can still be mailed (10 MB at most servers).
 MOST_PICTURES_BYTES = 6 << 20
-"""Bytes of all pictures in a report: with the third that base64 adds it can still be mailed (10 MB at most servers)."""
 
+# Files that make up the page's script, in the order in which they stand in it; the last one begins.
 SCRIPTS = ("plots.js", "head.js", "series.js", "page.js")
-"""Files that make up the page's script, in the order in which they stand in it; the last one begins."""
 
 _PLACE = re.compile(r"\{(title|plain|policy|data|style|script)\}")
 
@@ -745,7 +737,6 @@ def _spread(count: int) -> list[int]:
 
 
 def _plain(head: Head) -> str:
-    """Return the most important of it in a few lines."""
     return "\n".join(
         (
             head.sentence,

@@ -62,28 +62,22 @@ from foundation.errors import (
     StorageError,
 )
 
+# Where words and sentences of a run go: terminal first, then journal, then whoever is notified.
 Report = Callable[[str, str], object]
-"""Where words and sentences of a run go: terminal first, then journal, then whoever is notified."""
 
-POWER_LIMIT_S: Final = 300.0
-"""How long a lamp may take to light; makers state up to 130 s with repeated ignition."""
-RELIGHT_S: Final = 15.0
-"""No lamp is lit again, and its projector back on the network, in less."""
+POWER_LIMIT_S: Final = 300.0  # How long a lamp may take to light; makers state up to 130 s with repeated ignition
+RELIGHT_S: Final = 15.0  # No lamp is lit again, and its projector back on the network, in less
 
-QUESTIONS_SHARE: Final = 0.01
-"""Share of a frame's time that questions may always take: five answers of 4 ms in 2.3 s."""
+QUESTIONS_SHARE: Final = 0.01  # Share of a frame's time that questions may always take: five answers of 4 ms in 2.3 s
 
 _NAME: Final = "the projector"
 
+# How long a projector may take to begin to switch off, after it has said that it will; they answer before they do.
 OBEYS_S: Final = 5.0
-"""How long a projector may take to begin to switch off, after it has said that it will; they answer before they do."""
-LOOK_S: Final = 0.5
-"""Between two questions whether it has begun."""
+LOOK_S: Final = 0.5  # Between two questions whether it has begun
 
-TRIES: Final = 3
-"""Tries at putting the lamp out: an answer that is lost once must not let it burn till the morning."""
-AGAIN_S: Final = 2.0
-"""Between two of them; a controller that was busy answers then."""
+TRIES: Final = 3  # Tries at putting the lamp out: an answer that is lost once must not let it burn till the morning
+AGAIN_S: Final = 2.0  # Between two of them; a controller that was busy answers then
 
 _BY_HAND: Final = "switch it off by hand"
 
@@ -135,8 +129,8 @@ def _picture_fault(projector: Projector) -> DeviceFault | None:
     return DeviceFault(fault) if fault else None
 
 
+# What is asked of a projector, one question or two each; what explains the others comes first.
 _QUESTIONS: Final = (reported_error, _power_fault, _mute_fault, _picture_fault)
-"""What is asked of a projector, one question or two each; what explains the others comes first."""
 
 
 def health_fault(
@@ -254,7 +248,6 @@ def _is_lit(projector: Projector) -> bool:
 
 
 def _warm_up(projector: Projector, sequence: SequenceSettings, retry: RetryPolicy) -> None:
-    """Wait until the lamp has burned for its time without a break."""
     while sequence.warm_up_s and not _burned(projector, sequence, retry):
         pass
 
@@ -401,14 +394,14 @@ def fault_of(name: str, fault: CropError) -> CropError:
     return fault
 
 
+# How far a shutter time may lie from whole turns of the colour wheel, as a share: shutters are no more exact.
 MAX_TURN_ERROR = 0.005
-"""How far a shutter time may lie from whole turns of the colour wheel, as a share: shutters are no more exact."""
 
+# Shutter times in thirds of a stop as cameras show them, seconds: what is named before a camera can be asked.
 ENGRAVED_S = (
     *(1 / 60, 1 / 50, 1 / 40, 1 / 30, 1 / 25, 1 / 20, 1 / 15, 1 / 13, 1 / 10, 1 / 8, 1 / 6, 1 / 5, 1 / 4),
     *(0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.0, 8.0, 10.0, 13.0, 15.0, 20.0, 25.0, 30.0),
 )
-"""Shutter times in thirds of a stop as cameras show them, seconds: what is named before a camera can be asked."""
 
 
 def _light_period_s(projector: ProjectorCable) -> float:
@@ -459,29 +452,24 @@ def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> No
     )
 
 
+# Before the second try: a notification in front of the picture, or a cable put back, needs no more.
 RETRY_S: Final = 1.0
-"""Before the second try: a notification in front of the picture, or a cable put back, needs no more."""
-PAUSE_S: Final = 5.0
-"""Between two tries in a pause; an operator who mends something does not notice so short a wait."""
+PAUSE_S: Final = 5.0  # Between two tries in a pause; an operator who mends something does not notice so short a wait
+# A try that failed after so long has been tried often enough by its driver: the pause is told at once.
 SLOW_S: Final = 10.0
-"""A try that failed after so long has been tried often enough by its driver: the pause is told at once."""
+# How long a try may go without a sign of life: a camera's driver waits 90 s for a frame of 30 s, then looks for it
+# for 70 s more over a new connection, and a question may go without an answer for 20 s.
 TRY_S: Final = 300.0
-"""How long a try may go without a sign of life: a camera's driver waits 90 s for a frame of 30 s, then
-looks for it for 70 s more over a new connection, and a question may go without an answer for 20 s."""
+# Frames that must be accepted after a pause for the next one to count anew: what works for half a minute between two
+# faults lets a session get on, and what works for a frame or two does not.
 RECURS_WITHIN: Final = 10
-"""Frames that must be accepted after a pause for the next one to count anew: what works for half a minute between two
-faults lets a session get on, and what works for a frame or two does not."""
+# Between the second and the third try of what costs a refused file each; the second comes at once, each later pause
+# is twice the one before.
 BACK_OFF_S: Final = 5.0
-"""Between the second and the third try of what costs a refused file each; the second comes at once, each later pause is
-twice the one before."""
-LONGEST_BACK_OFF_S: Final = 300.0
-"""Between two such tries at most: an operator can wait for five minutes."""
-FRAMES: Final = "the frames"
-"""What is waited for where nothing fails but every frame is refused."""
-TOLD_LATER: Final = " (this was at "
-"""What stands behind a sentence that the disk could not take when it was said."""
-INSTANT_S: Final = 1e-6
-"""Resolution of simulated time: nothing shorter can be waited for."""
+LONGEST_BACK_OFF_S: Final = 300.0  # Between two such tries at most: an operator can wait for five minutes
+FRAMES: Final = "the frames"  # What is waited for where nothing fails but every frame is refused
+TOLD_LATER: Final = " (this was at "  # What stands behind a sentence that the disk could not take when it was said
+INSTANT_S: Final = 1e-6  # Resolution of simulated time: nothing shorter can be waited for
 
 _Result = TypeVar("_Result")
 
@@ -695,17 +683,14 @@ def _family(fault: CropError) -> type[CropError]:
     return next(kind for kind in type(fault).__mro__ if kind.__module__ == errors.__name__)
 
 
-TICK_S: Final = 1.0
-"""Between two looks at the time."""
+TICK_S: Final = 1.0  # Between two looks at the time
 
-GAP_S: Final = 10.0
-"""A look that comes so late was held up: a busy machine lets a thread wait for a second or two."""
+GAP_S: Final = 10.0  # A look that comes so late was held up: a busy machine lets a thread wait for a second or two
 
+# A step is late when it takes so many times as long as it is expected to: a download that is tried again takes two.
 LATE_TIMES: Final = 3.0
-"""A step is late when it takes so many times as long as it is expected to: a download that is tried again takes two."""
 
-LATE_S: Final = 10.0
-"""And so many seconds more: a disk, or a machine with other work, may stall for some."""
+LATE_S: Final = 10.0  # And so many seconds more: a disk, or a machine with other work, may stall for some
 
 
 @dataclass

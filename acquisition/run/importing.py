@@ -154,7 +154,6 @@ def _can_be_checked(path: Path) -> bool:
 
 
 def _left(session: Session) -> list[str]:
-    """Return what was listed of which no frame is accepted."""
     accepted = {(frame.kind, frame.illumination) for frame in session.frames() if frame.accepted}
     listed = dict.fromkeys((step.kind, step.illumination) for step in session.steps)
     return [

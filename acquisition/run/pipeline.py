@@ -70,20 +70,19 @@ from foundation.console import Ending
 from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted, first_of
 from foundation.files import write_whole
 
+# Frames whose verdict is not known when the next is exposed. A frame is judged while the next is exposed and
+# downloaded, which takes several times as long; with more frames ahead, more would be lost where one is refused.
 AHEAD = 1
-"""Frames whose verdict is not known when the next is exposed. A frame is judged while the next is exposed and
-downloaded, which takes several times as long; with more frames ahead, more would be lost where one is refused."""
 
+# Tries at fetching a frame before it is exposed again: a driver has renewed its connection several times by then.
 DOWNLOADS = 2
-"""Tries at fetching a frame before it is exposed again: a driver has renewed its connection several times by then."""
 
+# What steps are expected to take, seconds, until they took longer: a write to the journal, a picture that is shown or
+# read back, release and readout beside the shutter's time and as much again for the camera's own dark frame, the
+# verdict of a large frame, its download over a slow cable.
 COMMIT_S, SHOW_S, RELEASE_S, JUDGE_S, DOWNLOAD_S = 1.0, 2.0, 3.0, 5.0, 10.0
-"""What steps are expected to take, seconds, until they took longer: a write to the journal, a picture that is shown or
-read back, release and readout beside the shutter's time and as much again for the camera's own dark frame, the verdict
-of a large frame, its download over a slow cable."""
 
-PROMISE = "ending after this frame; press Ctrl-C again to end at once"
-"""What somebody is told who asks a run to end."""
+PROMISE = "ending after this frame; press Ctrl-C again to end at once"  # What somebody is told who asks a run to end
 
 _CAMERA, _SCREEN, _DISK = "the camera", "the screen", "the disk"
 
@@ -316,7 +315,6 @@ class Pipeline:
         return (Check("gap", gap_s, None, GAP_S, "s", reason),)
 
     def _screen_check(self, step: SessionStep) -> tuple[Check, ...]:
-        """Ask the screen whether it still shows the light, before it may change."""
         presenter = self._job.devices.presenter
         if not isinstance(presenter, ReadsBack):
             return ()
@@ -688,9 +686,9 @@ def _followed_changes(
     return said
 
 
+# Steps given up one after another after which going on makes no sense: something lasting is wrong. One may be chance,
+# and two neighbours may share a cause that passes.
 GIVEN_UP_IN_A_ROW = 3
-"""Steps given up one after another after which going on makes no sense: something lasting is wrong. One may be chance,
-and two neighbours may share a cause that passes."""
 
 
 class StepQueue:

@@ -54,14 +54,13 @@ from foundation.errors import (
 from foundation.files import file_sha256, storage_error
 from foundation.secret_texts import is_address, is_webhook, target_label
 
+# Settings that must stay for a whole session: they decide what its frames show.
 FIXED: Final = (
     "rig", "camera", "simulated.body", "simulated.camera", "simulated.seed", "simulated.room",
     "sequence.reference_every",
 )  # fmt: skip
-"""Settings that must stay for a whole session: they decide what its frames show."""
 
-KNOWN_AFTER: Final = 5
-"""Frames after which their own times and sizes tell more than what is assumed."""
+KNOWN_AFTER: Final = 5  # Frames after which their own times and sizes tell more than what is assumed
 
 
 @dataclass(frozen=True)
@@ -187,18 +186,18 @@ def order_of(steps: Sequence[SessionStep], settings: LabSettings) -> str:
     return "shuffled by another seed, as the session was begun"
 
 
+# Frames taken again for which there must be space, as a share of the plan: chosen; disturbances of an hour's run.
 RETAKEN_SHARE: Final = 0.1
-"""Frames taken again for which there must be space, as a share of the plan: chosen; disturbances of an hour's run."""
-BESIDE_BYTES: Final = 150_000
-"""Of each frame: a preview of 640 px, and its rows in the journal."""
+BESIDE_BYTES: Final = 150_000  # Of each frame: a preview of 640 px, and its rows in the journal
+# What is left free beside: the disk's other users, and file systems that slow down when they are full.
 SPARE_BYTES: Final = 500_000_000
-"""What is left free beside: the disk's other users, and file systems that slow down when they are full."""
+# Of lossless raw files of 14 bits: 1.34 at ISO 100 (EOS 550D, 25 MB; EOS 6D Mark II, 36 MB), more with noise.
 BYTES_PER_PIXEL: Final = 1.5
-"""Of lossless raw files of 14 bits: 1.34 at ISO 100 (EOS 550D, 25 MB; EOS 6D Mark II, 36 MB), more with noise."""
+# Of bodies that may write every photosite in 16 bits (Sony), and of those of the simulated lab, which do.
 LOOSE_BYTES_PER_PIXEL: Final = 2.0
-"""Of bodies that may write every photosite in 16 bits (Sony), and of those of the simulated lab, which do."""
-UNKNOWN_BYTES: Final = 60_000_000
-"""Assumed of a body that is not known: 40 million photosites."""
+UNKNOWN_BYTES: Final = 60_000_000  # Assumed of a body that is not known: 40 million photosites
+# Photosites in millions, and the bodies that have no more: the makers' numbers, about a twentieth added for masked
+# borders. From general knowledge but for the EOS 550D, 6D Mark II, 5D Mark II, 5DS and 1Ds Mark III.
 _MODELS: Final = (
     (0.52, "CroP Test"),
     (18.7, "EOS 550D, EOS REBEL T2i, EOS Kiss X4, EOS 650D, EOS 700D, EOS REBEL T4i, EOS REBEL T5i, "
@@ -217,11 +216,9 @@ _MODELS: Final = (
     (53.5, "EOS 5DS, EOS 5DS R"),
     (62.0, "ILCE-7RM3, ILCE-7RM4, ILCE-7RM5"),
 )  # fmt: skip
-"""Photosites in millions, and the bodies that have no more: the makers' numbers, about a twentieth added for masked
-borders. From general knowledge but for the EOS 550D, 6D Mark II, 5D Mark II, 5DS and 1Ds Mark III."""
 
+# Photosites of the bodies that are known, in millions.
 MEGAPIXELS: Final = {model: size for size, models in _MODELS for model in models.split(", ")}
-"""Photosites of the bodies that are known, in millions."""
 
 
 @dataclass(frozen=True)
@@ -362,19 +359,17 @@ def _projector_state(projector: Projector) -> tuple[str, bool | None]:
     return f"{name}{f', lamp {hours}' if hours else ''}, {state}", lit
 
 
+# What a cable is assumed to carry before a frame was taken: USB 2.0 carries 30 to 40 million bytes a second.
 DOWNLOAD_BYTES_PER_S: Final = 25e6
-"""What a cable is assumed to carry before a frame was taken: USB 2.0 carries 30 to 40 million bytes a second."""
+# What a frame is assumed to need beside light and cable: release, mirror, read-back of the screen, journal.
 STEP_S: Final = 0.4
-"""What a frame is assumed to need beside light and cable: release, mirror, read-back of the screen, journal."""
-LIGHTING_S: Final = 60.0
-"""Assumed time from switching on to a lit lamp; makers state 30 to 40 s, and up to 130 s."""
+LIGHTING_S: Final = 60.0  # Assumed time from switching on to a lit lamp; makers state 30 to 40 s, and up to 130 s
+# At this charge a series of many frames is not begun without mains power: bodies report in steps of a quarter, and
+# refuse to release a little later.
 LOW_BATTERY: Final = 0.25
-"""At this charge a series of many frames is not begun without mains power: bodies report in steps of a quarter, and
-refuse to release a little later."""
-FEW_FRAMES: Final = 50
-"""So many frames are taken on a low battery all the same."""
+FEW_FRAMES: Final = 50  # So many frames are taken on a low battery all the same
+# How far a shutter time may lie from one that the body offers, as a share; drivers take no more.
 OFFERED_WITHIN: Final = 0.01
-"""How far a shutter time may lie from one that the body offers, as a share; drivers take no more."""
 
 
 @dataclass(frozen=True)
@@ -445,10 +440,10 @@ def make_plan(
     )
 
 
+# Settling above which seconds may have been taken for milliseconds: chosen, many times what projectors need.
 LONG_SETTLE_S: Final = 10.0
-"""Settling above which seconds may have been taken for milliseconds: chosen, many times what projectors need."""
+# Warm-up below which a lamp is not yet steady: chosen; makers ask for ten minutes to half an hour.
 SHORT_WARM_UP_S: Final = 300.0
-"""Warm-up below which a lamp is not yet steady: chosen; makers ask for ten minutes to half an hour."""
 
 
 def settings_doubts(settings: LabSettings) -> tuple[str, ...]:
@@ -468,7 +463,6 @@ def settings_doubts(settings: LabSettings) -> tuple[str, ...]:
 
 
 def _targets(settings: LabSettings) -> tuple[tuple[str, str], ...]:
-    """Return who is told of a run, by the key that names them."""
     return ("sequence.notify", settings.sequence.notify), ("notify.alive", settings.notify.alive)
 
 

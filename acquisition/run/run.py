@@ -84,15 +84,12 @@ from foundation.errors import CropError, DeviceRefused, InputError, StorageError
 from foundation.secret_texts import is_webhook, target_label
 from foundation.version import software
 
-LIMIT_S: Final = 20.0
-"""How long a receiver may take; a message to a telephone takes seconds."""
-ENDING_S: Final = 2.0
-"""How much longer the end waits for the last one, so that a receiver that is too slow is named."""
+LIMIT_S: Final = 20.0  # How long a receiver may take; a message to a telephone takes seconds
+ENDING_S: Final = 2.0  # How much longer the end waits for the last one, so that a receiver that is too slow is named
+# Between two notices of a pause for the same cause: whoever was told once in the hour, and did not come, is not woken
+# by each time that it comes and goes.
 QUIET_S: Final = 3600.0
-"""Between two notices of a pause for the same cause: whoever was told once in the hour, and did not come, is not woken
-by each time that it comes and goes."""
-QUEUED: Final = 100
-"""Notices that may wait for a slow receiver; more are dropped."""
+QUEUED: Final = 100  # Notices that may wait for a slow receiver; more are dropped
 
 
 class Notices:
@@ -247,11 +244,11 @@ class PauseNotices:
             self._tell("resumed", sentence)
 
 
+# Checks that the line about the last frame has, as far as they have a number.
 SHOWN = (
     OFF_CODES_DEG.name, "movement", "blur", WHITE_DRIFT.name,
     LEAK_SHARE.name, STRAY_SHARE.name, DARK_DRIFT.name, "exposure",
 )  # fmt: skip
-"""Checks that the line about the last frame has, as far as they have a number."""
 
 
 def verdict_line(taken: Taken) -> str:
@@ -268,9 +265,9 @@ def _number_text(check: Check) -> str:
     return f"{check.name} {check.value:.3g}{unit}{' (beyond its limit)' if check.is_beyond else ''}"
 
 
+# Between two lines on how far a run is, where they go into a file: enough to see that it lives, and a night's
+# thousand lines can still be read.
 PLAIN_S: Final = 30.0
-"""Between two lines on how far a run is, where they go into a file: enough to see that it lives, and a night's thousand
-lines can still be read."""
 
 
 class Terminal:
@@ -356,11 +353,10 @@ def _print(line: str) -> None:
         print(line, file=sys.stderr)
 
 
-ALIVE_S: Final = 60.0
-"""Between two signs to a dead man's switch: services of that kind count minutes."""
+ALIVE_S: Final = 60.0  # Between two signs to a dead man's switch: services of that kind count minutes
 
+# Of the watchdog's time, between two signs at least: sd_watchdog_enabled(3) recommends half of it at most.
 WATCHDOG_SHARE: Final = 0.25
-"""Of the watchdog's time, between two signs at least: sd_watchdog_enabled(3) recommends half of it at most."""
 
 
 class Life:
@@ -427,8 +423,8 @@ def _watchdog_s(environment: Mapping[str, str]) -> float:
         return 0.0
 
 
+# How long a camera is expected to take for its settings: a dozen messages, each with an answer that is waited for.
 CONFIGURE_S = 10.0
-"""How long a camera is expected to take for its settings: a dozen messages, each with an answer that is waited for."""
 
 
 def run_session(
@@ -703,12 +699,11 @@ def _make_ready(job: Job) -> None:
         make_ready(devices.projector, settings.sequence, job.retry)
 
 
-BEGINS = "a run begins: it looks at its frames and opens its devices"
-"""What a run says before it takes frames."""
+BEGINS = "a run begins: it looks at its frames and opens its devices"  # What a run says before it takes frames
 
 
+# A run's way to say that it is there, and what is waited for; with nothing, that frames are taken.
 SignOfLife = Callable[[str], None]
-"""A run's way to say that it is there, and what is waited for; with nothing, that frames are taken."""
 
 
 @contextmanager

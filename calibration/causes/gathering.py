@@ -18,46 +18,39 @@ from calibration.sampling import WINDOW, bleed
 from experiment.measures.stains import Stains, cell_mm, joined_cells, light_of_spot, spot_colour, spots_of
 from experiment.session.records import FrameRecord
 
+# Deviation of a block beyond noise from which on a frame shows something there: clean frames in the simulated room
+# have less.
 LEAST_BLOCK = 0.004
-"""Deviation of a block beyond noise from which on a frame shows something there: clean frames in the simulated room
-have less."""
 
-SAME_THING = 0.3
-"""Share of the worst frame's deviation from which on another frame shows the same."""
+SAME_THING = 0.3  # Share of the worst frame's deviation from which on another frame shows the same
 
-MOST_PLACES = 12
-"""Places that are named and drawn of one figure: more hide the picture."""
+MOST_PLACES = 12  # Places that are named and drawn of one figure: more hide the picture
 
-IN_FIRST = 0.8
-"""Share of the frames that differ from the first at a place from which on it is the first that differs."""
+IN_FIRST = 0.8  # Share of the frames that differ from the first at a place from which on it is the first that differs
 
+# Share of a deviation in the mean of white frames that a single frame must have at least to be what made it.
 _HALF = 0.5
-"""Share of a deviation in the mean of white frames that a single frame must have at least to be what made it."""
 
+# Residual of references from which on something lies there: their noise under white is a tenth of it.
 _LEAST_RESIDUAL = 0.02
-"""Residual of references from which on something lies there: their noise under white is a tenth of it."""
 
-RIM_OFF = -0.005
-"""Mean residual of the outermost references below which a frame's corners are darker than its field."""
+RIM_OFF = -0.005  # Mean residual of the outermost references below which a frame's corners are darker than its field
 
-_LEAST_BRIGHT = 4
-"""Cells of a small place from which on light was added if all of them are brighter."""
+_LEAST_BRIGHT = 4  # Cells of a small place from which on light was added if all of them are brighter
 
+# Share of the cells of a small place that a thin shadow darkens at least (chosen: all of them, but for noise).
 _MOSTLY = 0.8
-"""Share of the cells of a small place that a thin shadow darkens at least (chosen: all of them, but for noise)."""
 
+# Deviation that what covers cells gives one of them at least, unless it darkens all (chosen: of a hand's reflectance
+# are few colours of a print within a tenth).
 _COVERED = 0.1
-"""Deviation that what covers cells gives one of them at least, unless it darkens all (chosen: of a hand's reflectance
-are few colours of a print within a tenth)."""
 
-_IN_SPOT = 0.5
-"""Share of noisy cells that lie in a spot of the print from which on the spot explains them."""
+_IN_SPOT = 0.5  # Share of noisy cells that lie in a spot of the print from which on the spot explains them
 
-_DISTURBED = 0.03
-"""Deviation of a block from which on what lies there moves the mean of the paper, too (judgement)."""
+_DISTURBED = 0.03  # Deviation of a block from which on what lies there moves the mean of the paper, too (judgement)
 
+# Logarithm of two exposures' ratio up to which they are one: shutter speeds differ by a quarter, and are rounded.
 _SAME = 0.03
-"""Logarithm of two exposures' ratio up to which they are one: shutter speeds differ by a quarter, and are rounded."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -92,7 +85,6 @@ def block_evidence(table: TableMeasurements, limit: float) -> Gathered:
 
 
 def _block_of(table: TableMeasurements, worst: FrameMeasurements, limit: float) -> Gathered:
-    """Return what is known of the place that deviates most in one frame."""
     seen = worst.consistency
     at_mm, size_mm = np.array(seen.at_mm), max(seen.extent_mm, 1e-9)
     deviation, tint = _colour(np.array(seen.colour))
@@ -242,7 +234,6 @@ def _lens(table: TableMeasurements) -> dict[str, float]:
 
 
 def _of_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.int64]) -> Gathered:
-    """Return what is known of one spot of the print."""
     place = _place_of(stains, spot, table.registered_frame.record.file)
     at_mm = np.array([place.x_mm, place.y_mm])
     colour = spot_colour(stains, spot)
@@ -504,12 +495,12 @@ def sum_evidence(table: TableMeasurements, limit: float) -> Gathered:
     return Gathered(known, frames, ())
 
 
+# How much further one primary lies from the nearer of the others than these from each other, to be alone (chosen).
 _MORE = 3.0
-"""How much further one primary lies from the nearer of the others than these from each other, to be alone (chosen)."""
 
+# Share of what white has more of one primary that it lacks of another at least, where the first's frame holds the
+# other's light (chosen).
 _EQUALLY = 0.7
-"""Share of what white has more of one primary that it lacks of another at least, where the first's frame holds the
-other's light (chosen)."""
 
 
 def _colour_range(table: TableMeasurements) -> float:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, fields
 from functools import cache
 from typing import Literal
 
+# What is to be taken again: the frames that are named, the whole session, or nothing, as no new frame helps.
 Mends = Literal["frames", "session", "nothing"]
-"""What is to be taken again: the frames that are named, the whole session, or nothing, as no new frame helps."""
 
 
 @dataclass(frozen=True)
@@ -151,15 +151,14 @@ MIXED = Cause(
     "take that frame again, and let the picture settle for longer (sequence.settle_s)",
     "frames",
 )
-UNKNOWN = Cause("unknown", "", "", "nothing")
-"""What was measured does not decide; the remedy is then that of the limit."""
+UNKNOWN = Cause("unknown", "", "", "nothing")  # What was measured does not decide; the remedy is then that of the limit
 
+# All of them.
 CAUSES = (
     HOT_PHOTOSITES, OBJECT_IN_FRAME, REFLECTION, REFLECTION_IN_FRAME, STAIN, SHADOW, CURL, FALL_OFF, SPREAD, BUMP,
     DEFOCUS, ANOTHER_PRINT, WRONG_NAME,
     OTHER_CAMERA, OTHER_EXPOSURE, ROOM_LIGHT, OTHER_BRIGHTNESS, MIXED, COLOUR_WHEEL, UNKNOWN,
 )  # fmt: skip
-"""All of them."""
 
 
 NAN = float("nan")
@@ -295,11 +294,11 @@ class Rule:
         return subject in self.about and all(condition.holds(evidence) for condition in self.conditions)
 
 
+# What a figure beyond its limit is about: the rules ask for that, and not for its name.
 Subject = Literal[
     "block", "few cells", "unfit cells", "spot", "references", "frame", "movement", "noisy cells", "chart", "drift",
     "names", "brightness", "sum", "dark", "stray", "camera", "iso",
 ]  # fmt: skip
-"""What a figure beyond its limit is about: the rules ask for that, and not for its name."""
 
 
 def _about(*subjects: Subject) -> frozenset[Subject]:
@@ -316,20 +315,21 @@ DARK = _about("dark")
 STRAY = _about("stray")
 CHART = _about("chart")
 
+# A place of the print looks in every frame as in the one registered first.
 _IN_ALL_FRAMES = (
     Condition("in_first", 0, 0), Condition("even_showing", 0, 0), Condition("some_whites", 0, 0),
     Condition("frames", 2, _FAR),
 )  # fmt: skip
-"""A place of the print looks in every frame as in the one registered first."""
 
+# What is off lies at one place, and the rest of the frame is as sharp as before.
 _SHARP_PLACE = (Condition("share", 0, 0.5), Condition("scatter", 0, 0.1), Condition("softer", -_FAR, 0.003))
-"""What is off lies at one place, and the rest of the frame is as sharp as before."""
 
+# A place is off in few of the frames, and not in the one that they are compared with.
 _IN_FEW_FRAMES = (
     Condition("in_first", 0, 0), Condition("frames", 3, _FAR), Condition("showing", 1e-9, 0.34),
 )  # fmt: skip
-"""A place is off in few of the frames, and not in the one that they are compared with."""
 
+# The table, in the order of deciding.
 RULES: tuple[Rule, ...] = (
     Rule(
         OTHER_CAMERA,
@@ -582,7 +582,6 @@ RULES: tuple[Rule, ...] = (
         "rim and middle of cells differ, and the print shows that the lens brings light from beyond them",
     ),
 )  # fmt: skip
-"""The table, in the order of deciding."""
 
 
 @dataclass(frozen=True)

@@ -42,46 +42,38 @@ from foundation.robust import huber_weights, sigma_of
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
-DEGREE = 4
-"""Of the polynomial in the code: 35 terms."""
+DEGREE = 4  # Of the polynomial in the code: 35 terms
 
-LEAST_COUNTS = 60.0
-"""Mean of 25 samples that a cell is expected to have for it to be compared: good to 3 %."""
+LEAST_COUNTS = 60.0  # Mean of 25 samples that a cell is expected to have for it to be compared: good to 3 %
 
+# Cells whose scatter and blocks are compared, at most: a quarter of a full chart, for every frame is compared.
 CELLS = 8192
-"""Cells whose scatter and blocks are compared, at most: a quarter of a full chart, for every frame is compared."""
 
-FIT_CELLS = 1500
-"""Cells that the polynomial is fitted on, about: forty for each of its terms."""
+FIT_CELLS = 1500  # Cells that the polynomial is fitted on, about: forty for each of its terms
 
+# Compared cells of a block: four times as many cells of a full chart, a square of six centimetres on A0.
 BLOCK_CELLS = 32
-"""Compared cells of a block: four times as many cells of a full chart, a square of six centimetres on A0."""
 
-LEAST_CELLS = 12
-"""Compared cells that a block must have for its mean to count."""
+LEAST_CELLS = 12  # Compared cells that a block must have for its mean to count
 
-CELLS_A_TERM = 2
-"""With fewer cells for each term, what is wrong would be fitted, or what is right not."""
+CELLS_A_TERM = 2  # With fewer cells for each term, what is wrong would be fitted, or what is right not
 
-_ROUNDS = 3
-"""Reweighted solutions in a row, after a first with equal weights."""
+_ROUNDS = 3  # Reweighted solutions in a row, after a first with equal weights
 
+# Standard errors that are taken off a block's mean, and off the cells' spread, before it counts: among a full chart's
+# 256 blocks noise alone exceeds them in one of sixty frames.
 _CERTAIN = 4.0
-"""Standard errors that are taken off a block's mean, and off the cells' spread, before it counts: among a full chart's
-256 blocks noise alone exceeds them in one of sixty frames."""
 
+# Variance of a standard deviation estimated by the median deviation of N normal values, over σ²/N (P. Rousseeuw and
+# C. Croux, Journal of the American Statistical Association 88, 1993: an efficiency of 37 %).
 _SPREAD_ERROR2 = 1.36
-"""Variance of a standard deviation estimated by the median deviation of N normal values, over σ²/N (P. Rousseeuw and
-C. Croux, Journal of the American Statistical Association 88, 1993: an efficiency of 37 %)."""
 
-_AS_MUCH = 0.3
-"""Share of the worst block's deviation from which on a block is part of the same thing."""
+_AS_MUCH = 0.3  # Share of the worst block's deviation from which on a block is part of the same thing
 
+# Of the cells' expected levels, what is taken for the brightest: bare paper is not among them.
 _BRIGHT_PERCENTILE = 99.0
-"""Of the cells' expected levels, what is taken for the brightest: bare paper is not among them."""
 
-_MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0
-"""Standard error of a cell's prediction: a share of its level, and counts."""
+_MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0  # Standard error of a cell's prediction: a share of its level, and counts
 
 
 @dataclass(frozen=True)
@@ -381,8 +373,8 @@ class OriginFigures:
         return max((max(frame.ratio, 1 / frame.ratio) - 1 for frame in self.other_exposure), default=0.0)
 
 
+# Ratio below which two exposures count as one: shutter speeds differ by 1.26 at least, and are written rounded.
 _SAME_EXPOSURE = 1.01
-"""Ratio below which two exposures count as one: shutter speeds differ by 1.26 at least, and are written rounded."""
 
 
 def origin_figures(frames: Sequence[tuple[FrameRecord, FrameOrigin]], iso: int | None = None) -> OriginFigures:

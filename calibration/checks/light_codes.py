@@ -27,54 +27,50 @@ from foundation.colorimetry import angles_deg
 
 _Array = npt.NDArray[np.float64]
 
+# Standard errors that are taken off an angle, or a brightness, so that noise is not taken for a wrong name.
 CERTAIN = 4.0
-"""Standard errors that are taken off an angle, or a brightness, so that noise is not taken for a wrong name."""
 
+# Twice the logarithm of the odds from which two names are called exchanged: a quarter of a million pairs are asked
+# about in a session of 707 lights, for which 25 are taken off; what remains are odds of ten to one.
 EXCHANGED = 30.0
-"""Twice the logarithm of the odds from which two names are called exchanged: a quarter of a million pairs are asked
-about in a session of 707 lights, for which 25 are taken off; what remains are odds of ten to one."""
 
+# A light counts as held against its codes if no light further than this from it could bear its name unnoticed: the
+# angle from which a table is refused.
 HELD_DEG = 8.0
-"""A light counts as held against its codes if no light further than this from it could bear its name unnoticed: the
-angle from which a table is refused."""
 
+# Largest standard error, degrees, of what codes predict for a light to count as held: blue for red is 85° off.
 _HELD_SD_DEG = 10.0
-"""Largest standard error, degrees, of what codes predict for a light to count as held: blue for red is 85° off."""
 
-_FEW = 24
-"""Lights up to which each is left out in turn where names do not fit; of more, the majority decides."""
+_FEW = 24  # Lights up to which each is left out in turn where names do not fit; of more, the majority decides
 
-_SUSPECTS = 8
-"""Lights among which exchanged names are looked for then: those whose absence helps most."""
+_SUSPECTS = 8  # Lights among which exchanged names are looked for then: those whose absence helps most
 
+# Misfit by which exchanged names may be worse than leaving a light out, to be believed: that takes three numbers
+# away, which each have 1 on average.
 _AS_GOOD = 9.0
-"""Misfit by which exchanged names may be worse than leaving a light out, to be believed: that takes three numbers away,
-which each have 1 on average."""
 
+# Scatter of a channel against the others, relative: what healthy lamps have, and up to where that of the session at
+# hand is believed to be its own. Beyond, a colour wheel is cut, or names are wrong; both are to be said.
 _CHROMA_SD, _MOST_CHROMA_SD = 0.003, 0.012
-"""Scatter of a channel against the others, relative: what healthy lamps have, and up to where that of the session at
-hand is believed to be its own. Beyond, a colour wheel is cut, or names are wrong; both are to be said."""
 
+# Scatter of a light's brightness, relative: lamps that flicker, and where no white frames show the lamp's drift.
 _BRIGHTNESS_SD, _UNTIED_SD = 0.03, 0.06
-"""Scatter of a light's brightness, relative: lamps that flicker, and where no white frames show the lamp's drift."""
 
+# Misfit up to which the names of few lights are believed, and what each light adds. In 360 random healthy rooms it
+# was below 6 + 1.7 a light, and with any two names exchanged that are 6° apart above 12 + 3.3.
 _HEALTHY, _HEALTHY_EACH = 8.0, 2.5
-"""Misfit up to which the names of few lights are believed, and what each light adds. In 360 random healthy rooms it was
-below 6 + 1.7 a light, and with any two names exchanged that are 6° apart above 12 + 3.3."""
 
+# Squared distance of two whites from what their exchanged codes give, above which these are none of theirs: six
+# dimensions have 6 on average and once in ten million times this.
 _FITS = 50.0
-"""Squared distance of two whites from what their exchanged codes give, above which these are none of theirs: six
-dimensions have 6 on average and once in ten million times this."""
 
-_FREE = 10.0
-"""Standard deviation of a light's brightness, relative, where only its direction counts."""
+_FREE = 10.0  # Standard deviation of a light's brightness, relative, where only its direction counts
 
+# Squared distance of two predictions, over `EXCHANGED`, up to which an exchange is weighed whole: both lights would
+# be off, so that twice this distance is to be expected of one.
 _FAR = 3.0
-"""Squared distance of two predictions, over `EXCHANGED`, up to which an exchange is weighed whole: both lights would be
-off, so that twice this distance is to be expected of one."""
 
-_BLOCK_PAIRS = 20_000
-"""Pairs whose exchange is weighed at a time: a hundred megabytes."""
+_BLOCK_PAIRS = 20_000  # Pairs whose exchange is weighed at a time: a hundred megabytes
 
 _Whole = npt.NDArray[np.int64]
 

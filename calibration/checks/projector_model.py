@@ -31,71 +31,63 @@ import numpy.typing as npt
 
 _Array = npt.NDArray[np.float64]
 
+# Share of white's count in channel R, G, B (rows) that each primary has: middles of five cameras' measured
+# sensitivities under a mercury lamp and LEDs.
 _SEEN = np.array([[0.70, 0.28, 0.015], [0.055, 0.83, 0.11], [0.013, 0.25, 0.70]])
-"""Share of white's count in channel R, G, B (rows) that each primary has: middles of five cameras' measured
-sensitivities under a mercury lamp and LEDs."""
 
+# Prior standard deviations of their logarithms: half as much again as those cameras and lamps differ by.
 _SEEN_SD = np.array([[0.25, 0.45, 0.9], [0.6, 0.2, 0.6], [1.0, 0.7, 0.25]])
-"""Prior standard deviations of their logarithms: half as much again as those cameras and lamps differ by."""
 
-_CHANNELS = np.array([0.45, 1.0, 0.70])
-"""White's counts in the channels over green's, of those cameras and lamps."""
+_CHANNELS = np.array([0.45, 1.0, 0.70])  # White's counts in the channels over green's, of those cameras and lamps
 
+# Prior standard deviations (logarithm) of a channel's level, a primary's, and that of all: projectors of 5000 to 11
+# 000 K, and any exposure.
 _CHANNEL_SD, _PRIMARY_SD, _SCALE_SD = 0.35, 0.3, 2.0
-"""Prior standard deviations (logarithm) of a channel's level, a primary's, and that of all: projectors of 5000 to
-11 000 K, and any exposure."""
 
+# Codes at which tone curves are known; between them a curve bends by less than a thousandth.
 _NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 184, 200, 216, 232, 255.0])
-"""Codes at which tone curves are known; between them a curve bends by less than a thousandth."""
 
-_POWER = 2.2
-"""Exponent about which tone curves are described: displays have 1.8 to 2.6."""
+_POWER = 2.2  # Exponent about which tone curves are described: displays have 1.8 to 2.6
 
+# Prior standard deviations of a tone curve's exponent and bends (logarithm), and the bends' length in the logarithm
+# of the code: sRGB, S-shaped curves and any exponent from 1.5 to 2.9 lie within two.
 _SLOPE, _BEND, _LENGTH = 0.4, 0.2, 0.4
-"""Prior standard deviations of a tone curve's exponent and bends (logarithm), and the bends' length in the logarithm of
-the code: sRGB, S-shaped curves and any exponent from 1.5 to 2.9 lie within two."""
 
-_OWN = 0.2
-"""How much of that a primary has for itself: the three curves of a projector are much alike, LCDs least."""
+_OWN = 0.2  # How much of that a primary has for itself: the three curves of a projector are much alike, LCDs least
 
+# Codes between which the light added where primaries overlap is interpolated.
 _OVERLAP_NODES = np.array([0.0, 64.0, 128.0, 192.0, 255.0])
-"""Codes between which the light added where primaries overlap is interpolated."""
 
+# Prior standard deviations of the light added where primaries overlap, over the primary's own: of the whole, and of
+# its course with the code, and the length in codes of that. White segments add up to half.
 _OVERLAP, _OVERLAP_BEND, _OVERLAP_LENGTH = 0.2, 0.15, 120.0
-"""Prior standard deviations of the light added where primaries overlap, over the primary's own: of the whole, and of
-its course with the code, and the length in codes of that. White segments add up to half."""
 
+# Primaries that overlap: each pair, and all three.
 _SUBSETS: tuple[tuple[int, ...], ...] = ((0, 1), (0, 2), (1, 2), (0, 1, 2))
-"""Primaries that overlap: each pair, and all three."""
 
+# Three of each primary.
 _TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if primary in subset]
-"""Three of each primary."""
 
 
+# Prior standard deviation of the light at code 0, of a primary's full light: after the dark frames' is taken off, and
+# where there are none. Contrasts of 1 : 500 and more, and a lit room, lie within.
 _REST, _REST_UNKNOWN = 5e-4, 0.02
-"""Prior standard deviation of the light at code 0, of a primary's full light: after the dark frames' is taken off, and
-where there are none. Contrasts of 1 : 500 and more, and a lit room, lie within."""
 
+# Error of a channel's white that does not shrink with it, of the brightest white's: black levels and stray light.
 _FLOOR = 2e-4
-"""Error of a channel's white that does not shrink with it, of the brightest white's: black levels and stray light."""
 
-_FREEDOM = 4.0
-"""Degrees of freedom of Student's t: outliers lose their weight, healthy lights keep nearly all of it."""
+_FREEDOM = 4.0  # Degrees of freedom of Student's t: outliers lose their weight, healthy lights keep nearly all of it
 
+# Noise added to each white in turn, as a share of it: from that of the priors down to none.
 _SCHEDULE = (0.5, 0.2, 0.06, 0.015, 0.0, 0.0, 0.0)
-"""Noise added to each white in turn, as a share of it: from that of the priors down to none."""
 
-_STEPS = 4
-"""Steps of Gauss and Newton for each of these, at most."""
+_STEPS = 4  # Steps of Gauss and Newton for each of these, at most
 
-_STILL = 1e-6
-"""Step, in standard deviations of what is known of any projector, after which no other follows."""
+_STILL = 1e-6  # Step, in standard deviations of what is known of any projector, after which no other follows
 
-_DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)
-"""Damping of a step that is tried in turn, over the curvature."""
+_DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)  # Damping of a step that is tried in turn, over the curvature
 
-_N = 12
-"""Principal components of a tone curve that are kept: the next ones have standard deviations below .003."""
+_N = 12  # Principal components of a tone curve that are kept: the next ones have standard deviations below .003
 
 _CURVES, _OVERLAPS = 4 * _N, len(_TERMS) * len(_OVERLAP_NODES)
 

@@ -19,34 +19,28 @@ _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
-_FAR = 5.0
-"""Standard deviations from which on a cell is far off: noise alone has one in a million comparisons there."""
+_FAR = 5.0  # Standard deviations from which on a cell is far off: noise alone has one in a million comparisons there
 
+# Standard deviations from which on a cell that stands alone is not what the print shows elsewhere (chosen: 707 frames
+# of a full chart are 70 million comparisons, and no polynomial is exact at the cube's corners).
 _ALONE = 8.0
-"""Standard deviations from which on a cell that stands alone is not what the print shows elsewhere (chosen: 707 frames
-of a full chart are 70 million comparisons, and no polynomial is exact at the cube's corners)."""
 
-_LEAST_ALONE = 0.05
-"""Deviation of such a cell, at least, as a share (chosen)."""
+_LEAST_ALONE = 0.05  # Deviation of such a cell, at least, as a share (chosen)
 
-_ALSO = 3.0
-"""Standard deviations from which on a cell is part of a place that it touches."""
+_ALSO = 3.0  # Standard deviations from which on a cell is part of a place that it touches
 
+# Standard deviation of what a cell's code predicts, at least, as a share: photosites answer to some 0.4 % alike.
 LEAST_MODEL_ERROR = 0.004
-"""Standard deviation of what a cell's code predicts, at least, as a share: photosites answer to some 0.4 % alike."""
 
+# Number of places of a size that a frame has by chance, from which on one of that size says nothing (chosen; in
+# frames of healthy rooms hardly a cell is far off, and two next to each other need two).
 _BY_CHANCE = 0.1
-"""Number of places of a size that a frame has by chance, from which on one of that size says nothing (chosen; in frames
-of healthy rooms hardly a cell is far off, and two next to each other need two)."""
 
-_NEXT = 1.6
-"""Distance, in distances of the nearest cell, up to which cells touch: diagonal ones do, 1.41."""
+_NEXT = 1.6  # Distance, in distances of the nearest cell, up to which cells touch: diagonal ones do, 1.41
 
-AROUND = 8
-"""Cells that touch one, at most."""
+AROUND = 8  # Cells that touch one, at most
 
-_ALIKE = 6
-"""Nearest codes that a cell is held against: one step along each axis of a cube of colours, either way."""
+_ALIKE = 6  # Nearest codes that a cell is held against: one step along each axis of a cube of colours, either way
 
 
 class SmallPlaces:

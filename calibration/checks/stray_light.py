@@ -19,21 +19,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-CERTAIN = 4.0
-"""Standard errors that are taken off each amount, so that noise is not taken for light."""
+CERTAIN = 4.0  # Standard errors that are taken off each amount, so that noise is not taken for light
 
+# Share of what white has beyond the primaries' sum that lights of two primaries may have of the third: a projector
+# that adds light where primaries overlap adds mostly theirs. What is wrong with the primaries' frames looks like such
+# a boost, so that the check becomes less sharp by it, but never switches itself off (judgement).
 BOOST_ELSEWHERE = 0.25
-"""Share of what white has beyond the primaries' sum that lights of two primaries may have of the third: a projector
-that adds light where primaries overlap adds mostly theirs. What is wrong with the primaries' frames looks like such a
-boost, so that the check becomes less sharp by it, but never switches itself off (judgement)."""
 
+# Amount beyond which it is no light of a room, but another light's frame or another exposure, which other figures
+# find (judgement).
 _LARGEST = 0.1
-"""Amount beyond which it is no light of a room, but another light's frame or another exposure, which other figures
-find (judgement)."""
 
+# Least singular value of the primaries' whites over the largest for amounts to be known (judgement): cameras have 0.1
+# and more.
 _LEAST_SHARE = 0.02
-"""Least singular value of the primaries' whites over the largest for amounts to be known (judgement): cameras have
-0.1 and more."""
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -177,21 +176,18 @@ def _are_alone(amounts: _Array, lights_of: _Mask, spread: _Array, share: float) 
     return bool(lacks[holds.any(axis=1)].max() <= _LITTLE * share)
 
 
-_MUCH = 0.5
-"""Amount of a primary from which on a light misses half of what else is in that primary's frame."""
+_MUCH = 0.5  # Amount of a primary from which on a light misses half of what else is in that primary's frame
 
-_WITNESSES = 3
-"""Lights of each primary that must agree (chosen: one could hold as much other light as it misses)."""
+_WITNESSES = 3  # Lights of each primary that must agree (chosen: one could hold as much other light as it misses)
 
+# Share of what primaries exceed white by that lights may lack of it, noise included, for the primaries to be alone.
 _LITTLE = 0.25
-"""Share of what primaries exceed white by that lights may lack of it, noise included, for the primaries to be alone."""
 
-_FULL = 255
-"""Code of a primary at its brightest."""
+_FULL = 255  # Code of a primary at its brightest
 
+# Standard deviation of a frame's brightness over the range of that of two or three white frames: 0.6 of three.
 _FLICKERS = 0.5
-"""Standard deviation of a frame's brightness over the range of that of two or three white frames: 0.6 of three."""
 
+# Range of what the primaries exceed white by, over its mean, up to which they do alike: daylight against a lamp's
+# white differs by less, frames of the primaries in a flicker by more (judgement).
 _ALIKE = 0.6
-"""Range of what the primaries exceed white by, over its mean, up to which they do alike: daylight against a lamp's
-white differs by less, frames of the primaries in a flicker by more (judgement)."""

@@ -23,11 +23,10 @@ if TYPE_CHECKING:
 
 Sense = Literal["at most", "at least"]
 Outcome = Literal["accept", "accept with remarks", "refuse"]
-OUTCOMES: Final[tuple[Outcome, ...]] = get_args(Outcome)
-"""From the best to the worst."""
+OUTCOMES: Final[tuple[Outcome, ...]] = get_args(Outcome)  # From the best to the worst
 
+# What a scientist asks about, one question a group of the report; no figure is of devices.
 Group = Literal["geometry", "light", "radiometry", "noise", "truth", "devices"]
-"""What a scientist asks about, one question a group of the report; no figure is of devices."""
 
 QUESTIONS: Final[dict[Group, str]] = {
     "geometry": "Was the chart found, and does each sample lie in its cell?",
@@ -37,25 +36,22 @@ QUESTIONS: Final[dict[Group, str]] = {
     "truth": "How well is each light's colour known?",
 }
 
+# Names of the report's pictures (`calibration.report.report`).
 Drawing = Literal[
     "chart", "lights", "budget", "errors", "noise", "residuals", "field", "course"
 ]  # fmt: skip
-"""Names of the report's pictures (`calibration.report.report`)."""
 
-JUDGEMENT: Final = "judgement"
-"""The source of a limit that nothing but experience supports."""
+JUDGEMENT: Final = "judgement"  # The source of a limit that nothing but experience supports
 
+# The source of a limit found in rooms whose truth is known (`benchmarks.rooms`, `benchmarks.accuracy`).
 SIMULATED: Final = "measured on simulated frames"
-"""The source of a limit found in rooms whose truth is known (`benchmarks.rooms`, `benchmarks.accuracy`)."""
 
-Range = tuple[float | None, float | None]
-"""Lowest and highest value; None where open."""
+Range = tuple[float | None, float | None]  # Lowest and highest value; None where open
 
+# Below it a figure is nothing: every limit that is not 0 is a thousand times as high and more (rounding of sums).
 _SMALL = 1e-7
-"""Below it a figure is nothing: every limit that is not 0 is a thousand times as high and more (rounding of sums)."""
 
-_LARGE = 1000.0
-"""From here on three significant digits would be written with an exponent."""
+_LARGE = 1000.0  # From here on three significant digits would be written with an exponent
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from calibration.measurements import TableMeasurements
     from experiment.chart.model import Chart
 
-_LEAST_CELLS = 8**4
-"""Cells from which on a veil is told from other smooth light."""
+_LEAST_CELLS = 8**4  # Cells from which on a veil is told from other smooth light
 
 _FLATTEN = "hang the print flatter"
 _LESS_VEIL = (
@@ -97,7 +96,6 @@ def _bleed(table: TableMeasurements) -> float:
 
 
 def _window_row(table: TableMeasurements) -> SummaryRow:
-    """Return what windows the cells allow."""
     registration, window = table.registration, table.cells.window
     largest = largest_window(registration.cell_px, registration.blur_px)
     safe = f"{100 * SAFE_BLEED:g} %"

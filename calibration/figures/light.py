@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from calibration.measurements import FrameMeasurements, TableMeasurements
     from experiment.session.records import FrameRecord
 
-_PAIRS = 4
-"""Pairs of exchanged lights that a remark names; the report has all."""
+_PAIRS = 4  # Pairs of exchanged lights that a remark names; the report has all
 
 _WARM_UP = "let the lamp warm up for longer before the session"
 
@@ -295,8 +294,7 @@ def _too_dark(table: TableMeasurements) -> float | None:
     return float(certain.max()) if (beyond > 0).all() and (beyond <= allowed).all() and (certain > 0).any() else 0.0
 
 
-_DARK_ALLOWS = 1.25
-"""Over the dark frames' light, what may have been subtracted too much: all of it, and its error."""
+_DARK_ALLOWS = 1.25  # Over the dark frames' light, what may have been subtracted too much: all of it, and its error
 
 
 TOO_DARK = Figure(

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 _FrameValue = Callable[["TableMeasurements", "FrameMeasurements"], float]
 
+# What helps against each cause of unfit cells (`calibration.pipeline.collecting`).
 _UNFIT_REMEDIES = {
     "outside": "bring all of the chart into the picture",
     "clipped": "expose less",
@@ -53,7 +54,6 @@ _UNFIT_REMEDIES = {
     "lit": "turn print or projector until no lamp, window or bright wall is mirrored on the print",
     "uneven": "focus on the print and keep the camera still",
 }
-"""What helps against each cause of unfit cells (`calibration.pipeline.collecting`)."""
 
 _SAME_EXPOSURE = "keep one exposure and ISO speed for the session, and take these frames again"
 
@@ -215,7 +215,6 @@ REREGISTERED_FRAMES = Figure(
 
 
 def _foreign(frames: tuple[ForeignFrame, ...]) -> str:
-    """Return which frames state otherwise than most, and what."""
     if not frames:
         return ""
     names = first_of([frame.record.file for frame in frames])

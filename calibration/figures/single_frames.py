@@ -84,8 +84,8 @@ ROWS: Final = Limit(
     remedy="check the cable and the memory card, and look at the picture",
 )  # fmt: skip
 
+# What only the live judge measures, besides what LAB.toml limits.
 FRAME_LIMITS: Final = (EMPTY_PHOTOSITES, REPEATED, UNIFORMITY, ROWS)
-"""What only the live judge measures, besides what LAB.toml limits."""
 
+# What only `acquire check` measures.
 RIG_LIMITS: Final = (EVENNESS, TURN, KEYSTONE, NOISE_REDUCTION, DISK, CARD, BATTERY)
-"""What only `acquire check` measures."""

@@ -54,26 +54,21 @@ from foundation.robust import huber_weights, sigma_of
 
 _Array = npt.NDArray[np.float64]
 
+# Of the polynomial in the codes, where there are cells enough: describes inks to a fraction of a per cent.
 CODE_DEGREE = 8
-"""Of the polynomial in the codes, where there are cells enough: describes inks to a fraction of a per cent."""
 
-LIGHT_ORDER = 4
-"""Of the polynomial over the page, where there are cells enough."""
+LIGHT_ORDER = 4  # Of the polynomial over the page, where there are cells enough
 
-_LEAST_CELLS_A_TERM = 5
-"""Cells for each term of the polynomial in the codes; with fewer its degree is lowered."""
+_LEAST_CELLS_A_TERM = 5  # Cells for each term of the polynomial in the codes; with fewer its degree is lowered
 
-_LEAST_COUNTS = 10.0
-"""Counts above black below which a cell's logarithm is mostly noise."""
+_LEAST_COUNTS = 10.0  # Counts above black below which a cell's logarithm is mostly noise
 
+# Counts from which on a cell weighs no more by being brighter: the polynomial's own error exceeds the noise.
 _EVEN_COUNTS = 300.0
-"""Counts from which on a cell weighs no more by being brighter: the polynomial's own error exceeds the noise."""
 
-_PAPER_WORTH = 10.0
-"""Cells that a white reference counts for: its colour needs no polynomial."""
+_PAPER_WORTH = 10.0  # Cells that a white reference counts for: its colour needs no polynomial
 
-_ROUNDS = 5
-"""Reweighted solutions in a row; Huber's weights, squared, have settled by then."""
+_ROUNDS = 5  # Reweighted solutions in a row; Huber's weights, squared, have settled by then
 
 
 def baseline_of(

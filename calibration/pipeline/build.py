@@ -89,22 +89,20 @@ from foundation.folders import clear_folder
 from foundation.records import to_plain
 from foundation.version import software
 
-CHECKPOINT_EVERY = 16
-"""Frames from one checkpoint to the next: what a build that is killed has to do again."""
+CHECKPOINT_EVERY = 16  # Frames from one checkpoint to the next: what a build that is killed has to do again
 
+# Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods.
 METHOD = 17
-"""Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods."""
 
-MOST_THREADS = 8
-"""Each thread holds a raw file and its counts, 110 MB for a 6D Mark II: more would not stay below 2 GB."""
+MOST_THREADS = 8  # Each thread holds a raw file and its counts, 110 MB for a 6D Mark II: more would not stay below 2 GB
 
 _Result = TypeVar("_Result")
 
+# A frame as measured before its turn; None where the chart has to be registered again in it.
 EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
-"""A frame as measured before its turn; None where the chart has to be registered again in it."""
 
+# Writes the report of a result and its session into a folder; `calibration.report.report.write_report`.
 WriteReport = Callable[[BuildResult, Session, Path], None]
-"""Writes the report of a result and its session into a folder; `calibration.report.report.write_report`."""
 
 
 @dataclass(frozen=True)
@@ -437,7 +435,6 @@ def refused_folder(out: Path) -> Path:
 
 
 def _require_dark_frames(session: Session, options: BuildOptions) -> None:
-    """Refuse to subtract dark light that no frame shows."""
     if options.subtract_dark and not any(record.kind == "dark" and record.accepted for record in session.frames()):
         raise FormatError(
             f"{session.folder} has no accepted dark frame, and --subtract-dark takes the light to subtract from them; "
@@ -446,7 +443,6 @@ def _require_dark_frames(session: Session, options: BuildOptions) -> None:
 
 
 def _require_white_frames(selected: SelectedFrames, session: Session, options: BuildOptions) -> None:
-    """Refuse to take out a drift that no frames show."""
     count = sum(record.kind == "white" for record in selected.records)
     if options.correct_drift and count < LEAST_WHITES:
         raise FormatError(
@@ -466,7 +462,6 @@ def thread_count() -> int:
 
 
 def _identity(session: Session, selected: SelectedFrames, options: BuildOptions) -> dict[str, Any]:
-    """Return what the samples depend on besides the frames taken in."""
     return {
         "software": software(),
         "method": METHOD,
@@ -482,12 +477,10 @@ def _identity(session: Session, selected: SelectedFrames, options: BuildOptions)
 
 
 def _frame_keys(selected: SelectedFrames) -> list[str]:
-    """Return what names each frame in a checkpoint."""
     return [f"{record.kind},{record.illumination},{record.sha256}" for record in selected.records]
 
 
 def _checkpoint(done: Accumulator, writer: LutWriter) -> Checkpoint:
-    """Return what a later program goes on from."""
     identity = _identity(done.session, done.selected, done.baseline.options)
     frames = _frame_keys(done.selected)[: len(done.figures)]
     return Checkpoint(identity, frames, done.to_json() | {"sha256": writer.sha256}, done.to_arrays())

@@ -25,8 +25,7 @@ from foundation.files import partial_path, sha256_of, storage_error, sync_folder
 from foundation.folders import held_folder, publish_folder, require_free
 from foundation.pieces import Piece, pieces_of
 
-RECORD = "checkpoint"
-"""Name of the record file in the hidden folder, and the beginning of the names of files of arrays."""
+RECORD = "checkpoint"  # Name of the record file in the hidden folder, and the beginning of the names of files of arrays
 
 
 @dataclass(frozen=True, eq=False)

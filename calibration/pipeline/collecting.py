@@ -39,8 +39,8 @@ from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.records import from_plain, to_plain
 
+# Of the cells' levels, what is taken for paper white: the brightest of all may be a reflection.
 _BRIGHTEST_PERCENTILE = 99.5
-"""Of the cells' levels, what is taken for paper white: the brightest of all may be a reflection."""
 
 _Array = npt.NDArray[np.float64]
 _Arrays = dict[str, npt.NDArray[Any]]

@@ -27,8 +27,7 @@ from foundation.files import file_sha256
 
 _log = logging.getLogger(__name__)
 
-_MORE_WHITES = 3
-"""White frames beside the first that a lens is measured on, where the noise of few cells matters."""
+_MORE_WHITES = 3  # White frames beside the first that a lens is measured on, where the noise of few cells matters
 
 
 @dataclass(frozen=True)
@@ -64,8 +63,7 @@ class BuildOptions:
         return self.window**2
 
 
-PAPER_OPTIONS = BuildOptions()
-"""The paper's options, which hold where none are given."""
+PAPER_OPTIONS = BuildOptions()  # The paper's options, which hold where none are given
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +104,9 @@ class SelectedFrames:
         return record == first or record is next(self._lit)
 
 
-ReportProgress = Callable[[int, int, str], None]
-"""Called with frames done, frames in all, and what is being done."""
+ReportProgress = Callable[[int, int, str], None]  # Called with frames done, frames in all, and what is being done
 
-_SETTING_RIGS = ("lab", "simulated")
-"""Rigs whose settings set the camera; of others they say nothing of the exposure."""
+_SETTING_RIGS = ("lab", "simulated")  # Rigs whose settings set the camera; of others they say nothing of the exposure
 
 
 def select_frames(session: Session) -> SelectedFrames:

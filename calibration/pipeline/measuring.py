@@ -68,16 +68,13 @@ from foundation.robust import MAD_TO_SIGMA
 _Array = npt.NDArray[np.float64]
 _Samples = npt.NDArray[np.float32]
 
-IN_PLACE = Shift(0.0, 0.0, 0.0, 0)
-"""No movement."""
+IN_PLACE = Shift(0.0, 0.0, 0.0, 0)  # No movement
 
 _TAKEN_AGAIN = "or take it again: acquire run LAB.toml SESSION finds such frames by itself"
 
-_OUTLIER_SIGMAS = 6.0
-"""Robust standard deviations from the median beyond which a patch is covered or dirty."""
+_OUTLIER_SIGMAS = 6.0  # Robust standard deviations from the median beyond which a patch is covered or dirty
 
-_FEW_PATCHES = 4
-"""Patches up to which none is left out: of so few, none is surely the one that is wrong."""
+_FEW_PATCHES = 4  # Patches up to which none is left out: of so few, none is surely the one that is wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,8 +254,8 @@ def sites_of(
     return cells, references
 
 
+# What all frames of a session have in common: visible area, shape of the sensor, Bayer pattern.
 SensorLayout = tuple[Area, tuple[int, ...], str]
-"""What all frames of a session have in common: visible area, shape of the sensor, Bayer pattern."""
 
 
 def sensor_layout(mosaic: Mosaic) -> SensorLayout:

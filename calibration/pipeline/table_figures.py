@@ -52,30 +52,28 @@ from foundation.errors import FormatError, InputError
 
 _Array = npt.NDArray[np.float64]
 
+# Standard uncertainty of a frame's black level, counts, beyond what its frames' scatter shows (judgement: masked
+# photosites give .03).
 _BLACK_COUNTS = 0.05
-"""Standard uncertainty of a frame's black level, counts, beyond what its frames' scatter shows (judgement: masked
-photosites give .03)."""
 
+# Standard deviation of photosites' response that is not seen beside their noise (usual of cameras: 0.3 to 1 %).
 _RESPONSE = 0.003
-"""Standard deviation of photosites' response that is not seen beside their noise (usual of cameras: 0.3 to 1 %)."""
 
-_SINGLE_DARK = 0.2
-"""Relative change of dark light over a session, where one dark frame does not show it (judgement)."""
+_SINGLE_DARK = 0.2  # Relative change of dark light over a session, where one dark frame does not show it (judgement)
 
+# Share of the dark light by which dark frames differ from what is there in the lights', where no light shows it
+# (judgement).
 _USUAL_TOO_DARK = 0.2
-"""Share of the dark light by which dark frames differ from what is there in the lights', where no light shows it
-(judgement)."""
 
+# Relative: a lamp that flickers, or a wheel that is cut, within an exposure (judgement: half-second exposures; Heinz
+# et al. 2018).
 _FLICKER = 5e-5
-"""Relative: a lamp that flickers, or a wheel that is cut, within an exposure (judgement: half-second exposures; Heinz
-et al. 2018)."""
 
-_STRAY = 1e-4
-"""Relative: light from beside the print where no figure shows it (judgement)."""
+_STRAY = 1e-4  # Relative: light from beside the print where no figure shows it (judgement)
 
+# Share of the mean square of these two that all channels have in common: a lamp flickers as a whole, a wheel is cut
+# in one primary; walls send back the light that is shown, in their own colour (judgement).
 _COMMON = 0.75
-"""Share of the mean square of these two that all channels have in common: a lamp flickers as a whole, a wheel is cut in
-one primary; walls send back the light that is shown, in their own colour (judgement)."""
 
 
 def budget_of(table: TableMeasurements) -> Budget:
@@ -218,11 +216,10 @@ def _geometry(table: TableMeasurements, white: _Array, cells: _Array) -> Compone
     )  # fmt: skip
 
 
-_LEAST_BITS = 3
-"""Bits of a channel from which on neighbours in colour predict a cell."""
+_LEAST_BITS = 3  # Bits of a channel from which on neighbours in colour predict a cell
 
+# Frames of different exposure times (judgement): with fewer, errors of the stated times look like nonlinearity.
 LEAST_FRAMES = 4
-"""Frames of different exposure times (judgement): with fewer, errors of the stated times look like nonlinearity."""
 
 
 def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
@@ -290,14 +287,13 @@ def _require_in_place(shift: Shift, path: Path) -> None:
         )
 
 
+# Counts that a channel's ground truth has at least, so that it is a direction even where no light is measured.
 _LEAST_WHITE = 1e-3
-"""Counts that a channel's ground truth has at least, so that it is a direction even where no light is measured."""
 
+# Drift of white, as a share and in degrees, up to which white frames are believed: a table is refused beyond.
 _MOST_DRIFT, _MOST_DRIFT_DEG = 0.15, 2.0
-"""Drift of white, as a share and in degrees, up to which white frames are believed: a table is refused beyond."""
 
-_FULL_CODE = 255
-"""Code of a primary at its brightest."""
+_FULL_CODE = 255  # Code of a primary at its brightest
 
 
 def table_figures(done: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:

@@ -24,26 +24,22 @@ from experiment.session.records import FrameRecord
 from foundation.records import FloatArray
 from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
 
-_LEAST_WHITE = 50.0
-"""Counts that paper must have in a channel for a cell's reflectance to be read there."""
+_LEAST_WHITE = 50.0  # Counts that paper must have in a channel for a cell's reflectance to be read there
 
-_MOST_REFLECTANCE = 1.5
-"""Of bare paper's: no print reflects more, but noise in a dim channel may seem to."""
+_MOST_REFLECTANCE = 1.5  # Of bare paper's: no print reflects more, but noise in a dim channel may seem to
 
+# Standard deviations from its patch's median up to which a sample is light: read noise alone passes 6 σ once in 2.5
+# million samples, a chart's.
 _FAR_SIGMA = 6.0
-"""Standard deviations from its patch's median up to which a sample is light: read noise alone passes 6 σ once in 2.5
-million samples, a chart's."""
 
 _Array = npt.NDArray[np.float64]
 
+# Counts above its patch from which a sample is hot: the signal of the darkest cells that are of use, about 30.
 HOT_COUNTS = 32.0
-"""Counts above its patch from which a sample is hot: the signal of the darkest cells that are of use, about 30."""
 
-HOT_SIGMA = 10.0
-"""Read noise alone passes 6 σ once in 2.5 million samples, a chart's."""
+HOT_SIGMA = 10.0  # Read noise alone passes 6 σ once in 2.5 million samples, a chart's
 
-_NEVER = 32767
-"""The excess of a sample that no dark frame has shown yet."""
+_NEVER = 32767  # The excess of a sample that no dark frame has shown yet
 
 
 @dataclass(frozen=True, eq=False)

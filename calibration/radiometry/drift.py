@@ -24,19 +24,18 @@ _Array = npt.NDArray[np.float64]
 
 SaturationSource = Literal["frames", "raw files", "settings"]
 
+# Decimals of the gains, as `lut.json` stores them: samples are divided by the stored number, which undoes it.
 DIGITS = 6
-"""Decimals of the gains, as `lut.json` stores them: samples are divided by the stored number, which undoes it."""
 
+# How `lut.json` says what the saturation of a table is known from.
 _SATURATION_FROM: dict[SaturationSource, str] = {
     "frames": "measured: photosites of this session reached it",
     "raw files": "the raw files' statement, which may be too high, as no photosite of a cell came near; "
     "no sample is affected, but white_level may be",
     "settings": "the settings of the computed camera",
 }
-"""How `lut.json` says what the saturation of a table is known from."""
 
-LEAST_WHITES = 2
-"""White frames that a drift needs: one shows a lamp, and not what becomes of it."""
+LEAST_WHITES = 2  # White frames that a drift needs: one shows a lamp, and not what becomes of it
 
 _Samples = npt.NDArray[np.uint16]
 

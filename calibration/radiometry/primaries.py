@@ -23,11 +23,10 @@ from experiment.measures.paper import FlatField, Paper
 
 _Array = npt.NDArray[np.float64]
 
+# Counts above black that paper must show under a primary for its field to be known well enough (judgement).
 LEAST_PAPER = 300.0
-"""Counts above black that paper must show under a primary for its field to be known well enough (judgement)."""
 
-_LARGEST = 0.2
-"""Share by which a cell's field may differ from paper's; beyond, the difference is noise and left out."""
+_LARGEST = 0.2  # Share by which a cell's field may differ from paper's; beyond, the difference is noise and left out
 
 
 @dataclass(frozen=True, eq=False)

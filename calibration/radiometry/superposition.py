@@ -24,50 +24,39 @@ import numpy.typing as npt
 from experiment.measures.least_squares import code_polynomial
 from foundation.robust import huber_weights, sigma_by_level
 
+# Shares of saturation between which the deviation is interpolated; it is 0 at black.
 NODES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0)
-"""Shares of saturation between which the deviation is interpolated; it is 0 at black."""
 
+# Standard deviation, before it is measured, of the relative deviation at saturation: EMVA 1288 linearity errors of
+# cameras' raw files are below 1 %.
 _USUAL_BEND = 0.01
-"""Standard deviation, before it is measured, of the relative deviation at saturation: EMVA 1288 linearity errors of
-cameras' raw files are below 1 %."""
 
-_USUAL_LOSS = 0.0005
-"""The same of what is lost or added near black, of saturation: some counts of 14 bits."""
+_USUAL_LOSS = 0.0005  # The same of what is lost or added near black, of saturation: some counts of 14 bits
 
-_LOSS_SCALES = (0.0005, 0.002)
-"""Shares of saturation within which that happens."""
+_LOSS_SCALES = (0.0005, 0.002)  # Shares of saturation within which that happens
 
-_USUAL_REST = 0.0003
-"""The same of what is neither, of each level."""
+_USUAL_REST = 0.0003  # The same of what is neither, of each level
 
-_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)
-"""By how much a camera may deviate otherwise than usual."""
+_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)  # By how much a camera may deviate otherwise than usual
 
-_LEAST_PATCHES = 100
-"""Patches in a channel from which on something is said (judgement)."""
+_LEAST_PATCHES = 100  # Patches in a channel from which on something is said (judgement)
 
-_CODE_DEGREE = 4
-"""Of the polynomial in the codes that says what a patch has without its noise."""
+_CODE_DEGREE = 4  # Of the polynomial in the codes that says what a patch has without its noise
 
-_LOOSE = 10.0
-"""Standard deviation of how much of a primary a light has, before it is fitted: nothing is known."""
+_LOOSE = 10.0  # Standard deviation of how much of a primary a light has, before it is fitted: nothing is known
 
-_OWN_SPECTRUM = 0.001
-"""The same of how it differs from channel to channel: a primary keeps its spectrum."""
+_OWN_SPECTRUM = 0.001  # The same of how it differs from channel to channel: a primary keeps its spectrum
 
+# What full white may be: how its primaries differ beside what they have in common, how each does from channel to
+# channel, and how likely that is beforehand (chosen). The primaries as they are alone; these, of a wheel that
+# exposures cut; and light of another spectrum besides, of a projector that brightens white.
 _WHITES = ((0.003, _OWN_SPECTRUM, 0.6), (0.05, _OWN_SPECTRUM, 0.3), (_LOOSE, _LOOSE, 0.1))
-"""What full white may be: how its primaries differ beside what they have in common, how each does from channel to
-channel, and how likely that is beforehand (chosen). The primaries as they are alone; these, of a wheel that exposures
-cut; and light of another spectrum besides, of a projector that brightens white."""
 
-_GROUPS = 12
-"""Groups of like levels, in each of which the scatter is measured."""
+_GROUPS = 12  # Groups of like levels, in each of which the scatter is measured
 
-_ROUNDS = 3
-"""Solutions in a row, each weighted and linearised by the one before."""
+_ROUNDS = 3  # Solutions in a row, each weighted and linearised by the one before
 
-_AMOUNTS = 12
-"""Unknowns before the nodes': of each primary, and what each channel sees otherwise."""
+_AMOUNTS = 12  # Unknowns before the nodes': of each primary, and what each channel sees otherwise
 
 _Array = npt.NDArray[np.float64]
 

@@ -14,15 +14,13 @@ if TYPE_CHECKING:
     from calibration.sampling import PhotonTransfer
     from calibration.table.lut import Lut
 
-_LIGHTS: Final = 6
-"""Lights whose cells are measured: 200 000 cells of a full table tell each number to a percent."""
+_LIGHTS: Final = 6  # Lights whose cells are measured: 200 000 cells of a full table tell each number to a percent
 
+# RMS by which variances may differ from the curve, relative: .006 in the simulated tables of two cameras, and .1
+# where a table has so few cells that a level is known from eight.
 _MISFIT: Final = 0.25
-"""RMS by which variances may differ from the curve, relative: .006 in the simulated tables of two cameras, and .1 where
-a table has so few cells that a level is known from eight."""
 
-_FEWEST: Final = 32
-"""Cells that a curve of three numbers is fitted to at least."""
+_FEWEST: Final = 32  # Cells that a curve of three numbers is fitted to at least
 
 
 def noise_curve(lut: Lut) -> PhotonTransfer | None:

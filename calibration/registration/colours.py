@@ -16,41 +16,33 @@ from experiment.chart.model import Chart
 from experiment.measures.least_squares import code_powers, least_squares
 from foundation.robust import MAD_TO_SIGMA, huber_weights, sigma_of
 
-MIN_COLOURS = 64
-"""Colours below which none is called mismatched: a model fitted on fewer is no judge of one of them."""
+MIN_COLOURS = 64  # Colours below which none is called mismatched: a model fitted on fewer is no judge of one of them
 
+# Usual deviations of a cell from its model beyond which it is mismatched: the model's errors are no normal noise.
 _MISMATCH_SIGMA = 10.0
-"""Usual deviations of a cell from its model beyond which it is mismatched: the model's errors are no normal noise."""
 
-_MISMATCH_SHARE = 0.08
-"""Of paper white: the model's own errors at the gamut's corners stay below."""
+_MISMATCH_SHARE = 0.08  # Of paper white: the model's own errors at the gamut's corners stay below
 
-_NEIGHBOURS = 13
-"""A cell and the twelve within two cells of it."""
+_NEIGHBOURS = 13  # A cell and the twelve within two cells of it
 
+# Share of mismatched neighbours from which on a cell is taken for covered with them (judgement).
 _MISMATCH_NEIGHBOURS = 0.35
-"""Share of mismatched neighbours from which on a cell is taken for covered with them (judgement)."""
 
-_SLIP_CELLS = 16
-"""Cells along a part of the field that is tested for a slip, at most."""
+_SLIP_CELLS = 16  # Cells along a part of the field that is tested for a slip, at most
 
-_SLIP = 0.5
-"""Cells by which a part must seem to be displaced: half the way to the next."""
+_SLIP = 0.5  # Cells by which a part must seem to be displaced: half the way to the next
 
-_SLIP_SIGMAS = 6.0
-"""Standard errors that a slip must have, too."""
+_SLIP_SIGMAS = 6.0  # Standard errors that a slip must have, too
 
-_PART_WORTH = 8
-"""Independent measurements that a part counts for: the misfit of the colours is alike over many cells."""
+_PART_WORTH = 8  # Independent measurements that a part counts for: the misfit of the colours is alike over many cells
 
+# Of paper white: what the model of the colours leaves, and what noise may add to it at most.
 _COLOUR_MISFIT, _MOST_NOISE = 0.003, 0.01
-"""Of paper white: what the model of the colours leaves, and what noise may add to it at most."""
 
-_MOST_MISFIT = 20.0
-"""Usual errors beyond which a cell's error counts no more."""
+_MOST_MISFIT = 20.0  # Usual errors beyond which a cell's error counts no more
 
+# Standard deviation of normal values over the median size of their neighbours' differences: 1 / (√2 Φ⁻¹(3/4)).
 _DIFFERENCE_TO_SIGMA = 1.0484
-"""Standard deviation of normal values over the median size of their neighbours' differences: 1 / (√2 Φ⁻¹(3/4))."""
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]

@@ -29,60 +29,56 @@ from drivers.raw.rawfile import CHANNELS, Channel
 from experiment.framing.homography import fit_homography, on_one_line, project
 from foundation.errors import RegistrationError
 
+# Pairs from which on all four coefficients are fitted, or the first: the corners of twelve tags and of four. Fewer do
+# not determine them, and each would fit noise.
 _PAIRS_FOR_ALL, _PAIRS_FOR_ONE = 48, 16
-"""Pairs from which on all four coefficients are fitted, or the first: the corners of twelve tags and of four. Fewer do
-not determine them, and each would fit noise."""
 
+# Focal length over half the frame's diagonal, as it is taken to be: a tilt of 2° is then seen to move the foot of the
+# camera's perpendicular by 3 to 5 % of the diagonal, where with lenses of 1.5 to .8 diagonals it moves by 5 to 3 %.
 _FOCAL_RADII = 2.2
-"""Focal length over half the frame's diagonal, as it is taken to be: a tilt of 2° is then seen to move the foot of the
-camera's perpendicular by 3 to 5 % of the diagonal, where with lenses of 1.5 to .8 diagonals it moves by 5 to 3 %."""
 
-_STEP = 1e-3
-"""Of the distance, by which points leave the plane: small enough for a straight line."""
+_STEP = 1e-3  # Of the distance, by which points leave the plane: small enough for a straight line
 
 _ON_ONE_LINE = (
     "the marks of the chart that were found lie on one line, and marks spread over the sheet are expected; bring all "
     "of the chart into the frame, and uncover it"
 )
 
+# Usual second difference of the displacement between knots: a wave of 2 px amplitude every 20 knots, or of 0.2 px
+# every 6. Where cells measure it, shorter waves are followed as well.
 ROUGHNESS_PX = 0.2
-"""Usual second difference of the displacement between knots: a wave of 2 px amplitude every 20 knots, or of 0.2 px
-every 6. Where cells measure it, shorter waves are followed as well."""
 
+# The same of a sheet that waves by 6 mm every 150 mm: rougher ones are refused, and not followed.
 MOST_ROUGHNESS_PX = 2.0
-"""The same of a sheet that waves by 6 mm every 150 mm: rougher ones are refused, and not followed."""
 
+# Usual displacement, half a field from its middle, by what is no height: a lens's distortion beyond Brown's, paper
+# that has grown in damp air (judgement).
 _IN_PLANE_PX = 2.0
-"""Usual displacement, half a field from its middle, by what is no height: a lens's distortion beyond Brown's, paper
-that has grown in damp air (judgement)."""
 
+# px⁻², on the diagonal: keeps knots that no measurement reaches solvable, and is nothing to a measured cell's.
 _RIDGE = 1e-3
-"""px⁻², on the diagonal: keeps knots that no measurement reaches solvable, and is nothing to a measured cell's."""
 
+# Draws from the posterior distribution: of 64 values a standard deviation is known to 9 %; always the same.
 _DRAWS, _SEED = 32, 20
-"""Draws from the posterior distribution: of 64 values a standard deviation is known to 9 %; always the same."""
 
 _Array = npt.NDArray[np.float64]
 
+# Shift at the frame's corner by which a term is taken to be 0 before it is measured: lenses have 0 to 1 px. It
+# decides only under lights that leave a channel dark.
 _USUAL_PX = 2.0
-"""Shift at the frame's corner by which a term is taken to be 0 before it is measured: lenses have 0 to 1 px. It decides
-only under lights that leave a channel dark."""
 
+# Standard error of each term that no number of cells takes away: what the model of the colours leaves is alike over
+# the frame (simulated frames: .003 to .009 px at the corner without aberration, .02 in a dim light).
 _MODEL_PX = 0.01
-"""Standard error of each term that no number of cells takes away: what the model of the colours leaves is alike over
-the frame (simulated frames: .003 to .009 px at the corner without aberration, .02 in a dim light)."""
 
+# Reweighted least squares: blocks that are covered, or whose colours the model misses, end with little weight.
 _ROUNDS = 4
-"""Reweighted least squares: blocks that are covered, or whose colours the model misses, end with little weight."""
 
-_HUBER = 2.0
-"""Usual misfits beyond which a block counts less."""
+_HUBER = 2.0  # Usual misfits beyond which a block counts less
 
-_ONE_DIRECTION = 1e-9
-"""Share of the larger eigenvalue of an information below which the smaller is rounding, and none."""
+_ONE_DIRECTION = 1e-9  # Share of the larger eigenvalue of an information below which the smaller is rounding, and none
 
-_MEDIAN_CHI2 = 3.357
-"""Median of χ² with 4 degrees of freedom: two colours, two directions."""
+_MEDIAN_CHI2 = 3.357  # Median of χ² with 4 degrees of freedom: two colours, two directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +292,6 @@ class Displacement:
         return ways if self.lens is None else [*ways, self.lens.parallax(points_mm)]
 
     def _roughnesses(self, roughness_px: float) -> list[float]:
-        """Return the usual second difference between knots of each group of coefficients, px."""
         if self.lens is None:
             return [roughness_px] * 2
         # Independent bends add up to √(n³ / 3) times their size after n knots.

@@ -32,85 +32,77 @@ from experiment.chart.model import PAPER_WHITE, Chart
 from experiment.framing.homography import rms
 from foundation.errors import RegistrationError
 
+# px⁻²: a block whose place has a standard error of half a pixel or more does not count as compared.
 _LEAST_INFORMATION = 4.0
-"""px⁻²: a block whose place has a standard error of half a pixel or more does not count as compared."""
 
-_MEDIAN_CHI2 = 1.386
-"""Median of χ² with 2 degrees of freedom."""
+_MEDIAN_CHI2 = 1.386  # Median of χ² with 2 degrees of freedom
 
+# Cells along a neighbourhood whose own movements are averaged: one alone is known to .05 px, its noise.
 _AROUND_CELLS = 3
-"""Cells along a neighbourhood whose own movements are averaged: one alone is known to .05 px, its noise."""
 
+# Of the usual cell's information, from which on a cell's movement counts as much as others': a curled rim has less.
 _LEAST_SHARE = 0.15
-"""Of the usual cell's information, from which on a cell's movement counts as much as others': a curled rim has less."""
 
+# Standard error that no number of cells takes away: the print as predicted is not blurred quite as the frame is
+# (simulated frames, small charts and large).
 SYSTEMATIC_PX = 0.01
-"""Standard error that no number of cells takes away: the print as predicted is not blurred quite as the frame is
-(simulated frames, small charts and large)."""
 
+# Square of a place's error for each square of the outline's residual: two axes for the one across, and twice that, as
+# the map bends towards the outline's points and not towards places inside.
 _OF_OUTLINE = 4.0
-"""Square of a place's error for each square of the outline's residual: two axes for the one across, and twice that, as
-the map bends towards the outline's points and not towards places inside."""
 
-_NEAR_MARKS = 24
-"""Points of an outline of 640 whose mean square is that of a part of it: known to a third."""
+_NEAR_MARKS = 24  # Points of an outline of 640 whose mean square is that of a part of it: known to a third
 
-_NOISE = 2.0
-"""Times the noise to be expected of such a mean that are taken off its square: what is left is no noise."""
+_NOISE = 2.0  # Times the noise to be expected of such a mean that are taken off its square: what is left is no noise
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
+# Cells along the blocks that are searched for, and how far, first and then: large ones are never taken for others,
+# small ones follow waves of 150 mm and curled edges to 0.2 … 0.3 px RMS, in simulated frames (of 6 mm).
 _COARSE_BLOCKS = ((10, 1.5), (5, 1.0))
-"""Cells along the blocks that are searched for, and how far, first and then: large ones are never taken for others,
-small ones follow waves of 150 mm and curled edges to 0.2 … 0.3 px RMS, in simulated frames (of 6 mm)."""
 
+# Cells along the window of the fine comparison: blocks of 6 leave larger errors at the worst cell, .40 px for .38.
 _BLOCK_CELLS = 8
-"""Cells along the window of the fine comparison: blocks of 6 leave larger errors at the worst cell, .40 px for .38."""
 
+# Cells between the displacement's knots: less than a window's, so that the spline follows what windows resolve.
 _KNOT_CELLS = 5
-"""Cells between the displacement's knots: less than a window's, so that the spline follows what windows resolve."""
 
-_COARSE_PER_CELL = 5
-"""Raster elements along a cell where whole blocks are searched for."""
+_COARSE_PER_CELL = 5  # Raster elements along a cell where whole blocks are searched for
 
+# Raster elements for each pixel of a cell in the fine comparison, and how many a cell has.
 _PER_CELL_PX, _LEAST_PER_CELL, _MOST_PER_CELL = 0.8, 8, 16
-"""Raster elements for each pixel of a cell in the fine comparison, and how many a cell has."""
 
+# Cells along the window within which gain and offset are constant where print and frame are blurred by cells.
 _FOLLOWED_CELLS = 12
-"""Cells along the window within which gain and offset are constant where print and frame are blurred by cells."""
 
+# Independent measurements that such a window counts for: what the colours leave is alike over many cells.
 _WINDOW_WORTH = 4
-"""Independent measurements that such a window counts for: what the colours leave is alike over many cells."""
 
-_RIM_SIGMAS = 3.0
-"""Standard deviations of the blur by which the field's rim is left out."""
+_RIM_SIGMAS = 3.0  # Standard deviations of the blur by which the field's rim is left out
 
+# How many neighbouring elements the misfit of the colours is alike over, where steps of colour are all there is.
 _COLOURS_REPEAT = 10
-"""How many neighbouring elements the misfit of the colours is alike over, where steps of colour are all there is."""
 
+# Of a cell: standard error of places by what the model of a smooth order's colours misses. It is taken for a
+# movement, alike over many cells (simulated frames: .002 to .005 RMS at cells of 8 to 23 px).
 _COLOURS_SHIFT = 0.005
-"""Of a cell: standard error of places by what the model of a smooth order's colours misses. It is taken for a movement,
-alike over many cells (simulated frames: .002 to .005 RMS at cells of 8 to 23 px)."""
 
-_BLURRED_CELLS = 0.6
-"""Blur in cells at which blocks of a smooth order are compared with the chart's."""
+_BLURRED_CELLS = 0.6  # Blur in cells at which blocks of a smooth order are compared with the chart's
 
-_LEAST_BLOCK_SCORE = 0.3
-"""Median correlation of the blocks that are searched for; blocks of another chart give about 0."""
+_LEAST_BLOCK_SCORE = 0.3  # Median correlation of the blocks that are searched for; blocks of another chart give about 0
 
+# Patches that the colour model is fitted on: more do not improve a polynomial of some dozen terms.
 _COLOUR_PATCHES = 5000
-"""Patches that the colour model is fitted on: more do not improve a polynomial of some dozen terms."""
 
-_LENS_POINTS = 2000
-"""Cells that the lens is fitted to again: more do not improve a dozen parameters."""
+_LENS_POINTS = 2000  # Cells that the lens is fitted to again: more do not improve a dozen parameters
 
+# How well they are known then (judgement): what is lost of the displacement, .02 px, the next steps measure again.
 _LENS_POINT_SIGMA_PX = 0.1
-"""How well they are known then (judgement): what is lost of the displacement, .02 px, the next steps measure again."""
 
+# σ that cubic interpolation adds to a frame's edges: measured on edges of σ 0.4 to 0.7 px, less where they are
+# softer. Without it in the template, the error of the cells' places is half as large again.
 _INTERPOLATION_PX = 0.28
-"""σ that cubic interpolation adds to a frame's edges: measured on edges of σ 0.4 to 0.7 px, less where they are softer.
-Without it in the template, the error of the cells' places is half as large again."""
 
 _Float = npt.NDArray[np.float32]
 
@@ -495,7 +487,6 @@ class Matcher:
         self.displacement = flat.fitted(points, known, left / _LENS_POINT_SIGMA_PX**2, self._roughness_px)
 
     def _compared_softly(self, sigma_cells: float) -> TileComparison:
-        """Return the comparison of print and frame, both blurred by some cells."""
         n = _COARSE_PER_CELL
         raster = Raster.of(self._low, self._cell / n, self._cells_across * n)
         cover = raster.coverage(self._centres, self._sizes)

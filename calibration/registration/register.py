@@ -28,57 +28,53 @@ from experiment.framing.sharpness import blur_px
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
 
+# What the place of a cell of 10 px may be off by, at most (`Registration.expanded_px`): at 0.5 px the outermost of
+# its 25 pixels, rounding included, has 0.1 % of its light from the next cell at a blur of 0.7 px
+# (`calibration.sampling`).
 MAX_PLACE_ERROR_PX = 0.5
-"""What the place of a cell of 10 px may be off by, at most (`Registration.expanded_px`): at 0.5 px the outermost of its
-25 pixels, rounding included, has 0.1 % of its light from the next cell at a blur of 0.7 px (`calibration.sampling`)."""
 
-CLEARANCE_PX = 1.75
-"""From there to the edge of a cell of 10 px, for which the limits of places were found."""
+CLEARANCE_PX = 1.75  # From there to the edge of a cell of 10 px, for which the limits of places were found
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
+# RMS of the tags against homography and distortion; 2.3 is a sheet that waves by 6 mm and curls by 10.
 MAX_TAG_RESIDUAL_PX = 8.0
-"""RMS of the tags against homography and distortion; 2.3 is a sheet that waves by 6 mm and curls by 10."""
 
+# Least correlation of the cells' colours with those predicted; another order of cells gives about 0.
 MIN_AGREEMENT = 0.8
-"""Least correlation of the cells' colours with those predicted; another order of cells gives about 0."""
 
+# The same for a chart without tags, whose smooth order a model of colours can follow into a cover; 0.99 is usual.
 MIN_PLAIN_AGREEMENT = 0.95
-"""The same for a chart without tags, whose smooth order a model of colours can follow into a cover; 0.99 is usual."""
 
-MIN_GOOD_BLOCKS = 0.75
-"""Least share of the blocks of cells that look as the chart has them (judgement)."""
+MIN_GOOD_BLOCKS = 0.75  # Least share of the blocks of cells that look as the chart has them (judgement)
 
+# RMS displacement that blocks may still need, for cells of 10 px: twice what the samples' reach allows for, and more
+# than ten times what a sheet that waves by 3 mm leaves in simulated frames.
 MAX_BLOCK_RESIDUAL_PX = 0.5
-"""RMS displacement that blocks may still need, for cells of 10 px: twice what the samples' reach allows for, and more
-than ten times what a sheet that waves by 3 mm leaves in simulated frames."""
 
+# Steps at most; each is the cost of a comparison of all cells. A flat print takes two or three, curled ones five.
 _GAUSS_NEWTON_STEPS = 8
-"""Steps at most; each is the cost of a comparison of all cells. A flat print takes two or three, curled ones five."""
 
+# Movements of a step below which there is none to follow: RMS, and of the cell that moves most. Half of either is
+# left at most: the map's own error. A curled rim comes last, when the RMS shows nothing of it.
 _SETTLED_PX, _SETTLED_CELL_PX = 0.015, 0.15
-"""Movements of a step below which there is none to follow: RMS, and of the cell that moves most. Half of either is left
-at most: the map's own error. A curled rim comes last, when the RMS shows nothing of it."""
 
-_TAG_SIGMA_PX = 0.15
-"""Standard error of a tag's corner: 0.085 px measured in white light, .20 in a weak one."""
+_TAG_SIGMA_PX = 0.15  # Standard error of a tag's corner: 0.085 px measured in white light, .20 in a weak one
 
-_LEAST_TAG_SIGMA_PX = 0.03
-"""The same at best: what the detector leaves in the sharpest frames."""
+_LEAST_TAG_SIGMA_PX = 0.03  # The same at best: what the detector leaves in the sharpest frames
 
-_OUTLINE_SIGMA_PX = 0.1
-"""Standard error of a point of the outline, across it (judgement)."""
+_OUTLINE_SIGMA_PX = 0.1  # Standard error of a point of the outline, across it (judgement)
 
+# Points of an outline further from its run than five of their standard deviations, and a pixel, are not of it.
 _APART, _APART_PX = 5.0, 1.0
-"""Points of an outline further from its run than five of their standard deviations, and a pixel, are not of it."""
 
+# Blur in cells of the steps that follow a chart without tags, before its cells are looked at.
 _FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
-"""Blur in cells of the steps that follow a chart without tags, before its cells are looked at."""
 
+# Number and share of a field's parts from which on it is refused: none looks slipped in any simulated room that is
+# registered well.
 _FEW_SLIPPED, _SLIPPED_SHARE = 2, 0.015
-"""Number and share of a field's parts from which on it is refused: none looks slipped in any simulated room that is
-registered well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,7 +313,6 @@ def _require_own_cells(matcher: Matcher, mismatched_cells: _Mask, what: str) -> 
 
 
 def _cell_px(lens: Lens, chart: Chart) -> float:
-    """Return the shorter side of the smallest cell, half-size px."""
     half = np.array(chart.cell_mm) / 2
     across = [lens.to_pixels(chart.centres_mm + half * sign) for sign in ((-1, 0), (1, 0), (0, -1), (0, 1))]
     sides = [np.linalg.norm(across[1] - across[0], axis=1), np.linalg.norm(across[3] - across[2], axis=1)]
@@ -339,7 +334,6 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
 
 
 def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
-    """Return the map with all figures of its quality."""
     seen, expected, paper = matcher.patches()
     there = np.asarray(np.isfinite(seen).all(axis=1))
     residual = marks.residual_px(matcher.in_channels(marks.points_mm))
@@ -377,7 +371,6 @@ def _without_mismatched_cells(blocks: Blocks, mismatched_cells: _Mask, chart: Ch
 
 
 def _judge(registration: Registration, least_agreement: float, what: str) -> None:
-    """Refuse a registration that would build a wrong table."""
     blocks = registration.blocks
     if registration.agreement < least_agreement:
         raise not_this_chart(

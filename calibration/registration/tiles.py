@@ -21,36 +21,32 @@ from foundation.robust import sigma_of
 
 _Array = npt.NDArray[np.float64]
 
-ToPixels = Callable[[_Array], _Array]
-"""From points (N, 2) mm to places (N, 2) px."""
+ToPixels = Callable[[_Array], _Array]  # From points (N, 2) mm to places (N, 2) px
 
+# Elements between nodes of the lattice on which maps are computed: bilinear within, they are off by < 0.001 px.
 _LATTICE_STRIDE = 8
-"""Elements between nodes of the lattice on which maps are computed: bilinear within, they are off by < 0.001 px."""
 
+# Least correlation of a part of the frame with the print as predicted, for it to move the map (judgement).
 MIN_SCORE = 0.5
-"""Least correlation of a part of the frame with the print as predicted, for it to move the map (judgement)."""
 
+# Share of a tile's surroundings that must be comparable, for its score to mean anything (judgement).
 _LEAST_SHARE = 0.25
-"""Share of a tile's surroundings that must be comparable, for its score to mean anything (judgement)."""
 
 _Float = npt.NDArray[np.float32]
 
+# Correlation below which a block does not count; other cells than the chart's give about 0, but for chance, which in
+# blocks of few cells reaches .4.
 _LEAST_SCORE, _LEAST_SCORE_OF_FEW = 0.3, 0.5
-"""Correlation below which a block does not count; other cells than the chart's give about 0, but for chance, which in
-blocks of few cells reaches .4."""
 
-_FEW_CELLS = 64
-"""Cells from which on a block has not few."""
+_FEW_CELLS = 64  # Cells from which on a block has not few
 
-_NEIGHBOUR_BLOCKS = 1.6
-"""Blocks that are nearer, in units of their spacing, are neighbours: the eight around."""
+_NEIGHBOUR_BLOCKS = 1.6  # Blocks that are nearer, in units of their spacing, are neighbours: the eight around
 
-_MOST_DISAGREEMENT = 0.6
-"""Cells that a block may move otherwise than its neighbours: more is the neighbouring cell."""
+_MOST_DISAGREEMENT = 0.6  # Cells that a block may move otherwise than its neighbours: more is the neighbouring cell
 
+# Standard error of a block's place, in cells: a tenth of an element of the coarse raster, 0.2 px of cells of 10 px
+# (simulated frames).
 _MOVE_SIGMA_CELLS = 0.02
-"""Standard error of a block's place, in cells: a tenth of an element of the coarse raster, 0.2 px of cells of 10 px
-(simulated frames)."""
 
 _Mask = npt.NDArray[np.bool_]
 

@@ -25,11 +25,9 @@ from experiment.measures.paper import FlatField
 from foundation.colorimetry import decode_srgb
 from foundation.plots import CHANNEL_INK, FAINT, INK, MARK, draw_squares
 
-_PAPER_PERCENTILE = 99.5
-"""What is taken for paper white: brighter are highlights and hot photosites."""
+_PAPER_PERCENTILE = 99.5  # What is taken for paper white: brighter are highlights and hot photosites
 
-_GAMMA = 2.2
-"""Exponent that stands for sRGB's curve where a picture is only looked at."""
+_GAMMA = 2.2  # Exponent that stands for sRGB's curve where a picture is only looked at
 _Mask = npt.NDArray[np.bool_]
 
 
@@ -79,7 +77,6 @@ def draw_registration(figure: Any, picture: _Image, chart: Chart, registration: 
 
 
 def _page_lines(chart: Chart) -> list[_Array]:
-    """Return lines over the cells, every tenth cell or so, as points in mm."""
     low, high = chart.centres_mm.min(axis=0), chart.centres_mm.max(axis=0)
     cell = np.array(chart.cell_mm)
     lines: list[_Array] = []
@@ -103,7 +100,6 @@ def _magnified(
     places: _Array,
     window: int,
 ) -> None:
-    """Draw part of the frame with the outlines of cells and of their samples."""
     height, width = shown.shape[:2]
     left, top = (max(0, int(value - reach)) for value in middle)
     right, bottom = (min(size, int(value + reach) + 2) for value, size in zip(middle, (width, height), strict=True))
@@ -277,8 +273,7 @@ def draw_budget(figure: Any, budget: Budget, levels: _Array) -> None:
     cells.legend(frameon=False, fontsize=8)
 
 
-_BARS_APART = 40
-"""Lights up to which each has a bar of its own, and its number."""
+_BARS_APART = 40  # Lights up to which each has a bar of its own, and its number
 
 
 def _ring(axes: Any, x: float, y: float, text: str) -> None:
@@ -297,8 +292,7 @@ def _ring(axes: Any, x: float, y: float, text: str) -> None:
     )
 
 
-_EDGE = 0.7
-"""Share of a plot's width and height beyond which a name would leave it."""
+_EDGE = 0.7  # Share of a plot's width and height beyond which a name would leave it
 
 
 def _ring_largest(axes: Any, values: Any, table: TableMeasurements, least: bool = False) -> None:
@@ -371,11 +365,10 @@ def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], table: TableMea
     _ring_largest(axes, block, table)
 
 
-_LEAST_LEVEL = 1.0
-"""Counts from which on a level is drawn: the axes are logarithmic."""
+_LEAST_LEVEL = 1.0  # Counts from which on a level is drawn: the axes are logarithmic
 
+# Of the errors of places, where the scale ends: the outermost cells are known much worse than all others.
 _SHOWN_PERCENTILE = 99.0
-"""Of the errors of places, where the scale ends: the outermost cells are known much worse than all others."""
 
 _Image = npt.NDArray[np.float32]
 _Array = npt.NDArray[np.float64]
@@ -412,7 +405,6 @@ def draw_errors(figure: Any, table: TableMeasurements, chart: Chart) -> None:
 
 
 def _mark(axes: Any, place_mm: _Array) -> None:
-    """Ring a place on the print."""
     axes.plot(*place_mm, "o", markersize=13, markerfacecolor="none", markeredgecolor="white", markeredgewidth=2.6)
     axes.plot(*place_mm, "o", markersize=13, markerfacecolor="none", markeredgecolor=MARK, markeredgewidth=1.4)
 
@@ -472,14 +464,12 @@ def draw_noise(figure: Any, noise: tuple[_Array, _Array], transfer: PhotonTransf
         axes.grid(color=FAINT, alpha=0.25, linewidth=0.5)
 
 
-_LEAST_LEVELS = 6
-"""Levels from which on the curve's three parameters are told as the camera's (chosen: twice as many)."""
+_LEAST_LEVELS = 6  # Levels from which on the curve's three parameters are told as the camera's (chosen: twice as many)
 
+# Radius of a circle at least, as a share of the page's width: one about a single cell is not seen in a thumbnail.
 _LEAST_CIRCLE = 0.012
-"""Radius of a circle at least, as a share of the page's width: one about a single cell is not seen in a thumbnail."""
 
-LabelledPlace = tuple[str, PrintPlace]
-"""What is said of a place, in few words, and the place."""
+LabelledPlace = tuple[str, PrintPlace]  # What is said of a place, in few words, and the place
 
 
 def draw_places(figure: Any, picture: _Image, chart: Chart, registration: Registration, places: Any) -> None:

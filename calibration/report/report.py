@@ -61,8 +61,8 @@ from foundation.files import write_whole
 from foundation.pages import render
 from foundation.plots import png_of
 
+# Points across and down the page whose places are told: enough to see how it hung, and how it bent, roughly.
 PLACES = (7, 5)
-"""Points across and down the page whose places are told: enough to see how it hung, and how it bent, roughly."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -154,7 +154,6 @@ def _geometry(table: TableMeasurements) -> dict[str, Any]:
 
 
 def _codes(codes: CodeAgreement) -> dict[str, Any]:
-    """Return how the lights agree with their codes, light by light."""
     return {
         "angle_deg": _short(codes.angle_deg),
         "error_deg": _short(codes.error_deg),
@@ -169,7 +168,6 @@ def _codes(codes: CodeAgreement) -> dict[str, Any]:
 
 
 def _origins(table: TableMeasurements) -> dict[str, Any]:
-    """Return which frames' files state another camera, lens or exposure than most."""
     return {
         name: [
             {"file": frame.record.file, "found": frame.found, "expected": frame.expected}
@@ -215,8 +213,7 @@ def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-MOST_FRAMES = 4
-"""Frames that are drawn with their places: each is read again, and more are looked at by nobody."""
+MOST_FRAMES = 4  # Frames that are drawn with their places: each is read again, and more are looked at by nobody
 
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
@@ -337,11 +334,10 @@ def _place_pictures(result: BuildResult, session: Session) -> list[_Picture]:
     return pictures
 
 
-MOST_UNFIT = 200
-"""Unfit cells that are listed; all of them are in lut.json, and a page of thousands is read by nobody."""
+MOST_UNFIT = 200  # Unfit cells that are listed; all of them are in lut.json, and a page of thousands is read by nobody
 
+# Outcomes, the worst first, as the page says them.
 _WORDS: dict[Outcome, str] = {"refuse": "refuse", "accept with remarks": "remark", "accept": "accept"}
-"""Outcomes, the worst first, as the page says them."""
 
 _ORDER: tuple[Outcome, ...] = tuple(_WORDS)
 
@@ -475,7 +471,6 @@ def _remedy(row: JudgedValue, found: ProbableCause | None, table: TableMeasureme
 
 
 def _cause(found: ProbableCause) -> dict[str, Any]:
-    """Return a finding with its probable cause, frames, place and command."""
     return {
         "title": BY_NAME[found.figure].title,
         "cause": found.decision.cause.name,

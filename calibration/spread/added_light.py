@@ -20,30 +20,24 @@ from calibration.spread.predicting import LevelModel
 from experiment.measures.least_squares import page_polynomial
 from foundation.robust import biweight, sigma_by_level
 
+# Places along the page's longer side at which added light is known; between them it is smooth: a spot of an eighth of
+# the page is.
 _KNOTS = 9
-"""Places along the page's longer side at which added light is known; between them it is smooth: a spot of an eighth of
-the page is."""
 
-_FACTOR_ORDER = 4
-"""Of a smooth factor of all levels, fitted along: an error of the field is no added light."""
+_FACTOR_ORDER = 4  # Of a smooth factor of all levels, fitted along: an error of the field is no added light
 
-_USUAL_FACTOR = 0.003
-"""Standard deviation of its coefficients (chosen)."""
+_USUAL_FACTOR = 0.003  # Standard deviation of its coefficients (chosen)
 
+# Standard deviations of added light that are tried.
 _SIZES = (1e-5, 1e-4, 2e-4, 4e-4, 8e-4, 1.6e-3, 3.2e-3, 6.4e-3, 0.013, 0.026, 0.05)
-"""Standard deviations of added light that are tried."""
 
-MOST_ADDED = 0.05
-"""Share of a cell's level that may have been added for the cell to be used (judgement)."""
+MOST_ADDED = 0.05  # Share of a cell's level that may have been added for the cell to be used (judgement)
 
-_CERTAIN = 4.0
-"""Standard errors that are taken off, so that of some thousand cells none is listed for its noise."""
+_CERTAIN = 4.0  # Standard errors that are taken off, so that of some thousand cells none is listed for its noise
 
-LEAST_LEVEL = 1e-3
-"""Level of a cell below which a relative error is stated as if it had that."""
+LEAST_LEVEL = 1e-3  # Level of a cell below which a relative error is stated as if it had that
 
-_LEAST_CELLS = 200
-"""Cells from which on something is said."""
+_LEAST_CELLS = 200  # Cells from which on something is said
 
 _Array = npt.NDArray[np.float64]
 

@@ -49,20 +49,16 @@ from drivers.raw.rawfile import CHANNELS
 from experiment.measures.least_squares import page_polynomial, page_powers
 from experiment.measures.paper import FlatField
 
-_MARGIN_PX = 12.0
-"""How far from the sheet's edge what lies behind it is looked at."""
+_MARGIN_PX = 12.0  # How far from the sheet's edge what lies behind it is looked at
 
-_LATTICE_PX = 24
-"""Distance of the places at which what lies behind the sheet is looked at."""
+_LATTICE_PX = 24  # Distance of the places at which what lies behind the sheet is looked at
 
+# References of one colour for each term of what is smooth over the page, at least, for them to say anything else.
 _LEAST_REFERENCES = 3
-"""References of one colour for each term of what is smooth over the page, at least, for them to say anything else."""
 
-_FIELD_ORDER = 6
-"""Highest order of the smooth change of white references by which a frame's field would change."""
+_FIELD_ORDER = 6  # Highest order of the smooth change of white references by which a frame's field would change
 
-_LEAST_LEVEL = 1e-3
-"""Level, bare paper 1, below which a cell's relative error is that of such a cell."""
+_LEAST_LEVEL = 1e-3  # Level, bare paper 1, below which a cell's relative error is that of such a cell
 
 _Array = npt.NDArray[np.float64]
 

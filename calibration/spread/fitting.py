@@ -32,153 +32,140 @@ from calibration.spread.predicting import VARYING_BITS, LevelModel
 from experiment.measures.least_squares import page_polynomial, page_powers
 from foundation.robust import sigma_by_level
 
+# σ of the near kernels, half-size px: from where a window of 25 pixels begins to see its neighbours to a slot's
+# width; in steps of two, within which a smooth spread differs from their sum by less than what is measured.
 NEAR_PX = (1.5, 3.0, 6.0)
-"""σ of the near kernels, half-size px: from where a window of 25 pixels begins to see its neighbours to a slot's width;
-in steps of two, within which a smooth spread differs from their sum by less than what is measured."""
 
+# σ of the far kernels: one slot, two, a tenth of a full chart's height, and the widest that it tells from a veil.
+# Power laws, whose reach is all of the frame, are mixtures of them.
 FAR_PX = (12.0, 24.0, 96.0, 384.0)
-"""σ of the far kernels: one slot, two, a tenth of a full chart's height, and the widest that it tells from a veil.
-Power laws, whose reach is all of the frame, are mixtures of them."""
 
+# Terms of a near kernel's share over the frame: aberrations grow with the field angle, and a lens may be decentred,
+# so it is a polynomial, quadratic along either axis (`place_terms`). What is wider comes from scatter, and is the
+# same everywhere.
 PLACES = 9
-"""Terms of a near kernel's share over the frame: aberrations grow with the field angle, and a lens may be decentred, so
-it is a polynomial, quadratic along either axis (`place_terms`). What is wider comes from scatter, and is the same
-everywhere."""
 
 _NEAR_TERMS = PLACES * len(NEAR_PX)
 
 _CHANNEL_TERMS = _NEAR_TERMS + len(FAR_PX) + 1
 
+# Unknowns: for each channel near kernels term by term over the frame, far ones, and the veil.
 TERMS = 3 * _CHANNEL_TERMS
-"""Unknowns: for each channel near kernels term by term over the frame, far ones, and the veil."""
 
+# By how much a kernel must lower the sum of squares, in units of its variance: a share of four standard errors. All
+# together must do as much on parts of the print that they were not fitted on.
 LEAST_GAIN = 16.0
-"""By how much a kernel must lower the sum of squares, in units of its variance: a share of four standard errors. All
-together must do as much on parts of the print that they were not fitted on."""
 
 _Array = npt.NDArray[np.float64]
 
+# Misfit from which on a veil is not told from other light; 1.5 to 3.3 in simulated rooms whose lens has a veil.
 MOST_MISFIT = 5.0
-"""Misfit from which on a veil is not told from other light; 1.5 to 3.3 in simulated rooms whose lens has a veil."""
 
-LEAST_COUNTS = 300.0
-"""Counts above black of bare paper from which on a channel of a frame is used."""
+LEAST_COUNTS = 300.0  # Counts above black of bare paper from which on a channel of a frame is used
 
+# Standard deviation of the coefficients of a smooth factor of cells' levels: errors of the fitted field and of an
+# even print (chosen).
 USUAL_UNEVENNESS = 0.003
-"""Standard deviation of the coefficients of a smooth factor of cells' levels: errors of the fitted field and of an even
-print (chosen)."""
 
-LOOSE_UNEVENNESS = 0.03
-"""The same where several primaries light the print, each with a field of its own (chosen)."""
+LOOSE_UNEVENNESS = 0.03  # The same where several primaries light the print, each with a field of its own (chosen)
 
-FOLDS = 4
-"""Parts of the print, each of which is predicted from the others."""
+FOLDS = 4  # Parts of the print, each of which is predicted from the others
 
+# Parts of the page's width that belong to one fold each, so that every fold has cells all over the print.
 _PATCHWORK = 10
-"""Parts of the page's width that belong to one fold each, so that every fold has cells all over the print."""
 
+# Orders over the page of light that is no kernel's, of smooth factors of a level, as high as a field's, and of a
+# density of ink (its level times its logarithm).
 _SHAPE_ORDER, _FACTOR_ORDER, _INK_ORDER = 4, 6, 2
-"""Orders over the page of light that is no kernel's, of smooth factors of a level, as high as a field's, and of a
-density of ink (its level times its logarithm)."""
 
-DARK_LEVEL = 0.1
-"""Level, bare paper 1, of cells whose counts a sensor's bend is held against paper's."""
+DARK_LEVEL = 0.1  # Level, bare paper 1, of cells whose counts a sensor's bend is held against paper's
 
-_LEAST_BEND = 1e-4
-"""Standard deviation of the sensor's bend, at least."""
+_LEAST_BEND = 1e-4  # Standard deviation of the sensor's bend, at least
 
+# Standard deviation that a share is expected to have at most: keeps kernels solvable that the windows hardly see.
 _PRIOR_SHARE = 0.1
-"""Standard deviation that a share is expected to have at most: keeps kernels solvable that the windows hardly see."""
 
+# Standard deviation of the veil that lenses have before it is measured: 0.3 to 1.5 % by ISO 9358 and ISO 18844. Where
+# a print is lit so evenly that it shows no veil, this is what is known of it.
 USUAL_VEIL = 0.01
-"""Standard deviation of the veil that lenses have before it is measured: 0.3 to 1.5 % by ISO 9358 and ISO 18844. Where
-a print is lit so evenly that it shows no veil, this is what is known of it."""
 
-_WIDE_KERNELS = 2
-"""Far kernels that, as the veil does, look like light that lies smoothly over a part of the print."""
+_WIDE_KERNELS = 2  # Far kernels that, as the veil does, look like light that lies smoothly over a part of the print
 
+# Standard deviation of each far kernel's share before it is measured, beside what the one before lets expect.
 _FAR_STEPS = (0.01, 0.01, 0.004, 0.003)
-"""Standard deviation of each far kernel's share before it is measured, beside what the one before lets expect."""
 
+# How much more than that lenses may have that scatter. Each is as likely beforehand, and is weighed by what the print
+# shows.
 _FAR_SIZES = (0.3, 1.0, 3.0)
-"""How much more than that lenses may have that scatter. Each is as likely beforehand, and is weighed by what the print
-shows."""
 
+# The same, and of near kernels, too, of a lens that does not scatter, and of the veil of one without: coated glass
+# without dust.
 _CLEAN = 0.001
-"""The same, and of near kernels, too, of a lens that does not scatter, and of the veil of one without: coated glass
-without dust."""
 
+# How likely a lens is beforehand that does not scatter, and of these one without a veil (chosen): charts of few
+# colours would else state what they have not seen, several times the error that there is.
 _CLEAN_ODDS, _CLEAN_ODDS_OF_FEW = 0.3, 0.7
-"""How likely a lens is beforehand that does not scatter, and of these one without a veil (chosen): charts of few
-colours would else state what they have not seen, several times the error that there is."""
 
+# How likely one that scatters is without a veil, on charts of few colours; others see it (chosen).
 _CLEAR_ODDS_OF_FEW = 0.3
-"""How likely one that scatters is without a veil, on charts of few colours; others see it (chosen)."""
 
+# Powers of the distance by which scattered light falls, and how much of the law there is far away: polish, scratches
+# and dust (J. E. Harvey, "Light-scattering characteristics of optical surfaces", 1976; I. R. King, "The profile of a
+# star image", 1971), and aberrations, which end within a slot.
 _LAWS = ((2.0, 1.0), (3.0, 1.0), (3.0, _CLEAN))
-"""Powers of the distance by which scattered light falls, and how much of the law there is far away: polish, scratches
-and dust (J. E. Harvey, "Light-scattering characteristics of optical surfaces", 1976; I. R. King, "The profile of a star
-image", 1971), and aberrations, which end within a slot."""
 
-_POWER_ODDS = 0.5
-"""How likely it is that what a lens scatters falls by one of these from its core on (chosen)."""
+_POWER_ODDS = 0.5  # How likely it is that what a lens scatters falls by one of these from its core on (chosen)
 
-_SCATTERED = 0.04
-"""Standard deviation of all that such a lens scatters (chosen)."""
+_SCATTERED = 0.04  # Standard deviation of all that such a lens scatters (chosen)
 
+# Standard deviation of a kernel's share against the law's, relative: of what is seen beside cells follows what lies
+# over all of the frame, channel by channel (chosen).
 _OFF_LAW = 0.35
-"""Standard deviation of a kernel's share against the law's, relative: of what is seen beside cells follows what lies
-over all of the frame, channel by channel (chosen)."""
 
+# As `CHANNELS_APART`, of how a lens's light deviates from a law: the form is the lens's, the amount each channel's
+# (chosen).
 _LAW_APART = 0.7
-"""As `CHANNELS_APART`, of how a lens's light deviates from a law: the form is the lens's, the amount each channel's
-(chosen)."""
 
-_SCATTER_APART = 0.5
-"""The same as `CHANNELS_APART` of such a lens."""
+_SCATTER_APART = 0.5  # The same as `CHANNELS_APART` of such a lens
 
+# Part of a far kernel's share that the next is expected to have: of r⁻² all, of r⁻³ a quarter, of an exponential
+# none. What is known of 24 px says something of 384 px, which charts of few colours do not show.
 _FAR_FALL = 0.5
-"""Part of a far kernel's share that the next is expected to have: of r⁻² all, of r⁻³ a quarter, of an exponential none.
-What is known of 24 px says something of 384 px, which charts of few colours do not show."""
 
+# Standard deviation of a channel's far share against what R, G and B have in common, in parts of that: scatter and
+# reflections at coated glass change that much over the visible spectrum (chosen).
 CHANNELS_APART = 1 / 3
-"""Standard deviation of a channel's far share against what R, G and B have in common, in parts of that: scatter and
-reflections at coated glass change that much over the visible spectrum (chosen)."""
 
+# The same of lenses whose channels are alike, that differ, and whose coatings suit one channel.
 _APART = (0.03, CHANNELS_APART, 0.7)
-"""The same of lenses whose channels are alike, that differ, and whose coatings suit one channel."""
 
+# How likely these are beforehand (chosen); weighed as `_FAR_SIZES` are, so that where the print shows no difference,
+# hardly any is put into it.
 _APART_ODDS = (0.4, 0.4, 0.2)
-"""How likely these are beforehand (chosen); weighed as `_FAR_SIZES` are, so that where the print shows no difference,
-hardly any is put into it."""
 
+# Veil beyond which it is none where shares cannot change over the frame: the worst lens by ISO 9358, and half a
+# standard error. Shoulders that grow threefold to the corners were taken for one of 4.6 %, and cells were 11 % off.
 MOST_VEIL = 0.02
-"""Veil beyond which it is none where shares cannot change over the frame: the worst lens by ISO 9358, and half a
-standard error. Shoulders that grow threefold to the corners were taken for one of 4.6 %, and cells were 11 % off."""
 
+# Misfit of charts of few colours, at least: what was taken for a veil common to the channels, in 46 rooms of
+# `benchmarks.troubles` without one, was 1.6 standard errors without it, RMS; cells' errors are alike in all channels.
 _LEAST_MISFIT = 3.0
-"""Misfit of charts of few colours, at least: what was taken for a veil common to the channels, in 46 rooms of
-`benchmarks.troubles` without one, was 1.6 standard errors without it, RMS; cells' errors are alike in all channels."""
 
-_LEVELS = 40
-"""Groups of like levels, in each of which the scatter is measured."""
+_LEVELS = 40  # Groups of like levels, in each of which the scatter is measured
 
-_HUBER = 3.0
-"""Standard deviations beyond which a cell weighs less."""
+_HUBER = 3.0  # Standard deviations beyond which a cell weighs less
 
-_ROUNDS = 2
-"""Solutions in a row, each weighted by what the one before left."""
+_ROUNDS = 2  # Solutions in a row, each weighted by what the one before left
 
+# Step of a stored share: far below its error, far above what another order of sums changes, so that a table's bytes
+# do not depend on the machine's linear algebra.
 _ROUNDING = 1e-7
-"""Step of a stored share: far below its error, far above what another order of sums changes, so that a table's bytes
-do not depend on the machine's linear algebra."""
 
+# Standard deviation of how a share changes over the frame that is allowed for where cells are too few to see it: half
+# of what mild shoulders of 1 % have (chosen).
 _SMALL_SHARE = 0.002
-"""Standard deviation of how a share changes over the frame that is allowed for where cells are too few to see it: half
-of what mild shoulders of 1 % have (chosen)."""
 
-_EVEN_TERMS = 3
-"""Unknowns of a kernel that is the same all over the frame, at most: one for each channel."""
+_EVEN_TERMS = 3  # Unknowns of a kernel that is the same all over the frame, at most: one for each channel
 
 
 def place_terms(places_px: npt.NDArray[np.floating], frame_px: tuple[int, int]) -> _Array:
@@ -581,7 +568,6 @@ def channels_alike(apart: float = CHANNELS_APART) -> _Array:
 
 
 def _of(normal: _Array, right: _Array, prior: _Array, chosen: npt.NDArray[np.int64]) -> tuple[_Array, _Array, _Array]:
-    """Return equations of some unknowns alone."""
     return normal[np.ix_(chosen, chosen)], right[chosen], prior[np.ix_(chosen, chosen)]
 
 
@@ -713,7 +699,6 @@ def _solved(normal: _Array, right: _Array, prior: _Array, kept: npt.NDArray[np.i
 
 
 def _explained(matrix: _Array, vector: _Array, solution: _Array) -> float:
-    """Return by how much a solution lowers the sum of squares."""
     return float(2 * vector @ solution - solution @ matrix @ solution)
 
 
@@ -758,5 +743,4 @@ def _selected(
 
 
 def _terms(kernels: Sequence[npt.NDArray[np.int64]]) -> npt.NDArray[np.int64]:
-    """Return the unknowns of kernels, ascending."""
     return np.sort(np.concatenate([*kernels, np.zeros(0, dtype=np.int64)]))

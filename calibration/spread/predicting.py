@@ -25,33 +25,26 @@ from scipy.ndimage import uniform_filter
 
 from calibration import kernels
 
+# Bits of a full chart, whose codes stand so near each other that their curvature is less than the noise of a cell.
 FULL_BITS = 5
-"""Bits of a full chart, whose codes stand so near each other that their curvature is less than the noise of a cell."""
 
-VARYING_BITS = 4
-"""Bits of a channel from which on cells are enough to be predicted by their neighbours alone."""
+VARYING_BITS = 4  # Bits of a channel from which on cells are enough to be predicted by their neighbours alone
 
-_BESIDE = 5
-"""Codes along each side of the square in which the usual curvature across an axis is taken."""
+_BESIDE = 5  # Codes along each side of the square in which the usual curvature across an axis is taken
 
+# Steps of a chart of three bits over which the square root of a level changes: its length scale (chosen; fitted ones
+# are 7 to 20).
 _REACH = 16.0
-"""Steps of a chart of three bits over which the square root of a level changes: its length scale (chosen; fitted ones
-are 7 to 20)."""
 
-_NOISES = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)
-"""Noise over the function's own size that is tried."""
+_NOISES = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)  # Noise over the function's own size that is tried
 
-_DARK = 0.02
-"""Level at which read noise is as much as that of the light (chosen)."""
+_DARK = 0.02  # Level at which read noise is as much as that of the light (chosen)
 
-_LEAST_LEVEL = 1e-3
-"""Least level of which a square root is taken."""
+_LEAST_LEVEL = 1e-3  # Least level of which a square root is taken
 
-_UNKNOWN = 1e4
-"""Variance of the function's linear part and of cells that cannot be used: nothing is known of either."""
+_UNKNOWN = 1e4  # Variance of the function's linear part and of cells that cannot be used: nothing is known of either
 
-_OUTLIER = 4.0
-"""Standard deviations beyond which a cell is not believed when others are predicted."""
+_OUTLIER = 4.0  # Standard deviations beyond which a cell is not believed when others are predicted
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]

@@ -28,27 +28,23 @@ from drivers.raw.rawfile import CHANNELS, Mosaic, channel_offset_px, phases
 from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 
-PAD = 6
-"""Slots around the outermost patches: margins and what lies behind the print, as far as wide kernels see them."""
+PAD = 6  # Slots around the outermost patches: margins and what lies behind the print, as far as wide kernels see them
 
-_OFF_GRID = 0.02
-"""Part of a slot that a patch may lie beside its grid: rounding of a file, and nothing to a lens."""
+_OFF_GRID = 0.02  # Part of a slot that a patch may lie beside its grid: rounding of a file, and nothing to a lens
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int32]
 
+# Bits of a channel from which on a cell has neighbours in colour whose curvature can be told from chance.
 LEAST_BITS = 3
-"""Bits of a channel from which on a cell has neighbours in colour whose curvature can be told from chance."""
 
+# First, step and number of the offsets of windows that shares are tabulated at: rounding, a quarter pixel of the
+# colour filters, registration and lateral colour stay within 2 px, and cubic terms of a step below 10⁻⁴ of a share.
 _OFFSETS_PX = (-2.0, 1 / 16, 65)
-"""First, step and number of the offsets of windows that shares are tabulated at: rounding, a quarter pixel of the
-colour filters, registration and lateral colour stay within 2 px, and cubic terms of a step below 10⁻⁴ of a share."""
 
-_PITCHES = 9
-"""Sizes of slots that shares are tabulated at, over those that occur."""
+_PITCHES = 9  # Sizes of slots that shares are tabulated at, over those that occur
 
-_FAR_REACH = 3.0
-"""Standard deviations after which a far kernel's tail, 0.3 %, is dropped; it is scaled to keep its sum."""
+_FAR_REACH = 3.0  # Standard deviations after which a far kernel's tail, 0.3 %, is dropped; it is scaled to keep its sum
 
 _Float = npt.NDArray[np.float32]
 

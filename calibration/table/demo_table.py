@@ -13,15 +13,13 @@ from foundation.files import sha256_of
 from foundation.folders import cache_folder
 from foundation.version import software
 
-DEMO: Final = "demo:"
-"""What stands in place of a table's folder."""
+DEMO: Final = "demo:"  # What stands in place of a table's folder
 
 CAMERA: Final = "Canon_EOS_600D"
+# Incandescent lamp to blue sky, a fluorescent lamp and an LED between.
 LIGHTS: Final = "2856K,4000K,D55,D65,FL2,LED-B3,7500K,10000K"
-"""Incandescent lamp to blue sky, a fluorescent lamp and an LED between."""
 
-BITS: Final = 4
-"""Bits kept of each channel: 4096 colours, 5 MB."""
+BITS: Final = 4  # Bits kept of each channel: 4096 colours, 5 MB
 
 _SETTINGS: Final = f"""\
 [room]

@@ -31,56 +31,44 @@ from foundation.records import Record, from_json
 
 FORMAT: Final = "crop.lut"
 
-VERSION: Final = 1
-"""The only version so far."""
+VERSION: Final = 1  # The only version so far
 
-Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-"""A SHA-256 as 64 lowercase hexadecimal digits."""
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]  # A SHA-256 as 64 lowercase hexadecimal digits
 
+# Name of a file that lies in the table's own folder.
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$")]
-"""Name of a file that lies in the table's own folder."""
 
-FRAME_FIELDS: Final = ("kind", "illumination", "file", "sha256")
-"""Columns of a table's `frames.csv` (docs/formats.md)."""
+FRAME_FIELDS: Final = ("kind", "illumination", "file", "sha256")  # Columns of a table's `frames.csv` (docs/formats.md)
 
-MOST_SAMPLES: Final = 1024
-"""Samples of a cell at most: the largest window has 9×9."""
+MOST_SAMPLES: Final = 1024  # Samples of a cell at most: the largest window has 9×9
 
+# What the table was made from and how; written last, so that a folder without it is no table.
 PROVENANCE: Final = "lut.json"
-"""What the table was made from and how; written last, so that a folder without it is no table."""
 
-SAMPLES: Final = "samples.npy"
-"""The samples, uint16 little-endian, C order, [light, colour, sample, RGB]."""
+SAMPLES: Final = "samples.npy"  # The samples, uint16 little-endian, C order, [light, colour, sample, RGB]
 
-ILLUMINATIONS: Final = "illuminations.csv"
-"""The lights and their ground truth."""
+ILLUMINATIONS: Final = "illuminations.csv"  # The lights and their ground truth
 
-FRAMES: Final = "frames.csv"
-"""The raw files that the table was made from; absent in computed tables."""
+FRAMES: Final = "frames.csv"  # The raw files that the table was made from; absent in computed tables
 
-REFERENCES: Final = "references.csv"
-"""The grey references under each light, where the chart has some."""
+REFERENCES: Final = "references.csv"  # The grey references under each light, where the chart has some
 
+# The expanded uncertainty of each light's ground truth, and its causes; absent in computed tables.
 UNCERTAINTY: Final = "uncertainty.csv"
-"""The expanded uncertainty of each light's ground truth, and its causes; absent in computed tables."""
 
-CELLS: Final = "cells.csv"
-"""The expanded relative uncertainty of each cell's mean; absent in computed tables."""
+CELLS: Final = "cells.csv"  # The expanded relative uncertainty of each cell's mean; absent in computed tables
 
-REPORT_PAGE: Final = "report.html"
-"""The report for people."""
+REPORT_PAGE: Final = "report.html"  # The report for people
 
-REPORT_JSON: Final = "report.json"
-"""The report for programs."""
+REPORT_JSON: Final = "report.json"  # The report for programs
 
-SUMS: Final = "SHA256SUMS"
-"""Hashes of all other files of the table, as `sha256sum -c` reads them."""
+SUMS: Final = "SHA256SUMS"  # Hashes of all other files of the table, as `sha256sum -c` reads them
 
 REPORT_FORMAT: Final = "crop.report"
 
-REPORT_VERSION: Final = 1
-"""`format` and `version` of `report.json` (docs/formats.md)."""
+REPORT_VERSION: Final = 1  # `format` and `version` of `report.json` (docs/formats.md)
 
+# Largest sizes of a table's files but its samples: forty times those of 707 lights and 32 768 colours.
 MOST_BYTES: Final = {
     PROVENANCE: 64 << 20,
     ILLUMINATIONS: 16 << 20,
@@ -92,27 +80,24 @@ MOST_BYTES: Final = {
     REPORT_PAGE: 256 << 20,
     SUMS: 64 << 10,
 }
-"""Largest sizes of a table's files but its samples: forty times those of 707 lights and 32 768 colours."""
 
+# Files that a table may do without: no number is read from them, and a table that was fetched has none.
 OPTIONAL: Final = frozenset({REPORT_PAGE})
-"""Files that a table may do without: no number is read from them, and a table that was fetched has none."""
 
 _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")
 _TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, REPORT_PAGE)
 RESTORE: Final = "restore it from a copy, fetch the table again, or build it anew"
 
+# Columns of `illuminations.csv` with the ground truth, after those of the lights.
 WHITE_COLUMNS: Final = ("white_r", "white_g", "white_b")
-"""Columns of `illuminations.csv` with the ground truth, after those of the lights."""
 
-EXPANDED: Final = "expanded_deg"
-"""Column of `uncertainty.csv` with a light's expanded uncertainty."""
+EXPANDED: Final = "expanded_deg"  # Column of `uncertainty.csv` with a light's expanded uncertainty
 
-CELL_COLUMNS: Final = ("expanded_r", "expanded_g", "expanded_b")
-"""Columns of `cells.csv` after the colour's index."""
+CELL_COLUMNS: Final = ("expanded_r", "expanded_g", "expanded_b")  # Columns of `cells.csv` after the colour's index
 
+# A ground truth is below this, in units of samples of 16 bits: what is larger was not measured, and its chromaticity
+# might not be a number.
 MOST_WHITE: Final = 1_000_000
-"""A ground truth is below this, in units of samples of 16 bits: what is larger was not measured, and its chromaticity
-might not be a number."""
 
 
 class Unfit(BaseModel):
@@ -169,7 +154,6 @@ class Provenance(Record):
 
     @model_validator(mode="after")
     def _require_colours(self) -> Self:
-        """Require that unfit cells are cells of the chart."""
         beyond = [cell.colour for cell in self.unfit if cell.colour >= 8**self.bits]
         if beyond:
             raise ValueError(f"unfit: colour {beyond[0]} is none of the {8**self.bits} of {self.bits} bits a channel")

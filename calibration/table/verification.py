@@ -23,7 +23,6 @@ from foundation.errors import FormatError, first_of
 
 
 def _uncertainty(lut: Lut) -> str:
-    """Return in words what the ground truth may be off by."""
     expanded = lut.truth_uncertainty_deg
     if expanded is None:
         return "not stated: the table was computed"

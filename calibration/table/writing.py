@@ -32,8 +32,8 @@ from foundation.files import csv_text, sha256_of, storage_error, write_whole
 
 _Array = npt.NDArray[np.float64]
 
+# Columns of a table's `references.csv` (docs/formats.md).
 REFERENCE_COLUMNS: Final = ("light", "name", "r", "g", "b", "r_error", "g_error", "b_error")
-"""Columns of a table's `references.csv` (docs/formats.md)."""
 
 
 def frames_csv(frames: Sequence[SourceFrame]) -> str:

@@ -51,34 +51,29 @@ from foundation.folders import require_free, whole_folder
 
 FORMAT: Final = "crop.lut.published"
 
-VERSION: Final = 1
-"""The only version so far."""
+VERSION: Final = 1  # The only version so far
 
+# Files that go along where the table has them, the one that makes a folder a table last.
 TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, SUMS, PROVENANCE)
-"""Files that go along where the table has them, the one that makes a folder a table last."""
 
-MOST_LIGHTS: Final = 65_536
-"""Lights of a table that is fetched, at most: a hundred times those of the paper."""
+MOST_LIGHTS: Final = 65_536  # Lights of a table that is fetched, at most: a hundred times those of the paper
 
 _METADATA: Final = "zarr.json"
 
+# The metadata hold all files of the table but samples and page; see `calibration.table.lut.MOST_BYTES`.
 _MOST_METADATA: Final = 256 << 20
-"""The metadata hold all files of the table but samples and page; see `calibration.table.lut.MOST_BYTES`."""
 
-_MOST_HEAD: Final = 10_000
-"""Longest head of an array file that NumPy reads."""
+_MOST_HEAD: Final = 10_000  # Longest head of an array file that NumPy reads
 
+# Codecs of published tables; others are not run, for a store may name any that this machine has.
 _CODECS: Final = frozenset({"sharding_indexed", "bytes", "blosc", "crc32c"})
-"""Codecs of published tables; others are not run, for a store may name any that this machine has."""
 
-HASH: Final = re.compile("[0-9a-f]{64}")
-"""A SHA-256 as it is printed and given."""
+HASH: Final = re.compile("[0-9a-f]{64}")  # A SHA-256 as it is printed and given
 
+# Lights of one object of the store: 100 MB compressed of a full table, a size that stores and networks like.
 SHARD_LIGHTS: Final = 32
-"""Lights of one object of the store: 100 MB compressed of a full table, a size that stores and networks like."""
 
-ReportLights = Callable[[int, int], None]
-"""Called with the number of lights copied, and the number of all."""
+ReportLights = Callable[[int, int], None]  # Called with the number of lights copied, and the number of all
 
 
 def reason_of(error: Exception) -> str:

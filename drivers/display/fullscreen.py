@@ -43,8 +43,7 @@ from foundation.holds import hold
 if TYPE_CHECKING:
     from types import ModuleType
 
-_users = 0
-"""How many need GLFW now."""
+_users = 0  # How many need GLFW now
 
 
 @dataclass(frozen=True)
@@ -182,10 +181,9 @@ COLOUR_BIT: Final = 0x4000
 DITHER: Final = 0x0BD0
 SCISSOR: Final = 0x0C11
 
-BGRA: Final = 0x80E1
-"""The order of channels that the next number is read with (gl.h)."""
+BGRA: Final = 0x80E1  # The order of channels that the next number is read with (gl.h)
+# Read so, a pixel is the number 0xAARRGGBB, which is how drivers keep it: nothing needs converting.
 UNSIGNED_INT_8_8_8_8_REVERSED: Final = 0x8367
-"""Read so, a pixel is the number 0xAARRGGBB, which is how drivers keep it: nothing needs converting."""
 
 
 class OpenGl:
@@ -212,23 +210,19 @@ class OpenGl:
         self.viewport = function("glViewport", number, number, number, number)
 
 
-OPENING_S: Final = 5.0
-"""How long a window may take to fill its display; window managers animate."""
+OPENING_S: Final = 5.0  # How long a window may take to fill its display; window managers animate
 
-CONFIRMING_S: Final = 1.0
-"""How long a frame may take from the swap to the screen; a compositor adds a frame or two."""
+CONFIRMING_S: Final = 1.0  # How long a frame may take from the swap to the screen; a compositor adds a frame or two
 
-RAMP_TOLERANCE: Final = 1.5 / 255
-"""How far a gamma ramp may be from a straight line: drivers end it at 255/256 or at 1."""
+RAMP_TOLERANCE: Final = 1.5 / 255  # How far a gamma ramp may be from a straight line: drivers end it at 255/256 or at 1
 
-_LOOK_AGAIN_S: Final = 0.002
-"""Pause between two looks at the screen: a frame lasts eight of them."""
+_LOOK_AGAIN_S: Final = 0.002  # Pause between two looks at the screen: a frame lasts eight of them
 
+# 0 … 9 in 3×5 blocks, rows from the top.
 _DIGITS: Final = (
     "111101101101111", "010110010010111", "111001111100111", "111001111001111", "101101111001001",
     "111100111001111", "111100111101111", "111001001001001", "111101111101111", "111101111001111",
 )  # fmt: skip
-"""0 … 9 in 3×5 blocks, rows from the top."""
 
 _LOOK: Final = "look for a window or notification in front, desktop scaling, or a colour filter"
 

@@ -24,29 +24,20 @@ import numpy.typing as npt
 
 from foundation.errors import RUN_AGAIN, DeviceError
 
-INPUT_ONLY = 2
-"""Window class of what shows nothing (X protocol, CreateWindow)."""
-VIEWABLE = 2
-"""Map state of a window that is mapped, with all above it (X protocol, GetWindowAttributes)."""
-MAX_TEXT = 256
-"""Bytes of a name that are read: enough to tell one window from another."""
-MAX_DEPTH = 4
-"""Levels below a top window at which its name is looked for; window managers frame a window in one or two."""
+INPUT_ONLY = 2  # Window class of what shows nothing (X protocol, CreateWindow)
+VIEWABLE = 2  # Map state of a window that is mapped, with all above it (X protocol, GetWindowAttributes)
+MAX_TEXT = 256  # Bytes of a name that are read: enough to tell one window from another
+MAX_DEPTH = 4  # Levels below a top window at which its name is looked for; window managers frame a window in one or two
+# Windows looked at for one name, so that a program with thousands of them costs no more than the rest.
 MAX_WINDOWS = 200
-"""Windows looked at for one name, so that a program with thousands of them costs no more than the rest."""
 
-_ANY_TYPE = 0
-"""AnyPropertyType of GetProperty: a name is wanted in whatever encoding it has."""
-_FOUR = 4
-"""GetProperty counts in words of four bytes (X protocol, GetProperty)."""
+_ANY_TYPE = 0  # AnyPropertyType of GetProperty: a name is wanted in whatever encoding it has
+_FOUR = 4  # GetProperty counts in words of four bytes (X protocol, GetProperty)
 
 
-_Z_PIXMAP = 2
-"""Format of GetImage: whole pixels one after the other (X protocol, GetImage; XYPixmap is 1)."""
-_ALL_PLANES = 0xFFFFFFFF
-"""Plane mask of GetImage: every bit of a pixel."""
-_DPMS_ON = 0
-"""Power level of a display that is lit (DPMS extension 1.2, DPMSInfo; 1 standby, 2 suspend, 3 off)."""
+_Z_PIXMAP = 2  # Format of GetImage: whole pixels one after the other (X protocol, GetImage; XYPixmap is 1)
+_ALL_PLANES = 0xFFFFFFFF  # Plane mask of GetImage: every bit of a pixel
+_DPMS_ON = 0  # Power level of a display that is lit (DPMS extension 1.2, DPMSInfo; 1 standby, 2 suspend, 3 off)
 
 
 _lost: set[int] = set()
@@ -115,6 +106,7 @@ _POINTER, _WORD, _HALF, _BYTE, _PLACE = (
     ctypes.c_uint8,
     ctypes.c_int16,
 )
+# The requests that are sent, by their names in libxcb, and the types of what they are given.
 _REQUESTS: dict[str, list[type]] = {
     "get_geometry": [_WORD],
     "get_image": [_BYTE, _WORD, _PLACE, _PLACE, _HALF, _HALF, _WORD],
@@ -124,7 +116,7 @@ _REQUESTS: dict[str, list[type]] = {
     "query_extension": [_HALF, ctypes.c_char_p],
     "query_tree": [_WORD],
 }
-"""The requests that are sent, by their names in libxcb, and the types of what they are given."""
+# What else of libxcb is called: what it returns and takes.
 _CALLS: dict[str, tuple[type | None, list[type]]] = {
     "connect": (_POINTER, [ctypes.c_char_p, ctypes.POINTER(ctypes.c_int)]),
     "connection_has_error": (ctypes.c_int, [_POINTER]),
@@ -140,7 +132,6 @@ _CALLS: dict[str, tuple[type | None, list[type]]] = {
     "request_check": (_POINTER, [_POINTER, _Cookie]),
     "disconnect": (None, [_POINTER]),
 }
-"""What else of libxcb is called: what it returns and takes."""
 
 
 def _library() -> ctypes.CDLL:
@@ -274,7 +265,6 @@ class XScreen:
         return None
 
     def _top_of(self, window: int) -> int:
-        """Return the child of the root that holds a window."""
         for _ in range(2 * MAX_DEPTH):
             parent, _children = self._tree(window)
             if parent in (0, self._root):
@@ -295,7 +285,6 @@ class XScreen:
         return f"a window of {program}" if program else f"a window without a name (0x{top:x})"
 
     def _family(self, top: int) -> Iterator[int]:
-        """Yield a window and what is in it, level by level."""
         level = [top]
         seen = 0
         for _ in range(MAX_DEPTH):

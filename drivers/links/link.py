@@ -94,15 +94,13 @@ class PeerLink:
 
 _log = logging.getLogger(__name__)
 
-POLL_S = 0.1
-"""How long to look for something that may have come and answers no question."""
+POLL_S = 0.1  # How long to look for something that may have come and answers no question
 
-MAX_MESSAGE = 512
-"""Bytes; no message of any language comes near it."""
+MAX_MESSAGE = 512  # Bytes; no message of any language comes near it
 
 _T = TypeVar("_T")
+# Returns the message at the front of the bytes and how many of them it took, or None while it is not whole.
 MessageParser = Callable[[bytes], tuple[_T, int] | None]
-"""Returns the message at the front of the bytes and how many of them it took, or None while it is not whole."""
 
 
 class Exchange:

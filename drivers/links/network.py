@@ -169,11 +169,9 @@ class TcpServer(ClosedAtEnd):
                 self._links.discard(link)
 
 
-POLLING_S = 0.02
-"""How often a peer is asked what it has to say by now: drivers wait seconds for an answer."""
+POLLING_S = 0.02  # How often a peer is asked what it has to say by now: drivers wait seconds for an answer
 
-_TIMEOUT_S = 30.0
-"""Longest wait for a client to take an answer."""
+_TIMEOUT_S = 30.0  # Longest wait for a client to take an answer
 
 
 def serve_peer(peer: Callable[[], Peer], port: int = 0) -> TcpServer:
@@ -195,8 +193,7 @@ def serve_peer(peer: Callable[[], Peer], port: int = 0) -> TcpServer:
 
 ANY_HOST = "0.0.0.0"
 BROADCAST = "255.255.255.255"
-MAX_DATAGRAM = 65535
-"""The length field of UDP has 16 bits (RFC 768), so that no datagram is cut off."""
+MAX_DATAGRAM = 65535  # The length field of UDP has 16 bits (RFC 768), so that no datagram is cut off
 
 Address = tuple[str, int]
 

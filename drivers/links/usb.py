@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from usb.backend import IBackend
 
 
+# Class, subclass and protocol of a still image interface (USB Still Image Capture Device Definition 1.0, clause 4).
 STILL_IMAGE_CLASS: Final = (6, 1, 1)
-"""Class, subclass and protocol of a still image interface (USB Still Image Capture Device Definition 1.0, clause 4)."""
 
 
 class PipeStalled(LinkError):
@@ -91,8 +91,7 @@ class UsbPipes(Protocol):
         """Release the interface; a second call does nothing."""
 
 
-UDEV_RULE = "70-crop-cameras.rules"
-"""The file in `drivers/data` that lets users of a Linux machine open cameras."""
+UDEV_RULE = "70-crop-cameras.rules"  # The file in `drivers/data` that lets users of a Linux machine open cameras
 _FORBIDDEN = (
     f"may not be opened by this user; on Linux install the rule {UDEV_RULE}, as docs/devices.md shows under USB "
     "permission, and plug the camera in again"
@@ -102,18 +101,14 @@ _HELD = (
     "systemctl --user stop gvfs-gphoto2-volume-monitor.service (on macOS: killall ptpcamerad)"
 )
 
-_CLASS_OUT: Final = 0x21
-"""bmRequestType of requests of the class to the interface (USB 2.0, 9.3)."""
-_CLASS_IN: Final = 0xA1
-"""bmRequestType of requests of the class from the interface."""
+_CLASS_OUT: Final = 0x21  # bmRequestType of requests of the class to the interface (USB 2.0, 9.3)
+_CLASS_IN: Final = 0xA1  # bmRequestType of requests of the class from the interface
 
-_BULK: Final = 2
-"""Transfer type in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
-_INTERRUPT: Final = 3
-"""Transfer type, as above."""
+_BULK: Final = 2  # Transfer type in an endpoint's bmAttributes (USB 2.0, 9.6.6)
+_INTERRUPT: Final = 3  # Transfer type, as above
 
+# Longest interval that is believed: a wrong descriptor must not slow the events down to seconds.
 _MAX_POLLING_S: Final = 0.05
-"""Longest interval that is believed: a wrong descriptor must not slow the events down to seconds."""
 
 
 @dataclass(frozen=True)
@@ -279,7 +274,6 @@ class OpenUsbDevice:
             return self._device.get_active_configuration()
 
     def _claim(self, interface: int) -> None:
-        """Claim the interface of this number, also again after a reset of the device."""
         with contextlib.suppress(NotImplementedError):
             if self._device.is_kernel_driver_active(interface):
                 self._device.detach_kernel_driver(interface)

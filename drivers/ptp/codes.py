@@ -338,5 +338,4 @@ class ReleaseButton(IntEnum):
     HALF_AND_FULL = 3
 
 
-VENDOR_CANON_USB = 0x04A9
-"""Canon's USB vendor id."""
+VENDOR_CANON_USB = 0x04A9  # Canon's USB vendor id

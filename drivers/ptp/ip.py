@@ -42,24 +42,15 @@ from drivers.ptp.protocol import (
 from foundation.clock import Clock
 from foundation.errors import DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
-PORT = 15740
-"""TCP port of PTP-IP (CIPA DC-005-2005)."""
-VERSION = 0x00010000
-"""PTP/IP 1.0."""
-_HEADER: Final = struct.Struct("<II")
-"""Length and type of a packet (clause 2.3)."""
-HEADER_LENGTH: Final = _HEADER.size
-"""Bytes of these."""
-_DATA_HEADER: Final = struct.Struct("<III")
-"""The same, and the transaction that data belong to."""
-MAX_PACKET = 4096
-"""Bytes of the longest packet that is no data; the longest real one carries a name of 40 characters."""
-MAX_NAME_UNITS = 255
-"""UTF-16 units of the longest name; the standard allows 39."""
-UNKNOWN_TOTAL = 0xFFFFFFFFFFFFFFFF
-"""Total length of a data phase whose sender does not know it yet."""
-GUID_LENGTH = 16
-"""Bytes of a GUID."""
+PORT = 15740  # TCP port of PTP-IP (CIPA DC-005-2005)
+VERSION = 0x00010000  # PTP/IP 1.0
+_HEADER: Final = struct.Struct("<II")  # Length and type of a packet (clause 2.3)
+HEADER_LENGTH: Final = _HEADER.size  # Bytes of these
+_DATA_HEADER: Final = struct.Struct("<III")  # The same, and the transaction that data belong to
+MAX_PACKET = 4096  # Bytes of the longest packet that is no data; the longest real one carries a name of 40 characters
+MAX_NAME_UNITS = 255  # UTF-16 units of the longest name; the standard allows 39
+UNKNOWN_TOTAL = 0xFFFFFFFFFFFFFFFF  # Total length of a data phase whose sender does not know it yet
+GUID_LENGTH = 16  # Bytes of a GUID
 
 
 class PacketType(IntEnum):
@@ -128,10 +119,8 @@ def _read_sends_data(cursor: Cursor, _: str) -> bool:
     return phase == _DATA_OUT
 
 
-_NO_DATA_OR_IN = 1
-"""Data phase information of an operation without data, or whose data come to the initiator."""
-_DATA_OUT = 2
-"""Data phase information of an operation whose data go to the responder."""
+_NO_DATA_OR_IN = 1  # Data phase information of an operation without data, or whose data come to the initiator
+_DATA_OUT = 2  # Data phase information of an operation whose data go to the responder
 
 Guid = Annotated[bytes, FieldKind(lambda cursor, field: cursor.take(GUID_LENGTH, field), _encode_guid)]
 Name = Annotated[str, FieldKind(_read_name, _encode_name)]
@@ -143,8 +132,8 @@ Total = Annotated[
 SendsData = Annotated[
     bool, FieldKind(_read_sends_data, lambda sends: encode_integer(_DATA_OUT if sends else _NO_DATA_OR_IN, 4))
 ]
+# What a packet's fields are on the wire, beside those of every dataset.
 Request = Annotated[PtpRequest, FieldKind(lambda cursor, _: PtpRequest.read(cursor), PtpRequest.encode)]
-"""What a packet's fields are on the wire, beside those of every dataset."""
 
 
 @dataclass(frozen=True)
@@ -234,8 +223,7 @@ class Pong(PtpDataset):
     """Answers `Ping`."""
 
 
-Packet = PtpDataset
-"""One of `_PACKETS`."""
+Packet = PtpDataset  # One of `_PACKETS`
 
 _PACKETS: dict[int, type[Packet]] = {
     PacketType.INIT_COMMAND_REQUEST: InitCommandRequest,
@@ -341,8 +329,8 @@ class PacketCutter:
         return self._left > 0
 
 
+# How what a server of pages says begins; as packets these would be of a gigabyte.
 _OF_HTTP: Final = (b"HTTP/", b"<!DOC", b"<HTML")
-"""How what a server of pages says begins; as packets these would be of a gigabyte."""
 
 
 def _decode(kind: int, data: bytes) -> Packet:
@@ -368,8 +356,8 @@ def _unusable(what: str) -> ProtocolError:
     return ProtocolError(f"the PTP/IP connection gives {what}; check that a camera answers at this port, and reconnect")
 
 
+# Bytes asked of a link at once: few calls for a long transfer, and no buffer that has to be mapped anew for each.
 READ: Final = 128 * 1024
-"""Bytes asked of a link at once: few calls for a long transfer, and no buffer that has to be mapped anew for each."""
 
 
 class Channel:
@@ -407,29 +395,24 @@ class Channel:
         self._link.close()
 
 
-MAX_EVENTS: Final = 4096
-"""Events kept for a caller who never asks for them."""
+MAX_EVENTS: Final = 4096  # Events kept for a caller who never asks for them
 
-CONNECT_S: Final = 10.0
-"""Wait for each connection and each greeting: a camera wakes its network up in a few seconds."""
+CONNECT_S: Final = 10.0  # Wait for each connection and each greeting: a camera wakes its network up in a few seconds
 
+# How long a connection is tried: devices refuse the second for about 0.1 s after they acknowledged the first.
 EVENT_CHANNEL_S: Final = 2.0
-"""How long a connection is tried: devices refuse the second for about 0.1 s after they acknowledged the first."""
 
-RETRY_S: Final = 0.1
-"""Pause between two such tries."""
+RETRY_S: Final = 0.1  # Pause between two such tries
 
-_PING_EVERY_S: Final = 1.0
-"""Longest wait on the command connection without a look at the event connection."""
+_PING_EVERY_S: Final = 1.0  # Longest wait on the command connection without a look at the event connection
 
+# Packets taken off the event connection at one look: a device that never stops talking must not keep us there.
 _MOST_AT_A_LOOK: Final = 1 << 17
-"""Packets taken off the event connection at one look: a device that never stops talking must not keep us there."""
 
+# Bytes of data in a packet to the device; what libgphoto2 sends, and bodies are used to it.
 DATA_PIECE: Final = 64 * 1024
-"""Bytes of data in a packet to the device; what libgphoto2 sends, and bodies are used to it."""
 
-_CALL_OFF_S: Final = 2.0
-"""Wait for the end of a transaction that was cancelled."""
+_CALL_OFF_S: Final = 2.0  # Wait for the end of a transaction that was cancelled
 
 
 class IpTransport(CableTransport):
@@ -604,8 +587,8 @@ class IpTransport(CableTransport):
         raise DeviceRefused(f"{self._place} refuses the connection; it {why}")
 
 
+# Why a device refuses, and what helps.
 _REFUSALS: dict[int, str] = {
     FailReason.REJECTED: "does not know this computer: pair the two anew in the camera's wireless menu",
     FailReason.BUSY: "is in use by another program or computer: disconnect that one, or switch the camera off and on",
 }
-"""Why a device refuses, and what helps."""

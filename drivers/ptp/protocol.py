@@ -112,16 +112,14 @@ class Cursor:
         return self.integers(self.u32(f"the count of {field}"), size, field, signed)
 
 
+# Bytes of the largest dataset that is read; real ones stay below 10 kB, long lists of handles included.
 MAX_DATASET = 1 << 20
-"""Bytes of the largest dataset that is read; real ones stay below 10 kB, long lists of handles included."""
-_MAX_STRING_UNITS = 254
-"""UTF-16 units of the longest string, its closing NUL not counted."""
+_MAX_STRING_UNITS = 254  # UTF-16 units of the longest string, its closing NUL not counted
 
-Value = int | str | tuple[int, ...]
-"""A property's value: an integer, a string, or an array of integers."""
+Value = int | str | tuple[int, ...]  # A property's value: an integer, a string, or an array of integers
 
-_ARRAY = 0x4000
-"""Bit that makes an array of a type of integers (ISO 15740, table of data type codes)."""
+_ARRAY = 0x4000  # Bit that makes an array of a type of integers (ISO 15740, table of data type codes)
+# Bytes and sign of each integer type.
 _INTEGERS: dict[int, tuple[int, bool]] = {
     DataType.INT8: (1, True),
     DataType.UINT8: (1, False),
@@ -134,7 +132,6 @@ _INTEGERS: dict[int, tuple[int, bool]] = {
     DataType.INT128: (16, True),
     DataType.UINT128: (16, False),
 }
-"""Bytes and sign of each integer type."""
 
 
 def _read_string(cursor: Cursor, field: str) -> str:
@@ -235,8 +232,7 @@ U32 = Annotated[int, _of_type(DataType.UINT32)]
 U64 = Annotated[int, _of_type(DataType.UINT64)]
 U16s = Annotated[tuple[int, ...], _of_type(_ARRAY + DataType.UINT16)]
 Text = Annotated[str, _of_type(DataType.STRING)]
-Rest = Annotated[bytes, FieldKind(lambda cursor, _: cursor.rest(), bytes)]
-"""What a dataset's fields are on the wire."""
+Rest = Annotated[bytes, FieldKind(lambda cursor, _: cursor.rest(), bytes)]  # What a dataset's fields are on the wire
 
 
 class PtpDataset:
@@ -245,7 +241,6 @@ class PtpDataset:
     @classmethod
     @cache
     def _layout(cls) -> tuple[tuple[str, str, FieldKind], ...]:
-        """Return name, name in messages and kind of every field."""
         hints = get_type_hints(cls, include_extras=True).items()
         fields = [(name, hint.__metadata__[0]) for name, hint in hints if get_origin(hint) is Annotated]
         return tuple((name, name.replace("_", " "), kind) for name, kind in fields)
@@ -328,8 +323,7 @@ class StorageInfo(PtpDataset):
     padding: Rest = field(default=b"", repr=False)
 
 
-_NO_FORM, _ENUMERATION = 0, 2
-"""How a property's values are listed (13.3.3): not at all, or one by one."""
+_NO_FORM, _ENUMERATION = 0, 2  # How a property's values are listed (13.3.3): not at all, or one by one
 
 
 @dataclass(frozen=True)
@@ -370,24 +364,19 @@ class DevicePropDesc:
 
 _log = logging.getLogger(__name__)
 
+# Wait for the answer to OpenSession: a body that a killed host left behind never answers before a reset.
 START_TIMEOUT_S = 1.5
-"""Wait for the answer to OpenSession: a body that a killed host left behind never answers before a reset."""
-TIMEOUT_S = 20.0
-"""Wait for every other answer, unless the caller sets another; libgphoto2 waits as long."""
-PASSING_LIMIT_S = 10.0
-"""How long an operation is asked again when a device declines it for the moment."""
-OPEN_TRIES = 3
-"""Tries at OpenSession with a reset between them, as many as libgphoto2 makes."""
+TIMEOUT_S = 20.0  # Wait for every other answer, unless the caller sets another; libgphoto2 waits as long
+PASSING_LIMIT_S = 10.0  # How long an operation is asked again when a device declines it for the moment
+OPEN_TRIES = 3  # Tries at OpenSession with a reset between them, as many as libgphoto2 makes
 
+# Responses that mean: not now.
 PASSING = (ResponseCode.DEVICE_BUSY, ResponseCode.EOS_OBJECT_NOT_READY, ResponseCode.EOS_MEMORY_STATUS_NOT_READY)
-"""Responses that mean: not now."""
 
-_FIRST_PAUSE_S = 0.05
-"""Before the first repetition: short to an operator, long beside the milliseconds of an operation."""
-_LONGEST_PAUSE_S = 1.0
-"""Pauses double up to here, so that a device that is free again waits for a second at most."""
+_FIRST_PAUSE_S = 0.05  # Before the first repetition: short to an operator, long beside the milliseconds of an operation
+_LONGEST_PAUSE_S = 1.0  # Pauses double up to here, so that a device that is free again waits for a second at most
+# Session numbers tried where a device declines the transaction number, as libgphoto2 does; a few, then no more.
 _LAST_SESSION = 8
-"""Session numbers tried where a device declines the transaction number, as libgphoto2 does; a few, then no more."""
 
 
 class OperationDeclined(DeviceRefused):
@@ -493,10 +482,8 @@ class PtpSession:
         return OperationDeclined(f"{self.label} answers {describe(ResponseCode, code)} to {request}{remedy}", code)
 
 
-MAX_PARAMETERS = 5
-"""Parameters of 32 bits that a request, response or event may carry."""
-LAST_TRANSACTION = 0xFFFFFFFE
-"""The highest transaction number; 1 follows it, for 0 and 0xffffffff are taken."""
+MAX_PARAMETERS = 5  # Parameters of 32 bits that a request, response or event may carry
+LAST_TRANSACTION = 0xFFFFFFFE  # The highest transaction number; 1 follows it, for 0 and 0xffffffff are taken
 
 
 def _read_parameters(cursor: Cursor, field: str) -> tuple[int, ...]:
@@ -559,8 +546,8 @@ def next_transaction(transaction: int) -> int:
     return 1 if transaction >= LAST_TRANSACTION else transaction + 1
 
 
+# Bytes of a data phase that a transport collects for a caller who takes none of it piece by piece.
 MAX_COLLECTED = 4 * 1024 * 1024
-"""Bytes of a data phase that a transport collects for a caller who takes none of it piece by piece."""
 
 
 @dataclass(frozen=True)

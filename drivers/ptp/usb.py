@@ -37,16 +37,12 @@ from drivers.ptp.protocol import (
 from foundation.clock import Clock
 from foundation.errors import LinkError, LinkTimeout, ProtocolError
 
-_HEADER: Final = struct.Struct("<IHHI")
-"""Length, type, code and transaction (clause 7)."""
-HEADER_LENGTH: Final = _HEADER.size
-"""Bytes of these."""
-_LENGTH_AND_TYPE = 6
-"""Bytes before the code: what follows them is a message as ISO 15740 has it."""
+_HEADER: Final = struct.Struct("<IHHI")  # Length, type, code and transaction (clause 7)
+HEADER_LENGTH: Final = _HEADER.size  # Bytes of these
+_LENGTH_AND_TYPE = 6  # Bytes before the code: what follows them is a message as ISO 15740 has it
+# A container's length where the payload goes on until a short packet: more than 4 GiB, or not known.
 UNKNOWN_LENGTH = 0xFFFFFFFF
-"""A container's length where the payload goes on until a short packet: more than 4 GiB, or not known."""
-HIGH_SPEED_PACKET = 512
-"""wMaxPacketSize of a bulk pipe at high speed; 64 at full speed, 1024 at super speed."""
+HIGH_SPEED_PACKET = 512  # wMaxPacketSize of a bulk pipe at high speed; 64 at full speed, 1024 at super speed
 
 
 class ContainerType(IntEnum):
@@ -210,10 +206,9 @@ class ControlRequest(IntEnum):
     GET_DEVICE_STATUS = 0x67
 
 
-_CANCELLATION = 0x4001
-"""Cancellation code in the data of a CANCEL request (clause 5)."""
+_CANCELLATION = 0x4001  # Cancellation code in the data of a CANCEL request (clause 5)
+# Bytes that GET_DEVICE_STATUS is asked for: a header of 4, and parameters that name stalled pipes.
 MAX_DEVICE_STATUS = 0x14
-"""Bytes that GET_DEVICE_STATUS is asked for: a header of 4, and parameters that name stalled pipes."""
 
 
 def encode_cancel(transaction: int) -> bytes:
@@ -253,23 +248,16 @@ class DeviceStatus:
         return encode_integer(4 + len(parameters), 2) + encode_integer(self.code, 2) + parameters
 
 
-PIECE = 512 * 1024
-"""Bytes of the largest transfer; bigger ones are more than some hosts and cameras bear."""
-MAX_EVENTS = 4096
-"""Events returned at once from a device that never stops raising them."""
+PIECE = 512 * 1024  # Bytes of the largest transfer; bigger ones are more than some hosts and cameras bear
+MAX_EVENTS = 4096  # Events returned at once from a device that never stops raising them
 
-_CONTROL_S = 1.0
-"""For a control request, which a device answers in milliseconds if at all."""
-_READY_TRIES = 40
-"""Two seconds in all for a device to be ready after a cancellation or reset."""
-_READY_EVERY_S = 0.05
-"""Between two questions for the status: little beside what a reset takes."""
-_DRAIN_S = 0.05
-"""A device that has been silent for so long has sent all that it had."""
+_CONTROL_S = 1.0  # For a control request, which a device answers in milliseconds if at all
+_READY_TRIES = 40  # Two seconds in all for a device to be ready after a cancellation or reset
+_READY_EVERY_S = 0.05  # Between two questions for the status: little beside what a reset takes
+_DRAIN_S = 0.05  # A device that has been silent for so long has sent all that it had
+# Pieces thrown away, 128 MiB at most: more than a raw frame, and an end to a device that never stops.
 _DRAIN_READS = 256
-"""Pieces thrown away, 128 MiB at most: more than a raw frame, and an end to a device that never stops."""
-_EMPTY_READS = 16
-"""Empty packets in a row that are skipped: one may follow a full packet, so many mean a fault."""
+_EMPTY_READS = 16  # Empty packets in a row that are skipped: one may follow a full packet, so many mean a fault
 
 
 class UsbTransport(CableTransport):

@@ -19,14 +19,14 @@ from numpy import int64, uint64
 
 from foundation.compiled import compiled
 
+# Markers (T.81, table B.1).
 _SOI, _EOI, _SOF0, _SOF1, _SOF3, _DHT, _DQT, _DRI, _SOS = 0xD8, 0xD9, 0xC0, 0xC1, 0xC3, 0xC4, 0xDB, 0xDD, 0xDA
-"""Markers (T.81, table B.1)."""
 
+# Bytes behind the last sample that say nothing: some encoders write whole words. More are padding if all are alike.
 _PADDING: Final = 4
-"""Bytes behind the last sample that say nothing: some encoders write whole words. More are padding if all are alike."""
 
+# Zeros in a row that are no samples: where zero bits say other than "as before", a dozen steps would be alike.
 _HOLE: Final = bytes(16)
-"""Zeros in a row that are no samples: where zero bits say other than "as before", a dozen steps would be alike."""
 
 _END: Final = bytes((0xFF, _EOI))
 

@@ -59,17 +59,14 @@ if TYPE_CHECKING:
     from rawpy import RawPy
 
 
+# Tags (Exif 2.32): of the Exif directory in the first one, and of the maker's note in that.
 _EXIF_POINTER, _NOTE = int(TiffTag.EXIF_IFD_POINTER), 37500
-"""Tags (Exif 2.32): of the Exif directory in the first one, and of the maker's note in that."""
 
-_CANON_SERIAL, _CANON_LENS = 0x000C, 0x0095
-"""Tags of Canon's note."""
+_CANON_SERIAL, _CANON_LENS = 0x000C, 0x0095  # Tags of Canon's note
 
-_MOST_ENTRIES = 512
-"""Entries of a directory that are looked at; Canon's notes have about sixty."""
+_MOST_ENTRIES = 512  # Entries of a directory that are looked at; Canon's notes have about sixty
 
-_MOST_TEXT = 128
-"""Bytes of a lens's name that are read; Canon's take seventy."""
+_MOST_TEXT = 128  # Bytes of a lens's name that are read; Canon's take seventy
 
 
 @dataclass(frozen=True)
@@ -165,11 +162,10 @@ def _entries(data: bytes | memoryview, order: str, at: int) -> dict[int, tuple[i
     return found
 
 
+# Three rows R, G, B of three numbers: from CIE XYZ (D65, Y = 1) to linear camera RGB.
 Matrix = tuple[tuple[float, float, float], ...]
-"""Three rows R, G, B of three numbers: from CIE XYZ (D65, Y = 1) to linear camera RGB."""
 
-_SIDE = 32
-"""Photosites along a side of the file that is opened; LibRaw opens none below 22."""
+_SIDE = 32  # Photosites along a side of the file that is opened; LibRaw opens none below 22
 
 
 @lru_cache(maxsize=64)
@@ -205,14 +201,12 @@ def camera_matrix(camera: str) -> Matrix | None:
     return matrix if any(any(row) for row in matrix) else None
 
 
-_SKIPPED_COLUMNS = 4
-"""The first columns of a masked area are disturbed by the readout of the row (seen on the 550D)."""
+_SKIPPED_COLUMNS = 4  # The first columns of a masked area are disturbed by the readout of the row (seen on the 550D)
 
-_LEAST_MASKED = 256
-"""Photosites per phase below which a masked mean is less certain than the metadata."""
+_LEAST_MASKED = 256  # Photosites per phase below which a masked mean is less certain than the metadata
 
+# Photosites at a frame's highest count from which on that count is saturation: noise does not pile up so at one.
 _PLATEAU = 64
-"""Photosites at a frame's highest count from which on that count is saturation: noise does not pile up so at one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,6 +312,9 @@ def _median(values: NDArray[np.float64], numbers: NDArray[np.int64]) -> float:
     return float(values[order][middle].mean())
 
 
+# Sensors, with LibRaw's visible area, of which dcraw shows one row more at the top. LibRaw makes the odd top margin
+# of a Canon even. Found with dcraw 9.28 and LibRaw 0.22 on CR2 files of, in this order, the 50D; 1D Mark IV; 550D,
+# 600D and 60D; 7D; 5D Mark II.
 _ONE_ROW_MORE = {
     ((3228, 4832), Area(52, 62, 3176, 4770)),
     ((3318, 5120), Area(46, 142, 3272, 4916)),
@@ -325,12 +322,10 @@ _ONE_ROW_MORE = {
     ((3516, 5360), Area(52, 158, 3464, 5202)),
     ((3804, 5792), Area(52, 158, 3752, 5634)),
 }
-"""Sensors, with LibRaw's visible area, of which dcraw shows one row more at the top.
 
-LibRaw makes the odd top margin of a Canon even. Found with dcraw 9.28 and LibRaw 0.22 on CR2 files of, in this order,
-the 50D; 1D Mark IV; 550D, 600D and 60D; 7D; 5D Mark II.
-"""
-
+# Columns at the left of a sensor that are not black all the same: so many at its edge, so many beside the picture.
+# From LibRaw 0.22 (src/metadata/identify.cpp, table of Canon's sensors). Of all other Canons with masked columns it
+# takes all but the outermost.
 _BLACK_COLUMNS = {
     "Canon EOS R10": (16, 48),
     "Canon EOS R6m2": (16, 48),
@@ -338,19 +333,14 @@ _BLACK_COLUMNS = {
     "Canon EOS R5m2": (128, 4),
     "Canon EOS R5 Mark II": (128, 4),
 }
-"""Columns at the left of a sensor that are not black all the same: so many at its edge, so many beside the picture.
 
-From LibRaw 0.22 (src/metadata/identify.cpp, table of Canon's sensors). Of all other Canons with masked columns it takes
-all but the outermost.
-"""
-
+# Optically black areas by camera and sensor, from rawspeed's cameras.xml; the corner that two share counts once.
 _MASKED = {
     ("Canon EOS 550D", (3516, 5344)): (Area(0, 0, 3516, 140), Area(4, 140, 44, 5204)),
     ("Canon EOS REBEL T2i", (3516, 5344)): (Area(0, 0, 3516, 140), Area(4, 140, 44, 5204)),
     ("Canon EOS Kiss X4", (3516, 5344)): (Area(0, 0, 3516, 140), Area(4, 140, 44, 5204)),
     ("Canon EOS 6D Mark II", (4224, 6384)): (Area(0, 2, 4224, 116), Area(8, 118, 32, 6266)),
 }
-"""Optically black areas by camera and sensor, from rawspeed's cameras.xml; the corner that two share counts once."""
 
 
 def read_raw(path: Path) -> Mosaic:
@@ -398,27 +388,24 @@ def _by_libraw(path: Path, data: bytes | memoryview, contents: _Contents) -> Mos
             raise _unreadable(path, str(error) or type(error).__name__) from error
 
 
-_LOSSLESS_BITS = 1.0
-"""Bits that lossless JPEG spends on a photosite at least (ITU-T T.81, annex H)."""
+_LOSSLESS_BITS = 1.0  # Bits that lossless JPEG spends on a photosite at least (ITU-T T.81, annex H)
 
+# Compression (TIFF 6.0; DNG 1.7.1, chapter 3; Sony's own).
 _UNCOMPRESSED, _OLD_JPEG, _JPEG, _SONY, _LOSSY_JPEG = 1, 6, 7, 32767, 34892
-"""Compression (TIFF 6.0; DNG 1.7.1, chapter 3; Sony's own)."""
 
+# Compression of DNG that LibRaw is not built with (DNG 1.7.1, chapter 3; 32946: Adobe's number of old).
 _UNSUPPORTED = {8: "Deflate", 32946: "Deflate", 9: "VC-5", 52546: "JPEG XL"}
-"""Compression of DNG that LibRaw is not built with (DNG 1.7.1, chapter 3; 32946: Adobe's number of old)."""
 
+# Beginnings of makers' names in files of TIFF of whose raw pixels TIFF's own tags say size and place.
 _MAKERS = ("nikon", "sony", "pentax", "ricoh", "olympus", "om digital", "samsung", "hasselblad")
-"""Beginnings of makers' names in files of TIFF of whose raw pixels TIFF's own tags say size and place."""
 
+# Tags of tables that LibRaw applies to what is stored.
 _TONES = (TiffTag.LINEARIZATION_TABLE, TiffTag.GRAY_RESPONSE_CURVE)
-"""Tags of tables that LibRaw applies to what is stored."""
 
-_LINEAR_RAW = 34892
-"""PhotometricInterpretation of pixels that hold all colours (DNG 1.7.1)."""
+_LINEAR_RAW = 34892  # PhotometricInterpretation of pixels that hold all colours (DNG 1.7.1)
 
 
-LAYOUT_START = 12
-"""Bytes at the beginning of a file that say which layout it has."""
+LAYOUT_START = 12  # Bytes at the beginning of a file that say which layout it has
 
 
 def layout_is_known(start: bytes | memoryview) -> bool:
@@ -430,8 +417,7 @@ def layout_is_known(start: bytes | memoryview) -> bool:
     return bytes(start[4:12]) == _CR3_START or (is_tiff(start) and start[:4] != b"IIU\0")
 
 
-_CR3_START = b"ftypcrx "
-"""Type and brand of the first box of a CR3, behind its size."""
+_CR3_START = b"ftypcrx "  # Type and brand of the first box of a CR3, behind its size
 
 
 def stored_frames(data: bytes | memoryview, directories: Sequence[Directory]) -> list[Stored]:
@@ -760,7 +746,6 @@ def _joined(maker: str, model: str) -> str:
 
 
 def _dcraw_frame(sensor: tuple[int, int], framed: Area) -> Area:
-    """Return dcraw's visible area, given LibRaw's."""
     if (sensor, framed) in _ONE_ROW_MORE:
         return Area(framed.top - 1, framed.left, framed.height + 1, framed.width)
     return framed
@@ -872,6 +857,7 @@ def _null_stream() -> int | None:
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 
+# What a plain file states, or does not state.
 _PLAIN: dict[TiffTag, tuple[tuple[int, ...], ...]] = {
     TiffTag.COMPRESSION: ((1,),),
     TiffTag.PHOTOMETRIC_INTERPRETATION: ((CFA,),),
@@ -884,7 +870,6 @@ _PLAIN: dict[TiffTag, tuple[tuple[int, ...], ...]] = {
     TiffTag.GRAY_RESPONSE_CURVE: ((),),
     TiffTag.TILE_OFFSETS: ((),),
 }
-"""What a plain file states, or does not state."""
 
 
 def _plain_mosaic(path: Path, data: bytes | memoryview, contents: _Contents) -> Mosaic | None:
@@ -958,14 +943,12 @@ def _stated_areas(pixels: Directory | None, tag: TiffTag, sensor: tuple[int, int
     )
 
 
+# Counts of black from which on a photosite that is far below it is none; cameras without such a level cut at zero.
 _LEAST_BLACK = 16
-"""Counts of black from which on a photosite that is far below it is none; cameras without such a level cut at zero."""
 
-_TILE = (32, 256)
-"""Rows and columns of the smallest part that is looked at: the least that is stored by itself."""
+_TILE = (32, 256)  # Rows and columns of the smallest part that is looked at: the least that is stored by itself
 
-_LARGEST = 65535
-"""The largest count: what ones are read as."""
+_LARGEST = 65535  # The largest count: what ones are read as
 
 
 def _require_levels(path: Path, black: NDArray[np.float64], white_level: float, bits: int) -> None:
@@ -1033,12 +1016,12 @@ def _extent_text(found: NDArray[np.intp], shape: tuple[int, ...]) -> str | None:
 Channel = Literal["R", "G", "B"]
 CHANNELS: tuple[Channel, Channel, Channel] = ("R", "G", "B")
 
+# Counts above this share of saturation are treated as clipped (judgement: the knee of the response lies above).
 CLIPPING_SHARE = 0.98
-"""Counts above this share of saturation are treated as clipped (judgement: the knee of the response lies above)."""
 
+# Percentile of the counts that stands for paper: bare paper is more than a fiftieth of a picture, hot photosites and
+# highlights are less.
 PAPER_PERCENTILE = 98
-"""Percentile of the counts that stands for paper: bare paper is more than a fiftieth of a picture, hot photosites and
-highlights are less."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,11 +18,10 @@ from dataclasses import dataclass
 
 from drivers.tiff import Directory, TiffDamaged, TiffTag, read_directories
 
-Extent = tuple[int, int]
-"""First byte, and how many."""
+Extent = tuple[int, int]  # First byte, and how many
 
+# Bits for each photosite below which no codec of a maker's puts a frame, since noise takes several. Chosen.
 LEAST_BITS = 0.25
-"""Bits for each photosite below which no codec of a maker's puts a frame, since noise takes several. Chosen."""
 
 
 class RawDamaged(ValueError):
@@ -101,25 +100,16 @@ def ciff_entries(data: bytes | memoryview) -> dict[int, Extent]:
     return found
 
 
-MAX_BOXES = 4096
-"""Boxes that are walked; a real file has about a hundred."""
+MAX_BOXES = 4096  # Boxes that are walked; a real file has about a hundred
 
-_CANON = bytes.fromhex("85c0b687820f11e08111f4ce462b6a48")
-"""The uuid of the box with Canon's metadata."""
-_SAMPLE_ENTRY_HEAD = 82
-"""Bytes of a CRAW sample entry before the boxes in it (cr3_parser.cpp)."""
-_MOST_SAMPLES = 4096
-"""Samples of a track that are looked at; a roll of bursts has a few hundred."""
-_UUID_LENGTH = 16
-"""Bytes of a uuid, which stands before the content of such a box (ISO/IEC 14496-12, 4.2)."""
-_TABLE_HEAD = 8
-"""Bytes of `stsd` before its entries: version and flags, and how many (ISO/IEC 14496-12, 8.5.2)."""
-_FULL_BOX_HEAD = 4
-"""Bytes of version and flags in a full box (ISO/IEC 14496-12, 4.2)."""
-_WHOLE_AREAS = 48
-"""Bytes of `IAD1` in the track of the whole picture: six areas of four numbers; a preview's has fewer."""
-_LEFT_BLACK, _UPPER_BLACK = 3, 4
-"""Which of those areas are optically black (cr3_parser.cpp)."""
+_CANON = bytes.fromhex("85c0b687820f11e08111f4ce462b6a48")  # The uuid of the box with Canon's metadata
+_SAMPLE_ENTRY_HEAD = 82  # Bytes of a CRAW sample entry before the boxes in it (cr3_parser.cpp)
+_MOST_SAMPLES = 4096  # Samples of a track that are looked at; a roll of bursts has a few hundred
+_UUID_LENGTH = 16  # Bytes of a uuid, which stands before the content of such a box (ISO/IEC 14496-12, 4.2)
+_TABLE_HEAD = 8  # Bytes of `stsd` before its entries: version and flags, and how many (ISO/IEC 14496-12, 8.5.2)
+_FULL_BOX_HEAD = 4  # Bytes of version and flags in a full box (ISO/IEC 14496-12, 4.2)
+_WHOLE_AREAS = 48  # Bytes of `IAD1` in the track of the whole picture: six areas of four numbers; a preview's has fewer
+_LEFT_BLACK, _UPPER_BLACK = 3, 4  # Which of those areas are optically black (cr3_parser.cpp)
 
 
 @dataclass(frozen=True)
@@ -213,8 +203,8 @@ def _directories(content: bytes | memoryview) -> tuple[Directory, ...]:
         return ()
 
 
+# Bytes of a box before the boxes in it.
 _HEADS = {b"stsd": _TABLE_HEAD, b"CRAW": _SAMPLE_ENTRY_HEAD, b"CDI1": _FULL_BOX_HEAD}
-"""Bytes of a box before the boxes in it."""
 
 
 def _inside(data: bytes | memoryview, box: _Box, left: list[int], *kinds: bytes) -> _Box | None:

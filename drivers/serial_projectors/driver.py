@@ -198,7 +198,6 @@ class LineProjector(Projector):
             self._announced = begins
 
     def _state_between(self, error: DeviceRefused) -> Power:
-        """Return whether it warms up or cools down, by the state before."""
         if self._settled is None:
             raise DeviceRefused(
                 f"{self.label} is warming up or cooling down, and does not report which; wait two minutes"
@@ -206,7 +205,6 @@ class LineProjector(Projector):
         return Power.WARMING if self._settled is Power.STANDBY else Power.COOLING
 
     def _take_late_answer(self) -> None:
-        """Check whether the command under way has been carried out."""
         if self._under_way is None:
             return
         words = self._language.power
@@ -253,7 +251,6 @@ class LineProjector(Projector):
         self._exchanged(command, (done,))
 
     def _exchanged(self, text: str, answers: tuple[str, ...]) -> str:
-        """Send a text and return the value in its answer."""
         self._take_late_answer()
         if self._under_way is not None:
             raise DeviceRefused(f"{self.label} is busy with its {self._under_way.value}; wait until that is done")
@@ -287,7 +284,6 @@ class LineProjector(Projector):
         return None
 
     def _take_unasked(self, message: str) -> bool:
-        """Return whether a message answers nothing, and keep what it reports."""
         for unasked in self._language.unasked:
             if value_in((unasked.text,), message) is not None:
                 break

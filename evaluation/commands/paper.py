@@ -125,7 +125,6 @@ def table1(
 
 
 def _says(lut: Lut) -> str:
-    """Return what a report says of a table."""
     origin = "" if lut.provenance.computed is None else ", computed and not photographed"
     return f"{lut.provenance.camera}, {len(lut.white)} lights{origin}, {lut.folder}"
 
@@ -332,7 +331,6 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
 
 
 def _sides(text: str) -> list[int]:
-    """Return the sides of images between commas, px."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts:
         if not part.isdigit() or not 1 <= int(part) <= 65535:
@@ -341,6 +339,5 @@ def _sides(text: str) -> list[int]:
 
 
 def _require_free(out: Path | None) -> None:
-    """Refuse a folder that is taken before the work begins."""
     if out is not None:
         require_free(out, "the report")

@@ -20,8 +20,8 @@ from foundation.console import EXIT_CODES, JsonOutput, option, with_json
 from foundation.errors import InputError
 from foundation.folders import require_free_file
 
+# The suite's own, for the help of commands.
 LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, kernel-ridge, convnet or constant-light"
-"""The suite's own, for the help of commands."""
 
 HELP = f"""Train a method on every image of a data set and write what it has learned to a model file.
 

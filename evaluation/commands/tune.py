@@ -10,8 +10,7 @@ from evaluation.commands.options import AngularError, Data, Read, image_steps, o
 from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, with_json
 
-FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"
-"""The families, for the help."""
+FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"  # The families, for the help
 
 HELP = f"""Choose a method's parameters on images whose lights nobody knows, by the green stability assumption.
 

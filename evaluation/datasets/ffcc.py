@@ -18,10 +18,8 @@ from evaluation.datasets.options import DataOptions, stated
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, first_of
 
-_DEPTH = 4
-"""Folders below the one given that are searched: more than the toolbox's own data sets have."""
-_SAMPLE = 100
-"""Names of a folder that are looked at to tell the layout."""
+_DEPTH = 4  # Folders below the one given that are searched: more than the toolbox's own data sets have
+_SAMPLE = 100  # Names of a folder that are looked at to tell the layout
 
 
 @dataclass(frozen=True, slots=True)

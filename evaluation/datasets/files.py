@@ -26,8 +26,7 @@ from foundation import files
 from foundation.errors import FormatError, InputError, first_of
 from generator.files import decode_png, decode_tiff
 
-IMAGE_ENDINGS = (".png", ".tif", ".tiff", ".npy")
-"""Of files that hold linear images of 16 bits or more."""
+IMAGE_ENDINGS = (".png", ".tif", ".tiff", ".npy")  # Of files that hold linear images of 16 bits or more
 
 
 @dataclass(frozen=True)
@@ -165,8 +164,7 @@ def present(
     return kept, note
 
 
-Light = tuple[float, float, float]
-"""Linear camera RGB of a light, of any length."""
+Light = tuple[float, float, float]  # Linear camera RGB of a light, of any length
 
 
 def check_light(values: Sequence[float], where: str, remedy: str = "restore the file") -> Light:
@@ -253,8 +251,7 @@ def number_of(text: str, where: str, column: str) -> float:
         raise FormatError(f"{where}: {column} is {text!r}, expected a number; correct it") from error
 
 
-Mask = npt.NDArray[np.bool_]
-"""(H, W), True where a pixel must not be used."""
+Mask = npt.NDArray[np.bool_]  # (H, W), True where a pixel must not be used
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,12 +313,11 @@ def require_above_black(scenes: Iterable[RawScene]) -> None:
         )
 
 
-_LOOKED_AT = 16
-"""Images that are looked at for a black level that was not subtracted."""
+_LOOKED_AT = 16  # Images that are looked at for a black level that was not subtracted
 
+# Share of an image's largest value that some pixel of it is below; pedestals of cameras are 3 % of saturation or
+# more, and of usual exposures a larger share.
 _NEAR_BLACK = 0.01
-"""Share of an image's largest value that some pixel of it is below; pedestals of cameras are 3 % of saturation or more,
-and of usual exposures a larger share."""
 
 
 def pedestal_note(scenes: Sequence[RawScene]) -> str:
@@ -435,7 +431,6 @@ def decode_image(path: str, eight_bits: bool = False) -> Image:
 
 
 def _values(path: str) -> npt.NDArray[Any]:
-    """Return whatever array a file holds."""
     ending = Path(path).suffix.lower()
     try:
         if ending == ".npy":

@@ -78,8 +78,8 @@ def _number(kind: str, text: str) -> int:
     return int(sha256_of(f"{kind}\t{text}".encode())[:16], 16)
 
 
+# Bytes of a file that are compared: a hundred thousand pixels and more, of which no two photographs agree in all.
 _PIECE: Final = 1 << 20
-"""Bytes of a file that are compared: a hundred thousand pixels and more, of which no two photographs agree in all."""
 
 
 def first_copies(scenes: Sequence[Scene]) -> list[int]:

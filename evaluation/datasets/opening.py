@@ -64,10 +64,11 @@ class Layout:
     takes: str | None = "folder"
 
 
+# What is stated with results of a data set whose reader has met made-up copies only.
 _UNVERIFIED = "not verified against a published copy; compare one image with the authors' program"
-"""What is stated with results of a data set whose reader has met made-up copies only."""
 
 
+# By the names that the command takes.
 LAYOUTS: Mapping[str, Layout] = {
     "generated": Layout(
         "a dataset made by generate",
@@ -155,7 +156,6 @@ LAYOUTS: Mapping[str, Layout] = {
         takes=None,
     ),
 }
-"""By the names that the command takes."""
 
 
 def open_scenes(place: Path | str, layout: str | None = None, options: DataOptions | None = None) -> SceneSet:
@@ -255,7 +255,6 @@ def _refuse_results(folder: Path, place: str) -> None:
 
 
 def _refuse_pictures(folder: Folder, place: str) -> None:
-    """Refuse a folder of pictures beside which no file could hold their ground truths."""
     pictures = [name for name in folder.files if name.lower().endswith((*IMAGE_ENDINGS, ".jpg", ".jpeg"))]
     if pictures and not any(name.endswith((".csv", ".mat", ".txt", ".json")) for name in folder.files):
         raise FormatError(

@@ -29,18 +29,16 @@ from evaluation.datasets.options import DataOptions, stated
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError, first_of
 
-COLUMNS = ("image", "r", "g", "b")
-"""What the table must have."""
+COLUMNS = ("image", "r", "g", "b")  # What the table must have
 
+# What is stated where nothing says what black is.
 ASSUMED_BLACK = "0: assumed, as neither a column black nor --read black gives it"
-"""What is stated where nothing says what black is."""
 
 _PICTURES = (".jpg", ".jpeg", ".webp", ".heic", ".gif", ".bmp")
 _RAWS = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef", ".srw", ".crw")
 _MASK = "_mask"
 _MASK_ENDINGS = (".png", ".tif", ".tiff")
-_MOST = 50
-"""Tables of a folder whose heads are read to find the one with the lights."""
+_MOST = 50  # Tables of a folder whose heads are read to find the one with the lights
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,11 +36,11 @@ LEVEL: Final = 0.95
 Floats = npt.NDArray[np.float64]
 Places = npt.NDArray[np.int64]
 
+# The numbers of `evaluation.metrics.Summary`, by their names there.
 Statistic = Literal["mean", "median", "trimean", "best25", "worst25", "avg"]
-"""The numbers of `evaluation.metrics.Summary`, by their names there."""
 
+# All of them, in the order of the paper's tables.
 STATISTICS: tuple[Statistic, ...] = ("mean", "median", "trimean", "best25", "worst25", "avg")
-"""All of them, in the order of the paper's tables."""
 
 
 class BoundedFigure(NamedTuple):

@@ -35,8 +35,8 @@ from evaluation.scene import Image, Scene, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
+# Share of a pixel's area of which more must be usable; less is rounding of areas rather than a colour.
 _COVERED: Final = 1e-3
-"""Share of a pixel's area of which more must be usable; less is rounding of areas rather than a colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +106,9 @@ def shrink_image(
     return small, empty
 
 
-Places = npt.NDArray[np.int64]
-"""(P,) int64: which scenes of a data set, from 0."""
+Places = npt.NDArray[np.int64]  # (P,) int64: which scenes of a data set, from 0
 
-AnyLearner = Learner | FeatureLearner
-"""A learner of either kind: of scenes, or of features."""
+AnyLearner = Learner | FeatureLearner  # A learner of either kind: of scenes, or of features
 
 
 @dataclass(frozen=True, eq=False)

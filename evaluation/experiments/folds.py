@@ -20,11 +20,9 @@ from foundation.errors import FormatError, InputError, counted, first_of
 from foundation.files import csv_text, read_csv
 from generator.named_numbers import is_number
 
-FOLDS = 3
-"""Folds that are drawn by default: what the field's tables have, on NUS and on Cube+."""
+FOLDS = 3  # Folds that are drawn by default: what the field's tables have, on NUS and on Cube+
 
-_LEAST = 2
-"""Folds: with one there is nothing left to train on."""
+_LEAST = 2  # Folds: with one there is nothing left to train on
 
 
 def group_of(scene: Scene) -> str:

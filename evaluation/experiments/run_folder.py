@@ -115,7 +115,6 @@ def _trained_on(name: str, record: TrainingRecord, data: SceneSet, sha256: str) 
 
 
 def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> dict[str, str]:
-    """Return the texts of the files of a results folder by their names."""
     subject, results = run.subject, run.results
     tables = [summary_table(subject, results, kind), *lights_tables(subject, results, kind)]
     pixels, regions = several_lights_csv(subject.images, results)

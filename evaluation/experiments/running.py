@@ -27,8 +27,8 @@ from evaluation.scene import MixedScene, Scene, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import CropError, FormatError, InputError
 
+# This package's folder: what lies outside of it, and is no installed library, is the user's.
 _HOUSE = Path(__file__).parents[1]
-"""This package's folder: what lies outside of it, and is no installed library, is the user's."""
 
 
 @runtime_checkable

@@ -18,20 +18,18 @@ from evaluation.results.result import Result
 
 _Lights = npt.NDArray[np.float64]
 
-_LEAST_IMAGES: Final = 8
-"""Images below which a median says too little."""
+_LEAST_IMAGES: Final = 8  # Images below which a median says too little
 
+# Median error below which lights are read rightly: all ways of reading lights near grey fit about as well.
 _LEAST_DEG: Final = 5.0
-"""Median error below which lights are read rightly: all ways of reading lights near grey fit about as well."""
 
+# Share of the median error that another way of reading must leave at most; right data never come near it.
 _BETTER: Final = 0.5
-"""Share of the median error that another way of reading must leave at most; right data never come near it."""
 
+# Median error that another way of reading must leave at most: one that is bad too is not how lights were written.
 _GOOD_DEG: Final = 8.0
-"""Median error that another way of reading must leave at most: one that is bad too is not how lights were written."""
 
-_FLOOR: Final = 1e-9
-"""What replaces a channel at 0, over the largest, where a light is inverted."""
+_FLOOR: Final = 1e-9  # What replaces a channel at 0, over the largest, where a light is inverted
 
 
 def suspicions(images: Sequence[str], truths: npt.NDArray[np.float64], results: Sequence[Result]) -> tuple[str, ...]:

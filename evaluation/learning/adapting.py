@@ -28,14 +28,11 @@ import numpy.typing as npt
 from evaluation.learning.feature_learner import FeatureLearner, Features, LearnedMethod, LightModel, fit_extracted
 from evaluation.metrics import recovery_error
 
-WORTH: Final = 200.0
-"""Images that what was learned elsewhere is taken to be worth before any is seen."""
-STRENGTH: Final = 25.0
-"""Images that this opinion weighs as much as."""
-_SHARES: Final = np.linspace(0, 1, 101)
-"""Weights to choose among."""
+WORTH: Final = 200.0  # Images that what was learned elsewhere is taken to be worth before any is seen
+STRENGTH: Final = 25.0  # Images that this opinion weighs as much as
+_SHARES: Final = np.linspace(0, 1, 101)  # Weights to choose among
+# Parts of the N images, each estimated by a model that learned of the others; so few since each is a training.
 _PARTS: Final = 3
-"""Parts of the N images, each estimated by a model that learned of the others; so few since each is a training."""
 
 
 @dataclass(frozen=True, eq=False)

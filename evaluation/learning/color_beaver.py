@@ -28,16 +28,12 @@ from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.prepared import GREY
 from evaluation.scene import Image
 
-_ELITE = 4
-"""Genomes that survive unchanged: few, so that a generation is not made of copies."""
-_TOURNAMENT = 3
-"""Genomes of which the best becomes a parent."""
-_BLEND = 0.3
-"""How far beyond its parents' genes a child's may lie, share of their distance (BLX-α)."""
-_MUTATED = 0.15
-"""Probability that a gene of a child is mutated: one or two a genome."""
+_ELITE = 4  # Genomes that survive unchanged: few, so that a generation is not made of copies
+_TOURNAMENT = 3  # Genomes of which the best becomes a parent
+_BLEND = 0.3  # How far beyond its parents' genes a child's may lie, share of their distance (BLX-α)
+_MUTATED = 0.15  # Probability that a gene of a child is mutated: one or two a genome
+# Standard deviation of a mutation in the first and in the last generation, spreads of the training lights.
 _STEP = (0.5, 0.02)
-"""Standard deviation of a mutation in the first and in the last generation, spreads of the training lights."""
 
 
 @dataclass(frozen=True)

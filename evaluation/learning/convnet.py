@@ -25,17 +25,13 @@ from evaluation.learning.working_size import reduce
 from evaluation.scene import Image
 from foundation.errors import InputError
 
-_KERNEL = 5
-"""Side of the first convolution, px; the others have 3."""
-_BATCH = 16
-"""Images a step of the optimiser, as in the paper."""
+_KERNEL = 5  # Side of the first convolution, px; the others have 3
+_BATCH = 16  # Images a step of the optimiser, as in the paper
+# Range of the gain on each channel of an image that is lit anew. The paper's 0.6 to 1.4 hides which lights are
+# likely, which a few hundred images cannot do without.
 _GAINS = (0.9, 1.1)
-"""Range of the gain on each channel of an image that is lit anew. The paper's 0.6 to 1.4 hides which lights are likely,
-which a few hundred images cannot do without."""
-_TUNED = 4
-"""Tuning has this many times fewer epochs and smaller steps than training: not chosen by results."""
-_DECAY = 1e-4
-"""Decay of the weights, which are more than the images."""
+_TUNED = 4  # Tuning has this many times fewer epochs and smaller steps than training: not chosen by results
+_DECAY = 1e-4  # Decay of the weights, which are more than the images
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from evaluation.scene import Image, Scene, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
+# Features of one image (...) of any dtype; each learner says which shape and dtype its own have.
 Features = npt.NDArray[Any]
-"""Features of one image (...) of any dtype; each learner says which shape and dtype its own have."""
 
 
 class LightModel(Protocol):

@@ -26,14 +26,10 @@ from evaluation.learning.feature_learner import FeatureLearner, Features, LightM
 from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
 from evaluation.scene import Image
 
-BINS = 64
-"""Bins of r and of g, each 0 … 1: one is 2 to 4 degrees wide about usual lights, the grain of what is counted."""
-_LARGEST = 255
-"""Working size up to which the counts of a histogram fit in 16 bits where each pixel counts alike."""
-_IMAGES = 900
-"""Training images of which `penalty` is the λ."""
-_WHOLE = 65535
-"""What the share of a bin that holds all of an image is kept as: the largest that 16 bits hold."""
+BINS = 64  # Bins of r and of g, each 0 … 1: one is 2 to 4 degrees wide about usual lights, the grain of what is counted
+_LARGEST = 255  # Working size up to which the counts of a histogram fit in 16 bits where each pixel counts alike
+_IMAGES = 900  # Training images of which `penalty` is the λ
+_WHOLE = 65535  # What the share of a bin that holds all of an image is kept as: the largest that 16 bits hold
 
 
 @dataclass(frozen=True)

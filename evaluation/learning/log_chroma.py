@@ -38,15 +38,12 @@ from evaluation.learning.working_size import reduce
 from evaluation.scene import Image
 from foundation.errors import InputError
 
-BINS = 64
-"""Bins of the torus along each axis (section 5 of the paper)."""
-_BATCH = 16
-"""Images at a time: their arrays then lie in a processor's second cache."""
+BINS = 64  # Bins of the torus along each axis (section 5 of the paper)
+_BATCH = 16  # Images at a time: their arrays then lie in a processor's second cache
 _SHAPE = (BINS, BINS)
-_ANGLE = 2 * np.pi / BINS
-"""Radians a bin."""
+_ANGLE = 2 * np.pi / BINS  # Radians a bin
+# Least squared length of a mean direction: that of a flat distribution is 0, and its angle nothing to divide by.
 _TINY = 1e-12
-"""Least squared length of a mean direction: that of a flat distribution is 0, and its angle nothing to divide by."""
 
 
 @dataclass(frozen=True)
@@ -219,19 +216,14 @@ def _scale(smoothness: float, size: float) -> npt.NDArray[np.float64]:
     return 1 / (BINS * np.sqrt(weights))
 
 
+# Bins of the histogram that is extracted, along each axis: four natural logarithms. It is folded to 64 bins of 1/32,
+# the paper's, or of 1/16 when the training lights are known.
 _FINE_BINS = 128
-"""Bins of the histogram that is extracted, along each axis: four natural logarithms. It is folded to 64 bins of 1/32,
-the paper's, or of 1/16 when the training lights are known."""
-_FINE_SIZE = 1 / 32
-"""Width of a bin, natural logarithm (section 5 of the paper)."""
-_CHANNELS = 2
-"""Histograms: of pixels and of edges."""
-_IMAGE = _CHANNELS * _FINE_BINS**2
-"""Bins of an image."""
-_SPREAD = 0.75
-"""Share of the torus that the lights may span: the rest tells one turn of it from the next."""
-_LARGEST = 255
-"""Working size up to which the counts of a histogram fit in 16 bits."""
+_FINE_SIZE = 1 / 32  # Width of a bin, natural logarithm (section 5 of the paper)
+_CHANNELS = 2  # Histograms: of pixels and of edges
+_IMAGE = _CHANNELS * _FINE_BINS**2  # Bins of an image
+_SPREAD = 0.75  # Share of the torus that the lights may span: the rest tells one turn of it from the next
+_LARGEST = 255  # Working size up to which the counts of a histogram fit in 16 bits
 
 
 @dataclass(frozen=True)

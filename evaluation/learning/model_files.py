@@ -39,8 +39,8 @@ _TRAINED = "trained_on"
 _REMEDY = "name a file that evaluate train has made"
 
 
+# An array beside the text, which says all else.
 _Images = Annotated[npt.NDArray[np.uint64], PlainValidator(np.asarray), Field(exclude=True)]
-"""An array beside the text, which says all else."""
 
 
 @dataclass(frozen=True)

@@ -27,14 +27,10 @@ from evaluation.learning.feature_learner import FeatureLearner, Features, requir
 from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
 from evaluation.scene import Image
 
-_FEATURES = 4
-"""Mean, brightest, dominant and palette mode (section 3.1)."""
-_TARGETS = 2
-"""A tree for r and one for g (section 3.2)."""
-_WINDOW_WEIGHT = 20
-"""How often a training script of OpenCV repeats the images of a window."""
-_AGREEING = 3
-"""Features of four that must agree for their estimates to count."""
+_FEATURES = 4  # Mean, brightest, dominant and palette mode (section 3.1)
+_TARGETS = 2  # A tree for r and one for g (section 3.2)
+_WINDOW_WEIGHT = 20  # How often a training script of OpenCV repeats the images of a window
+_AGREEING = 3  # Features of four that must agree for their estimates to count
 
 
 @dataclass(frozen=True)

@@ -25,14 +25,11 @@ from evaluation.learning.working_size import chromaticities, lights_from_chromat
 from evaluation.metrics import recovery_error
 from evaluation.scene import Image
 
-FINE = 720
-"""Bins that are extracted, 0 … 1; divisible by each of `CHOICES`."""
+FINE = 720  # Bins that are extracted, 0 … 1; divisible by each of `CHOICES`
+# Numbers of bins to choose among: from fewer than can tell lights apart to more than the paper's data could fill.
 CHOICES = (3, 4, 5, 6, 8, 9, 10, 12, 15, 16, 18, 20, 24, 30, 36, 40, 48, 60)
-"""Numbers of bins to choose among: from fewer than can tell lights apart to more than the paper's data could fill."""
-_PARTS = 5
-"""Parts of the training images in the choice of the number of bins."""
-_LEAST = 2 * _PARTS
-"""Training images from which on there is something to choose by."""
+_PARTS = 5  # Parts of the training images in the choice of the number of bins
+_LEAST = 2 * _PARTS  # Training images from which on there is something to choose by
 
 
 @dataclass(frozen=True)

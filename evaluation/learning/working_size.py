@@ -8,9 +8,9 @@ import numpy.typing as npt
 from evaluation.methods.prepared import PreparedImage
 from evaluation.scene import Image
 
+# Share of a block's pixels that must be usable for its mean to be: with less, a masked chart's rim or a clipped sky
+# would come in through single pixels.
 _LEAST_SHARE = 0.5
-"""Share of a block's pixels that must be usable for its mean to be: with less, a masked chart's rim or a clipped sky
-would come in through single pixels."""
 
 
 def reduce(
@@ -93,5 +93,5 @@ def lights_from_chromaticities(red_green: npt.NDArray[np.float64]) -> npt.NDArra
     return bounded / bounded.sum(axis=1, keepdims=True)
 
 
+# Least share of a channel in an estimated light: a model that extrapolates must not leave the colours that exist.
 _DARKEST = 1e-6
-"""Least share of a channel in an estimated light: a model that extrapolates must not leave the colours that exist."""

@@ -44,19 +44,15 @@ from generator.kernels.vector import (
     store,
 )
 
+# Vectors that are found at a time: as many sums as a multiplication takes cycles, so that none waits for another.
 OUTPUTS: Final = 4
-"""Vectors that are found at a time: as many sums as a multiplication takes cycles, so that none waits for another."""
-_BYTES: Final = 4
-"""Of a float32."""
-CHUNK: Final = 16
-"""Interleaved pixels of a row that are three whole vectors."""
-_PIXEL: Final = 3 * LINE
-"""Bytes from pixel to pixel of 16 rows."""
+_BYTES: Final = 4  # Of a float32
+CHUNK: Final = 16  # Interleaved pixels of a row that are three whole vectors
+_PIXEL: Final = 3 * LINE  # Bytes from pixel to pixel of 16 rows
 
+# Kinds of kernels: Σ w(k) (x(k) + x(-k)) + w(0) x(0); Σ w(k) (x(k) - x(-k)); Σ w(k) (x(k) + x(-k) - 2 x(0)). Those of
+# a Gaussian and of its first two derivatives.
 EVEN, ODD, BEND = 0, 1, 2
-"""Kinds of kernels: Σ w(k) (x(k) + x(-k)) + w(0) x(0); Σ w(k) (x(k) - x(-k)); Σ w(k) (x(k) + x(-k) - 2 x(0)).
-
-Those of a Gaussian and of its first two derivatives."""
 
 
 def _call(builder: Builder, name: str, *arguments: Any) -> Any:
@@ -278,13 +274,12 @@ def transpose(builder: Builder, source: Value, pitch: Value, target: Value) -> N
         store(builder, value, target, LINE * row)
 
 
-GROUP: Final = LANES
-"""Rows that are filtered along x at a time: one a lane."""
+GROUP: Final = LANES  # Rows that are filtered along x at a time: one a lane
+# Reach of kernels up to which rows are not transposed for order 2: its four transpositions a vector take longer than
+# loads that begin between two cache lines. Orders 0 and 1 have two and three, and are not faster so.
 NEAR: Final = 9
-"""Reach of kernels up to which rows are not transposed for order 2: its four transpositions a vector take longer than
-loads that begin between two cache lines. Orders 0 and 1 have two and three, and are not faster so."""
+# Numbers of a row that are converted before they are transposed: 16 rows of them take 12 KB of the nearest cache.
 STRETCH: Final = 4 * 3 * CHUNK
-"""Numbers of a row that are converted before they are transposed: 16 rows of them take 12 KB of the nearest cache."""
 
 
 @inlined
@@ -486,14 +481,13 @@ def filter_columns(
                 down_curvature(smooth, smooth + field, smooth + 2 * field, reach, even, odd, bend, target, pitch)
 
 
+# Pixels of a tile's width at most, a multiple of 16: narrower, and more of a row is neighbours of the tile.
 TILE_WIDTH = 256
-"""Pixels of a tile's width at most, a multiple of 16: narrower, and more of a row is neighbours of the tile."""
+# Rows of a tile, a multiple of 16: with the widest standard kernels a tile's intermediate results take 0.8 MB at
+# most, which a core's cache holds.
 TILE_ROWS = 64
-"""Rows of a tile, a multiple of 16: with the widest standard kernels a tile's intermediate results take 0.8 MB at most,
-which a core's cache holds."""
 
-_ALIGNMENT = 64
-"""Bytes of a cache line: aligned buffers make a third of the difference between two loads and three."""
+_ALIGNMENT = 64  # Bytes of a cache line: aligned buffers make a third of the difference between two loads and three
 
 
 def gaussian_kernel(sigma: float, order: int) -> npt.NDArray[np.float64]:

@@ -32,23 +32,16 @@ import numpy.typing as npt
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 from evaluation.scene import Image
 
-SIGMA = 0.5
-"""Scale of the derivatives, px, of both methods' programs."""
-SMOOTHING = 7
-"""Side of the mean filters, px, of both methods' programs."""
-DARK = 8 / 255
-"""Sum of red, green and blue, in parts of white, up to which the authors' examples leave a pixel out."""
-_KERNEL_REACH = 2
-"""Of the derivative's kernel: exp(-x² / 2σ²) above 1e-6, as in the authors' program."""
-_HALO = 8
-"""Rows that a pixel's index comes from on either side: mean filter and derivative, with some to spare."""
-_STRIP = 1 << 20
-"""Pixels of a strip: 12 MB a float32 colour image."""
-_LEAST = float(np.finfo(np.float64).eps)
-"""Stands for zero in a logarithm, as in the authors' programs."""
+SIGMA = 0.5  # Scale of the derivatives, px, of both methods' programs
+SMOOTHING = 7  # Side of the mean filters, px, of both methods' programs
+DARK = 8 / 255  # Sum of red, green and blue, in parts of white, up to which the authors' examples leave a pixel out
+_KERNEL_REACH = 2  # Of the derivative's kernel: exp(-x² / 2σ²) above 1e-6, as in the authors' program
+_HALO = 8  # Rows that a pixel's index comes from on either side: mean filter and derivative, with some to spare
+_STRIP = 1 << 20  # Pixels of a strip: 12 MB a float32 colour image
+_LEAST = float(np.finfo(np.float64).eps)  # Stands for zero in a logarithm, as in the authors' programs
 
+# From a strip (H, W, 3) float32, parts of white: the index (H, W) float32, and (H, W) bool, True where it has none.
 Index = Callable[[npt.NDArray[np.float32]], tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]]
-"""From a strip (H, W, 3) float32, parts of white: the index (H, W) float32, and (H, W) bool, True where it has none."""
 
 
 def slope(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -122,8 +115,7 @@ def _strips(prepared: PreparedImage) -> Iterator[tuple[slice, slice, npt.NDArray
         yield slice(top, bottom), slice(top - first, bottom - first), strip
 
 
-LEAST_CONTRAST = 1e-4
-"""Derivative, parts of white a pixel, up to which all channels count as flat (the authors' δ)."""
+LEAST_CONTRAST = 1e-4  # Derivative, parts of white a pixel, up to which all channels count as flat (the authors' δ)
 
 
 def grayness(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
@@ -169,10 +161,8 @@ class GraynessIndex(PreparedMethod):
         return greyest(*index_map(prepared, grayness), self.share)
 
 
-_WIDTH = 0.2
-"""σ of a cluster's weight exp(-d / 2σ²), d in parts of the image's diagonal, as in the paper."""
-_ROUNDS = 50
-"""Rounds of k-means, more than it takes."""
+_WIDTH = 0.2  # σ of a cluster's weight exp(-d / 2σ²), d in parts of the image's diagonal, as in the paper
+_ROUNDS = 50  # Rounds of k-means, more than it takes
 
 
 @dataclass(frozen=True)
@@ -232,21 +222,15 @@ def _clusters(places: npt.NDArray[np.float64], count: int) -> tuple[npt.NDArray[
     return centres, member
 
 
-MOST_CANDIDATES = 2000
-"""Candidates that are clustered: as many as a photograph of 0.2 megapixels has."""
-BANDWIDTH = 0.1
-"""h of the mean shift (the authors' `bandwidth`)."""
-_REACH = 0.01 * BANDWIDTH
-"""Angle in radians times squared distance below which a colour belongs to a mean."""
-_STILL = 1e-3 * BANDWIDTH
-"""Distance times angle of a step below which a mean has arrived."""
-_MERGED = BANDWIDTH / 2
-"""Distance times angle below which two means are one cluster."""
-_MOST_STEPS = 100
-"""Steps of a mean, many times what it takes."""
+MOST_CANDIDATES = 2000  # Candidates that are clustered: as many as a photograph of 0.2 megapixels has
+BANDWIDTH = 0.1  # h of the mean shift (the authors' `bandwidth`)
+_REACH = 0.01 * BANDWIDTH  # Angle in radians times squared distance below which a colour belongs to a mean
+_STILL = 1e-3 * BANDWIDTH  # Distance times angle of a step below which a mean has arrived
+_MERGED = BANDWIDTH / 2  # Distance times angle below which two means are one cluster
+_MOST_STEPS = 100  # Steps of a mean, many times what it takes
+# Derivative of a logarithm up to which a channel counts as flat: rounding to float32 makes as much where nothing
+# changes, and a step of one count of 16 bits below white makes 8e-6.
 _FLAT = 2e-6
-"""Derivative of a logarithm up to which a channel counts as flat: rounding to float32 makes as much where nothing
-changes, and a step of one count of 16 bits below white makes 8e-6."""
 
 
 def angle_to_grey(strip: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:

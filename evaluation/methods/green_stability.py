@@ -22,8 +22,7 @@ from evaluation.scene import Scene, told_of
 from foundation.compiled import ordered_map
 from foundation.errors import InputError
 
-_FEWEST_IMAGES = 2
-"""Images that a spread is found of."""
+_FEWEST_IMAGES = 2  # Images that a spread is found of
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,13 +49,12 @@ from foundation.version import PACKAGES, require_own_packages
 if TYPE_CHECKING:
     from evaluation.methods.method import Learner, Method
 
-FAMILIES = ("shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2")
-"""The methods that take parameters."""
+FAMILIES = ("shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2")  # The methods that take parameters
 
 _MODIFIERS = re.compile(r"(?P<size>[0-9]{1,6})|patches(=(?P<patches>[0-9]{1,6}))?")
 
+# Scale of a Gaussian that a text may ask for, px: no image has structure beyond, and the filter's width is bounded.
 LARGEST_SIGMA = 1000
-"""Scale of a Gaussian that a text may ask for, px: no image has structure beyond, and the filter's width is bounded."""
 
 _FORMS = "a name of this suite, module:Class or path/file.py:Class"
 

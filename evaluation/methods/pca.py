@@ -15,12 +15,11 @@ import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, unit
 
+# Pixels from which some of them say where the limits are: below, counting all takes under a millisecond.
 _MANY = 1 << 16
-"""Pixels from which some of them say where the limits are: below, counting all takes under a millisecond."""
-_SPARSE = 16
-"""One pixel of so many is counted then."""
+_SPARSE = 16  # One pixel of so many is counted then
+# Standard deviations, of pixels drawn independently, that the limits may lie off; beyond, all pixels are counted.
 _DEVIATIONS = 4.0
-"""Standard deviations, of pixels drawn independently, that the limits may lie off; beyond, all pixels are counted."""
 
 
 @dataclass(frozen=True)

@@ -38,20 +38,14 @@ if TYPE_CHECKING:
     from evaluation.scene import Image
 
 
-SPAN = 64
-"""Pixels of a row that are added at a time where none is left out: a few vectors in each of three channels."""
-SPANS_OF_A_SUM = 60_000
-"""Values of uint16 that a sum of uint32 holds, less those of one more row of 350 000 px."""
-CHUNK = 256
-"""Pixels whose powers are found at a time, in the nearest cache."""
-BLOCK = 16
-"""Pixels of float32 whose whole powers are found at a time: three vectors, which become six of float64."""
-MOST_PRODUCTS = 64
-"""Powers up to which products are used."""
+SPAN = 64  # Pixels of a row that are added at a time where none is left out: a few vectors in each of three channels
+SPANS_OF_A_SUM = 60_000  # Values of uint16 that a sum of uint32 holds, less those of one more row of 350 000 px
+CHUNK = 256  # Pixels whose powers are found at a time, in the nearest cache
+BLOCK = 16  # Pixels of float32 whose whole powers are found at a time: three vectors, which become six of float64
+MOST_PRODUCTS = 64  # Powers up to which products are used
 
 
-_BYTES = 4
-"""Of a float32."""
+_BYTES = 4  # Of a float32
 _DOUBLES = ir.VectorType(ir.DoubleType(), 8)
 
 
@@ -304,10 +298,9 @@ def sum_powers(
             sums[j % 3] += found[j]
 
 
-BINS = 4096
-"""Of the histogram of projections: one that holds a limit has some thousand pixels of 18 million."""
+BINS = 4096  # Of the histogram of projections: one that holds a limit has some thousand pixels of 18 million
+# Pixels by which the counted ones move on from row to row: no column is preferred where every 16th pixel counts.
 _STRIDE = 5
-"""Pixels by which the counted ones move on from row to row: no column is preferred where every 16th pixel counts."""
 
 
 @compiled

@@ -23,11 +23,9 @@ import numpy.typing as npt
 from evaluation.methods.method import Method
 from evaluation.scene import Image
 
+# The estimate (3,) float64 where no pixel is usable, or every one is black: no colour cast. Methods then return this
+# very array, which distinguishes it from an estimate that happens to be grey.
 GREY = np.full(3, 3**-0.5)
-"""The estimate (3,) float64 where no pixel is usable, or every one is black: no colour cast.
-
-Methods then return this very array, which distinguishes it from an estimate that happens to be grey.
-"""
 GREY.setflags(write=False)
 
 
@@ -99,17 +97,13 @@ def shrink(
     return found.astype(np.float32), masked
 
 
-KEPT_PIXELS = 1 << 20
-"""Pixels up to which derivatives are kept for the next method: 12 MB each."""
+KEPT_PIXELS = 1 << 20  # Pixels up to which derivatives are kept for the next method: 12 MB each
 
+# Norm up to which no power of a value between 1 and 1e-19 of the image's largest leaves the range of float64. So the
+# largest usable value need not be found first.
 SAFE_POWER = 16
-"""Norm up to which no power of a value between 1 and 1e-19 of the image's largest leaves the range of float64.
 
-So the largest usable value need not be found first.
-"""
-
-_ALL = np.zeros((0, 0), dtype=bool)
-"""Stands for: every pixel may be used."""
+_ALL = np.zeros((0, 0), dtype=bool)  # Stands for: every pixel may be used
 
 
 @runtime_checkable

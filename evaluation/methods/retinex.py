@@ -85,8 +85,7 @@ def patch_sums(
     return sums, maxima
 
 
-SPRAYS = 1000
-"""Sprays that a point's is chosen from, as in the authors' program."""
+SPRAYS = 1000  # Sprays that a point's is chosen from, as in the authors' program
 
 
 @dataclass(frozen=True)

@@ -38,11 +38,9 @@ from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, uni
 from evaluation.methods.retinex import ColorSparrow, ImprovedWhitePatch, SurfaceReflectance
 from evaluation.methods.wrapped import PatchwiseMethod
 
-_TOP = 16383
-"""Value that white gets: a quarter of uint16, so that a channel multiplied by up to 4 is not cut off."""
+_TOP = 16383  # Value that white gets: a quarter of uint16, so that a channel multiplied by up to 4 is not cut off
 
-_ROWS = 256
-"""Rows that are scaled at a time, so that no float64 copy of a large image is made."""
+_ROWS = 256  # Rows that are scaled at a time, so that no float64 copy of a large image is made
 
 
 @dataclass(frozen=True)
@@ -84,8 +82,8 @@ class OpenCvGrayWorld(PreparedMethod):
         return unit(np.divide(before, after, out=np.zeros(3), where=after > 0)[::-1])
 
 
+# Names of the methods that stand in most tables of the field; the others may take seconds on a large image.
 STANDARD = ("white-patch", "gray-world", "shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2", "pca")
-"""Names of the methods that stand in most tables of the field; the others may take seconds on a large image."""
 
 
 def standard_methods() -> Mapping[str, Method]:

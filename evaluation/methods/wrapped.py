@@ -24,11 +24,9 @@ from evaluation.methods.method import Method
 from evaluation.methods.prepared import GREY, PreparedImage, PreparedMethod, estimate
 from evaluation.scene import Image
 
+# Patches along the shorter side: of a photograph of two lights each is small beside a lit region, and has many
+# pixels. A judgement; the paper's patches are of 5 to 20 px on images of 300.
 PATCHES = 8
-"""Patches along the shorter side: of a photograph of two lights each is small beside a lit region, and has many pixels.
-
-A judgement; the paper's patches are of 5 to 20 px on images of 300.
-"""
 
 
 @dataclass(frozen=True)

@@ -26,23 +26,19 @@ from foundation.colorimetry import srgb_codes
 from foundation.errors import counted
 from foundation.plots import FAINT, legend_label, series_style, svg_of
 
+# Percentile of all methods' errors at which the axis of errors ends: a few wild ones would squeeze the others.
 _SHOWN_PERCENTILE = 98
-"""Percentile of all methods' errors at which the axis of errors ends: a few wild ones would squeeze the others."""
 
-_STEPS = 300
-"""Points of a curve: as many as a column of a page has pixels, whatever the number of images."""
+_STEPS = 300  # Points of a curve: as many as a column of a page has pixels, whatever the number of images
 
-_PANELS = 12
-"""Methods that get a panel of their own: more are too small to be read."""
+_PANELS = 12  # Methods that get a panel of their own: more are too small to be read
 
-_COLUMNS = 3
-"""Panels beside each other: what a page of 1100 px has room for."""
+_COLUMNS = 3  # Panels beside each other: what a page of 1100 px has room for
 
+# Points that are drawn one by one; more become a picture, for a page of millions of circles opens slowly.
 _VECTORS = 3000
-"""Points that are drawn one by one; more become a picture, for a page of millions of circles opens slowly."""
 
-_BRIGHTEST_PERCENTILE = 95
-"""Percentile of all methods' errors at which the scale of colours ends."""
+_BRIGHTEST_PERCENTILE = 95  # Percentile of all methods' errors at which the scale of colours ends
 
 
 def error_curves(results: Sequence[Result], kind: ErrorKind) -> bytes:
@@ -121,29 +117,23 @@ def _draw_planes(figure: Any, results: Sequence[Result], truths: npt.NDArray[np.
     bar.outline.set_edgecolor(FAINT)
 
 
-_HEIGHT = 170
-"""Pixels of a picture's height: three beside each other fill half a page."""
+_HEIGHT = 170  # Pixels of a picture's height: three beside each other fill half a page
 
-_WIDEST = 300
-"""Pixels of a picture's width at most: a panorama would make the others tiny."""
+_WIDEST = 300  # Pixels of a picture's width at most: a panorama would make the others tiny
 
+# Percentile of the brightest channel, under the true light, that becomes white: what is above are highlights.
 _WHITE_PERCENTILE = 98.0
-"""Percentile of the brightest channel, under the true light, that becomes white: what is above are highlights."""
 
-_GAP = 6
-"""Pixels between pictures, white on every screen."""
+_GAP = 6  # Pixels between pictures, white on every screen
 
-_MASKED = 0.18
-"""Linear grey that stands for masked pixels: the middle of a display's range."""
+_MASKED = 0.18  # Linear grey that stands for masked pixels: the middle of a display's range
 
-_HALF = 0.5
-"""Share of a small pixel that is masked above which it is drawn as masked."""
+_HALF = 0.5  # Share of a small pixel that is masked above which it is drawn as masked
 
+# Of the JPEG files: traces of compression are not seen, and a page of a hundred pictures stays below 2 MB.
 _QUALITY = 88
-"""Of the JPEG files: traces of compression are not seen, and a page of a hundred pictures stays below 2 MB."""
 
-_LEAST_GAIN = 1e-6
-"""Share of the green channel that replaces a light's channel at zero, which cannot be divided by."""
+_LEAST_GAIN = 1e-6  # Share of the green channel that replaces a light's channel at zero, which cannot be divided by
 
 
 def developed(scene: Scene, estimates: Sequence[npt.NDArray[np.float64]]) -> list[bytes]:
@@ -202,11 +192,9 @@ def _resized(array: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return np.asarray(cv2.resize(array, size, interpolation=way), dtype=np.float32)
 
 
-WORST, MIDDLE = 3, 2
-"""Images shown of each method: its largest errors, and those nearest to its median."""
+WORST, MIDDLE = 3, 2  # Images shown of each method: its largest errors, and those nearest to its median
 
-MOST_SHOWN = 12
-"""Methods of which images are shown: with more the page would be too large to be mailed."""
+MOST_SHOWN = 12  # Methods of which images are shown: with more the page would be too large to be mailed
 
 _DEFINITIONS = (
     "Recovery error: angle between estimated and true light. Reproduction error: angle between white and a white "
@@ -313,7 +301,6 @@ def _image(run: Run, number: int, place: int, kind: ErrorKind, pictures: Mapping
 
 
 def _method(method: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Return name, class and settings of a method."""
     settings: Mapping[str, Any] = method.get("settings", method.get("estimates", {}))
     told = ", ".join(f"{name} {_short(value)}" for name, value in settings.items())
     return str(method.get("name", "")), str(method.get("class", "estimates of another program")), told

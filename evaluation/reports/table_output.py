@@ -15,8 +15,7 @@ from evaluation.results.tables import Table
 from foundation import pages
 from foundation.console import JsonOutput
 
-_WIDE = 10_000
-"""Columns of a terminal that no table fills: the table is measured as wide as it likes to be."""
+_WIDE = 10_000  # Columns of a terminal that no table fills: the table is measured as wide as it likes to be
 
 
 def print_table(table: Table) -> None:
@@ -78,6 +77,7 @@ def show_notes(output: JsonOutput, notes: Sequence[str], treatment: Mapping[str,
         print(f"{what}: {how}")
 
 
+# Characters that LaTeX reads as commands or that its default fonts lack, and what sets them.
 _SPECIAL = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
@@ -108,11 +108,9 @@ _SPECIAL = {
     "μ": r"$\mu$",
     "σ": r"$\sigma$",
 }
-"""Characters that LaTeX reads as commands or that its default fonts lack, and what sets them."""
 
 
-_WIDE_COLUMNS = 7
-"""Columns of the paper's tables; with more a table is set smaller, to fit a page's text."""
+_WIDE_COLUMNS = 7  # Columns of the paper's tables; with more a table is set smaller, to fit a page's text
 
 
 def escape_latex(text: str) -> str:

@@ -30,8 +30,7 @@ from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError, counted, first_of
 from foundation.files import csv_text, file_sha256, read_text
 
-ERRORS_FILE = "errors.csv"
-"""Its name in a results folder."""
+ERRORS_FILE = "errors.csv"  # Its name in a results folder
 
 _KINDS: tuple[ErrorKind, ...] = ("recovery", "reproduction")
 _TRUTH = ("truth_r", "truth_g", "truth_b")
@@ -97,8 +96,7 @@ def read_errors(place: Path | str) -> dict[str, MethodErrors]:
     return {method: _errors_of(method, images) for method, images in found.items()}
 
 
-_Line = tuple[list[float], bool, str]
-"""Of an image: errors and truth, whether it was guessed, and its group."""
+_Line = tuple[list[float], bool, str]  # Of an image: errors and truth, whether it was guessed, and its group
 
 
 def _errors_of(method: str, images: Mapping[str, _Line]) -> MethodErrors:
@@ -124,8 +122,7 @@ def _number(text: str | None, name: str, where: str) -> float:
     return value
 
 
-RUN_FORMAT = "crop.run"
-"""What `run.json` says of itself."""
+RUN_FORMAT = "crop.run"  # What `run.json` says of itself
 
 
 def errors_csv(

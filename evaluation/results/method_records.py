@@ -19,8 +19,8 @@ import numpy.typing as npt
 from evaluation.results.files import GivenEstimates
 from foundation.files import file_sha256, sha256_of
 
+# Levels of values within values that are followed: settings are flat, and a graph of objects may have a circle.
 _DEEPEST = 6
-"""Levels of values within values that are followed: settings are flat, and a graph of objects may have a circle."""
 
 
 def describe_method(method: object) -> dict[str, Any]:

@@ -73,8 +73,8 @@ class Result:
         return summarise(self.errors[kind])
 
 
+# The cause where a method of the suite gave no light: too small an image for it, clipped, black or even.
 NO_PIXEL = "no usable pixel"
-"""The cause where a method of the suite gave no light: too small an image for it, clipped, black or even."""
 
 
 @dataclass(frozen=True)

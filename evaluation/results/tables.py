@@ -18,11 +18,9 @@ from evaluation.results.result import NO_PIXEL, Result, Subject
 from foundation.errors import first_of
 from foundation.files import csv_text
 
-Cell = str | float | None
-"""A name, a number (an `int` stays one), or nothing known."""
+Cell = str | float | None  # A name, a number (an `int` stays one), or nothing known
 
-MISSING = "–"
-"""What stands for `None` where people read; in CSV the field is empty."""
+MISSING = "–"  # What stands for `None` where people read; in CSV the field is empty
 
 
 @dataclass(frozen=True)
@@ -99,20 +97,17 @@ def table_to_csv(table: Table) -> str:
     return csv_text([table.columns, *cells])
 
 
-PAPER_COLUMNS = ("Algorithm", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
-"""Heads of the paper's tables."""
+PAPER_COLUMNS = ("Algorithm", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")  # Heads of the paper's tables
 
+# Heads of the statistics beyond them: 95th percentile, maximum, and percentage of errors below 3 degrees.
 FURTHER_COLUMNS = ("95%", "Max.", "< 3° (%)")
-"""Heads of the statistics beyond them: 95th percentile, maximum, and percentage of errors below 3 degrees."""
 
+# Heads of all statistics in files for programs; `below3` is a share, 0 … 1.
 STATISTICS_COLUMNS = ("mean", "median", "trimean", "best25", "worst25", "avg", "p95", "maximum", "below3")
-"""Heads of all statistics in files for programs; `below3` is a share, 0 … 1."""
 
-_NO_PIXEL_CAUSES = "too small for it, clipped, black or even"
-"""Why an image has no usable pixel for a method."""
+_NO_PIXEL_CAUSES = "too small for it, clipped, black or even"  # Why an image has no usable pixel for a method
 
-_NAMED = 3
-"""Images that a note names: all of them stand in errors.csv."""
+_NAMED = 3  # Images that a note names: all of them stand in errors.csv
 
 
 def summary_table(subject: Subject, results: Sequence[Result], kind: ErrorKind, further: bool = False) -> Table:

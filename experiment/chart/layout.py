@@ -32,39 +32,31 @@ from experiment.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, 
 from foundation.errors import InputError
 from foundation.version import software
 
-SLOT_PX = 125
-"""Usual side of a slot, 5.29 mm: the largest at which A0 holds 32 768 colours, tags and references."""
+SLOT_PX = 125  # Usual side of a slot, 5.29 mm: the largest at which A0 holds 32 768 colours, tags and references
 
-SLOT_STEP_PX = 5
-"""Slots are multiples of it, because a tag's ten modules are four slots."""
+SLOT_STEP_PX = 5  # Slots are multiples of it, because a tag's ten modules are four slots
 
-LEAST_SLOT_PX = 25
-"""A cell of 1.06 mm, a module of 0.42 mm: below, a printer's dots are too few to mix a colour."""
+LEAST_SLOT_PX = 25  # A cell of 1.06 mm, a module of 0.42 mm: below, a printer's dots are too few to mix a colour
 
-TAG_SLOTS = 4
-"""Slots along a tag with its white rim: its ten modules are then 2/5 of a slot, whole pixels at 600 dpi."""
+TAG_SLOTS = 4  # Slots along a tag with its white rim: its ten modules are then 2/5 of a slot, whole pixels at 600 dpi
 
-TAG_SPACING_SLOTS = 38
-"""Largest distance between tags: 35 tags on A0, seven by five."""
+TAG_SPACING_SLOTS = 38  # Largest distance between tags: 35 tags on A0, seven by five
 
-TAG_IDS = 587
-"""Codes in the family 36h11."""
+TAG_IDS = 587  # Codes in the family 36h11
 
-MARGIN_MM = 8.0
-"""Least white margin: printers leave 3 to 5 mm, and rulers and targets need the rest."""
+MARGIN_MM = 8.0  # Least white margin: printers leave 3 to 5 mm, and rulers and targets need the rest
 
+# Columns and rows of blocks in the paper's grid, for each number of bits: one block for each level of blue.
 PAPER_BLOCKS = {1: (2, 1), 2: (2, 2), 3: (4, 2), 4: (4, 4), 5: (8, 4)}
-"""Columns and rows of blocks in the paper's grid, for each number of bits: one block for each level of blue."""
 
-PAPER_REFERENCE_MM = 100.0
-"""Largest distance between the patches of bare paper in the margin of the paper's grid."""
+PAPER_REFERENCE_MM = 100.0  # Largest distance between the patches of bare paper in the margin of the paper's grid
 
+# Side of these patches, 5 mm: about that of a cell, and even, so that its middle is a whole pixel.
 PAPER_REFERENCE_PX = 118
-"""Side of these patches, 5 mm: about that of a cell, and even, so that its middle is a whole pixel."""
 
-PAPER_REFERENCES = 4
-"""Parts into which these patches divide the upper and the right margin at least."""
+PAPER_REFERENCES = 4  # Parts into which these patches divide the upper and the right margin at least
 
+# Landscape sheets of ISO 216, largest first.
 A_SERIES_MM: dict[str, tuple[float, float]] = {
     "A0": (1189, 841),
     "A1": (841, 594),
@@ -76,20 +68,17 @@ A_SERIES_MM: dict[str, tuple[float, float]] = {
     "A7": (105, 74),
     "A8": (74, 52),
 }
-"""Landscape sheets of ISO 216, largest first."""
 
+# Reference greys besides paper white: in sRGB each reflects half the light of the one before, 1/2 … 1/16 of white.
+# Four even stops show whether a frame is linear, and the darkest is still some hundred counts where white is well
+# exposed. None is a colour of the chart: its low bits are not zero.
 GREY_CODES = (188, 137, 99, 71)
-"""Reference greys besides paper white: in sRGB each reflects half the light of the one before, 1/2 … 1/16 of white.
 
-Four even stops show whether a frame is linear, and the darkest is still some hundred counts where white is well
-exposed. None is a colour of the chart: its low bits are not zero.
-"""
-
+# White references from which on calibration sees the light fall towards the corners; from fewer, a slope alone.
 LEAST_WHITES = 18
-"""White references from which on calibration sees the light fall towards the corners; from fewer, a slope alone."""
 
+# Longest side of a page: no printer has wider rolls, and a larger number is a mistake of units.
 LARGEST_PAGE_MM = 10_000.0
-"""Longest side of a page: no printer has wider rolls, and a larger number is a mistake of units."""
 
 _Slots = npt.NDArray[np.bool_]
 

@@ -23,20 +23,16 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-MM_PER_INCH = 25.4
-"""Exact, by definition of the international inch."""
+MM_PER_INCH = 25.4  # Exact, by definition of the international inch
 
-DESIGN_DPI = 600
-"""Resolution of the design: photo printers and plotters work at it or at a multiple."""
+DESIGN_DPI = 600  # Resolution of the design: photo printers and plotters work at it or at a multiple
 
-PX_MM = MM_PER_INCH / DESIGN_DPI
-"""Millimetres of a pixel of the design."""
+PX_MM = MM_PER_INCH / DESIGN_DPI  # Millimetres of a pixel of the design
 
+# How far a coordinate read from a file may lie beside a whole pixel: six decimals of a millimetre are 2e-5 px.
 _ROUNDING_PX = 1e-3
-"""How far a coordinate read from a file may lie beside a whole pixel: six decimals of a millimetre are 2e-5 px."""
 
-Boxes = npt.NDArray[np.int64]
-"""(N, 4) int64: left, top, right, bottom, px at 600 dpi."""
+Boxes = npt.NDArray[np.int64]  # (N, 4) int64: left, top, right, bottom, px at 600 dpi
 
 
 def whole_px(boxes_mm: npt.ArrayLike) -> Boxes:
@@ -47,48 +43,38 @@ def whole_px(boxes_mm: npt.ArrayLike) -> Boxes:
     )
 
 
+# Bare paper around the field: 1.5 mm are three half-size pixels of the EOS 550D, more than its blur reaches.
 GAP_PX = 35
-"""Bare paper around the field: 1.5 mm are three half-size pixels of the EOS 550D, more than its blur reaches."""
 
+# Length and width of a crop mark's strokes, 5 mm and 0.2 mm: long enough to lay a rule along, and visible.
 CROP_PX, CROP_STROKE_PX = 120, 5
-"""Length and width of a crop mark's strokes, 5 mm and 0.2 mm: long enough to lay a rule along, and visible."""
 
-TICK_PX = 4
-"""Width of a ruler's tick: 0.17 mm, as on a steel rule."""
+TICK_PX = 4  # Width of a ruler's tick: 0.17 mm, as on a steel rule
 
-TICKS_PX = ((100, 60), (10, 47), (5, 36), (1, 24))
-"""A ruler's ticks: their distance in mm and their length."""
+TICKS_PX = ((100, 60), (10, 47), (5, 36), (1, 24))  # A ruler's ticks: their distance in mm and their length
 
-NUMBERS_PX = 100
-"""Where a ruler's numbers begin, outwards from the field."""
+NUMBERS_PX = 100  # Where a ruler's numbers begin, outwards from the field
 
+# Widths of the line target's bars, three bars each: 0.39, 0.59, 0.79, 0.98, 1.2 … 11.8 line pairs a millimetre. The
+# EOS 550D's half-size image of an A0 sheet ends at 0.97, a 600-dpi print at 11.8.
 BARS_PX = (30, 20, 15, 12, 10, 8, 6, 5, 4, 3, 2, 1)
-"""Widths of the line target's bars, three bars each: 0.39, 0.59, 0.79, 0.98, 1.2 … 11.8 line pairs a millimetre.
 
-The EOS 550D's half-size image of an A0 sheet ends at 0.97, a 600-dpi print at 11.8.
-"""
+BAR_LENGTH_PX = 75  # Length of the bars, 3.2 mm: several pixels of a half-size image of A0 to average along
 
-BAR_LENGTH_PX = 75
-"""Length of the bars, 3.2 mm: several pixels of a half-size image of A0 to average along."""
-
+# Diameter and spokes of the Siemens star: 0.75 line pairs a millimetre at its rim, finer inwards; a half-size image
+# of the EOS 550D resolves the rim.
 STAR_PX, STAR_CYCLES = 120, 12
-"""Diameter and spokes of the Siemens star: 0.75 line pairs a millimetre at its rim, finer inwards; a half-size image of
-the EOS 550D resolves the rim."""
 
+# The slanted edge of ISO 12233: 24 steps of one pixel in twelve, 4.8 degrees.
 EDGE_STEPS, EDGE_RUN_PX, EDGE_DEPTH_PX = 24, 12, 60
-"""The slanted edge of ISO 12233: 24 steps of one pixel in twelve, 4.8 degrees."""
 
-_DOT_PX = 2
-"""Pixels of a dot of text: capitals of 15 dots are 1.3 mm high."""
+_DOT_PX = 2  # Pixels of a dot of text: capitals of 15 dots are 1.3 mm high
 
-_LINE_PX = 48
-"""From line to line of text, 2 mm."""
+_LINE_PX = 48  # From line to line of text, 2 mm
 
-_AIR_PX = 20
-"""Bare paper around whatever is put into a margin, 0.85 mm."""
+_AIR_PX = 20  # Bare paper around whatever is put into a margin, 0.85 mm
 
-_SEARCH_PX = 24
-"""Steps in which a free place along a margin is looked for, 1 mm."""
+_SEARCH_PX = 24  # Steps in which a free place along a margin is looked for, 1 mm
 
 Side = Literal["left", "top", "right", "bottom"]
 

@@ -23,17 +23,15 @@ from foundation.files import reading_error, write_whole
 from foundation.records import from_json
 
 FORMAT = "crop.chart"
-VERSION = 1
-"""`format` and `version` of the `chart.json` that this software writes and reads (docs/formats.md)."""
+VERSION = 1  # `format` and `version` of the `chart.json` that this software writes and reads (docs/formats.md)
 
-PAPER_WHITE = (255, 255, 255)
-"""Printed code of bare paper: no ink."""
+PAPER_WHITE = (255, 255, 255)  # Printed code of bare paper: no ink
 
+# Family of the AprilTags: codes of 36 bits, any two of which differ in 11 or more (E. Olson, ICRA 2011).
 TAG_FAMILY = "36h11"
-"""Family of the AprilTags: codes of 36 bits, any two of which differ in 11 or more (E. Olson, ICRA 2011)."""
 
+# Modules along the black square of a tag 36h11: 6 of data and a black border of one; the white rim comes on top.
 TAG_MODULES = 8
-"""Modules along the black square of a tag 36h11: 6 of data and a black border of one; the white rim comes on top."""
 
 
 def colour_of_index(index: npt.ArrayLike, bits: int) -> npt.NDArray[np.uint8]:

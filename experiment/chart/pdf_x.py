@@ -33,40 +33,34 @@ import numpy.typing as npt
 from foundation.colorimetry import decode_srgb, encode_srgb
 from foundation.files import whole_file
 
+# The date that the metadata must have: one for all, so that the same chart gives the same bytes.
 DATE = "2000-01-01T00:00:00+00:00"
-"""The date that the metadata must have: one for all, so that the same chart gives the same bytes."""
 
+# What the output intent calls the printing condition: none that is registered, for no printer is characterised.
 CONDITION = "RGB codes, unmanaged"
-"""What the output intent calls the printing condition: none that is registered, for no printer is characterised."""
 
+# The output intent in words.
 CONDITION_INFO = (
     "The codes name inks: print them without colour management. A workflow that manages colours all the same takes "
     "them as sRGB."
 )
-"""The output intent in words."""
 
+# XYZ of red, green and blue at full, columns, relative to D50.
 _PRIMARIES = np.array(
     [[0.4360747, 0.3850649, 0.1430804], [0.2225045, 0.7168786, 0.0606169], [0.0139322, 0.0971045, 0.7141733]]
 )
-"""XYZ of red, green and blue at full, columns, relative to D50."""
 
-_WHITE = (0.9642, 1.0, 0.8249)
-"""D50, the white of the profile connection space (ICC.1:2001-04, 6.1.11)."""
+_WHITE = (0.9642, 1.0, 0.8249)  # D50, the white of the profile connection space (ICC.1:2001-04, 6.1.11)
 
-_CURVE = 4096
-"""Entries of a curve, the most that lut16Type takes."""
+_CURVE = 4096  # Entries of a curve, the most that lut16Type takes
 
-_DISPLAY_CURVE = 1024
-"""Entries of a curve of the display profile, as in the ICC's own."""
+_DISPLAY_CURVE = 1024  # Entries of a curve of the display profile, as in the ICC's own
 
-_GAMUT_GRID = 17
-"""Points along each side of the gamut's table: a warning needs no more."""
+_GAMUT_GRID = 17  # Points along each side of the gamut's table: a warning needs no more
 
-_FULL = 65535
-"""Encoding of 1 of a device value, 16 bits (ICC.1:2001-04, 6.5.8)."""
+_FULL = 65535  # Encoding of 1 of a device value, 16 bits (ICC.1:2001-04, 6.5.8)
 
-_ONE_XYZ = 32768
-"""Encoding of 1 of X, Y or Z as u1Fixed15 (ICC.1:2001-04, 5.3.4.2)."""
+_ONE_XYZ = 32768  # Encoding of 1 of X, Y or Z as u1Fixed15 (ICC.1:2001-04, 5.3.4.2)
 
 Box = tuple[float, float, float, float]
 Code = tuple[int, int, int]
@@ -211,8 +205,7 @@ def _curves(curve: _Array) -> npt.NDArray[np.uint16]:
     return np.tile(np.rint(_FULL * np.clip(curve, 0, 1)).astype(np.uint16), (3, 1))
 
 
-_LINEAR = _curves(np.array([0.0, 1.0]))
-"""A curve that changes nothing."""
+_LINEAR = _curves(np.array([0.0, 1.0]))  # A curve that changes nothing
 
 
 def _gamut() -> bytes:

@@ -27,21 +27,18 @@ from experiment.chart.pdf_x import filled, save_page, srgb_display_profile
 from foundation.errors import InputError
 from foundation.files import whole_file, write_whole
 
-POINTS_PER_MM = 72 / MM_PER_INCH
-"""Points of a PDF's user space, 72 to the inch (ISO 32000-1, 8.3.2.3)."""
+POINTS_PER_MM = 72 / MM_PER_INCH  # Points of a PDF's user space, 72 to the inch (ISO 32000-1, 8.3.2.3)
 
+# Rows of a strip of the TIFF: 5 MB of an A0 sheet at 600 dpi, little to hold and long enough to compress.
 _STRIP_ROWS = 64
-"""Rows of a strip of the TIFF: 5 MB of an A0 sheet at 600 dpi, little to hold and long enough to compress."""
 
-_BANDS = 64
-"""Bands of like rows that are painted at a time: the picture is never held, however many edges a sheet has."""
+_BANDS = 64  # Bands of like rows that are painted at a time: the picture is never held, however many edges a sheet has
 
-_SUPERSAMPLING = 8
-"""Pixels along each side of a preview's pixel: edges are then good to 1/8 of it."""
+_SUPERSAMPLING = 8  # Pixels along each side of a preview's pixel: edges are then good to 1/8 of it
 
+# How far a cell of the PDF reaches below its neighbours, so that no hairline of paper shows between them, and how
+# much smaller than its box each part is drawn, so that rounding does not paint the next pixel.
 _LAP_PX, _INSET_PX = 0.2, 0.01
-"""How far a cell of the PDF reaches below its neighbours, so that no hairline of paper shows between them, and how much
-smaller than its box each part is drawn, so that rounding does not paint the next pixel."""
 
 
 @dataclass(frozen=True, eq=False)

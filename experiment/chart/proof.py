@@ -27,24 +27,21 @@ from experiment.chart.printing import (
 )
 from foundation.files import write_whole
 
-PAGE_MM = (297.0, 210.0)
-"""A4, landscape (ISO 216): every printer takes it."""
+PAGE_MM = (297.0, 210.0)  # A4, landscape (ISO 216): every printer takes it
 
-WINDOW_MM = (262.0, 107.0)
-"""Room for the piece of the field: what rulers, targets, greys and text leave of the page."""
+WINDOW_MM = (262.0, 107.0)  # Room for the piece of the field: what rulers, targets, greys and text leave of the page
 
-CORNER_PX = (360, 330)
-"""Left and top of the piece of the field."""
+CORNER_PX = (360, 330)  # Left and top of the piece of the field
 
+# Place and size of the greys: below the piece of the field, and about as wide.
 WEDGE_TOP_MM, WEDGE_HEIGHT_MM, WEDGE_STEP_MM = 137.0, 12.0, 8.0
-"""Place and size of the greys: below the piece of the field, and about as wide."""
 
-WEDGE_CODES = (*range(0, 256, 8), 255)
-"""The 32 levels of a channel that the chart's colours have, and bare paper."""
+WEDGE_CODES = (*range(0, 256, 8), 255)  # The 32 levels of a channel that the chart's colours have, and bare paper
 
+# Place of the text, from line to line, and its dots: capitals are 1.9 mm high.
 TEXT_TOP_MM, TEXT_LINE_MM, TEXT_DOT_PX = 154.0, 4.8, 3
-"""Place of the text, from line to line, and its dots: capitals are 1.9 mm high."""
 
+# What the proof page says.
 LOOK_FOR = (
     "1 Scale: each 100 mm of both rulers measure 100 mm with a steel rule, to 0.3 mm. Else something scaled the page.",
     "2 Colour management: the grey steps consist of two halves, the upper drawn, the lower an image of the same codes.",
@@ -56,7 +53,6 @@ LOOK_FOR = (
     "5 Surface: matte from every side, no varnish, no lamination. Let it dry for a day before judging colours.",
     "Keep the page: the sheet must be printed with the same paper, ink and settings.",
 )
-"""What the proof page says."""
 
 
 def proof_drawing(chart: Chart) -> Drawing:

@@ -26,70 +26,61 @@ from experiment.framing.homography import fit_homography, project
 from foundation.errors import InputError, RegistrationError
 from foundation.robust import biweight, huber_weights, sigma_of
 
+# Counts above black that the brightest parts of the strongest plane must have for a chart to be looked for.
 MIN_SIGNAL = 12.0
-"""Counts above black that the brightest parts of the strongest plane must have for a chart to be looked for."""
 
-CORNER_REACH_PX = 24.0
-"""How far from a guess the field's outline is looked for."""
+CORNER_REACH_PX = 24.0  # How far from a guess the field's outline is looked for
 
-SIDE_POINTS = 160
-"""Places along a side at which the edge is looked for: many times the six coefficients of its curve."""
+SIDE_POINTS = 160  # Places along a side at which the edge is looked for: many times the six coefficients of its curve
 
 
+# Raw pixels a side must have for its edge to be looked for around it: four times the 24 half-size pixels that the
+# search reaches to either side (`experiment.framing.field.CORNER_REACH_PX`).
 LEAST_SIDE_PX = 192
-"""Raw pixels a side must have for its edge to be looked for around it: four times the 24 half-size pixels that the
-search reaches to either side (`experiment.framing.field.CORNER_REACH_PX`)."""
 
 
+# Share of the cells' variation that the chart's colours must explain; another order of cells explains none.
 MIN_EXPLAINED = 0.5
-"""Share of the cells' variation that the chart's colours must explain; another order of cells explains none."""
 
+# How many times better than the second best the best orientation must fit, in standard deviations of the residual.
 MIN_ADVANTAGE = 1.3
-"""How many times better than the second best the best orientation must fit, in standard deviations of the residual."""
 
-MIRRORED = 4
-"""Of the eight orientations of a rectangle the first that is mirrored."""
+MIRRORED = 4  # Of the eight orientations of a rectangle the first that is mirrored
 
-_SMALL_WIDTH_PX = 640
-"""Width of the small raster on which the level of paper is looked for."""
+_SMALL_WIDTH_PX = 640  # Width of the small raster on which the level of paper is looked for
 
+# Light of a colour over that of the strongest: to be looked at for colours, and for edges.
 _LEAST_LIGHT, _MUCH_LIGHT = 0.03, 0.2
-"""Light of a colour over that of the strongest: to be looked at for colours, and for edges."""
 
-_PROFILE_STEP_PX = 0.5
-"""Step of the profiles across an edge: half a half-size pixel, a photosite."""
+_PROFILE_STEP_PX = 0.5  # Step of the profiles across an edge: half a half-size pixel, a photosite
 
+# σ by which profiles are smoothed before their steepest rise is looked for: the blur of a picture just usable.
 _EDGE_SIGMA_PX = 1.0
-"""σ by which profiles are smoothed before their steepest rise is looked for: the blur of a picture just usable."""
 
+# How far from the guess the edge is looked for, the order of the curve drawn through it, and how well it is known.
 _ROUNDS = ((CORNER_REACH_PX, 2, 1e3), (CORNER_REACH_PX / 2, 5, 12.0), (6.0, 5, 6.0))
-"""How far from the guess the edge is looked for, the order of the curve drawn through it, and how well it is known."""
 
-_MIN_EDGE = 0.05
-"""Of paper white: what the step from cells to paper must have to be taken for the outline."""
+_MIN_EDGE = 0.05  # Of paper white: what the step from cells to paper must have to be taken for the outline
 
 _REFINE_ALONG_PX = np.arange(-2.0, 2.1)
+# Around a place of the edge: one cell inwards, and outwards not as far as marks in the margin begin.
 _REFINE_ACROSS_PX = np.arange(-3.5, 2.1, 0.5)
-"""Around a place of the edge: one cell inwards, and outwards not as far as marks in the margin begin."""
 
+# Rounds of the fit of a blurred step; each moves it by half a pixel at most, and three pixels are looked at.
 _REFINE_STEPS = 6
-"""Rounds of the fit of a blurred step; each moves it by half a pixel at most, and three pixels are looked at."""
 
-_INTERPOLATION_PX = 0.4
-"""σ that linear interpolation adds to an edge."""
+_INTERPOLATION_PX = 0.4  # σ that linear interpolation adds to an edge
 
-_REFINED_PX = 1.5
-"""How far from where it was taken to be an edge may be: beyond, the profile ends before the blur does."""
+_REFINED_PX = 1.5  # How far from where it was taken to be an edge may be: beyond, the profile ends before the blur does
 
-_CLEAR_EDGE = 0.15
-"""Of paper: a lower step from cells to margin does not give its place to a tenth of a pixel."""
+_CLEAR_EDGE = 0.15  # Of paper: a lower step from cells to margin does not give its place to a tenth of a pixel
 
+# Of the run of a side beside a map: corners that curl by 6 px are followed to .1 px, marks in the margin along a
+# twelfth of a side are not.
 _RUN_ORDER = 8
-"""Of the run of a side beside a map: corners that curl by 6 px are followed to .1 px, marks in the margin along a
-twelfth of a side are not."""
 
+# Cells whose colours are compared, chosen at random: a hundred for each parameter of the fit, at little cost.
 _TRIED_CELLS = 1500
-"""Cells whose colours are compared, chosen at random: a hundred for each parameter of the fit, at little cost."""
 
 _Float = npt.NDArray[np.float32]
 _Points = npt.NDArray[np.float64]
@@ -152,12 +143,12 @@ def field_mm(chart: Chart) -> _Points:
     return np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
 
 
+# The remedy of every message about a field of cells whose place is not known.
 HOW_TO_GIVE_CORNERS = (
     "give the corners of its field of cells by --corners, for example --corners 297,90 4866,160 4805,3319 296,3326: "
     "x,y in pixels of the raw file as it is stored, clockwise from the corner that is printed top-left; read them off "
     "the ticks at the border of the picture that acquire check --picture saves, or in an image viewer"
 )
-"""The remedy of every message about a field of cells whose place is not known."""
 
 
 def find_field(
@@ -576,7 +567,6 @@ def _bent(share: _Points, curve: _Points, start: _Points, end: _Points) -> _Poin
 
 
 def _sum(one: _Points, other: _Points) -> _Points:
-    """Return the sum of two series of different lengths."""
     total = np.zeros(max(len(one), len(other)))
     total[: len(one)] += one
     total[: len(other)] += other

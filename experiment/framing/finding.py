@@ -25,17 +25,14 @@ from experiment.framing.field import MIN_SIGNAL, FoundField, corners_text, find_
 from experiment.framing.homography import project, rms, robust_homography
 from foundation.errors import InputError, RegistrationError
 
-MIN_TAGS = 2
-"""Tags without which no homography is looked for: two give eight points, twice as many as one needs."""
+MIN_TAGS = 2  # Tags without which no homography is looked for: two give eight points, twice as many as one needs
 
+# Share of the chart's tags that must be found; fewer mean that part of the chart is covered, dark or outside.
 MIN_TAG_SHARE = 0.75
-"""Share of the chart's tags that must be found; fewer mean that part of the chart is covered, dark or outside."""
 
-MIN_MODULE_PX = 3.0
-"""Half-size pixels a tag module must have; below, detectors fail one tag after another."""
+MIN_MODULE_PX = 3.0  # Half-size pixels a tag module must have; below, detectors fail one tag after another
 
-_CORNERS = [1, 0, 3, 2]
-"""pyapriltags' corners in the order clockwise from the printed top-left."""
+_CORNERS = [1, 0, 3, 2]  # pyapriltags' corners in the order clockwise from the printed top-left
 
 _Points = npt.NDArray[np.float64]
 
@@ -250,13 +247,13 @@ def _detect(image: npt.NDArray[np.uint8], offset_px: tuple[float, float]) -> tup
     return tuple(found[number] for number in sorted(found))
 
 
+# BGR codes: of page and tags; of outlines that place them and of what deviates; of texts and candidates; of ticks.
 GREEN, RED, AMBER, _GREY = (60, 200, 60), (40, 40, 255), (40, 200, 255), (200, 200, 200)
-"""BGR codes: of page and tags; of outlines that place them and of what deviates; of texts and candidates; of ticks."""
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
+# Raw pixels from tick to tick along the border: about ten on the longer side of an 18-megapixel frame.
 _TICK_RAW_PX = 500
-"""Raw pixels from tick to tick along the border: about ten on the longer side of an 18-megapixel frame."""
 
 _Image = npt.NDArray[np.uint8]
 
@@ -336,15 +333,14 @@ def _draw_text(image: _Image, *lines: str) -> None:
         cv2.putText(image, line, place, FONT, scale, AMBER, 1, cv2.LINE_AA)
 
 
+# Half-size pixels a cell must have for 25 of them to lie safely inside: 5, rounding and registration, and the blur.
+# 8.6 already bleeds 1 % at σ = 0.7.
 MIN_CELL_PX = 8.0
-"""Half-size pixels a cell must have for 25 of them to lie safely inside: 5, rounding and registration, and the blur.
-8.6 already bleeds 1 % at σ = 0.7."""
 
+# Width and height of the paper's cameras' half-size images (section 3.3 names them).
 HALF_SIZE_PX = {"EOS 550D": (2601, 1732), "EOS 6D Mark II": (3132, 2090)}
-"""Width and height of the paper's cameras' half-size images (section 3.3 names them)."""
 
-FILL = 0.94
-"""Share of the frame that a sheet fills along its tighter axis."""
+FILL = 0.94  # Share of the frame that a sheet fills along its tighter axis
 
 
 @dataclass(frozen=True)

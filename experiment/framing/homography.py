@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+# Extent of points across a line, over that along it, below which they lie on it: rounding of coordinates leaves 1e-9,
+# and the corners of two small tags at the ends of an A0 sheet have 1e-3.
 FLAT = 1e-6
-"""Extent of points across a line, over that along it, below which they lie on it: rounding of coordinates leaves 1e-9,
-and the corners of two small tags at the ends of an A0 sheet have 1e-3."""
 
 _Points = npt.NDArray[np.float64]
 

@@ -21,44 +21,37 @@ from experiment.framing.field import FoundField
 from experiment.framing.finding import AMBER, FONT, GREEN, RED, FoundTag, Framing
 from foundation.robust import huber_weights, sigma_of
 
+# Half-size px that are measured at most: an edge that moved further has left the crop around its tag or its strip.
 MAX_SHIFT_PX = 3.0
-"""Half-size px that are measured at most: an edge that moved further has left the crop around its tag or its strip."""
 
+# Half-size px that the chart may move before the sampling grid follows: a fifth of the rounding of samples' places.
 STILL_PX = 0.1
-"""Half-size px that the chart may move before the sampling grid follows: a fifth of the rounding of samples' places."""
 
+# Half-size px of movement from which on the chart is registered again: it was knocked, and may have turned too.
 REREGISTER_PX = 0.5
-"""Half-size px of movement from which on the chart is registered again: it was knocked, and may have turned too."""
 
-_GAUGE_TAGS = 8
-"""Tags that are measured: the median of eight has an error of 0.005 px where paper has 290 counts."""
+_GAUGE_TAGS = 8  # Tags that are measured: the median of eight has an error of 0.005 px where paper has 290 counts
 
-_STEPS = 5
-"""Gauss-Newton steps at most."""
+_STEPS = 5  # Gauss-Newton steps at most
 
-_SETTLED_PX = 1e-3
-"""Step from which on no other is made: a fifth of the error."""
+_SETTLED_PX = 1e-3  # Step from which on no other is made: a fifth of the error
 
+# Half-size px around a tag that are read: the largest movement, the smoothing, and a turned tag's corners.
 _AROUND_TAG_PX = 12
-"""Half-size px around a tag that are read: the largest movement, the smoothing, and a turned tag's corners."""
 
-_STRIPS = 32
-"""Strips spread over the field's outline: eight a side, of which covered ones are outvoted."""
+_STRIPS = 32  # Strips spread over the field's outline: eight a side, of which covered ones are outvoted
 
-_STRIP_ALONG, _STRIP_ACROSS = 30, 8
-"""Half the length and the width of a strip, px."""
+_STRIP_ALONG, _STRIP_ACROSS = 30, 8  # Half the length and the width of a strip, px
 
+# Half-size px around a strip that are read: the largest movement, the steps' overshoot and cubic interpolation.
 _STRIP_REACH_PX = 6
-"""Half-size px around a strip that are read: the largest movement, the steps' overshoot and cubic interpolation."""
 
-_MIN_STRIPS = 8
-"""Strips that must be measured for shift, turn and growth to be known twice over."""
+_MIN_STRIPS = 8  # Strips that must be measured for shift, turn and growth to be known twice over
 
-_LEAST_CORRELATION = 0.5
-"""Of a tag or strip with itself in the earlier frame, for its movement to count (judgement)."""
+_LEAST_CORRELATION = 0.5  # Of a tag or strip with itself in the earlier frame, for its movement to count (judgement)
 
+# Least eigenvalue of a tag's scaled normal matrix; below, its picture is too plain to measure a movement.
 _LEAST_INDEPENDENT = 1e-6
-"""Least eigenvalue of a tag's scaled normal matrix; below, its picture is too plain to measure a movement."""
 
 _Points = npt.NDArray[np.float64]
 
@@ -280,20 +273,15 @@ def _similarity(
     return Shift(dx, dy, largest, len(moved), softer)
 
 
-WIDTH_PX = 640
-"""Longer side of a preview at most, as the journal has it."""
+WIDTH_PX = 640  # Longer side of a preview at most, as the journal has it
 
-_QUALITY = 80
-"""JPEG quality: some 40 kB, 30 MB a session."""
+_QUALITY = 80  # JPEG quality: some 40 kB, 30 MB a session
 
-_LETTER_PX = 7.4
-"""Width of a letter of the cause at `_SCALE`, px."""
+_LETTER_PX = 7.4  # Width of a letter of the cause at `_SCALE`, px
 
-_SCALE = 0.42
-"""Size of the letters, of OpenCV's font: the least that is read with ease."""
+_SCALE = 0.42  # Size of the letters, of OpenCV's font: the least that is read with ease
 
-_FAINTEST = 0.01
-"""Share of white to which a dark frame is brightened at most: else its noise would be the picture."""
+_FAINTEST = 0.01  # Share of white to which a dark frame is brightened at most: else its noise would be the picture
 
 
 def preview_jpeg(
@@ -332,7 +320,6 @@ def preview_jpeg(
 
 
 def _written(image: npt.NDArray[np.uint8], cause: str) -> npt.NDArray[np.uint8]:
-    """Return the picture with a sentence over its lower edge."""
     # OpenCV's letters are those of ASCII.
     plain = cause.replace("°", " deg").replace("×", "x").replace("–", "-").replace("−", "-").replace("…", "...")
     lines = textwrap.wrap(plain.encode("ascii", "replace").decode(), max(20, int(image.shape[1] / _LETTER_PX)))[:5]

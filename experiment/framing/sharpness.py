@@ -15,18 +15,18 @@ from experiment.framing.finding import FoundTag, Framing
 
 _Points = npt.NDArray[np.float64]
 
+# σ of the print's edges up to which cells of any size are found to a few hundredths of a pixel; beyond it the 25
+# samples of a cell of 10 px take in more than 1 % of light from its neighbours.
 MAX_BLUR_PX = 1.0
-"""σ of the print's edges up to which cells of any size are found to a few hundredths of a pixel; beyond it the 25
-samples of a cell of 10 px take in more than 1 % of light from its neighbours."""
 
+# σ that are tried, half-size px: from less than a photosite's own to far beyond use, 7 % apart.
 _BLURS = np.geomspace(0.15, 4, 48)
-"""σ that are tried, half-size px: from less than a photosite's own to far beyond use, 7 % apart."""
 
+# Places of the field's outline at which blur is measured: enough for a median that marks in the margin do not move.
 _OUTLINE_PLACES = 80
-"""Places of the field's outline at which blur is measured: enough for a median that marks in the margin do not move."""
 
+# How much around a place of the field's outline is looked at: one cell, and not the marks in the margin.
 _INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0
-"""How much around a place of the field's outline is looked at: one cell, and not the marks in the margin."""
 
 
 def blur_px(framing: Framing) -> float:

@@ -8,9 +8,9 @@ import numpy as np
 
 from drivers.raw.rawfile import CLIPPING_SHARE, Mosaic, frame_black
 
+# Percentile that stands for the brightest counts: bare paper fills more than a thousandth of a frame, hot photosites
+# and reflections less.
 BRIGHTEST_PERCENTILE = 99.9
-"""Percentile that stands for the brightest counts: bare paper fills more than a thousandth of a frame, hot photosites
-and reflections less."""
 
 
 @dataclass(frozen=True)

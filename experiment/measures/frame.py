@@ -21,30 +21,27 @@ from drivers.raw.rawfile import CHANNELS, CLIPPING_SHARE, Channel, Mosaic, frame
 from experiment.measures.exposure import BRIGHTEST_PERCENTILE
 from foundation.compiled import compiled
 
+# Tiles over a frame of 3 : 2: 384 squares of 108 px on an EOS 550D, each about a hundred cells of the chart, so that
+# their mean is known to 0.1 % and a hand covers several.
 TILE_COLUMNS, TILE_ROWS = 24, 16
-"""Tiles over a frame of 3 : 2: 384 squares of 108 px on an EOS 550D, each about a hundred cells of the chart, so that
-their mean is known to 0.1 % and a hand covers several."""
 
+# Strips along a row: 650 px on an EOS 550D, 65 cells, whose mean differs from row of cells to row of cells.
 SEGMENTS = 4
-"""Strips along a row: 650 px on an EOS 550D, 65 cells, whose mean differs from row of cells to row of cells."""
 
+# Blocks whose photosites are kept to compare the noise of two frames: correlations are then known to 1 %.
 SAMPLES = 8192
-"""Blocks whose photosites are kept to compare the noise of two frames: correlations are then known to 1 %."""
 
+# Counts below this share of black are none of a sensor: its noise reaches down by some tens, black is hundreds.
 _EMPTY_SHARE = 0.5
-"""Counts below this share of black are none of a sensor: its noise reaches down by some tens, black is hundreds."""
 
+# Counts of black below which nothing can be said of counts below it: Nikon's older bodies subtract it themselves.
 _LEAST_BLACK = 64.0
-"""Counts of black below which nothing can be said of counts below it: Nikon's older bodies subtract it themselves."""
 
-_NOISE_BINS = 6
-"""Levels at which noise is measured: enough for a straight line, with a thousand blocks each."""
+_NOISE_BINS = 6  # Levels at which noise is measured: enough for a straight line, with a thousand blocks each
 
-_INNER = 0.3
-"""Share of a level's blocks, those with the least differences, from which its noise is taken."""
+_INNER = 0.3  # Share of a level's blocks, those with the least differences, from which its noise is taken
 
-_INNER_SIGMAS = 0.3853
-"""Standard deviations within which that share of normal deviates lies: Φ⁻¹(0.65)."""
+_INNER_SIGMAS = 0.3853  # Standard deviations within which that share of normal deviates lies: Φ⁻¹(0.65)
 
 _Array = npt.NDArray[np.float64]
 

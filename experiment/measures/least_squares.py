@@ -16,25 +16,22 @@ import numpy.typing as npt
 from foundation.compiled import compiled
 from foundation.robust import MAD_TO_SIGMA
 
+# The highest order that flat fields are fitted with: a basis of a lower one is the beginning of this one's.
 _CACHED_ORDER: Final = 8
-"""The highest order that flat fields are fitted with: a basis of a lower one is the beginning of this one's."""
 
 
-_LINE_ROUNDS = 8
-"""Reweighted solutions in a row of a line."""
+_LINE_ROUNDS = 8  # Reweighted solutions in a row of a line
 
+# Of the median residual: what a point's residual counts for at least, so that none on the line has all the weight.
 _LEAST_RESIDUAL = 0.1
-"""Of the median residual: what a point's residual counts for at least, so that none on the line has all the weight."""
 
+# Points that the terms are added up for at a time: three channels of them, and a line of the basis, stay in the
+# processor's second cache.
 _POINTS_AT_A_TIME = 2048
-"""Points that the terms are added up for at a time: three channels of them, and a line of the basis, stay in the
-processor's second cache."""
 
-_RIDGE = 1e-10
-"""Share of the normal matrix's mean diagonal that is added to it: keeps equal columns solvable."""
+_RIDGE = 1e-10  # Share of the normal matrix's mean diagonal that is added to it: keeps equal columns solvable
 
-_CUT = 6.0
-"""Robust standard deviations from which on a residual has no weight (J. W. Tukey's biweight)."""
+_CUT = 6.0  # Robust standard deviations from which on a residual has no weight (J. W. Tukey's biweight).
 
 _Array = npt.NDArray[np.float64]
 
@@ -324,7 +321,6 @@ def _normal_equations(design: _Array, values: _Array, weights: _Array) -> tuple[
 
 @compiled
 def _factorise(gram: _Array) -> None:
-    """Replace the lower half of a positive definite matrix by its Cholesky factor."""
     unknowns = len(gram)
     for j in range(unknowns):
         for k in range(j):
@@ -337,7 +333,6 @@ def _factorise(gram: _Array) -> None:
 
 @compiled
 def _solve_lower(factor: _Array, solution: _Array) -> None:
-    """Replace a right side by the solution, given a lower triangle."""
     for i in range(len(solution)):
         for k in range(i):
             solution[i] -= factor[i, k] * solution[k]

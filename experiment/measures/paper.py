@@ -34,57 +34,51 @@ from foundation.errors import QualityError
 from foundation.records import FloatArray
 from foundation.robust import sigma_of
 
+# Where a polynomial that is extrapolated falls below this share of the mean light, the field is taken to be this:
+# samples are divided by it, and no print is lit so unevenly.
 LEAST_FIELD = 0.05
-"""Where a polynomial that is extrapolated falls below this share of the mean light, the field is taken to be this:
-samples are divided by it, and no print is lit so unevenly."""
 
 
+# Highest order of a frame's flat field: light whose corners have 42 to 52 % of the centre's needs the sixth power of
+# the distance from its centre, and where the mount shades the rim the eighth, on simulated frames.
 MAX_ORDER = 8
-"""Highest order of a frame's flat field: light whose corners have 42 to 52 % of the centre's needs the sixth power of
-the distance from its centre, and where the mount shades the rim the eighth, on simulated frames."""
 
+# The same where references lie around the cells and not among them: from order 4 on there are shapes that vanish in
+# all the margin.
 MAX_ORDER_AROUND = 3
-"""The same where references lie around the cells and not among them: from order 4 on there are shapes that vanish in
-all the margin."""
 
+# White references that a frame must show (judgement): with fewer, their mean has no error that means anything.
 MIN_REFERENCES = 6
-"""White references that a frame must show (judgement): with fewer, their mean has no error that means anything."""
 
-REFERENCES_A_TERM = 3
-"""With fewer references for each term, a fit forecasts none of them."""
+REFERENCES_A_TERM = 3  # With fewer references for each term, a fit forecasts none of them
 
+# References for each term of the fit that tells which are covered or dirty: with three, the terms describe a stain of
+# a tenth of the references.
 JUDGING_A_TERM = 12
-"""References for each term of the fit that tells which are covered or dirty: with three, the terms describe a stain of
-a tenth of the references."""
 
-_PLAIN = 6
-"""Terms of a slope and a bend."""
+_PLAIN = 6  # Terms of a slope and a bend
 
+# By how much a term must lower N log(mean squared error of the N references held out), chosen: 0 takes a shape for
+# one in four frames that have none, and at 60 counts adds .2 % of noise to the field; 4 misses shapes of .3 % at 300.
 TERM_PRICE = 1.0
-"""By how much a term must lower N log(mean squared error of the N references held out), chosen: 0 takes a shape for one
-in four frames that have none, and at 60 counts adds .2 % of noise to the field; 4 misses shapes of .3 % at 300."""
 
+# Signal whose photon noise is as large as the read noise, counts: 6 counts at 1.8 electrons a count. The variance of
+# a reference is taken to be that of the light there and of this, so that dim corners count as they are known.
 READ_COUNTS = 65.0
-"""Signal whose photon noise is as large as the read noise, counts: 6 counts at 1.8 electrons a count. The variance of a
-reference is taken to be that of the light there and of this, so that dim corners count as they are known."""
 
+# Solutions in a row of the robust fit; of references few are covered or dirty, and the weights settle at once.
 _ROUNDS = 4
-"""Solutions in a row of the robust fit; of references few are covered or dirty, and the weights settle at once."""
 
+# Rings of equally many references about the page's middle, by which a fall-off that is left over is recognised.
 _RINGS = 10
-"""Rings of equally many references about the page's middle, by which a fall-off that is left over is recognised."""
 
-_NEAR = 4
-"""References, one and its neighbours, whose mean deviation is the worst: a tenth of a page's side on A0."""
+_NEAR = 4  # References, one and its neighbours, whose mean deviation is the worst: a tenth of a page's side on A0
 
-_USUAL = 5.0
-"""Usual deviations beyond which a reference is off: by chance one in two million."""
+_USUAL = 5.0  # Usual deviations beyond which a reference is off: by chance one in two million
 
-_UNLIKELY = 0.01
-"""Likelihood of a number of terms up to which it is not asked about."""
+_UNLIKELY = 0.01  # Likelihood of a number of terms up to which it is not asked about
 
-_EXACT = 1e-9
-"""Coefficients of terms below this are rounding errors of their computation."""
+_EXACT = 1e-9  # Coefficients of terms below this are rounding errors of their computation
 
 _Array = npt.NDArray[np.float64]
 

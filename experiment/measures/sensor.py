@@ -19,27 +19,22 @@ import numpy.typing as npt
 
 from experiment.measures.least_squares import least_squares
 
+# Counts that the black level may drift over a session without a remark (judgement): a sixth of the read noise of a
+# photosite, and a thirtieth of the darkest cells of use.
 MAX_BLACK_DRIFT = 1.0
-"""Counts that the black level may drift over a session without a remark (judgement): a sixth of the read noise of a
-photosite, and a thirtieth of the darkest cells of use."""
 
-LOWEST, HIGHEST = 0.05, 0.95
-"""Between which shares of saturation a sensor has to be linear (EMVA 1288)."""
+LOWEST, HIGHEST = 0.05, 0.95  # Between which shares of saturation a sensor has to be linear (EMVA 1288)
 
-_NODES = 10
-"""Levels at which the deviation is measured: about half a stop apart."""
+_NODES = 10  # Levels at which the deviation is measured: about half a stop apart
 
-_LEAST_PATCHES = 50.0
-"""Patches near a level for it to be measured: their mean is good to a seventh of a patch's noise."""
+_LEAST_PATCHES = 50.0  # Patches near a level for it to be measured: their mean is good to a seventh of a patch's noise
 
-_STOPS = 3
-"""Shutter speeds are set in thirds of a stop."""
+_STOPS = 3  # Shutter speeds are set in thirds of a stop
 
-_LEAST_POWER = 0.1
-"""Below, the frames did not follow their times at all, and the figure is as bad as can be."""
+_LEAST_POWER = 0.1  # Below, the frames did not follow their times at all, and the figure is as bad as can be
 
+# Weights of the constraints on deviations, beside patches of weight 1: mean and slope are 0, each one is near 0.
 _HARD, _SOFT = 1e2, 0.1
-"""Weights of the constraints on deviations, beside patches of weight 1: mean and slope are 0, each one is near 0."""
 
 _Array = npt.NDArray[np.float64]
 

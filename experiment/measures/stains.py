@@ -31,63 +31,51 @@ from scipy.spatial import cKDTree
 from experiment.measures.least_squares import least_absolute_line
 from foundation.robust import sigma_of
 
-NEIGHBOURS = 13
-"""A cell and the twelve within two cells of it: a tenth of a thumb's stain at 5 mm a cell."""
+NEIGHBOURS = 13  # A cell and the twelve within two cells of it: a tenth of a thumb's stain at 5 mm a cell
 
-STAINED = 0.02
-"""Deviation of a neighbourhood from its codes, a share, from which its cells are listed as unfit."""
+STAINED = 0.02  # Deviation of a neighbourhood from its codes, a share, from which its cells are listed as unfit
 
+# Deviation from which cells are counted and shown. Clean prints in the simulated room stay below, to one cell.
 DOUBTFUL = 0.01
-"""Deviation from which cells are counted and shown. Clean prints in the simulated room stay below, to one cell."""
 
-SIGNIFICANT = 6.0
-"""Standard errors that it must be, too; by chance one neighbourhood in 5·10⁸."""
+SIGNIFICANT = 6.0  # Standard errors that it must be, too; by chance one neighbourhood in 5·10⁸
 
-RIM_SIGMA = 4.0
-"""Usual deviations of single cells that a cell next to a stain must deviate by to belong to it."""
+RIM_SIGMA = 4.0  # Usual deviations of single cells that a cell next to a stain must deviate by to belong to it
 
-LEAST_COUNTS = 30.0
-"""Darker cells are not judged: a count of stray light is 3 % of them."""
+LEAST_COUNTS = 30.0  # Darker cells are not judged: a count of stray light is 3 % of them
 
+# Bits of a channel: with 2, curvature changes too fast between the four levels of a code to be predicted.
 LEAST_BITS = 3
-"""Bits of a channel: with 2, curvature changes too fast between the four levels of a code to be predicted."""
 
 
-LEAST_CELLS = 6
-"""Cells of a place for a line through them to mean anything."""
+LEAST_CELLS = 6  # Cells of a place for a line through them to mean anything
 
+# Share of the cells from which on a place counts: that of the limit on unfit cells. A glint on fewer is listed, and
+# what it leaves around them is a few cells' error.
 LARGE_SPOT = 0.005
-"""Share of the cells from which on a place counts: that of the limit on unfit cells. A glint on fewer is listed, and
-what it leaves around them is a few cells' error."""
 
+# Share of their own light that cells keep under a reflection at least: less, and something covers them (as in the
+# table of causes, where a hand is named below it).
 OWN_KEPT = 0.85
-"""Share of their own light that cells keep under a reflection at least: less, and something covers them (as in the
-table of causes, where a hand is named below it)."""
 
-_ROUNDS = 3
-"""Repetitions at most, each without the stained cells of the one before in the predictions."""
+_ROUNDS = 3  # Repetitions at most, each without the stained cells of the one before in the predictions
 
-_LEAST_KNOWN = 9
-"""Codes of the 25 across an axis that must be known for their median to be a curvature."""
+_LEAST_KNOWN = 9  # Codes of the 25 across an axis that must be known for their median to be a curvature
 
-_LEAST_TIED = 3
-"""Codes with two equal values that must be known for their median to be a bend."""
+_LEAST_TIED = 3  # Codes with two equal values that must be known for their median to be a bend
 
-_LEAST_NEIGHBOURS = 5
-"""Cells of a neighbourhood that must be known for its mean to count."""
+_LEAST_NEIGHBOURS = 5  # Cells of a neighbourhood that must be known for its mean to count
 
+# Stained cells of a neighbourhood from which on it need not deviate itself for a cell to belong to the stain.
 _MANY_BESIDE = 2
-"""Stained cells of a neighbourhood from which on it need not deviate itself for a cell to belong to the stain."""
 
-_BRIGHT_PERCENTILE = 99.0
-"""Of the cells' levels, what is taken for paper white."""
+_BRIGHT_PERCENTILE = 99.0  # Of the cells' levels, what is taken for paper white
 
-_BESIDE = 2.3
-"""Distance, in sides of a cell, up to which deviating cells are of one place: one may lie between them."""
+_BESIDE = 2.3  # Distance, in sides of a cell, up to which deviating cells are of one place: one may lie between them
 
+# Distance, in sides of a cell, from the cells of a spot up to which light is looked for in cells that are not listed:
+# two rings, of which the first is half in the neighbourhoods of the spot (chosen).
 _AROUND = 2.5
-"""Distance, in sides of a cell, from the cells of a spot up to which light is looked for in cells that are not listed:
-two rings, of which the first is half in the neighbourhoods of the spot (chosen)."""
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]

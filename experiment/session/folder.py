@@ -55,8 +55,8 @@ from foundation.files import (
 )
 from foundation.folders import held_folder, require_free, unmounted_at, whole_folder
 
+# Columns of `frames.csv` (docs/formats.md).
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
-"""Columns of `frames.csv` (docs/formats.md)."""
 
 
 @dataclass(frozen=True)

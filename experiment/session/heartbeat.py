@@ -23,21 +23,20 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Literal
 
+# What a run does: takes frames, hangs at a step, waits for something that comes by itself, waits for somebody, or is
+# over.
 RunState = Literal["running", "late", "waiting", "paused", "ended"]
-"""What a run does: takes frames, hangs at a step, waits for something that comes by itself, waits for somebody, or
-is over."""
 
+# Seconds after which a sign of life that is due is missing: chosen; clocks of two machines that keep their time over
+# a network differ by less than one, and a disk may stall for seconds.
 LATE_S = 30.0
-"""Seconds after which a sign of life that is due is missing: chosen; clocks of two machines that keep their time over
-a network differ by less than one, and a disk may stall for seconds."""
 
+# Seconds between two signs of life of a run that takes frames: each is a write to the disk, and "5 s ago" frightens
+# nobody.
 BEAT_S = 5.0
-"""Seconds between two signs of life of a run that takes frames: each is a write to the disk, and "5 s ago" frightens
-nobody."""
 
 
-AGAIN = "run the same command again"
-"""What helps after a run was killed."""
+AGAIN = "run the same command again"  # What helps after a run was killed
 
 
 @dataclass(frozen=True)
@@ -72,8 +71,8 @@ class Process:
         return bool(self.is_alive()) and _fields_of(self.pid)[:1] in (["T"], ["t"])
 
 
+# File systems, as /proc/self/mounts names them, that may make up the numbers of their files: those say nothing.
 INVENTED_NUMBERS = ("fuse", "cifs", "smb3", "smbfs", "virtiofs")
-"""File systems, as /proc/self/mounts names them, that may make up the numbers of their files: those say nothing."""
 
 
 def file_system_of(path: Path) -> str:
@@ -87,8 +86,8 @@ def file_system_of(path: Path) -> str:
     return max(holding, default=(0, ""))[1]
 
 
+# `FS_IOC_GETVERSION` of linux/fs.h, `_IOR('v', 1, long)`; what is no Linux refuses it.
 _GETVERSION = 0x80007601 | struct.calcsize("l") << 16
-"""`FS_IOC_GETVERSION` of linux/fs.h, `_IOR('v', 1, long)`; what is no Linux refuses it."""
 
 
 @dataclass(frozen=True)

@@ -78,12 +78,11 @@ from foundation.files import (
     write_whole,
 )
 
-JOURNAL_FILE = "journal.sqlite"
-"""Name of the journal in a session's folder."""
+JOURNAL_FILE = "journal.sqlite"  # Name of the journal in a session's folder
 
+# How long a write waits for another program's unless the caller says otherwise: as long as a run waits for a device
+# by default (`sequence.patience_s`).
 PATIENCE_S = 600.0
-"""How long a write waits for another program's unless the caller says otherwise: as long as a run waits for a device by
-default (`sequence.patience_s`)."""
 
 
 @dataclass(frozen=True)
@@ -583,8 +582,8 @@ def time_text(at: datetime) -> str:
     return at.isoformat(timespec="microseconds")
 
 
+# Rows of each kind that are kept as values: whoever watches a session reads its 800 frames again after each.
 _ROWS_KEPT: Final = 8192
-"""Rows of each kind that are kept as values: whoever watches a session reads its 800 frames again after each."""
 
 _accepted_file: Final = lru_cache(_ROWS_KEPT)(AcceptedFile)
 
@@ -731,15 +730,14 @@ class _LockRetry:
                     announced = True
 
 
-LEDGER_FILE: Final = "ledger.jsonl"
-"""Its name in a session's folder."""
+LEDGER_FILE: Final = "ledger.jsonl"  # Its name in a session's folder
 
+# Of a ledger that is read: twenty times what 707 lights have, so that a stranger's fills no memory.
 _MOST_LEDGER_BYTES: Final = 1 << 30
-"""Of a ledger that is read: twenty times what 707 lights have, so that a stranger's fills no memory."""
 
-PLACE: Final = "place"
-"""Key of the record that says for which folder signs of life are given."""
+PLACE: Final = "place"  # Key of the record that says for which folder signs of life are given
 
+# What tells the rows of a table apart.
 _ROW_KEYS: Final = {
     "plan": ("step",),
     "attempts": ("id",),
@@ -749,14 +747,12 @@ _ROW_KEYS: Final = {
     "timings": ("attempt", "name"),
     "records": ("key",),
 }
-"""What tells the rows of a table apart."""
 
+# Columns of an attempt that are not known when it begins, as the journal has them then.
 _BEGUN: Final = dict.fromkeys(("ended_at", "taken_at", "exposure_s", "size", "sha256", "verdict")) | {"reason": ""}
-"""Columns of an attempt that are not known when it begins, as the journal has them then."""
 
 Row = dict[str, Any]
-Rows = dict[str, dict[tuple[Any, ...], Row]]
-"""Rows by table and key, columns by name."""
+Rows = dict[str, dict[tuple[Any, ...], Row]]  # Rows by table and key, columns by name
 
 
 def ledger_path(folder: Path) -> Path:
@@ -794,7 +790,6 @@ def _read_transactions(path: Path, size: int = _MOST_LEDGER_BYTES + 1) -> list[M
 
 
 def _gathered(transactions: Sequence[Mapping[str, Sequence[Row]]]) -> Rows:
-    """Return the facts that transactions left."""
     rows: Rows = {}
     for transaction in transactions:
         for table, changes in transaction.items():
@@ -831,7 +826,6 @@ def _put_row(rows: Rows, table: str, row: Row) -> None:
 
 
 def _ledger_line(rows: Mapping[str, Sequence[Row]]) -> bytes:
-    """Return a transaction as a line."""
 
     def plain(value: object) -> str:
         return base64.b64encode(cast("bytes", value)).decode()
@@ -928,7 +922,6 @@ class _Ledger:
         return False
 
     def _opened(self) -> tuple[int, int]:
-        """Return a handle of the file, and its size."""
         try:
             handle = os.open(self._path, os.O_RDWR)
             return handle, os.fstat(handle).st_size
@@ -936,8 +929,7 @@ class _Ledger:
             raise storage_error(self._path, error) from error
 
 
-Frames = set[tuple[int, str, str | None]]
-"""Frames by attempt and hash, with their verdicts."""
+Frames = set[tuple[int, str, str | None]]  # Frames by attempt and hash, with their verdicts
 
 
 def settled_frames(path: Path) -> Frames:

@@ -41,21 +41,20 @@ _log = logging.getLogger(__name__)
 
 _DAMAGED: Final = "it is damaged, or not to be trusted"
 
-JOURNAL_VERSION = 2
-"""`PRAGMA user_version` of the journals that this software writes and reads (docs/formats.md)."""
+JOURNAL_VERSION = 2  # `PRAGMA user_version` of the journals that this software writes and reads (docs/formats.md)
 
+# How long SQLite itself waits for another program before it gives the control back: as long as Ctrl-C may wait.
 TRY_S = 1.0
-"""How long SQLite itself waits for another program before it gives the control back: as long as Ctrl-C may wait."""
 
+# How long a reader waits where the journal is not in write-ahead mode: a commit takes milliseconds, a disk may stall
+# for seconds.
 READING_LIMIT_S = 10.0
-"""How long a reader waits where the journal is not in write-ahead mode: a commit takes milliseconds, a disk may stall
-for seconds."""
 
+# Longest text, blob or row that SQLite makes of a journal: what the judge keeps of a frame is some 100 kilobytes.
 _MOST_VALUE_BYTES: Final = 64 << 20
-"""Longest text, blob or row that SQLite makes of a journal: what the judge keeps of a frame is some 100 kilobytes."""
 
+# Largest sizes of what is read whole beside a journal: forty times those of 707 lights and 32 768 colours.
 MOST_BYTES: Final = {"chart.json": 256 << 20, "illuminations.csv": 16 << 20, "session.toml": 1 << 20}
-"""Largest sizes of what is read whole beside a journal: forty times those of 707 lights and 32 768 colours."""
 
 _TABLES = """
 CREATE TABLE attempts (
@@ -97,23 +96,21 @@ CREATE TABLE heartbeat (
 CREATE TABLE records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
 """
 
+# What SQLite answers where it would have to write in order to read.
 _CANNOT_IN_PLACE = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
-"""What SQLite answers where it would have to write in order to read."""
 
+# What a file system answers that has no locks (fcntl(2); Lustre, FUSE, NFS without its lock service).
 _NO_LOCKS = {errno.ENOLCK, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EBADF}
-"""What a file system answers that has no locks (fcntl(2); Lustre, FUSE, NFS without its lock service)."""
 
+# Faults of a disk that can be read all the same.
 _READABLE_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
-"""Faults of a disk that can be read all the same."""
 
-_SIDE_FILES = ("-wal", "-shm", "-journal")
-"""What SQLite keeps beside a journal, by suffix."""
+_SIDE_FILES = ("-wal", "-shm", "-journal")  # What SQLite keeps beside a journal, by suffix
 
-_PROBE_BYTES = 65536
-"""As much as a commit writes, with the pages of its log."""
+_PROBE_BYTES = 65536  # As much as a commit writes, with the pages of its log
 
+# File systems on which several machines work and share no memory, as /proc/self/mounts names them.
 _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "ceph", "fuse.glusterfs", "lustre"}
-"""File systems on which several machines work and share no memory, as /proc/self/mounts names them."""
 
 
 def restoring(path: Path) -> str:
@@ -267,7 +264,6 @@ def _opened_or_copied(path: Path) -> sqlite3.Connection:
 
 
 def _copied(path: Path) -> sqlite3.Connection:
-    """Return a reader of a copy in memory, with what its side files hold."""
     memory = sqlite3.connect(":memory:", isolation_level=None)
     with tempfile.TemporaryDirectory(prefix="crop-") as scratch:
         copy = Path(scratch) / path.name
@@ -474,6 +470,7 @@ _MAYBE_TIME = "({0} IS NULL OR {0} = '' OR (" + _TIME + "))"
 
 _SHA256 = "({0} IS NULL OR (typeof({0}) = 'text' AND length({0}) <= 64 AND trim({0}, '0123456789abcdef') = ''))"
 
+# What a row must fulfil, by table and column; times as `datetime.fromisoformat` reads them.
 _COLUMNS: Final = {
     "plan": {
         "step": _WHOLE,
@@ -532,7 +529,6 @@ _COLUMNS: Final = {
     },
     "records": {"key": _TEXT, "text": _TEXT},
 }
-"""What a row must fulfil, by table and column; times as `datetime.fromisoformat` reads them."""
 
 _TOGETHER: Final = {
     # A frame that has a hash was taken at a time with an exposure (0 where nobody knows), and has a verdict.

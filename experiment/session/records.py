@@ -18,25 +18,20 @@ from typing import Literal, Protocol, get_args, runtime_checkable
 from drivers.presenter import BLACK, WHITE, Colour
 from experiment.lights import Illumination
 
-ACCEPTED = "accepted"
-"""Verdict of a frame that may be used."""
+ACCEPTED = "accepted"  # Verdict of a frame that may be used
 
-REFUSED = "refused"
-"""Verdict of a frame that is there and cannot be used."""
+REFUSED = "refused"  # Verdict of a frame that is there and cannot be used
 
-FAILED = "failed"
-"""Verdict of an attempt that gave no frame."""
+FAILED = "failed"  # Verdict of an attempt that gave no frame
 
-VOIDED = "voided"
-"""Verdict of a frame that was accepted and must not be used: what was found out later says why."""
+VOIDED = "voided"  # Verdict of a frame that was accepted and must not be used: what was found out later says why
 
 
-DOUBT = "doubt"
-"""The event that tells what stops nothing, and is to be seen in the morning."""
+DOUBT = "doubt"  # The event that tells what stops nothing, and is to be seen in the morning
 
+# Attempts by which the time left is told: enough that retakes and references do not sway their median, few enough to
+# follow a change of the settings.
 RECENT = 50
-"""Attempts by which the time left is told: enough that retakes and references do not sway their median, few enough to
-follow a change of the settings."""
 
 
 @dataclass(frozen=True)
@@ -283,34 +278,31 @@ def duration_text(seconds: float | None) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
+# What a frame shows: one of the planned lights, full white, the picture's black, or a colour by which the projector
+# is known. Frames of the last kind are looked at while a session is taken, and never part of a table.
 FrameKind = Literal["light", "white", "dark", "response"]
-"""What a frame shows: one of the planned lights, full white, the picture's black, or a colour by which the projector is
-known. Frames of the last kind are looked at while a session is taken, and never part of a table."""
 
-KINDS: tuple[FrameKind, ...] = get_args(FrameKind)
-"""Every kind, as journals name them."""
+KINDS: tuple[FrameKind, ...] = get_args(FrameKind)  # Every kind, as journals name them
 
-REFERENCES: tuple[FrameKind, ...] = ("white", "dark")
-"""Kinds of frames that lights are held against."""
+REFERENCES: tuple[FrameKind, ...] = ("white", "dark")  # Kinds of frames that lights are held against
 
+# Highest code of a response frame; 255 is left to white and to the lights, so that none is taken for one of them.
 TOP = 250
-"""Highest code of a response frame; 255 is left to white and to the lights, so that none is taken for one of them."""
 
-PRIMARIES = (Colour(TOP, 0, 0), Colour(0, TOP, 0), Colour(0, 0, TOP))
-"""The projector's red, green and blue, each alone."""
+PRIMARIES = (Colour(TOP, 0, 0), Colour(0, TOP, 0), Colour(0, 0, TOP))  # The projector's red, green and blue, each alone
 
-MIDDLE = 136
-"""Code of a quarter of the light, at which each primary's own curve is compared with that of grey."""
+MIDDLE = 136  # Code of a quarter of the light, at which each primary's own curve is compared with that of grey
 
+# What a session shows first so that the light of any codes can be predicted: the primaries; greys that give the curve
+# from codes to light; pairs of primaries, for what light is added where they overlap; and each primary at half code,
+# for what its curve has of its own. The steps are chosen: even in code, and closer where the curve is steep in
+# proportion.
 RESPONSE = (
     *PRIMARIES,
     *(Colour(code, code, code) for code in (TOP, 232, 208, 184, 160, 136, 112, 88, 64, 48, 32, 16)),
     *(Colour(TOP, TOP, 0), Colour(TOP, 0, TOP), Colour(0, TOP, TOP)),
     *(Colour(MIDDLE, 0, 0), Colour(0, MIDDLE, 0), Colour(0, 0, MIDDLE)),
 )
-"""What a session shows first so that the light of any codes can be predicted: the primaries; greys that give the curve
-from codes to light; pairs of primaries, for what light is added where they overlap; and each primary at half code, for
-what its curve has of its own. The steps are chosen: even in code, and closer where the curve is steep in proportion."""
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from generator.dataset.layouts import LAYOUTS
 from generator.dataset.records import DATASHEET, Description, one_line, table_cell
 from generator.files import FULL, suffix_of
 
-OPEN: Final = "**TO BE ANSWERED BY THE LAB.**"
-"""What stands where only the makers of a dataset know the answer."""
+OPEN: Final = "**TO BE ANSWERED BY THE LAB.**"  # What stands where only the makers of a dataset know the answer
 
 
 def uncertainty_of(description: Description) -> str:
@@ -130,7 +129,6 @@ def noise_of(description: Description) -> str:
 
 
 def _procedure(description: Description) -> str:
-    """Return in words how the table's colours were obtained and what vouches for them."""
     table = description.table
     name = one_line(table_title(table.camera, table.lights, table.origin, table.computed is not None))
     if table.computed is not None:
@@ -200,6 +198,7 @@ def datasheet(description: Description) -> str:
     return template.substitute(answers, count=template.template.count("${open}") + 1)
 
 
+# Numbers of images below which a data set is of a size category of the Hub.
 _SIZES = (
     (1_000, "n<1K"),
     (10_000, "1K<n<10K"),
@@ -209,7 +208,6 @@ _SIZES = (
     (100_000_000, "10M<n<100M"),
     (1_000_000_000, "100M<n<1B"),
 )
-"""Numbers of images below which a data set is of a size category of the Hub."""
 
 _TAGS = ("color-constancy", "white-balance", "illumination-estimation", "raw-images", "image")
 
@@ -245,7 +243,6 @@ def card(description: Description) -> str:
 
 
 def _front_matter(description: Description) -> str:
-    """Return the YAML between the lines of three hyphens."""
     keys: dict[str, object] = {
         "pretty_name": name_of(description),
         "license": "unknown",
@@ -272,7 +269,6 @@ def _configs(description: Description) -> str:
 
 
 def _reading(description: Description) -> str:
-    """Return how the images are read without losing bits."""
     layout = LAYOUTS[option(description, "layout")]
     if isinstance(layout, JoinedLayout):
         return layout.reading

@@ -22,16 +22,13 @@ from generator.lights.lighting import parse_mixture
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_ROWS: Final = 12
-"""Sources of a sheet: what is still recognised where the page fills a screen."""
-MAX_COLUMNS: Final = 8
-"""Lights of a sheet, for the same reason."""
+MAX_ROWS: Final = 12  # Sources of a sheet: what is still recognised where the page fills a screen
+MAX_COLUMNS: Final = 8  # Lights of a sheet, for the same reason
+# Images of one light each over rows of several: 24 in a grid of 6 by 4 fill a screen as 12 rows of 8 lights do.
 _ALONE: Final = 2
-"""Images of one light each over rows of several: 24 in a grid of 6 by 4 fill a screen as 12 rows of 8 lights do."""
+# Columns over rows of that grid: most pictures and screens are about as wide, and captions stand below.
 _WIDE: Final = 1.5
-"""Columns over rows of that grid: most pictures and screens are about as wide, and captions stand below."""
-_NAME: Final = 26
-"""Characters of a name below one image of the grid: more would run into its neighbour's."""
+_NAME: Final = 26  # Characters of a name below one image of the grid: more would run into its neighbour's
 _PAPER: Final = "#16171a"
 _INK: Final = "#e8e6e1"
 _FAINT: Final = "#8d8f96"

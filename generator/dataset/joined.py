@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     import pyarrow.parquet as pq
 
 
+# Arguments of `__exit__`: the type, value and traceback of what ended the block, or None.
 ExitReason = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
-"""Arguments of `__exit__`: the type, value and traceback of what ended the block, or None."""
 
 
 def metadata_of(sample: Sample) -> dict[str, Any]:
@@ -166,20 +166,17 @@ def _members(stream: BinaryIO) -> Iterator[tuple[str, int, int]]:
         offset += -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
 
 
+# Bytes from which a group of rows is written: what a reader has to read to get at one image.
 _GROUP_BYTES: Final = 4 << 20
-"""Bytes from which a group of rows is written: what a reader has to read to get at one image."""
 
-_GROUP_ROWS: Final = 64
-"""Rows of a group at most: small images stay quick to reach too."""
+_GROUP_ROWS: Final = 64  # Rows of a group at most: small images stay quick to reach too
 
+# Longest text in the description of a shard, of which the longest of ours are a few kilobytes.
 _MOST_THRIFT_BYTES: Final = 64 << 20
-"""Longest text in the description of a shard, of which the longest of ours are a few kilobytes."""
 
-_MOST_THRIFT_ITEMS: Final = 1 << 20
-"""Things that a list in it may hold: ours hold columns and groups, some hundred."""
+_MOST_THRIFT_ITEMS: Final = 1 << 20  # Things that a list in it may hold: ours hold columns and groups, some hundred
 
-_MOST_ROWS: Final = 1 << 16
-"""Rows of a group that is read: a thousand times those that are written."""
+_MOST_ROWS: Final = 1 << 16  # Rows of a group that is read: a thousand times those that are written
 
 _COLUMNS: Final = {"images": "image", "previews": "preview", "ground_truth": "ground_truth"}
 
@@ -370,6 +367,7 @@ _HUB_READING: Final = (
 )
 
 
+# Layouts of shards in one file each by name.
 JOINED: Final[Mapping[str, JoinedLayout]] = {
     "webdataset": JoinedLayout(
         ending="tar",
@@ -388,4 +386,3 @@ JOINED: Final[Mapping[str, JoinedLayout]] = {
         reading=_HUB_READING,
     ),
 }
-"""Layouts of shards in one file each by name."""

@@ -14,10 +14,9 @@ from generator.dataset.joined import JOINED, Beside, ExitReason, JoinedLayout, J
 from generator.dataset.records import FileSum, Sample, part_of
 from generator.stores import Store
 
+# Images from which files are synchronised while others are made: enough that one wait for the disk serves many.
 _SYNCED_IMAGES: Final = 32
-"""Images from which files are synchronised while others are made: enough that one wait for the disk serves many."""
-_SYNCED_PIXELS: Final = 1 << 23
-"""Pixels of such images, for the same reason where images are large."""
+_SYNCED_PIXELS: Final = 1 << 23  # Pixels of such images, for the same reason where images are large
 
 
 class FileWriter:
@@ -75,9 +74,9 @@ class FileWriter:
         self._thread.shutdown(cancel_futures=True)
 
 
+# Writes the samples of one shard, in a block; files that are still open appear only if the block ends well. `store`
+# is called from the thread that made a sample, `append` in the order of their numbers.
 ShardWriter = FileWriter | JoinedWriter
-"""Writes the samples of one shard, in a block; files that are still open appear only if the block ends well.
-`store` is called from the thread that made a sample, `append` in the order of their numbers."""
 
 
 @dataclass(frozen=True)
@@ -116,11 +115,11 @@ class FileLayout:
         return list(dict.fromkeys(self.place("images", part, f"*{ending}") for part in parts))
 
 
+# All layouts by name.
 LAYOUTS: Final[Mapping[str, FileLayout | JoinedLayout]] = {
     "folder": FileLayout(place=lambda kind, part, name: f"{kind}/{name}"),
     **JOINED,
 }
-"""All layouts by name."""
 
 
 def require_library(layout: str) -> None:

@@ -125,12 +125,12 @@ def parse_share(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
+# How often a shard is submitted at most. Dask gives a task up once it was on four workers that died; after five times
+# four it is the shard, and no accident, that kills them.
 ATTEMPTS: Final = 5
-"""How often a shard is submitted at most. Dask gives a task up once it was on four workers that died; after five times
-four it is the shard, and no accident, that kills them."""
 
+# How long a scheduler may take to answer, s: one that runs answers in milliseconds, also on a busy network.
 CONNECT_S: Final = 10.0
-"""How long a scheduler may take to answer, s: one that runs answers in milliseconds, also on a busy network."""
 
 _Event = Callable[[], None]
 
@@ -591,7 +591,6 @@ def _require_same(notes: Store, identity: PlanIdentity, out: str | Path, remedy:
 
 
 def _differences(stored: Any, wanted: Any, name: str = "") -> Generator[str]:
-    """Yield each difference of two plans, in words."""
     if isinstance(stored, dict) and isinstance(wanted, dict):
         one, other = cast("dict[str, Any]", stored), cast("dict[str, Any]", wanted)
         for key in dict.fromkeys([*one, *other]):

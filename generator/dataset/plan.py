@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from generator.pictures.sources import Source
 
 
+# Images of a shard unless said otherwise: all that a kill can cost, for each shard that was being made.
 SHARD_IMAGES: Final = 256
-"""Images of a shard unless said otherwise: all that a kill can cost, for each shard that was being made."""
 
+# Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options. 1 took the
+# grey in the print's black cell out where 2 takes the grey that black was mapped to; 3 tries more cells for greys
+# that 2 left off by .2 degrees and more; 4 prints through one map of the chart, interpolated between cells, where
+# those before it mixed cells for each light.
 RENDERING_VERSION: Final = 4
-"""Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options.
-1 took the grey in the print's black cell out where 2 takes the grey that black was mapped to; 3 tries more cells for
-greys that 2 left off by .2 degrees and more; 4 prints through one map of the chart, interpolated between cells, where
-those before it mixed cells for each light."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,7 @@ class DatasetOptions:
             raise InputError(f"the split {shares} is to be three shares from 0 that sum to 1, such as 0.8,0.1,0.1")
 
 
-_ROUNDED: Final = 1e-6
-"""By which a sum of shares may differ from 1."""
+_ROUNDED: Final = 1e-6  # By which a sum of shares may differ from 1
 
 
 def parse_split(text: str) -> tuple[float, float, float]:

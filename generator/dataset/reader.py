@@ -50,14 +50,13 @@ from generator.lights.lighting import parse_mixture
 from generator.masks.maps import decode_ground_truth, decode_weights
 from generator.stores import DESCRIPTION, Store, open_store, read_bounded
 
+# A number, of which ten digits count all images that a dataset holds, and an ending.
 _NAME: Final = re.compile(r"([0-9]{1,10})(\.[A-Za-z0-9.]*)?")
-"""A number, of which ten digits count all images that a dataset holds, and an ending."""
 _VALID: Final = "with r + g + b = 1 and none below 0"
+# What sums and means of chromaticities may be off by: more than six written digits are, and less than a thousandth of
+# a degree.
 _ROUNDING: Final = 2e-6
-"""What sums and means of chromaticities may be off by: more than six written digits are, and less than a thousandth of
-a degree."""
-_KEPT: Final = 4096
-"""Lights of images that are kept, since many images share one: several times a table's lights."""
+_KEPT: Final = 4096  # Lights of images that are kept, since many images share one: several times a table's lights
 
 
 def read_entries(store: Store, description: Description) -> Iterator[Entry]:
@@ -187,8 +186,7 @@ def _triple(red: str, green: str, blue: str) -> Triple:
     return triple
 
 
-_LINE: Final = re.compile("[0-9a-f]{64}")
-"""A hash as `sha256sum` writes it."""
+_LINE: Final = re.compile("[0-9a-f]{64}")  # A hash as `sha256sum` writes it
 
 
 def file_faults(
@@ -247,8 +245,8 @@ def _fault_of(store: Store, name: str, digest: str) -> str | None:
     return None if found == digest else f"{name} has changed"
 
 
+# Lists that are read whole have a line an image or source, some hundred bytes: this is forty million of them.
 MOST_LIST_BYTES: Final = 4 << 30
-"""Lists that are read whole have a line an image or source, some hundred bytes: this is forty million of them."""
 
 
 @dataclass(frozen=True)
@@ -338,17 +336,14 @@ class Dataset:
             raise FormatError(f"{self.store.place}/{IMAGES} has no column image; make the dataset again") from error
 
     def _list(self, name: str) -> str:
-        """Return the text of a list."""
         return read_bounded(self.store, name, MOST_LIST_BYTES).decode("utf-8", "replace")
 
     def _map(self, entry: Entry, kind: str, ending: str) -> bytes:
-        """Return the file of a map that lies beside an image of several lights."""
         if len(entry.lights) == 1:
             raise InputError(f"one light falls on {entry.image}, so that it has no masks; see its truth")
         return self._bytes(self._name(entry, kind, ending))
 
     def _name(self, entry: Entry, kind: str, ending: str) -> str:
-        """Return the name of one of an image's files."""
         key = PurePosixPath(entry.image).stem
         shard = _number(entry.image) // self._options.shard_images
         return LAYOUTS[self.layout].name_of(kind, part_of(entry.split), shard, key, ending)

@@ -28,14 +28,13 @@ class SparseRecord(Record):
 
 
 FORMAT: Final = "crop.dataset"
-VERSION: Final = 2
-"""Of `dataset.json`; raised when a reader of the version before would misread a dataset."""
+VERSION: Final = 2  # Of `dataset.json`; raised when a reader of the version before would misread a dataset
 
 
 GROUND_TRUTH: Final = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")
+# Column of `ground_truth.csv` on request: what the light's direction may be off by, expanded (k = 2), degrees.
 UNCERTAINTY_COLUMN: Final = "uncertainty_deg"
-"""Column of `ground_truth.csv` on request: what the light's direction may be off by, expanded (k = 2), degrees."""
 
 IMAGES: Final = "images.csv"
 SOURCES: Final = "sources.csv"
@@ -45,12 +44,12 @@ SUMS: Final = "SHA256SUMS"
 DATASHEET: Final = "DATASHEET.md"
 CARD: Final = "README.md"
 
+# Files that a lab completes, so that no hash of them is recorded; nothing of this software reads them.
 COMPLETED_BY_HAND: Final = (CARD, DATASHEET)
-"""Files that a lab completes, so that no hash of them is recorded; nothing of this software reads them."""
 
 Triple = tuple[float, float, float]
+# What options did to one image, by column of `images.csv`; all images of a dataset have the same columns.
 Details = dict[str, int | float | str]
-"""What options did to one image, by column of `images.csv`; all images of a dataset have the same columns."""
 
 Layout = Literal["folder", "webdataset", "parquet"]
 Split = Literal["train", "validation", "test"]

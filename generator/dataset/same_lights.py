@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
+# What a light is known by: codes, and its name if it has a spectrum of its own.
 _Shown = tuple[tuple[int, int, int], str | None]
-"""What a light is known by: codes, and its name if it has a spectrum of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +172,6 @@ def _is_tinted(dataset: Dataset) -> bool:
 
 
 def _same_lights(used: Sequence[Light], lut: Lut, place: str) -> dict[int, int]:
-    """Return the number in the table of each light that a dataset used."""
     by_codes: dict[_Shown, int] = {}
     for shown in lut.illuminations:
         by_codes.setdefault((shown.colour, shown.name), shown.index)

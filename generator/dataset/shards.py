@@ -103,22 +103,19 @@ if TYPE_CHECKING:
 
 PLAN: Final = "plan.json"
 RECORDS: Final = "shards"
+# Names among a place's notes: of the plan, of the folder of shards' records, and in a store of the notes' folder.
 NOTES: Final = ".plan"
-"""Names among a place's notes: of the plan, of the folder of shards' records, and in a store of the notes' folder."""
-_WHOLE: Final = "shard"
-"""Name of the piece that is a shard; those of images are their numbers."""
-_READERS: Final = 16
-"""Record files that are read at a time: a store is waited for most of the time."""
+_WHOLE: Final = "shard"  # Name of the piece that is a shard; those of images are their numbers
+_READERS: Final = 16  # Record files that are read at a time: a store is waited for most of the time
 
 PlanIdentity = Mapping[str, Any]
 
 _threads: Final = threading.local()
 
+# A shorter side below which a picture is noted: icons and failed downloads are so small, photographs never are.
 TINY_PX: Final = 16
-"""A shorter side below which a picture is noted: icons and failed downloads are so small, photographs never are."""
 
-_WORD: Final = 1 << 64
-"""Values of the eight bytes of a hash that place a source among the parts."""
+_WORD: Final = 1 << 64  # Values of the eight bytes of a hash that place a source among the parts
 
 
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
@@ -335,8 +332,7 @@ class Callbacks:
     on_wait: Callable[[str], None] = _ignore
 
 
-SILENT: Final = Callbacks()
-"""Callbacks that do nothing."""
+SILENT: Final = Callbacks()  # Callbacks that do nothing
 
 
 @dataclass(frozen=True)
@@ -760,7 +756,6 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> Dataset:
 
 
 def _records(place: Workplace, shards: int) -> Iterator[tuple[ShardRecord, list[SourceRecord], list[Skipped]]]:
-    """Yield each shard's record, and those of its sources that no shard before had."""
     last: SourceRecord | Skipped | None = None
     for shard in range(shards):
         record = place.load(shard)
@@ -902,7 +897,6 @@ _Finished = TypeVar("_Finished", ShardRecord, FinishedImage)
 
 
 def _record_in(piece: Piece, kind: type[_Finished]) -> _Finished:
-    """Return what a piece's line says of it, with its files."""
     files = [FileSum(name=name, sha256=sha256) for name, sha256 in piece.files.items()]
     return from_json(kind, piece.values, f"the piece {piece.name}", "make the dataset again").model_copy(
         update={"files": files}

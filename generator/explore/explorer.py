@@ -49,23 +49,19 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
-MAX_SIDE: Final = 1000
-"""Longest side of a picture on the page, px: what a window shows, and made in milliseconds."""
+MAX_SIDE: Final = 1000  # Longest side of a picture on the page, px: what a window shows, and made in milliseconds
 
-MOST_DROPPED: Final = 8
-"""Pictures sent by pages that are kept, the newest; and decoded pictures that are at hand."""
+MOST_DROPPED: Final = 8  # Pictures sent by pages that are kept, the newest; and decoded pictures that are at hand
 
+# Pixels of a picture that a page sends: those of the largest cameras, 200 MB while it is decoded.
 MOST_DROPPED_PIXELS: Final = 1 << 26
-"""Pixels of a picture that a page sends: those of the largest cameras, 200 MB while it is decoded."""
 
+# Side of the field of equal pixels whose spread is a pixel's noise: 256 draws tell a deviation to a twentieth.
 _DRAWS: Final = 16
-"""Side of the field of equal pixels whose spread is a pixel's noise: 256 draws tell a deviation to a twentieth."""
 
-_STEPS: Final = 33
-"""Points of the curve of the black bodies."""
+_STEPS: Final = 33  # Points of the curve of the black bodies
 
-_PLACE: Final = "dataset"
-"""Where the command that is shown makes its dataset."""
+_PLACE: Final = "dataset"  # Where the command that is shown makes its dataset
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,8 +246,7 @@ def _seen_from_here(location: str) -> str:
     return os.fspath(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else location
 
 
-MOST_BYTES: Final = 64 << 20
-"""Bytes of a file that a page sends: photographs of 16 bits, and not a film."""
+MOST_BYTES: Final = 64 << 20  # Bytes of a file that a page sends: photographs of 16 bits, and not a film
 
 
 class ExploreServer(LocalServer):
@@ -330,12 +325,11 @@ def _rendering(asked: Mapping[str, str]) -> Rendering:
     raise InputError(f"{text[:40]!r} is no rendering; expected one of {', '.join(get_args(Rendering))}")
 
 
-_WIDTH: Final = 900
-"""Width of the pictures, px: as much as a page shows without making them smaller."""
+_WIDTH: Final = 900  # Width of the pictures, px: as much as a page shows without making them smaller
 
-_HEIGHT: Final = 600
-"""Height, px."""
+_HEIGHT: Final = 600  # Height, px
 
+# Balls: centre and radius, px, and linear sRGB of the surface, back to front.
 _BALLS: Final = (
     ((160, 395, 130), (0.78, 0.05, 0.04)),
     ((395, 330, 175), (0.85, 0.55, 0.06)),
@@ -345,13 +339,10 @@ _BALLS: Final = (
     ((520, 530, 65), (0.45, 0.10, 0.50)),
     ((765, 535, 45), (0.90, 0.90, 0.88)),
 )
-"""Balls: centre and radius, px, and linear sRGB of the surface, back to front."""
 
-_FROM: Final = np.array([-0.5, -0.65, 0.57])
-"""Direction to the lamp: right, down, towards the viewer."""
+_FROM: Final = np.array([-0.5, -0.65, 0.57])  # Direction to the lamp: right, down, towards the viewer
 
-_PATCHES: Final = 6
-"""Patches in a row: hues, and below them greys."""
+_PATCHES: Final = 6  # Patches in a row: hues, and below them greys
 
 
 def sample_folder(cache: Path | None = None) -> Path:
@@ -410,7 +401,6 @@ def _patches() -> Picture:
 
 
 def _random() -> Picture:
-    """Return blocks of uniformly random colours, each of ten by ten pixels."""
     return _enlarged(RandomScene(0, _WIDTH // 10, _HEIGHT // 10).read().picture, 10)
 
 

@@ -59,16 +59,15 @@ from generator.kernels.vector import (
 )
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES, key_of
 
+# Groups of pixels by which choosing offsets leads fetching samples, so that the processor computes while it waits.
 LEAD: Final = 2
-"""Groups of pixels by which choosing offsets leads fetching samples, so that the processor computes while it waits."""
-OFFSETS_BYTES: Final = 4 * GROUP
-"""Bytes of a group's offsets, uint32 each."""
+OFFSETS_BYTES: Final = 4 * GROUP  # Bytes of a group's offsets, uint32 each
+# Bytes by which prefetching the picture leads reading it, some 21 groups: time for the memory to answer.
 _PREFETCH_BYTES: Final = 2048
-"""Bytes by which prefetching the picture leads reading it, some 21 groups: time for the memory to answer."""
+# Bytes of scratch memory for the last pixels of a row: a group's 96, rounded up to whole lines of the cache.
 EDGE_BYTES: Final = 128
-"""Bytes of scratch memory for the last pixels of a row: a group's 96, rounded up to whole lines of the cache."""
+# Bytes of scratch memory a thread needs: a row's last pixels, and the offsets of four groups, LEAD + 1 in use.
 SCRATCH_BYTES: Final = EDGE_BYTES + 4 * OFFSETS_BYTES
-"""Bytes of scratch memory a thread needs: a row's last pixels, and the offsets of four groups, LEAD + 1 in use."""
 
 _P0: Final = np.uint64(MULTIPLIERS[0])
 _P1: Final = np.uint64(MULTIPLIERS[1])
@@ -77,8 +76,7 @@ _W1: Final = np.uint32(KEY_STEPS[1])
 _HALF: Final = np.uint64(32)
 _PURPOSE: Final = np.uint32(SAMPLES)
 _PAIRS: Final = ir.VectorType(I64, LANES // 2)
-_MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
-"""Of the three rounds of the rule."""
+_MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)  # Of the three rounds of the rule
 
 
 def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
@@ -95,7 +93,6 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
 
 
 def _hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
-    """Return the words h of a group."""
     numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
     h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
     h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
@@ -278,10 +275,9 @@ def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
 Samples = npt.NDArray[np.uint16]
 Picture = npt.NDArray[np.uint8]
 
+# Bytes of a page, the smallest unit of memory protection on x86-64 and arm64; larger pages are whole multiples.
 _PAGE: Final = 4096
-"""Bytes of a page, the smallest unit of memory protection on x86-64 and arm64; larger pages are whole multiples."""
-_OFFSETS: Final = 0xFFFFFFFF
-"""Most bytes of a light's samples: compiled code counts them in 32 bits."""
+_OFFSETS: Final = 0xFFFFFFFF  # Most bytes of a light's samples: compiled code counts them in 32 bits
 
 
 def check_samples(samples: Samples) -> int:

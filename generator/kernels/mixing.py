@@ -184,16 +184,16 @@ def mixed_table(
     return out
 
 
+# Pixels of a row that are mixed together, whole groups: their weights and offsets stay in the second-level cache.
 SEGMENT_PIXELS: Final = 512
-"""Pixels of a row that are mixed together, whole groups: their weights and offsets stay in the second-level cache."""
+# Pixels by which prefetching weights leads reading them: eight segments: time for the memory to answer.
 _PREFETCH_PIXELS: Final = 4096
-"""Pixels by which prefetching weights leads reading them: eight segments: time for the memory to answer."""
+# Bytes of a segment's offsets, or of one light's weights; a row's last may be longer by up to seven pixels.
 SEGMENT_BYTES: Final = OFFSETS_BYTES * (SEGMENT_PIXELS // GROUP + 1)
-"""Bytes of a segment's offsets, or of one light's weights; a row's last may be longer by up to seven pixels."""
+# Bytes of a segment's weights in the order of pixels and in that of `mix`, and of its offsets, for two lights each.
 PAIR_BYTES: Final = 6 * SEGMENT_BYTES
-"""Bytes of a segment's weights in the order of pixels and in that of `mix`, and of its offsets, for two lights each."""
+# Bytes of a segment that is put together before it is streamed.
 _LINES_BYTES: Final = line_buffer_bytes(SAMPLE_BYTES * (SEGMENT_PIXELS + BLOCK))
-"""Bytes of a segment that is put together before it is streamed."""
 
 
 @compiled

@@ -39,11 +39,9 @@ from generator.kernels.choice import (
 )
 from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored
 
-Window = tuple[int, int, int, int]
-"""x and y of a window's first pixel in the picture, and its width and height, px."""
+Window = tuple[int, int, int, int]  # x and y of a window's first pixel in the picture, and its width and height, px
 
-SCALES: Final = 7
-"""Numbers of an item that `vector.planes8` takes: factors and summands of three channels, and a limit."""
+SCALES: Final = 7  # Numbers of an item that `vector.planes8` takes: factors and summands of three channels, and a limit
 
 
 @compiled

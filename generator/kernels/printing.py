@@ -73,14 +73,11 @@ from generator.kernels.vector import (
     store,
 )
 
-SIDE: Final = 17
-"""Nodes of a channel."""
+SIDE: Final = 17  # Nodes of a channel
 
-NODES: Final = SIDE**3
-"""Nodes of all colours."""
+NODES: Final = SIDE**3  # Nodes of all colours
 
-NODE_CODES: Final = (*range(0, 256, 16), 255)
-"""sRGB codes of a channel's nodes."""
+NODE_CODES: Final = (*range(0, 256, 16), 255)  # sRGB codes of a channel's nodes
 
 _RED, _GREEN, _BLUE = np.int32(SIDE * SIDE), np.int32(SIDE), np.int32(1)
 _ALL, _HALF = np.int32(SIDE * SIDE + SIDE + 1), np.int32(8)
@@ -163,22 +160,18 @@ def means_at(
 
 
 _FOUR: Final = ir.VectorType(F32, 4)
-PRINTED_BLOCK: Final = LANES
-"""Pixels that are planned and interpolated at a time."""
+PRINTED_BLOCK: Final = LANES  # Pixels that are planned and interpolated at a time
+# Rows of 16 numbers that the plan of a block has: offsets of three nodes in bytes, weights of four, the offset of the
+# nearest. The fourth node is one step farther in each channel than the first.
 _PLAN_ROWS: Final = 8
-"""Rows of 16 numbers that the plan of a block has: offsets of three nodes in bytes, weights of four, the offset of the
-nearest. The fourth node is one step farther in each channel than the first."""
-_ROW: Final = 4 * PRINTED_BLOCK
-"""Bytes of a row: one number of 32 bits a pixel."""
+_ROW: Final = 4 * PRINTED_BLOCK  # Bytes of a row: one number of 32 bits a pixel
 _PLAN_BYTES: Final = _ROW * _PLAN_ROWS
-_LINE_BYTES: Final = 16 * PRINTED_BLOCK
-"""Bytes of a block's pixels: red, green, blue and noise, float32 each."""
+_LINE_BYTES: Final = 16 * PRINTED_BLOCK  # Bytes of a block's pixels: red, green, blue and noise, float32 each
+# Blocks of a row that are planned, and their samples prefetched, while those before are interpolated.
 _SEGMENT: Final = 8
-"""Blocks of a row that are planned, and their samples prefetched, while those before are interpolated."""
-_ROWS_AHEAD: Final = 2
-"""Rows by which prefetching the picture leads planning it."""
+_ROWS_AHEAD: Final = 2  # Rows by which prefetching the picture leads planning it
+# Groups of 32 pixels, whose choices are made together, that a segment may touch.
 _SEGMENT_GROUPS: Final = _SEGMENT * PRINTED_BLOCK // GROUP + 2
-"""Groups of 32 pixels, whose choices are made together, that a segment may touch."""
 
 
 @step(ADDRESS, ADDRESS, ADDRESS)
@@ -328,7 +321,6 @@ def add_deviations(
 
 
 def _write_planes(builder: Builder, line: Value, scales: Value, targets: Sequence[Value], mirrored: bool) -> None:
-    """Write a block to three planes."""
 
     def number(place: int) -> Value:
         return broadcast(builder, load(builder, scales, 4 * place, F32), FLOATS)
@@ -562,8 +554,7 @@ class PrintedMembers:
         self.most = max(sizes)
 
 
-_NOTHING: Final = np.zeros(GROUP, np.uint32)
-"""What is added to choices, none."""
+_NOTHING: Final = np.zeros(GROUP, np.uint32)  # What is added to choices, none
 
 
 class SharedTables:

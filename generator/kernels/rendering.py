@@ -127,11 +127,11 @@ def _copy_group(samples: int, offsets: int, target: int) -> None:
         copy8(samples + offset_at(offsets + 4 * i), target + SAMPLE_BYTES * i)
 
 
+# Pixels from which copying all samples of a light (5 MB) is cheaper than reading their pages in random order.
 WHOLE_LIGHT_PIXELS: Final = 1 << 20
-"""Pixels from which copying all samples of a light (5 MB) is cheaper than reading their pages in random order."""
 
+# Groups of pixels that are put together before they are streamed: 3 KiB, which stay in the first-level cache.
 _SEGMENT_GROUPS: Final = 16
-"""Groups of pixels that are put together before they are streamed: 3 KiB, which stay in the first-level cache."""
 
 
 @compiled

@@ -22,16 +22,11 @@ from llvmlite import ir
 
 from foundation.compiled import inlined, intrinsic
 
-LANES: Final = 16
-"""Numbers of 32 bits in a vector: one register of AVX-512."""
-GROUP: Final = 2 * LANES
-"""Pixels whose choices come from one vector of words, two from each word; see `choice.py`."""
-EIGHT: Final = 8
-"""Pixels that are written to float32 planes at a time: one register of AVX2 a channel."""
-SAMPLE_BYTES: Final = 6
-"""Bytes of a sample: red, green and blue, uint16 each."""
-LINE: Final = 64
-"""Bytes of a line of the cache, on x86-64 and on most arm64 processors."""
+LANES: Final = 16  # Numbers of 32 bits in a vector: one register of AVX-512
+GROUP: Final = 2 * LANES  # Pixels whose choices come from one vector of words, two from each word; see `choice.py`
+EIGHT: Final = 8  # Pixels that are written to float32 planes at a time: one register of AVX2 a channel
+SAMPLE_BYTES: Final = 6  # Bytes of a sample: red, green and blue, uint16 each
+LINE: Final = 64  # Bytes of a line of the cache, on x86-64 and on most arm64 processors
 
 I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 F32 = ir.FloatType()
@@ -246,22 +241,17 @@ def plane1(builder: Builder, source: Value, factor: Value, summand: Value, limit
     store(builder, minimum(builder, builder.fadd(value, summand), limit), target, 0)
 
 
-BLOCK: Final = 8
-"""Pixels that are mixed at a time: their weights under two lights fill a vector of 16."""
-MEAN_BYTES: Final = 16
-"""Bytes of a colour's mean under one light: red, green, blue and padding, float32."""
-PLAN_ENTRIES: Final = 6
-"""Addresses that `mix` takes of each pair of lights."""
-FAULT_BYTES: Final = 4 * LANES
-"""Bytes of the 16 float32 that become NaN where a weight is faulty."""
+BLOCK: Final = 8  # Pixels that are mixed at a time: their weights under two lights fill a vector of 16
+MEAN_BYTES: Final = 16  # Bytes of a colour's mean under one light: red, green, blue and padding, float32
+PLAN_ENTRIES: Final = 6  # Addresses that `mix` takes of each pair of lights
+FAULT_BYTES: Final = 4 * LANES  # Bytes of the 16 float32 that become NaN where a weight is faulty
 
-_QUAD: Final = 4
-"""Numbers of a pixel in a vector, a quarter of it: red, green, blue and padding."""
+_QUAD: Final = 4  # Numbers of a pixel in a vector, a quarter of it: red, green, blue and padding
 _SHORTS: Final = ir.VectorType(I16, 2 * LANES)
+# Which two of eight pixels share a vector, so that pixels are packed without crossing its quarters.
 _PIXEL_PAIRS: Final = ((0, 2), (4, 6), (1, 3), (5, 7))
-"""Which two of eight pixels share a vector, so that pixels are packed without crossing its quarters."""
+# Pixel and light of each of a block's weights in the order of `arrange_weights`, in the quarters of `_PIXEL_PAIRS`.
 _ORDER: Final = tuple((_PIXEL_PAIRS[lane % _QUAD][lane // (2 * _QUAD)], lane // _QUAD % 2) for lane in range(LANES))
-"""Pixel and light of each of a block's weights in the order of `arrange_weights`, in the quarters of `_PIXEL_PAIRS`."""
 
 
 @step(ADDRESS, "int64", ADDRESS, returned="int64")
@@ -496,8 +486,8 @@ def mix(
     store(builder, builder.load(fault), faults, 0)
 
 
+# Bytes of an image from which it is streamed: the size of a desktop processor's last-level cache.
 STREAMED_BYTES: Final = 24 << 20
-"""Bytes of an image from which it is streamed: the size of a desktop processor's last-level cache."""
 
 
 def line_buffer_bytes(segment_bytes: int) -> int:

@@ -29,13 +29,13 @@ from generator.named_numbers import parse_numbers
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
+# Chromaticities drawn at a time: one of them lies in the gamut for all but narrow gamuts, and numpy is used well.
 _BATCH: Final = 32
-"""Chromaticities drawn at a time: one of them lies in the gamut for all but narrow gamuts, and numpy is used well."""
+# Batches drawn at most for a light: 65 536 draws, of which none is in the gamut with probability e⁻⁶⁵ where a share
+# of `_LEAST_WITHIN` is.
 _BATCHES: Final = 2048
-"""Batches drawn at most for a light: 65 536 draws, of which none is in the gamut with probability e⁻⁶⁵ where a share of
-`_LEAST_WITHIN` is."""
+# Share of a distribution that must lie in the gamut; with less, a light would take thousands of draws.
 _LEAST_WITHIN: Final = 1e-3
-"""Share of a distribution that must lie in the gamut; with less, a light would take thousands of draws."""
 
 
 @dataclass(frozen=True)
@@ -194,15 +194,13 @@ def light_numbers(text: str, total: int) -> tuple[int, ...]:
     return tuple(lights)
 
 
-_LEAST_K: Final = 1000
-"""From here on a number is rather a temperature in kelvin than that of a light."""
+_LEAST_K: Final = 1000  # From here on a number is rather a temperature in kelvin than that of a light
 
+# White balances that cameras name, kelvin, as manuals of EOS bodies have them.
 _WHITE_BALANCES: Final = {"sunny": 5200, "daylight": 5200, "shade": 7000, "cloudy": 6000, "tungsten": 3200}
-"""White balances that cameras name, kelvin, as manuals of EOS bodies have them."""
 
 
 def _no_light(text: str, names: Sequence[str]) -> str:
-    """Return what is said of a text that names no light."""
     known = _WHITE_BALANCES.get(text.lower())
     near = f"write {known}K for a black body like it" if known else nearest_names(text, names)
     usual = "write a light such as 12, 12:0.25+40:0.75, 5600K or r=.3,b=.25"

@@ -26,13 +26,13 @@ from generator.philox import Words, standard_normal
 _Array = npt.NDArray[np.float64]
 
 
+# Columns of a ground truth, as data sets and tables name them.
 TRIPLES: Final = (
     ("gt_r", "gt_g", "gt_b"),
     ("r", "g", "b"),
     ("red", "green", "blue"),
     ("white_r", "white_g", "white_b"),
 )
-"""Columns of a ground truth, as data sets and tables name them."""
 
 
 def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
@@ -79,8 +79,7 @@ def is_ground_truth(numbers: Sequence[float]) -> bool:
     return len(numbers) == 3 and bool(np.isfinite(numbers).all()) and min(numbers) >= 0 and sum(numbers) > 0
 
 
-_WORD: Final = float(1 << 32)
-"""Values of a random word."""
+_WORD: Final = float(1 << 32)  # Values of a random word
 
 
 @dataclass(frozen=True)
@@ -176,9 +175,10 @@ class Fitted:
         }
 
 
+# Chromaticities r and b as a function of random words; some may be no chromaticities at all.
 Distribution = Uniform | Gaussian | Fitted
-"""Chromaticities r and b as a function of random words; some may be no chromaticities at all."""
 
+# Ranges of the numbers of a Gaussian; without breadth, or with a correlation of 1, it would have no density.
 _GAUSSIAN: Final = {
     "r": (0.0, 1.0),
     "b": (0.0, 1.0),
@@ -187,7 +187,6 @@ _GAUSSIAN: Final = {
     "sd_b": (1e-6, 1.0),
     "corr": (-0.999999, 0.999999),
 }
-"""Ranges of the numbers of a Gaussian; without breadth, or with a correlation of 1, it would have no density."""
 
 
 def parse_distribution(text: str) -> Distribution:

@@ -30,17 +30,17 @@ from generator.lights.lighting import Mixture, mixture_of
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
+# Angle to a wanted light within which one light, or two, are taken instead of three, degrees: about a table's own
+# error.
 TOLERANCE_DEG: Final = 0.01
-"""Angle to a wanted light within which one light, or two, are taken instead of three, degrees: about a table's own
-error."""
 
+# What to do about a light that the table cannot make: refuse it, or take the nearest that it can.
 OutsideGamut = Literal["refuse", "nearest"]
-"""What to do about a light that the table cannot make: refuse it, or take the nearest that it can."""
 
 _Array = npt.NDArray[np.float64]
+# Ratio of the singular values of the lights' chromaticities below which they lie on a line: far above what rounding
+# makes of a line, far below the breadth of three lights of a projector.
 _THIN: Final = 1e-6
-"""Ratio of the singular values of the lights' chromaticities below which they lie on a line: far above what rounding
-makes of a line, far below the breadth of three lights of a projector."""
 
 
 class OutsideGamutError(InputError):

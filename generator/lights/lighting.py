@@ -33,8 +33,7 @@ from generator.masks.making import MaskMaker
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-_BILLION: Final = 10**9
-"""Parts of a weight: as many decimals as a label has."""
+_BILLION: Final = 10**9  # Parts of a weight: as many decimals as a label has
 
 
 @dataclass(frozen=True)

@@ -36,19 +36,18 @@ from generator import philox
 from generator.files import require_plausible
 from generator.named_numbers import Range, parse_numbers
 
+# float32: what is computed from float32 arrays and Python's own numbers stays float32.
 Array = npt.NDArray[np.floating[Any]]
-"""float32: what is computed from float32 arrays and Python's own numbers stays float32."""
 _ZERO: Final = np.float32(0)
 _HALF: Final = np.float32(0.5)
 _ONE: Final = np.float32(1)
 _THREE: Final = np.float32(3)
-_STEP: Final = 64
-"""Numbers of one stream: as many as the largest shape draws, 1 + 3 · 20 of the spots, and some."""
+_STEP: Final = 64  # Numbers of one stream: as many as the largest shape draws, 1 + 3 · 20 of the spots, and some
+# Breadth of the bars between a window's panes, as a share of the window: 6 cm of a metre, as glazing bars are.
 _BAR: Final = 0.06
-"""Breadth of the bars between a window's panes, as a share of the window: 6 cm of a metre, as glazing bars are."""
 
+# From v (h, 1), rows' distances from the picture's centre, shares of its longer side, to lights' shares (K, h, W).
 Shares = Callable[[Array], Array]
-"""From v (h, 1), rows' distances from the picture's centre, shares of its longer side, to lights' shares (K, h, W)."""
 
 
 @dataclass(frozen=True)
@@ -260,8 +259,8 @@ class Windows:
         return matrix.tolist(), columns, rows, max(soft, pixel / float(min(width, height)))
 
 
+# A kind of masks: from the streams of an image to where its lights fall.
 Shape = HalfPlanes | Spots | SmoothFields | Windows
-"""A kind of masks: from the streams of an image to where its lights fall."""
 
 
 @compiled
@@ -351,11 +350,9 @@ def _over_the_first(shares: Array) -> Array:
     return shares
 
 
-FULL: Final = 65535
-"""Weight 1 as a 16-bit file holds it: the largest value of 16 bits."""
+FULL: Final = 65535  # Weight 1 as a 16-bit file holds it: the largest value of 16 bits
 
-Weights = npt.NDArray[np.float32]
-"""(H, W, K) float32, 0 … 1: the weight of each of K lights in each pixel; sum 1."""
+Weights = npt.NDArray[np.float32]  # (H, W, K) float32, 0 … 1: the weight of each of K lights in each pixel; sum 1
 
 _FULL: Final = np.float32(FULL)
 _WHOLE: Final = np.int32(FULL)
@@ -420,8 +417,8 @@ def decode_values(file: bytes, what: Path | str) -> npt.NDArray[Any]:
     return image[..., 0] if image.shape[2] < 3 else image[..., 2::-1]
 
 
+# Endings of what is taken for a mask.
 SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".webp", ".pgm", ".ppm")
-"""Endings of what is taken for a mask."""
 
 _Array = npt.NDArray[np.float32]
 
@@ -539,8 +536,8 @@ def _fitted(mask: _Array, height: int, width: int) -> _Array:
     return np.asarray(cv2.resize(mask, (width, height), interpolation=interpolation), dtype=np.float32)
 
 
+# Pixels computed at a time: intermediate arrays of so many float32 stay in the processor's cache.
 _PIXELS: Final = 1 << 15
-"""Pixels computed at a time: intermediate arrays of so many float32 stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -579,14 +576,11 @@ class MadeMaskPlan:
         return self.shape.describe()
 
 
-MaskMaker = GivenMasks | MadeMasks
-"""Where in one picture each of its lights falls."""
+MaskMaker = GivenMasks | MadeMasks  # Where in one picture each of its lights falls
 
-MaskPlan = GivenMaskPlan | MadeMaskPlan
-"""Masks for every image of a dataset."""
+MaskPlan = GivenMaskPlan | MadeMaskPlan  # Masks for every image of a dataset
 
-_SHARE: Range = (0.0, 1.0)
-"""Least and most of a share."""
+_SHARE: Range = (0.0, 1.0)  # Least and most of a share
 _OPTIONS: Final[dict[str, dict[str, Range]]] = {
     "half-plane": {"angle": (-360.0, 360.0), "width": _SHARE},
     "soft-edge": {"angle": (-360.0, 360.0), "width": _SHARE},

@@ -23,7 +23,6 @@ _ZERO: Final = np.float32(0)
 
 @inlined
 def _light_at(weights: Any, whites: Any, y: int, x: int) -> Any:
-    """Return linear red, green and blue of the light of a pixel."""
     red = green = blue = _ZERO
     for light in range(weights.shape[2]):
         weight = weights[y, x, light]

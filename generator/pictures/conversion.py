@@ -22,22 +22,20 @@ if TYPE_CHECKING:
     from PIL.ImageCms import ImageCmsTransform
 
 
+# Codes of each channel, every 32nd, of the grid of 729 colours that shows whether a profile is sRGB.
 _PROBE_STEPS: Final = 9
-"""Codes of each channel, every 32nd, of the grid of 729 colours that shows whether a profile is sRGB."""
 
-_ADOBE_GAMMA: Final = 563 / 256
-"""Adobe RGB (1998) Color Image Encoding, clause 4.3.1.2."""
+_ADOBE_GAMMA: Final = 563 / 256  # Adobe RGB (1998) Color Image Encoding, clause 4.3.1.2
 
+# Of linear light: the matrices of Adobe RGB (1998), clause 4.3.5.3, and IEC 61966-2-1; both have the white D65.
 _ADOBE_TO_SRGB: Final = np.array(
     [[1.39835574, -0.39835574, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04292899, 1.04292899]], np.float32
 )
-"""Of linear light: the matrices of Adobe RGB (1998), clause 4.3.5.3, and IEC 61966-2-1; both have the white D65."""
 
+# Steps of the table of encoded linear light: where the curve is steepest a step is a twentieth of a code.
 _STEPS: Final = 65535
-"""Steps of the table of encoded linear light: where the curve is steepest a step is a twentieth of a code."""
 
-_ROWS: Final = 256
-"""Rows that are converted together, so that their float32 take little memory beside the picture."""
+_ROWS: Final = 256  # Rows that are converted together, so that their float32 take little memory beside the picture
 
 
 def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes) -> tuple[npt.NDArray[np.uint8], str]:

@@ -47,19 +47,17 @@ if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
 
 
-ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"
-"""Remark on a picture that a camera made in that space."""
+ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"  # Remark on a picture that a camera made in that space
 
 LINEAR: Final = "floating-point values, taken as linear light"
 TRANSPARENT: Final = "transparent, composited on white"
+# Notes on a picture, as those above, for its row of the dataset's list of sources.
 PROFILE_UNUSED: Final = "colour profile not applied"
-"""Notes on a picture, as those above, for its row of the dataset's list of sources."""
 
-_PNG: Final = b"\x89PNG\r\n\x1a\n"
-"""First bytes of a PNG file."""
+_PNG: Final = b"\x89PNG\r\n\x1a\n"  # First bytes of a PNG file
 
+# Places of which a further crop takes the best; chosen, not measured: with one, crops may be nearly the same.
 _CANDIDATES: Final = 8
-"""Places of which a further crop takes the best; chosen, not measured: with one, crops may be nearly the same."""
 
 
 def random_places(
@@ -104,7 +102,6 @@ def random_places(
 
 
 def _overlap(one: tuple[int, int], other: tuple[int, int], size: tuple[int, int]) -> int:
-    """Return the pixels that crops at two places share."""
     wide, high = (max(0, side - abs(a - b)) for side, a, b in zip(size, one, other, strict=True))
     return wide * high
 
@@ -118,15 +115,13 @@ def clear_bits(codes: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint8]
 
 Picture = npt.NDArray[np.uint8]
 
-LARGEST_SIDE: Final = 65535
-"""Longest side of a crop or a random scene, px: what 16 bits count."""
+LARGEST_SIDE: Final = 65535  # Longest side of a crop or a random scene, px: what 16 bits count
+# Most pixels of a picture, 1.6 GB of codes: a small file can claim more than memory holds.
 LARGEST_PICTURE: Final = 1 << 29
-"""Most pixels of a picture, 1.6 GB of codes: a small file can claim more than memory holds."""
 
-_UNCALIBRATED: Final = 0xFFFF
-"""Value of the tag ColorSpace (EXIF 2.3, tag 40961) for a space that is not sRGB."""
+_UNCALIBRATED: Final = 0xFFFF  # Value of the tag ColorSpace (EXIF 2.3, tag 40961) for a space that is not sRGB
+# Formats whose colours are multiplied by alpha unless the file says otherwise, by OpenImageIO's names.
 _MULTIPLIED: Final = frozenset({"dpx", "iff", "openexr", "rla", "tiff"})
-"""Formats whose colours are multiplied by alpha unless the file says otherwise, by OpenImageIO's names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,8 +179,7 @@ class Preparation:
         return options
 
 
-UNPREPARED: Final = Preparation()
-"""Nothing is done on request: the whole picture in its own size, profiles honoured."""
+UNPREPARED: Final = Preparation()  # Nothing is done on request: the whole picture in its own size, profiles honoured
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -515,26 +509,26 @@ def _shrink(picture: Picture, scale: float) -> Picture:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
+# Ends of the names for which a folder is searched, in either case; a file that is named itself may have any end.
 SUFFIXES: Final = frozenset(
     {".bmp", ".dpx", ".exr", ".gif", ".hdr", ".j2k", ".jp2", ".jpe", ".jpeg", ".jpg"}
     | {".jxl", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".psd", ".rgbe", ".sgi", ".tga", ".tif", ".tiff", ".webp"}
 )
-"""Ends of the names for which a folder is searched, in either case; a file that is named itself may have any end."""
 
+# Ends of pictures' names that no library of a plain installation reads; those in a folder are told.
 UNREADABLE: Final = frozenset({".avif", ".heic", ".heif"})
-"""Ends of pictures' names that no library of a plain installation reads; those in a folder are told."""
 
+# Backslashes before a byte that is no text, or before two digits that are written like one.
 _LIKE_A_BYTE: Final = re.compile(r"\\+(?=x[89a-f][0-9a-f]|[\udc80-\udcff])")
-"""Backslashes before a byte that is no text, or before two digits that are written like one."""
+# Most bytes of a file that is read once, to be hashed and decoded: 32 MiB are nothing beside what it unpacks to.
 _KEPT: Final = 1 << 25
-"""Most bytes of a file that is read once, to be hashed and decoded: 32 MiB are nothing beside what it unpacks to."""
 
 _log = logging.getLogger(__name__)
 
+# Errors of reading that have their cause in the machine or its store, not in the file.
 _MACHINE_ERRORS: Final = frozenset(
     {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN}
 )
-"""Errors of reading that have their cause in the machine or its store, not in the file."""
 
 
 class Source(Protocol):
@@ -665,7 +659,6 @@ def _is_of_the_file(path: Path, error: OSError) -> bool:
 
 
 def _folder_is_there(store: AbstractFileSystem, path: str) -> bool:
-    """Return whether the folder of an object is there without it."""
     try:
         store.invalidate_cache()
         return bool(store.isdir(path.rpartition("/")[0]))

@@ -4,5 +4,4 @@ from typing import Final, Literal
 
 Rendering = Literal["codes", "colorimetric"]
 
-DEFAULT: Final[Rendering] = "colorimetric"
-"""Rendering unless said otherwise (decision 0043)."""
+DEFAULT: Final[Rendering] = "colorimetric"  # Rendering unless said otherwise (decision 0043)

@@ -45,12 +45,11 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from generator.lights.lighting import Mixture
 
+# Largest random share unless said otherwise. Chosen: with it, learned methods did best on real photographs, of shares
+# that others had tried (docs/transfer.md); real scenes have some veil of their own.
 MOST: Final = 0.97
-"""Largest random share unless said otherwise. Chosen: with it, learned methods did best on real photographs, of shares
-that others had tried (docs/transfer.md); real scenes have some veil of their own."""
 
-_HALVINGS: Final = 40
-"""Steps to find what samples above 0 are lowered by: to 2⁻²⁴ counts."""
+_HALVINGS: Final = 40  # Steps to find what samples above 0 are lowered by: to 2⁻²⁴ counts
 
 _Array = npt.NDArray[np.float64]
 
@@ -104,8 +103,7 @@ class BlackPoint:
         return np.full(np.shape(words), 1.0 if self.kind == "compensate" else 0.0)
 
 
-KEEP: Final = BlackPoint()
-"""The print's black is kept."""
+KEEP: Final = BlackPoint()  # The print's black is kept
 
 
 def parse_black_point(text: str) -> BlackPoint:

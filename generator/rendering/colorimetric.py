@@ -56,45 +56,43 @@ if TYPE_CHECKING:
 
 _Array = npt.NDArray[np.float64]
 
+# Temperature of the light under which places are found, kelvin: about the middle of daylight. Maps of 5600 K trained
+# estimators as well as maps of each light (docs/transfer.md).
 REFERENCE_K: Final = 5600.0
-"""Temperature of the light under which places are found, kelvin: about the middle of daylight. Maps of 5600 K trained
-estimators as well as maps of each light (docs/transfer.md)."""
 
+# Least of a channel's white over the largest under which a light may be the reference: it must see all colours.
 _LEAST_RATIO: Final = 0.2
-"""Least of a channel's white over the largest under which a light may be the reference: it must see all colours."""
 
+# Largest relative difference in a channel of a place that shows the wanted colour: a fifth of what neighbouring cells
+# of a chart of five bits differ.
 MET_WITHIN: Final = 0.02
-"""Largest relative difference in a channel of a place that shows the wanted colour: a fifth of what neighbouring
-cells of a chart of five bits differ."""
 
+# Angle to grey of the black that is asked of a print, degrees: a little less than the half that greys may be off.
 BLACK_WITHIN_DEG: Final = 0.4
-"""Angle to grey of the black that is asked of a print, degrees: a little less than the half that greys may be off."""
 
+# Black point over the darkest grey that the print makes at most. Simulated unmanaged prints need 1.0 to 1.2; a lift
+# of 1.25 makes the contrast of a print less by a hundredth of white.
 MOST_LIFT: Final = 1.25
-"""Black point over the darkest grey that the print makes at most. Simulated unmanaged prints need 1.0 to 1.2; a lift of
-1.25 makes the contrast of a print less by a hundredth of white."""
 
+# Largest factor by which a channel of greys is made neutral. Prints need up to 1.1; a channel in which a light has
+# hardly any counts may ask for more, of noise.
 MOST_TINT: Final = 1.5
-"""Largest factor by which a channel of greys is made neutral. Prints need up to 1.1; a channel in which a light has
-hardly any counts may ask for more, of noise."""
 
+# Largest factor by which recorded deviations are made as large as the noise is at their level: 25 of them have a
+# spread of their own that is off by a seventh, and that of the nearest cell is of another level.
 MOST_SPREAD: Final = 2.0
-"""Largest factor by which recorded deviations are made as large as the noise is at their level: 25 of them have a
-spread of their own that is off by a seventh, and that of the nearest cell is of another level."""
 
+# Standard deviations of noise that are left between a mean and 0 where black is taken out: what is cut off then lifts
+# a mean by 2 %.
 NOISE_ABOVE: Final = 1.5
-"""Standard deviations of noise that are left between a mean and 0 where black is taken out: what is cut off then lifts
-a mean by 2 %."""
 
+# Steps of a code, and of a level, that places are known to: a thousandth of what neighbouring cells differ, and far
+# more than rounding leaves between processors.
 _STEPS: Final = 1024
-"""Steps of a code, and of a level, that places are known to: a thousandth of what neighbouring cells differ, and far
-more than rounding leaves between processors."""
 
-_GREYS: Final = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)
-"""Nodes of three equal codes."""
+_GREYS: Final = np.arange(SIDE) * (SIDE * SIDE + SIDE + 1)  # Nodes of three equal codes
 
-_LIGHTS_AT_HAND: Final = 1024
-"""Lights of a table whose nodes are kept in memory, 200 kB each."""
+_LIGHTS_AT_HAND: Final = 1024  # Lights of a table whose nodes are kept in memory, 200 kB each
 
 
 def source_colours(matrix: ColourMatrix) -> _Array:
@@ -146,8 +144,7 @@ class PrintMap:
         return float(shares @ self.outside), float(shares @ self.distance)
 
 
-_finding: Final = threading.Lock()
-"""Held while a map is read or found, so that of several threads one does so."""
+_finding: Final = threading.Lock()  # Held while a map is read or found, so that of several threads one does so
 
 _KEPT: Final = tuple(PrintMap.__dataclass_fields__)
 _SUFFIX: Final = ".print"

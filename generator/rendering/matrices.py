@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
+# XYZ under D65 to camera RGB, row by row in ten-thousandths: the numbers that Adobe's DNG converter writes as
+# ColorMatrix2, as the tables `adobe_coeff` of dcraw 9.28 and LibRaw (src/tables/colordata.cpp, commit e419de0) list
+# them; the two agree on all that both have. The 5DS R has that of the 5DS.
 _TO_CAMERA: Final = {
     "Canon EOS 550D": (6941, -1164, -857, -3825, 11597, 2534, -416, 1540, 6039),
     "Canon EOS 600D": (6461, -907, -882, -4300, 12184, 2378, -819, 1944, 5931),
@@ -38,21 +41,17 @@ _TO_CAMERA: Final = {
     "Canon EOS 5D Mark II": (4716, 603, -830, -7798, 15474, 2480, -1496, 1937, 6651),
     "Canon EOS 200D": (7377, -742, -998, -4235, 11981, 2549, -673, 1918, 5538),
 }
-"""XYZ under D65 to camera RGB, row by row in ten-thousandths: the numbers that Adobe's DNG converter writes as
-ColorMatrix2, as the tables `adobe_coeff` of dcraw 9.28 and LibRaw (src/tables/colordata.cpp, commit e419de0) list them;
-the two agree on all that both have. The 5DS R has that of the 5DS."""
 
+# Where the matrices of named cameras come from.
 SOURCE: Final = "ColorMatrix2 as listed by dcraw 9.28 and LibRaw (adobe_coeff)"
-"""Where the matrices of named cameras come from."""
 
+# Linear sRGB to XYZ, white D65: IEC 61966-2-1:1999, clause 5.2.
 _SRGB_TO_XYZ: Final = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-"""Linear sRGB to XYZ, white D65: IEC 61966-2-1:1999, clause 5.2."""
 
-_LEAST_SUM: Final = 1e-6
-"""Least sum of a row: that of a row that leaves white black cannot be made 1."""
+_LEAST_SUM: Final = 1e-6  # Least sum of a row: that of a row that leaves white black cannot be made 1
 
+# Largest number of a matrix in a file: rows in ten-thousandths have some 10⁴, and sums of such are exact enough.
 _LARGEST: Final = 1e6
-"""Largest number of a matrix in a file: rows in ten-thousandths have some 10⁴, and sums of such are exact enough."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +121,6 @@ def choose_matrix(text: str) -> ColourMatrix | None:
 
 
 def _bare(camera: str) -> str:
-    """Return a camera's name without the maker, blanks, hyphens and capitals."""
     return "".join(camera.lower().replace("-", " ").split()).removeprefix("canon")
 
 
@@ -137,11 +135,10 @@ def _normalised(rows: npt.NDArray[np.float64], name: str) -> npt.NDArray[np.floa
     return rows / sums
 
 
+# Temperature of the light for the fit, kelvin: sRGB's white is D65 (IEC 61966-2-1, clause 4.1).
 DAYLIGHT_K: Final = 6500.0
-"""Temperature of the light for the fit, kelvin: sRGB's white is D65 (IEC 61966-2-1, clause 4.1)."""
 
-TABLE: Final = "table"
-"""The word that asks for the matrix from the table."""
+TABLE: Final = "table"  # The word that asks for the matrix from the table
 
 
 def matrix_for(lut: Lut, text: str | None = None) -> ColourMatrix:

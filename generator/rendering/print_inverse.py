@@ -28,21 +28,19 @@ from generator.kernels.choice import channels_of
 
 _Array = npt.NDArray[np.float64]
 
+# Steps of a path from grey to a colour: with twice as many, places differ by less than a hundredth of a cell.
 STEPS: Final = 8
-"""Steps of a path from grey to a colour: with twice as many, places differ by less than a hundredth of a cell."""
 
-_ROUNDS: Final = 12
-"""Levenberg-Marquardt steps at each step of a path; inside the gamut four are enough."""
+_ROUNDS: Final = 12  # Levenberg-Marquardt steps at each step of a path; inside the gamut four are enough
 
-_STRIDE: Final = 4.0
-"""Cells that one of these steps goes at most, along each axis."""
+_STRIDE: Final = 4.0  # Cells that one of these steps goes at most, along each axis
 
+# What a relative difference of brightness counts against one of chromaticity. Chosen: see
+# docs/reference/rendering.md.
 BRIGHTNESS_COST: Final = 0.5
-"""What a relative difference of brightness counts against one of chromaticity. Chosen: see
-docs/reference/rendering.md."""
 
+# Brightness and two directions of chromaticity, of length 1, for logarithmic differences of channels.
 _AXES: Final = np.array([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]]) / np.sqrt([[3.0], [2.0], [6.0]])
-"""Brightness and two directions of chromaticity, of length 1, for logarithmic differences of channels."""
 
 _SCALE: Final = _AXES * np.array([[BRIGHTNESS_COST**0.5], [1.0], [1.0]])
 
@@ -194,5 +192,4 @@ def _grey_places(colours: _Array, levels: _Array, bits: int) -> _Array:
 
 
 def _diagonal(bits: int) -> npt.NDArray[np.int64]:
-    """Return the cells of three equal codes, ascending."""
     return np.arange(1 << bits) * (1 | 1 << bits | 1 << 2 * bits)

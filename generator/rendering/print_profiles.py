@@ -27,20 +27,19 @@ from generator.lights.lighting import plain
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
+# Distance of a cell's mean from its median, in standard errors, from which its mean is not trusted: far beyond the
+# tails of 100 000 cells and channels of normal samples, where the standard error is known to a seventh from 25
+# samples; one photosite of 25 that is clipped beside a cell of a tenth of saturation moves the mean by more.
 ODD_SIGMAS: Final = 8.0
-"""Distance of a cell's mean from its median, in standard errors, from which its mean is not trusted: far beyond the
-tails of 100 000 cells and channels of normal samples, where the standard error is known to a seventh from 25 samples;
-one photosite of 25 that is clipped beside a cell of a tenth of saturation moves the mean by more."""
 
-ODD_SHIFT: Final = 0.02
-"""Least shift of a mean, relative to the median, that matters: 0.02 is a degree of hue at most."""
+ODD_SHIFT: Final = 0.02  # Least shift of a mean, relative to the median, that matters: 0.02 is a degree of hue at most
 
+# White point over the brightest grey that the print's cells can make: at the very edge of the gamut, cells of unlike
+# colours would have to be mixed. Greys near white are then within 0.1 degrees on simulated unmanaged prints.
 WHITE_MARGIN: Final = 0.99
-"""White point over the brightest grey that the print's cells can make: at the very edge of the gamut, cells of unlike
-colours would have to be mixed. Greys near white are then within 0.1 degrees on simulated unmanaged prints."""
 
+# White point over the mean of the paper at most, so that white, too, is drawn from several cells.
 PAPER_MARGIN: Final = 0.97
-"""White point over the mean of the paper at most, so that white, too, is drawn from several cells."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -74,7 +73,6 @@ class PrintProfile:
 
     @cached_property
     def _neutral(self) -> tuple[float, float]:
-        """Return the black and the white."""
         brightness = self.colours.mean(axis=1)
         usable = np.flatnonzero(self.usable)
         darkest, brightest = (float(pick(brightness[usable])) for pick in (np.min, np.max))

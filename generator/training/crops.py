@@ -55,8 +55,7 @@ if TYPE_CHECKING:
     from generator.variation.sensor_noise import SensorNoise
 
 
-KEPT: Final = 2
-"""Pieces of memory that are kept for later: a loop still refers to one batch while it gets the next."""
+KEPT: Final = 2  # Pieces of memory that are kept for later: a loop still refers to one batch while it gets the next
 
 
 class Recycled:
@@ -93,8 +92,7 @@ class Recycled:
         return memory
 
 
-_HALF: Final = np.uint64(32)
-"""Bits of a random word."""
+_HALF: Final = np.uint64(32)  # Bits of a random word
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,6 +416,7 @@ def _below(words: npt.NDArray[np.uint32], bound: int | npt.NDArray[np.int64]) ->
     return (words.astype(np.uint64) * np.asarray(bound, dtype=np.uint64) >> _HALF).astype(np.int64)
 
 
+# Keywords of `Crops`, each kept in an attribute of its name.
 _OPTIONS: Final = (
     "length",
     "lights",
@@ -432,7 +431,6 @@ _OPTIONS: Final = (
     "matrix",
     "black_point",
 )
-"""Keywords of `Crops`, each kept in an attribute of its name."""
 
 
 def _reopened(folder: Path, gallery: Gallery, size: tuple[int, int], options: dict[str, Any]) -> Crops:

@@ -24,8 +24,7 @@ from generator.kernels.choice import check_picture
 from generator.pictures.sources import Picture, Source
 
 FORMAT: Final = "crop.gallery"
-VERSION: Final = 1
-"""The only version so far."""
+VERSION: Final = 1  # The only version so far
 
 
 class _Entry(Record):

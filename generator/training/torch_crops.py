@@ -22,9 +22,9 @@ try:
 except ImportError as error:
     raise TorchMissingError("training batches for PyTorch need it: pip install torch") from error
 
+# ``image`` (3, height, width) float32, linear camera RGB, 1 = saturation, and ``illuminant`` (3,) float32, r + g + b
+# = 1; a batch has N as its first dimension.
 Item = dict[str, Any]
-"""``image`` (3, height, width) float32, linear camera RGB, 1 = saturation, and ``illuminant`` (3,) float32,
-r + g + b = 1; a batch has N as its first dimension."""
 
 
 def _tensors(batch: Batch) -> Item:

@@ -38,8 +38,7 @@ from generator.variation.sensor_noise import BITS, SensorNoise, normal_deviates
 Image = npt.NDArray[np.uint16]
 Three = tuple[float, float, float]
 
-PURPOSE: Final = np.uint32(philox.NOISE)
-"""Of the words that are the keys of rows, as compiled code takes it."""
+PURPOSE: Final = np.uint32(philox.NOISE)  # Of the words that are the keys of rows, as compiled code takes it
 _STEP: Final = np.uint64(0x9E3779B97F4A7C15)
 _FIRST: Final = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND: Final = np.uint64(0x94D049BB133111EB)
@@ -229,8 +228,8 @@ def _weights_of(image: Image, weights: npt.NDArray[np.float32] | None) -> tuple[
 
 
 _ZERO: Final = np.float32(0)
+# Least value where counts below black are kept: as far below 0 as saturation is above, where no noise reaches.
 _NO_FLOOR: Final = np.float32(-1)
-"""Least value where counts below black are kept: as far below 0 as saturation is above, where no noise reaches."""
 _ONE: Final = np.float32(1)
 
 

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 
-BITS: Final = 14
-"""Of a random word that choose a deviate: 64 KiB of them stay in the second-level cache."""
+BITS: Final = 14  # Of a random word that choose a deviate: 64 KiB of them stay in the second-level cache
 
 
 @lru_cache(maxsize=1)
@@ -45,12 +44,12 @@ def normal_deviates() -> npt.NDArray[np.float32]:
 
 Three = tuple[float, float, float]
 
+# Read noise of a photosite before the amplifier, electrons: sensors of 2008 to 2020 have some 2 to 3 at their highest
+# speeds, where nothing else is left (W. Claff, photonstophotos.net, input-referred read noise); chosen, not measured.
 SENSOR_ELECTRONS: Final = 2.5
-"""Read noise of a photosite before the amplifier, electrons: sensors of 2008 to 2020 have some 2 to 3 at their highest
-speeds, where nothing else is left (W. Claff, photonstophotos.net, input-referred read noise); chosen, not measured."""
 
+# Photosites whose mean a sample of red, green and blue is: those of the half-size image of a Bayer mosaic.
 _PHOTOSITES: Final = (1, 2, 1)
-"""Photosites whose mean a sample of red, green and blue is: those of the half-size image of a Bayer mosaic."""
 
 
 @dataclass(frozen=True)

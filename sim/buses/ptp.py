@@ -33,17 +33,14 @@ from drivers.ptp.ip import (
 from drivers.ptp.protocol import Answer, NoAnswer, PtpRequest, PtpResponse, Responder
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
-GUID = bytes(range(16))
-"""Identifier of a simulated device."""
+GUID = bytes(range(16))  # Identifier of a simulated device
+# What a simulated device calls itself unless another is given; ptpy fails on names of more than 19 characters.
 NAME = "CroP camera"
-"""What a simulated device calls itself unless another is given; ptpy fails on names of more than 19 characters."""
-DATA_PIECE = 256 * 1024
-"""Bytes of data in a packet to the initiator; what fits goes out in one EndData."""
+DATA_PIECE = 256 * 1024  # Bytes of data in a packet to the initiator; what fits goes out in one EndData
 
-_TICK_S = 0.05
-"""Between two looks for events while no command comes: soon enough for a host, and hardly any load."""
+_TICK_S = 0.05  # Between two looks for events while no command comes: soon enough for a host, and hardly any load
+# For the first packet, a data phase under way, and a host that reads slowly; long beside a transfer on one machine.
 _TIMEOUT_S = 10.0
-"""For the first packet, a data phase under way, and a host that reads slowly; long beside a transfer on one machine."""
 
 
 def serve_ptpip(responder: Responder, port: int = PORT, *, name: str = NAME) -> TcpServer:

@@ -18,11 +18,10 @@ from drivers.links.network import POLLING_S
 from foundation.errors import LinkClosed
 
 _WAKE: Final = b"w"
-_END: Final = b"e"
-"""What rings the serving thread: to say when it has caught up, and to end."""
+_END: Final = b"e"  # What rings the serving thread: to say when it has caught up, and to end
 
+# Longest wait for the thread to catch up; it takes milliseconds unless the machine is overloaded.
 _TIMEOUT_S: Final = 10.0
-"""Longest wait for the thread to catch up; it takes milliseconds unless the machine is overloaded."""
 
 
 class PseudoTerminal(ClosedAtEnd):

@@ -42,21 +42,16 @@ from foundation.clock import SimulatedClock
 from foundation.errors import ProtocolError
 
 PACKET = HIGH_SPEED_PACKET
-INTERRUPT_PACKET = 8
-"""wMaxPacketSize of the interrupt pipe: an EOS splits its events over packets of 8 bytes."""
-BULK_IN = 0x81
-"""Endpoint address of a real EOS; bit 7 is the direction, to the host (USB 2.0, 9.6.6)."""
-BULK_OUT = 0x02
-"""Endpoint address of a real EOS."""
-INTERRUPT_IN = 0x83
-"""Endpoint address of a real EOS; bit 7 as in `BULK_IN`."""
+INTERRUPT_PACKET = 8  # wMaxPacketSize of the interrupt pipe: an EOS splits its events over packets of 8 bytes
+BULK_IN = 0x81  # Endpoint address of a real EOS; bit 7 is the direction, to the host (USB 2.0, 9.6.6)
+BULK_OUT = 0x02  # Endpoint address of a real EOS
+INTERRUPT_IN = 0x83  # Endpoint address of a real EOS; bit 7 as in `BULK_IN`
 
-_BULK, _INTERRUPT = 2, 3
-"""Transfer types in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
+_BULK, _INTERRUPT = 2, 3  # Transfer types in an endpoint's bmAttributes (USB 2.0, 9.6.6)
+# Types of descriptors (USB 2.0, 9.4, table 9-5).
 _DEVICE, _CONFIGURATION, _STRING, _INTERFACE, _ENDPOINT = 1, 2, 3, 4, 5
-"""Types of descriptors (USB 2.0, 9.4, table 9-5)."""
+# The one language of the string descriptors: LANGID of English, United States (USB 2.0, 9.6.7).
 _LANGUAGE_ENGLISH = 0x0409
-"""The one language of the string descriptors: LANGID of English, United States (USB 2.0, 9.6.7)."""
 
 
 class Stalled(Exception):
@@ -199,7 +194,6 @@ class PtpUsbDevice:
         return bytes([2 + len(body), _STRING]) + body
 
     def _interface_descriptors(self) -> bytes:
-        """Return the descriptors of the interface and the three endpoints."""
         interface = struct.pack("<BBBBBBBBB", 9, _INTERFACE, 0, 0, 3, *STILL_IMAGE_CLASS, 0)
         bulk = endpoint_descriptor(BULK_IN, _BULK, PACKET) + endpoint_descriptor(BULK_OUT, _BULK, PACKET)
         return interface + bulk + endpoint_descriptor(INTERRUPT_IN, _INTERRUPT, INTERRUPT_PACKET, 6)
@@ -324,8 +318,9 @@ _ERRORS = {
     errno.EOVERFLOW: (-8, "Overflow"),
     errno.EPIPE: (-9, "Pipe error"),
 }
-_HIGH_SPEED = 3
-"""LIBUSB_SPEED_HIGH, 480 Mbit/s, as the real bodies."""
+_HIGH_SPEED = 3  # LIBUSB_SPEED_HIGH, 480 Mbit/s, as the real bodies
+# Fields of each type of descriptor behind length and type; what begins with w, id or bcd has two bytes, the rest one
+# (USB 2.0, 9.6).
 _FIELDS = {
     _DEVICE: "bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol bMaxPacketSize0 idVendor idProduct bcdDevice "
     "iManufacturer iProduct iSerialNumber bNumConfigurations",
@@ -334,8 +329,6 @@ _FIELDS = {
     "bInterfaceProtocol iInterface",
     _ENDPOINT: "bEndpointAddress bmAttributes wMaxPacketSize bInterval",
 }
-"""Fields of each type of descriptor behind length and type; what begins with w, id or bcd has two bytes, the rest one
-(USB 2.0, 9.6)."""
 
 
 @dataclass(frozen=True)

@@ -32,12 +32,9 @@ from drivers.ptp.codes import (
 )
 from drivers.ptp.protocol import DeviceInfo
 
-NO_LIST = 1
-"""Kind of a list record: the property has no list; with few exceptions it cannot be set."""
-LIST = 3
-"""Kind of a list record: the property can be set to what the list holds; to nothing while it is empty."""
-FREE = 7
-"""Kind of a list record: no list; text, times and structures."""
+NO_LIST = 1  # Kind of a list record: the property has no list; with few exceptions it cannot be set
+LIST = 3  # Kind of a list record: the property can be set to what the list holds; to nothing while it is empty
+FREE = 7  # Kind of a list record: no list; text, times and structures
 
 
 @dataclass(frozen=True)
@@ -140,10 +137,9 @@ def structure(*numbers: int) -> bytes:
     return struct.pack(f"<{1 + len(numbers)}I", 4 + 4 * len(numbers), *numbers)
 
 
-HALF_STOPS = 0x0101
-"""Custom function: exposure is set in half stops, not thirds."""
+HALF_STOPS = 0x0101  # Custom function: exposure is set in half stops, not thirds
+# Custom function: the first press lifts the mirror, on bodies that do not have it in the menu (group 3).
 MIRROR_LOCKUP = 0x060F
-"""Custom function: the first press lifts the mirror, on bodies that do not have it in the menu (group 3)."""
 
 
 def custom_functions(group: int, functions: Mapping[int, int]) -> bytes:
@@ -320,10 +316,9 @@ _COMMON_WHITE = (
     WhiteBalance.FLASH,
     WhiteBalance.MANUAL,
 )
+# Codes of the picture styles: standard to monochrome, then the user's three (as libgphoto2 names them).
 _STYLES = (0x81, 0x82, 0x83, 0x84, 0x85, 0x86, 0x21, 0x22, 0x23)
-"""Codes of the picture styles: standard to monochrome, then the user's three (as libgphoto2 names them)."""
-_BULB = 0x0C
-"""Code of the shutter time that has no number: B."""
+_BULB = 0x0C  # Code of the shutter time that has no number: B
 
 _CHOICES_550D = _Choices(
     model_id=0x80000270,
@@ -344,6 +339,9 @@ _CHOICES_550D = _Choices(
     lens="EF-S18-55mm f/3.5-5.6 IS",
 )
 
+# An EOS 550D as it leaves the factory: third stops, no highlight priority, off after 30 s, as is generally known. Of
+# the 60D are vendor extension id, operations, events, third-stop apertures, white balance shifts, structures, order,
+# capture destinations 2, 4, 6, and that camera time and counters are reported.
 EOS_550D = EosModel(
     info=_device_info("Canon EOS 550D", "3-1.0.9", "Canon Inc.", 200),
     usb=(VENDOR_CANON_USB, 0x31EA),
@@ -355,12 +353,8 @@ EOS_550D = EosModel(
     write_s=0.783,
     shots_per_charge=440,
 )
-"""An EOS 550D as it leaves the factory: third stops, no highlight priority, off after 30 s, as is generally known.
 
-Of the 60D are vendor extension id, operations, events, third-stop apertures, white balance shifts, structures, order,
-capture destinations 2, 4, 6, and that camera time and counters are reported.
-"""
-
+# The EOS 550D whose owner listed its settings: half stops, no ISO 100 (highlight priority, it seems), f/4 at best.
 EOS_550D_AS_LISTED = replace(
     EOS_550D,
     properties=_properties(
@@ -371,10 +365,14 @@ EOS_550D_AS_LISTED = replace(
     shutter_codes=(_BULB, *_stops(canon.SHUTTER, 0x10, 0x98, thirds=False)),
     aperture_codes=_stops(canon.APERTURE, 0x28, 0x54, thirds=False),
 )
-"""The EOS 550D whose owner listed its settings: half stops, no ISO 100 (highlight priority, it seems), f/4 at best."""
 
 _JPEGS_6D2 = _jpegs((0, True), (1, True), (14, True), (15, False))
 
+# An EOS 6D Mark II; bulb is on its dial, not in its list. mRAW and sRAW are listed, but frames come in full size. Of
+# the 60D are vendor extension id, operations, events, structures, order, nine focus points where it has 45, capture
+# destinations 2, 4, 6, and that objects are announced by the records of 32 bits. Shutter times and apertures are
+# third stops of the body and the lens that its owner listed; mirror lockup as property 0xd13a is named by libgphoto2,
+# and in no listing of this body.
 EOS_6D_MARK_II = EosModel(
     info=_device_info("Canon EOS 6D Mark II", "3-1.0.2", "Canon.Inc", 100),
     usb=(VENDOR_CANON_USB, 0x32CA),
@@ -415,23 +413,16 @@ EOS_6D_MARK_II = EosModel(
     write_s=0.617,
     shots_per_charge=1200,
 )
-"""An EOS 6D Mark II; bulb is on its dial, not in its list. mRAW and sRAW are listed, but frames come in full size.
 
-Of the 60D are vendor extension id, operations, events, structures, order, nine focus points where it has 45, capture
-destinations 2, 4, 6, and that objects are announced by the records of 32 bits. Shutter times and apertures are third
-stops of the body and the lens that its owner listed; mirror lockup as property 0xd13a is named by libgphoto2, and in no
-listing of this body.
-"""
-
+# A 550D with the small frames of the test sensor.
 TEST_BODY = replace(
     EOS_550D,
     info=replace(EOS_550D.info, model="CroP Test"),
     frame_bytes=1 << 20,
     write_s=0.113,
 )
-"""A 550D with the small frames of the test sensor."""
 
+# Every body by the name that settings and commands use, the same as in `sim.world.sensors.BODIES`.
 EOS_BODIES: Mapping[str, EosModel] = MappingProxyType(
     {"EOS 550D": EOS_550D, "EOS 6D Mark II": EOS_6D_MARK_II, "Test": TEST_BODY}
 )
-"""Every body by the name that settings and commands use, the same as in `sim.world.sensors.BODIES`."""

@@ -77,22 +77,16 @@ from foundation.errors import CropError, DeviceError, DeviceRefused, LinkClosed,
 from sim.camera.bodies import FREE, LIST, MIRROR_LOCKUP, EosModel, custom_functions
 from sim.camera.film import Film
 
-CARD = 0x00020001
-"""The store that is the card."""
-EMPTY_SLOT = 0x00020000
-"""The storage id while there is no card."""
-DCIM = 0x90000000
-"""Handle of the folder DCIM in the root of the card."""
-FOLDER = 0x91900000
-"""Handle of the folder 100CANON; files on the card are numbered from it, 16 apart."""
+CARD = 0x00020001  # The store that is the card
+EMPTY_SLOT = 0x00020000  # The storage id while there is no card
+DCIM = 0x90000000  # Handle of the folder DCIM in the root of the card
+FOLDER = 0x91900000  # Handle of the folder 100CANON; files on the card are numbered from it, 16 apart
+# The shutter speed that lasts as long as the release is held; a press gives one frame of `_METERED_S` all the same.
 BULB = 0x0C
-"""The shutter speed that lasts as long as the release is held; a press gives one frame of `_METERED_S` all the same."""
+# What a parameter or a time can hold at most; in GetObjectHandles any store, any format, or the root (ISO 15740).
 U32 = 0xFFFFFFFF
-"""What a parameter or a time can hold at most; in GetObjectHandles any store, any format, or the root (ISO 15740)."""
-_MEMORY = 0xA0000000
-"""Handles of objects in the camera's memory are numbered from here (assumed)."""
-_MOST_SHOTS = 0x7FFFFFFF
-"""Highest number of free shots that is reported: what a signed number of 32 bits holds."""
+_MEMORY = 0xA0000000  # Handles of objects in the camera's memory are numbered from here (assumed)
+_MOST_SHOTS = 0x7FFFFFFF  # Highest number of free shots that is reported: what a signed number of 32 bits holds
 _TEXTS = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT)
 
 
@@ -166,15 +160,11 @@ class Card:
         return self.capacity - sum(len(item.data) for item in self.objects.values())
 
 
-_AUTO_ISO = 400
-"""ISO speed where the body may choose (assumed; there is no meter)."""
-_METERED_S = 1 / 60
-"""Shutter time where the body may choose (assumed; there is no meter)."""
-_METERED_APERTURE = 5.6
-"""Aperture where the body may choose (assumed; there is no meter)."""
+_AUTO_ISO = 400  # ISO speed where the body may choose (assumed; there is no meter)
+_METERED_S = 1 / 60  # Shutter time where the body may choose (assumed; there is no meter)
+_METERED_APERTURE = 5.6  # Aperture where the body may choose (assumed; there is no meter)
 _FORMATS_BY_SUFFIX = {".crw": ObjectFormat.CRW, ".cr3": ObjectFormat.CR3}
-_JPEG_SIZE = (160, 240)
-"""Height and width, px: enough for the file's name, and next to nothing to encode."""
+_JPEG_SIZE = (160, 240)  # Height and width, px: enough for the file's name, and next to nothing to encode
 
 
 class _Refusal(Enum):
@@ -205,8 +195,7 @@ class _Frame:
 
 _FREELY_SET = (*_TEXTS, Property.EOS_CAMERA_TIME)
 
-_SHUTDOWN_WARNING_S = 10.0
-"""How long before it goes to sleep the camera says so (assumed)."""
+_SHUTDOWN_WARNING_S = 10.0  # How long before it goes to sleep the camera says so (assumed)
 
 
 class SimulatedEos:
@@ -286,13 +275,11 @@ class SimulatedEos:
 
     @contextmanager
     def _moved(self) -> Generator[None]:
-        """Let everything happen that has fallen due, and hold the state for the block."""
         with self._guard:
             self._move()
             yield
 
     def _move(self) -> None:
-        """Let everything happen that has fallen due, and fall asleep in the end."""
         now = self._clock.monotonic()
         while self._due and self._due[0][0] <= now:
             _, _, happen = heapq.heappop(self._due)
@@ -617,7 +604,6 @@ class SimulatedEos:
     # The shutter.
 
     def _plan(self, opens_at: float, settings: ExposureSettings) -> None:
-        """Open the shutter at a time."""
         self._unfinished += 1
         self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
 

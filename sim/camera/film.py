@@ -99,8 +99,8 @@ _COLOUR_MATRICES = {
     "Canon_EOS_600D": (6461, -907, -882, -4300, 12184, 2378, -819, 1944, 5931),
     "Canon_EOS_200D": (7377, -742, -998, -4235, 11981, 2549, -673, 1918, 5538),
 }
+# XYZ to linear sRGB (IEC 61966-2-1): neutral things stay neutral for a camera that no converter knows.
 _LINEAR_SRGB = (32406, -15372, -4986, -9689, 18758, 415, 557, -2040, 10570)
-"""XYZ to linear sRGB (IEC 61966-2-1): neutral things stay neutral for a camera that no converter knows."""
 
 
 def write_dng(
@@ -169,7 +169,6 @@ def write_dng(
 
 
 def _edges(top: int, left: int, height: int, width: int) -> tuple[int, int, int, int]:
-    """Return top, left, bottom, right, as DNG has a rectangle."""
     return top, left, top + height, left + width
 
 
@@ -189,8 +188,7 @@ def _colour_matrix(body: Body) -> tuple[int, ...]:
     return _LINEAR_SRGB if rows is None else tuple(round(10_000 * value) for row in rows for value in row)
 
 
-_WATCHED = 256
-"""First part of the key of a watched frame's noise: no code, so that it is no other frame's."""
+_WATCHED = 256  # First part of the key of a watched frame's noise: no code, so that it is no other frame's
 
 
 class Film(Protocol):

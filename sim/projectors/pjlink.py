@@ -77,7 +77,6 @@ class PjLinkPeer:
         return answer
 
     def _begun(self) -> tuple[_Connection, bytes]:
-        """Return a new connection and its greeting."""
         now = self._projector.clock.monotonic()
         if self._password is None:
             return _Connection(now), wire.encode_greeting(None)
@@ -113,11 +112,9 @@ class PjLinkPeer:
         return value if isinstance(value, str) else wire.OK
 
 
-_LONGEST = wire.MAX_LINE + wire.DIGEST_LENGTH
-"""Bytes of a connection's first command."""
+_LONGEST = wire.MAX_LINE + wire.DIGEST_LENGTH  # Bytes of a connection's first command
 _INPUTS = tuple(kind + number for kind in "123456" for number in "123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ")
-_Answers = Mapping[str, Mapping[str, Callable[[], str | None]]]
-"""Command to parameter to what is done; None is OK."""
+_Answers = Mapping[str, Mapping[str, Callable[[], str | None]]]  # Command to parameter to what is done; None is OK
 
 
 def _class_1(projector: SimulatedProjector) -> _Answers:

@@ -16,8 +16,7 @@ from drivers.projector import FAULT_PARTS, Fault, Lamp, Power, ProjectorIdentity
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 
-REFRESH_S = 1 / 60
-"""60 Hz, the usual picture rate."""
+REFRESH_S = 1 / 60  # 60 Hz, the usual picture rate
 
 
 @dataclass
@@ -48,13 +47,10 @@ class SimulatedPresenter:
         self._open = False
 
 
-WARM_UP_S = 30.0
-"""A little less than the 40 s typical of PWR ON (Epson, ESC/VP21 Command User's Guide)."""
-COOL_DOWN_S = 60.0
-"""A little more than the 10 to 50 s of PWR OFF (same source): drivers must wait for it."""
+WARM_UP_S = 30.0  # A little less than the 40 s typical of PWR ON (Epson, ESC/VP21 Command User's Guide)
+COOL_DOWN_S = 60.0  # A little more than the 10 to 50 s of PWR OFF (same source): drivers must wait for it
 IDENTITY = ProjectorIdentity("CroP", "Simulated Projector", "dark room")
-INPUTS = ("11", "31", "32", "3A", "61")
-"""Codes of the inputs (PJLink INPT); class 1 has the first three."""
+INPUTS = ("11", "31", "32", "3A", "61")  # Codes of the inputs (PJLink INPT); class 1 has the first three
 PANEL = Resolution(1920, 1080)
 
 
@@ -217,7 +213,6 @@ class SimulatedProjector:
         return self._power in (Power.ON, Power.WARMING)
 
     def _move(self) -> None:
-        """Let the state follow the time that has passed."""
         passed = self.clock.monotonic() - self._since
         if self._power is Power.WARMING and passed >= self.traits.warm_up_s:
             self._enter(Power.ON, self._since + self.traits.warm_up_s)

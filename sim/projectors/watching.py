@@ -25,24 +25,21 @@ from drivers.projector import Power
 from foundation.clock import Clock
 from foundation.errors import DeviceError, InputError
 
+# Pause between two looks at the screen while the shutter is open: about a refresh, so that no window comes and goes
+# between two looks that a camera would have seen for more than a few per cent of its exposure.
 SAMPLE_S: Final = 0.02
-"""Pause between two looks at the screen while the shutter is open: about a refresh, so that no window comes and goes
-between two looks that a camera would have seen for more than a few per cent of its exposure."""
 
-POLL_S: Final = 0.1
-"""Pause between two questions to the projector."""
+POLL_S: Final = 0.1  # Pause between two questions to the projector
 
+# Pixels across that a picture is averaged to, at most; on an A0 chart that is 2.6 mm, less than a cell.
 FINEST_PX: Final = 480
-"""Pixels across that a picture is averaged to, at most; on an A0 chart that is 2.6 mm, less than a cell."""
 
+# Light of a lamp that warms up, over its full light: its control port does not tell how far it has come (chosen).
 WARMING_SHARE: Final = 0.5
-"""Light of a lamp that warms up, over its full light: its control port does not tell how far it has come (chosen)."""
 
-_INSTANT_S: Final = 1e-4
-"""Time that clocks, which count in whole microseconds, need not tell from none."""
+_INSTANT_S: Final = 1e-4  # Time that clocks, which count in whole microseconds, need not tell from none
 
-_ALIKE: Final = 1e-3
-"""Difference of light below which a picture is called plain: a quarter of a code at the bright end."""
+_ALIKE: Final = 1e-3  # Difference of light below which a picture is called plain: a quarter of a code at the bright end
 
 _PLACE = re.compile(r"(?P<display>[^,]*:\d+(?:\.\d+)?)?(?:,|^)?(?P<region>\d+x\d+\+\d+\+\d+)?")
 

@@ -26,26 +26,22 @@ from foundation.colorimetry import decode_srgb
 from foundation.errors import ConfigurationError
 from sim.world.world import UNDISTURBED, Blob, Glare, Patch, Place, Situation
 
-_HALF: Final[Place] = (-9.0, 0.5, 9.0, 9.0)
-"""The lower half of the picture, its overscan included."""
+_HALF: Final[Place] = (-9.0, 0.5, 9.0, 9.0)  # The lower half of the picture, its overscan included
 
+# A shoulder that reaches over a quarter of the chart from its lower right.
 _QUARTER: Final[Place] = (0.5, 0.35, 1.1, 1.4)
-"""A shoulder that reaches over a quarter of the chart from its lower right."""
 
+# Most of the upper half of the page: what a matt surface mirrors of a lamp is broad.
 _SPOT: Final[Place] = (0.1, -0.2, 0.9, 0.8)
-"""Most of the upper half of the page: what a matt surface mirrors of a lamp is broad."""
 
 _PRIMARIES: Final = ("red", "green", "blue")
 
-_PATCH: Final = 6.0
-"""Standard deviation of a screen saver's patches, sixtieths of the picture's height."""
+_PATCH: Final = 6.0  # Standard deviation of a screen saver's patches, sixtieths of the picture's height
 
-_SLANTED_DEG: Final = 30.0
-"""Direction of a push, clockwise from the right: along neither axis."""
+_SLANTED_DEG: Final = 30.0  # Direction of a push, clockwise from the right: along neither axis
 
 
-_Code = Annotated[int, Field(ge=0, le=255)]
-"""A code of a colour, as files of settings give it."""
+_Code = Annotated[int, Field(ge=0, le=255)]  # A code of a colour, as files of settings give it
 
 
 @dataclass(frozen=True)
@@ -358,18 +354,17 @@ class ScreenSaver(Disturbance):
         return replace(situation, picture=mixed.astype(np.float32))
 
 
+# Every event, by its `what`.
 AnyDisturbance = (
     FrozenScreen | PopUp | HalfChanged | Bump | LampStep | LampDrift | AmbientStep | Defocus | Person | SensorWarming
     | StaleFile | ZeroedStrip | ScrambledRows | Reflection | DeadPrimary | ScreenSaver
 )  # fmt: skip
-"""Every event, by its `what`."""
 
 _LISTED: Final[TypeAdapter[tuple[AnyDisturbance, ...]]] = TypeAdapter(
     tuple[Annotated[AnyDisturbance, Field(discriminator="what")], ...]
 )
 
-KINDS: Final = tuple(str(kind.what) for kind in get_args(AnyDisturbance))
-"""What can happen, as settings name it."""
+KINDS: Final = tuple(str(kind.what) for kind in get_args(AnyDisturbance))  # What can happen, as settings name it
 
 
 @dataclass(frozen=True)
@@ -412,8 +407,7 @@ class Disturbances:
         return any(isinstance(event, StaleFile) for event in self.events)
 
 
-CALM: Final = Disturbances()
-"""Nothing goes wrong."""
+CALM: Final = Disturbances()  # Nothing goes wrong
 
 
 def read_disturbances(listed: Sequence[Any], where: str, key: str = "simulated.events") -> Disturbances:
@@ -441,6 +435,7 @@ def _said_of(fault: ErrorDetails) -> str:
     return known.get(fault["type"], f"{given}: {fault['msg'].removeprefix('Value error, ')}; correct it")
 
 
+# What a value should have been, by the first words of the kind of fault.
 _EXPECTED: Final = {
     "float_": "a number",
     "int_": "a whole number",
@@ -452,7 +447,6 @@ _EXPECTED: Final = {
     "dataclass_type": "a table",
     "model_attributes_type": "a table",
 }
-"""What a value should have been, by the first words of the kind of fault."""
 
 
 def _lit(situation: Situation, percent: float, rgb: tuple[float, float, float], grown: float) -> Situation:

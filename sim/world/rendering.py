@@ -30,14 +30,11 @@ from numpy.typing import NDArray
 
 from foundation.compiled import compiled
 
-_RIPPLE: Final = 0.1
-"""Height of each of the weaker short waves over that of the first; chosen."""
+_RIPPLE: Final = 0.1  # Height of each of the weaker short waves over that of the first; chosen
 
-_NEWTON_STEPS = 6
-"""An end to steps that do not converge; they stop earlier once every point is met within 10⁻⁷ px."""
+_NEWTON_STEPS = 6  # An end to steps that do not converge; they stop earlier once every point is met within 10⁻⁷ px
+# Half the distance of the differences that stand for derivatives: short beside folds and waves, long beside rounding.
 _STEP_MM = 0.05
-"""Half the distance of the differences that stand for derivatives: short beside folds and waves, long beside
-rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +84,9 @@ class Waviness:
         return total
 
 
-ROUND_MM = 4.0
-"""Paper bends; a crease is no sharper than this."""
+ROUND_MM = 4.0  # Paper bends; a crease is no sharper than this
 
-FLANK_MM = 40.0
-"""From the crease to where the sheet lies flat again, to 1 / e."""
+FLANK_MM = 40.0  # From the crease to where the sheet lies flat again, to 1 / e
 
 
 @dataclass(frozen=True)
@@ -247,14 +242,11 @@ def _rotation(tilt_deg: float, pan_deg: float, roll_deg: float) -> NDArray[np.fl
     return pan @ tilt @ roll
 
 
-PAPER: Final = (255, 255, 255)
-"""The code that prints nothing."""
+PAPER: Final = (255, 255, 255)  # The code that prints nothing
 
-_FINEST_MM: Final = 1e-3
-"""Coordinates nearer than a micrometre are one: rounding parts them, and no lens does."""
+_FINEST_MM: Final = 1e-3  # Coordinates nearer than a micrometre are one: rounding parts them, and no lens does
 
-_MOST_LINES: Final = 6000
-"""Distinct coordinates along an axis of the map, so that its labels stay below 150 MB."""
+_MOST_LINES: Final = 6000  # Distinct coordinates along an axis of the map, so that its labels stay below 150 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,14 +319,11 @@ def _lines(ends: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.i
     return np.bincount(index.ravel(), weights=ends.ravel()) / count, index[:, 0], index[:, 1]
 
 
-GRID_PX = 16
-"""Photosites between the nodes of the position grid."""
+GRID_PX = 16  # Photosites between the nodes of the position grid
 
-REACH = 4.0
-"""Standard deviations after which the blur's tail (3·10⁻⁵) is dropped."""
+REACH = 4.0  # Standard deviations after which the blur's tail (3·10⁻⁵) is dropped
 
-_PHI_STEPS = 1024
-"""Entries per standard deviation: the error of linear interpolation stays below 2·10⁻⁷."""
+_PHI_STEPS = 1024  # Entries per standard deviation: the error of linear interpolation stays below 2·10⁻⁷
 _PHI: NDArray[np.float32] = np.array(
     [0.5 * (1 + math.erf((i / _PHI_STEPS) / math.sqrt(2))) for i in range(int(REACH * _PHI_STEPS) + 2)],
     dtype=np.float32,

@@ -202,12 +202,12 @@ _TEST = replace(
     masked=(Rectangle(0, 0, 609, 44),),
 )
 
+# Every body by the name that settings use. ``Test`` is a small frame with the colours and noise of the EOS 550D.
 BODIES: Mapping[str, Body] = MappingProxyType({"EOS 550D": _EOS_550D, "EOS 6D Mark II": _EOS_6D_MARK_II, "Test": _TEST})
-"""Every body by the name that settings use. ``Test`` is a small frame with the colours and noise of the EOS 550D."""
 
 
+# Masked rows above and masked columns left of the picture, as Canon's sensors have about as many.
 _BORDER: Final = (50, 140)
-"""Masked rows above and masked columns left of the picture, as Canon's sensors have about as many."""
 
 
 def _areas(width: int, height: int) -> dict[str, Any]:
@@ -238,6 +238,7 @@ def _body(
     )
 
 
+# Bodies by the name of their sensitivities; the EOS 600D has the sensor generation of the EOS 550D, and its facts.
 FACTS: Final[Mapping[str, Body]] = MappingProxyType(
     {
         "Canon_EOS_600D": replace(BODIES["EOS 550D"], model="Canon EOS 600D"),
@@ -247,7 +248,6 @@ FACTS: Final[Mapping[str, Body]] = MappingProxyType(
         "Canon_EOS_5DS": _body("Canon_EOS_5DS", (8688, 5792), 2048, 15500, 2.4, 5.6, 2.5),
     }
 )
-"""Bodies by the name of their sensitivities; the EOS 600D has the sensor generation of the EOS 550D, and its facts."""
 
 
 def find_body(
@@ -273,7 +273,6 @@ def _of_sensitivities(camera: str, found: Sensitivities) -> Body:
 
 
 def _checked_pixels(pixels: Any, where: str, key: str) -> tuple[int, int]:
-    """Return how many columns and rows see light, as settings say."""
     try:
         width, height = TypeAdapter(tuple[int, int]).validate_python(pixels)
     except ValidationError as error:
@@ -286,7 +285,6 @@ def _checked_pixels(pixels: Any, where: str, key: str) -> tuple[int, int]:
 
 
 def _require_sensor(body: Body, where: str, key: str) -> None:
-    """Refuse numbers that no sensor has."""
     top = 2**body.bits - 1
     limits = (
         ("bits", body.bits, 8 <= body.bits <= 16, "8 to 16"),

@@ -42,37 +42,31 @@ from sim.spectral import LampSpectrum, PaperName, ProfileName, printed_reflectan
 from sim.world.rendering import GRID_PX, PAPER, Fold, Print, Sheet, View, Waviness, label_map
 from sim.world.sensors import Body, HotPattern, counts
 
-_SLANT: Final = 0.36
-"""Tangent of 20°: a projector beside the camera."""
+_SLANT: Final = 0.36  # Tangent of 20°: a projector beside the camera
 
-RIM_MM = 1.0
-"""Over which a stain's edge fades."""
+RIM_MM = 1.0  # Over which a stain's edge fades
 
-_BACKDROP_REFLECTANCE: Final = 0.04
-"""Of what lies behind the print, at every wavelength: dark, as a backdrop should be."""
+_BACKDROP_REFLECTANCE: Final = 0.04  # Of what lies behind the print, at every wavelength: dark, as a backdrop should be
 
+# Rows that one thread works at. Noise is drawn block by block, so that another number gives other frames.
 _BLOCK_ROWS: Final = 64
-"""Rows that one thread works at. Noise is drawn block by block, so that another number gives other frames."""
 
-_A0_DIAGONAL_MM: Final = math.hypot(1189, 841)
-"""Of a sheet of A0 (ISO 216)."""
+_A0_DIAGONAL_MM: Final = math.hypot(1189, 841)  # Of a sheet of A0 (ISO 216)
 
 _CHANNELS: Final = "RGB"
 
-Place = tuple[float, float, float, float]
-"""A rectangle: left, top, right, bottom, shares of the page."""
+Place = tuple[float, float, float, float]  # A rectangle: left, top, right, bottom, shares of the page
 
+# Share of the page by which the projected picture reaches beyond it where it is nearest: an operator zooms until the
+# whole sheet is lit, and a little more.
 OVERSCAN: Final = 0.04
-"""Share of the page by which the projected picture reaches beyond it where it is nearest: an operator zooms until the
-whole sheet is lit, and a little more."""
 
+# Share of a blob's radius over which its edge fades: what stands a metre before the chart is out of focus.
 _BLOB_RIM: Final = 0.15
-"""Share of a blob's radius over which its edge fades: what stands a metre before the chart is out of focus."""
 
-REFERENCE_APERTURE: Final = 8.0
-"""Also what a lens without contacts is set to by hand in the simulated room."""
+REFERENCE_APERTURE: Final = 8.0  # Also what a lens without contacts is set to by hand in the simulated room
+# The exposure at which `Room.white_level_share` holds.
 REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=REFERENCE_APERTURE, shutter_s=0.5)
-"""The exposure at which `Room.white_level_share` holds."""
 
 
 @dataclass(frozen=True)
@@ -392,8 +386,7 @@ class Situation:
         return added
 
 
-UNDISTURBED: Final = Situation()
-"""Nothing is otherwise."""
+UNDISTURBED: Final = Situation()  # Nothing is otherwise
 
 
 def projected_mm(page_mm: tuple[float, float], aspect: float) -> Place:

@@ -36,8 +36,7 @@ from foundation.holds import hold
 __all__ = ["Attached", "attached_devices", "identify_displays"]
 
 
-CONNECT_S = 5.0
-"""How long a projector may take to accept a connection; on a lab's network it takes milliseconds."""
+CONNECT_S = 5.0  # How long a projector may take to accept a connection; on a lab's network it takes milliseconds
 
 
 def open_lab(settings: LabSettings, session: Session | None, opened: ExitStack, shows: bool = True) -> Devices:

@@ -36,8 +36,7 @@ from sim.world.rendering import Print
 from sim.world.sensors import BODIES, Body, find_body
 from sim.world.world import Room, World, read_room
 
-SERIAL = "0000000001"
-"""Serial number of the simulated body, on its wire and in its frames; one lab has one body."""
+SERIAL = "0000000001"  # Serial number of the simulated body, on its wire and in its frames; one lab has one body
 
 
 def open_simulated(settings: LabSettings, chart: Chart, session: Session | None, opened: ExitStack) -> Devices:

@@ -53,14 +53,13 @@ from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError
 
-BELOW_PEAK = 2
-"""The authors' advice, see above: the two values below an image's largest count as clipped too."""
+BELOW_PEAK = 2  # The authors' advice, see above: the two values below an image's largest count as clipped too
 
+# The rule in the words of a treatment.
 PEAK_RULE = (
     "in each image from m - 2, m its largest value in any channel (advice of the authors of Cube+, "
     "ipg.fer.hr/ipg/resources/color_constancy)"
 )
-"""The rule in the words of a treatment."""
 
 
 @dataclass(frozen=True)
@@ -109,13 +108,13 @@ class PeakScene(RawScene):
         return image
 
 
+# Black level of all files: the data set's page; of Cube++ "approximately 2048, not subtracted" (description.md).
 BLACK = 2048
-"""Black level of all files: the data set's page; of Cube++ "approximately 2048, not subtracted" (description.md)."""
+# From where the calibration cube's rectangle reaches to the lower right corner, px; the data set's page.
 CUBE_ROW, CUBE_COLUMN = 1050, 2050
-"""From where the calibration cube's rectangle reaches to the lower right corner, px; the data set's page."""
 
+# Name and number of images by the file of ground truths; arXiv:1712.00436.
 _OWN = {"cube+_gt.txt": ("Cube+", 1707), "cube_gt.txt": ("Cube", 1365)}
-"""Name and number of images by the file of ground truths; arXiv:1712.00436."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,12 +174,10 @@ def open_cube_plus(place: str, options: DataOptions, listed: Folder | None = Non
     )
 
 
-SIZE = (1728, 2592)
-"""Height and width of Cube++, px (description.md)."""
-SIMPLE_SCALE = 4
-"""How often SimpleCube++ is reduced (code/build_simple_ds.py)."""
+SIZE = (1728, 2592)  # Height and width of Cube++, px (description.md)
+SIMPLE_SCALE = 4  # How often SimpleCube++ is reduced (code/build_simple_ds.py)
+# The rectangle with the SpyderCube, from the lower right corner, px of Cube++ (code/build_simple_ds.py).
 CUBE_HEIGHT, CUBE_WIDTH = 1000, 700
-"""The rectangle with the SpyderCube, from the lower right corner, px of Cube++ (code/build_simple_ds.py)."""
 
 _TRUTHS = ("mean", "left", "right", "left_white", "right_white")
 _PUBLISHED = {"Cube++": 4890, "SimpleCube++": 2234}
@@ -333,7 +330,6 @@ def _is_blank(row: Mapping[str, str], columns: Sequence[str]) -> bool:
 
 
 def _white_levels(path: Path) -> dict[str, float]:
-    """Return the saturation of each image that a table of properties has one of."""
     levels: dict[str, float] = {}
     for where, row in read_rows(path, ["image"]):
         text = row.get(_WHITE, "").strip()

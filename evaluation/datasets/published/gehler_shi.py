@@ -44,15 +44,12 @@ from evaluation.datasets.published.matlab import read_mat, table
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, InputError
 
-BLACK: Final = {"1D": 0, "5D": 129}
-"""Black levels of the two cameras' files (GehlerShiSensor.m of FFCC)."""
-WHITE = 3692
-"""Saturation of both cameras' files, black not subtracted (GehlerShiSensor.m of FFCC)."""
+BLACK: Final = {"1D": 0, "5D": 129}  # Black levels of the two cameras' files (GehlerShiSensor.m of FFCC)
+WHITE = 3692  # Saturation of both cameras' files, black not subtracted (GehlerShiSensor.m of FFCC)
 
+# Folders below the one given in which files are looked for: Canon1D/png is two deep, an archive's own one more.
 _DEPTH = 3
-"""Folders below the one given in which files are looked for: Canon1D/png is two deep, an archive's own one more."""
-_SAMPLE = 1000
-"""Names of a folder that are looked at for corners of charts; the data set has 568."""
+_SAMPLE = 1000  # Names of a folder that are looked at for corners of charts; the data set has 568
 _TRUTHS: Final = {
     "recommended": (("ColorCheckerData.mat", "REC_groundtruth.mat"), "REC_groundtruth"),
     "shi": (("real_illum_568..mat", "real_illum_568.mat"), "real_rgb"),
@@ -72,9 +69,9 @@ def _numbers(runs: str) -> Iterator[int]:
         yield from range(int(first), int(last or first) + 1)
 
 
+# The 568 images in the order of the rows of both truths: those names that the files of the recommended release carry
+# behind the number of their row.
 NAMES: Final = tuple([f"8D5U{number}" for number in _numbers(_1D)] + [f"IMG_{number:04d}" for number in _numbers(_5D)])
-"""The 568 images in the order of the rows of both truths: those names that the files of the recommended release carry
-behind the number of their row."""
 _KNOWN = frozenset(NAMES)
 
 

@@ -22,15 +22,12 @@ from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError, first_of
 
+# The parts of each camera, as its folders are named.
 SUBSETS = ("field_1_cameras", "field_3_cameras", "lab_printouts", "lab_realscene")
-"""The parts of each camera, as its folders are named."""
-WHITE = 65535
-"""End of the scale of 16-bit files that are normalised by saturation."""
+WHITE = 65535  # End of the scale of 16-bit files that are normalised by saturation
 
-_PUBLISHED = 7022
-"""Images of the whole data set (arXiv:1910.10404)."""
-_FOLDS = 10
-"""The authors' folds; their loader reads as many lists."""
+_PUBLISHED = 7022  # Images of the whole data set (arXiv:1910.10404)
+_FOLDS = 10  # The authors' folds; their loader reads as many lists
 
 
 def is_intel_tau(folder: Folder) -> bool:
@@ -135,6 +132,5 @@ def _folds(folder: Folder, scenes: Sequence[PaintedScene]) -> tuple[int, ...] | 
 
 
 def _key(path: str) -> str:
-    """Return camera, part and unpadded name of an image's path."""
     parts = path.split("/")[-3:]
     return "/".join([*parts[:-1], _unpadded(parts[-1].rpartition(".")[0])])

@@ -38,10 +38,8 @@ from evaluation.scene import Image, Scene, SceneSet
 from foundation.errors import FormatError, InputError, first_of
 from generator.files import decode_png
 
-_SONY: Final = (128.0, 4095.0)
-"""Black level and saturation of Sony's .tiff files (1_make_mixture_map.py)."""
-_HALF = 2
-"""The charts' corners are in px of the raw file, whose .tiff is half as large (1_make_mixture_map.py)."""
+_SONY: Final = (128.0, 4095.0)  # Black level and saturation of Sony's .tiff files (1_make_mixture_map.py)
+_HALF = 2  # The charts' corners are in px of the raw file, whose .tiff is half as large (1_make_mixture_map.py)
 _PARTS = ("train", "val", "test")
 _COUNTS: Final = {"single": (1,), "mixed": (2, 3)}
 _IMAGE = re.compile(r"(?P<place>.+)_(?P<lights>[123]{1,3})\.tiff?")
@@ -177,7 +175,6 @@ def _cameras(folder: Folder) -> dict[str, Folder]:
 
 
 def _subset(given: str | None, place: str) -> tuple[str | None, str | None]:
-    """Return part and number of lights of a subset's name."""
     if given is None:
         return None, None
     known = [*_PARTS, *_COUNTS, *(f"{part}-{count}" for part in _PARTS for count in _COUNTS)]

@@ -33,17 +33,15 @@ from evaluation.datasets.published.matlab import read_mat, scalar, strings, tabl
 from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError, first_of
 
+# First and last row, first and last column of a chart, px counted from 1, both ends included.
 Box = tuple[int, int, int, int]
-"""First and last row, first and last column of a chart, px counted from 1, both ends included."""
 
 _COORDS = "CC_coords"
 _MASKS = "CHECKER"
+# Share of their union that two boxes of one chart have in common at least. Margins around a chart may differ from
+# source to source; boxes counted from another corner, of a turned image or with rows and columns in each other's
+# place meet less.
 _ALIKE = 0.5
-"""Share of their union that two boxes of one chart have in common at least.
-
-Margins around a chart may differ from source to source; boxes counted from another corner, of a turned image or with
-rows and columns in each other's place meet less.
-"""
 
 
 def charts(
@@ -138,8 +136,9 @@ def _mask_files(path: Path, root: Folder) -> dict[str, Path]:
 
 
 _ENDING = "_gt.mat"
+# By how many px a chart's box may go over the edge of its image, px: what rounding and counting from 0 can make.
 _OVER = 2
-"""By how many px a chart's box may go over the edge of its image, px: what rounding and counting from 0 can make."""
+# Images of each camera, as the list of ground truths in github.com/TheZino/COCOA has them.
 _PUBLISHED: Final = {
     "Canon1DsMkIII": 259,
     "Canon600D": 200,
@@ -151,7 +150,6 @@ _PUBLISHED: Final = {
     "SonyA57": 268,
     "NikonD40": 117,
 }
-"""Images of each camera, as the list of ground truths in github.com/TheZino/COCOA has them."""
 
 
 @dataclass(frozen=True, slots=True)

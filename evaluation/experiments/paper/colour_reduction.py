@@ -28,11 +28,9 @@ from foundation.compiled import ordered_map
 from generator.files import Flash, fit_flash
 from generator.pictures.sources import clear_bits
 
-BITS: Final = tuple(range(8))
-"""Numbers of bits set to zero, as in the paper's figure."""
+BITS: Final = tuple(range(8))  # Numbers of bits set to zero, as in the paper's figure
 
-GRAY_EDGE_SIGMA: Final = 6.0
-"""Scale of Gray-Edge, px: that of its entry in the NUS tables, for images of full size."""
+GRAY_EDGE_SIGMA: Final = 6.0  # Scale of Gray-Edge, px: that of its entry in the NUS tables, for images of full size
 
 
 def reduce_colours(
@@ -156,14 +154,11 @@ def bits_table(found: BitsResult, kind: ErrorKind, name: str) -> Table:
     )
 
 
-PANEL: Final = 200
-"""Longest side of a panel, px: eight of them fit a page, and the steps of 3 bits can still be seen."""
+PANEL: Final = 200  # Longest side of a panel, px: eight of them fit a page, and the steps of 3 bits can still be seen
 
-_GAP: Final = 6
-"""White between panels, px."""
+_GAP: Final = 6  # White between panels, px
 
-_COLUMNS: Final = 4
-"""Panels side by side."""
+_COLUMNS: Final = 4  # Panels side by side
 
 
 def reduction_strip(picture: npt.NDArray[np.uint8], bits: Sequence[int] = BITS) -> npt.NDArray[np.uint8]:

@@ -158,11 +158,9 @@ def rendered(lut: Lut, sources: Sequence[Source], lights: ChosenLights, seed: in
     return tuple(RenderedScene(lut, source, light, number, seed) for number, (source, light) in enumerate(pairs))
 
 
-WHITE_PERCENTILE: Final = 99.0
-"""Percentile that becomes white; dcraw's."""
+WHITE_PERCENTILE: Final = 99.0  # Percentile that becomes white; dcraw's
 
-_DARKEST: Final = 1e-12
-"""What replaces a white level of 0: an image that is black stays black."""
+_DARKEST: Final = 1e-12  # What replaces a white level of 0: an image that is black stays black
 
 
 def develop(
@@ -238,8 +236,7 @@ def developed(data: SceneSet, matrix: ColourMatrix | None) -> tuple[DevelopedSou
     return tuple(DevelopedSource(scene, matrix) for scene in data.scenes)
 
 
-_TEXTS = (".csv", ".txt")
-"""Endings of files of text."""
+_TEXTS = (".csv", ".txt")  # Endings of files of text
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,9 +33,9 @@ class PublishedRow:
         return astuple(self)
 
 
-Cell = tuple[str, str, str]
-"""Scenes, sensor and illuminations of a data set of the first table."""
+Cell = tuple[str, str, str]  # Scenes, sensor and illuminations of a data set of the first table
 
+# Table 1: by data set and method, in the paper's order. C1 is the Canon 1Ds Mark III of the NUS data set.
 TABLE1: Final[Mapping[Cell, Mapping[str, PublishedRow]]] = {
     ("C1", "6D", "C1"): {
         "White-Patch": PublishedRow(2.61, 2.59, 2.50, 1.03, 4.38, 2.38),
@@ -78,12 +78,10 @@ TABLE1: Final[Mapping[Cell, Mapping[str, PublishedRow]]] = {
         "Shades-of-Gray (p=2)": PublishedRow(4.01, 2.80, 2.81, 0.85, 9.69, 3.04),
     },
 }
-"""Table 1: by data set and method, in the paper's order. C1 is the Canon 1Ds Mark III of the NUS data set."""
 
+# Names of C1's images in every copy of the data set, without folder and ending.
 _C1_NAME: Final = re.compile(r"Canon1DsMkIII_\d{4}")
-"""Names of C1's images in every copy of the data set, without folder and ending."""
-_C1_IMAGES: Final = 259
-"""Images of C1: a part of them has other numbers than the whole."""
+_C1_IMAGES: Final = 259  # Images of C1: a part of them has other numbers than the whole
 
 
 def is_c1(images: Sequence[str]) -> bool:
@@ -112,6 +110,7 @@ def cell_name(name: str, images: Sequence[str]) -> str:
     return f'"{name}"' if name in ("C1", "Random") else name
 
 
+# Table 2: by what the methods were trained on, tested on Cube+; ``real`` by cross-validation on Cube+ itself.
 TABLE2: Final[Mapping[Literal["real", "generated"], Mapping[str, PublishedRow]]] = {
     "real": {
         "Smart Color Cat": PublishedRow(2.27, 1.35, 1.61, 0.34, 5.72, 1.58),
@@ -124,4 +123,3 @@ TABLE2: Final[Mapping[Literal["real", "generated"], Mapping[str, PublishedRow]]]
         "Color Beaver (using Gray-world)": PublishedRow(1.73, 0.74, 0.97, 0.37, 4.75, 1.17),
     },
 }
-"""Table 2: by what the methods were trained on, tested on Cube+; ``real`` by cross-validation on Cube+ itself."""

@@ -89,11 +89,11 @@ def coverage_table(luts: Sequence[Lut], sets: Mapping[str, npt.NDArray[np.float6
     )
 
 
+# Markers of series, so that they differ in print without colour.
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
-"""Markers of series, so that they differ in print without colour."""
 
+# Width of a dot in the figure of chromaticities; of points in one square of that width one is drawn.
 _SEEN: Final = 0.004
-"""Width of a dot in the figure of chromaticities; of points in one square of that width one is drawn."""
 
 
 def _draw_bits(figure: Any, found: BitsResult, kind: ErrorKind) -> None:

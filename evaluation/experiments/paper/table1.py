@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from generator import Lut
 
 
+# The black body, kelvin, under which the print's colours are looked at: near what pictures are balanced for.
 DAYLIGHT_K: Final = 5600.0
-"""The black body, kelvin, under which the print's colours are looked at: near what pictures are balanced for."""
 
 
 def noise_table(luts: Sequence[Lut]) -> Table:
@@ -95,24 +95,24 @@ def print_table(luts: Sequence[Lut]) -> Table:
 
 _Thing = TypeVar("_Thing")
 
+# The methods of the table, by their names on the command line.
 METHODS: Final = ("white-patch", "gray-world", "shades-of-gray")
-"""The methods of the table, by their names on the command line."""
 
+# Side of an image, px; White-Patch takes the largest of so many noisy values, and its error grows with them.
 SIDE: Final = 512
-"""Side of an image, px; White-Patch takes the largest of so many noisy values, and its error grows with them."""
 
+# Most images of a data set on which sizes and hot photosites are studied: their medians differ by more than chance
+# among 64, and every image of 1024 px is drawn for each of them.
 STUDIED: Final = 64
-"""Most images of a data set on which sizes and hot photosites are studied: their medians differ by more than chance
-among 64, and every image of 1024 px is drawn for each of them."""
 
+# The paper's names of its cameras, by those that tables have.
 SENSORS: Final[Mapping[str, str]] = {"Canon EOS 550D": "550D", "Canon EOS 6D Mark II": "6D"}
-"""The paper's names of its cameras, by those that tables have."""
 
+# Names of pictures and of ground truths of which nothing is said: the paper has no numbers of them.
 OWN: Final = ("Given", "Given")
-"""Names of pictures and of ground truths of which nothing is said: the paper has no numbers of them."""
 
+# What a row of numbers is about, in CSV.
 _HEAD: Final = ("scenes", "sensor", "illuminations", "images", "method", "error")
-"""What a row of numbers is about, in CSV."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,12 +282,12 @@ def size_table(rows: Sequence[SizeRow]) -> Table:
     )
 
 
+# The learners of the table: our short names, and the paper's names.
 LEARNERS: Final[Mapping[str, str]] = {
     "regression-trees": "Regression trees (simple features)",
     "smart-color-cat": "Smart Color Cat",
     "color-beaver": "Color Beaver (using Gray-world)",
 }
-"""The learners of the table: our short names, and the paper's names."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,7 +117,6 @@ def figures_of(rows: Sequence[TransferRow], error: ErrorKind, groups: Sequence[s
 
 
 def _batches(figures: Sequence[BoundedFigure]) -> Iterator[tuple[BoundedFigure, ...]]:
-    """Yield the figures of one row, or of one ratio, after another."""
     several = iter(figures)
     while batch := tuple(itertools.islice(several, len(STATISTICS))):
         yield batch
@@ -165,8 +164,8 @@ def _spread(several: Sequence[ErrorSample]) -> tuple[float, ...] | None:
     return tuple(float(part) for part in deviations)
 
 
+# Heads of the statistics, in their order: all six stand in every table, since any one of them misleads alone.
 HEADS: Final = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
-"""Heads of the statistics, in their order: all six stand in every table, since any one of them misleads alone."""
 
 
 def errors_table(found: TransferFigures, name: str, images: int) -> Table:
@@ -231,7 +230,6 @@ def naive_ratios_table(found: TransferFigures, name: str) -> Table | None:
 def _ratios_table(
     title: str, ratios: Sequence[tuple[RowRatio, str]], note: str, second_head: str = "Trained on"
 ) -> Table:
-    """Return ratios with their intervals, each with what its second column says."""
     rows = tuple(
         (
             one.row.method,
@@ -330,12 +328,12 @@ def long_table(found: TransferFigures) -> Table:
     return Table("All numbers", _LONG, tuple(rows))
 
 
+# Columns of the file for other programs; empty where a row has no such number.
 _LONG: Final = (
     *("method", "training", "data", "images", "seeds", "error", "statistic"),
     *("degrees", "low", "high", "seed_sd", "ratio_to_real", "ratio_low", "ratio_high"),
     *("way", "real"),
 )
-"""Columns of the file for other programs; empty where a row has no such number."""
 
 
 def _heads(row: TransferRow) -> tuple[str, str, int | None]:

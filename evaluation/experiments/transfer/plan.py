@@ -99,8 +99,7 @@ def trainable_images(
     return training.scenes, shared
 
 
-_Key = tuple[str, str]
-"""How an image is known, "name" or "content", and by what."""
+_Key = tuple[str, str]  # How an image is known, "name" or "content", and by what
 
 
 def _keys(scenes: SceneSet, named: bool, seen: bool) -> list[tuple[str, list[_Key]]]:
@@ -209,8 +208,7 @@ def preparation_of(dataset: Dataset) -> Preparation:
     )
 
 
-_LINEAR: Final = decode_srgb(np.arange(256) / 255)
-"""Linear light 0 … 1 of each code."""
+_LINEAR: Final = decode_srgb(np.arange(256) / 255)  # Linear light 0 … 1 of each code
 
 
 def naive_image(
@@ -425,7 +423,6 @@ def plan_transfer(
 
 
 def _trainable(some: SceneSet, test: SceneSet, notes: list[str]) -> tuple[Scene, ...]:
-    """Return the images of a set that may be trained on."""
     kept, shared = trainable_images(some, test)
     if shared:
         notes.append(f"{shared}; left out")

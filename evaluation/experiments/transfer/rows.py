@@ -35,16 +35,15 @@ from evaluation.results.result import Result, SceneAnswer
 from evaluation.scene import Scene
 from foundation.errors import InputError
 
+# How a method was trained: on other folds of the test set, on generated images, on their naive counterparts, on real
+# scenes of another camera under their lights, on a data set that was not generated, on N images of the test set's
+# other folds alone, or not at all.
 Kind = Literal["cross-validation", "generated", "naive", "naive with matrix", "relit", "other", "real", "none"]
-"""How a method was trained: on other folds of the test set, on generated images, on their naive counterparts, on real
-scenes of another camera under their lights, on a data set that was not generated, on N images of the test set's other
-folds alone, or not at all."""
 
+# What was done with N real images: nothing; trained on them alone; trained on a set, and then adapted to them.
 Way = Literal["", "alone", "adapted"]
-"""What was done with N real images: nothing; trained on them alone; trained on a set, and then adapted to them."""
 
-NAIVE: Final[tuple[Kind, ...]] = ("naive", "naive with matrix")
-"""The kinds of the naive baseline."""
+NAIVE: Final[tuple[Kind, ...]] = ("naive", "naive with matrix")  # The kinds of the naive baseline
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,8 +213,8 @@ def transfer(
     return tuple(rows)
 
 
+# From learner, its number, places of N real images (N,) int64 and seed to a method.
 _Fit = Callable[[AnyLearner, int, Places, int], Method]
-"""From learner, its number, places of N real images (N,) int64 and seed to a method."""
 
 
 @dataclass(frozen=True, eq=False)
