@@ -365,8 +365,7 @@ class TransferRequest:
     type: int = EosEvent.REQUEST_OBJECT_TRANSFER
     reserved: int = field(default=0, repr=False)
     extra: tuple[int, ...] = field(default=(), repr=False)
-    padding: int = field(default=0, repr=False)
-    """NULs behind the name's own."""
+    padding: int = field(default=0, repr=False)  # NULs behind the name's own
 
 
 @dataclass(frozen=True)

@@ -195,10 +195,8 @@ class _PatientLink(io.RawIOBase):
 class LocalServer(ABC, ThreadingHTTPServer):
     """Serves one page; not yet serving when it is made. An InputError says why it cannot listen there."""
 
-    command: ClassVar[str]
-    """The command that serves, as messages name it."""
-    most_bytes: ClassVar[int] = 0
-    """Bytes of the largest body of a PUT that is taken; 0 takes none."""
+    command: ClassVar[str]  # The command that serves, as messages name it
+    most_bytes: ClassVar[int] = 0  # Bytes of the largest body of a PUT that is taken; 0 takes none
 
     daemon_threads = True
     request_queue_size = MOST_CONNECTIONS

@@ -43,11 +43,9 @@ class LightModel(Protocol):
 class FeatureLearner(ABC):
     """A method yet to be fitted: a frozen dataclass whose fields, plain numbers and words, are its settings."""
 
-    key: ClassVar[str]
-    """Its name on the command line and in model files."""
+    key: ClassVar[str]  # Its name on the command line and in model files
 
-    title: ClassVar[str]
-    """Its name in tables, where that does not depend on its settings."""
+    title: ClassVar[str]  # Its name in tables, where that does not depend on its settings
 
     needs: ClassVar[tuple[str, str] | None] = None
     """What training needs beside NumPy and SciPy: the module, and the command that installs it; None if nothing."""

@@ -71,8 +71,7 @@ class UsbIdentity:
     serial: str | None = "0123456789"
     manufacturer: str = "Canon Inc."
     name: str = "Canon Digital Camera"
-    version: int = 0x0200
-    """bcdUSB: high speed from 2.00 on."""
+    version: int = 0x0200  # bcdUSB: high speed from 2.00 on
 
 
 @dataclass(frozen=True)
@@ -117,8 +116,7 @@ def endpoint_descriptor(address: int, kind: int, packet: int, interval: int = 0)
 class PtpUsbDevice:
     """A still image device, at high speed: its descriptors and standard requests, and its pipes."""
 
-    pipes: Final = frozenset({BULK_IN, BULK_OUT, INTERRUPT_IN})
-    """Addresses of its endpoints."""
+    pipes: Final = frozenset({BULK_IN, BULK_OUT, INTERRUPT_IN})  # Addresses of its endpoints
 
     def __init__(self, responder: Responder, identity: UsbIdentity | None = None) -> None:
         self.identity = identity or UsbIdentity()
