@@ -128,7 +128,6 @@ def _newest_checks(view: SessionView) -> Mapping[str, Check]:
 
 
 def _open_reasons(view: SessionView) -> dict[int, str]:
-    """Return the last reason of each step that has no accepted frame, by step, oldest first."""
     done = {attempt.step for attempt in view.attempts if attempt.verdict == ACCEPTED}
     return {
         attempt.step: f"{attempt.file}: {attempt.reason}"

@@ -477,7 +477,6 @@ def _photosites(
     int,
     npt.NDArray[np.float32],
 ]:
-    """Return the sensor, and where on it patches lie, as the kernels expect them."""
     width, reach = mosaic.sensor.shape[1], sites.window // 2
     corner = (mosaic.visible.top + 2 * (sites.rows - reach)) * width + mosaic.visible.left + 2 * (sites.columns - reach)
     found = phases(mosaic)

@@ -1563,7 +1563,6 @@ class CanonEos:
                 self._drop(error)
 
     def _connected(self) -> EosBody:
-        """Return the connected body, after a fault on a new connection and with its settings."""
         if self._closed:
             raise DeviceError("the camera has been closed; open the rig again")
         if self._body is not None:
@@ -1604,7 +1603,6 @@ class CanonEos:
         return body
 
     def _drop(self, fault: DeviceError | None) -> None:
-        """Close the cable, with a reset where the body may still be in the midst of something."""
         transport, self._transport, self._body = self._transport, None, None
         if transport is not None:
             if fault is not None and not isinstance(fault, LinkClosed):

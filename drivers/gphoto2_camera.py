@@ -459,13 +459,11 @@ def _translated(error: gphoto2.GPhoto2Error, label: str) -> DeviceError:
 
 
 def _text(camera: gphoto2.Camera, names: Iterable[str]) -> str:
-    """Return the value of the first of some settings that the body has, empty where it has none."""
     found = (_setting(camera, name) for name in names)
     return next((setting.value for setting in found if setting is not None and setting.value), "")
 
 
 def _setting(camera: gphoto2.Camera, name: str) -> BodySetting | None:
-    """Return a setting as the body shows it, None where it has none of that name."""
     gp = library()
     try:
         widget = camera.get_single_config(name)

@@ -561,7 +561,6 @@ class PjLinkProjector:
         return "a camera (PTP/IP)" if self._answer_to(_PTPIP_QUESTION)[4:8] in _PTPIP_ANSWERS else None
 
     def _answer_to(self, question: bytes) -> bytes:
-        """Return what comes first over a new connection after a question that is no projector's."""
         try:
             link = self._connect()
         except LinkError:

@@ -511,7 +511,6 @@ def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None
 
 
 def _found_secret(key: str, place: dict[str, Any], folder: Path) -> str:
-    """Return the secret of a key from an environment variable, or the first line of a file."""
     match place:
         case {"env": str(name), **more} if not more:
             secret = os.environ.get(name, "")

@@ -185,7 +185,6 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
 
 
 def _has_lost_its_folder() -> bool:
-    """Return whether the working folder was removed, which every path of a user depends on."""
     try:
         os.getcwd()  # noqa: PTH109  the same, without an object
     except OSError:

@@ -283,7 +283,6 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
 
 
 def _wider_print(made: Description) -> str:
-    """Return what shows more colours where the table was computed with a print whose codes are ink codes."""
     computed = made.table.computed or {}
     unmanaged = computed.get("room", {}).get("profile") == "unmanaged"
     return (

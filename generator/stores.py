@@ -309,7 +309,6 @@ class RemoteStore:
 
     @contextmanager
     def _translated_errors(self, name: str, reading: bool = False) -> Generator[None]:
-        """Raise any error of a store's library as a FormatError or StorageError that names the object and a remedy."""
         try:
             yield
         except (CropError, MemoryError):

@@ -161,7 +161,6 @@ _SEED = 1
 
 @contextmanager
 def _film(world: World, screen: str | None, projector: str | None) -> Generator[Film]:
-    """Yield pictures of a world under white light, or lit by a screen that is watched."""
     from drivers.links.network import TcpLink
     from drivers.pjlink import PjLinkProjector
     from drivers.presenter import WHITE

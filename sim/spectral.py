@@ -358,7 +358,6 @@ def _sorted(table: Mapping[str, list[float]], where: str) -> tuple[_Array, _Arra
 
 
 def _require_camera(wavelengths: _Array, curves: _Array, where: str) -> None:
-    """Refuse numbers that cannot be a camera's sensitivities."""
     require_grid(wavelengths, where)
     if curves.min() < 0:
         row, channel = np.unravel_index(int(curves.argmin()), curves.shape)

@@ -202,7 +202,6 @@ def _published(name: str, given: str) -> Iterable[LightSpectrum]:
 
 
 def _named(name: str, known: list[str], given: str) -> list[str]:
-    """Return which of the known spectra a name or the name of a set stands for."""
     pattern = SETS.get(name.lower())
     if pattern is not None:
         return [key for key in known if re.fullmatch(pattern, key)]

@@ -126,7 +126,6 @@ class PatchMeasurement:
         return self.reader.read(whites, "the frame of white")[0]
 
     def _sites(self) -> tuple[Sites, Sites]:
-        """Return where the cells lie in a frame of patches, and where the references."""
         sites, count = self.sensor.sites, len(self.points.cells_mm)
         return (
             Sites(sites.rows[:count], sites.columns[:count], sites.inside[:count], sites.window),
@@ -290,7 +289,6 @@ def _provenance(
 
 
 def _require_room(out: Path, needed: int) -> None:
-    """Refuse a disk that has not so many bytes left."""
     there = out.absolute()
     while not there.exists():
         there = there.parent

@@ -239,7 +239,6 @@ def _figure_finding(row: JudgedValue, table: TableMeasurements) -> Finding:
 
 
 def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
-    """Return the findings on how the chart stands in the picture, and how evenly it is lit."""
     if trial.table is None:
         return not_checked_all((TURN.name, KEYSTONE.name, EVENNESS.name), "the chart cannot be measured")
     table = trial.table

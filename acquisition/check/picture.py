@@ -59,7 +59,6 @@ def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:
 
 
 def _verdict_lines(report: CheckReport) -> list[tuple[str, str]]:
-    """Return the verdicts as lines, faults first, each with its grade."""
     lines: list[tuple[str, str]] = []
     for grade in GRADES:
         for finding in report.of(grade):

@@ -243,7 +243,6 @@ class LiveJudge:
         found: _Findings,
         cause: Check | None,
     ) -> bytes:
-        """Return the frame as JPEG, paper of the first white frame as white, with the chart and what deviates."""
         frame = found.frame
         first = frame.paper if before.first_white is None else before.first_white.paper
         white = np.maximum(first, 1.0)

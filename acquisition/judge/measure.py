@@ -194,7 +194,6 @@ def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
 
 
 def _textures(plane: Plane) -> Framing:
-    """Return a framing whose tags are the places of most texture, one in each part of the frame."""
     values = plane.values
     height, width = values.shape
     energy = cv2.boxFilter(cv2.Laplacian(values, cv2.CV_32F) ** 2, -1, (_TEXTURE_PX, _TEXTURE_PX))

@@ -639,7 +639,6 @@ def digest(values: Json) -> str:
 
 
 def _preview_version(folder: Path, file: str) -> int | None:
-    """Return a number that is another for another preview, or None if there is none."""
     try:
         return preview_path(folder, file).stat().st_mtime_ns // 1_000_000
     except OSError:
@@ -707,7 +706,6 @@ def write_session_report(folder: Path, path: Path | None = None) -> Path:
 
 
 def _ended(view: SessionView) -> SessionView:
-    """Return a session whose run, if this process is at it, has ended."""
     beat = view.heartbeat
     if beat is None or beat.process != Process.own() or beat.state == "ended":
         return view

@@ -565,7 +565,6 @@ class Verdicts:
         self._void_ahead(under_way, reason)
 
     def _void_ahead(self, under_way: Sequence[Exposed], reason: str) -> None:
-        """Void frames that have left the camera when they are known to be accepted."""
         self._voided_ahead.update({frame.number: reason for frame in under_way})
 
     def _void(self, attempts: Collection[int], reason: str) -> None:

@@ -667,7 +667,6 @@ def take_session(
 
 
 def _open_steps(session: Session, settings: LabSettings, first: Sequence[int]) -> StepQueue:
-    """Return the steps without an accepted frame, and what puts references behind the plan where they are needed."""
 
     def append(kind: FrameKind) -> SessionStep:
         step = SessionStep(session.steps[-1].number + 1, kind, None, WHITE if kind == "white" else BLACK)
@@ -688,7 +687,6 @@ def _open_steps(session: Session, settings: LabSettings, first: Sequence[int]) -
 
 
 def _make_ready(job: Job) -> None:
-    """Make the devices ready to take what is open, and let the judge know what was taken."""
     devices, settings, journal = job.devices, job.settings, job.session.journal
     journal.note(devices.clock.now(), "start", f"{len(job.queue)} of {len(job.session.steps)} frames to take")
     with job.watch.step("the camera", "takes its settings", CONFIGURE_S, "configure"):

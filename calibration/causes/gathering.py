@@ -385,7 +385,6 @@ def _place_of(stains: Stains, spot: npt.NDArray[np.int64], file: str) -> PrintPl
 
 
 def _spot_share(stains: Stains, at_mm: _Array, size_mm: float) -> float:
-    """Return the share of the cells about a place that deviate in the mean of the white frames."""
     if not stains.known:
         return np.nan
     near = np.linalg.norm(stains.places_mm - at_mm, axis=1) < max(size_mm / 2, 2 * cell_mm(stains))
@@ -393,7 +392,6 @@ def _spot_share(stains: Stains, at_mm: _Array, size_mm: float) -> float:
 
 
 def _hot_share(table: TableMeasurements, at_mm: _Array, size_mm: float) -> float:
-    """Return the share of the cells about a place that hold a photosite hot in every dark frame."""
     hottest, places = table.dark_frames.hottest, table.cells.stains.places_mm
     if len(hottest) != len(places):
         return np.nan

@@ -193,7 +193,6 @@ def light_pairs(one: Sequence[Illumination], other: Sequence[Illumination]) -> l
 
 
 def _warnings(one: Lut, other: Lut, common: int) -> tuple[str, ...]:
-    """Return what a reader must know of two tables with so many lights in common, a sentence each."""
     ours, theirs = one.provenance, other.provenance
     alone, others = len(one.white) - common, len(other.white) - common
     same_frames = ours.session_sha256 == theirs.session_sha256 and ours.computed is None

@@ -68,7 +68,6 @@ def _are_named_right(table: TableMeasurements) -> bool:
 
 
 def _has_drift(table: TableMeasurements) -> bool:
-    """Return whether two white frames were taken, and not one file twice."""
     return len({frame.record.sha256 for frame in table.white_frames}) > 1
 
 

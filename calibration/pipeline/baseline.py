@@ -191,7 +191,6 @@ def with_lens(
 
 
 def _is_still(baseline: Baseline, decoded: DecodedFrame) -> bool:
-    """Return whether the chart lies in a frame where it was registered."""
     shift = baseline.movement(decoded.mosaic, decoded.black, decoded.strongest, decoded.record.file)
     return shift.gauges > 0 and shift.length_px <= STILL_PX and shift.largest_px <= 2 * STILL_PX
 

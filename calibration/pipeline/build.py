@@ -372,7 +372,6 @@ def prefetched(
 
 
 def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWriter) -> None:
-    """Write all of the table but its samples, which are there, and its report."""
     session, records, lights, greys = done.session, done.records, figures.lights, figures.greys
     by_light = {frame.record.illumination: frame for frame in figures.frames if frame.record.kind == "light"}
     frames = [by_light[light.index] for light in session.illuminations]

@@ -94,7 +94,6 @@ class UnfinishedTable:
         publish_folder(self.folder, self.out, "the table")
 
     def _remove(self, kept: set[str] | None = None) -> None:
-        """Remove the files of checkpoints, but for those whose names are kept."""
         for path in self.folder.glob(f"{RECORD}*"):
             if path.name not in (kept or ()):
                 path.unlink()

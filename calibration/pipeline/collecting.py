@@ -159,7 +159,6 @@ class Accumulator:
         )
 
     def _registered_again(self, registered: RegisteredFrame) -> Accumulator:
-        """Return what there is once the chart is registered in another frame."""
         error = registered.registration.expanded_px(self.baseline.points.cells_mm)
         return replace(
             self,

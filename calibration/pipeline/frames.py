@@ -165,7 +165,6 @@ def _last_of_each_light(session: Session, accepted: Sequence[FrameRecord]) -> di
 
 
 def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> FrameRecord:
-    """Return the first white frame, or else the brightest light's."""
     white = next((record for record in accepted if record.kind == "white"), None)
     if white is not None:
         return white

@@ -301,7 +301,6 @@ def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple
 
 
 def _require_own_cells(matcher: Matcher, mismatched_cells: _Mask, what: str) -> None:
-    """Refuse a map on which parts of the field show the colours of the neighbouring cells."""
     places, parts = matcher.slipped(mismatched_cells)
     if len(places) >= max(_FEW_SLIPPED, _SLIPPED_SHARE * parts):
         x, y = places[0]

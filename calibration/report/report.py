@@ -98,7 +98,6 @@ def report_json(result: BuildResult) -> dict[str, Any]:
 
 
 def _causes(result: BuildResult) -> list[dict[str, Any]]:
-    """Return what each figure beyond its limit is probably caused by, and what that was decided from."""
     return [
         {
             "figure": name,
@@ -141,7 +140,6 @@ def _chart_places(table: TableMeasurements) -> dict[str, Any]:
 
 
 def _geometry(table: TableMeasurements) -> dict[str, Any]:
-    """Return how well cells' places are known, and where red and blue lie against green, half-size px."""
     registration = table.registration
     inner, outer = registration.places_known_px
     lateral = registration.lateral
@@ -316,7 +314,6 @@ def _first_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np
 
 
 def _place_pictures(result: BuildResult, session: Session) -> list[_Picture]:
-    """Return a picture of each frame in which something is beyond its limit at a place, which is circled."""
     by_file: dict[str, list[LabelledPlace]] = {}
     for name, found in findings(result.verdict, result.figures).items():
         cause = found.decision.cause.name if found.is_known else "cause not known"
@@ -432,7 +429,6 @@ def summary(table: TableMeasurements, group: Group | None = None) -> list[Summar
 def _group(
     group: Group, rows: Sequence[_Row], table: TableMeasurements, pictures: Sequence[_Picture]
 ) -> dict[str, Any]:
-    """Return a group of figures, folded unless something in it is beyond its limit."""
     own = [row for row in rows if row.judged.figure.group == group]
     beyond = sum(row.judged.outcome != "accept" for row in own)
     within = f"{beyond} beyond their limits" if beyond else "all within their limits"

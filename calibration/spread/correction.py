@@ -521,7 +521,6 @@ def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:
 
 
 def _places_beyond(grid: PrintedGrid, registration: Registration, shape: tuple[int, int], window: int) -> Sites:
-    """Return places that show what lies behind the print, all over the frame beside it."""
     rows, columns = shape
     width, height = grid.pitch_mm
     # The outermost patches, and from them straight on to the sheet's edge and a margin.

@@ -273,7 +273,6 @@ class XScreen:
         return window
 
     def _name(self, top: int) -> str:
-        """Return the name of a window or of the first named one in it, with its program's."""
         title, program = "", ""
         for window in self._family(top):
             title = title or self._text(window, "_NET_WM_NAME") or self._text(window, "WM_NAME")
@@ -330,7 +329,6 @@ class XScreen:
             return parent, list(struct.unpack(f"={count}I", children))
 
     def _place(self, window: int) -> tuple[int, int, int, int] | None:
-        """Return left, top, width and height with the border, None for a window that shows nothing."""
         with self._ask("get_window_attributes", window) as reply:
             if not reply:
                 return None

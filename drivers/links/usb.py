@@ -263,7 +263,6 @@ class OpenUsbDevice:
         return pipes
 
     def _configuration(self) -> usb.core.Configuration:
-        """Return the device's configuration, made active if none is."""
         try:
             return self._device.get_active_configuration()
         except usb.core.USBError as error:
@@ -356,7 +355,6 @@ def _packet_size(endpoint: usb.core.Endpoint) -> int:
 
 
 def _found(backend: IBackend | None) -> Iterator[tuple[usb.core.Device, UsbDevice, DeviceRefused | None]]:
-    """Yield the still image devices, and for each why its serial number could not be read."""
     try:
         devices = list(usb.core.find(find_all=True, backend=backend, custom_match=_has_still_image))
     except usb.core.NoBackendError as error:

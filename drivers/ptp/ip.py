@@ -344,7 +344,6 @@ def _decode(kind: int, data: bytes) -> Packet:
 
 
 def _checked(kind: int, length: int) -> None:
-    """Raise ProtocolError unless a packet of this type can be of this length."""
     if kind not in _PACKETS:
         raise _unusable(f"a packet of type {kind} and {length} bytes; a type of 1 to 14 was expected")
     least, most = (_DATA_HEADER.size, 0xFFFFFFFF) if kind in _DATA_TYPES else (HEADER_LENGTH, MAX_PACKET)
@@ -571,7 +570,6 @@ class IpTransport(CableTransport):
             self._clock.sleep(RETRY_S)
 
     def _acknowledged(self, channel: Channel, expected: type[_P]) -> _P:
-        """Return the first packet on a new connection, which is to be an acknowledgement."""
         try:
             answer = channel.next(CONNECT_S)
         except ProtocolError as error:

@@ -182,7 +182,6 @@ def ends_with_empty_packet(total: int, packet_size: int) -> bool:
 
 
 def _check_length(kind: int, length: int) -> None:
-    """Raise ProtocolError unless a container without payload can be of this type and length."""
     if kind not in _MESSAGES:
         raise _unusable(f"a container of type {kind}; 1 command, 2 data, 3 response or 4 event was expected")
     count, odd = divmod(length - HEADER_LENGTH, 4)

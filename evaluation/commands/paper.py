@@ -284,7 +284,6 @@ def _treatment(data: SceneSet) -> str:
 
 
 def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None, output: JsonOutput) -> None:
-    """Write the folder, if one was named, and print the tables."""
     from evaluation.experiments.paper.reporting import write_report
     from evaluation.reports.table_output import show_notes, show_tables
 

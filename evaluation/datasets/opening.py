@@ -234,7 +234,6 @@ def layout_of(place: str) -> str:
 
 
 def _require_kind(place: str, name: str, known: Layout) -> None:
-    """Refuse what is a file where the layout is a folder, the other way round, or not there."""
     path = Path(place)
     if not path.exists():
         raise FormatError(f"{place} is not there, expected a {known.takes} of {known.title} ({name}); name that")
@@ -265,7 +264,6 @@ def _refuse_pictures(folder: Folder, place: str) -> None:
 
 
 def _recognise(place: str) -> tuple[str, Folder | None]:
-    """Return the layout of a place, and the names in its folder if it is one."""
     if "://" in place:
         return "generated", None
     path = Path(place)

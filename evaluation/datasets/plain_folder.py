@@ -178,12 +178,10 @@ def require_no_other_table(folder: Folder) -> None:
 
 
 def _tables(folder: Folder) -> list[str]:
-    """Return the names of the .csv files of a folder that have the columns of such a table."""
     return [name for name, head in _heads(folder).items() if all(column in _columns(head) for column in COLUMNS)]
 
 
 def _heads(folder: Folder) -> dict[str, str]:
-    """Return the first lines of the .csv files of a folder by their names."""
     found: dict[str, str] = {}
     for name in [name for name in folder.files if name.lower().endswith(".csv")][:_MOST]:
         try:

@@ -204,7 +204,6 @@ def _map_error(
 
 
 def _reason(error: BaseException) -> str:
-    """Return an exception as a sentence, with the last line outside this suite's packages and installed libraries."""
     frames = traceback.extract_tb(error.__traceback__)
     foreign = [frame for frame in frames if _HOUSE not in Path(frame.filename).parents]
     own = [frame for frame in foreign if "site-packages" not in Path(frame.filename).parts] or foreign

@@ -124,7 +124,6 @@ def _fitted(features: Features, truths: npt.NDArray[np.float64], bins: int) -> L
 
 
 def _chosen(features: Features, truths: npt.NDArray[np.float64], seed: int) -> int:
-    """Return the number of bins with the least median error in a cross-validation of the training images."""
     if len(features) < _LEAST:
         return CHOICES[0]
     parts = np.random.default_rng(seed).permutation(len(features)) % _PARTS

@@ -244,7 +244,6 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
 
 
 def _by_stem(images: Sequence[str]) -> dict[str, str]:
-    """Return images by their names without extension, those left out of which two have the same."""
     stems: defaultdict[str, list[str]] = defaultdict(list)
     for image in images:
         stems[_stem(image)].append(image)

@@ -97,7 +97,6 @@ def _wedge_boxes() -> npt.NDArray[np.float64]:
 
 
 def _image_half() -> bytes:
-    """Return what draws the lower half of the greys as an image, one pixel a step."""
     boxes = _wedge_boxes() * POINTS_PER_MM
     left, right = float(boxes[0, 0]), float(boxes[-1, 2])
     bottom = PAGE_MM[1] * POINTS_PER_MM - float(boxes[0, 3])

@@ -345,7 +345,6 @@ def journal_path(folder: Path) -> Path:
 
 
 def _require_mounted(folder: Path) -> None:
-    """Refuse a place that is not on the disk that it should be on."""
     if place := unmounted_at(folder):
         raise StorageError(
             f"nothing is mounted at {place}, where /etc/fstab has a disk, so that {folder} is not the folder on it",

@@ -164,7 +164,6 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
 
 
 def _rows(entries: Sequence[Entry], max_rows: int, max_columns: int) -> list[list[Entry]]:
-    """Return an even choice of the images of sources of several lights, one row a source."""
     rows: dict[str, list[Entry]] = {}
     for entry in entries:
         rows.setdefault(entry.source, []).append(entry)

@@ -276,7 +276,6 @@ def _cell_of(file: str) -> tuple[str, int | None]:
 
 
 def _read_parquet(stream: BinaryIO, file: str) -> bytes | None:
-    """Return the bytes of a file, named as in a tar file, in a Parquet file."""
     import pyarrow.parquet as pq
 
     number = int(file.partition(".")[0])

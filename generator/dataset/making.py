@@ -240,7 +240,6 @@ def _by_dask(
 
 @contextmanager
 def _client(address: str, workers: int) -> Generator[distributed.Client]:
-    """Connect to a scheduler, or to a cluster of processes of this machine that ends with the block."""
     from distributed import Client, LocalCluster
 
     if address:
@@ -394,7 +393,6 @@ def made_before(plan: Plan, out: Path | str) -> Dataset | None:
 
 
 def _other_pictures(dataset: Dataset, plan: Plan, out: Path | str) -> list[str]:
-    """Return in words a picture of the plan that the dataset was not made of."""
     known = {source.position: (source.name, source.sha256) for source in dataset.sources}
     known |= {skipped.position: (skipped.name, None) for skipped in dataset.description.skipped}
     if len(known) != len(plan.sources):

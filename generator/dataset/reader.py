@@ -95,7 +95,6 @@ def read_entries(store: Store, description: Description) -> Iterator[Entry]:
 
 
 def _numbered_rows(name: str, table: Iterable[str]) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the rows of a CSV file with the line where each ends."""
     rows = csv.DictReader(table)
     try:
         for row in rows:
@@ -107,7 +106,6 @@ def _numbered_rows(name: str, table: Iterable[str]) -> Iterator[tuple[int, dict[
 def _read_rows(
     name: str, rows: Iterable[tuple[int, dict[str, str]]]
 ) -> tuple[str, tuple[str, ...], tuple[Triple, ...]]:
-    """Return source, labels and ground truths of the lights from an image's rows with their line numbers."""
     lights: list[tuple[str, Triple]] = []
     source = ""
     for line, row in rows:

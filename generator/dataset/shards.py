@@ -424,7 +424,6 @@ def make_shard(
 
 
 def _finished_images(job: ShardJob, place: Workplace, pool: ThreadPoolExecutor) -> dict[int, FinishedImage]:
-    """Return by number the images of a shard that whoever was at it before has finished."""
     found = pool.map(place.image_of, place.pieces(job.shard).values())
     return {image.image.number: image for image in found if image is not None}
 
@@ -445,7 +444,6 @@ def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
 
 @contextmanager
 def _cancelling(*queues: deque[Future[Any]]) -> Generator[None]:
-    """Cancel what still waits for a thread if the block fails."""
     try:
         yield
     except BaseException:

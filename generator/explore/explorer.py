@@ -241,7 +241,6 @@ def _as_place(name: str) -> str:
 
 
 def _seen_from_here(location: str) -> str:
-    """Return a file's path from the working folder if it lies below that."""
     path = Path(location)
     return os.fspath(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else location
 
@@ -369,7 +368,6 @@ def sample_folder(cache: Path | None = None) -> Path:
 
 
 def _balls() -> Picture:
-    """Return matt balls with a highlight on a grey table before a wall, under one lamp."""
     y, x = np.mgrid[:_HEIGHT, :_WIDTH].astype(np.float64)
     lamp = _FROM / np.linalg.norm(_FROM)
     floor = y > 0.55 * _HEIGHT
@@ -390,7 +388,6 @@ def _balls() -> Picture:
 
 
 def _patches() -> Picture:
-    """Return patches of six hues at three saturations above a row of greys from black to white."""
     hues = np.arange(_PATCHES) / _PATCHES
     wheel = 0.5 + 0.5 * np.cos(2 * np.pi * (hues[:, None] - np.array([0.0, 1 / 3, 2 / 3])))
     rows = [0.25 + part * (wheel - 0.5) for part in (0.4, 0.25, 0.1)]

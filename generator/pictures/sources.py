@@ -647,7 +647,6 @@ def _hashed(path: Path) -> tuple[str, bytes | None]:
 
 
 def _is_of_the_file(path: Path, error: OSError) -> bool:
-    """Return whether the cause of the error is the file itself, not the machine or the disk."""
     if error.errno in _MACHINE_ERRORS:
         return False
     # The folder of a disk that is not mounted, or fails, is missing, empty or cannot be listed.
@@ -667,7 +666,6 @@ def _folder_is_there(store: AbstractFileSystem, path: str) -> bool:
 
 
 def _unreadable(location: str, error: Exception, of_the_file: bool) -> FormatError | StorageError:
-    """Return the exception for a picture that cannot be read, whether the cause is the file itself or not."""
     reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split()).rstrip(".")
     if of_the_file:
         return FormatError(f"cannot read {location}: {reason}; name a picture")
@@ -737,7 +735,6 @@ def find_pictures(
 
 
 def _refuse_names(found: Sequence[PictureFile]) -> None:
-    """Raise an InputError that names two pictures of one name, if there are any."""
     seen: dict[str, PictureFile] = {}
     for picture in found:
         if (other := seen.setdefault(picture.name, picture)) is not picture:

@@ -209,7 +209,6 @@ def _send(channel: Channel, packet: Packet) -> None:
 
 
 def _collect(packets: Channel) -> bytes | None:
-    """Return the initiator's data phase, None if it is called off."""
     data = bytearray()
     while True:
         match packets.next(_TIMEOUT_S):

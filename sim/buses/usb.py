@@ -285,7 +285,6 @@ class PtpUsbDevice:
         return b"".join(taken)
 
     def _class_request(self, setup: Setup, data: bytes) -> bytes:
-        """Carry out a request of the still image class and return its data, if it goes to the host."""
         match setup.request:
             case ControlRequest.CANCEL:
                 try:

@@ -211,7 +211,6 @@ _BORDER: Final = (50, 140)
 
 
 def _areas(width: int, height: int) -> dict[str, Any]:
-    """Return sensor, visible and masked areas for so many columns and rows that see light."""
     top, left = _BORDER
     sensor = height + top, width + left
     return {

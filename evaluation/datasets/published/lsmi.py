@@ -337,7 +337,6 @@ class _Camera:
 
 
 def _by_place(folder: Folder) -> dict[str, list[tuple[str, str]]]:
-    """Return the images of each place in a folder with the digits of their lights."""
     found: dict[str, list[tuple[str, str]]] = {}
     for name in folder.files:
         match = _IMAGE.fullmatch(name)

@@ -222,7 +222,6 @@ def open_nus8(place: str, options: DataOptions, listed: Folder | None = None) ->
 
 
 def _tables(folder: Folder) -> Iterator[Path]:
-    """Yield the .mat files of the cameras in a folder and in those right below it."""
     for place in folder.within(1):
         yield from (place.path / name for name in place.files if name.endswith(_ENDING) and len(name) > len(_ENDING))
 
@@ -263,7 +262,6 @@ def _open_camera(
 
 
 def _images(root: Folder, camera: str, path: Path) -> tuple[Path, dict[str, str]]:
-    """Return where the images of a camera lie, and their paths by name."""
     beside = Folder(path.parent)
     places = [beside, *(beside.folders.get(name) for name in ("PNG", "png")), root.folders.get("images")]
     for place in places:

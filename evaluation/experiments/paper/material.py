@@ -274,6 +274,5 @@ def read_truths(place: str) -> Truths:
 
 
 def _first_column(path: Path) -> list[str]:
-    """Return the first field of every row below the head."""
     rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
     return [row[0] for row in rows if row and any(field.strip() for field in row)][1:]
