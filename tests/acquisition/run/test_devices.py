@@ -31,6 +31,7 @@ from acquisition.run.devices import (
     RetryPolicy,
     RunEnd,
     RunWatch,
+    ask_all,
     await_health,
     health_fault,
     lamp_fate,
@@ -62,6 +63,7 @@ from foundation.errors import (
     DeviceError,
     DeviceFault,
     DeviceRefused,
+    InputError,
     LinkClosed,
     LinkTimeout,
     StorageError,
@@ -813,3 +815,19 @@ def test_the_wheel_before_the_camera_is_the_lab_s_or_the_simulated_room_s() -> N
     rigs = [("lab", of_lab), ("simulated", of_room), ("simulated", of_lab), ("imported", of_lab)]
     wheels = [wheel_of(parse_lab(f'rig = "{rig}"\n{head}{table}', "LAB.toml")) for rig, table in rigs]
     assert wheels == [120, 60, 0, 0]
+
+
+@pytest.mark.parametrize("fault", [InputError("no such file"), ConfigurationError("line.baud is missing")])
+def test_what_the_user_wrote_decides_the_exit_code_and_all_faults_are_reported(fault: CropError) -> None:
+    def fails(error: CropError) -> Callable[[], object]:
+        def ask() -> None:
+            raise error
+
+        return ask
+
+    unplugged = LinkClosed("no camera on USB")
+    with pytest.raises(InputError) as told:
+        ask_all({"camera": fails(unplugged), "projector": fails(fault), "display": lambda: None})
+    assert told.value.exit_code == 2
+    assert str(unplugged) in str(told.value)
+    assert str(fault) in str(told.value)
