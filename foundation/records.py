@@ -134,35 +134,40 @@ def find_mistakes(
     """
     errors = error.errors()
     unknown = [one["loc"] for one in errors if one["type"] == "extra_forbidden"]
-    found: list[str] = []
+    found: dict[str, str] = {}
     for one in errors:
         place, table = one["loc"], _table_at(model, one["loc"][:-1])
+        key, value = _key_of(place, document), one["input"]
         if one["type"] == "extra_forbidden" and table is not None:
-            found.append(unknown_key(_key_of(place, document), table.model_fields))
+            found[key] = unknown_key(key, table.model_fields)
         elif one["type"] == "missing" and table is not None:
             # A key that is misspelt is not missing as well.
             near = (nearest_names(str(other[-1]), table.model_fields) for other in unknown if other[:-1] == place[:-1])
             if f"did you mean {place[-1]!r}?" not in near:
-                found.append(_missing(_key_of(place, document), _table_at(model, place)))
+                found[key] = _missing(key, _table_at(model, place))
         else:
-            found.append(_wrong_value(_key_of(place, document), one, is_secret, not_to_choose))
-    return found
+            expected = _expectation(key, one, is_secret(key), not_to_choose)
+            # A whole table is too long for a message.
+            shown = "" if isinstance(value, dict) else f" = {MASK if is_secret(key) else repr(value)}"
+            begin = f"{key}{shown}: " if key else ""
+            # A value that may be of several types has an error for each of them.
+            found[key] = f"{found[key]}, or {expected}" if key in found else f"{begin}{expected}"
+    return list(found.values())
 
 
 def _key_of(place: tuple[int | str, ...], document: Any) -> str:
-    """Return the key as it is in the file: a single value that is read as a list has no number there.
+    """Return the key as it is in the file, without what pydantic adds.
 
-    What pydantic adds after the key of a table, if the key itself is wrong, is left out.
+    It adds a number if a single value is read as a list, the type if there are several, and "[key]" if the key of a
+    table is wrong.
     """
     parts: list[str] = []
     for part in place:
-        if part == "[key]" or (isinstance(part, int) and not isinstance(document, list)):
+        if part == "[key]" or not isinstance(document, list if isinstance(part, int) else dict):
             break
         parts.append(str(part))
-        try:
-            document = document[part]
-        except (LookupError, TypeError):
-            document = None
+        # A key that is missing ends the place.
+        document = cast("Any", document)[part] if isinstance(part, int) or part in document else None
     return ".".join(parts)
 
 
@@ -173,16 +178,6 @@ def _missing(key: str, table: type[BaseModel] | None) -> str:
     others = [name for name in table.model_fields if name not in needed]
     may = f"; it may also have {', '.join(others)}" if others else ""
     return f"the table [{key}] is missing; add it, with {', '.join(needed) or 'at least one key'}{may}"
-
-
-def _wrong_value(key: str, error: ErrorDetails, is_secret: Callable[[str], bool], not_to_choose: str) -> str:
-    value, secret = error["input"], is_secret(key)
-    reason = _expectation(key, error, secret, not_to_choose)
-    if not key:
-        return reason
-    # A whole table is too long for a message.
-    shown = "" if isinstance(value, dict) else f" = {MASK if secret else repr(value)}"
-    return f"{key}{shown}: {reason}"
 
 
 def _expectation(key: str, error: ErrorDetails, secret: bool = False, not_to_choose: str = "") -> str:
