@@ -238,7 +238,7 @@ def check(
     one suits, then judges white, dark, the primaries and grey by the figures of build-lut. Each verdict is good, a
     remark, a fault, or not checked, with its number, limit, reason and remedy.
     Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all
-    named at once, each with its remedy, and end it with 3, or with 2 where LAB.toml alone is at fault.
+    named at once, each with its remedy, and end it with 3, or with 2 if LAB.toml or a language file is at fault.
     """
     from acquisition.check.check import check_lab
     from experiment.config import load_lab

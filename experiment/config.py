@@ -5,16 +5,13 @@ Nothing here opens anything: paths are resolved against the file's folder, value
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
 import shlex
-import tomllib
-from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, cast
+from typing import Annotated, Any, Final, Literal, TypeVar, cast
 from urllib.parse import urlsplit
 
 import tomli_w
@@ -33,24 +30,21 @@ from pydantic import (
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
-from foundation.records import known_keys, unknown_key
+from foundation.records import find_mistakes, list_mistakes, parse_toml
 from foundation.secret_texts import MASK, is_webhook, target_label
-
-if TYPE_CHECKING:
-    from pydantic_core import ErrorDetails
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
+# Keys whose values are in no message, nor in `session.toml`: a session is copied, shown and published.
 _SECRETS = ("sequence.notify", "notify.alive", "lab.projector.password")
-"""Keys whose values are in no message, nor in `session.toml`: a session is copied, shown and published."""
 
+# The rig of a session of which nothing more can be taken: no one writes it into LAB.toml.
 NOT_TO_CHOOSE: Final = "imported"
-"""The rig of a session of which nothing more can be taken: no one writes it into LAB.toml."""
 
+# A file that is named for a secret is read as far as this: passwords and addresses are shorter, and a file that is
+# longer was named by mistake.
 _SECRET_BYTES = 4096
-"""A file that is named for a secret is read as far as this: passwords and addresses are shorter, and a file that is
-longer was named by mistake."""
 
 
 def _target_checked(target: str) -> str:
@@ -87,8 +81,12 @@ def spdx_expression(licence: str) -> str:
 
 
 def _endless(value: object) -> object:
-    """Return infinity for the word ``forever``, and anything else as it is."""
-    return math.inf if isinstance(value, str) and value.strip().lower() == "forever" else value
+    """Return infinity for the word ``forever``, and a number as it is."""
+    if not isinstance(value, str):
+        return value
+    if value.strip().lower() != "forever":
+        raise ValueError('a number of seconds was expected, or "forever"')
+    return math.inf
 
 
 def _f_number(value: object) -> float | Literal["none"]:
@@ -299,7 +297,7 @@ class ProjectorCable(Settings):
     control: Literal["none", "pjlink", "serial"] = "none"
     """PJLink, or the maker's language over a serial port or TCP; none: someone switches it by hand."""
     language: str | None = None
-    """With ``serial``: name of the language (benq, epson, optoma), or path of a language file (.toml), relative to the
+    """With ``serial``: name of a language (docs/devices.md), or path of a language file (.toml), relative to the
     settings file."""
     host: Host | None = None
     """Address, for PJLink and for languages over TCP."""
@@ -409,79 +407,20 @@ def parse_lab(text: str, where: str, folder: Path | None = None) -> LabSettings:
     return checked(LabSettings, document, where).read_from(where)
 
 
-def parse_toml(text: str, where: str) -> dict[str, Any]:
-    """Return the tables of a TOML text; `where` names it in errors."""
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ConfigurationError(f"{where} is not TOML: {error}; correct that line") from error
-
-
 def checked(kind: type[_AnySettings], document: dict[str, Any], where: str) -> _AnySettings:
     """Return the settings in a document; a ConfigurationError names every key that cannot be used, no secret."""
     try:
         return kind.model_validate(document)
     except ValidationError as error:
-        found = [_mistake(kind, one) for one in error.errors()]
+        found = find_mistakes(kind, document, error, _is_secret, NOT_TO_CHOOSE)
         # The cause has the values, too.
-        secret = any(_is_secret(_key_of(one)) for one in error.errors())
-        raise ConfigurationError(f"{where}:{_listed(found)}") from (None if secret else error)
-
-
-def _listed(found: Sequence[str]) -> str:
-    several = [f" {len(found)} mistakes:", *(f"\n  {one}" for one in found)]
-    return f" {found[0]}" if len(found) == 1 else "".join(several)
-
-
-def _key_of(error: ErrorDetails) -> str:
-    return ".".join(str(part) for part in error["loc"])
+        secret = any(_is_secret(".".join(map(str, one["loc"]))) for one in error.errors())
+        raise ConfigurationError(f"{where}:{list_mistakes(found)}") from (None if secret else error)
 
 
 def _is_secret(key: str) -> bool:
     """Return whether the value of a key holds a secret: what is above one does, and so does what is below it."""
     return any(f"{known}.".startswith(f"{key}.") or key.startswith(f"{known}.") for known in _SECRETS)
-
-
-def _mistake(kind: type[Settings], error: ErrorDetails) -> str:
-    """Return what is wrong with one key: its value, and what was expected."""
-    key, place = _key_of(error), error["loc"]
-    match error["type"]:
-        case "extra_forbidden":
-            return unknown_key(key, known_keys(kind, place[:-1]))
-        case "missing":
-            return f"{key} is missing; add it"
-        case "literal_error":
-            known = [name for name in re.findall(r"'([^']+)'", error["msg"]) if name != NOT_TO_CHOOSE]
-            reason = f"expected one of {', '.join(map(repr, known))}" if known else error["msg"]
-        case "tuple_type":
-            reason = "a list was expected, in square brackets"
-            if isinstance(error["input"], str):
-                reason += f": [{json.dumps(error['input'], ensure_ascii=False)}]"
-        case "float_parsing" | "float_type" | "int_parsing" | "int_type" | "int_from_float":
-            reason = _number_expected(key, error["type"].startswith("int"))
-        case "string_type":
-            given = error["input"]
-            is_number = isinstance(given, int | float) and not isinstance(given, bool)
-            meant = f': "{MASK if _is_secret(key) else given}"' if is_number else ""
-            reason = f"a text was expected, in quotation marks{meant}"
-        case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal":
-            ((bound, limit),) = error.get("ctx", {}).items()
-            reason = f"a number {_BOUNDS[bound]} {limit:g} was expected"
-        case _:
-            reason = error["msg"].removeprefix("Value error, ")
-    return f"{key} = {MASK if _is_secret(key) else repr(error['input'])}: {reason}"
-
-
-_BOUNDS: Final = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of at most"}
-"""What a number is to be, by the name of its bound in an error of pydantic."""
-
-
-def _number_expected(key: str, whole: bool) -> str:
-    what = "a whole number" if whole else "a number"
-    reason = f"{what} of seconds was expected" if key.endswith("_s") else f"{what} was expected"
-    if key == "sequence.patience_s":
-        return f'{reason}, or "forever"'
-    return reason
 
 
 def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None:
@@ -507,7 +446,7 @@ def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None
             except ConfigurationError as error:
                 missing.append(error)
     if missing:
-        raise ConfigurationError(f"{where}:{_listed([str(one) for one in missing])}") from missing[0]
+        raise ConfigurationError(f"{where}:{list_mistakes([str(one) for one in missing])}") from missing[0]
 
 
 def _found_secret(key: str, place: dict[str, Any], folder: Path) -> str:

@@ -6,10 +6,13 @@ added has a default. Arrays are lists in the file, numbers that are not finite a
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Collection, Iterable, Mapping
+import re
+import tomllib
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import cache
-from typing import Annotated, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +25,11 @@ from pydantic import (
     ValidationError,
 )
 
-from foundation.errors import ConfigurationError, FormatError, nearest_names
+from foundation.errors import ConfigurationError, FormatError, counted, nearest_names
+from foundation.secret_texts import MASK
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 T = TypeVar("T")
 
@@ -42,8 +49,8 @@ def _as_floats(value: Any) -> npt.NDArray[np.float64]:
     return np.asarray(value, dtype=np.float64)
 
 
+# A float64 array of any shape as nested lists; NaN is null in the file.
 FloatArray = Annotated[npt.NDArray[np.float64], PlainValidator(_as_floats), PlainSerializer(_as_lists)]
-"""A float64 array of any shape as nested lists; NaN is null in the file."""
 
 
 class Record(BaseModel):
@@ -98,15 +105,138 @@ def damaged(error: ValidationError, about: object, remedy: str) -> FormatError:
     )
 
 
-def known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterable[str]:
-    """Return the keys of the table that lies at a location of a model: names of tables, and places in lists."""
+def parse_toml(text: str, where: str) -> dict[str, Any]:
+    """Return the tables of a TOML text; `where` names it in errors."""
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ConfigurationError(
+            f"{where} is not TOML: {error}; correct that line: a text stands in quotation marks"
+        ) from error
+
+
+def list_mistakes(found: Collection[str]) -> str:
+    """Return one mistake after a space, several on lines of their own."""
+    lines = "".join(f"\n  {mistake}" for mistake in found)
+    return f" {next(iter(found))}" if len(found) == 1 else f" {len(found)} mistakes:{lines}"
+
+
+def find_mistakes(
+    model: type[BaseModel],
+    document: Mapping[str, Any],
+    error: ValidationError,
+    is_secret: Callable[[str], bool] = lambda key: False,
+    not_to_choose: str = "",
+) -> list[str]:
+    """Return each mistake in a settings file: key, value and what was expected.
+
+    `is_secret`: whether the value of a key is masked. `not_to_choose`: a word that is not named among the known ones.
+    """
+    errors = error.errors()
+    unknown = [one["loc"] for one in errors if one["type"] == "extra_forbidden"]
+    found: dict[str, str] = {}
+    for one in errors:
+        place, table = one["loc"], _table_at(model, one["loc"][:-1])
+        key, value = _key_of(place, document), one["input"]
+        if one["type"] == "extra_forbidden" and table is not None:
+            found[key] = unknown_key(key, table.model_fields)
+        elif one["type"] == "missing" and table is not None:
+            # A key that is misspelt is not missing as well.
+            near = (nearest_names(str(other[-1]), table.model_fields) for other in unknown if other[:-1] == place[:-1])
+            if f"did you mean {place[-1]!r}?" not in near:
+                found[key] = _missing(key, _table_at(model, place))
+        else:
+            expected = _expectation(key, one, is_secret(key), not_to_choose)
+            # A whole table is too long for a message.
+            shown = "" if isinstance(value, dict) else f" = {MASK if is_secret(key) else repr(value)}"
+            begin = f"{key}{shown}: " if key else ""
+            # A value that may be of several types has an error for each of them.
+            found[key] = f"{found[key]}, or {expected}" if key in found else f"{begin}{expected}"
+    return list(found.values())
+
+
+def _key_of(place: tuple[int | str, ...], document: Any) -> str:
+    """Return the key as it is in the file, without what pydantic adds.
+
+    It adds a number if a single value is read as a list, the type if there are several, and "[key]" if the key of a
+    table is wrong.
+    """
+    parts: list[str] = []
+    for part in place:
+        if part == "[key]" or not isinstance(document, list if isinstance(part, int) else dict):
+            break
+        parts.append(str(part))
+        # A key that is missing ends the place.
+        document = cast("Any", document)[part] if isinstance(part, int) or part in document else None
+    return ".".join(parts)
+
+
+def _missing(key: str, table: type[BaseModel] | None) -> str:
+    if table is None:
+        return f"{key} is missing; add it"
+    needed = [name for name, field in table.model_fields.items() if field.is_required()]
+    others = [name for name in table.model_fields if name not in needed]
+    may = f"; it may also have {', '.join(others)}" if others else ""
+    return f"the table [{key}] is missing; add it, with {', '.join(needed) or 'at least one key'}{may}"
+
+
+def _expectation(key: str, error: ErrorDetails, secret: bool = False, not_to_choose: str = "") -> str:
+    """Return what was expected of a key's value, in place of pydantic's words."""
+    value, limits = error["input"], error.get("ctx", {})
+    match error["type"]:
+        case "literal_error" | "enum":
+            known = [name for name in re.findall(r"'([^']+)'", error["msg"]) if name != not_to_choose]
+            return f"expected one of {', '.join(map(repr, known))}" if known else error["msg"]
+        case "tuple_type" | "list_type":
+            if isinstance(value, dict):
+                return f"a list of tables was expected: write [[{key}]]"
+            meant = f": [{json.dumps(value, ensure_ascii=False)}]" if isinstance(value, str) and not secret else ""
+            return f"a list was expected, in square brackets{meant}"
+        case "float_parsing" | "float_type" | "int_parsing" | "int_type" | "int_from_float":
+            what = "a whole number" if error["type"].startswith("int") else "a number"
+            unit = " of seconds" if key.endswith("_s") else ""
+            is_number = isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d+)?", value) and not secret
+            return f"{what}{unit} was expected{f', without quotation marks: {value}' if is_number else ''}"
+        case "bool_parsing" | "bool_type":
+            return "true or false was expected, without quotation marks"
+        case "string_type" | "path_type":
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            meant = f': "{MASK if secret else value}"' if is_number else ""
+            return f"a text was expected, in quotation marks{meant}"
+        case "model_type" | "dict_type":
+            return f"a table was expected, as in {key.rsplit('.', 1)[-1]} = {{ … }} or [{key}]"
+        case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal":
+            ((bound, limit),) = limits.items()
+            return f"a number {_BOUNDS[bound]} {limit:g} was expected"
+        case "too_short" | "string_too_short":
+            return f"at least {_length(value, limits['min_length'])} expected"
+        case "too_long" | "string_too_long":
+            return f"at most {_length(value, limits['max_length'])} expected"
+        case _:
+            return error["msg"].removeprefix("Value error, ")
+
+
+# What a number is to be, by the name of its bound in an error of pydantic.
+_BOUNDS: Final = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of at most"}
+
+
+def _length(value: Any, limit: int) -> str:
+    unit = "character" if isinstance(value, str) else "value"
+    return counted(limit, f"{unit} was", f"{unit}s were")
+
+
+def _table_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel] | None:
+    """Return the table at a location of a model: names of keys, and places in lists; None if no table is there."""
     for part in location:
         if isinstance(part, int):
             continue
         annotation = model.model_fields[part].annotation
         options = [option for option in (annotation, *getattr(annotation, "__args__", ())) if isinstance(option, type)]
-        model = next(option for option in options if issubclass(option, BaseModel))
-    return model.model_fields
+        table = next((option for option in options if issubclass(option, BaseModel)), None)
+        if table is None:
+            return None
+        model = table
+    return model
 
 
 def unknown_key(key: str, known: Iterable[str]) -> str:
@@ -131,4 +261,4 @@ def from_settings(
     except ValidationError as error:
         first = error.errors()[0]
         at = ".".join([key, *(str(part) for part in first["loc"][:1])])
-        raise ConfigurationError(f"{where}: {at}: {first['msg']}, got {first['input']!r}") from error
+        raise ConfigurationError(f"{where}: {at}: {_expectation(at, first)}, got {first['input']!r}") from error

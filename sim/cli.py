@@ -46,7 +46,7 @@ def projector(
     password: Annotated[str | None, typer.Option(help="PJLink password, at most 32 characters.")] = None,
     serial: Annotated[
         str | None,
-        option("LANGUAGE", "Language on a serial port: benq, epson, optoma, or a language file (.toml)."),
+        option("LANGUAGE", "Language on a serial port: a name (docs/devices.md), or a language file (.toml)."),
     ] = None,
     lit: Annotated[bool, typer.Option("--lit", help="Begin with the lamp burning, not in standby.")] = False,
     warm_up: Annotated[float, option("SECONDS", "Time to warm up.", min=0)] = 30.0,

@@ -15,11 +15,11 @@ from pydantic import Field
 from calibration.citation import OriginRecord
 from calibration.sampling import WINDOW, WINDOWS
 from experiment.chart.layout import design_chart
-from experiment.config import CameraSettings, CitationSettings, Settings, checked, parse_toml
+from experiment.config import CameraSettings, CitationSettings, Settings, checked
 from experiment.lights import plan_illuminations
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
-from foundation.records import from_settings
+from foundation.records import from_settings, parse_toml
 from sim.spectral import describe_sensitivities, read_sensitivities
 from sim.world.sensors import find_body
 from sim.world.world import Room

@@ -58,6 +58,7 @@ from foundation.errors import (
     DeviceError,
     DeviceFault,
     DeviceRefused,
+    InputError,
     LinkError,
     StorageError,
 )
@@ -371,15 +372,16 @@ def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
     for name, question in questions.items():
         try:
             question()
-        except (DeviceError, ConfigurationError) as fault:
+        except (DeviceError, InputError) as fault:
             faults[name] = fault
     if not faults:
         return
     if len(faults) == 1:
         ((name, fault),) = faults.items()
         raise fault_of(name, fault)
-    of_settings = all(isinstance(fault, ConfigurationError) for fault in faults.values())
-    kind = ConfigurationError if of_settings else DeviceError
+    # What the user wrote comes first: no device is used before it is corrected.
+    of_input = any(isinstance(fault, InputError) for fault in faults.values())
+    kind = ConfigurationError if of_input else DeviceError
     listed = "".join(f"\n  {name}: {fault}" for name, fault in faults.items())
     raise kind(f"{len(faults)} of {len(questions)} devices cannot be used:{listed}") from next(iter(faults.values()))
 

@@ -7,31 +7,27 @@ The languages that come with the suite lie in ``drivers/data/languages``; a user
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, cast
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from drivers.links.link import MessageParser, quoted
 from drivers.projector import FAULT_PARTS, Power
-from foundation.errors import ConfigurationError, ProtocolError
+from foundation.errors import ConfigurationError, ProtocolError, nearest_names
 from foundation.files import read_text
-from foundation.records import known_keys, unknown_key
+from foundation.records import find_mistakes, list_mistakes, parse_toml
 
-FOLDER: Final = Path(__file__).parents[1] / "data" / "languages"
-"""The languages that come with the suite, a file each."""
+FOLDER: Final = Path(__file__).parents[1] / "data" / "languages"  # The languages that come with the suite, a file each
 
-FILE_ENDING: Final = ".toml"
-"""What tells the path of a language file from the name of a language."""
+FILE_ENDING: Final = ".toml"  # What tells the path of a language file from the name of a language
 
+# The remedy against bytes that make no sense.
 CHECK_SPEED: Final = "check that speed and parity are those set in the projector's menu, and that its language is right"
-"""The remedy against bytes that make no sense."""
 
-_BLANK: Final = b"\r\n\0 "
-"""Bytes between two messages that mean nothing in any language."""
+_BLANK: Final = b"\r\n\0 "  # Bytes between two messages that mean nothing in any language
 
 _VALUE: Final = "{}"
 
@@ -48,12 +44,29 @@ def _with_value(text: str) -> str:
     return text
 
 
-def _as_list(given: Any) -> Any:
-    return [given] if isinstance(given, str) else given
+def _without_value(text: str) -> str:
+    if not text or _VALUE in text:
+        raise ValueError(f"a text without {_VALUE} was expected, as it is sent or received")
+    return text
+
+
+def _as_tuple(given: Any) -> Any:
+    if isinstance(given, str):
+        return (given,)
+    return tuple(cast("list[Any]", given)) if isinstance(given, list) else given
 
 
 def _in_capitals(table: dict[str, Any]) -> dict[str, Any]:
-    return {key.upper(): value for key, value in table.items()}
+    changed = {key.strip().upper(): value for key, value in table.items()}
+    if len(changed) < len(table):
+        raise ValueError("values that differ in more than capitals were expected")
+    return changed
+
+
+def _hexadecimal(text: str) -> str:
+    if not re.fullmatch(r"[0-9A-Fa-f]{2}", text):
+        raise ValueError('two hexadecimal digits were expected, as in "0A"')
+    return text.upper()
 
 
 def _fault_part(part: str) -> str:
@@ -62,20 +75,21 @@ def _fault_part(part: str) -> str:
     return part
 
 
-Words = Annotated[str, AfterValidator(_in_bytes)]
-"""A text that is sent or received."""
-Template = Annotated[Words, AfterValidator(_with_value)]
-"""A text that holds one value."""
-Templates = Annotated[tuple[Template, ...], BeforeValidator(_as_list), Field(min_length=1)]
-"""A text that holds one value, or several such texts of which any may come."""
-Part = Annotated[str, AfterValidator(_fault_part)]
-"""What is faulty, as `drivers.projector.Fault` calls it."""
+Words = Annotated[str, AfterValidator(_in_bytes)]  # A text that is sent or received
+PlainWords = Annotated[Words, AfterValidator(_without_value)]  # A text that holds no value, and is not empty
+Texts = Annotated[tuple[PlainWords, ...], BeforeValidator(_as_tuple)]  # Such a text, or a list of them
+Template = Annotated[Words, AfterValidator(_with_value)]  # A text that holds one value
+# A text that holds one value, or several such texts of which any may come.
+Templates = Annotated[tuple[Template, ...], BeforeValidator(_as_tuple), Field(min_length=1)]
+State = Annotated[Power, Field(strict=False)]  # A power state, by its name
+Hexadecimal = Annotated[str, AfterValidator(_hexadecimal)]  # A byte
+Part = Annotated[str, AfterValidator(_fault_part)]  # What is faulty, as `drivers.projector.Fault` calls it
 
 
 class _Table(BaseModel):
-    """A table of a language file: frozen, and an unknown key is an error."""
+    """A table of a language file: frozen, and an unknown key, or a text in place of a number, is an error."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True)
 
 
 class LineFormat(_Table):
@@ -84,12 +98,12 @@ class LineFormat(_Table):
     baud: Annotated[int, Field(ge=300)]
     """Speed as the projector leaves the factory; 8 data bits, no parity, 1 stop bit."""
     command: Template
-    """A command as it is sent; `{}` is its text."""
+    """A command as it is sent; `{}` is its text. What stands after `{}` ends the command."""
     answer: Template
     """An answer as it is received; `{}` is its text. What stands before `{}` may be missing."""
     ends: Annotated[Words, Field(min_length=1)]
     """Characters of which each ends an answer."""
-    unended: tuple[Words, ...] = ()
+    unended: Texts = ()
     """Answers that may come without such a character."""
     echo: bool = False
     """Whether the projector may repeat what it received before it answers."""
@@ -99,6 +113,27 @@ class LineFormat(_Table):
     """What is sent over a new connection before the first command, and is answered; empty for nothing."""
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 5.0
     """Longest time to an answer."""
+
+    @model_validator(mode="after")
+    def _ends_are_written(self) -> LineFormat:
+        if not self.command.partition(_VALUE)[2]:
+            raise ValueError(f"command = {self.command!r}: characters that end a command were expected after {_VALUE}")
+        begin, _, end = self.answer.partition(_VALUE)
+        blank = _BLANK.decode("ascii")
+        if not any(character in end for character in self.ends) or end.strip(blank) not in ("", *self.ends):
+            raise ValueError(
+                f"answer = {self.answer!r}: after {_VALUE} one of the characters of ends = {self.ends!r} was expected, "
+                "and no others"
+            )
+        self.require_received("answer", begin.strip(blank))
+        for text in self.unended:
+            self.require_received("unended", text)
+        return self
+
+    def require_received(self, key: str, text: str) -> None:
+        """Refuse a text that an answer cannot hold, since a character in it ends the answer."""
+        if any(character in text for character in self.ends):
+            raise ValueError(f"{key} has {text!r}: a text without the characters of line.ends was expected")
 
 
 class Handshake(_Table):
@@ -112,9 +147,9 @@ class Handshake(_Table):
     """Bytes of the answer."""
     state_at: Annotated[int, Field(ge=0, le=255)]
     """Position of the byte that holds the state."""
-    accepted: str
+    accepted: Hexadecimal
     """The state of a connection that is accepted, two hexadecimal digits."""
-    refusals: Annotated[dict[str, str], AfterValidator(_in_capitals)] = {}
+    refusals: Annotated[dict[Hexadecimal, str], AfterValidator(_in_capitals)] = {}
     """Other states, and what is wrong and what to do about it."""
 
     @model_validator(mode="after")
@@ -136,11 +171,11 @@ class Network(_Table):
 class Refusals(_Table):
     """Answers that refuse a command or a question."""
 
-    unknown: tuple[Words, ...] = ()
+    unknown: Texts = ()
     """The projector does not have it."""
-    busy: tuple[Words, ...] = ()
+    busy: Texts = ()
     """Not now. The power state is refused in this way only in warm-up and cooling."""
-    unclear: tuple[Words, ...] = ()
+    unclear: Texts = ()
     """Either of both; from a projector that is on, the former."""
 
     @model_validator(mode="after")
@@ -149,11 +184,16 @@ class Refusals(_Table):
             raise ValueError("at least one answer that refuses was expected, as unknown, busy or unclear")
         return self
 
+    @property
+    def all(self) -> tuple[str, ...]:
+        """All of them."""
+        return (*self.unknown, *self.busy, *self.unclear)
+
 
 class Question(_Table):
     """A question, and the answers that are understood."""
 
-    ask: Words
+    ask: PlainWords
     """The text of the question."""
     answer: Templates
     """The text of the answer."""
@@ -166,19 +206,30 @@ class TextQuestion(Question):
     """The name as it is reported."""
 
 
-class PowerWords(Question):
+class _Commands(_Table):
+    """Two commands for the two values of a setting."""
+
+    on: PlainWords
+    """Switches on, or hides the picture."""
+    off: PlainWords
+    """Switches off, or shows the picture."""
+    done: Words
+    """The answer to both. It may have a `{}`, the value of the new state; the driver takes any value for it."""
+
+    @model_validator(mode="after")
+    def _differ(self) -> _Commands:
+        if self.on.upper() == self.off.upper():
+            raise ValueError(f"on and off are both {self.on!r}: two commands were expected, none that toggles")
+        return self
+
+
+class PowerWords(_Commands, Question):
     """The power state."""
 
-    states: Annotated[dict[str, Power], AfterValidator(_in_capitals)]
+    states: Annotated[dict[str, State], AfterValidator(_in_capitals)]
     """What the values mean: on, standby, warm-up or cooling. A language may lack the last two."""
     stopped: Annotated[dict[str, str], AfterValidator(_in_capitals)] = {}
     """Values of a state that needs help, and what to do."""
-    on: Words
-    """Switches on."""
-    off: Words
-    """Switches off."""
-    done: Words
-    """What is answered to both; `{}` is the value of the state."""
     done_within_s: Annotated[float, Field(ge=0, le=600)] = 0.0
     """Longest time to that answer if it comes only when the lamp has struck, or gone out; 0: it comes at once."""
 
@@ -187,6 +238,8 @@ class PowerWords(Question):
         for needed in (Power.ON, Power.STANDBY):
             if needed not in self.states.values():
                 raise ValueError(f'a value for "{needed.value}" was expected among the states')
+        if both := self.states.keys() & self.stopped.keys():
+            raise ValueError(f"{', '.join(sorted(both))}: a value either of states or of stopped was expected")
         return self
 
     def value_of(self, power: Power) -> str | None:
@@ -194,23 +247,25 @@ class PowerWords(Question):
         return next((value for value, meaning in self.states.items() if meaning is power), None)
 
 
-class MuteWords(_Table):
+class MuteWords(_Commands):
     """The picture that is hidden, or shown."""
 
     ask: Words = ""
-    """The text of the question; empty if there is none, and what was set last counts."""
+    """The text of the question; empty if there is none, and what was set last counts. With it, `states` are needed."""
     answer: Templates = (_VALUE,)
     """The text of the answer."""
     states: Annotated[dict[str, bool], AfterValidator(_in_capitals)] = {}
     """What the values mean: true if the picture is hidden."""
-    on: Words
-    """Hides the picture."""
-    off: Words
-    """Shows the picture."""
-    done: Words
-    """What is answered to both; `{}` is the value of the state."""
     only_changes: bool = False
     """Whether a command that changes nothing may be refused, and is not sent."""
+
+    @model_validator(mode="after")
+    def _states_if_asked(self) -> MuteWords:
+        if self.ask and set(self.states.values()) != {True, False}:
+            raise ValueError("states with a value for true and one for false were expected, since ask is given")
+        if not self.ask and "answer" in self.model_fields_set:
+            raise ValueError("answer is given without ask: the question was expected, too")
+        return self
 
     def value_of(self, muted: bool) -> str:
         """Return the value of a state; empty if there is none."""
@@ -220,10 +275,19 @@ class MuteWords(_Table):
 class FaultWords(Question):
     """The faults; several are separated by spaces."""
 
-    healthy: Words
+    healthy: PlainWords
     """The value without a fault."""
-    parts: Annotated[dict[str, Part], AfterValidator(_in_capitals)]
+    parts: Annotated[dict[str, Part], AfterValidator(_in_capitals), Field(min_length=1)]
     """What the values mean; all others mean another part."""
+
+    @model_validator(mode="after")
+    def _single_words(self) -> FaultWords:
+        for value in (self.healthy, *self.parts):
+            if len(value.split()) != 1:
+                raise ValueError(f"{value!r}: one word was expected, since a space separates two faults")
+        if self.healthy.upper() in self.parts:
+            raise ValueError(f"healthy = {self.healthy!r}: a value that is none of the parts was expected")
+        return self
 
 
 class Unasked(_Table):
@@ -231,7 +295,7 @@ class Unasked(_Table):
 
     text: Words
     """The message; `{}` stands for anything."""
-    power: Power | None = None
+    power: State | None = None
     """The power state that begins."""
     fault: Part | None = None
     """The part that fails; it is reported until the lamp is struck again."""
@@ -253,7 +317,26 @@ class Language(_Table):
     lamp_hours: Question | None = None
     model: TextQuestion | None = None
     name: TextQuestion | None = None
-    unasked: tuple[Unasked, ...] = ()
+    unasked: Annotated[tuple[Unasked, ...], BeforeValidator(_as_tuple)] = ()
+
+    @model_validator(mode="after")
+    def _answers_arrive(self) -> Language:
+        named = ("power", "mute", "faults", "lamp_hours", "model", "name")
+        parts = {key: part for key in named if (part := getattr(self, key)) is not None}
+        answers = {f"{key}.answer": part.answer for key, part in parts.items()}
+        answers |= {f"{key}.done": (part.done,) for key, part in parts.items() if isinstance(part, _Commands)}
+        for key, texts in answers.items():
+            for text in texts:
+                self.line.require_received(key, text)
+                if text and refusal_in(self.refusals, text) is not None:
+                    raise ValueError(f"{key} = {text!r} is one of the refusals, too: another text was expected")
+                if any(value_in((message.text,), text) is not None for message in self.unasked):
+                    raise ValueError(f"{key} = {text!r} is one of the unasked messages, too: another text was expected")
+        others = {"refusals": self.refusals.all, "unasked": tuple(message.text for message in self.unasked)}
+        for key, texts in others.items():
+            for text in texts:
+                self.line.require_received(key, text)
+        return self
 
     @property
     def announces_power(self) -> bool:
@@ -275,9 +358,11 @@ def load_language(named: str) -> Language:
     """Return the language of a name, or of a file if `named` ends with ``.toml``."""
     if named.lower().endswith(FILE_ENDING):
         return _read_language(Path(named))
-    if named.lower() not in built_in_languages():
+    known = built_in_languages()
+    if named.lower() not in known:
+        hint = f"{near} " if (near := nearest_names(named, known)) else ""
         raise ConfigurationError(
-            f"no projector language {named!r}; expected {', '.join(built_in_languages())}, "
+            f"no projector language {named!r}; {hint}expected {', '.join(known)}, "
             f"or the path of a file that ends with {FILE_ENDING}"
         )
     return _read_language(FOLDER / f"{named.lower()}{FILE_ENDING}")
@@ -290,23 +375,12 @@ def _read_language(path: Path) -> Language:
 
 def parse_language(text: str, where: str) -> Language:
     """Return the language in a TOML text; `where` names it in errors."""
+    document = parse_toml(text, where)
     try:
-        return Language.model_validate(tomllib.loads(text))
+        return Language.model_validate(document)
     except ValidationError as error:
-        mistakes = "; ".join(_mistake(one["type"], one["loc"], one["msg"], one["input"]) for one in error.errors())
-        raise ConfigurationError(f"{where}: {mistakes}; see {FOLDER} for examples") from error
-    except (ValueError, RecursionError) as error:
-        raise ConfigurationError(f"{where} is not TOML: {error}; see {FOLDER} for examples") from error
-
-
-def _mistake(kind: str, place: tuple[int | str, ...], reason: str, given: Any) -> str:
-    key = ".".join(map(str, place))
-    if kind == "extra_forbidden":
-        return unknown_key(key, known_keys(Language, place[:-1]))
-    if kind == "missing":
-        return f"{key} is missing; add it"
-    value = "" if isinstance(given, dict) else f" = {given!r}"
-    return f"{key}{value}: {reason.removeprefix('Value error, ')}"
+        mistakes = list_mistakes(find_mistakes(Language, document, error))
+        raise ConfigurationError(f"{where}:{mistakes}; see {FOLDER} for examples") from error
 
 
 def encode_command(line: LineFormat, text: str) -> bytes:
@@ -386,8 +460,7 @@ def _pattern(template: str) -> re.Pattern[str]:
     return re.compile(re.escape(template).replace(re.escape(_VALUE), "(.*)"), re.IGNORECASE)
 
 
-Refusal = Literal["unknown", "busy", "unclear"]
-"""The kinds of `Refusals`."""
+Refusal = Literal["unknown", "busy", "unclear"]  # The kinds of `Refusals`
 
 
 def refusal_in(refusals: Refusals, text: str) -> Refusal | None:

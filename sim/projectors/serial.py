@@ -24,6 +24,8 @@ class LinePeer:
         self._network = network
         self._begin, end = (part.strip("\r\n") for part in language.line.command.split("{}"))
         self._end = end
+        # CR by all makers; a language may end its commands with another character.
+        self._last = language.line.command[-1:].encode("ascii")
         self._handshake = language.network.handshake if network and language.network is not None else None
         self._greeted = self._handshake is None
         self._heard = b""
@@ -52,8 +54,8 @@ class LinePeer:
         self._heard += data
         if not self._greeted:
             said += self._greet()
-        while self._greeted and self._switching_to is None and (end := self._heard.find(b"\r")) >= 0:
-            line = self._heard[:end].decode("ascii", "replace").strip()
+        while self._greeted and self._switching_to is None and (end := self._heard.find(self._last)) >= 0:
+            line = self._heard[: end + 1].decode("ascii", "replace").strip()
             self._heard = self._heard[end + 1 :]
             said += self._answered(line) + self._news()
         return said

@@ -102,6 +102,10 @@ def test_numbers_are_taken_up_to_their_limits(
         (MINIMAL + '[sequence]\npatience_s = "for ever"', 'a number of seconds was expected, or "forever"'),
         (MINIMAL + "[lab.projector]\npassword = 1234", 'password = …: a text was expected, in quotation marks: "…"'),
         (MINIMAL + "[lab.camera]\nserial = 1234", 'serial = 1234: a text was expected, in quotation marks: "1234"'),
+        (
+            MINIMAL + "[lab.light]\ndisplay = 1.5",
+            'display = 1.5: a text was expected, in quotation marks: "1.5", or a',
+        ),
         ("rig = ", "is not TOML"),
     ],
 )

@@ -30,6 +30,7 @@ from acquisition.run.devices import (
     RetryPolicy,
     RunEnd,
     RunWatch,
+    ask_all,
     await_health,
     health_fault,
     lamp_fate,
@@ -57,6 +58,7 @@ from foundation.errors import (
     DeviceError,
     DeviceFault,
     DeviceRefused,
+    InputError,
     LinkClosed,
     LinkTimeout,
     StorageError,
@@ -695,3 +697,19 @@ def test_what_hangs_is_named_while_it_hangs(
     # Of half a second the camera's own dark frame takes as much again.
     assert SETTINGS.camera.shutter_s == 0.5
     assert expected.items() >= {"expose": 1 + 3.0, "download": 10.0, "judge": 5.0, "show": 2.0}.items()
+
+
+@pytest.mark.parametrize("fault", [InputError("no such file"), ConfigurationError("line.baud is missing")])
+def test_what_the_user_wrote_decides_the_exit_code_and_all_faults_are_reported(fault: CropError) -> None:
+    def fails(error: CropError) -> Callable[[], object]:
+        def ask() -> None:
+            raise error
+
+        return ask
+
+    unplugged = LinkClosed("no camera on USB")
+    with pytest.raises(InputError) as told:
+        ask_all({"camera": fails(unplugged), "projector": fails(fault), "display": lambda: None})
+    assert told.value.exit_code == 2
+    assert str(unplugged) in str(told.value)
+    assert str(fault) in str(told.value)

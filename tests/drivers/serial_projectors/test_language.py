@@ -28,6 +28,8 @@ def test_languages_are_found_in_any_case_and_unknown_ones_name_the_known() -> No
     assert load_language("Epson") == EPSON
     with pytest.raises(ConfigurationError, match=f"'klingon'; expected {', '.join(built_in_languages())}, or "):
         load_language("klingon")
+    with pytest.raises(ConfigurationError, match="did you mean 'epson'"):
+        load_language("epsn")
 
 
 def test_speeds_and_ports_are_those_of_the_manuals() -> None:
@@ -69,6 +71,27 @@ def test_a_file_of_ones_own_is_read(tmp_path: Path) -> None:
         ("busy =", "bussy =", "unknown key 'refusals.bussy'; did you mean 'busy'?"),
         ("[mute]", "[mutes]", "unknown key 'mutes'; did you mean 'mute'?"),
         ("baud = 19200", "", "line.baud is missing; add it"),
+        ("baud = 19200", 'baud = "9600"', "line.baud = '9600': a whole number was expected"),
+        ("baud = 19200", "baud = 19200\necho = 'yes'", "line.echo = 'yes': true or false was expected"),
+        ('busy = ["BUSY"]', "busy = 5", "refusals.busy = 5: a list was expected"),
+        ('answer = "POWER {}"', 'answer = "POWER"', "power.answer = 'POWER': a text with {}"),
+        ('on = "POWER ON"', 'on = "POWER {}"', "power.on = 'POWER {}': a text without {}"),
+        ('off = "POWER OFF"', 'off = "Power On"', "power: on and off are both 'POWER ON'"),
+        ('done = "POWER {}"', 'done = "BUSY"', "power.done = 'BUSY' is one of the refusals"),
+        ("stopped = { HOT", "stopped = { Off", "power: OFF: a value either of states or of stopped"),
+        ("{ NO = true, YES = false }", "{ NO = true, no = false }", "mute.states: values that differ in more"),
+        ("states = { NO = true, YES = false }", "", "mute: states with a value for true and one for false"),
+        ("states = { NO = true, YES = false }", "states = { NO = true }", "mute: states with a value for true and"),
+        ('ask = "SHOW?"', "", "mute: answer is given without ask"),
+        ('healthy = "NONE"', 'healthy = "NO FAULT"', "faults: 'NO FAULT': one word was expected"),
+        ('healthy = "NONE"', 'healthy = "f"', "faults: healthy = 'f': a value that is none of the parts"),
+        ('{ F = "fan", L = "lamp", T = "temperature" }', "{}", "faults.parts: at least 1 value was expected"),
+        ('command = "@{}\\r\\n"', 'command = "@{}"', "line: command = '@{}': characters that end a command"),
+        ('ends = "\\r"', 'ends = "#"', "one of the characters of ends = '#' was expected"),
+        ('answer = "@{}\\r\\n"', 'answer = "@{}#\\r\\n"', "one of the characters of ends = '\\r' was expected"),
+        ('ends = "\\r"', 'ends = "S\\r"', "mute.answer has 'SHOW {}': a text without the characters of line.ends"),
+        ("[name]", '[[unasked]]\ntext = "{}"\n[name]', "power.answer = 'POWER {}' is one of the unasked messages"),
+        ("[name]", '[unasked]\ntext = "BYE"\n[name]', "unasked: a list of tables was expected: write [[unasked]]"),
         ("baud = 19200", "baud = 20", "line.baud = 20: "),
         ('HEATING = "warm-up"', 'HEATING = "warm"', "power.states.HEATING = 'warm': "),
         ('OFF = "standby"', 'OFF = "cooling"', 'power: a value for "standby" was expected'),
@@ -76,7 +99,6 @@ def test_a_file_of_ones_own_is_read(tmp_path: Path) -> None:
         ('F = "fan"', 'F = "fans"', f"faults.parts.F = 'fans': expected one of {', '.join(FAULT_PARTS)}"),
         ('on = "POWER ON"', 'on = "MARCHÉ"', "power.on = 'MARCHÉ': ASCII characters were expected"),
         ('busy = ["BUSY"]\nunknown = ["WHAT"]', "", "refusals: at least one answer that refuses was expected"),
-        ("baud = 19200", "baud = x", "is not TOML"),
     ],
 )
 def test_a_mistake_names_file_key_and_expectation(before: str, after: str, said: str) -> None:
@@ -86,6 +108,27 @@ def test_a_mistake_names_file_key_and_expectation(before: str, after: str, said:
     assert str(told.value).startswith("lantern.toml")
     assert said in str(told.value)
     assert "languages for examples" in str(told.value)
+    assert "mistakes" not in str(told.value), "one mistake is reported once"
+
+
+def test_a_missing_table_is_described_and_missing_quotation_marks_are_suggested() -> None:
+    begin, _, end = TEXT.partition("[mute]")
+    without_mute = begin + end[end.index("[faults]") :]
+    with pytest.raises(ConfigurationError, match=r"the table \[mute\] is missing; add it, with on, off, done"):
+        parse_language(without_mute, "lantern.toml")
+    with pytest.raises(ConfigurationError, match=r"is not TOML.*quotation marks"):
+        parse_language(TEXT.replace("baud = 19200", "baud = x"), "lantern.toml")
+
+
+def test_one_refusal_needs_no_list() -> None:
+    assert parse_language(TEXT.replace('["BUSY"]', '"BUSY"'), "lantern.toml") == MADE_UP
+
+
+@pytest.mark.parametrize("state", ['accepted = "2"', 'accepted = "20"\nrefusals = { 4g = "a bad request" }'])
+def test_a_state_that_is_no_byte_is_refused(state: str) -> None:
+    handshake = f'[network.handshake]\nsend = "hi"\nanswer_begins = "h"\nanswer_length = 2\nstate_at = 1\n{state}\n'
+    with pytest.raises(ConfigurationError, match="two hexadecimal digits"):
+        parse_language(TEXT.replace("[refusals]", f"{handshake}[refusals]"), "lantern.toml")
 
 
 def test_a_state_behind_the_end_of_the_answer_is_refused() -> None:
