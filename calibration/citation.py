@@ -39,7 +39,7 @@ _BYTES = 16  # Of the hash: 128 bits never meet by chance
 NOT_RECORDED: Final = "not recorded"  # What stands where a table does not say something
 
 # What stood at the end of the cables; see `experiment.config.LabSettings`.
-Rig = Literal["lab", "simulated", "replay", "imported"]
+Rig = Literal["lab", "simulated", "imported"]
 
 Line = Annotated[str, Field(max_length=500)]
 Text = Annotated[str, Field(max_length=20_000)]
@@ -89,7 +89,7 @@ def with_published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> 
 class OriginRecord(Record):
     """With what, when and by whom the frames of a table were taken.
 
-    - `rig`: ``lab``, ``simulated``, ``replay`` or ``imported``; None where the session does not say.
+    - `rig`: ``lab``, ``simulated`` or ``imported``; None where the session does not say.
     - `camera_serial`: serial number of the body, or its hash, as `camera_serial_is` says.
     - `camera_serial_is`: ``hash`` (`calibration.citation.serial_hash`), ``plain``, ``withheld`` by the
       lab's choice, or ``not stated`` by the raw files.
@@ -184,7 +184,6 @@ def _rig_text(rig: Rig | None) -> str | None:
     words = {
         "lab": "a laboratory",
         "simulated": "the simulated laboratory: nothing was photographed",
-        "replay": "a recorded session, served again",
         "imported": "a laboratory; its frames were imported",
     }
     return None if rig is None else words[rig]

@@ -263,13 +263,6 @@ class SimulatedSettings(Settings):
     """What goes wrong, by frame or time; see sim.world.disturbances. May change within a session, as luck does."""
 
 
-class ReplaySettings(Settings):
-    """A recorded session to be served again."""
-
-    session: Path
-    """Folder of the recorded session."""
-
-
 class CameraCable(Settings):
     """Where the camera of a real lab is found."""
 
@@ -333,9 +326,9 @@ class LabRig(Settings):
 class LabSettings(Settings):
     """Everything that LAB.toml says."""
 
-    rig: Literal["lab", "simulated", "replay", "imported"]
-    """What stands at the end of the cables: real devices, the simulated lab, or a recorded session; `imported` marks a
-    session whose frames were taken by other means."""
+    rig: Literal["lab", "simulated", "imported"]
+    """What stands at the end of the cables: real devices or the simulated lab; `imported` marks a session whose frames
+    were taken by other means."""
     chart: Path
     """chart.json of the print, relative to the settings file."""
     illuminations: Path
@@ -347,7 +340,6 @@ class LabSettings(Settings):
     judge: JudgeSettings = JudgeSettings()
     simulated: SimulatedSettings = SimulatedSettings()
     citation: CitationSettings = CitationSettings()
-    replay: ReplaySettings | None = None
     lab: LabRig = LabRig()
     _file: str = PrivateAttr(default="LAB.toml")
 
@@ -383,11 +375,7 @@ def load_lab(path: Path) -> LabSettings:
         str(path),
         folder,
     )
-    if settings.rig == "replay" and settings.replay is None:
-        raise ConfigurationError(f"{path}: rig = 'replay' needs [replay] with session = 'FOLDER' of the recording")
     changes: dict[str, Any] = {"chart": folder / settings.chart, "illuminations": folder / settings.illuminations}
-    if settings.replay is not None:
-        changes["replay"] = ReplaySettings(session=folder / settings.replay.session)
     language = settings.lab.projector.language
     if language is not None and language.lower().endswith(".toml"):
         projector = settings.lab.projector.model_copy(update={"language": str(folder / language)})

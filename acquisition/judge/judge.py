@@ -171,7 +171,7 @@ class LiveJudge:
         frame = Frame(measured, np.full(3, np.nan), UNKNOWN_PLACE)
         checks = [
             *_judge_origin(state, mosaic, measured, settings),
-            _judge_repeated(state, measured, settings),
+            _judge_repeated(state, measured),
             *_judge_exposure(state, measured, step, settings),
         ]
         if any(check.reason for check in checks):
@@ -314,11 +314,8 @@ def _judge_origin(
     )
 
 
-def _judge_repeated(state: JudgeState, measured: Measured, settings: LabSettings) -> Check:
+def _judge_repeated(state: JudgeState, measured: Measured) -> Check:
     """Return whether the camera gave a frame again that it gave before: its noise is the same."""
-    if settings.rig == "replay":
-        # A recording has one frame of a light, and gives it as often as it is asked.
-        return Check(REPEATED.name)
     reason = f"{REPEATED.why}; {REPEATED.remedy}"
     if measured.digest in state.digests:
         return Check(REPEATED.name, 0.0, REPEATED.accept, None, "", reason)

@@ -1,8 +1,7 @@
 """What is on a simulated camera's pictures, apart from how its body behaves, and the raw files that hold it.
 
 `sim.camera.eos` has settings, names and time; a `Film` makes the picture: the `World` as it is lit now (`WorldFilm`)
-or by a real screen (`WatchedFilm`), or the frames of a recorded session, byte for byte, in the order in which they were
-taken under each colour (`ReplayFilm`). Raw files are Adobe DNG 1.4, one uncompressed 16-bit mosaic of the whole sensor,
+or by a real screen (`WatchedFilm`). Raw files are Adobe DNG 1.4, one uncompressed 16-bit mosaic of the whole sensor,
 with what raw converters need to read it as a camera's own file; `Software` says that no camera took the picture.
 
 Sources: DNG 1.4 chapter 2 and 4, Exif 2.32 section 4.6.
@@ -11,13 +10,11 @@ Sources: DNG 1.4 chapter 2 and 4, Exif 2.32 section 4.6.
 from __future__ import annotations
 
 import itertools
-import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from fractions import Fraction
-from pathlib import Path
 from typing import BinaryIO, Protocol
 
 import numpy as np
@@ -28,69 +25,10 @@ from drivers.presenter import BLACK, Colour
 from drivers.raw.rawfile import camera_matrix
 from drivers.tiff import CFA, D65, Tags, TiffTag, ValueType, head, rationals, text
 from foundation.clock import OPENING
-from foundation.errors import DeviceError, DeviceRefused
+from foundation.errors import DeviceRefused
 from sim.world.disturbances import CALM, Disturbances, Moment
 from sim.world.sensors import Body
 from sim.world.world import UNDISTURBED, World
-
-
-@dataclass(frozen=True)
-class RecordedFrame:
-    """One raw file of a recording: under which colour, at which shutter time (0 if unknown) it was taken."""
-
-    colour: Colour
-    path: Path
-    shutter_s: float
-
-
-class ReplayFilm:
-    """Pictures from a recording; see `sim.camera.film.Film`."""
-
-    def __init__(
-        self, frames: Sequence[RecordedFrame], look: Callable[[], Colour], exposed: Mapping[Colour, int]
-    ) -> None:
-        self._frames: dict[Colour, list[RecordedFrame]] = {}
-        for frame in frames:
-            self._frames.setdefault(frame.colour, []).append(frame)
-        self._look = look
-        self._exposed = Counter(dict(exposed))
-        self._suffix = frames[0].path.suffix.lower()
-
-    @property
-    def suffix(self) -> str:
-        """Suffix of the recorded files."""
-        return self._suffix
-
-    def accept(self, settings: ExposureSettings) -> None:
-        """Refuse a shutter time that the recording was not taken with."""
-        times = {frame.shutter_s for frames in self._frames.values() for frame in frames if frame.shutter_s > 0}
-        if times and all(abs(settings.shutter_s - time) > 1e-6 * time for time in times):
-            known = ", ".join(f"{time:g} s" for time in sorted(times))
-            raise DeviceRefused(
-                f"the recording was taken with {known}, not with shutter_s = {settings.shutter_s:g}; "
-                "set camera.shutter_s in LAB.toml to the recording's"
-            )
-
-    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
-        """Hand out the next recorded file of the colour on the screen."""
-        del settings, released_at
-        colour = self._look()
-        frames = self._frames.get(colour, [])
-        number = self._exposed[colour]
-        if number >= len(frames):
-            codes = tuple(colour)
-            raise DeviceRefused(
-                f"the recording has {len(frames)} frames under the colour {codes}, frame {number + 1} was asked for; "
-                "replay it with the illuminations and sequence settings it was taken with"
-            )
-        path = frames[number].path
-        try:
-            with path.open("rb") as recorded:
-                shutil.copyfileobj(recorded, into, 1 << 20)
-        except FileNotFoundError as error:
-            raise DeviceError(f"the recording lacks {path}; restore the file") from error
-        self._exposed[colour] += 1
-
 
 SOFTWARE = "CroP simulated camera"
 

@@ -1,4 +1,4 @@
-"""A session is taken, interrupted anywhere, taken up again, replayed and imported; its frames stay the same."""
+"""A session is taken, interrupted anywhere, taken up again and imported; its frames stay the same."""
 
 from __future__ import annotations
 
@@ -88,14 +88,6 @@ def test_ctrl_c_at_every_frame_ends_in_the_same_frames(lab: Path, undisturbed: P
         except KeyboardInterrupt:
             continue
     assert frame_hashes(interrupted) == frame_hashes(undisturbed)
-
-
-def test_a_replayed_session_has_the_same_bytes(lab: Path, session: Path, frame_hashes: Hashes) -> None:
-    replayed = lab.parent / "replayed"
-    text = lab.read_text().replace('"simulated"', '"replay"')
-    lab.write_text(text + '[replay]\nsession = "session"\n')
-    assert run("run", lab, replayed) == 0
-    assert frame_hashes(replayed) == frame_hashes(session)
 
 
 @pytest.mark.parametrize(("text", "said"), [(None, "No such file"), ("garbage", "expected lights under the columns")])
@@ -228,15 +220,6 @@ def test_a_journal_that_another_program_holds_is_waited_for_as_long_as_the_setti
         run_session(load_lab(lab), folder, hold)
     others[0].close()
     assert run_session(load_lab(lab), folder, lambda done, total: None).complete
-
-
-def test_a_replay_with_another_exposure_is_told_the_recordings(
-    lab: Path, session: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = lab.read_text().replace('"simulated"', '"replay"')
-    lab.write_text(text + '[replay]\nsession = "session"\n[camera]\nshutter_s = 1.0\n')
-    assert run("run", lab, lab.parent / "replayed") == 3
-    assert "was taken with 0.5 s" in capsys.readouterr().err
 
 
 def test_a_series_longer_than_a_battery_lasts(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:

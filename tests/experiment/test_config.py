@@ -23,10 +23,8 @@ MINIMAL = 'rig = "simulated"\nchart = "c/chart.json"\nilluminations = "lights.cs
 
 def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     lab = tmp_path / "LAB.toml"
-    lab.write_text(MINIMAL + '[replay]\nsession = "recorded/"\n')
+    lab.write_text(MINIMAL)
     settings = load_lab(lab)
-    assert settings.replay is not None
-    assert settings.replay.session == tmp_path.resolve() / "recorded"
     assert settings.chart == tmp_path.resolve() / "c/chart.json"
     assert settings.illuminations == tmp_path.resolve() / "lights.csv"
 
@@ -34,11 +32,9 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
 def test_keys_that_are_left_out_have_the_value_that_the_documentation_shows() -> None:
     text = (Path(__file__).parents[2] / "docs/lab.md").read_text(encoding="utf-8").split("```")[1].removeprefix("toml")
     top, *sections = text.split("\n[")
-    assert len(sections) == 13
+    assert len(sections) == 12
     for section in sections:
         name = section.partition("]")[0]
-        if name == "replay":
-            continue
         if name not in ("simulated.room", "simulated.camera"):
             assert parse_lab(f"{top}\n[{section}", "LAB.toml") == parse_lab(top, "LAB.toml"), name
             # What is left out of the list has no value.
@@ -92,7 +88,7 @@ def test_numbers_are_taken_up_to_their_limits(
         (MINIMAL + "[sequence]\npatience_s = nan\n", "sequence.patience_s = nan"),
         (MINIMAL + "[sequence]\norder = 'random'\n", "sequence.order = 'random'"),
         (MINIMAL.replace('chart = "c/chart.json"\n', ""), "chart is missing"),
-        (MINIMAL.replace("simulated", "labor"), "expected one of 'lab', 'simulated', 'replay'"),
+        (MINIMAL.replace("simulated", "labor"), "expected one of 'lab', 'simulated'"),
         (MINIMAL + "[citation]\nauthors = 'Ban, N.'\n", 'in square brackets: ["Ban, N."]'),
         (MINIMAL + "[lab.projector]\nhost = '/dev/ttyUSB0'\n", "a serial port, which is given as device"),
         (MINIMAL + "[lab.camera]\nhost = 'http://1.2.3.4/'\n", "without http://"),
@@ -200,13 +196,6 @@ def test_a_folder_of_a_lab_is_answered_with_its_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError) as told:
         load_lab(tmp_path)
     assert told.value.remedy == f"name {tmp_path / 'LAB.toml'}"
-
-
-def test_replay_needs_a_recording(tmp_path: Path) -> None:
-    lab = tmp_path / "LAB.toml"
-    lab.write_text(MINIMAL.replace("simulated", "replay"))
-    with pytest.raises(ConfigurationError):
-        load_lab(lab)
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

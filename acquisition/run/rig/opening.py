@@ -1,7 +1,6 @@
 """Open the rig that the settings name, and close it whatever happens.
 
-`rig = "lab"` opens the devices that LAB.toml names, `rig = "simulated"` builds the simulated lab, `rig = "replay"` puts
-a recorded session into the same simulated camera.
+`rig = "lab"` opens the devices that LAB.toml names, `rig = "simulated"` builds the simulated lab.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ def open_rig(
 
 def known_frame_bytes(settings: LabSettings) -> int | None:
     """Return the size of the raw files of a simulated rig, bytes; None where a real camera decides it."""
-    if settings.rig not in ("simulated", "replay"):
+    if settings.rig != "simulated":
         return None
     from acquisition.run.rig.simulated import simulated_frame_bytes
 

@@ -23,11 +23,11 @@ from experiment.config import LabSettings
 from experiment.session.folder import Session
 from experiment.session.records import last_moment
 from foundation.clock import OPENING, SimulatedClock
-from foundation.errors import ConfigurationError, FormatError
+from foundation.errors import ConfigurationError
 from sim.buses.usb import MemoryTransport
 from sim.camera.bodies import EOS_BODIES
 from sim.camera.eos import SimulatedEos
-from sim.camera.film import Film, RecordedFrame, ReplayFilm, WorldFilm
+from sim.camera.film import WorldFilm
 from sim.projectors.pjlink import PjLinkPeer
 from sim.projectors.projector import Screen, SimulatedPresenter, SimulatedProjector
 from sim.spectral import known_sensitivities
@@ -40,7 +40,7 @@ SERIAL = "0000000001"  # Serial number of the simulated body, on its wire and in
 
 
 def open_simulated(settings: LabSettings, chart: Chart, session: Session | None, opened: ExitStack) -> Devices:
-    """Build the simulated lab, or put a recorded session into its camera.
+    """Build the simulated lab.
 
     `session`: the session that is taken up; None for a check that records nothing.
     """
@@ -51,14 +51,9 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     screen = Screen()
     simulated = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)
     sensor = simulated_body(settings)
-    if settings.rig == "simulated":
-        world = World(sheet(chart), sensor, simulated_room(settings))
-        events = read_disturbances(settings.simulated.events, settings.file)
-        film: Film = WorldFilm(world, lambda: screen.colour, simulated.light, SERIAL, exposed, events, before)
-    else:
-        assert settings.replay is not None
-        film = ReplayFilm(_recording(settings.replay.session), lambda: screen.colour, exposed)
-        film.accept(settings.camera.exposure)
+    world = World(sheet(chart), sensor, simulated_room(settings))
+    events = read_disturbances(settings.simulated.events, settings.file)
+    film = WorldFilm(world, lambda: screen.colour, simulated.light, SERIAL, exposed, events, before)
     # On mains power, as a camera that takes 707 frames is.
     # A body of sensitivities alone speaks as an EOS 550D does: only what its sensor sees is its own.
     spoken = EOS_BODIES.get(settings.simulated.body, EOS_BODIES["EOS 550D"])
@@ -92,9 +87,7 @@ def simulated_body(settings: LabSettings) -> Body:
 
 
 def simulated_frame_bytes(settings: LabSettings) -> int:
-    """Return the size of a raw file that the simulated camera writes: 16 bits a photosite, or the largest recorded."""
-    if settings.replay is not None and settings.rig == "replay":
-        return max(frame.path.stat().st_size for frame in _recording(settings.replay.session))
+    """Return the size of a raw file that the simulated camera writes: 16 bits a photosite."""
     rows, columns = simulated_body(settings).sensor
     return 2 * rows * columns
 
@@ -114,15 +107,3 @@ def _taken_before(session: Session | None) -> list[tuple[float, Colour]]:
         for attempt in session.journal.attempts()
         if attempt.has_frame
     ]
-
-
-def _recording(folder: Path) -> list[RecordedFrame]:
-    with Session.open(folder) as recording:
-        colours = {step.number: step.colour for step in recording.steps}
-        shown = {attempt.file: colours[attempt.step] for attempt in recording.journal.attempts()}
-        frames = [
-            RecordedFrame(shown[frame.file], folder / frame.file, frame.exposure_s) for frame in recording.frames()
-        ]
-    if not frames:
-        raise FormatError(f"{folder} holds no frames; name a session in which some were taken")
-    return frames
