@@ -1,13 +1,14 @@
 """Check a rig before the session: devices asked, an exposure suggested, trial frames judged as a table is.
 
-Takes some 20 frames; records nothing. The lamp is switched on if it was off, and stays on, which is said; a muted
-picture is shown.
+Takes some 25 frames into a hidden folder beside LAB.toml, which is removed at the end; records nothing. The lamp is
+switched on if it was off, and stays on, which is said; a muted picture is shown.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,8 +31,8 @@ from acquisition.check.findings import CheckReport, Finding, judged, not_checked
 from acquisition.check.picture import check_png
 from acquisition.check.supplies import judge_disk, judge_noise_reduction, judge_supplies
 from acquisition.check.trial import (
+    PRIMARIES,
     Trial,
-    at_settings,
     measure_trial,
     series_times,
     take_trial,
@@ -40,13 +41,13 @@ from acquisition.check.trial import (
 )
 from acquisition.judge.measure import Anchor, disagreement, refusal
 from acquisition.run.devices import Devices, RetryPolicy, ask_all, make_ready, period_s, reported_error
-from acquisition.run.plan import planned_steps, settings_doubts
+from acquisition.run.plan import bytes_text, free_bytes_at, planned_steps, settings_doubts
 from acquisition.run.rig.opening import open_rig
 from calibration.figures.light import LEAK_SHARE
 from calibration.figures.single_frames import EVENNESS, KEYSTONE, TURN
 from calibration.figures.truth import BRIGHTEST_SHARE
 from calibration.measurements import TableMeasurements
-from calibration.verdict import JudgedValue, Verdict, detail_and_remedy, explain, places_text
+from calibration.verdict import JudgedValue, detail_and_remedy, explain, places_text
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE, Colour, ReportsWarnings
 from drivers.projector import Power, Projector, Severity
@@ -60,7 +61,7 @@ from experiment.measures.exposure import measure_exposure
 from experiment.measures.paper import falloff
 from experiment.measures.pose import keystone, off_level_deg
 from experiment.session.folder import Session
-from foundation.errors import DeviceError, RegistrationError, counted
+from foundation.errors import DeviceError, RegistrationError, StorageError, counted
 from foundation.files import write_whole
 
 # White at the settings' shutter time, of saturation, at which trial frames are taken so; else with a better time.
@@ -108,19 +109,24 @@ def check_lab(
     recorded = settings.rig == "replay"
     frames = len(planned_steps(settings, lights))
     lines = [f"lights      {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} of a session"]
-    with tempfile.TemporaryDirectory() as name:
-        scratch = Path(name)
-        shown = trial_lights(lights)
-        steps = trial_steps(shown, recorded)
+    beside = Path(settings.file).parent
+    with _scratch_folder(beside) as scratch:
         with open_rig(settings, chart) as devices:
             described, screen = _make_devices_ready(devices, settings, announce)
             camera = Photographer(devices, settings, scratch)
-            found = _find_exposure(camera, settings, chart, devices.camera.shutter_speeds(), corners, announce)
+            found = _find_exposure(camera, settings, chart, devices.camera.shutter_speeds(), announce)
             announce("taking trial frames: white, dark, primaries, grey")
-            taken = Session.create(scratch / "trial", settings.to_toml(), chart, shown, steps)
             series = scratch / "series" if linearity and not recorded else None
             best = best_of(found.trials)
             series_s = series_times(found.times_s, best.shutter_s, best.highest) if series else ()
+            primaries = np.eye(3)
+            if not recorded:
+                shots = [camera.take(colour, found.used_s) for colour in PRIMARIES.values()]
+                primaries = np.array([shot.brightest(99.0) for shot in shots])
+            shown = trial_lights(lights, primaries)
+            steps = trial_steps(shown, recorded)
+            _require_space(beside, (len(steps) + len(series_s)) * found.first.size)
+            taken = Session.create(scratch / "trial", settings.to_toml(), chart, shown, steps)
             (scratch / "series").mkdir()
             take_trial(camera, taken, found.used_s, series_s, scratch / "series")
             camera.restore()
@@ -133,24 +139,40 @@ def check_lab(
         lines.append(
             f"frames      taken at {found.used_s:.4g} s, since white is clipped or dark as the settings have it"
         )
-    verdict = at_settings(trial.verdict, found.trials[0].highest, found.first.shutter_s / found.used_s)
     findings = [
         *_exposure_findings(found, settings, recorded),
-        *_figure_findings(verdict, trial, settings),
+        *_figure_findings(trial, settings),
         *_pose_and_light(trial, chart),
         judge_noise_reduction(camera.timings),
         *_linearity_findings(trial, linearity, recorded),
         *screen,
         *(Finding("settings", "remark", doubt) for doubt in settings_doubts(settings)),
-        judge_disk(Path(settings.file).parent, frames, found.first.size),
+        judge_disk(beside, frames, found.first.size),
         *supplies,
     ]
-    values = {row.figure.name: row.value for row in verdict.rows}
-    outcome = None if trial.table is None else verdict.outcome
-    report = CheckReport(tuple(lines), tuple(findings), outcome, values, trial.not_known)
+    values = {row.figure.name: row.value for row in trial.verdict.rows}
+    first_s = found.used_s if found.used_s != found.first.shutter_s else None
+    outcome = None if trial.table is None or first_s is not None else trial.verdict.outcome
+    report = CheckReport(tuple(lines), tuple(findings), outcome, values, trial.not_known, first_s)
     if picture is not None:
         write_whole(picture, check_png(trial, chart, report))
     return report
+
+
+@contextmanager
+def _scratch_folder(beside: Path) -> Generator[Path]:
+    """Yield a hidden folder in another, which is removed at the end: the memory of /tmp may be too small for frames."""
+    free_bytes_at(beside)
+    with tempfile.TemporaryDirectory(prefix=".check.", dir=beside) as name:
+        yield Path(name)
+
+
+def _require_space(folder: Path, needed: int) -> None:
+    if (free := free_bytes_at(folder)) < needed:
+        raise StorageError(
+            f"{bytes_text(free)} free at {folder}, {bytes_text(needed, up=True)} needed for the frames of a check; "
+            "free as much"
+        )
 
 
 def _find_exposure(
@@ -158,7 +180,6 @@ def _find_exposure(
     settings: LabSettings,
     chart: Chart,
     offered_s: Sequence[float],
-    corners: Corners | None,
     announce: Callable[[str], None],
 ) -> FoundExposure:
     """Return how bright white is at the shutter times that were tried until one suits."""
@@ -166,20 +187,20 @@ def _find_exposure(
     if settings.rig == "replay":
         stated, counts = float(first.mosaic.white_level), float(first.mosaic.saturation())
         saturation = Saturation(counts, counts < stated, stated)
-        return FoundExposure(first, (level_of(first, saturation, _paper(first, chart, corners)),), (), saturation)
+        return FoundExposure(first, (level_of(first, saturation, _paper(first, chart)),), (), saturation)
     # A time that the body does not list was taken all the same, so it counts among them.
     times = fitting_times(sorted({*offered_s, settings.camera.shutter_s}) if offered_s else (), period_s(settings))
     announce("measuring the sensor's saturation: frames of white, longer and longer")
     saturation = measure_saturation(first, lambda seconds: camera.take(WHITE, seconds), times)
 
     def level(shot: Shot) -> TriedTime:
-        return level_of(shot, saturation, _paper(shot, chart, corners))
+        return level_of(shot, saturation, _paper(shot, chart))
 
     trials = search(level(first), lambda seconds: level(camera.take(WHITE, seconds)), times)
     return FoundExposure(first, trials, tuple(times), saturation)
 
 
-def _paper(shot: Shot, chart: Chart, corners: Corners | None) -> _Array | None:
+def _paper(shot: Shot, chart: Chart) -> _Array | None:
     """Return (3,) counts above black of bare paper, as the live judge measures it; None if the chart is not found."""
     if not chart.tags:
         return None
@@ -209,20 +230,27 @@ def _exposure_findings(found: FoundExposure, settings: LabSettings, recorded: bo
     return findings
 
 
-def _figure_findings(verdict: Verdict, trial: Trial, settings: LabSettings) -> list[Finding]:
+def _figure_findings(trial: Trial, settings: LabSettings) -> list[Finding]:
     if trial.table is None:
         return [Finding("chart", "fault", trial.trouble), not_checked("figures", "the chart cannot be measured")]
     table = trial.table
-    rows = [row for row in verdict.rows if row.figure is not BRIGHTEST_SHARE]
+    rows = [row for row in trial.verdict.rows if row.figure is not BRIGHTEST_SHARE]
     findings = [_figure_finding(row, table) for row in rows]
-    dark = settings.judge.dark_percent / 100
+    value, allowed = trial.dark_percent, settings.judge.dark_percent
+    if value <= allowed:
+        return findings
     # The run refuses dark frames earlier than a table is refused.
-    return [
-        replace(one, grade="fault", tolerable=(None, dark))
-        if one.name == LEAK_SHARE.name and (one.value or 0.0) > dark
-        else one
-        for one in findings
-    ]
+    fault = Finding(
+        LEAK_SHARE.name,
+        "fault",
+        f"the dark frame has {value:.1f} % of white, in the mean or in some places",
+        value / 100,
+        LEAK_SHARE.unit,
+        tolerable=(None, allowed / 100),
+        reason=f"judge.dark_percent allows {allowed:g} %: a run refuses the frame",
+        remedy=LEAK_SHARE.remedy,
+    )
+    return [*(one for one in findings if one.name != LEAK_SHARE.name), fault]
 
 
 def _figure_finding(row: JudgedValue, table: TableMeasurements) -> Finding:

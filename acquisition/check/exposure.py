@@ -114,10 +114,6 @@ PROPORTIONAL = 0.9
 # Share of the stated range from which on counts may be saturation: noise in the dark is not proportional either.
 LEAST_RANGE = 0.25
 
-# White's share of saturation at which what is not the exposure's matter is judged well enough; else it is judged at a
-# better time.
-USABLE = (0.3, 0.9)
-
 _Array = npt.NDArray[np.float64]
 
 

@@ -56,9 +56,10 @@ class CheckReport:
     - `devices`: what answered, a line each, and what was done with it.
     - `findings`: in the order in which they were looked at.
     - `forecast`: what `build-lut` would say, as far as these frames show it: "accept", "accept with remarks" or
-      "refuse"; None where the chart was not found.
+      "refuse"; None where the chart was not found, or the exposure of the settings is not that of the frames.
     - `figures`: the table's figures that are known, by their names in `report.json`.
     - `not_known`: the names of those that are known only when there are frames of a session.
+    - `first_s`: the shutter time to set before anything is forecast, at which the figures hold; None if it is set.
     """
 
     devices: tuple[str, ...]
@@ -66,6 +67,7 @@ class CheckReport:
     forecast: Outcome | None = None
     figures: Mapping[str, float] = field(default_factory=dict[str, float])
     not_known: tuple[str, ...] = ()
+    first_s: float | None = None
 
     def of(self, grade: Grade) -> tuple[Finding, ...]:
         """Return the findings of one grade."""
@@ -81,22 +83,30 @@ class CheckReport:
         return *self.devices, *described, *self._forecast_lines()
 
     def _forecast_lines(self) -> list[str]:
-        if self.forecast is None:
+        if not self.figures:
             return []
         names = ", ".join(name.replace("_", " ") for name in self.not_known)
+        said = f"build-lut would say {self.forecast!r} by the {len(self.figures)} figures known now"
+        if self.first_s is not None:
+            said = f"set camera.shutter_s to {self.first_s:.4g} first; these figures hold for {self.first_s:.4g} s"
         return [
-            f"table       build-lut would say {self.forecast!r} by the {len(self.figures)} figures known now",
+            f"table       {said}",
             f"            not known before the session: {names}",
         ]
 
     def values(self) -> dict[str, Any]:
         """Return the report for programs: `devices`, `faults` (their number), `findings`, `table`."""
-        table = {"outcome": self.forecast, "figures": self.figures, "not_known": self.not_known}
+        table = {
+            "outcome": self.forecast,
+            "shutter_s": self.first_s,
+            "figures": self.figures,
+            "not_known": self.not_known,
+        }
         return {
             "devices": self.devices,
             "faults": len(self.of("fault")),
             "findings": self.findings,
-            "table": None if self.forecast is None else table,
+            "table": table if self.figures else None,
         }
 
 

@@ -41,7 +41,7 @@ def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:
     if trial.table is None:
         for axes in places:
             axes.axis("off")
-            axes.text(0.5, 0.5, "not measured: the chart was not found", ha="center", color="0.4")
+            axes.text(0.5, 0.5, "not measured: see the fault of the chart", ha="center", color="0.4")
     else:
         _draw_light(places[0], trial.table, chart)
         _draw_sharpness(places[1], trial.table, chart)
