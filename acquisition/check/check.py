@@ -7,8 +7,7 @@ switched on if it was off, and stays on, which is said; a muted picture is shown
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -41,7 +40,7 @@ from acquisition.check.trial import (
 )
 from acquisition.judge.measure import Anchor, disagreement, refusal
 from acquisition.run.devices import Devices, RetryPolicy, ask_all, make_ready, period_s, reported_error
-from acquisition.run.plan import bytes_text, free_bytes_at, planned_steps, settings_doubts
+from acquisition.run.plan import bytes_text, free_bytes_at, planned_steps, projector_state, settings_doubts
 from acquisition.run.rig.opening import open_rig
 from calibration.figures.light import LEAK_SHARE
 from calibration.figures.single_frames import EVENNESS, KEYSTONE, TURN
@@ -50,7 +49,7 @@ from calibration.measurements import TableMeasurements
 from calibration.verdict import JudgedValue, detail_and_remedy, explain, places_text
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE, Colour, ReportsWarnings
-from drivers.projector import Power, Projector, Severity
+from drivers.projector import Projector, Severity
 from drivers.raw.rawfile import frame_black, phases
 from experiment.chart.model import Chart, load_chart
 from experiment.config import LabSettings
@@ -61,7 +60,7 @@ from experiment.measures.exposure import measure_exposure
 from experiment.measures.paper import falloff
 from experiment.measures.pose import keystone, off_level_deg
 from experiment.session.folder import Session
-from foundation.errors import DeviceError, RegistrationError, StorageError, counted
+from foundation.errors import RegistrationError, StorageError, counted
 from foundation.files import write_whole
 
 # White at the settings' shutter time, of saturation, at which trial frames are taken so; else with a better time.
@@ -110,7 +109,10 @@ def check_lab(
     frames = len(planned_steps(settings, lights))
     lines = [f"lights      {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} of a session"]
     beside = Path(settings.file).parent
-    with _scratch_folder(beside) as scratch:
+    free_bytes_at(beside)
+    # Not in /tmp, which may be in memory: the frames are 0.4 to 0.7 GB.
+    with tempfile.TemporaryDirectory(prefix=".check.", dir=beside) as name:
+        scratch = Path(name)
         with open_rig(settings, chart) as devices:
             described, screen = _make_devices_ready(devices, settings, announce)
             camera = Photographer(devices, settings, scratch)
@@ -157,14 +159,6 @@ def check_lab(
     if picture is not None:
         write_whole(picture, check_png(trial, chart, report))
     return report
-
-
-@contextmanager
-def _scratch_folder(beside: Path) -> Generator[Path]:
-    """Yield a hidden folder in another, which is removed at the end: the memory of /tmp may be too small for frames."""
-    free_bytes_at(beside)
-    with tempfile.TemporaryDirectory(prefix=".check.", dir=beside) as name:
-        yield Path(name)
 
 
 def _require_space(folder: Path, needed: int) -> None:
@@ -314,14 +308,12 @@ def _make_devices_ready(
     if projector is None:
         lines.append("projector   not under control: see to its lamp yourself")
         return lines, findings
-    before = _state(projector)
+    state, _ = projector_state(projector)
     patience = RetryPolicy(
         devices.clock, 0, lambda what, sentence: announce(f"{what}: {sentence}"), lambda: keep_awake(devices.camera)
     )
     make_ready(projector, settings.sequence, patience)
-    identity = projector.identity()
-    hours = ", ".join(f"{lamp.hours} h" for lamp in projector.lamps()) or "no lamp"
-    lines.append(f"projector   {identity.maker} {identity.model} {identity.name}, {hours}; {before}")
+    lines.append(f"projector   {state}; it stays on when the check is over")
     parts = [fault.part for fault in projector.faults() if fault.severity is Severity.WARNING]
     if parts:
         said = f"the projector warns of its {', '.join(parts)}"
@@ -332,12 +324,3 @@ def _make_devices_ready(
 def _require_sound(projector: Projector) -> None:
     if (fault := reported_error(projector)) is not None:
         raise fault
-
-
-def _state(projector: Projector) -> str:
-    try:
-        if projector.power() is not Power.ON:
-            return "its lamp was off; it is switched on, and stays on when the check is over"
-        return "it was muted, and shows its picture now" if projector.muted() else "its lamp was on, and stays on"
-    except DeviceError:
-        return "it is switched on, and stays on"

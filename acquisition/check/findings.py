@@ -48,6 +48,10 @@ class Finding:
         why = f" ({self.reason})" if self.reason else ""
         return f"{self.said}{why}{f'; {self.remedy}' if self.remedy else ''}"
 
+    def line(self) -> str:
+        """Return grade, name and sentence, in columns."""
+        return f"{self.grade:<12}{self.name:<24}{self.sentence()}"
+
 
 @dataclass(frozen=True)
 class CheckReport:
@@ -69,18 +73,17 @@ class CheckReport:
     not_known: tuple[str, ...] = ()
     first_s: float | None = None
 
+    def sorted(self) -> list[Finding]:
+        """Return the findings by their grades, faults first."""
+        return [finding for grade in GRADES for finding in self.of(grade)]
+
     def of(self, grade: Grade) -> tuple[Finding, ...]:
         """Return the findings of one grade."""
         return tuple(finding for finding in self.findings if finding.grade == grade)
 
     def lines(self) -> tuple[str, ...]:
         """Return the report as lines for a terminal: devices, then findings, faults first."""
-        described = [
-            f"{finding.grade:<12}{finding.name:<24}{finding.sentence()}"
-            for grade in GRADES
-            for finding in self.of(grade)
-        ]
-        return *self.devices, *described, *self._forecast_lines()
+        return *self.devices, *(finding.line() for finding in self.sorted()), *self._forecast_lines()
 
     def _forecast_lines(self) -> list[str]:
         if not self.figures:

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from acquisition.check.findings import GRADES, CheckReport
+from acquisition.check.findings import CheckReport
 from acquisition.check.trial import Trial
 from calibration.measurements import TableMeasurements
 from experiment.chart.model import Chart
@@ -60,11 +60,8 @@ def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:
 
 def _verdict_lines(report: CheckReport) -> list[tuple[str, str]]:
     lines: list[tuple[str, str]] = []
-    for grade in GRADES:
-        for finding in report.of(grade):
-            text = f"{grade:<12}{finding.name:<24}{finding.sentence()}"
-            wrapped = textwrap.wrap(text, _LINE, subsequent_indent=36 * " ") or [text]
-            lines += [(line, grade) for line in wrapped]
+    for finding in report.sorted():
+        lines += [(line, finding.grade) for line in textwrap.wrap(finding.line(), _LINE, subsequent_indent=36 * " ")]
     return lines
 
 
