@@ -26,7 +26,7 @@ from acquisition.check.exposure import (
     measure_saturation,
     search,
 )
-from acquisition.check.findings import CheckReport, Finding, judged, not_checked, not_checked_all
+from acquisition.check.findings import CheckReport, Finding, judged, not_checked
 from acquisition.check.picture import check_png
 from acquisition.check.supplies import judge_disk, judge_noise_reduction, judge_supplies
 from acquisition.check.trial import (
@@ -136,6 +136,8 @@ def check_lab(
         announce("measuring the trial frames")
         with taken:
             trial = measure_trial(taken, found.saturation, corners, series, recorded)
+        if linearity and recorded:
+            trial = replace(trial, series_trouble="a recording cannot be exposed again")
     lines += described
     if found.used_s != found.first.shutter_s:
         lines.append(
@@ -146,7 +148,7 @@ def check_lab(
         *_figure_findings(trial, settings),
         *_pose_and_light(trial, chart),
         judge_noise_reduction(camera.timings),
-        *_linearity_findings(trial, linearity, recorded),
+        *([not_checked("series", trial.series_trouble)] if trial.series_trouble else []),
         *screen,
         *(Finding("settings", "remark", doubt) for doubt in settings_doubts(settings)),
         judge_disk(beside, frames, found.first.size),
@@ -262,7 +264,7 @@ def _figure_finding(row: JudgedValue, table: TableMeasurements) -> Finding:
 
 def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
     if trial.table is None:
-        return not_checked_all((TURN.name, KEYSTONE.name, EVENNESS.name), "the chart cannot be measured")
+        return [not_checked(one.name, "the chart cannot be measured") for one in (TURN, KEYSTONE, EVENNESS)]
     table = trial.table
     framing, (width, height) = table.registration.framing, chart.page_mm
     off, quarters = off_level_deg(framing.rotation_deg)
@@ -281,12 +283,6 @@ def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
             details={"falloff": lost.tolist()},
         ),
     ]
-
-
-def _linearity_findings(trial: Trial, linearity: bool, recorded: bool) -> list[Finding]:
-    if linearity and recorded:
-        return [not_checked("series", "a recording cannot be exposed again")]
-    return [not_checked("series", trial.series_trouble)] if trial.series_trouble else []
 
 
 def _make_devices_ready(

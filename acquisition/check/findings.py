@@ -6,7 +6,7 @@ A value that a table is accepted with is good, one that it is remarked on for a 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -137,31 +137,3 @@ def judged(
 def not_checked(name: str, why: str, remedy: str = "") -> Finding:
     """Return the finding of what could not be looked at."""
     return Finding(name, "not checked", why, remedy=remedy)
-
-
-def not_checked_all(names: Iterable[str], why: str) -> list[Finding]:
-    """Return the findings of what could not be looked at for one reason."""
-    return [not_checked(name, why) for name in names]
-
-
-def amount(value: float, unit: str) -> str:
-    """Return a value with its unit, a share as per cent.
-
-    >>> amount(0.046, "share"), amount(0.0004, "share"), amount(1.25, "px"), amount(3, "")
-    ('4.6 %', '0.04 %', '1.25 px', '3')
-    """
-    if unit == "share":
-        return percent(value)
-    return f"{value:.0f}" if unit == "" and value >= 100 else f"{value:.3g}{'' if unit in ('', '°') else ' '}{unit}"
-
-
-def percent(share: float) -> str:
-    """Return a share as per cent, two digits below ten.
-
-    >>> percent(0.7123), percent(0.0461), percent(0.00042), percent(0.0)
-    ('71 %', '4.6 %', '0.04 %', '0 %')
-    """
-    value = 100 * share
-    if abs(value) >= 10 or value == 0:
-        return f"{value:.0f} %"
-    return f"{value:.1f} %" if abs(value) >= 1 else f"{value:.2f} %"
