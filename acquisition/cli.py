@@ -234,7 +234,7 @@ def check(
 ) -> None:
     """Say whether the lab is ready: a verdict on exposure, light, sharpness, print, sensor, supplies; record nothing.
 
-    Reads LAB.toml, the chart and the lights it names. Takes some 20 frames and keeps none; tries shutter times until
+    Reads LAB.toml, the chart and the lights it names. Takes some 25 frames and keeps none; tries shutter times until
     one suits, then judges white, dark, the primaries and grey by the figures of build-lut. Each verdict is good, a
     remark, a fault, or not checked, with its number, limit, reason and remedy.
     Writes nothing unless asked with --picture. Ends with 4 when there is a fault. Devices that cannot be used are all

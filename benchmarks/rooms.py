@@ -23,7 +23,7 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from io import BytesIO
@@ -35,7 +35,7 @@ import numpy.typing as npt
 
 from benchmarks.cases import BY_NAME, CASES, FAILURES, LENS_LEFT, WRONG_SHARE, Outcome, chart_of, outcome_of, try_case
 from benchmarks.sessions import short_session, world_of
-from calibration.figures.geometry import CELL_PX, cell_sides_px
+from calibration.figures.geometry import CELL_PX
 from calibration.registration.register import Registration, register
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
@@ -233,11 +233,24 @@ def tried(case: Case, small: bool) -> Outcome:
         return outcome_of(session, Path(folder) / "lut", world, chart)
 
 
+def _cell_sides_px(to_pixels: Callable[..., npt.NDArray[np.float64]], chart: Chart) -> npt.NDArray[np.float64]:
+    """Return the shorter side of each cell (N,) float64 half-size px, in the chart's order.
+
+    `to_pixels`: takes places on the print (N, 2) mm to the half-size frame.
+    """
+    half = np.array(chart.cell_mm) / 2
+    sides = [
+        np.linalg.norm(to_pixels(chart.centres_mm + half * axis) - to_pixels(chart.centres_mm - half * axis), axis=1)
+        for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    ]
+    return np.asarray(np.min(sides, axis=0))
+
+
 def true_rows(case: Case, small: bool) -> set[str]:
     """Return the rows of a verdict that may remark on a calm room: that of the cells' size where one is too small."""
     chart = chart_of(small, case.seed)
     world = world_of(chart, BODIES["Test" if small else case.body], case.room)
-    return {CELL_PX.name} if cell_sides_px(world.project, chart).min() < CELL_PX.accept else set()
+    return {CELL_PX.name} if _cell_sides_px(world.project, chart).min() < CELL_PX.accept else set()
 
 
 def is_silent(found: Outcome) -> bool:

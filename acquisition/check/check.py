@@ -1,7 +1,7 @@
 """Check a rig before the session: devices asked, an exposure suggested, trial frames judged as a table is.
 
-Takes some 20 frames; records nothing. The lamp is switched on if it was off, and stays on, which is said; a muted
-picture is shown.
+Takes some 25 frames into a hidden folder beside LAB.toml, which is removed at the end; records nothing. The lamp is
+switched on if it was off, and stays on, which is said; a muted picture is shown.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from acquisition.check.exposure import (
     measure_saturation,
     search,
 )
-from acquisition.check.findings import CheckReport, Finding, judged, not_checked, not_checked_all
+from acquisition.check.findings import CheckReport, Finding, judged, not_checked
 from acquisition.check.picture import check_png
 from acquisition.check.supplies import judge_disk, judge_noise_reduction, judge_supplies
 from acquisition.check.trial import (
+    PRIMARIES,
     Trial,
-    at_settings,
     measure_trial,
     series_times,
     take_trial,
@@ -40,16 +40,16 @@ from acquisition.check.trial import (
 )
 from acquisition.judge.measure import Anchor, disagreement, refusal
 from acquisition.run.devices import Devices, RetryPolicy, ask_all, make_ready, period_s, reported_error
-from acquisition.run.plan import planned_steps, settings_doubts
+from acquisition.run.plan import bytes_text, free_bytes_at, planned_steps, projector_state, settings_doubts
 from acquisition.run.rig.opening import open_rig
 from calibration.figures.light import LEAK_SHARE
 from calibration.figures.single_frames import EVENNESS, KEYSTONE, TURN
 from calibration.figures.truth import BRIGHTEST_SHARE
 from calibration.measurements import TableMeasurements
-from calibration.verdict import JudgedValue, Verdict, detail_and_remedy, explain, places_text
+from calibration.verdict import JudgedValue, detail_and_remedy, explain, places_text
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE, Colour, ReportsWarnings
-from drivers.projector import Power, Projector, Severity
+from drivers.projector import Projector, Severity
 from drivers.raw.rawfile import frame_black, phases
 from experiment.chart.model import Chart, load_chart
 from experiment.config import LabSettings
@@ -60,7 +60,7 @@ from experiment.measures.exposure import measure_exposure
 from experiment.measures.paper import falloff
 from experiment.measures.pose import keystone, off_level_deg
 from experiment.session.folder import Session
-from foundation.errors import DeviceError, RegistrationError, counted
+from foundation.errors import RegistrationError, StorageError, counted
 from foundation.files import write_whole
 
 # White at the settings' shutter time, of saturation, at which trial frames are taken so; else with a better time.
@@ -108,19 +108,27 @@ def check_lab(
     recorded = settings.rig == "replay"
     frames = len(planned_steps(settings, lights))
     lines = [f"lights      {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} of a session"]
-    with tempfile.TemporaryDirectory() as name:
+    beside = Path(settings.file).parent
+    free_bytes_at(beside)
+    # Not in /tmp, which may be in memory: the frames are 0.4 to 0.7 GB.
+    with tempfile.TemporaryDirectory(prefix=".check.", dir=beside) as name:
         scratch = Path(name)
-        shown = trial_lights(lights)
-        steps = trial_steps(shown, recorded)
         with open_rig(settings, chart) as devices:
             described, screen = _make_devices_ready(devices, settings, announce)
             camera = Photographer(devices, settings, scratch)
-            found = _find_exposure(camera, settings, chart, devices.camera.shutter_speeds(), corners, announce)
+            found = _find_exposure(camera, settings, chart, devices.camera.shutter_speeds(), announce)
             announce("taking trial frames: white, dark, primaries, grey")
-            taken = Session.create(scratch / "trial", settings.to_toml(), chart, shown, steps)
             series = scratch / "series" if linearity and not recorded else None
             best = best_of(found.trials)
             series_s = series_times(found.times_s, best.shutter_s, best.highest) if series else ()
+            primaries = np.eye(3)
+            if not recorded:
+                shots = [camera.take(colour, found.used_s) for colour in PRIMARIES.values()]
+                primaries = np.array([shot.brightest(99.0) for shot in shots])
+            shown = trial_lights(lights, primaries)
+            steps = trial_steps(shown, recorded)
+            _require_space(beside, (len(steps) + len(series_s)) * found.first.size)
+            taken = Session.create(scratch / "trial", settings.to_toml(), chart, shown, steps)
             (scratch / "series").mkdir()
             take_trial(camera, taken, found.used_s, series_s, scratch / "series")
             camera.restore()
@@ -128,29 +136,39 @@ def check_lab(
         announce("measuring the trial frames")
         with taken:
             trial = measure_trial(taken, found.saturation, corners, series, recorded)
+        if linearity and recorded:
+            trial = replace(trial, series_trouble="a recording cannot be exposed again")
     lines += described
     if found.used_s != found.first.shutter_s:
         lines.append(
             f"frames      taken at {found.used_s:.4g} s, since white is clipped or dark as the settings have it"
         )
-    verdict = at_settings(trial.verdict, found.trials[0].highest, found.first.shutter_s / found.used_s)
     findings = [
         *_exposure_findings(found, settings, recorded),
-        *_figure_findings(verdict, trial, settings),
+        *_figure_findings(trial, settings),
         *_pose_and_light(trial, chart),
         judge_noise_reduction(camera.timings),
-        *_linearity_findings(trial, linearity, recorded),
+        *([not_checked("series", trial.series_trouble)] if trial.series_trouble else []),
         *screen,
         *(Finding("settings", "remark", doubt) for doubt in settings_doubts(settings)),
-        judge_disk(Path(settings.file).parent, frames, found.first.size),
+        judge_disk(beside, frames, found.first.size),
         *supplies,
     ]
-    values = {row.figure.name: row.value for row in verdict.rows}
-    outcome = None if trial.table is None else verdict.outcome
-    report = CheckReport(tuple(lines), tuple(findings), outcome, values, trial.not_known)
+    values = {row.figure.name: row.value for row in trial.verdict.rows}
+    first_s = found.used_s if found.used_s != found.first.shutter_s else None
+    outcome = None if trial.table is None or first_s is not None else trial.verdict.outcome
+    report = CheckReport(tuple(lines), tuple(findings), outcome, values, trial.not_known, first_s)
     if picture is not None:
         write_whole(picture, check_png(trial, chart, report))
     return report
+
+
+def _require_space(folder: Path, needed: int) -> None:
+    if (free := free_bytes_at(folder)) < needed:
+        raise StorageError(
+            f"{bytes_text(free)} free at {folder}, {bytes_text(needed, up=True)} needed for the frames of a check; "
+            "free as much"
+        )
 
 
 def _find_exposure(
@@ -158,7 +176,6 @@ def _find_exposure(
     settings: LabSettings,
     chart: Chart,
     offered_s: Sequence[float],
-    corners: Corners | None,
     announce: Callable[[str], None],
 ) -> FoundExposure:
     """Return how bright white is at the shutter times that were tried until one suits."""
@@ -166,20 +183,20 @@ def _find_exposure(
     if settings.rig == "replay":
         stated, counts = float(first.mosaic.white_level), float(first.mosaic.saturation())
         saturation = Saturation(counts, counts < stated, stated)
-        return FoundExposure(first, (level_of(first, saturation, _paper(first, chart, corners)),), (), saturation)
+        return FoundExposure(first, (level_of(first, saturation, _paper(first, chart)),), (), saturation)
     # A time that the body does not list was taken all the same, so it counts among them.
     times = fitting_times(sorted({*offered_s, settings.camera.shutter_s}) if offered_s else (), period_s(settings))
     announce("measuring the sensor's saturation: frames of white, longer and longer")
     saturation = measure_saturation(first, lambda seconds: camera.take(WHITE, seconds), times)
 
     def level(shot: Shot) -> TriedTime:
-        return level_of(shot, saturation, _paper(shot, chart, corners))
+        return level_of(shot, saturation, _paper(shot, chart))
 
     trials = search(level(first), lambda seconds: level(camera.take(WHITE, seconds)), times)
     return FoundExposure(first, trials, tuple(times), saturation)
 
 
-def _paper(shot: Shot, chart: Chart, corners: Corners | None) -> _Array | None:
+def _paper(shot: Shot, chart: Chart) -> _Array | None:
     """Return (3,) counts above black of bare paper, as the live judge measures it; None if the chart is not found."""
     if not chart.tags:
         return None
@@ -209,20 +226,27 @@ def _exposure_findings(found: FoundExposure, settings: LabSettings, recorded: bo
     return findings
 
 
-def _figure_findings(verdict: Verdict, trial: Trial, settings: LabSettings) -> list[Finding]:
+def _figure_findings(trial: Trial, settings: LabSettings) -> list[Finding]:
     if trial.table is None:
         return [Finding("chart", "fault", trial.trouble), not_checked("figures", "the chart cannot be measured")]
     table = trial.table
-    rows = [row for row in verdict.rows if row.figure is not BRIGHTEST_SHARE]
+    rows = [row for row in trial.verdict.rows if row.figure is not BRIGHTEST_SHARE]
     findings = [_figure_finding(row, table) for row in rows]
-    dark = settings.judge.dark_percent / 100
+    value, allowed = trial.dark_percent, settings.judge.dark_percent
+    if value <= allowed:
+        return findings
     # The run refuses dark frames earlier than a table is refused.
-    return [
-        replace(one, grade="fault", tolerable=(None, dark))
-        if one.name == LEAK_SHARE.name and (one.value or 0.0) > dark
-        else one
-        for one in findings
-    ]
+    fault = Finding(
+        LEAK_SHARE.name,
+        "fault",
+        f"the dark frame has {value:.1f} % of white, in the mean or in some places",
+        value / 100,
+        LEAK_SHARE.unit,
+        tolerable=(None, allowed / 100),
+        reason=f"judge.dark_percent allows {allowed:g} %: a run refuses the frame",
+        remedy=LEAK_SHARE.remedy,
+    )
+    return [*(one for one in findings if one.name != LEAK_SHARE.name), fault]
 
 
 def _figure_finding(row: JudgedValue, table: TableMeasurements) -> Finding:
@@ -240,7 +264,7 @@ def _figure_finding(row: JudgedValue, table: TableMeasurements) -> Finding:
 
 def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
     if trial.table is None:
-        return not_checked_all((TURN.name, KEYSTONE.name, EVENNESS.name), "the chart cannot be measured")
+        return [not_checked(one.name, "the chart cannot be measured") for one in (TURN, KEYSTONE, EVENNESS)]
     table = trial.table
     framing, (width, height) = table.registration.framing, chart.page_mm
     off, quarters = off_level_deg(framing.rotation_deg)
@@ -259,12 +283,6 @@ def _pose_and_light(trial: Trial, chart: Chart) -> list[Finding]:
             details={"falloff": lost.tolist()},
         ),
     ]
-
-
-def _linearity_findings(trial: Trial, linearity: bool, recorded: bool) -> list[Finding]:
-    if linearity and recorded:
-        return [not_checked("series", "a recording cannot be exposed again")]
-    return [not_checked("series", trial.series_trouble)] if trial.series_trouble else []
 
 
 def _make_devices_ready(
@@ -286,14 +304,12 @@ def _make_devices_ready(
     if projector is None:
         lines.append("projector   not under control: see to its lamp yourself")
         return lines, findings
-    before = _state(projector)
+    state, _ = projector_state(projector)
     patience = RetryPolicy(
         devices.clock, 0, lambda what, sentence: announce(f"{what}: {sentence}"), lambda: keep_awake(devices.camera)
     )
     make_ready(projector, settings.sequence, patience)
-    identity = projector.identity()
-    hours = ", ".join(f"{lamp.hours} h" for lamp in projector.lamps()) or "no lamp"
-    lines.append(f"projector   {identity.maker} {identity.model} {identity.name}, {hours}; {before}")
+    lines.append(f"projector   {state}; it stays on when the check is over")
     parts = [fault.part for fault in projector.faults() if fault.severity is Severity.WARNING]
     if parts:
         said = f"the projector warns of its {', '.join(parts)}"
@@ -304,12 +320,3 @@ def _make_devices_ready(
 def _require_sound(projector: Projector) -> None:
     if (fault := reported_error(projector)) is not None:
         raise fault
-
-
-def _state(projector: Projector) -> str:
-    try:
-        if projector.power() is not Power.ON:
-            return "its lamp was off; it is switched on, and stays on when the check is over"
-        return "it was muted, and shows its picture now" if projector.muted() else "its lamp was on, and stays on"
-    except DeviceError:
-        return "it is switched on, and stays on"

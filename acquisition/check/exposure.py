@@ -19,8 +19,9 @@ from typing import BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.check.findings import Finding, amount, judged, percent
+from acquisition.check.findings import Finding, judged
 from acquisition.run.devices import Devices, holds_whole_turns
+from calibration.figures.figure import format_value
 from calibration.figures.truth import BRIGHTEST_SHARE
 from drivers.camera import CapturedFrame, capture
 from drivers.presenter import Colour
@@ -113,10 +114,6 @@ PROPORTIONAL = 0.9
 
 # Share of the stated range from which on counts may be saturation: noise in the dark is not proportional either.
 LEAST_RANGE = 0.25
-
-# White's share of saturation at which what is not the exposure's matter is judged well enough; else it is judged at a
-# better time.
-USABLE = (0.3, 0.9)
 
 _Array = npt.NDArray[np.float64]
 
@@ -272,7 +269,7 @@ def judge_exposure(
     """
     first, best = trials[0], best_of(trials)
     channel = CHANNELS[int(np.argmax(first.level))]
-    seen = "saturates" if first.clipped else f"is at {percent(first.highest)} of saturation"
+    seen = "saturates" if first.clipped else f"is at {format_value(first.highest, 'share')} of saturation"
     said = f"white {seen} ({saturation}) in {channel} at {first.shutter_s:.4g} s"
     details = {
         "shutter_s": first.shutter_s,
@@ -287,7 +284,7 @@ def judge_exposure(
     elif not times_s:
         remedy = "the camera lists no shutter times; set another camera.shutter_s and check again"
     elif _is_suitable(best):
-        remedy = f"set camera.shutter_s = {best.shutter_s:.4g} (tried: {percent(best.highest)})"
+        remedy = f"set camera.shutter_s = {best.shutter_s:.4g} (tried: {format_value(best.highest, 'share')})"
         details["proposed_shutter_s"] = best.shutter_s
     else:
         remedy = _no_time(best, period_s)
@@ -295,7 +292,9 @@ def judge_exposure(
     if found.grade != "good":
         return found
     if not _is_suitable(first):
-        why = f"{percent(SUITABLE[0])} to {percent(SUITABLE[1])} suits: above, other places clip; below, noise grows"
+        why = (
+            f"{100 * SUITABLE[0]:.0f} to {100 * SUITABLE[1]:.0f} % suits: above, other places clip; below, noise grows"
+        )
         return replace(found, grade="remark", reason=why, remedy=remedy)
     if not saturation.measured:
         why = "no frame saturates the sensor: the share is of what the file states"
@@ -308,11 +307,11 @@ def _is_suitable(trial: TriedTime) -> bool:
 
 
 def _no_time(best: TriedTime, period_s: float | None) -> str:
-    turns = f" and holds whole turns of {amount(period_s, 's')}" if period_s else ""
+    turns = f" and holds whole turns of {format_value(period_s, 's')}" if period_s else ""
     nearest = (
         f"even the shortest, {best.shutter_s:.4g} s, saturates"
         if best.clipped
-        else f"the nearest, camera.shutter_s = {best.shutter_s:.4g}, gives {percent(best.highest)}"
+        else f"the nearest, camera.shutter_s = {best.shutter_s:.4g}, gives {format_value(best.highest, 'share')}"
     )
     bright = best.clipped or best.highest > TARGET
     aperture, speed = ("higher", "lower") if bright else ("lower", "higher")

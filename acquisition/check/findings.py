@@ -6,7 +6,7 @@ A value that a table is accepted with is good, one that it is remarked on for a 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -48,6 +48,10 @@ class Finding:
         why = f" ({self.reason})" if self.reason else ""
         return f"{self.said}{why}{f'; {self.remedy}' if self.remedy else ''}"
 
+    def line(self) -> str:
+        """Return grade, name and sentence, in columns."""
+        return f"{self.grade:<12}{self.name:<24}{self.sentence()}"
+
 
 @dataclass(frozen=True)
 class CheckReport:
@@ -56,9 +60,10 @@ class CheckReport:
     - `devices`: what answered, a line each, and what was done with it.
     - `findings`: in the order in which they were looked at.
     - `forecast`: what `build-lut` would say, as far as these frames show it: "accept", "accept with remarks" or
-      "refuse"; None where the chart was not found.
+      "refuse"; None where the chart was not found, or the exposure of the settings is not that of the frames.
     - `figures`: the table's figures that are known, by their names in `report.json`.
     - `not_known`: the names of those that are known only when there are frames of a session.
+    - `first_s`: the shutter time to set before anything is forecast, at which the figures hold; None if it is set.
     """
 
     devices: tuple[str, ...]
@@ -66,6 +71,11 @@ class CheckReport:
     forecast: Outcome | None = None
     figures: Mapping[str, float] = field(default_factory=dict[str, float])
     not_known: tuple[str, ...] = ()
+    first_s: float | None = None
+
+    def sorted(self) -> list[Finding]:
+        """Return the findings by their grades, faults first."""
+        return [finding for grade in GRADES for finding in self.of(grade)]
 
     def of(self, grade: Grade) -> tuple[Finding, ...]:
         """Return the findings of one grade."""
@@ -73,30 +83,33 @@ class CheckReport:
 
     def lines(self) -> tuple[str, ...]:
         """Return the report as lines for a terminal: devices, then findings, faults first."""
-        described = [
-            f"{finding.grade:<12}{finding.name:<24}{finding.sentence()}"
-            for grade in GRADES
-            for finding in self.of(grade)
-        ]
-        return *self.devices, *described, *self._forecast_lines()
+        return *self.devices, *(finding.line() for finding in self.sorted()), *self._forecast_lines()
 
     def _forecast_lines(self) -> list[str]:
-        if self.forecast is None:
+        if not self.figures:
             return []
         names = ", ".join(name.replace("_", " ") for name in self.not_known)
+        said = f"build-lut would say {self.forecast!r} by the {len(self.figures)} figures known now"
+        if self.first_s is not None:
+            said = f"set camera.shutter_s to {self.first_s:.4g} first; these figures hold for {self.first_s:.4g} s"
         return [
-            f"table       build-lut would say {self.forecast!r} by the {len(self.figures)} figures known now",
+            f"table       {said}",
             f"            not known before the session: {names}",
         ]
 
     def values(self) -> dict[str, Any]:
         """Return the report for programs: `devices`, `faults` (their number), `findings`, `table`."""
-        table = {"outcome": self.forecast, "figures": self.figures, "not_known": self.not_known}
+        table = {
+            "outcome": self.forecast,
+            "shutter_s": self.first_s,
+            "figures": self.figures,
+            "not_known": self.not_known,
+        }
         return {
             "devices": self.devices,
             "faults": len(self.of("fault")),
             "findings": self.findings,
-            "table": None if self.forecast is None else table,
+            "table": table if self.figures else None,
         }
 
 
@@ -124,31 +137,3 @@ def judged(
 def not_checked(name: str, why: str, remedy: str = "") -> Finding:
     """Return the finding of what could not be looked at."""
     return Finding(name, "not checked", why, remedy=remedy)
-
-
-def not_checked_all(names: Iterable[str], why: str) -> list[Finding]:
-    """Return the findings of what could not be looked at for one reason."""
-    return [not_checked(name, why) for name in names]
-
-
-def amount(value: float, unit: str) -> str:
-    """Return a value with its unit, a share as per cent.
-
-    >>> amount(0.046, "share"), amount(0.0004, "share"), amount(1.25, "px"), amount(3, "")
-    ('4.6 %', '0.04 %', '1.25 px', '3')
-    """
-    if unit == "share":
-        return percent(value)
-    return f"{value:.0f}" if unit == "" and value >= 100 else f"{value:.3g}{'' if unit in ('', '°') else ' '}{unit}"
-
-
-def percent(share: float) -> str:
-    """Return a share as per cent, two digits below ten.
-
-    >>> percent(0.7123), percent(0.0461), percent(0.00042), percent(0.0)
-    ('71 %', '4.6 %', '0.04 %', '0 %')
-    """
-    value = 100 * share
-    if abs(value) >= 10 or value == 0:
-        return f"{value:.0f} %"
-    return f"{value:.1f} %" if abs(value) >= 1 else f"{value:.2f} %"

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from acquisition.check.findings import GRADES, CheckReport
+from acquisition.check.findings import CheckReport
 from acquisition.check.trial import Trial
 from calibration.measurements import TableMeasurements
 from experiment.chart.model import Chart
@@ -41,7 +41,7 @@ def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:
     if trial.table is None:
         for axes in places:
             axes.axis("off")
-            axes.text(0.5, 0.5, "not measured: the chart was not found", ha="center", color="0.4")
+            axes.text(0.5, 0.5, "not measured: see the fault of the chart", ha="center", color="0.4")
     else:
         _draw_light(places[0], trial.table, chart)
         _draw_sharpness(places[1], trial.table, chart)
@@ -60,11 +60,8 @@ def check_png(trial: Trial, chart: Chart, report: CheckReport) -> bytes:
 
 def _verdict_lines(report: CheckReport) -> list[tuple[str, str]]:
     lines: list[tuple[str, str]] = []
-    for grade in GRADES:
-        for finding in report.of(grade):
-            text = f"{grade:<12}{finding.name:<24}{finding.sentence()}"
-            wrapped = textwrap.wrap(text, _LINE, subsequent_indent=36 * " ") or [text]
-            lines += [(line, grade) for line in wrapped]
+    for finding in report.sorted():
+        lines += [(line, finding.grade) for line in textwrap.wrap(finding.line(), _LINE, subsequent_indent=36 * " ")]
     return lines
 
 

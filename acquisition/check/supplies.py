@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from acquisition.check.findings import Finding, judged, not_checked, percent
+from acquisition.check.findings import Finding, judged, not_checked
 from acquisition.run.plan import bytes_text, free_bytes_at, needed_bytes
+from calibration.figures.figure import format_value
 from calibration.figures.single_frames import BATTERY, CARD, DISK, NOISE_REDUCTION
 from drivers.camera import Camera, ReportsSupplies, Supplies
 from foundation.errors import DeviceError, StorageError
@@ -51,7 +52,7 @@ def _battery(found: Supplies, frames: int) -> Finding:
     if found.battery is None:
         why = "the camera does not tell its battery's charge"
         return not_checked("battery", why, f"use a mains adapter: the plan has {frames} frames")
-    charged = f"{percent(found.battery)} charged, and the plan has {frames} frames"
+    charged = f"{format_value(found.battery, 'share')} charged, and the plan has {frames} frames"
     enough = found.battery * CHARGE / max(frames, 1)
     if found.mains is None and found.battery >= 1 and BATTERY.outcome(enough) != "accept":
         why = f"{charged}: a battery, or a mains adapter, which this body does not tell apart"

@@ -1,6 +1,6 @@
 """The trial set: a session of a dozen frames, taken into a folder that is thrown away, and measured as any session is.
 
-White several times, dark, the primaries, grey, and the plan's darkest light.
+White several times, dark, the primaries, grey, and the light of the plan that gives the fewest counts.
 """
 
 from __future__ import annotations
@@ -10,18 +10,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from acquisition.check.exposure import Photographer, Saturation
+from acquisition.judge.judge import dark_level, white_scale
 from calibration.figures.all_figures import FIGURES
-from calibration.figures.truth import BRIGHTEST_SHARE, DARKEST_COUNTS
 from calibration.measurements import TableMeasurements
 from calibration.pipeline.build import check, judge_trial
 from calibration.pipeline.frames import PAPER_OPTIONS
-from calibration.verdict import Verdict, judge
+from calibration.verdict import Verdict
 from drivers.presenter import BLACK, WHITE, Colour
-from drivers.raw.rawfile import Mosaic, read_raw
+from drivers.raw.rawfile import Mosaic, frame_black, read_raw
 from experiment.framing.field import Corners
 from experiment.lights import Illumination
+from experiment.measures.frame import measure
 from experiment.session.folder import Session
 from experiment.session.records import MIDDLE, FrameKind, Judgement, SessionStep
 from foundation.colorimetry import decode_srgb
@@ -31,14 +33,10 @@ WHITES = 3  # White frames before the lights, and as many after them: their spre
 
 SERIES = 8  # Shutter times of a series of linearity
 
+PRIMARIES = {"red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255)}
+
 # The lights of a trial by name, besides the plan's darkest.
-_COLOURS = {
-    "white": WHITE,
-    "red": Colour(255, 0, 0),
-    "green": Colour(0, 255, 0),
-    "blue": Colour(0, 0, 255),
-    "grey": Colour(MIDDLE, MIDDLE, MIDDLE),
-}
+_COLOURS = {"white": WHITE, **PRIMARIES, "grey": Colour(MIDDLE, MIDDLE, MIDDLE)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +46,7 @@ class Trial:
     - `white`: the first white frame.
     - `table`: their measurements; None if the chart was not found, or cannot be used.
     - `verdict`: the figures that trial frames show, judged.
+    - `dark_percent`: the light of the dark frames as the live judge measures it, of white.
     - `trouble`: why there are no measurements; "" if there are.
     - `series_trouble`: why a series of exposures shows nothing; "" if it does, or none was asked for.
     """
@@ -55,6 +54,7 @@ class Trial:
     white: Mosaic
     table: TableMeasurements | None
     verdict: Verdict
+    dark_percent: float = 0.0
     trouble: str = ""
     series_trouble: str = ""
 
@@ -65,12 +65,16 @@ class Trial:
         return tuple(figure.name for figure in FIGURES if figure.name not in known)
 
 
-def trial_lights(plan: Sequence[Illumination]) -> tuple[Illumination, ...]:
-    """Return the lights of a trial: white, the primaries, grey, and the darkest light of the plan."""
+def trial_lights(plan: Sequence[Illumination], primaries: npt.NDArray[np.float64]) -> tuple[Illumination, ...]:
+    """Return the lights of a trial: white, the primaries, grey, and the darkest light of the plan.
+
+    `primaries`: (3, 3) counts of R, G and B under the projector's red, its green and its blue, which predict those of a
+    light. The darkest has the fewest in its strongest channel, as in `darkest_counts`.
+    """
     colours = dict(_COLOURS)
     if plan:
-        linear = [decode_srgb(np.array(light.colour) / 255).max() for light in plan]
-        darkest = plan[int(np.argmin(linear))].colour
+        counts = decode_srgb(np.array([light.colour for light in plan]) / 255) @ primaries
+        darkest = plan[int(np.argmin(counts.max(axis=1)))].colour
         if darkest not in colours.values():
             colours["darkest"] = darkest
     return tuple(
@@ -115,7 +119,8 @@ def measure_trial(
     session: Session, saturation: Saturation, corners: Corners | None, series: Path | None, recorded: bool
 ) -> Trial:
     """Return what trial frames show."""
-    white = read_raw(session.folder / session.frames()[0].file)
+    frames = session.frames()
+    white = read_raw(session.folder / frames[0].file)
     options = replace(PAPER_OPTIONS, corners=corners)
     try:
         if recorded:
@@ -125,17 +130,14 @@ def measure_trial(
     except (RegistrationError, QualityError, FormatError, InputError) as error:
         if series is not None:
             return replace(measure_trial(session, saturation, corners, None, recorded), series_trouble=str(error))
-        return Trial(white, None, Verdict(()), str(error))
+        return Trial(white, None, Verdict(()), trouble=str(error))
     rows = tuple(row for row in result.verdict.rows if row.figure.before_session)
-    return Trial(white, result.figures, Verdict(rows))
+    lit = _tiles(white)
+    dark = [_tiles(read_raw(session.folder / frame.file)) for frame in frames if frame.kind == "dark"]
+    # From white the live judge subtracts the dark light that it knows: all but in the first dark frame of a session.
+    levels = [dark_level(tiles, white_scale(lit - dark[0])) for tiles in dark]
+    return Trial(white, result.figures, Verdict(rows), max(levels, default=0.0))
 
 
-def at_settings(verdict: Verdict, white: float, ratio: float) -> Verdict:
-    """Return a verdict as of frames at the shutter time of the settings.
-
-    `white`: of saturation, there. `ratio`: that time over the time of the trial frames.
-    """
-    values = {row.figure.name: row.value for row in verdict.rows} | {BRIGHTEST_SHARE.name: white}
-    if DARKEST_COUNTS.name in values:
-        values[DARKEST_COUNTS.name] *= ratio
-    return judge(values)
+def _tiles(mosaic: Mosaic) -> npt.NDArray[np.float64]:
+    return measure(mosaic, frame_black(mosaic)).tiles

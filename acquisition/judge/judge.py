@@ -463,11 +463,8 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
     """
     if state.white is None:
         return (Check(LEAK_SHARE.name),)
-    white = state.white.tiles - (0 if state.dark is None else state.dark.tiles)
-    # Of a tile that white hardly lights, such as a black backdrop, against a third of the mean.
-    scale = np.maximum(white, np.maximum(white.mean(axis=0) / 3, 1.0))
-    level = 100 * frame.tiles / scale
-    value = float(max(level.mean(axis=0).max(), np.percentile(level, 94)))
+    scale = white_scale(state.white.tiles - (0 if state.dark is None else state.dark.tiles))
+    value = dark_level(frame.tiles, scale)
     stale = ""
     before = state.recent[-1] if state.recent else None
     if value > dark_percent and state.basis is not None and before is not None and before.amounts is not None:
@@ -504,6 +501,17 @@ def judge_dark(state: JudgeState, frame: Measured, dark_percent: float, ambient_
             )
         checks.append(Check(DARK_DRIFT.name, round(drift, 3), None, round(limit, 3), "%", reason))
     return tuple(checks)
+
+
+def white_scale(white: _Array) -> _Array:
+    """Return (T, 3) the light of white that tiles are compared with; of a dim one, a third of the mean."""
+    return np.maximum(white, np.maximum(white.mean(axis=0) / 3, 1.0))
+
+
+def dark_level(tiles: _Array, scale: _Array) -> float:
+    """Return the light of a dark frame, per cent of white: its mean, or a tile (T, 3) that 6 % are beyond."""
+    level = 100 * tiles / scale
+    return float(max(level.mean(axis=0).max(), np.percentile(level, 94)))
 
 
 def _by_region(tiles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

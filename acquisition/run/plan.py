@@ -336,7 +336,7 @@ def ask(devices: Devices) -> Answers:
         unasked.append("ISO speed and aperture: they are set and verified before the lamp is lit")
     state, lit = "", None
     if projector is not None:
-        state, lit = answer("projector", lambda: _projector_state(projector), ("", None))
+        state, lit = answer("projector", lambda: projector_state(projector), ("", None))
         if lit is not None:
             error = answer("projector", lambda: reported_error(projector), None)
             faults += [] if error is None else [error]
@@ -348,7 +348,7 @@ def ask(devices: Devices) -> Answers:
     return Answers(identity, offered, supplies, state, lit, warnings, tuple(unasked), tuple(faults))
 
 
-def _projector_state(projector: Projector) -> tuple[str, bool | None]:
+def projector_state(projector: Projector) -> tuple[str, bool | None]:
     """Return who a projector is and how its lamp is, in words; and whether it burns."""
     identity = projector.identity()
     name = " ".join(word for word in (identity.maker, identity.model, identity.name) if word) or "projector"

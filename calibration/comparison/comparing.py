@@ -24,8 +24,8 @@ import numpy.typing as npt
 from scipy import stats
 
 from calibration.kernels import moments
-from calibration.pipeline.build import build
-from calibration.table.lut import REFERENCES, Lut, open_lut
+from calibration.pipeline.build import build, refused_folder
+from calibration.table.lut import REFERENCES, REPORT_JSON, Lut, open_lut
 from calibration.table.verification import chart_difference
 from experiment.chart.model import Chart, load_chart
 from experiment.lights import Illumination
@@ -35,6 +35,7 @@ from experiment.session.journal import JOURNAL_FILE
 from foundation.colorimetry import angles_deg
 from foundation.compiled import ordered_map, processor_count
 from foundation.errors import FormatError, first_of
+from foundation.files import write_whole
 
 _Array = npt.NDArray[np.float64]
 _Numbers = npt.NDArray[np.int64]
@@ -164,15 +165,23 @@ def compare(
 def table_of(place: Path, progress: Callable[[int, int, str], None] | None = None) -> Generator[Lut]:
     """Yield the table in a folder, or that of the session in it, which is built as `build-lut` builds it.
 
-    The table of a session lies in a hidden folder beside the session until the end: 707 lights need 3.5 GB.
+    The table of a session lies in a hidden folder beside the session until the end: 707 lights need 3.5 GB. Of a build
+    that ends at a frame the report stays in `SESSION.refused`.
     """
     if not (place / JOURNAL_FILE).is_file():
         yield open_lut(place)
         return
     beside = tempfile.TemporaryDirectory(prefix=f".{place.name}.compared.", dir=place.resolve().parent)
     with beside as folder, Session.open(place) as session:
-        build(session, Path(folder) / "table", progress)
-        yield open_lut(Path(folder) / "table")
+        table = Path(folder) / "table"
+        try:
+            build(session, table, progress)
+        finally:
+            # `acquire run --retake bad`, which the message of a refused frame names, looks for it beside the session.
+            refused = refused_folder(table) / REPORT_JSON
+            if refused.is_file():
+                write_whole(refused_folder(place.resolve()) / REPORT_JSON, refused.read_bytes())
+        yield open_lut(table)
 
 
 def chart_of(places: Sequence[Path]) -> Chart | None:

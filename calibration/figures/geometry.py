@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from calibration.causes.gathering import chart_evidence
 from calibration.figures.figure import (
     JUDGEMENT,
@@ -25,12 +23,7 @@ from calibration.sampling import SAFE_BLEED, bleed, largest_window
 from experiment.framing.finding import MIN_CELL_PX, MIN_TAG_SHARE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import numpy.typing as npt
-
     from calibration.measurements import TableMeasurements
-    from experiment.chart.model import Chart
 
 _LEAST_CELLS = 8**4  # Cells from which on a veil is told from other smooth light
 
@@ -39,19 +32,6 @@ _LESS_VEIL = (
     "take frames of red, green and blue alone and a chart of more colours, use the lens's hood, hang black cloth "
     "around the print, and keep lights and bright walls out of its view"
 )
-
-
-def cell_sides_px(to_pixels: Callable[..., npt.NDArray[np.float64]], chart: Chart) -> npt.NDArray[np.float64]:
-    """Return the shorter side of each cell (N,) float64 half-size px, in the chart's order.
-
-    `to_pixels`: takes places on the print (N, 2) mm to the half-size frame.
-    """
-    half = np.array(chart.cell_mm) / 2
-    sides = [
-        np.linalg.norm(to_pixels(chart.centres_mm + half * axis) - to_pixels(chart.centres_mm - half * axis), axis=1)
-        for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
-    ]
-    return np.asarray(np.min(sides, axis=0))
 
 
 def _tags_found(table: TableMeasurements) -> float | None:

@@ -18,9 +18,9 @@ frame counts only if the frame registered last is still the same, and is measure
 a few frames whatever the session.
 
 The table appears whole or not at all. Until then it stands beside its place under a hidden name, and a build that was
-stopped, anywhere, goes on from its last checkpoint and ends in the bytes of one that was not. A checkpoint is one file,
-replaced whole: the accumulator, and the hashes of the samples on the disk. It is used only if it was made of what is
-asked for now and the samples have these hashes.
+stopped, anywhere, goes on from its last checkpoint and ends in the bytes of one that was not. A checkpoint is a record
+and its file of arrays (`checkpoint`): the accumulator, and the hashes of the samples on the disk. It is used only if it
+was made of what is asked for now and the samples have these hashes.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class BuildOptions:
     - `window`: pixels along the side of a cell's window: one of `calibration.sampling.WINDOWS`.
     - `subtract_dark`: whether the light of the dark frames is subtracted from samples and ground truth.
     - `corners`: four corners (x, y) of the field of cells in the frame that is registered first, half-size px,
-      clockwise from the printed top-left, for a chart without tags; None to have it found.
+      clockwise from the printed top-left, which a chart without tags needs; None for a chart with tags.
     - `correct_drift`: whether the lamp's drift between white frames is taken out of samples and ground truth at the
       end.
     - `lens_correction`: whether what the lens spreads beside its sharp core is subtracted from samples and ground

@@ -37,7 +37,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def trial_of(lab: Lab, folder: Path) -> Trial:
-    lights = trial_lights(())
+    lights = trial_lights((), np.eye(3))
     steps = trial_steps(lights, recorded=False)
     with record_session(
         folder, lab.chart, lights, lambda step: lab.dng(step.colour, step.number), steps=steps
@@ -76,6 +76,6 @@ def test_the_picture_shows_light_blur_print_and_verdicts(tmp_path: Path, drawn: 
 @pytest.mark.slow
 def test_without_a_chart_the_frame_is_drawn_alone(tmp_path: Path, drawn: list[Any]) -> None:
     lab = hang()
-    trial = Trial(lab.mosaic(tmp_path), None, Verdict(()), "not found")
+    trial = Trial(lab.mosaic(tmp_path), None, Verdict(()), trouble="not found")
     assert check_png(trial, lab.chart, CheckReport((), FINDINGS))[:4] == b"\x89PNG"
     assert sum("not measured" in text.get_text() for axes in drawn[0].axes for text in axes.texts) == 3

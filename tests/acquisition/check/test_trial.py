@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 
 from acquisition.check.exposure import Saturation
-from acquisition.check.trial import at_settings, measure_trial, series_times, trial_lights, trial_steps
+from acquisition.check.trial import measure_trial, series_times, trial_lights, trial_steps
+from acquisition.judge.judge import LiveJudge
 from benchmarks.sessions import record_session
 from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
-from calibration.verdict import judge, judged_values
+from calibration.verdict import judged_values
 from drivers.presenter import Colour
+from experiment.config import LabSettings
 from experiment.lights import Illumination
+from experiment.session.records import SessionStep
 from sim.world.world import Room
 from tests.calibration.lab import hang
 
@@ -23,10 +29,10 @@ PLAN = (Illumination(1, "uniform", None, Colour(255, 0, 0)), DIM)
 
 
 def test_a_trial_is_of_white_dark_primaries_grey_and_the_darkest_light() -> None:
-    lights = trial_lights(PLAN)
+    lights = trial_lights(PLAN, np.eye(3))
     assert [one.name for one in lights] == ["white", "red", "green", "blue", "grey", "darkest"]
     assert lights[-1].colour == DIM.colour
-    assert [one.name for one in trial_lights(PLAN[:1])] == ["white", "red", "green", "blue", "grey"]
+    assert [one.name for one in trial_lights(PLAN[:1], np.eye(3))] == ["white", "red", "green", "blue", "grey"]
     kinds = [step.kind for step in trial_steps(lights, recorded=False)]
     assert kinds == ["white"] * 3 + ["dark"] + ["light"] * 6 + ["white"] * 3 + ["dark"]
     assert [step.kind for step in trial_steps(lights, recorded=True)] == ["white", "dark"]
@@ -40,11 +46,37 @@ def test_a_series_goes_from_dim_to_nearly_saturated() -> None:
     assert series_times([10.0], 0.5, 0.7) == []
 
 
-def test_figures_are_those_at_the_shutter_time_of_the_settings() -> None:
-    verdict = judge({"brightest_share": 0.7, "darkest_counts": 1000.0, "cell_px": 10.0})
-    values = {row.figure.name: row.value for row in at_settings(verdict, 0.14, 0.2).rows}
-    assert values == {"brightest_share": 0.14, "darkest_counts": pytest.approx(200.0), "cell_px": 10.0}
-    assert at_settings(verdict, 0.14, 0.2).outcome == "accept with remarks"
+@pytest.mark.parametrize(("red", "darkest"), [(0.3, 70), (1.0, 60)])
+def test_the_darkest_light_is_that_of_the_fewest_counts(red: float, darkest: int) -> None:
+    plan = [replace(DIM, colour=Colour(60, 60, 60)), replace(DIM, colour=Colour(70, 0, 0))]
+    primaries = 4000 * np.array([[red, 0.0, 0.0], [0.0, 1.0, 0.1], [0.0, 0.1, 0.7]])
+    assert trial_lights(plan, primaries)[-1].colour[0] == darkest
+
+
+@pytest.mark.slow
+def test_a_lamp_in_a_corner_is_measured_as_the_live_judge_measures_it(tmp_path: Path) -> None:
+    lab, lights = hang(3), trial_lights((), np.eye(3))
+
+    def lit(counts: npt.NDArray[np.uint16]) -> None:
+        height, width = counts.shape
+        counts[: height // 3, : width // 3] += 800
+
+    def frame(step: SessionStep) -> bytes:
+        return lab.dng(step.colour, step.number, paint=lit if step.kind == "dark" else None)
+
+    steps = trial_steps(lights, recorded=False)
+    with record_session(tmp_path / "session", lab.chart, lights, frame, steps=steps) as session:
+        trial = measure_trial(session, Saturation(13584, True, 15831), None, None, recorded=False)
+        settings = LabSettings(rig="lab", chart=Path("chart.json"), illuminations=Path("lights.csv"))
+        live = LiveJudge(settings, lab.chart, lights)
+        files = {record.kind: session.folder / record.file for record in reversed(session.frames())}
+        live.judge(files["white"], steps[0])
+        (judged,) = [one for one in live.judge(files["dark"], steps[3]).checks if one.name == "leak_share"]
+    assert judged.reason
+    # The judge knows no dark light yet that it could subtract from white.
+    assert judged.value == pytest.approx(trial.dark_percent / (1 + trial.dark_percent / 100), rel=0.05)
+    (table,) = [row.value for row in trial.verdict.rows if row.figure.name == "leak_share"]
+    assert 100 * table < 5 < trial.dark_percent
 
 
 @pytest.mark.slow
@@ -58,7 +90,7 @@ def test_trial_frames_show_what_a_table_of_them_shows(
 ) -> None:
     # A trial does not measure the lens.
     monkeypatch.setattr("calibration.pipeline.baseline.unsuitable", Mock(return_value="not measured in this test"))
-    lab, lights = hang(3, room=room), trial_lights(PLAN)
+    lab, lights = hang(3, room=room), trial_lights(PLAN, np.eye(3))
     with record_session(
         tmp_path / "session",
         lab.chart,

@@ -36,7 +36,8 @@ from calibration.table.writing import LutWriter, references_csv
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from foundation.errors import FormatError
+from experiment.session.records import SessionStep
+from foundation.errors import FormatError, QualityError
 from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, take
 
@@ -427,6 +428,22 @@ def test_one_room_and_other_noise_are_the_same(folders: tuple[Path, Path], small
         found = compare(one, other)
     assert found.same_within_noise
     assert float(found.lights.angle_deg.max()) < 0.05
+
+
+@pytest.mark.slow
+def test_a_frame_that_ends_the_build_of_a_session_can_be_taken_again(small: Lab, tmp_path: Path) -> None:
+    def nothing(counts: npt.NDArray[np.uint16]) -> None:
+        counts[...] = counts.min()
+
+    def frame(step: SessionStep) -> bytes:
+        return small.dng(step.colour, step.number, paint=nothing if step.illumination == 1 else None)
+
+    take(small, tmp_path / "dim", FEW, every=4, frame=frame).close()
+    with pytest.raises(QualityError, match="--retake bad"), table_of(tmp_path / "dim"):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == {"dim", "dim.refused"}
+    with Session.open(tmp_path / "dim") as session:
+        assert [frame.illumination for frame in session.asked_again("bad").frames] == [1]
 
 
 @pytest.mark.slow
