@@ -201,7 +201,6 @@ def preparation_of(dataset: Dataset) -> Preparation:
         crop=(int(crop[0]), int(crop[1])) if crop else None,
         cover=bool(options.get("cover", False)),
         crop_at=options.get("crop_at", "centre"),
-        profiles=options.get("profiles", "honour"),
         # Scenes that another data set had first are cut where its seed said.
         seed=options.get("lights_of", {}).get("pictures_seed", dataset.description.seed),
         crops=int(options.get("crops", 1)),
