@@ -491,24 +491,16 @@ def _same_scenes(lut: Lut, place: str, pictures: PictureOptions, light: LightOpt
 
 def _prepared_as(pictures: PictureOptions, made: Description, place: str) -> Preparation:
     """Return the preparation of a dataset's pictures; an InputError if the options give another one."""
-    from generator.pictures.sources import Preparation
+    from generator.dataset.same_lights import preparation_of
+    from generator.pictures.sources import UNPREPARED
 
     if pictures.random_scenes:
         raise InputError(
             f"--lights-of {place} gives the pictures; leave --random-scenes out, those of it are made again"
         )
-    options = made.options
-    crop = options.get("crop")
-    prepared = Preparation(
-        max_side=options.get("max_side"),
-        crop=None if crop is None else (crop[0], crop[1]),
-        cover=bool(options.get("cover", False)),
-        crop_at=options.get("crop_at"),
-        seed=made.seed,
-        crops=int(options.get("crops", 1)),
-    )
-    given = pictures.preparation(made.seed)
-    if given.describe() not in (prepared.describe(), Preparation().describe()):
+    prepared = preparation_of(made)
+    given = pictures.preparation(prepared.seed)
+    if given.describe() not in (prepared.describe(), UNPREPARED.describe()):
         raise InputError(
             f"--max-side, --crop and --crops prepare pictures in another way than those of {place}; leave them out, "
             "pictures are prepared as there"
