@@ -40,7 +40,7 @@ _LEAST_WITHIN: Final = 1e-3
 # methods, which are 2 degrees, so that the light taken would be another one than was asked for.
 _FAR_DEG: Final = 3.0
 # Share of far ground truths with which a file does not fit the table: edges of a data set may lie outside, not much of
-# it. Channels in another order and the lights of another camera are so far.
+# it. So far are channels in another order and lights of another camera, unless the table makes nearly every light.
 _MOST_FAR: Final = 0.25
 _MOST_DEG: Final = 10.0  # Angle to the nearest light of the table that no ground truth of a table's camera has
 
