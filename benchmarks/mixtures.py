@@ -33,7 +33,8 @@ from experiment.config import LabSettings, SimulatedSettings
 from experiment.lights import Illumination, plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from foundation.colorimetry import angles_deg, decode_srgb
-from generator.lights.gamut import Gamut, Match, OutsideGamutError
+from foundation.errors import InputError
+from generator.lights.gamut import Gamut, Match
 
 _Array = npt.NDArray[np.float64]
 WELL_LIT_DN = 300
@@ -87,7 +88,7 @@ def leave_out(rgb: _Array) -> list[LeftOut]:
         others = np.delete(np.arange(len(rgb)), light)
         try:
             match: Match = Gamut(rgb[others]).match(rgb[light])
-        except OutsideGamutError:
+        except InputError:
             continue
         lights = tuple(int(others[number]) for number in match.mixture.lights)
         found.append(LeftOut(light, lights, match.mixture.weights))

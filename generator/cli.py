@@ -240,6 +240,9 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
     pictures = counted(made.sources, "picture")
     if different < made.sources:
         pictures += f", {different} of them different,"
+    choice = made.options["lights"]
+    if choice["choice"] == "together":
+        choice = choice["lights"]
     output.add(
         dataset=masked(out),
         made=not was_there,
@@ -248,6 +251,7 @@ def _print_summary(dataset: Dataset, out: str, output: JsonOutput, was_there: bo
         pictures=made.sources,
         different_pictures=different,
         lights=lights,
+        outside=choice.get("outside"),
         splits=made.splits,
         skipped=[skipped.name for skipped in made.skipped],
         noted=len(noted),

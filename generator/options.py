@@ -168,7 +168,7 @@ class LightOptions:
         _light_option(
             "GT.csv",
             "The same with a mixture of lights that matches the ground truth; where the table cannot make it, with the "
-            "nearest that it can.",
+            "nearest that it can, unless that is too far off.",
         ),
     ] = None
     lights_per_image: Annotated[
@@ -213,7 +213,7 @@ class LightOptions:
     def _lights(self, lut: Lut, seed: int, together: int) -> LightChoice:
         """Return the choice of lights with as many for each picture as its images have together."""
         from generator.lights import choices
-        from generator.lights.distributions import load_ground_truths, parse_distribution
+        from generator.lights.distributions import ground_truths_by_line, load_ground_truths, parse_distribution
         from generator.lights.gamut import Gamut
         from generator.lights.lighting import RandomLights
 
@@ -235,7 +235,7 @@ class LightOptions:
         if self.nearest is not None:
             return choices.nearest_lights(lut, load_ground_truths(self.nearest), self.nearest.name, together)
         if self.match is not None:
-            return choices.matched_lights(Gamut.of(lut), load_ground_truths(self.match), self.match.name, together)
+            return choices.matched_lights(Gamut.of(lut), ground_truths_by_line(self.match), self.match.name, together)
         if self.distribution is not None:
             return choices.DrawnLights(Gamut.of(lut), parse_distribution(self.distribution), count, seed)
         return RandomLights(count, len(lut.white), seed)
@@ -491,25 +491,16 @@ def _same_scenes(lut: Lut, place: str, pictures: PictureOptions, light: LightOpt
 
 def _prepared_as(pictures: PictureOptions, made: Description, place: str) -> Preparation:
     """Return the preparation of a dataset's pictures; an InputError if the options give another one."""
-    from generator.pictures.sources import Preparation
+    from generator.dataset.same_lights import preparation_of
+    from generator.pictures.sources import UNPREPARED
 
     if pictures.random_scenes:
         raise InputError(
             f"--lights-of {place} gives the pictures; leave --random-scenes out, those of it are made again"
         )
-    options = made.options
-    crop = options.get("crop")
-    prepared = Preparation(
-        max_side=options.get("max_side"),
-        crop=None if crop is None else (crop[0], crop[1]),
-        cover=bool(options.get("cover", False)),
-        crop_at=options.get("crop_at"),
-        profiles=options.get("profiles", "honour"),
-        seed=made.seed,
-        crops=int(options.get("crops", 1)),
-    )
-    given = pictures.preparation(made.seed)
-    if given.describe() not in (prepared.describe(), Preparation().describe()):
+    prepared = preparation_of(made)
+    given = pictures.preparation(prepared.seed)
+    if given.describe() not in (prepared.describe(), UNPREPARED.describe()):
         raise InputError(
             f"--max-side, --crop and --crops prepare pictures in another way than those of {place}; leave them out, "
             "pictures are prepared as there"

@@ -423,13 +423,13 @@ def make_share(
         raise InputError(f"share {index} of {count} was asked for, expected 0 to {count - 1}")
     with workplace(out, plan.identity(), alone=False) as place:
         _make(plan, place, range(index, plan.shards, count), workers or Workers(), callbacks)
-        return len(place.done()), plan.shards
+        return place.count_done(), plan.shards
 
 
 def _make(plan: Plan, place: Workplace, wanted: range, workers: Workers, callbacks: Callbacks) -> None:
-    done = place.done()
+    done = place.done(wanted)
     missing = [shard for shard in wanted if shard not in done]
-    callbacks.on_done(sum(plan.images_of(shard) for shard in wanted if shard in done))
+    callbacks.on_done(sum(map(plan.images_of, done)))
     if not missing:
         return
     if workers.address is None:

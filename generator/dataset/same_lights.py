@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any
 from foundation.errors import FormatError, InputError, first_of
 from generator.dataset.layouts import LAYOUTS, FileLayout
 from generator.dataset.reader import Dataset
-from generator.dataset.records import GROUND_TRUTH, Light
+from generator.dataset.records import GROUND_TRUTH, Description, Light
 from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture
 from generator.masks.making import GivenMaskPlan, find_masks
 from generator.pictures.random_scenes import RandomScene
-from generator.pictures.sources import Source, SourcePicture
+from generator.pictures.sources import Preparation, Source, SourcePicture
 from generator.stores import is_remote, local_path
 
 if TYPE_CHECKING:
@@ -108,6 +108,20 @@ class LeftOutPicture:
     def to_json(self) -> dict[str, Any]:
         """Return its name as a JSON object."""
         return {"left_out": self.name}
+
+
+def preparation_of(made: Description) -> Preparation:
+    """Return how the pictures of a dataset were prepared."""
+    crop = made.options.get("crop")
+    return Preparation(
+        max_side=made.options.get("max_side"),
+        crop=None if crop is None else (crop[0], crop[1]),
+        cover=bool(made.options.get("cover", False)),
+        crop_at=made.options.get("crop_at"),
+        # Scenes that another dataset had first are cut where its seed said.
+        seed=made.options.get("lights_of", {}).get("pictures_seed", made.seed),
+        crops=int(made.options.get("crops", 1)),
+    )
 
 
 def lights_of(dataset: Dataset, lut: Lut) -> LightsOf:

@@ -28,7 +28,7 @@ import math
 import shutil
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Container, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -106,6 +106,7 @@ RECORDS: Final = "shards"
 # Names among a place's notes: of the plan, of the folder of shards' records, and in a store of the notes' folder.
 NOTES: Final = ".plan"
 _WHOLE: Final = "shard"  # Name of the piece that is a shard; those of images are their numbers
+_HEAD_BYTES: Final = 80  # Of a record: a line end, a SHA-256 and the name of its first piece
 _READERS: Final = 16  # Record files that are read at a time: a store is waited for most of the time
 
 PlanIdentity = Mapping[str, Any]
@@ -424,8 +425,9 @@ def make_shard(
 
 
 def _finished_images(job: ShardJob, place: Workplace, pool: ThreadPoolExecutor) -> dict[int, FinishedImage]:
-    found = pool.map(place.image_of, place.pieces(job.shard).values())
-    return {image.image.number: image for image in found if image is not None}
+    # Another program may have committed the whole shard meanwhile.
+    pieces = [piece for name, piece in place.pieces(job.shard).items() if name != _WHOLE]
+    return {image.image.number: image for image in pool.map(place.image_of, pieces) if image is not None}
 
 
 def _taken_up(image: FinishedImage) -> Sample:
@@ -826,13 +828,28 @@ class Workplace:
     out: str
     plan_id: str
 
-    def done(self) -> set[int]:
-        """Return the shards that are done."""
-        ending = f".{self.plan_id}"
-        found = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
-        shards = [int(name.removesuffix(ending)) for name in found if name.endswith(ending)]
+    def done(self, wanted: Container[int]) -> set[int]:
+        """Return which of the wanted shards are done; records of others are not read."""
+        shards = [shard for shard in self._recorded() if shard in wanted]
         whole = ordered_map(self.has, shards, _READERS)
         return {shard for shard, is_done in zip(shards, whole, strict=True) if is_done}
+
+    def count_done(self) -> int:
+        """Return how many shards are done by the heads of their records; the rest of a record is not read."""
+        return sum(ordered_map(self._is_headed_whole, self._recorded(), _READERS))
+
+    def _recorded(self) -> list[int]:
+        """Return the shards that have a record, of the whole or of images."""
+        ending = f".{self.plan_id}"
+        found = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
+        return [int(name.removesuffix(ending)) for name in found if name.endswith(ending)]
+
+    def _is_headed_whole(self, shard: int) -> bool:
+        # In a store there are no records of images; elsewhere `commit` replaces them, so that the whole comes first.
+        if not isinstance(self.notes, LocalStore):
+            return True
+        with self.notes.open(self._record_name(shard)) as stream:
+            return f"\t{_WHOLE}\t".encode() in stream.read(_HEAD_BYTES)
 
     def has(self, shard: int) -> bool:
         """Return whether a shard is done."""

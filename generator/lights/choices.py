@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -36,6 +36,13 @@ _BATCH: Final = 32
 _BATCHES: Final = 2048
 # Share of a distribution that must lie in the gamut; with less, a light would take thousands of draws.
 _LEAST_WITHIN: Final = 1e-3
+# Angle, degrees, to the nearest light of the table beyond which a ground truth is far: more than the errors of good
+# methods, which are 2 degrees, so that the light taken would be another one than was asked for.
+_FAR_DEG: Final = 3.0
+# Share of far ground truths with which a file does not fit the table: edges of a data set may lie outside, not much of
+# it. So far are channels in another order and lights of another camera, unless the table makes nearly every light.
+_MOST_FAR: Final = 0.25
+_MOST_DEG: Final = 10.0  # Angle to the nearest light of the table that no ground truth of a table's camera has
 
 
 @dataclass(frozen=True)
@@ -63,12 +70,25 @@ class SequentialLights:
 
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values."""
-        return {
+        described: dict[str, Any] = {
             "choice": self.method,
             "file": self.file,
             "each": self.lights_each,
             "lights": [match.mixture.label for match in self.matches],
         }
+        if self.method == "match":
+            described["outside"] = {"count": self.outside, "largest_deg": round(self.largest_deg, 3)}
+        return described
+
+    @property
+    def outside(self) -> int:
+        """How many ground truths the lights found do not make."""
+        return sum(match.angle > TOLERANCE_DEG for match in self.matches)
+
+    @property
+    def largest_deg(self) -> float:
+        """Largest angle of a light to its ground truth, degrees."""
+        return max(match.angle for match in self.matches)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,12 +304,25 @@ def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", ea
     return SequentialLights("nearest", tuple(matches), file, each)
 
 
-def matched_lights(gamut: Gamut, truths: npt.NDArray[np.float64], file: str = "", each: int = 1) -> SequentialLights:
+def matched_lights(
+    gamut: Gamut, truths: Mapping[int, Sequence[float]], file: str = "", each: int = 1
+) -> SequentialLights:
     """Return for each ground truth the mixture of the table's lights that has it, or the nearest that there is.
 
-    `truths`: (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length. See `gamut.Gamut.match`.
+    An InputError says that too many ground truths are far from what the table can make, or one is very far.
+
+    `truths`: by their lines in the file, linear RGB ≥ 0 of the table's camera, of any length. See `gamut.Gamut.match`.
     """
-    return SequentialLights("match", tuple(gamut.match(truth, "nearest") for truth in truths), file, each)
+    choice = SequentialLights("match", tuple(gamut.match(truth, "nearest") for truth in truths.values()), file, each)
+    far = [line for line, match in zip(truths, choice.matches, strict=True) if match.angle > _FAR_DEG]
+    if len(far) > _MOST_FAR * len(truths) or choice.largest_deg > _MOST_DEG:
+        raise InputError(
+            f"{len(far)} of the {len(truths)} ground truths of {file} lie more than {_FAR_DEG:g} degrees outside what "
+            f"{gamut.table} can make, up to {choice.largest_deg:.2f} degrees, the first in line {far[0]}; expected at "
+            f"most {_MOST_FAR:.0%}, and none beyond {_MOST_DEG:g} degrees: see that the channels are in the order R, "
+            "G, B and the file is of the table's camera, or take a table with a wider gamut"
+        )
+    return choice
 
 
 def light_notes(choice: LightChoice) -> tuple[str, ...]:
@@ -298,11 +331,9 @@ def light_notes(choice: LightChoice) -> tuple[str, ...]:
         return light_notes(choice.choice)
     if not isinstance(choice, SequentialLights) or choice.method != "match":
         return ()
-    angles = [match.angle for match in choice.matches]
-    outside = sum(angle > TOLERANCE_DEG for angle in angles)
-    if not outside:
+    if not choice.outside:
         return ()
     return (
-        f"{outside} of the {len(angles)} lights of {choice.file} lie outside what the table can make, up to "
-        f"{max(angles):.2f} degrees; the nearest that it can make are taken, and are the ground truth",
+        f"{choice.outside} of the {len(choice.matches)} lights of {choice.file} lie outside what the table can make, "
+        f"up to {choice.largest_deg:.2f} degrees; the nearest that it can make are taken, and are the ground truth",
     )

@@ -36,12 +36,18 @@ TRIPLES: Final = (
 
 
 def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
-    """Return the ground truths of a file.
+    """Return the ground truths of a file as `ground_truths_by_line` reads it.
+
+    Returns (N, 3) float64 ≥ 0, linear camera RGB, not normalised.
+    """
+    return np.array(list(ground_truths_by_line(path).values()))
+
+
+def ground_truths_by_line(path: Path) -> dict[int, list[float]]:
+    """Return the ground truths of a file, linear camera RGB ≥ 0, by the numbers of their lines.
 
     Either a CSV file whose head names the columns `GT_R,GT_G,GT_B` or `r,g,b` (others are ignored), or lines of three
     numbers between blanks or commas, as in `gt.txt` and Cube+.
-
-    Returns (N, 3) float64 ≥ 0, linear camera RGB, not normalised.
     """
     lines = read_text(path, "name a text file", "ground truths").splitlines()
     numbered = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
@@ -55,7 +61,7 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
         if triple is None:
             raise FormatError(f"{path}, line 1: no columns GT_R,GT_G,GT_B or r,g,b; found {','.join(head)}")
         columns = [head.index(name) for name in triple]
-    truths: list[list[float]] = []
+    truths: dict[int, list[float]] = {}
     for number, line in numbered[named:]:
         fields = next(csv.reader([line])) if named else re.split(r"[\s,;]+", line.strip(",; "))
         try:
@@ -68,10 +74,10 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
             raise FormatError(
                 f"{path}, line {number}: {line!r} is no ground truth: expected numbers from 0, sum above 0"
             )
-        truths.append(truth)
+        truths[number] = truth
     if not truths:
         raise FormatError(f"{path} holds no ground truth below its head line")
-    return np.array(truths)
+    return truths
 
 
 def is_ground_truth(numbers: Sequence[float]) -> bool:

@@ -43,17 +43,6 @@ _Array = npt.NDArray[np.float64]
 _THIN: Final = 1e-6
 
 
-class OutsideGamutError(InputError):
-    """A light is wanted that no mixture of the table's lights makes.
-
-    - `angle`: angle to the nearest light that can be made, degrees.
-    """
-
-    def __init__(self, message: str, angle: float) -> None:
-        super().__init__(message)
-        self.angle = angle
-
-
 @dataclass(frozen=True)
 class Match:
     """The mixture found for a wanted light, and the angle between the two in degrees."""
@@ -141,10 +130,9 @@ class Gamut:
             return nearest
         r, b = rb_of(target)
         near_r, near_b = rb_of(np.asarray(nearest.mixture.weights) @ self.white[list(nearest.mixture.lights)])
-        raise OutsideGamutError(
+        raise InputError(
             f"the light r={r:.4f}, b={b:.4f} lies {nearest.angle:.2f}° outside what {self.table} can make; the nearest "
-            f"it can is r={near_r:.4f}, b={near_b:.4f}: ask for that",
-            nearest.angle,
+            f"it can is r={near_r:.4f}, b={near_b:.4f}: ask for that"
         )
 
     @cached_property

@@ -126,7 +126,7 @@ _MULTIPLIED: Final = frozenset({"dpx", "iff", "openexr", "rla", "tiff"})
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """How pictures are prepared on request: made smaller, cut, taken as sRGB.
+    """How pictures are prepared on request: made smaller, cut.
 
     - `max_side`: longest side allowed, px; a larger picture is made smaller.
     - `crop`: (width, height), px, to cut every picture to.
@@ -135,8 +135,6 @@ class Preparation:
       for the centre of one crop, and random places of several.
     - `crops`: how many different crops to cut. The first is where `crop_at` says, at random that of one; the others are
       at random places far from it and from each other.
-    - `profiles`: ``"honour"`` converts pictures of other colour spaces to sRGB; ``"ignore"`` takes all codes as they
-      stand.
     - `seed`: 0 … 2⁶⁴ − 1, of random crops.
     """
 
@@ -144,7 +142,6 @@ class Preparation:
     crop: tuple[int, int] | None = None
     cover: bool = False
     crop_at: Literal["centre", "random"] | None = None
-    profiles: Literal["honour", "ignore"] = "honour"
     seed: int = 0
     crops: int = 1
 
@@ -169,7 +166,7 @@ class Preparation:
 
     def describe(self) -> dict[str, Any]:
         """Return the options that are set, as a JSON object."""
-        options: dict[str, Any] = {"profiles": self.profiles}
+        options: dict[str, Any] = {"profiles": "honour"}
         if self.max_side is not None:
             options["max_side"] = self.max_side
         if self.crop is not None:
@@ -179,7 +176,7 @@ class Preparation:
         return options
 
 
-UNPREPARED: Final = Preparation()  # Nothing is done on request: the whole picture in its own size, profiles honoured
+UNPREPARED: Final = Preparation()  # Nothing is done on request: the whole picture in its own size
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -281,17 +278,14 @@ def open_picture(
         word = "linear light, encoded as sRGB"
     elif values.icc is None and not values.adobe_rgb:
         word = "none, taken as sRGB"
-    elif preparation.profiles == "ignore":
-        word = "ignored, taken as sRGB"
     elif values.icc is not None:
         codes, word = to_srgb(codes, values.icc)
     else:
         codes, word = from_adobe_rgb(codes), ADOBE_RGB
-    honoured = values.icc is not None and preparation.profiles == "honour"
     noted = {
         LINEAR: values.linear,
         TRANSPARENT: values.alpha is not None,
-        PROFILE_UNUSED: honoured and word.endswith("taken as sRGB"),
+        PROFILE_UNUSED: values.icc is not None and word.endswith("taken as sRGB"),
     }
     codes = _turn(codes, values.orientation)
     cuts = _fit(codes, preparation, path, path.name if name is None else name)

@@ -78,6 +78,27 @@ def test_what_is_odd_of_a_picture_is_noted(generate: Generate, capsys: pytest.Ca
     assert capsys.readouterr().out.count("4 pictures have notes in sources.csv, such as alpha.png: transparent") == 1
 
 
+def test_lights_of_a_file_fit_the_table_or_are_refused(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
+    white = open_lut(Path("lut")).white
+    near = white[0] / white[0].sum() + [0.0, 0.02, 0.0]
+    wish = ("lut", "out", "--sources", "pictures", "--match", "gt.csv", "--json")
+    rows = [white[1], white[0], white[2], white[3], near]
+    Path("gt.csv").write_text("r,g,b\n\n" + "".join("{:.9f},{:.9f},{:.9f}\n".format(*row) for row in rows))
+    with Path("gt.csv").open("a") as stream:
+        stream.write("0,0,1\n")
+    assert generate(*wish) == 2
+    assert "of gt.csv lie more than 3 degrees" in (said := capsys.readouterr().err)
+    assert "the first in line 8;" in said
+    assert not Path("out").exists()
+    Path("gt.csv").write_text(Path("gt.csv").read_text().removesuffix("0,0,1\n"))
+    assert generate(*wish, "--lights-per-image", "2") == 0
+    outside = json.loads(capsys.readouterr().out)["outside"]
+    assert outside["count"] == 1
+    assert 0.1 < outside["largest_deg"] < 3
+    described = json.loads(Path("out/dataset.json").read_text())["options"]["lights"]["lights"]
+    assert described["outside"] == outside
+
+
 def test_a_dataset_with_its_contact_sheet(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
     Path("pictures/bad.png").write_bytes(b"?")
     wish = ("--sources", "pictures", "--light", "0,2-3", "--seed", "4", "--rendering", "codes")

@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,7 @@ from foundation.colorimetry import decode_srgb
 from foundation.errors import FormatError, InputError, first_of
 from foundation.files import file_sha256, sha256_of
 from generator.dataset.reader import Dataset
+from generator.dataset.same_lights import preparation_of
 from generator.lights.lighting import parse_mixture
 from generator.pictures.random_scenes import RandomScene
 from generator.pictures.sources import Preparation, find_pictures, open_picture
@@ -160,7 +161,7 @@ def find_sources(dataset: Dataset, place: Path | str) -> tuple[Mapping[str, Foun
     A picture is the one that is meant if its bytes have the hash that the data set records; a file of that name is
     tried first, then files of other names. Pictures of random colours need no file.
     """
-    preparation = preparation_of(dataset)
+    preparation = preparation_of(dataset.description)
     if "://" in str(place):
         raise InputError(f"{place} is no folder of this machine; copy the pictures to one")
     # A set of random colours needs no folder, but one that is named must be there.
@@ -190,22 +191,6 @@ def find_sources(dataset: Dataset, place: Path | str) -> tuple[Mapping[str, Foun
         else:
             found[record.name] = FoundPicture(record.name, path, record.height, record.width, preparation)
     return found, tuple(missing)
-
-
-def preparation_of(dataset: Dataset) -> Preparation:
-    """Return how the pictures of a data set were prepared, by its description."""
-    options: Mapping[str, Any] = dataset.description.options
-    crop = options.get("crop")
-    return Preparation(
-        max_side=options.get("max_side"),
-        crop=(int(crop[0]), int(crop[1])) if crop else None,
-        cover=bool(options.get("cover", False)),
-        crop_at=options.get("crop_at", "centre"),
-        profiles=options.get("profiles", "honour"),
-        # Scenes that another data set had first are cut where its seed said.
-        seed=options.get("lights_of", {}).get("pictures_seed", dataset.description.seed),
-        crops=int(options.get("crops", 1)),
-    )
 
 
 _LINEAR: Final = decode_srgb(np.arange(256) / 255)  # Linear light 0 … 1 of each code

@@ -70,6 +70,19 @@ def test_both_cameras_see_the_same_scenes_under_the_same_light(lab: Path, lights
     assert one == pytest.approx(two, abs=4)
 
 
+def test_pictures_of_a_third_camera_are_cut_as_for_the_first(lab: Path) -> None:
+    del lab
+    wish = ("--sources", "pictures", "--no-preview")
+    cut = ("--crop", "20x16,random", "--seed", "7")
+    assert main(("one", "first", *wish, "--light", "all", *cut)) == 0
+    assert main(("two", "second", *wish, "--lights-of", "first", "--seed", "7")) == 0
+    assert main(("two", "other", *wish, "--lights-of", "first", "--seed", "1")) == 0
+    assert main(("two", "third", *wish, "--lights-of", "other", "--seed", "7")) == 0
+    for entry in open_dataset("second").entries:
+        second, third = (Path(name, "images", entry.image).read_bytes() for name in ("second", "third"))
+        assert second == third
+
+
 def test_masks_are_those_of_the_first(lab: Path) -> None:
     del lab
     wish = ("--sources", "pictures", "--no-preview")

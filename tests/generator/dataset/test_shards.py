@@ -407,6 +407,48 @@ def test_shares_are_made_beside_each_other(make_lut: MakeLut, tmp_path: Path) ->
             make_dataset(plan_of(lut), tmp_path / "out")
 
 
+def test_a_shard_is_made_twice_and_by_two_programs_at_once(
+    make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lut, out = make_lut(), tmp_path / "out"
+    plan = plan_of(lut)
+    make_dataset(plan, tmp_path / "whole")
+    done = Workplace.done
+
+    def done_by_another_meanwhile(place: Workplace, wanted: range) -> set[int]:
+        found = done(place, wanted)
+        with monkeypatch.context() as other:
+            other.setattr(Workplace, "done", done)
+            make_share(plan, out, (0, 2))
+        return found
+
+    with workplace(out, plan.identity(), alone=False) as place, ThreadPoolExecutor(1) as pool:
+        assert make_shard(plan.job(1), lut, place, pool, 1) == make_shard(plan.job(1), lut, place, pool, 1)
+        monkeypatch.setattr(Workplace, "done", done_by_another_meanwhile)
+        assert make_share(plan, out, (0, 2)) == (4, 6)
+        monkeypatch.undo()
+        assert make_share(plan, out, (0, 1)) == (6, 6)
+    make_dataset(plan, out)
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_a_share_reads_the_records_of_its_own_shards(
+    make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lut, out, read = make_lut(), tmp_path / "out", set[int]()
+    make_share(plan_of(lut), out, (0, 2))
+    killed_after(1, lambda: make_share(plan_of(lut), out, (3, 6)))
+    pieces = Workplace.pieces
+
+    def noted(place: Workplace, shard: int) -> dict[str, Any]:
+        read.add(shard)
+        return pieces(place, shard)
+
+    monkeypatch.setattr(Workplace, "pieces", noted)
+    assert make_share(plan_of(lut), out, (1, 6)) == (4, 6), "shard 3 has finished images, and is not done"
+    assert read == {1}
+
+
 def test_a_share_that_waited_for_the_whole_is_refused(
     make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -67,19 +67,39 @@ def test_lights_together_share_an_image() -> None:
     assert choice.describe()["lights"] == inner.describe()
 
 
+GAMUT = Gamut(rgb_of([[0.5, 0.2], [0.3, 0.15], [0.2, 0.45]]))
+INSIDE = rgb_of([0.33, 0.25]).tolist()
+
+
+def aside(degrees: float) -> list[float]:
+    """Return a light beside the first of `GAMUT`, away from all that it makes."""
+    corner, away = GAMUT.directions[0], np.array([1.0, 0.0, 0.0])
+    away = away - (away @ corner) * corner
+    angle = np.radians(degrees)
+    return (np.cos(angle) * corner + np.sin(angle) * away / np.linalg.norm(away)).tolist()
+
+
 def test_lights_that_the_table_cannot_make_are_noted_and_the_nearest_taken() -> None:
-    gamut = Gamut(rgb_of([[0.5, 0.1], [0.3, 0.2], [0.2, 0.45]]))
-    inside, outside = rgb_of([[0.33, 0.25], [0.1, 0.1]])
-    choice = matched_lights(gamut, np.array([inside, outside]), "gt.csv")
-    assert choice.matches[0].angle < TOLERANCE_DEG < 5 < choice.matches[1].angle
+    choice = matched_lights(GAMUT, {1: INSIDE, 2: aside(2.5)}, "gt.csv")
+    assert choice.matches[0].angle < TOLERANCE_DEG
+    assert choice.matches[1].angle == pytest.approx(2.5)
     (note,) = light_notes(choice)
     assert note.startswith("1 of the 2 lights of gt.csv lie outside")
-    assert f"up to {choice.matches[1].angle:.2f} degrees" in note
-    together = SimultaneousLights(
-        matched_lights(gamut, np.array([outside]), "gt.csv", 2), 2, parse_masks("spots", 2, 0)
-    )
+    assert "up to 2.50 degrees" in note
+    assert choice.describe()["outside"] == {"count": 1, "largest_deg": 2.5}
+    together = SimultaneousLights(matched_lights(GAMUT, {1: aside(2.5)}, "gt.csv", 2), 2, parse_masks("spots", 2, 0))
     assert len(light_notes(together)) == 1
-    assert light_notes(matched_lights(gamut, np.array([inside]))) == light_notes(RandomLights(1, 3, 0)) == ()
+    assert light_notes(matched_lights(GAMUT, {1: INSIDE})) == light_notes(RandomLights(1, 3, 0)) == ()
+
+
+def test_ground_truths_far_from_the_table_are_refused() -> None:
+    several = dict.fromkeys(range(2, 12), INSIDE)
+    assert matched_lights(GAMUT, {1: aside(9.9), **several}).outside == 1
+    assert matched_lights(GAMUT, {1: aside(3.1), 2: INSIDE, 3: INSIDE, 4: aside(2.9)}).outside == 2
+    with pytest.raises(InputError, match=r"^1 of the 11 .* of gt\.csv .* 10\.10 degrees, the first in line 9;"):
+        matched_lights(GAMUT, {**several, 9: aside(10.1), 12: INSIDE}, "gt.csv")
+    with pytest.raises(InputError, match=r"^2 of the 4 .* 3\.20 degrees, the first in line 2; .*order R, G, B.*camera"):
+        matched_lights(GAMUT, {1: INSIDE, 2: aside(3.1), 3: INSIDE, 4: aside(3.2)})
 
 
 def test_lists_and_lights_are_told_apart(make_lut: MakeLut) -> None:
