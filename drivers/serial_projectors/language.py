@@ -279,15 +279,23 @@ class FaultWords(Question):
     """The value without a fault."""
     parts: Annotated[dict[str, Part], AfterValidator(_in_capitals), Field(min_length=1)]
     """What the values mean; all others mean another part."""
+    digits: Annotated[int, Field(ge=0, le=8)] = 0
+    """Hexadecimal digits of every value; 0 if any word may come."""
 
     @model_validator(mode="after")
     def _single_words(self) -> FaultWords:
         for value in (self.healthy, *self.parts):
             if len(value.split()) != 1:
                 raise ValueError(f"{value!r}: one word was expected, since a space separates two faults")
+            if not self.may_be(value):
+                raise ValueError(f"{value!r}: {self.digits} hexadecimal digits were expected, as digits says")
         if self.healthy.upper() in self.parts:
             raise ValueError(f"healthy = {self.healthy!r}: a value that is none of the parts was expected")
         return self
+
+    def may_be(self, value: str) -> bool:
+        """Return whether a word can be a value."""
+        return not self.digits or re.fullmatch(f"[0-9A-Fa-f]{{{self.digits}}}", value) is not None
 
 
 class Unasked(_Table):
@@ -330,13 +338,17 @@ class Language(_Table):
                 self.line.require_received(key, text)
                 if text and refusal_in(self.refusals, text) is not None:
                     raise ValueError(f"{key} = {text!r} is one of the refusals, too: another text was expected")
-                if any(value_in((message.text,), text) is not None for message in self.unasked):
+                if self.unasked_in(text) is not None:
                     raise ValueError(f"{key} = {text!r} is one of the unasked messages, too: another text was expected")
         others = {"refusals": self.refusals.all, "unasked": tuple(message.text for message in self.unasked)}
         for key, texts in others.items():
             for text in texts:
                 self.line.require_received(key, text)
         return self
+
+    def unasked_in(self, text: str) -> Unasked | None:
+        """Return the first unasked message that a text is; None if it is none."""
+        return next((message for message in self.unasked if value_in((message.text,), text) is not None), None)
 
     @property
     def announces_power(self) -> bool:
@@ -394,15 +406,15 @@ def encode_answer(line: LineFormat, text: str) -> bytes:
     return (whole if text else whole.lstrip("\r\n")).encode("ascii")
 
 
-def answer_parser(line: LineFormat, sent: str = "") -> MessageParser[str]:
+def answer_parser(language: Language, sent: str = "") -> MessageParser[str]:
     """Return what takes one answer, without its framing, off the front of the bytes.
 
     `sent`: the command before it, whose echo is passed over. If the echo and the answer are alike and only one of them
-    comes, the prompt after it shows that it was the answer.
+    comes, the prompt after it shows that it was the answer. An unended answer ends where an unasked message begins.
     """
+    line = language.line
     ends = [character.encode("ascii") for character in line.ends]
-    begin = line.answer.partition(_VALUE)[0]
-    prompt = line.prompt.encode("ascii")
+    begin, prompt = line.answer.partition(_VALUE)[0].encode("ascii"), line.prompt.encode("ascii")
 
     def take(data: bytes) -> tuple[str, int] | None:
         place, echoed = 0, False
@@ -413,10 +425,14 @@ def answer_parser(line: LineFormat, sent: str = "") -> MessageParser[str]:
                 if echoed:
                     return sent, place
                 continue
+            place += len(begin) if data.startswith(begin, place) else 0
             found = [end for end in (data.find(character, place) for character in ends) if end >= 0]
-            text = text_of(data[place : min(found, default=len(data))].strip(_BLANK)).removeprefix(begin)
+            text = text_of(data[place : min(found, default=len(data))].strip(_BLANK))
             if not found:
                 return (text, len(data)) if text in line.unended else None
+            for word in line.unended:
+                if text.startswith(word) and language.unasked_in(text.removeprefix(word).removeprefix(begin.decode())):
+                    return word, data.index(word.encode("ascii"), place) + len(word)
             place = min(found) + 1
             if not line.echo or text != sent or echoed:
                 return text, place
