@@ -147,7 +147,7 @@ class LineProjector(Projector):
         words = self._language.mute
         if words.only_changes and self._mute_told() is muted:
             return
-        self._command(words.on if muted else words.off, words.done)
+        self._exchanged(words.on if muted else words.off, (words.done,))
         self._muted = muted
 
     def faults(self) -> tuple[Fault, ...]:
@@ -201,7 +201,7 @@ class LineProjector(Projector):
             self._under_way = begins
             self._give_up_at = self._clock.monotonic() + words.done_within_s
             return
-        self._command(command, words.done)
+        self._exchanged(command, (words.done,))
         if self._language.announces_power:
             self._announced = begins
 
@@ -253,9 +253,6 @@ class LineProjector(Projector):
 
     def _value(self, question: Question) -> str:
         return self._exchanged(question.ask, question.answer)
-
-    def _command(self, command: str, done: str) -> None:
-        self._exchanged(command, (done,))
 
     def _exchanged(self, text: str, answers: tuple[str, ...]) -> str:
         self._take_late_answer()

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, cast
+from typing import Annotated, Any, Final, Literal, cast, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -481,12 +481,4 @@ Refusal = Literal["unknown", "busy", "unclear"]  # The kinds of `Refusals`
 
 def refusal_in(refusals: Refusals, text: str) -> Refusal | None:
     """Return in which way an answer refuses; None if it does not."""
-    kinds: dict[Refusal, tuple[str, ...]] = {
-        "unknown": refusals.unknown,
-        "busy": refusals.busy,
-        "unclear": refusals.unclear,
-    }
-    for kind, words in kinds.items():
-        if any(text.upper() == word.upper() for word in words):
-            return kind
-    return None
+    return next((kind for kind in get_args(Refusal) if value_in(getattr(refusals, kind), text) is not None), None)
