@@ -368,19 +368,15 @@ def built_in_languages() -> tuple[str, ...]:
 
 def load_language(named: str) -> Language:
     """Return the language of a name, or of a file if `named` ends with ``.toml``."""
-    if named.lower().endswith(FILE_ENDING):
-        return _read_language(Path(named))
-    known = built_in_languages()
-    if named.lower() not in known:
-        hint = f"{near} " if (near := nearest_names(named, known)) else ""
-        raise ConfigurationError(
-            f"no projector language {named!r}; {hint}expected {', '.join(known)}, "
-            f"or the path of a file that ends with {FILE_ENDING}"
-        )
-    return _read_language(FOLDER / f"{named.lower()}{FILE_ENDING}")
-
-
-def _read_language(path: Path) -> Language:
+    path, known = Path(named), built_in_languages()
+    if not named.lower().endswith(FILE_ENDING):
+        if named.lower() not in known:
+            hint = f"{near} " if (near := nearest_names(named, known)) else ""
+            raise ConfigurationError(
+                f"no projector language {named!r}; {hint}expected {', '.join(known)}, "
+                f"or the path of a file that ends with {FILE_ENDING}"
+            )
+        path = FOLDER / f"{named.lower()}{FILE_ENDING}"
     text = read_text(path, "write one as docs/devices.md describes", "language file")
     return parse_language(text, str(path))
 
