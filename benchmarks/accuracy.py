@@ -24,6 +24,7 @@ import numpy.typing as npt
 from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
 from acquisition.run.run import run_session
 from benchmarks import words_given
+from benchmarks.sessions import stated_of_cells
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from drivers.camera import ExposureSettings
@@ -183,9 +184,8 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
         f"World.white, {len(lights)} lights",
     )
     report(f"{case}: ground truth, worst angle", float(degrees.max()), "degrees", f"World.white, {len(lights)} lights")
-    stated, stated_cells = lut.truth_uncertainty_deg, lut.cell_uncertainty
+    stated, stated_cells = lut.truth_uncertainty_deg, stated_of_cells(lut)
     assert stated is not None
-    assert stated_cells is not None
     for name, value in (("median", np.median(stated)), ("worst", stated.max())):
         report(f"{case}: ground truth, {name} stated", float(value), "degrees, k = 2", "uncertainty.csv")
     report(f"{case}: cells, RMS stated", 100 * float(np.sqrt((stated_cells**2).mean())), "%, k = 2", "cells.csv")

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from calibration.measurements import FrameMeasurements
 from calibration.registration.register import Registration
 from calibration.sampling import sites_at
-from calibration.table.lut import Lut
+from calibration.table.lut import CELLS, Lut
 from calibration.verdict import BuildResult
 from drivers.camera import CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
@@ -321,11 +321,15 @@ def compare(
     fit = np.ones(len(codes), dtype=np.bool_)
     fit[unfit] = False
     offset = offsets_px(result.figures.registration, world, cells_mm, session.folder / records[0].record.file)
-    stated_light, stated_cell = lut.truth_uncertainty_deg, lut.cell_uncertainty
+    stated_light = lut.truth_uncertainty_deg
     assert stated_light is not None
-    assert stated_cell is not None
     light = angles_deg(white, lut.white)
-    return TableTruth(light, stated_light, stated_cell, share / np.median(share), level, error, fit, offset)
+    return TableTruth(light, stated_light, stated_of_cells(lut), share / np.median(share), level, error, fit, offset)
+
+
+def stated_of_cells(lut: Lut) -> _Array:
+    """Return (C, 3) float64: the expanded relative uncertainty (k = 2) that a table states of its cells' means."""
+    return np.loadtxt(lut.folder / CELLS, delimiter=",", skiprows=1)[:, 1:]
 
 
 def noise_of(

@@ -45,15 +45,7 @@ _ZERO: Final = 1e-12
 def recovery_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return the angle between estimated and true light, degrees (paper, equation 3).
 
-    Parameters
-    ----------
-    estimate, truth
-        (..., 3) float or int, linear camera RGB of any length > 0.
-
-    Returns
-    -------
-    ndarray
-        (...) float64, 0 … 180.
+    `estimate`, `truth`: (..., 3) float or int, linear camera RGB of any length > 0. Returns (...) float64, 0 … 180.
 
     Examples
     --------
@@ -68,15 +60,8 @@ def recovery_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDArray
 def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return the angle between the white surface after correction and white, degrees (paper, equation 4).
 
-    Parameters
-    ----------
-    estimate, truth
-        (..., 3) float or int, linear camera RGB of any length > 0; a channel of the estimate at zero gives the limit.
-
-    Returns
-    -------
-    ndarray
-        (...) float64, 0 … 54.74: arccos(1/√3), white corrected to a single channel.
+    `estimate`, `truth`: (..., 3) float or int, linear camera RGB of any length > 0; a channel of the estimate at zero
+    gives the limit. Returns (...) float64, 0 … 54.74: arccos(1/√3), white corrected to a single channel.
 
     Examples
     --------
@@ -107,14 +92,9 @@ _ROWS_OF: Final = 1 << 19
 class RegionError:
     """The error of the region of one light, degrees.
 
-    Attributes
-    ----------
-    light
-        The light's number, from 0.
-    share
-        Pixels of the region over pixels that are judged, above 0.
-    recovery, reproduction
-        Angular errors against that light, averaged over the region's pixels.
+    - `light`: the light's number, from 0.
+    - `share`: pixels of the region over pixels that are judged, above 0.
+    - `recovery`, `reproduction`: angular errors against that light, averaged over the region's pixels.
     """
 
     light: int
@@ -127,14 +107,10 @@ class RegionError:
 class MapError:
     """The errors of an estimate on an image under several lights, degrees.
 
-    Attributes
-    ----------
-    recovery, reproduction
-        Angular errors by pixel, averaged over pixels; the first is LSMI's MAE_illum. NaN where no pixel is judged.
-    rgb
-        LSMI's MAE_rgb. NaN where no pixel is judged.
-    regions
-        Of each light that gives more than half of some pixel's light, in the lights' order.
+    - `recovery`, `reproduction`: angular errors by pixel, averaged over pixels; the first is LSMI's MAE_illum. NaN
+      where no pixel is judged.
+    - `rgb`: LSMI's MAE_rgb. NaN where no pixel is judged.
+    - `regions`: of each light that gives more than half of some pixel's light, in the lights' order.
     """
 
     recovery: float
@@ -156,23 +132,12 @@ def measure_map(
 
     Left out are pixels that are masked, and those of which the true light is not known (NaN).
 
-    Parameters
-    ----------
-    estimate
-        (3,) float, the light of every pixel, or (H, W, 3) float, one light a pixel; linear camera RGB of any length
-        above 0, no channel below 0.
-    truth
-        (H, W, 3) float, the true light of each pixel, of any length; NaN where it is not known.
-    weights
-        (H, W, K) float, the share of each light in each pixel, 0 … 1.
-    lights
-        (K, 3) float, the lights, of any length above 0.
-    image
-        (H, W, 3) of any dtype of numbers, linear camera RGB ≥ 0, black subtracted.
-    saturation
-        Value at which a corrected pixel is clipped; None if none is.
-    mask
-        (H, W) bool, True where a pixel must not be judged.
+    `estimate`: (3,) float, the light of every pixel, or (H, W, 3) float, one light a pixel; linear camera RGB of any
+    length above 0, no channel below 0. `truth`: (H, W, 3) float, the true light of each pixel, of any length; NaN where
+    it is not known. `weights`: (H, W, K) float, the share of each light in each pixel, 0 … 1. `lights`: (K, 3) float,
+    the lights, of any length above 0. `image`: (H, W, 3) of any dtype of numbers, linear camera RGB ≥ 0, black
+    subtracted. `saturation`: value at which a corrected pixel is clipped; None if none is. `mask`: (H, W) bool, True
+    where a pixel must not be judged.
 
     Examples
     --------
@@ -248,22 +213,13 @@ SMALL_DEG: Final = 3.0
 class Summary:
     """The numbers that sum up the errors of a method on a data set, degrees: first the paper's six, in its order.
 
-    Attributes
-    ----------
-    mean, median
-        Of all errors.
-    trimean
-        (Q1 + 2 Q2 + Q3) / 4.
-    best25, worst25
-        Means of the errors up to the 25th and from the 75th percentile.
-    avg
-        Geometric mean of the five (J. T. Barron, "Convolutional color constancy", ICCV 2015).
-    p95
-        95th percentile.
-    maximum
-        The largest error.
-    below3
-        Share of the errors below 3 degrees, 0 … 1.
+    - `mean`, `median`: of all errors.
+    - `trimean`: (Q1 + 2 Q2 + Q3) / 4.
+    - `best25`, `worst25`: means of the errors up to the 25th and from the 75th percentile.
+    - `avg`: geometric mean of the five (J. T. Barron, "Convolutional color constancy", ICCV 2015).
+    - `p95`: 95th percentile.
+    - `maximum`: the largest error.
+    - `below3`: share of the errors below 3 degrees, 0 … 1.
     """
 
     mean: float
@@ -284,10 +240,7 @@ class Summary:
 def summarise(errors: npt.ArrayLike) -> Summary:
     """Return the summary of errors (N,) float, N ≥ 1, degrees.
 
-    Raises
-    ------
-    InputError
-        There is no error to summarise, or one is NaN or infinite.
+    Raises `InputError`: there is no error to summarise, or one is NaN or infinite.
 
     Examples
     --------

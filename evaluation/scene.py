@@ -75,25 +75,16 @@ def told_of(made: Iterable[_Made], on_scene: Callable[[], None] | None) -> Itera
 class SceneSet:
     """The images of a data set, and what was done to them before a method sees them.
 
-    Attributes
-    ----------
-    name
-        The data set's name as its authors write it, for the heads of tables: "Cube+".
-    layout
-        The name of the layout it was read by: "cube-plus".
-    place
-        Its folder, file or URL as it was given.
-    scenes
-        Its images, in the data set's own order; at least one.
-    treatment
-        Stated with every result: "black level", "saturation", "mask" and "ground truth", each with a sentence that
-        gives the value applied and its source. "reader" stands beside them where the layout's reader was never tried
-        on a published copy.
-    folds
-        The fold of each scene, counted from 0, where the data set's authors divide it; else None.
-    truth_uncertainty_deg
-        What the direction of a ground truth may be off by at worst, degrees, expanded (k = 2), where the data set
-        states it; else None.
+    - `name`: the data set's name as its authors write it, for the heads of tables: "Cube+".
+    - `layout`: the name of the layout it was read by: "cube-plus".
+    - `place`: its folder, file or URL as it was given.
+    - `scenes`: its images, in the data set's own order; at least one.
+    - `treatment`: stated with every result: "black level", "saturation", "mask" and "ground truth", each with a
+      sentence that gives the value applied and its source. "reader" stands beside them where the layout's reader was
+      never tried on a published copy.
+    - `folds`: the fold of each scene, counted from 0, where the data set's authors divide it; else None.
+    - `truth_uncertainty_deg`: what the direction of a ground truth may be off by at worst, degrees, expanded (k = 2),
+      where the data set states it; else None.
     """
 
     name: str

@@ -30,10 +30,7 @@ def noise_curve(lut: Lut) -> PhotonTransfer | None:
     dark samples, which are cut at 0 and hence too quiet, are few; cells with such a sample, and unfit cells, are left
     out. The curve is fitted by `calibration.sampling`.
 
-    Raises
-    ------
-    InputError
-        The samples do not follow the curve, or too few cells can be read.
+    Raises `InputError`: the samples do not follow the curve, or too few cells can be read.
     """
     count = lut.samples.shape[2]
     lights = np.argsort(-lut.white.min(axis=1), kind="stable")[:_LIGHTS]

@@ -426,21 +426,8 @@ class Lut:
         FormatError
             `uncertainty.csv` is damaged.
         """
-        found = _load_numbers(self.folder / UNCERTAINTY, (EXPANDED,), len(self.illuminations))
-        return None if found is None else found[:, 0]
-
-    @cached_property
-    def cell_uncertainty(self) -> npt.NDArray[np.float64] | None:
-        """(8**bits, 3) float64, expanded relative uncertainty (k = 2) of each cell's mean in R, G and B, noise apart.
-
-        Under the light that the chart was registered in; None in computed tables.
-
-        Raises
-        ------
-        FormatError
-            `cells.csv` is damaged.
-        """
-        return _load_numbers(self.folder / CELLS, CELL_COLUMNS, 8**self.provenance.bits)
+        path = self.folder / UNCERTAINTY
+        return _load_uncertainty(path, len(self.illuminations)) if path.is_file() else None
 
     @cached_property
     def frames(self) -> tuple[SourceFrame, ...]:
@@ -491,15 +478,13 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
     return Lut(folder, map_samples(folder / SAMPLES, len(lights), provenance.bits), lights, white, provenance)
 
 
-def _load_numbers(path: Path, columns: Sequence[str], count: int) -> npt.NDArray[np.float64] | None:
-    """Return columns (count, N) float64 of a table of numbers; None where there is no such file."""
-    if not path.is_file():
-        return None
+def _load_uncertainty(path: Path, count: int) -> npt.NDArray[np.float64]:
+    """Return the expanded uncertainties (count,) float64 of the lights."""
     try:
-        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
-        found = np.array([[float(row[column]) for column in columns] for row in rows]).reshape(len(rows), len(columns))
+        rows = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8")))
+        found = np.array([float(row[EXPANDED]) for row in rows])
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{path} is damaged: numbers under {','.join(columns)} expected; {RESTORE}") from error
+        raise FormatError(f"{path} is damaged: numbers under {EXPANDED} expected; {RESTORE}") from error
     if len(found) != count or not np.isfinite(found).all() or (found < 0).any():
         raise FormatError(f"{path} has {len(found)} rows, {count} of finite numbers from 0 on expected; {RESTORE}")
     return found

@@ -136,9 +136,9 @@ class Exchange:
         """Send `question` and return the first message that `unsolicited` does not claim."""
         return self._again_if_lost(lambda: self._ask_once(question, take, unsolicited))
 
-    def open_with(self, question: bytes, take: MessageParser[_T]) -> _T:
-        """Send `question` over the connection just opened and return its answer; only for `greet`."""
-        return self._ask_once(question, take, None)
+    def open_with(self, opening: bytes, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None = None) -> _T:
+        """Send `opening` over the connection just opened and return its answer, as `ask`; only for `greet`."""
+        return self._ask_once(opening, take, unsolicited)
 
     def listen(self, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None = None) -> _T:
         """Return what the other side says first over the connection just opened; only for `greet`."""

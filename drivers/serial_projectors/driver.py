@@ -31,6 +31,7 @@ _CHECK_CABLE = (
     "check the cable (straight or null-modem, as its manual says), the speed, and that it may be controlled in standby"
 )
 _WAIT = "wait until its power is on and try again"
+_BY_HAND = "do it with its remote control, or try again when its power is on"
 
 
 class _Unknown(DeviceRefused):
@@ -45,7 +46,7 @@ class _Unclear(DeviceRefused):
     """The projector does not have it, or cannot carry it out now."""
 
 
-_REFUSED = {"unknown": _Unknown, "busy": _Busy, "unclear": _Unclear}
+_REFUSED = {"unknown": (_Unknown, _BY_HAND), "busy": (_Busy, _WAIT), "unclear": (_Unclear, _WAIT)}
 
 
 class LineProjector(Projector):
@@ -126,10 +127,17 @@ class LineProjector(Projector):
 
     def muted(self) -> bool | None:
         """Return whether the picture is hidden; what was set last if the projector cannot tell, None before that."""
+        told = self._mute_told()
+        return self._muted if told is None else told
+
+    def _mute_told(self) -> bool | None:
+        """Return whether it answers that the picture is hidden; without such a question, what was set last."""
         words = self._language.mute
-        value = self._value_if_known(Question(ask=words.ask, answer=words.answer)) if words.ask else None
-        if value is None:
+        if not words.ask:
             return self._muted
+        value = self._value_if_known(Question(ask=words.ask, answer=words.answer))
+        if value is None:
+            return None
         if value.upper() not in words.states:
             raise self._unexpected(words.ask, value, f"one of {', '.join(words.states)}")
         return words.states[value.upper()]
@@ -137,9 +145,9 @@ class LineProjector(Projector):
     def set_muted(self, muted: bool) -> None:
         """Hide the picture, or show it; refused unless the projector is on."""
         words = self._language.mute
-        if words.only_changes and self.muted() is muted:
+        if words.only_changes and self._mute_told() is muted:
             return
-        self._command(words.on if muted else words.off, words.done)
+        self._exchanged(words.on if muted else words.off, (words.done,))
         self._muted = muted
 
     def faults(self) -> tuple[Fault, ...]:
@@ -151,7 +159,7 @@ class LineProjector(Projector):
         words = self._language.faults
         if words is None:
             # To be silent because the cable is out must not look like health.
-            with contextlib.suppress(DeviceRefused):
+            with contextlib.suppress(_Busy):
                 self.power()
             if self._language.has_news:
                 self._pass_over(POLL_S)
@@ -164,8 +172,8 @@ class LineProjector(Projector):
             if self.power() is Power.STANDBY:
                 raise
             return ()
-        if not codes:
-            raise self._unexpected(words.ask, "", f"{words.healthy} or one of {', '.join(words.parts)}")
+        if not codes or not all(map(words.may_be, codes)):
+            raise self._unexpected(words.ask, " ".join(codes), f"{words.healthy} or one of {', '.join(words.parts)}")
         parts = dict.fromkeys(words.parts.get(code, "other") for code in codes if code != words.healthy.upper())
         return tuple(Fault(part, Severity.ERROR) for part in parts)
 
@@ -193,15 +201,14 @@ class LineProjector(Projector):
             self._under_way = begins
             self._give_up_at = self._clock.monotonic() + words.done_within_s
             return
-        self._command(command, words.done)
+        self._exchanged(command, (words.done,))
         if self._language.announces_power:
             self._announced = begins
 
     def _state_between(self, error: DeviceRefused) -> Power:
         if self._settled is None:
-            raise DeviceRefused(
-                f"{self.label} is warming up or cooling down, and does not report which; wait two minutes"
-            ) from error
+            unclear = f"{self.label} is warming up or cooling down, and does not report which; wait two minutes"
+            raise _Busy(unclear) from error
         return Power.WARMING if self._settled is Power.STANDBY else Power.COOLING
 
     def _take_late_answer(self) -> None:
@@ -247,9 +254,6 @@ class LineProjector(Projector):
     def _value(self, question: Question) -> str:
         return self._exchanged(question.ask, question.answer)
 
-    def _command(self, command: str, done: str) -> None:
-        self._exchanged(command, (done,))
-
     def _exchanged(self, text: str, answers: tuple[str, ...]) -> str:
         self._take_late_answer()
         if self._under_way is not None:
@@ -258,18 +262,19 @@ class LineProjector(Projector):
             # What waits is thrown away when a question is asked; here it may be news.
             self._pass_over(0.0)
         line = self._language.line
-        reply = self._exchange.ask(encode_command(line, text), answer_parser(line, text), self._take_unasked)
-        self._require_accepted(text, reply, _WAIT)
+        reply = self._exchange.ask(encode_command(line, text), answer_parser(self._language, text), self._take_unasked)
+        self._require_accepted(text, reply)
         value = value_in(answers, reply)
         if value is None:
             self._exchange.close()
             raise self._unexpected(text, reply, f"{' or '.join(map(repr, answers))}; {CHECK_SPEED}")
         return value
 
-    def _require_accepted(self, sent: str, reply: str, remedy: str) -> None:
+    def _require_accepted(self, sent: str, reply: str, remedy: str = "") -> None:
         refusal = refusal_in(self._language.refusals, reply)
         if refusal is not None:
-            raise _REFUSED[refusal](f"{self.label} answers {reply} to {sent}; {remedy}")
+            kind, usual = _REFUSED[refusal]
+            raise kind(f"{self.label} answers {reply} to {sent}; {remedy or usual}")
 
     def _pass_over(self, wait: float) -> None:
         while self._next_answer(wait) is not None:
@@ -277,17 +282,15 @@ class LineProjector(Projector):
 
     def _next_answer(self, wait: float) -> str | None:
         """Return the next message that answers something, None if none comes within `wait` seconds."""
-        take = answer_parser(self._language.line)
+        take = answer_parser(self._language)
         while (message := self._exchange.poll(take, wait)) is not None:
             if not self._take_unasked(message):
                 return message
         return None
 
     def _take_unasked(self, message: str) -> bool:
-        for unasked in self._language.unasked:
-            if value_in((unasked.text,), message) is not None:
-                break
-        else:
+        unasked = self._language.unasked_in(message)
+        if unasked is None:
             return False
         if unasked.power is not None:
             self._announced = None if unasked.power in (Power.STANDBY, Power.ON) else unasked.power
@@ -305,7 +308,7 @@ class LineProjector(Projector):
                 raise DeviceRefused(f"{self.label} refuses the connection with 0x{state}: {reason}")
         elif line.wake:
             try:
-                exchange.open_with(line.wake.encode("ascii"), answer_parser(line))
+                exchange.open_with(line.wake.encode("ascii"), answer_parser(self._language), self._take_unasked)
             except LinkTimeout as error:
                 limit = self._language.power.done_within_s
                 late = f"; or it is still switching on or off for an earlier program: wait {limit:g} s" if limit else ""

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, cast
+from typing import Annotated, Any, Final, Literal, cast, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -279,15 +279,23 @@ class FaultWords(Question):
     """The value without a fault."""
     parts: Annotated[dict[str, Part], AfterValidator(_in_capitals), Field(min_length=1)]
     """What the values mean; all others mean another part."""
+    digits: Annotated[int, Field(ge=0, le=8)] = 0
+    """Hexadecimal digits of every value; 0 if any word may come."""
 
     @model_validator(mode="after")
     def _single_words(self) -> FaultWords:
         for value in (self.healthy, *self.parts):
             if len(value.split()) != 1:
                 raise ValueError(f"{value!r}: one word was expected, since a space separates two faults")
+            if not self.may_be(value):
+                raise ValueError(f"{value!r}: {self.digits} hexadecimal digits were expected, as digits says")
         if self.healthy.upper() in self.parts:
             raise ValueError(f"healthy = {self.healthy!r}: a value that is none of the parts was expected")
         return self
+
+    def may_be(self, value: str) -> bool:
+        """Return whether a word can be a value."""
+        return not self.digits or re.fullmatch(f"[0-9A-Fa-f]{{{self.digits}}}", value) is not None
 
 
 class Unasked(_Table):
@@ -330,13 +338,17 @@ class Language(_Table):
                 self.line.require_received(key, text)
                 if text and refusal_in(self.refusals, text) is not None:
                     raise ValueError(f"{key} = {text!r} is one of the refusals, too: another text was expected")
-                if any(value_in((message.text,), text) is not None for message in self.unasked):
+                if self.unasked_in(text) is not None:
                     raise ValueError(f"{key} = {text!r} is one of the unasked messages, too: another text was expected")
         others = {"refusals": self.refusals.all, "unasked": tuple(message.text for message in self.unasked)}
         for key, texts in others.items():
             for text in texts:
                 self.line.require_received(key, text)
         return self
+
+    def unasked_in(self, text: str) -> Unasked | None:
+        """Return the first unasked message that a text is; None if it is none."""
+        return next((message for message in self.unasked if value_in((message.text,), text) is not None), None)
 
     @property
     def announces_power(self) -> bool:
@@ -356,19 +368,15 @@ def built_in_languages() -> tuple[str, ...]:
 
 def load_language(named: str) -> Language:
     """Return the language of a name, or of a file if `named` ends with ``.toml``."""
-    if named.lower().endswith(FILE_ENDING):
-        return _read_language(Path(named))
-    known = built_in_languages()
-    if named.lower() not in known:
-        hint = f"{near} " if (near := nearest_names(named, known)) else ""
-        raise ConfigurationError(
-            f"no projector language {named!r}; {hint}expected {', '.join(known)}, "
-            f"or the path of a file that ends with {FILE_ENDING}"
-        )
-    return _read_language(FOLDER / f"{named.lower()}{FILE_ENDING}")
-
-
-def _read_language(path: Path) -> Language:
+    path, known = Path(named), built_in_languages()
+    if not named.lower().endswith(FILE_ENDING):
+        if named.lower() not in known:
+            hint = f"{near} " if (near := nearest_names(named, known)) else ""
+            raise ConfigurationError(
+                f"no projector language {named!r}; {hint}expected {', '.join(known)}, "
+                f"or the path of a file that ends with {FILE_ENDING}"
+            )
+        path = FOLDER / f"{named.lower()}{FILE_ENDING}"
     text = read_text(path, "write one as docs/devices.md describes", "language file")
     return parse_language(text, str(path))
 
@@ -394,15 +402,15 @@ def encode_answer(line: LineFormat, text: str) -> bytes:
     return (whole if text else whole.lstrip("\r\n")).encode("ascii")
 
 
-def answer_parser(line: LineFormat, sent: str = "") -> MessageParser[str]:
+def answer_parser(language: Language, sent: str = "") -> MessageParser[str]:
     """Return what takes one answer, without its framing, off the front of the bytes.
 
     `sent`: the command before it, whose echo is passed over. If the echo and the answer are alike and only one of them
-    comes, the prompt after it shows that it was the answer.
+    comes, the prompt after it shows that it was the answer. An unended answer ends where an unasked message begins.
     """
+    line = language.line
     ends = [character.encode("ascii") for character in line.ends]
-    begin = line.answer.partition(_VALUE)[0]
-    prompt = line.prompt.encode("ascii")
+    begin, prompt = line.answer.partition(_VALUE)[0].encode("ascii"), line.prompt.encode("ascii")
 
     def take(data: bytes) -> tuple[str, int] | None:
         place, echoed = 0, False
@@ -413,10 +421,14 @@ def answer_parser(line: LineFormat, sent: str = "") -> MessageParser[str]:
                 if echoed:
                     return sent, place
                 continue
+            place += len(begin) if data.startswith(begin, place) else 0
             found = [end for end in (data.find(character, place) for character in ends) if end >= 0]
-            text = text_of(data[place : min(found, default=len(data))].strip(_BLANK)).removeprefix(begin)
+            text = text_of(data[place : min(found, default=len(data))].strip(_BLANK))
             if not found:
                 return (text, len(data)) if text in line.unended else None
+            for word in line.unended:
+                if text.startswith(word) and language.unasked_in(text.removeprefix(word).removeprefix(begin.decode())):
+                    return word, data.index(word.encode("ascii"), place) + len(word)
             place = min(found) + 1
             if not line.echo or text != sent or echoed:
                 return text, place
@@ -465,12 +477,4 @@ Refusal = Literal["unknown", "busy", "unclear"]  # The kinds of `Refusals`
 
 def refusal_in(refusals: Refusals, text: str) -> Refusal | None:
     """Return in which way an answer refuses; None if it does not."""
-    kinds: dict[Refusal, tuple[str, ...]] = {
-        "unknown": refusals.unknown,
-        "busy": refusals.busy,
-        "unclear": refusals.unclear,
-    }
-    for kind, words in kinds.items():
-        if any(text.upper() == word.upper() for word in words):
-            return kind
-    return None
+    return next((kind for kind in get_args(Refusal) if value_in(getattr(refusals, kind), text) is not None), None)

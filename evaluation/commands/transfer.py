@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import ceil
 from pathlib import Path
+from statistics import median_low
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -33,10 +35,11 @@ if TYPE_CHECKING:
 
     from evaluation.experiments.cross_validation import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
-    from evaluation.scene import SceneSet
+    from evaluation.scene import Scene
 
 # Ratio of sizes from which all images are made small: learned methods reduce images by up to 2 themselves.
 _ALIKE = 2.0
+_LOOKED_AT = 25  # Images of a set whose sizes are read at most
 
 HELP = f"""Train learned methods on generated images and test them on real ones.
 
@@ -95,7 +98,7 @@ def transfer(
         require_free(out, "the results")
     threads = workers or processor_count()
     names = split_names(method or ["all", "gray-world", "shades-of-gray", "gray-edge-1"])
-    learned = [name for name in names if name == "all" or is_learner(name)]
+    learned = [name for name in names if name.lower() == "all" or is_learner(name)]
     learners, left_out = _learners(learned)
     references = choose_methods(name for name in names if name not in learned)
     asked = _counts(real)
@@ -104,7 +107,7 @@ def transfer(
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, others)
     drawn = tuple(choose_folds(tested, None, seed)[0] for seed in range(seeds))
     counts, too_many = _within(asked, drawn)
-    side, made_small = _side(tested, plan)
+    side, made_small = _side(tested.scenes, plan)
     notes = [*plan.notes, *made_small, *left_out, *too_many]
     images = min(len(some.scenes) for some in plan.training)
     with image_steps(count_images(tested.scenes, plan.training, len(drawn), images)) as step:
@@ -166,13 +169,19 @@ def _within(
     return tuple(count for count in counts if count not in left_out), notes
 
 
-def _side(test: SceneSet, plan: TransferPlan) -> tuple[int | None, list[str]]:
+def _side(test: Sequence[Scene], plan: TransferPlan) -> tuple[int | None, list[str]]:
     """Return the longest side that all images are made small to, and why; None if their sizes are alike."""
-    sizes = [max(scenes[0].read()[0].shape) for scenes in (test.scenes, plan.training[0].scenes)]
-    side = min(sizes)
-    if max(sizes) <= _ALIKE * side:
+    tested, *trained = [_median_side(scenes) for scenes in (test, *(some.scenes for some in plan.training))]
+    side = min(tested, *trained)
+    if max(tested, *trained) <= _ALIKE * side:
         return None, []
     return side, [
-        f"Test images have sides of up to {sizes[0]} px, training images of up to {sizes[1]} px: all were made small "
-        f"to at most {side} px by averaging areas without clipped and masked pixels"
+        f"Half of the test images have sides of up to {tested} px, half of the images of each training set up to "
+        f"{', '.join(map(str, dict.fromkeys(trained)))} px: all were made small to at most {side} px by averaging "
+        "areas without clipped and masked pixels"
     ]
+
+
+def _median_side(scenes: Sequence[Scene]) -> int:
+    """Return the median of the longest sides of up to `_LOOKED_AT` images of a set, evenly spaced in its order, px."""
+    return median_low(max(scene.read()[0].shape) for scene in scenes[:: ceil(len(scenes) / _LOOKED_AT)])

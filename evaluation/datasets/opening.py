@@ -34,24 +34,15 @@ _LEVELS = ("black", "saturation")
 class Layout:
     """A way in which data sets lie on the disk.
 
-    Attributes
-    ----------
-    title
-        What lies so, for help and messages: "a dataset made by generate".
-    signs
-        What a place is told by: "cube+_gt.txt".
-    matches
-        Whether a folder looks like it; reads names, and the first lines of tables, at most.
-    open
-        Returns the data set at a path or URL; takes the names in its folder where they were read already.
-    options
-        The fields of `DataOptions` that have a meaning for it.
-    general
-        Whether it is no particular data set's, and asked only where no other matches.
-    unverified
-        Whether it is others' and its reader was never tried on a copy that they published; results then say so.
-    takes
-        "folder" or "file", which a place must be; None if it may be either, or a URL.
+    - `title`: what lies so, for help and messages: "a dataset made by generate".
+    - `signs`: what a place is told by: "cube+_gt.txt".
+    - `matches`: whether a folder looks like it; reads names, and the first lines of tables, at most.
+    - `open`: returns the data set at a path or URL; takes the names in its folder where they were read already.
+    - `options`: the fields of `DataOptions` that have a meaning for it.
+    - `general`: whether it is no particular data set's, and asked only where no other matches.
+    - `unverified`: whether it is others' and its reader was never tried on a copy that they published; results then say
+      so.
+    - `takes`: "folder" or "file", which a place must be; None if it may be either, or a URL.
     """
 
     title: str
@@ -161,21 +152,13 @@ LAYOUTS: Mapping[str, Layout] = {
 def open_scenes(place: Path | str, layout: str | None = None, options: DataOptions | None = None) -> SceneSet:
     """Return the data set at a place; images are read when they are used.
 
-    Parameters
-    ----------
-    place
-        Folder, file or URL; URLs are those of datasets made by `generate`.
-    layout
-        A name of `LAYOUTS`; by default the one that the place looks like.
-    options
-        What to take of it, and levels that replace those of the layout.
+    `place`: folder, file or URL; URLs are those of datasets made by `generate`. `layout`: a name of `LAYOUTS`; by
+    default the one that the place looks like. `options`: what to take of it, and levels that replace those of the
+    layout.
 
-    Raises
-    ------
-    InputError
-        There is no layout of that name, the place looks like several, or an option has no meaning for its layout.
-    FormatError
-        The place looks like no layout; or the data set is not as its layout has it: the message says what is missing.
+    Raises `InputError`: there is no layout of that name, the place looks like several, or an option has no meaning for
+    its layout; `FormatError`: the place looks like no layout; or the data set is not as its layout has it: the message
+    says what is missing.
     """
     chosen = DataOptions() if options is None else options
     text = str(place)
@@ -200,17 +183,9 @@ def with_black_judged(data: SceneSet, black: float | None) -> SceneSet:
 
     Reads images, mostly one: until one says that nothing is wrong.
 
-    Parameters
-    ----------
-    data
-        What was opened.
-    black
-        The level that the user gave.
+    `data`: what was opened. `black`: the level that the user gave.
 
-    Raises
-    ------
-    InputError
-        The level of the user, or of a table of theirs, is above every pixel of all images.
+    Raises `InputError`: the level of the user, or of a table of theirs, is above every pixel of all images.
     """
     scenes = [scene for scene in data.scenes if isinstance(scene, RawScene)]
     if black is not None or data.layout == "folder":
@@ -223,12 +198,7 @@ def with_black_judged(data: SceneSet, black: float | None) -> SceneSet:
 def layout_of(place: str) -> str:
     """Return the name of the layout that a place looks like.
 
-    Raises
-    ------
-    InputError
-        It looks like several.
-    FormatError
-        It looks like none, or is not there.
+    Raises `InputError`: it looks like several; `FormatError`: it looks like none, or is not there.
     """
     return _recognise(place)[0]
 

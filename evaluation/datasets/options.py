@@ -13,26 +13,15 @@ from foundation.errors import InputError
 class DataOptions:
     """What to take of a data set, and levels that replace those of its layout; None leaves the layout's own.
 
-    Attributes
-    ----------
-    camera
-        One of the cameras of a data set of several, as its files name it: "Canon600D".
-    subset
-        A part that the data set's authors name: "test", "lab_printouts".
-    truth
-        Which ground truth, where the authors give several for an image: "left", "recommended".
-    black
-        Black level in the units of the files, ≥ 0.
-    saturation
-        Value from which a pixel is clipped, in the units of the files, before black is subtracted, > 0.
-    partial
-        Whether images that the data set should have, but this copy has not, are left out and counted; else they are
-        an error.
+    - `camera`: one of the cameras of a data set of several, as its files name it: "Canon600D".
+    - `subset`: a part that the data set's authors name: "test", "lab_printouts".
+    - `truth`: which ground truth, where the authors give several for an image: "left", "recommended".
+    - `black`: black level in the units of the files, ≥ 0.
+    - `saturation`: value from which a pixel is clipped, in the units of the files, before black is subtracted, > 0.
+    - `partial`: whether images that the data set should have, but this copy has not, are left out and counted; else
+      they are an error.
 
-    Raises
-    ------
-    InputError
-        A level is none.
+    Raises `InputError`: a level is none.
 
     Examples
     --------
@@ -64,21 +53,10 @@ class DataOptions:
 def choose(given: str | None, known: Collection[str], option: str, place: str) -> str | None:
     """Return `given` as `known` spells it, or None if nothing was given.
 
-    Parameters
-    ----------
-    given
-        What the user gave; upper and lower case, "_" and "-" are the same.
-    known
-        What there is.
-    option
-        The option's name in the message: "camera".
-    place
-        Where it was looked for, for the message.
+    `given`: what the user gave; upper and lower case, "_" and "-" are the same. `known`: what there is. `option`: the
+    option's name in the message: "camera". `place`: where it was looked for, for the message.
 
-    Raises
-    ------
-    InputError
-        There is none of that name.
+    Raises `InputError`: there is none of that name.
 
     Examples
     --------

@@ -47,28 +47,17 @@ _Images = Annotated[npt.NDArray[np.uint64], PlainValidator(np.asarray), Field(ex
 class TrainingRecord:
     """What a model was trained on, by what and when.
 
-    Attributes
-    ----------
-    data_name, data_place, data_layout
-        The data set; see `scene.SceneSet`.
-    treatment
-        What was done to its images before the method saw them.
-    scenes
-        Number of images.
-    sha256
-        Of the images' names and ground truths, 64 hexadecimal digits; see `scenes_sha256`.
-    part
-        The part of the data set: "all", or which folds.
-    seed
-        Of the fit.
-    software
-        Name and version of what trained it.
-    date
-        ISO 8601, UTC.
-    adapted_from
-        Of a model that was adapted: what the one that it was adapted from was trained on, in a sentence; else empty.
-    images
-        (N, 2) uint64, by what each image is known again, see `datasets.identity`.
+    - `data_name`, `data_place`, `data_layout`: the data set; see `scene.SceneSet`.
+    - `treatment`: what was done to its images before the method saw them.
+    - `scenes`: number of images.
+    - `sha256`: of the images' names and ground truths, 64 hexadecimal digits; see `scenes_sha256`.
+    - `part`: the part of the data set: "all", or which folds.
+    - `seed`: of the fit.
+    - `software`: name and version of what trained it.
+    - `date`: ISO 8601, UTC.
+    - `adapted_from`: of a model that was adapted: what the one that it was adapted from was trained on, in a sentence;
+      else empty.
+    - `images`: (N, 2) uint64, by what each image is known again, see `datasets.identity`.
     """
 
     data_name: str
@@ -97,10 +86,7 @@ class TrainingRecord:
 class StoredMethod(LearnedMethod):
     """A learned method from a model file.
 
-    Attributes
-    ----------
-    provenance
-        What it was trained on.
+    - `provenance`: what it was trained on.
     """
 
     provenance: TrainingRecord | None = None
@@ -144,12 +130,8 @@ def scenes_sha256(scenes: Sequence[Scene]) -> str:
 def save_model(path: Path, method: Method, provenance: TrainingRecord) -> None:
     """Write a learned method to a new model file.
 
-    Raises
-    ------
-    InputError
-        The method is not one of `standard_learners`, or something is at `path` already.
-    StorageError
-        The disk is full, read-only or gone.
+    Raises `InputError`: the method is not one of `standard_learners`, or something is at `path` already;
+    `StorageError`: the disk is full, read-only or gone.
     """
     if not isinstance(method, LearnedMethod) or method.learner.key not in standard_learners():
         raise InputError(
@@ -175,10 +157,7 @@ def save_model(path: Path, method: Method, provenance: TrainingRecord) -> None:
 def load_model(path: Path) -> StoredMethod:
     """Return the learned method of a model file.
 
-    Raises
-    ------
-    FormatError
-        The file is not there, is no model file, or is damaged; the message says which.
+    Raises `FormatError`: the file is not there, is no model file, or is damaged; the message says which.
     """
     try:
         arrays = _read_arrays(path)

@@ -23,24 +23,14 @@ from evaluation.methods.prepared import PreparedImage, PreparedMethod, unit
 class GrayEdge(PreparedMethod):
     """One method of the framework.
 
-    Attributes
-    ----------
-    name
-        Its name in tables.
-    order
-        n, order of the derivative: 0, 1 or 2.
-    p
-        Minkowski norm, ≥ 1; infinity takes the maximum.
-    sigma
-        Scale of the Gaussian, px; 0 for none, which only order 0 allows.
-    border
-        Pixels left out along every edge; by default 0 where σ is 0, else ⌊σ⌋ + 1 as in the authors' program, which
-        leaves out 1 px for σ = 0 too.
+    - `name`: its name in tables.
+    - `order`: n, order of the derivative: 0, 1 or 2.
+    - `p`: Minkowski norm, ≥ 1; infinity takes the maximum.
+    - `sigma`: scale of the Gaussian, px; 0 for none, which only order 0 allows.
+    - `border`: pixels left out along every edge; by default 0 where σ is 0, else ⌊σ⌋ + 1 as in the authors' program,
+      which leaves out 1 px for σ = 0 too.
 
-    Raises
-    ------
-    ValueError
-        Order, norm and scale make no method of the framework.
+    Raises `ValueError`: order, norm and scale make no method of the framework.
 
     Examples
     --------

@@ -29,12 +29,8 @@ class BrightDark(PreparedMethod):
     Pixels are projected on the direction of their mean. The light is the first eigenvector of the uncentred
     second-moment matrix of the lowest and the highest `share` of them.
 
-    Attributes
-    ----------
-    name
-        Its name in tables.
-    share
-        Part of the pixels kept at either end, 0 … 0.5; the authors' value is 0.035.
+    - `name`: its name in tables.
+    - `share`: part of the pixels kept at either end, 0 … 0.5; the authors' value is 0.035.
 
     Examples
     --------

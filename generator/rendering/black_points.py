@@ -58,17 +58,10 @@ _Array = npt.NDArray[np.float64]
 class BlackPoint:
     """What becomes of the print's black.
 
-    Attributes
-    ----------
-    kind
-        ``"keep"``: nothing; ``"compensate"``: all of it is taken out; ``"random"``: of each image a random share.
-    most
-        Largest random share, above 0 and at most 1.
+    - `kind`: ``"keep"``: nothing; ``"compensate"``: all of it is taken out; ``"random"``: of each image a random share.
+    - `most`: largest random share, above 0 and at most 1.
 
-    Raises
-    ------
-    InputError
-        The largest share is out of range.
+    Raises `InputError`: the largest share is out of range.
 
     Examples
     --------

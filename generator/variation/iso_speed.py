@@ -18,17 +18,10 @@ if TYPE_CHECKING:
 class IsoSpeed:
     """A speed at or above that of the table: noise can be added, and not be taken away.
 
-    Attributes
-    ----------
-    wanted, base
-        The speed that images are to have, and that with which the table was photographed.
-    sensor_electrons
-        Read noise of a photosite before the amplifier, electrons; see `sensor_noise`.
+    - `wanted`, `base`: the speed that images are to have, and that with which the table was photographed.
+    - `sensor_electrons`: read noise of a photosite before the amplifier, electrons; see `sensor_noise`.
 
-    Raises
-    ------
-    InputError
-        The wanted speed is below that of the table, or a number is not above 0.
+    Raises `InputError`: the wanted speed is below that of the table, or a number is not above 0.
     """
 
     wanted: float

@@ -112,12 +112,8 @@ def _draw_bits(figure: Any, found: BitsResult, kind: ErrorKind) -> None:
     axes.legend()
 
 
-def sizes_figure(rows: Sequence[SizeRow], method: str) -> bytes:
-    """Return a method's median error against the images' side, a line for each data set."""
-    return svg_of(_draw_sizes, rows, method, inches=(7.6, 4.8))
-
-
 def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:
+    """Draw a method's median error against the images' side, a line for each data set."""
     axes = figure.add_subplot()
     for place, cell in enumerate(dict.fromkeys(row.cell for row in rows)):
         of_cell = [row for row in rows if row.cell == cell]
@@ -236,7 +232,7 @@ def table1_report(
     ]
     tables = [*first, noise, prints]
     if sizes:
-        drawn = sizes_figure(sizes, "White-Patch")
+        drawn = svg_of(_draw_sizes, sizes, "White-Patch", inches=(7.6, 4.8))
         table = size_table(sizes)
         tables.append(table)
         files |= {"sizes.csv": table_to_csv(table).encode(), "sizes.svg": standalone(drawn)}

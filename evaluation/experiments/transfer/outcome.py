@@ -34,7 +34,7 @@ from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import errors_csv
 from evaluation.results.result import Result
-from evaluation.results.tables import Table, finite_or_none, table_to_csv
+from evaluation.results.tables import PAPER_COLUMNS, Table, finite_or_none, table_to_csv
 from evaluation.scene import SceneSet
 from foundation import pages
 from foundation.files import write_whole
@@ -164,8 +164,8 @@ def _spread(several: Sequence[ErrorSample]) -> tuple[float, ...] | None:
     return tuple(float(part) for part in deviations)
 
 
-# Heads of the statistics, in their order: all six stand in every table, since any one of them misleads alone.
-HEADS: Final = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
+# All six statistics stand in every table, since any one of them misleads alone.
+HEADS: Final = PAPER_COLUMNS[1:]
 
 
 def errors_table(found: TransferFigures, name: str, images: int) -> Table:
@@ -231,13 +231,7 @@ def _ratios_table(
     title: str, ratios: Sequence[tuple[RowRatio, str]], note: str, second_head: str = "Trained on"
 ) -> Table:
     rows = tuple(
-        (
-            one.row.method,
-            said,
-            one.row.images or None,
-            one.base.images or None,
-            *map(_written, one.ratios),
-        )
+        (one.row.method, said, one.row.images or None, one.base.images or None, *map(_written, one.ratios))
         for one, said in ratios
     )
     return Table(title, ("Method", second_head, "Images", "Base", *HEADS), rows, notes=(note, _BASE))
@@ -296,19 +290,6 @@ def naive_adapted_table(found: TransferFigures, name: str) -> Table | None:
         rows,
         notes=("Paired by test image. Below 1: beside N real images the table is still worth something.",),
     )
-
-
-def tables_of(found: TransferFigures, name: str, images: int) -> tuple[Table, ...]:
-    """Return all tables of rows on so many images of a test set, in the order in which they are shown."""
-    made = (
-        errors_table(found, name, images),
-        intervals_table(found, name),
-        real_ratios_table(found, name),
-        naive_ratios_table(found, name),
-        beside_table(found, name),
-        naive_adapted_table(found, name),
-    )
-    return tuple(table for table in made if table is not None)
 
 
 def long_table(found: TransferFigures) -> Table:
@@ -400,7 +381,16 @@ class TransferOutcome:
 
     def tables(self) -> tuple[Table, ...]:
         """Return the tables in the order in which they are shown."""
-        return tables_of(self.figures, self.test.name, len(self.test.scenes))
+        found, name = self.figures, self.test.name
+        made = (
+            errors_table(found, name, len(self.test.scenes)),
+            intervals_table(found, name),
+            real_ratios_table(found, name),
+            naive_ratios_table(found, name),
+            beside_table(found, name),
+            naive_adapted_table(found, name),
+        )
+        return tuple(table for table in made if table is not None)
 
 
 def labelled_results(rows: Sequence[TransferRow]) -> tuple[Result, ...]:

@@ -260,6 +260,24 @@ def test_epson_passes_over_events() -> None:
     assert script.ended()
 
 
+def test_epson_event_is_no_answer_to_the_wake_up() -> None:
+    script = Script((b"\r", b"IMEVENT=0001 02 00000002 00000000 T1 F1\r:"))
+    with pytest.raises(LinkTimeout):
+        LineProjector(EPSON, lambda: script, clock=SimulatedClock()).power()
+
+
+@pytest.mark.parametrize("codes", [b"ZZ", b"4", b"004", b"00 X1"])
+def test_epson_fault_that_is_no_code_is_refused(codes: bytes) -> None:
+    projector, _ = scripted("epson", (b"ERR?\r", b"ERR=" + codes + b"\r:"))
+    with pytest.raises(ProtocolError):
+        projector.faults()
+
+
+def test_epson_fault_of_an_unknown_code_is_of_another_part() -> None:
+    projector, _ = scripted("epson", (b"ERR?\r", b"ERR=1f 04\r:"))
+    assert projector.faults() == (Fault("other", Severity.ERROR), Fault("temperature", Severity.ERROR))
+
+
 HELLO = b"ESC/VP.net\x10\x03\x00\x00\x00\x00"
 WELCOME = b"ESC/VP.net\x10\x03\x00\x00\x20\x00"
 
@@ -376,6 +394,28 @@ def test_benq_that_does_not_know_its_mute_cannot_tell(answer: bytes) -> None:
     assert projector.muted() is None
 
 
+def test_benq_whose_mute_is_unknown_is_sent_it_again() -> None:
+    # A remote control may have shown the picture meanwhile.
+    ask = (b"\r*blank=?#\r", b"*Unsupported item#\r\n")
+    hide = (b"\r*blank=on#\r", b"*BLANK=ON#\r\n")
+    projector, script = scripted("benq", ask, hide, ask, hide, ask)
+    projector.set_muted(True)
+    projector.set_muted(True)
+    assert projector.muted(), "what was set last is known where the projector does not tell"
+    assert script.ended()
+
+
+def test_without_a_question_about_faults_only_busy_counts_as_health() -> None:
+    ask = b"\r*pow=?#\r"
+    projector, _ = scripted("benq", (ask, b"*Block item#\r\n"), (ask, b"*Unsupported item#\r\n"))
+    assert projector.faults() == ()
+    with pytest.raises(DeviceRefused, match="remote control"):
+        projector.faults()
+    projector, _ = scripted("optoma", (OPTOMA_STATE, b"F\r"))
+    with pytest.raises(DeviceRefused):
+        projector.faults()
+
+
 # "Power ON ~XX00 1: 7E 30 30 30 30 20 31 0D", HD50 manual.
 OPTOMA_ON = bytes.fromhex("7E 30 30 30 30 20 31 0D")
 OPTOMA_MUTE = bytes.fromhex("7E 30 30 30 32 20 31 0D")
@@ -419,6 +459,21 @@ def test_optoma_mute_lamp_model_and_refusal() -> None:
     with pytest.raises(DeviceRefused):
         projector.set_muted(False)
     assert script.ended()
+
+
+@pytest.mark.parametrize("pieces", [(b"PINFO1\r",), (b"P", b"INFO1\r"), (b"PIN", b"FO1\r"), (b"INFO1\rP",)], ids=str)
+def test_optoma_answer_without_end_before_news(pieces: tuple[bytes, ...]) -> None:
+    projector, script = scripted("optoma", (OPTOMA_STATE, b"OK0\r"), (OPTOMA_ON, pieces), (OPTOMA_STATE, b"OK0\r"))
+    projector.switch_on()
+    assert projector.power() is Power.WARMING
+    assert script.ended()
+
+
+def test_optoma_refusal_without_end_before_news() -> None:
+    projector, _ = scripted("optoma", (OPTOMA_MUTE, b"FINFO6\r"), (OPTOMA_STATE, b"OK1\r"))
+    with pytest.raises(DeviceRefused):
+        projector.set_muted(True)
+    assert projector.faults() == (Fault("fan", Severity.ERROR),)
 
 
 def test_optoma_mute_that_nobody_knows_cannot_be_told() -> None:

@@ -85,6 +85,7 @@ def test_a_file_of_ones_own_is_read(tmp_path: Path) -> None:
         ('ask = "SHOW?"', "", "mute: answer is given without ask"),
         ('healthy = "NONE"', 'healthy = "NO FAULT"', "faults: 'NO FAULT': one word was expected"),
         ('healthy = "NONE"', 'healthy = "f"', "faults: healthy = 'f': a value that is none of the parts"),
+        ('healthy = "NONE"', 'healthy = "NONE"\ndigits = 1', "faults: 'NONE': 1 hexadecimal digits were expected"),
         ('{ F = "fan", L = "lamp", T = "temperature" }', "{}", "faults.parts: at least 1 value was expected"),
         ('command = "@{}\\r\\n"', 'command = "@{}"', "line: command = '@{}': characters that end a command"),
         ('ends = "\\r"', 'ends = "#"', "one of the characters of ends = '#' was expected"),
@@ -142,7 +143,7 @@ def test_a_state_behind_the_end_of_the_answer_is_refused() -> None:
 def test_an_answer_survives_both_ends() -> None:
     for language in (EPSON, BENQ, OPTOMA, MADE_UP):
         data = encode_answer(language.line, "Answer 1")
-        taken = answer_parser(language.line)(data + b"more")
+        taken = answer_parser(language)(data + b"more")
         assert taken is not None
         assert taken[0] == "Answer 1"
     assert encode_answer(EPSON.line, "") == b":"
@@ -152,7 +153,7 @@ def test_an_answer_survives_both_ends() -> None:
 def test_whatever_comes_is_taken_waited_for_or_refused(data: bytes) -> None:
     assert EPSON.network is not None
     assert EPSON.network.handshake is not None
-    parsers = [answer_parser(language.line, "pow=?") for language in (EPSON, BENQ, OPTOMA, MADE_UP)]
+    parsers = [answer_parser(language, "pow=?") for language in (EPSON, BENQ, OPTOMA, MADE_UP)]
     for take in (*parsers, handshake_parser(EPSON.network.handshake)):
         try:
             taken = take(data)

@@ -9,6 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from calibration.table.lut import open_lut
 from evaluation.cli import main
 from evaluation.datasets.generated import open_generated
 from evaluation.experiments.transfer import rows as transfer_rows
@@ -63,12 +64,41 @@ def test_the_same_command_gives_the_same_bytes(place: Path, capsys: pytest.Captu
     np.savez("tiny.npz", **content | {"images": content["images"].repeat(8, axis=1).repeat(8, axis=2)})
     wish = ["transfer", "tiny.npz", *BASIC[2:]]
     assert main([*wish, "--out", "one", "--workers", "1"]) == 0
-    assert "sides of up to 64 px, training images of up to 24 px: all were made small" in capsys.readouterr().out
+    assert (
+        "sides of up to 64 px, half of the images of each training set up to 24 px: all were made small"
+        in capsys.readouterr().out
+    )
     found = json_of(main, [*wish, "--out", "two", "--workers", "3"], capsys)
     assert (found["command"], found["test"], found["settings"]["side"]) == ("evaluate transfer", "tiny", 24)
     assert all(table["rows"] for table in found["tables"])
     for path in (place / "one").iterdir():
         assert path.read_bytes() == (place / "two" / path.name).read_bytes(), path.name
+
+
+@pytest.mark.parametrize(
+    ("sides", "trained", "side"),
+    [
+        ((96, 24), ["odd"], None),
+        ((24, 96), ["made", "odd"], 24),
+    ],
+    ids=["one image is larger", "the second set is larger"],
+)
+def test_images_are_made_small_by_the_sizes_of_whole_sets(
+    place: Path, capsys: pytest.CaptureFixture[str], sides: tuple[int, int], trained: list[str], side: int | None
+) -> None:
+    save_pictures(place / "sources", ["a.png"], 1, sides[0])
+    save_pictures(place / "sources", ["b.png", "c.png", "d.png"], 2, sides[1])
+    Maker(place, open_lut(place / "lut")).make("odd", pictures=place / "sources")
+    with np.load("real.npz") as data:
+        content = {name: data[name] for name in data.files}
+    np.savez("real.npz", **content | {"images": content["images"].repeat(3, axis=1).repeat(3, axis=2)})
+    found = json_of(main, ["transfer", "real.npz", *trained, "--method", "gray-world"], capsys)
+    assert found["settings"]["side"] == side
+
+
+def test_all_is_understood_in_any_case(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    methods = [json_of(main, [*BASIC[:3], "--method", word], capsys)["settings"]["methods"] for word in ("ALL", "all")]
+    assert methods[0] == methods[1]
 
 
 @pytest.mark.parametrize(
