@@ -105,7 +105,6 @@ def check_lab(
     """
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
-    recorded = settings.rig == "replay"
     frames = len(planned_steps(settings, lights))
     lines = [f"lights      {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} of a session"]
     beside = Path(settings.file).parent
@@ -118,15 +117,13 @@ def check_lab(
             camera = Photographer(devices, settings, scratch)
             found = _find_exposure(camera, settings, chart, devices.camera.shutter_speeds(), announce)
             announce("taking trial frames: white, dark, primaries, grey")
-            series = scratch / "series" if linearity and not recorded else None
+            series = scratch / "series" if linearity else None
             best = best_of(found.trials)
             series_s = series_times(found.times_s, best.shutter_s, best.highest) if series else ()
-            primaries = np.eye(3)
-            if not recorded:
-                shots = [camera.take(colour, found.used_s) for colour in PRIMARIES.values()]
-                primaries = np.array([shot.brightest(99.0) for shot in shots])
+            shots = [camera.take(colour, found.used_s) for colour in PRIMARIES.values()]
+            primaries = np.array([shot.brightest(99.0) for shot in shots])
             shown = trial_lights(lights, primaries)
-            steps = trial_steps(shown, recorded)
+            steps = trial_steps(shown)
             _require_space(beside, (len(steps) + len(series_s)) * found.first.size)
             taken = Session.create(scratch / "trial", settings.to_toml(), chart, shown, steps)
             (scratch / "series").mkdir()
@@ -135,16 +132,14 @@ def check_lab(
             supplies = judge_supplies(devices.camera, frames, found.first.size)
         announce("measuring the trial frames")
         with taken:
-            trial = measure_trial(taken, found.saturation, corners, series, recorded)
-        if linearity and recorded:
-            trial = replace(trial, series_trouble="a recording cannot be exposed again")
+            trial = measure_trial(taken, found.saturation, corners, series)
     lines += described
     if found.used_s != found.first.shutter_s:
         lines.append(
             f"frames      taken at {found.used_s:.4g} s, since white is clipped or dark as the settings have it"
         )
     findings = [
-        *_exposure_findings(found, settings, recorded),
+        *_exposure_findings(found, settings),
         *_figure_findings(trial, settings),
         *_pose_and_light(trial, chart),
         judge_noise_reduction(camera.timings),
@@ -209,10 +204,10 @@ def _paper(shot: Shot, chart: Chart) -> _Array | None:
     return None if np.isnan(level).any() else level
 
 
-def _exposure_findings(found: FoundExposure, settings: LabSettings, recorded: bool) -> list[Finding]:
+def _exposure_findings(found: FoundExposure, settings: LabSettings) -> list[Finding]:
     """Return the findings on the frame at the settings' exposure: its brightness, and what a run would refuse of it."""
     first = found.first.mosaic
-    findings = [judge_exposure(found.trials, found.saturation, found.times_s, period_s(settings), recorded)]
+    findings = [judge_exposure(found.trials, found.saturation, found.times_s, period_s(settings))]
     measured = measure_exposure(replace(first, white_level=round(found.saturation.counts)))
     refused = refusal(measured, "white", settings.limits)
     is_clipped = 100 * measured.clipped > settings.limits.clipped_percent
@@ -220,7 +215,7 @@ def _exposure_findings(found: FoundExposure, settings: LabSettings, recorded: bo
     findings.append(Finding("clipping", "fault", refused or "") if is_clipped else Finding("clipping", "good", said))
     if refused is not None and not is_clipped:
         findings.append(Finding("exposure", "fault", refused))
-    differs = None if recorded else disagreement(first, settings.camera.exposure)
+    differs = disagreement(first, settings.camera.exposure)
     if differs is not None:
         findings.append(Finding("settings", "fault", differs, remedy="set the mode dial to M and touch no other"))
     return findings

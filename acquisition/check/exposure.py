@@ -261,7 +261,6 @@ def judge_exposure(
     saturation: Saturation,
     times_s: Sequence[float],
     period_s: float | None,
-    recorded: bool,
 ) -> Finding:
     """Return the finding on the exposure of the settings, which is that of the first trial.
 
@@ -279,9 +278,7 @@ def judge_exposure(
         "saturation_stated": saturation.stated,
         "trials": [[trial.shutter_s, trial.highest, trial.clipped] for trial in trials],
     }
-    if recorded:
-        remedy = "a recording cannot be exposed anew; take another session"
-    elif not times_s:
+    if not times_s:
         remedy = "the camera lists no shutter times; set another camera.shutter_s and check again"
     elif _is_suitable(best):
         remedy = f"set camera.shutter_s = {best.shutter_s:.4g} (tried: {format_value(best.highest, 'share')})"
@@ -298,7 +295,7 @@ def judge_exposure(
         return replace(found, grade="remark", reason=why, remedy=remedy)
     if not saturation.measured:
         why = "no frame saturates the sensor: the share is of what the file states"
-        return replace(found, grade="remark", reason=why, remedy="" if recorded else "brighten the light if you can")
+        return replace(found, grade="remark", reason=why, remedy="brighten the light if you can")
     return found
 
 

@@ -16,7 +16,7 @@ from acquisition.check.exposure import Photographer, Saturation
 from acquisition.judge.judge import dark_level, white_scale
 from calibration.figures.all_figures import FIGURES
 from calibration.measurements import TableMeasurements
-from calibration.pipeline.build import check, judge_trial
+from calibration.pipeline.build import judge_trial
 from calibration.pipeline.frames import PAPER_OPTIONS
 from calibration.verdict import Verdict
 from drivers.presenter import BLACK, WHITE, Colour
@@ -82,11 +82,12 @@ def trial_lights(plan: Sequence[Illumination], primaries: npt.NDArray[np.float64
     )
 
 
-def trial_steps(lights: Sequence[Illumination], recorded: bool) -> tuple[SessionStep, ...]:
-    """Return the plan of a trial; of a recording one white and one dark frame, which is all that it can show."""
-    around: list[tuple[FrameKind, int | None, Colour]] = [("white", None, WHITE)] * (1 if recorded else WHITES)
+def trial_steps(lights: Sequence[Illumination]) -> tuple[SessionStep, ...]:
+    """Return the plan of a trial."""
+    around: list[tuple[FrameKind, int | None, Colour]] = [("white", None, WHITE)] * WHITES
     around.append(("dark", None, BLACK))
-    shown = around if recorded else [*around, *(("light", one.index, one.colour) for one in lights), *around]
+    lit: list[tuple[FrameKind, int | None, Colour]] = [("light", one.index, one.colour) for one in lights]
+    shown = [*around, *lit, *around]
     return tuple(SessionStep(number, *step) for number, step in enumerate(shown))
 
 
@@ -115,21 +116,16 @@ def take_trial(
             camera.capture(WHITE, seconds, stream)
 
 
-def measure_trial(
-    session: Session, saturation: Saturation, corners: Corners | None, series: Path | None, recorded: bool
-) -> Trial:
+def measure_trial(session: Session, saturation: Saturation, corners: Corners | None, series: Path | None) -> Trial:
     """Return what trial frames show."""
     frames = session.frames()
     white = read_raw(session.folder / frames[0].file)
     options = replace(PAPER_OPTIONS, corners=corners)
     try:
-        if recorded:
-            result = check(session, options)
-        else:
-            result = judge_trial(session, round(saturation.counts), options, series)
+        result = judge_trial(session, round(saturation.counts), options, series)
     except (RegistrationError, QualityError, FormatError, InputError) as error:
         if series is not None:
-            return replace(measure_trial(session, saturation, corners, None, recorded), series_trouble=str(error))
+            return replace(measure_trial(session, saturation, corners, None), series_trouble=str(error))
         return Trial(white, None, Verdict(()), trouble=str(error))
     rows = tuple(row for row in result.verdict.rows if row.figure.before_session)
     lit = _tiles(white)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Generator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,17 +20,11 @@ from acquisition.check.findings import CheckReport, Finding
 from acquisition.cli import main
 from acquisition.run.devices import Devices
 from acquisition.run.rig.opening import open_rig
-from benchmarks.sessions import record_session
 from calibration.figures.all_figures import BY_NAME, FIGURES
-from drivers.presenter import BLACK, WHITE
 from drivers.raw.rawfile import Mosaic
 from drivers.raw.storage import Area
 from experiment.chart.layout import paper_chart
-from experiment.chart.model import load_chart
 from experiment.config import LabSettings, load_lab
-from experiment.lights import load_illuminations
-from experiment.session.journal import Journal
-from experiment.session.records import plan_steps
 from foundation.console import plain
 from foundation.errors import DeviceError, StorageError
 from sim.world.world import Room
@@ -243,27 +237,6 @@ def test_the_command_says_it_in_json(
     document = json.loads(capsys.readouterr().out)
     assert document["faults"] == 0
     assert [finding["name"] for finding in document["findings"]] == ["disk", "turn"]
-
-
-def test_a_recording_is_judged_as_it_was_taken(folder: Path, tmp_path: Path) -> None:
-    chart = load_chart(folder / "chart2.json")
-    lab = hang_chart(chart, "Test", Room(white_level_share=0.3))
-    shown = {"white": lab.dng(WHITE, 1), "dark": lab.dng(BLACK, 2)}
-    lights = load_illuminations(folder / "illuminations.csv")
-    record_session(tmp_path / "session", chart, lights, lambda step: shown.get(step.kind, b"unread")).close()
-    with closing(Journal.open_for_run(tmp_path / "session" / "journal.sqlite")) as journal:
-        journal.add_steps(plan_steps(lights, 25))
-    replay = folder / "replay.toml"
-    replay.write_text(
-        'rig = "replay"\nchart = "chart2.json"\nilluminations = "illuminations.csv"\n'
-        f"[replay]\nsession = {json.dumps(str(tmp_path / 'session'))}\n"
-    )
-    report = check_lab(load_lab(replay))
-    found = of(report, "brightest_share")
-    assert found.grade == "remark"
-    assert "cannot be exposed anew" in found.remedy
-    assert {"white_drift", "additivity"} <= set(report.not_known)
-    assert of(report, "bleed").grade == of(report, "evenness").grade == "good"
 
 
 @pytest.mark.parametrize("faulty", FAULTY, ids="+".join)

@@ -90,7 +90,7 @@ def test_the_search_ends_at_a_good_time_wherever_there_is_one() -> None:
 )  # fmt: skip
 def test_white_is_judged_at_the_settings_time(level: float, grade: str) -> None:
     trials = tried(level / 0.5, 0.5, TIMES)
-    found = judge_exposure(trials, Saturation(13584, True, 15831), TIMES, PERIOD_S, recorded=False)
+    found = judge_exposure(trials, Saturation(13584, True, 15831), TIMES, PERIOD_S)
     assert found.grade == grade
     assert (found.remedy == "") == (grade == "good")
     if grade != "good":
@@ -99,7 +99,7 @@ def test_white_is_judged_at_the_settings_time(level: float, grade: str) -> None:
 
 
 def test_a_share_of_a_stated_saturation_is_not_called_good() -> None:
-    found = judge_exposure(tried(1.4, 0.5, TIMES), Saturation(15831, False, 15831), TIMES, PERIOD_S, recorded=False)
+    found = judge_exposure(tried(1.4, 0.5, TIMES), Saturation(15831, False, 15831), TIMES, PERIOD_S)
     assert found.grade == "remark"
     assert "as the file states, not measured" in found.said
 
@@ -118,12 +118,10 @@ def test_a_share_of_a_stated_saturation_is_not_called_good() -> None:
 )
 def test_where_no_time_suits_lens_or_speed_are_named(trials: list[tuple[float, float]], said: str) -> None:
     tried = [TriedTime(time, (0.1, level, 0.2), level >= 0.95) for time, level in trials]
-    found = judge_exposure(tried, Saturation(13584, True, 15831), TIMES, PERIOD_S, recorded=False)
+    found = judge_exposure(tried, Saturation(13584, True, 15831), TIMES, PERIOD_S)
     assert said in found.remedy
     assert ("proposed_shutter_s" in found.details) == ("tried" in said)
-    recorded = judge_exposure(tried, Saturation(13584, True, 15831), TIMES, PERIOD_S, recorded=True)
-    assert "take another session" in recorded.remedy
-    without = judge_exposure(tried, Saturation(13584, True, 15831), [], PERIOD_S, recorded=False)
+    without = judge_exposure(tried, Saturation(13584, True, 15831), [], PERIOD_S)
     assert "lists no shutter times" in without.remedy
 
 

@@ -38,11 +38,11 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def trial_of(lab: Lab, folder: Path) -> Trial:
     lights = trial_lights((), np.eye(3))
-    steps = trial_steps(lights, recorded=False)
+    steps = trial_steps(lights)
     with record_session(
         folder, lab.chart, lights, lambda step: lab.dng(step.colour, step.number), steps=steps
     ) as session:
-        return measure_trial(session, Saturation(13584, True, 15831), None, None, recorded=False)
+        return measure_trial(session, Saturation(13584, True, 15831), None, None)
 
 
 @pytest.mark.slow

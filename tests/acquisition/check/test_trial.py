@@ -33,9 +33,8 @@ def test_a_trial_is_of_white_dark_primaries_grey_and_the_darkest_light() -> None
     assert [one.name for one in lights] == ["white", "red", "green", "blue", "grey", "darkest"]
     assert lights[-1].colour == DIM.colour
     assert [one.name for one in trial_lights(PLAN[:1], np.eye(3))] == ["white", "red", "green", "blue", "grey"]
-    kinds = [step.kind for step in trial_steps(lights, recorded=False)]
+    kinds = [step.kind for step in trial_steps(lights)]
     assert kinds == ["white"] * 3 + ["dark"] + ["light"] * 6 + ["white"] * 3 + ["dark"]
-    assert [step.kind for step in trial_steps(lights, recorded=True)] == ["white", "dark"]
 
 
 def test_a_series_goes_from_dim_to_nearly_saturated() -> None:
@@ -64,9 +63,9 @@ def test_a_lamp_in_a_corner_is_measured_as_the_live_judge_measures_it(tmp_path: 
     def frame(step: SessionStep) -> bytes:
         return lab.dng(step.colour, step.number, paint=lit if step.kind == "dark" else None)
 
-    steps = trial_steps(lights, recorded=False)
+    steps = trial_steps(lights)
     with record_session(tmp_path / "session", lab.chart, lights, frame, steps=steps) as session:
-        trial = measure_trial(session, Saturation(13584, True, 15831), None, None, recorded=False)
+        trial = measure_trial(session, Saturation(13584, True, 15831), None, None)
         settings = LabSettings(rig="lab", chart=Path("chart.json"), illuminations=Path("lights.csv"))
         live = LiveJudge(settings, lab.chart, lights)
         files = {record.kind: session.folder / record.file for record in reversed(session.frames())}
@@ -96,13 +95,13 @@ def test_trial_frames_show_what_a_table_of_them_shows(
         lab.chart,
         lights,
         lambda step: lab.dng(step.colour, step.number),
-        steps=trial_steps(lights, recorded=False),
+        steps=trial_steps(lights),
     ) as session:
-        trial = measure_trial(session, Saturation(13584, True, 15831), None, None, recorded=False)
+        trial = measure_trial(session, Saturation(13584, True, 15831), None, None)
         built = judged_values(build(session, tmp_path / "lut").figures)
         without = tmp_path / "series"
         without.mkdir()
-        again = measure_trial(session, Saturation(13584, True, 15831), None, without, recorded=False)
+        again = measure_trial(session, Saturation(13584, True, 15831), None, without)
     assert not trial.series_trouble
     assert "holds 0 files" in again.series_trouble
     assert again.verdict == trial.verdict
