@@ -379,8 +379,7 @@ def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
     if len(faults) == 1:
         ((name, fault),) = faults.items()
         raise fault_of(name, fault)
-    # What the user wrote comes first: no device is used before it is corrected.
-    of_input = any(isinstance(fault, InputError) for fault in faults.values())
+    of_input = all(isinstance(fault, InputError) for fault in faults.values())
     kind = ConfigurationError if of_input else DeviceError
     listed = "".join(f"\n  {name}: {fault}" for name, fault in faults.items())
     raise kind(f"{len(faults)} of {len(questions)} devices cannot be used:{listed}") from next(iter(faults.values()))

@@ -1,17 +1,17 @@
 """A session becomes a table, in a straight line of stages; each takes a value and returns the next one.
 
-| stage | function | its value |
-|---|---|---|
-| frames | `frames.select_frames` | `SelectedFrames` |
-| shared by all | `baseline.baseline_of` | `Baseline`, made once before the first frame |
-| decoded | `measuring.decode_frame` | `DecodedFrame` |
-| located | `measuring.locate` | `LocatedFrame` |
-| sampled | `measuring.sample` | `SampledFrame` |
-| measured | `measuring.measure` | `MeasuredFrame` |
-| collected | `Accumulator.with_frame` | `Accumulator` |
-| figures | `table_figures.table_figures` | `TableMeasurements` |
-| verdict | `calibration.verdict.judge` | `Verdict` |
-| table | `_write_table` | the folder |
+The stages, their functions and their values::
+
+    frames         frames.select_frames          SelectedFrames
+    shared by all  baseline.baseline_of          Baseline, made once before the first frame
+    decoded        measuring.decode_frame        DecodedFrame
+    located        measuring.locate              LocatedFrame
+    sampled        measuring.sample              SampledFrame
+    measured       measuring.measure             MeasuredFrame
+    collected      Accumulator.with_frame        Accumulator
+    figures        table_figures.table_figures   TableMeasurements
+    verdict        calibration.verdict.judge     Verdict
+    table          _write_table                  the folder
 
 Threads take frames from decoded to measured before their turn, with what is collected at that moment (`_measured`); a
 frame counts only if the frame registered last is still the same, and is measured again otherwise. The memory is that of

@@ -492,13 +492,16 @@ def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Ge
         notes = LocalStore(folder / "plan")
         plan_id = _plan_id(identity)
         place = Workplace(LocalStore(folder / f"dataset-{plan_id}"), notes, str(path), plan_id)
+        is_begun = notes.has(PLAN)
+        if is_begun:
+            # What another plan has made stays, so that the command that began it can finish it.
+            _require_same(notes, identity, path, f"remove {folder}")
         try:
-            if not notes.has(PLAN):
+            if not is_begun:
                 _require_still_free(path, folder)
                 _begin(folder, plan_id)
                 notes.put(PLAN, _text(identity))
                 notes.sync([PLAN])
-            _require_same(notes, identity, path, f"remove {folder}")
             if not alone:
                 lock.share()
             yield place

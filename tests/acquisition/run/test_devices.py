@@ -700,16 +700,17 @@ def test_what_hangs_is_named_while_it_hangs(
 
 
 @pytest.mark.parametrize("fault", [InputError("no such file"), ConfigurationError("line.baud is missing")])
-def test_what_the_user_wrote_decides_the_exit_code_and_all_faults_are_reported(fault: CropError) -> None:
+def test_all_faults_are_reported_and_settings_alone_end_with_2(fault: CropError) -> None:
     def fails(error: CropError) -> Callable[[], object]:
         def ask() -> None:
             raise error
 
         return ask
 
-    unplugged = LinkClosed("no camera on USB")
-    with pytest.raises(InputError) as told:
-        ask_all({"camera": fails(unplugged), "projector": fails(fault), "display": lambda: None})
-    assert told.value.exit_code == 2
-    assert str(unplugged) in str(told.value)
-    assert str(fault) in str(told.value)
+    unplugged, nowhere = LinkClosed("no camera on USB"), ConfigurationError("lab.camera.host is missing")
+    for camera, exit_code in ((unplugged, 3), (nowhere, 2)):
+        with pytest.raises(CropError) as told:
+            ask_all({"camera": fails(camera), "projector": fails(fault), "display": lambda: None})
+        assert told.value.exit_code == exit_code
+        assert str(camera) in str(told.value)
+        assert str(fault) in str(told.value)

@@ -91,7 +91,7 @@ def test_damaged_settings_are_told_where_a_table_is_made(
     assert "neither its origin" in caplog.text
 
 
-@pytest.mark.parametrize(("rig", "iso"), [("lab", 200), ("simulated", 200), ("replay", None)])
+@pytest.mark.parametrize(("rig", "iso"), [("lab", 200), ("simulated", 200), ("imported", None)])
 def test_the_exposure_of_settings_is_stated_where_they_set_the_camera(
     taken: Callable[[Sequence[float]], Session], rig: str, iso: int | None
 ) -> None:

@@ -23,6 +23,7 @@ from calibration.table.lut import Lut
 from evaluation.datasets.generated import open_generated
 from evaluation.scene import MixedScene
 from foundation.errors import FormatError, InputError
+from foundation.files import partial_path
 from foundation.folders import FolderLock, held_folder
 from generator.cli import main
 from generator.dataset import layouts as plain_files
@@ -366,6 +367,16 @@ def test_another_plan_in_the_same_place_is_refused(make_lut: MakeLut, tmp_path: 
     with pytest.raises(InputError, match=r"sha256.*2.*3"):
         make(other, out)
     make(lut, out)
+
+
+def test_images_of_an_unfinished_shard_stay_if_another_plan_is_refused(make_lut: MakeLut, tmp_path: Path) -> None:
+    lut, out = make_lut(), tmp_path / "out"
+    with pytest.raises(StopIt):
+        make(lut, out, shard_images=100, on_image=interrupt_after(3))
+    begun = sorted(partial_path(out).rglob("*"))
+    with pytest.raises(InputError, match="seed 3, now 4"):
+        make(lut, out, shard_images=100, seed=4)
+    assert sorted(partial_path(out).rglob("*")) == begun
 
 
 def test_one_program_makes_a_dataset_at_a_time(make_lut: MakeLut, tmp_path: Path) -> None:

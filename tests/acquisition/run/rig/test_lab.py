@@ -49,7 +49,7 @@ def test_a_device_that_opens_and_does_not_answer_is_told_beside_one_that_does_no
     for name in ("camera", "projector"):
         device = Broken(SAYS[name]) if name in silent else Mock()
         monkeypatch.setattr(rig, f"_lab_{name}", Mock(return_value=device))
-    with pytest.raises(ConfigurationError) as told, ExitStack() as opened:
+    with pytest.raises(DeviceError) as told, ExitStack() as opened:
         rig.open_lab(lab_settings(), None, opened)
     for name in DEVICES:
         assert (SAYS[name] in str(told.value)) == (name in (*silent, "display"))
