@@ -231,5 +231,6 @@ def paired(
 
 
 def ratio_of(one: Floats, other: Floats) -> Floats:
-    """Return one / other; NaN if `other` is 0 but for the rounding of angles, about 1e-6 degrees."""
-    return np.divide(one, other, out=np.full(np.shape(other), np.nan), where=np.abs(other) > _ROUNDING_DEG)
+    """Return one / other; infinite, or NaN for 0 / 0, if `other` is 0 but for the rounding of angles."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return one / np.where(np.abs(other) > _ROUNDING_DEG, other, 0)

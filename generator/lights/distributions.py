@@ -67,8 +67,10 @@ def ground_truths_by_line(path: Path) -> dict[int, list[float]]:
         try:
             if not named and len(fields) != 3:
                 raise ValueError(f"expected 3 numbers, found {len(fields)}")
+            if len(fields) <= max(columns):
+                raise ValueError(f"expected at least {max(columns) + 1} fields, found {len(fields)}")
             truth = [float(fields[column]) for column in columns]
-        except (ValueError, IndexError) as error:
+        except ValueError as error:
             raise FormatError(f"{path}, line {number}: {line!r} is no ground truth: {error}") from error
         if not is_ground_truth(truth):
             raise FormatError(
