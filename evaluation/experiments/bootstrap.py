@@ -24,8 +24,10 @@ from scipy import stats
 
 from foundation.errors import InputError
 
+# Errors are equal up to twice the last of the six decimals that files hold.
+TIE_DEG: Final = 2e-6
+
 # Counts drawn at once, resamples times images: arrays of 1.6 MB stay in a processor's cache.
-_ROUNDING_DEG: Final = 2e-6  # Files hold six decimals of an error, so a smaller one is none
 _AT_ONCE: Final = 200_000
 
 # The ends of a 95 % interval then vary by some 2 % of its length (one standard deviation) between seeds.
@@ -233,4 +235,4 @@ def paired(
 def ratio_of(one: Floats, other: Floats) -> Floats:
     """Return one / other; infinite, or NaN for 0 / 0, if `other` is 0 but for the rounding of angles."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return one / np.where(np.abs(other) > _ROUNDING_DEG, other, 0)
+        return one / np.where(np.abs(other) > TIE_DEG, other, 0)

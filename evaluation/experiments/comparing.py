@@ -20,7 +20,7 @@ import numpy.typing as npt
 from markupsafe import Markup
 from scipy import stats
 
-from evaluation.experiments.bootstrap import LEVEL, RESAMPLES, STATISTICS, Compared, numbered, paired
+from evaluation.experiments.bootstrap import LEVEL, RESAMPLES, STATISTICS, TIE_DEG, Compared, numbered, paired
 from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex
 from evaluation.results.files import MethodErrors
@@ -36,9 +36,6 @@ _FLOOR_DEG: Final = 0.01
 
 # Ground truths of the same image are equal but for the rounding of files.
 _SAME_TRUTH_DEG: Final = 0.01
-
-# Errors are equal up to twice the last of the six decimals that files hold.
-_TIE_DEG: Final = 2e-6
 
 _HEADS: Final = dict(zip(STATISTICS, PAPER_COLUMNS[1:], strict=True))
 
@@ -160,7 +157,7 @@ def signed_rank(one: npt.ArrayLike, other: npt.ArrayLike) -> SignedRank:
     (5, 1, 0, -0.905, 0.0625)
     """
     difference = np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
-    difference = np.where(np.abs(difference) < _TIE_DEG, 0, difference)
+    difference = np.where(np.abs(difference) < TIE_DEG, 0, difference)
     wins, losses = int((difference < 0).sum()), int((difference > 0).sum())
     if not wins + losses:
         return SignedRank(0, 0, len(difference), 1.0, 0.0)
@@ -251,7 +248,7 @@ def images_table(comparison: Comparison, count: int = 10) -> Table:
     matched = comparison.matched
     one, other = matched.one.tolist(), matched.other.tolist()
     size = np.abs(matched.one - matched.other)
-    largest = [place for place in np.argsort(-size, kind="stable")[:count].tolist() if size[place] >= _TIE_DEG]
+    largest = [place for place in np.argsort(-size, kind="stable")[:count].tolist() if size[place] >= TIE_DEG]
     return Table(
         "{} against {}: the largest differences, degrees".format(*matched.names),
         ("Image", "First", "Second", "Difference"),
