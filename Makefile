@@ -70,7 +70,7 @@ lint: $(READY)
 
 # The site: tutorial, how-to, reference from the docstrings, explanation; a warning is an error. Needs no network.
 docs: $(READY)
-	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --jobs auto --quiet --doctree-dir build/doctrees docs build/site
+	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --jobs auto --doctree-dir build/doctrees docs build/site
 	@echo "The site: $(CURDIR)/build/site/index.html"
 
 bench: $(READY)

@@ -52,10 +52,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 MEASURED = (
     "README.md",
-    "docs/measured.md",
     "docs/paper.md",
-    "docs/transfer.md",
-    "docs/how-to/rendering.md",
+    "docs/reference/rendering.md",
     "docs/how-to/table-without-a-lab.md",
     "docs/how-to/transfer.md",
     "docs/how-to/tune.md",

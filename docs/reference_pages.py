@@ -1,10 +1,12 @@
-"""Two pages of the documentation, written from the code: `docs/reference/figures.md` and `docs/reference/causes.md`.
+"""Write the generated parts of the documentation.
 
-`python -m docs.reference_pages` writes both anew; a test compares them.
+`docs/reference/figures.md` and `causes.md` come from the code. The result tables of `docs/measured.md`,
+`docs/transfer.md` and `docs/reference/judge.md` come from the recorded results in `docs/results`. A test compares the files with the output of this module.
 """
 
 from __future__ import annotations
 
+import csv
 import inspect
 import math
 import re
@@ -15,7 +17,8 @@ from calibration.figures.all_figures import FIGURES
 from calibration.figures.figure import QUESTIONS, Figure, Limit
 from calibration.figures.single_frames import FRAME_LIMITS, RIG_LIMITS
 
-_PAGES = Path(__file__).parent / "reference"
+_DOCS = Path(__file__).parent
+_RESULTS = _DOCS / "results"
 
 _FIGURES_HEAD = """# Figures
 
@@ -123,6 +126,34 @@ def _evidence() -> list[tuple[str, str]]:
     return [(name, text[0].upper() + text[1:]) for name, text in texts]
 
 
+def fill_results(page: str) -> str:
+    """Replace each table between "results" comments by the rows of the CSV file that the comment names."""
+    return re.sub(
+        r"(<!-- results (\S+) -->\n).*?(<!-- end of results -->)",
+        lambda match: f"{match[1]}\n{_results_table(_RESULTS / match[2])}\n{match[3]}",
+        page,
+        flags=re.DOTALL,
+    )
+
+
+def _results_table(path: Path) -> str:
+    with path.open(encoding="utf-8", newline="") as file:
+        header, *rows = csv.reader(file)
+    command = header.index("command")
+    for row in rows:
+        row[command] = f"`{row[command]}`"
+    lines = [header, ["---"] * len(header), *rows]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def generated_pages() -> dict[Path, str]:
+    """Return the text of each page with generated parts."""
+    pages = {_DOCS / "reference/figures.md": figures_page(), _DOCS / "reference/causes.md": causes_page()}
+    for name in ("measured.md", "transfer.md", "reference/judge.md"):
+        pages[_DOCS / name] = fill_results((_DOCS / name).read_text(encoding="utf-8"))
+    return pages
+
+
 if __name__ == "__main__":
-    for name, text in (("figures", figures_page()), ("causes", causes_page())):
-        (_PAGES / f"{name}.md").write_text(text, encoding="utf-8")
+    for path, text in generated_pages().items():
+        path.write_text(text, encoding="utf-8")

@@ -142,7 +142,7 @@ def test_what_is_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_every_number_of_the_judge_says_what_it_is() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "how-to" / "night-run.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "judge.md").read_text("utf-8")
     table = page.partition("| check | question | limit |")[2].partition("\n\n")[0]
     named = {name for row in table.splitlines()[2:] for name in re.findall(r"`([a-z_]+)`", row.split("|")[1])}
     assert named - {"other_camera", "settings"} == set(MEANINGS)
