@@ -1,0 +1,17 @@
+"""The API reference is complete: it documents every public name of `croplab`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import croplab
+
+PAGES = Path(__file__).parents[2] / "docs" / "reference" / "api"
+DIRECTIVE = re.compile(r"^\.\. auto(?:function|class|data):: (\S+)$", re.MULTILINE)
+
+
+def test_documents_every_public_name() -> None:
+    documented = {name for page in PAGES.glob("*.rst") for name in DIRECTIVE.findall(page.read_text(encoding="utf-8"))}
+    names = {name.rpartition(".")[2] for name in documented}
+    assert set(getattr(croplab, "__all__")) - names == set()
