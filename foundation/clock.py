@@ -50,7 +50,8 @@ def elapsed_s() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
-SET_S = 10.0  # A date that is off by more was set: what keeps clocks right over a network moves them by less in a night
+# Smallest step of the system clock that counts as set by hand, s: network time corrections are smaller in one night.
+MIN_STEP_S = 10.0
 
 
 class SteadyClock:
@@ -73,13 +74,13 @@ class SteadyClock:
         """Seconds by which `clock` was behind `not_before` at the start; 0 where it was not."""
         self._set_by_s = -self.behind_s
 
-    def set_by_s(self) -> float:
-        """Return the seconds by which the date of `clock` was set since this was asked last; 0 below `SET_S`."""
-        set_by_s = (self._clock.now() - self.now()).total_seconds()
-        moved_s = set_by_s - self._set_by_s
-        if abs(moved_s) < SET_S:
+    def step_s(self) -> float:
+        """Return the seconds by which the date of `clock` was set since this was asked last; 0 below `MIN_STEP_S`."""
+        step_s = (self._clock.now() - self.now()).total_seconds()
+        moved_s = step_s - self._set_by_s
+        if abs(moved_s) < MIN_STEP_S:
             return 0.0
-        self._set_by_s = set_by_s
+        self._set_by_s = step_s
         return moved_s
 
     def now(self) -> datetime:
@@ -95,13 +96,14 @@ class SteadyClock:
         self._clock.sleep(seconds)
 
 
-OPENING = datetime(2026, 1, 1, 8, 0, 0, tzinfo=UTC)  # When the simulated lab opens for a session that has not begun
+# Start of simulated time for a new session.
+SIM_START = datetime(2026, 1, 1, 8, 0, 0, tzinfo=UTC)
 
 
 class SimulatedClock:
     """A clock that stands still until `sleep` moves it."""
 
-    def __init__(self, start: datetime = OPENING) -> None:
+    def __init__(self, start: datetime = SIM_START) -> None:
         self._start = start
         self._elapsed = timedelta()
 

@@ -27,7 +27,7 @@ from types import CellType, CodeType, FunctionType
 from typing import Any, Final, TypeVar, cast
 
 from foundation.errors import CropError
-from foundation.files import whole_file
+from foundation.files import atomic_file
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -206,7 +206,7 @@ def _checked_cache() -> Any:
             if not self._impl.check_cachable(data):
                 return
             code = serialize.dumps(self._impl.reduce(data))
-            with suppress(CropError, OSError), whole_file(self._path(sig, data.codegen)) as file:
+            with suppress(CropError, OSError), atomic_file(self._path(sig, data.codegen)) as file:
                 file.write(self._hash(sig, data.codegen, code) + code)
 
         def _path(self, sig: Any, codegen: Any) -> Path:

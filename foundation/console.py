@@ -38,7 +38,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
-from foundation.files import disk_remedy_of, remedy_of
+from foundation.files import disk_remedy, path_remedy
 from foundation.secret_texts import masked, printable
 
 if TYPE_CHECKING:
@@ -63,15 +63,15 @@ def say_error(message: str) -> None:
         print(f"error: {printable(masked(message))}", file=sys.stderr)
 
 
-def run(command: Callable[[], object], *, keeps: bool = True, loads: bool = False) -> int:
+def run(command: Callable[[], object], *, is_resumable: bool = True, pause_gc: bool = False) -> int:
     """Call `command` and return the exit code; a foreseeable fault is one line on stderr, no traceback."""
     _make_printable()
     collects = gc.isenabled()
-    if loads:
+    if pause_gc:
         gc.disable()
     try:
         with logging_as_before():
-            code = _outcome(command, keeps)
+            code = _outcome(command, is_resumable)
     finally:
         if collects:
             gc.enable()
@@ -134,7 +134,7 @@ def _patient(stream: Any) -> TextIOWrapper:
     )
 
 
-def loaded() -> None:
+def resume_gc() -> None:
     """Say that the modules of a command that `loads` are there: from here on garbage is looked for, if new."""
     if not gc.isenabled():
         _set_apart()
@@ -147,17 +147,17 @@ def _set_apart() -> None:
     gc.freeze()
 
 
-def _outcome(command: Callable[[], object], keeps: bool) -> int:
+def _outcome(command: Callable[[], object], is_resumable: bool) -> int:
     try:
         command()
     except CropError as error:
         say_error(_LOST if error.exit_code == InputError.exit_code and _has_lost_its_folder() else str(error))
         return error.exit_code
     except KeyboardInterrupt:
-        return _interrupted(keeps)
+        return _interrupted(is_resumable)
     except OSError as error:
         named = isinstance(error.filename, str | bytes)
-        remedy = disk_remedy_of(error)
+        remedy = disk_remedy(error)
         # A file that is not there, and a socket that is not connected, are no fault of a disk.
         if remedy is not None and error.errno not in (errno.ENOENT, errno.ENOTCONN):
             about = os.fsdecode(error.filename) if named else "the disk"
@@ -169,7 +169,7 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
         if _has_lost_its_folder():
             say_error(_LOST)
             return InputError.exit_code
-        remedy = remedy_of(error)
+        remedy = path_remedy(error)
         if remedy is None or not named:
             raise
         say_error(f"cannot use {os.fsdecode(error.filename)}: {error.strerror}; {remedy}")
@@ -179,7 +179,7 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
         return InputError.exit_code
     except SystemExit as error:
         if error.code == EXIT_INTERRUPTED:
-            return _interrupted(keeps)
+            return _interrupted(is_resumable)
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0
 
@@ -197,8 +197,8 @@ def _abandon(descriptor: int) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
 
 
-def _interrupted(keeps: bool) -> int:
-    say_error(f"interrupted; {'run the same command again to go on' if keeps else 'nothing of it was kept'}")
+def _interrupted(is_resumable: bool) -> int:
+    say_error(f"interrupted; {'run the same command again to go on' if is_resumable else 'nothing of it was kept'}")
     return EXIT_INTERRUPTED
 
 
@@ -208,30 +208,30 @@ def _say(sentence: str) -> None:
         os.write(2, f"\n{sentence}\n".encode())
 
 
-class Ending:
+class EndRequest:
     """Whether the process was asked to end, and whether it may end at once.
 
     A request comes as a signal, in the midst of anything. A block of work that must not be cut says so with
-    `finishing`; a request that comes meanwhile is noted, answered with a sentence, and seen by the block where it can
+    `postponed`; a request that comes meanwhile is noted, answered with a sentence, and seen by the block where it can
     end. A second request ends it at once.
     """
 
     def __init__(self, say: Callable[[str], object] = _say) -> None:
         self._say = say
         self._promise = ""
-        self.asked = False
+        self.is_requested = False
         """Whether somebody asked for the end."""
 
-    def ask(self) -> None:
+    def request(self) -> None:
         """Ask for the end, as a signal does."""
-        first, self.asked = not self.asked, True
+        first, self.is_requested = not self.is_requested, True
         if not (first and self._promise):
             raise KeyboardInterrupt
         self._say(self._promise)
 
     @contextmanager
-    def finishing(self, promise: str) -> Generator[None]:
-        """Let the first request wait for the end of the block; the block ends early where `asked` says so."""
+    def postponed(self, promise: str) -> Generator[None]:
+        """Let the first request wait for the end of the block; the block ends early where `is_requested` says so."""
         before, self._promise = self._promise, promise
         try:
             yield
@@ -243,7 +243,7 @@ class Ending:
         """Let the first request end the block at once: nothing has begun in it that could be finished."""
         before, self._promise = self._promise, ""
         try:
-            if self.asked:
+            if self.is_requested:
                 raise KeyboardInterrupt
             yield
         finally:
@@ -251,12 +251,12 @@ class Ending:
 
 
 @contextmanager
-def orderly_end() -> Generator[Ending]:
+def orderly_end() -> Generator[EndRequest]:
     """End as by Ctrl-C, devices closed, where the process is asked to end: by `kill`, or by a terminal that went away.
 
     A signal that is ignored already, as a hang-up is under `nohup`, stays ignored.
     """
-    ending = Ending()
+    ending = EndRequest()
     if threading.current_thread() is not threading.main_thread():
         yield ending
         return
@@ -266,7 +266,7 @@ def orderly_end() -> Generator[Ending]:
     def end(number: int, frame: object) -> None:
         nonlocal from_outside
         from_outside = from_outside or number != signal.SIGINT
-        ending.ask()
+        ending.request()
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     taken = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
@@ -403,7 +403,7 @@ COMMON = {"verbose": (_VERBOSE, 0), "quiet": (_QUIET, False), "version": (_VERSI
 _COMMON_WORD = re.compile(r"-v+|-q|--verbose|--quiet")
 
 
-def is_common(word: str) -> bool:
+def is_common_option(word: str) -> bool:
     """Return whether an argument is a common option that may stand before the name of a command."""
     return _COMMON_WORD.fullmatch(word) is not None
 
@@ -524,10 +524,10 @@ def new_app(help_text: str | None = None, **more: Any) -> typer.Typer:
 class MainCommand(StyledCommand):
     """A command with others beside it: its first word may name one of them in place of its own first argument.
 
-    Its help lists the others. `others` is the app of the others.
+    Its help lists the others. `subcommands` is the app of the others.
     """
 
-    others: ClassVar[typer.Typer]
+    subcommands: ClassVar[typer.Typer]
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
@@ -539,7 +539,7 @@ class MainCommand(StyledCommand):
     @cached_property
     def commands(self) -> Mapping[str, Any]:
         """The others by their names."""
-        return get_group(self.others).commands
+        return get_group(self.subcommands).commands
 
     # The others are passed on by name.
     def main(  # pyrefly: ignore[bad-override]
@@ -547,7 +547,7 @@ class MainCommand(StyledCommand):
     ) -> Any:
         """Run the command that the arguments name."""
         words = list(sys.argv[1:] if args is None else args)
-        place = next((place for place, word in enumerate(words) if not is_common(word)), len(words))
+        place = next((place for place, word in enumerate(words) if not is_common_option(word)), len(words))
         name = words[place] if place < len(words) else ""
         if name in self.commands:
             named = {**self.context_settings, **more}
@@ -578,7 +578,7 @@ class JsonOutput:
     """Figures of a command, gathered for the object that is printed at its end."""
 
     def __init__(self, command: str, asked: bool) -> None:
-        self.asked = asked
+        self.is_requested = asked
         self._command = command
         self._values: dict[str, Any] = {}
 
@@ -593,7 +593,7 @@ class JsonOutput:
     def write(self, stream: TextIO) -> None:
         """Print the object, if there is anything in it."""
         if self._values:
-            whole = plain({"command": self._command, **self._values})
+            whole = json_value({"command": self._command, **self._values})
             print(json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False), file=stream)
 
 
@@ -623,7 +623,7 @@ def option(metavar: str | None, text: str, *names: str, panel: str | None = None
     return typer.Option(*names, metavar=metavar, help=text, rich_help_panel=panel, **more)
 
 
-def grouped(function: Callable[..., None]) -> Callable[..., None]:
+def with_option_groups(function: Callable[..., None]) -> Callable[..., None]:
     """Return a command for typer in which options stand in the place of each parameter that is a group of them.
 
     A group is a frozen dataclass, whose fields are ``Annotated`` with typer's ``Option`` or ``Argument`` and have
@@ -672,7 +672,7 @@ def with_json(command: str) -> Callable[[Callable[..., None]], Callable[..., Non
         if output_name is None:
             raise ValueError(f"{command} has no parameter of type JsonOutput to put the option in the place of")
         option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_AS_JSON)
-        others = [
+        subcommands = [
             parameter.replace(annotation=hints[name])
             for name, parameter in inspect.signature(function).parameters.items()
             if name != output_name
@@ -682,12 +682,12 @@ def with_json(command: str) -> Callable[[Callable[..., None]], Callable[..., Non
             with json_output(command, as_json) as output:
                 function(*arguments, **named, **{output_name: output})
 
-        return _declared(with_option, function, [*others, option])
+        return _declared(with_option, function, [*subcommands, option])
 
     return decorate
 
 
-def plain(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """Return a value as JSON has it: paths and other objects as text, numbers of numpy as numbers, no infinities.
 
     Examples
@@ -701,10 +701,10 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {field.name: json_value(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in cast("Mapping[Any, Any]", value).items()}
+        return {str(key): json_value(item) for key, item in cast("Mapping[Any, Any]", value).items()}
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [plain(item) for item in cast("list[Any]", value)]
+        return [json_value(item) for item in cast("list[Any]", value)]
     listed: Callable[[], Any] | None = getattr(value, "tolist", None)
-    return str(value) if listed is None else plain(listed())
+    return str(value) if listed is None else json_value(listed())

@@ -185,17 +185,17 @@ def nearest_names(wanted: str, known: Iterable[str], most: int = 1) -> str:
     return f"did you mean {' or '.join(repr(plain[name]) for name in near)}?" if near else ""
 
 
-def first_of(things: Sequence[object], most: int = 10) -> str:
+def first_few(things: Sequence[object], most: int = 10) -> str:
     """Return things between commas as a message names them: the first ones, and an ellipsis where there are more."""
     return ", ".join(map(str, things[:most])) + (" …" if len(things) > most else "")
 
 
-def kind_of(value: object) -> str:
+def value_text(value: object) -> str:
     """Return what a value is, for a message about a wrong argument: type and shape of an array, the text of a text.
 
     Examples
     --------
-    >>> kind_of("cat.png"), kind_of(3.5), kind_of([1, 2])
+    >>> value_text("cat.png"), value_text(3.5), value_text([1, 2])
     ("the text 'cat.png'", 'float 3.5', 'a list')
     """
     if isinstance(value, str | PurePath):

@@ -89,23 +89,23 @@ def is_partial(name: str) -> bool:
     return name.startswith(".") and name.endswith(_PARTIAL)
 
 
-def remedy_of(error: OSError) -> str | None:
+def path_remedy(error: OSError) -> str | None:
     """Return what helps against a fault of the path that was named; None if the fault is another."""
     return _REMEDIES.get(error.errno or 0)
 
 
-def disk_remedy_of(error: OSError) -> str | None:
+def disk_remedy(error: OSError) -> str | None:
     """Return what helps against a fault of the disk, not of the path; None if the fault is another."""
     return _DISK_FAULTS.get(error.errno or 0)
 
 
 def storage_error(path: Path, error: OSError, what: str = "write") -> InputError | StorageError:
     """Return what went wrong at `path` as one sentence with its remedy; an InputError if the name is to blame."""
-    remedy = remedy_of(error)
+    remedy = path_remedy(error)
     by_name = remedy is not None and not isinstance(error, PermissionError)
     return (InputError if by_name else StorageError)(
         f"cannot {what} {path}: {error.strerror or error}; "
-        f"{remedy or disk_remedy_of(error) or f'see to the disk, or choose another, {RUN_AGAIN}'}"
+        f"{remedy or disk_remedy(error) or f'see to the disk, or choose another, {RUN_AGAIN}'}"
     )
 
 
@@ -122,7 +122,7 @@ def _making_error(path: Path, error: OSError) -> InputError | StorageError:
 
 def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> FormatError | StorageError:
     """Return why `path` cannot be read: the disk's fault with its own remedy, else the file's with `remedy`."""
-    of_disk = disk_remedy_of(error) if error.errno != errno.ENOENT else None
+    of_disk = disk_remedy(error) if error.errno != errno.ENOENT else None
     named = f"{what} {path}" if what else str(path)
     kind = StorageError if of_disk else FormatError
     return kind(f"cannot read {named}: {error.strerror or error}", remedy=of_disk or remedy)
@@ -172,7 +172,7 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
     return text.getvalue()
 
 
-def is_about_writing(error: BaseException, path: Path) -> TypeGuard[OSError]:
+def is_write_error(error: BaseException, path: Path) -> TypeGuard[OSError]:
     """Return whether `error` is about writing `path`, rather than about something that the caller read meanwhile."""
     if not isinstance(error, OSError):
         return False
@@ -182,12 +182,12 @@ def is_about_writing(error: BaseException, path: Path) -> TypeGuard[OSError]:
     return about in (path, partial, *path.parents) or partial in about.parents
 
 
-def make_folder(folder: Path, of: Path | None = None) -> None:
+def make_folder(folder: Path, target: Path | None = None) -> None:
     """Make a folder and those above it, where they are missing.
 
-    `of`: what the folder is made for, named in the messages; the folder itself if None.
+    `target`: what the folder is made for, named in the messages; the folder itself if None.
     """
-    path = folder if of is None else of
+    path = folder if target is None else target
     for _ in range(FOLDER_ATTEMPTS):
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -216,12 +216,12 @@ def sync_folder(folder: Path) -> None:
             os.close(handle)
     except OSError as error:
         # Systems that cannot flush a folder say EINVAL, ENOTSUP or EACCES.
-        if disk_remedy_of(error):
+        if disk_remedy(error):
             raise storage_error(folder, error) from error
 
 
 @contextmanager
-def whole_file(path: Path, final: Callable[[], Path] | None = None, *, make: bool = True) -> Generator[BufferedRandom]:
+def atomic_file(path: Path, final: Callable[[], Path] | None = None, *, make: bool = True) -> Generator[BufferedRandom]:
     """Open `path` for writing (and reading back) so that it appears complete, or not at all.
 
     An existing file of that name is replaced at the very end.
@@ -239,12 +239,12 @@ def whole_file(path: Path, final: Callable[[], Path] | None = None, *, make: boo
     except BaseException as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
-        if is_about_writing(error, path):
+        if is_write_error(error, path):
             raise _making_error(path, error) from error
         raise
 
 
-def read_whole(path: Path) -> memoryview:
+def read_buffer(path: Path) -> memoryview:
     """Return a large file's bytes, read only: for a `bytes` object the system clears each page of memory first."""
     import numpy as np
 
@@ -258,9 +258,9 @@ def read_whole(path: Path) -> memoryview:
     return memoryview(bytes(room[:filled]) + rest) if rest else room[:filled].toreadonly()
 
 
-def write_whole(path: Path, data: bytes | str) -> None:
-    """Write `data` (text as UTF-8) to `path`, complete or not at all; see `whole_file`."""
-    with whole_file(path) as stream:
+def write_atomic(path: Path, data: bytes | str) -> None:
+    """Write `data` (text as UTF-8) to `path`, complete or not at all; see `atomic_file`."""
+    with atomic_file(path) as stream:
         stream.write(data.encode() if isinstance(data, str) else data)
 
 
@@ -320,10 +320,10 @@ class HashingWriter(io.RawIOBase):
 
 
 # JSON is read as far as this: the description of a data set of a million pictures, all skipped, is a third of it.
-MOST_JSON_BYTES: Final = 256 << 20
+MAX_JSON_BYTES: Final = 256 << 20
 
 # Longest line of a file that is read by lines: the longest of ours are some hundred bytes, names of files 4096.
-MOST_LINE_BYTES: Final = 1 << 20
+MAX_LINE_BYTES: Final = 1 << 20
 
 _MOST_NAME: Final = 4096  # Longest name, as PATH_MAX of Linux has it
 
@@ -366,16 +366,14 @@ def open_inside(root: Path, name: str) -> Generator[BinaryIO]:
         yield stream
 
 
-def require_plain_folder(
-    folder: Path, most_bytes: Mapping[str, int] | None = None, below: tuple[str, ...] = ()
-) -> None:
+def require_plain_folder(folder: Path, max_bytes: Mapping[str, int] | None = None, below: tuple[str, ...] = ()) -> None:
     """Refuse a folder that holds anything but folders, regular files and links that stay inside."""
     try:
         for inner in ("", *below):
             with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder / inner) as entries:
                 for entry in entries:
                     _require_plain(folder, f"{inner}/{entry.name}" if inner else entry.name, entry)
-        for name, most in (most_bytes or {}).items():
+        for name, most in (max_bytes or {}).items():
             _require_size(folder / name, most)
     except OSError as error:
         raise reading_error(folder, error, "see that it may be read") from error
@@ -405,10 +403,10 @@ def require_plain_tree(folder: Path) -> None:
 
 
 def bounded_lines(stream: BinaryIO, what: str) -> Iterator[bytes]:
-    """Yield the lines of a stream; a FormatError that names `what` if one is longer than `MOST_LINE_BYTES`."""
-    while line := stream.readline(MOST_LINE_BYTES + 1):
-        if len(line) > MOST_LINE_BYTES:
-            raise FormatError(f"{what} has a line of more than {MOST_LINE_BYTES} bytes; it is damaged")
+    """Yield the lines of a stream; a FormatError that names `what` if one is longer than `MAX_LINE_BYTES`."""
+    while line := stream.readline(MAX_LINE_BYTES + 1):
+        if len(line) > MAX_LINE_BYTES:
+            raise FormatError(f"{what} has a line of more than {MAX_LINE_BYTES} bytes; it is damaged")
         yield line
 
 

@@ -24,8 +24,8 @@ from typing import Final
 from foundation.errors import InputError, StorageError
 from foundation.files import (
     FOLDER_ATTEMPTS,
-    disk_remedy_of,
-    is_about_writing,
+    disk_remedy,
+    is_write_error,
     make_folder,
     partial_path,
     storage_error,
@@ -54,7 +54,7 @@ def require_free(path: Path, what: str) -> None:
     try:
         empty = path.is_dir() and not any(path.iterdir())
     except OSError as error:
-        if disk_remedy_of(error) is None:
+        if disk_remedy(error) is None:
             raise
         raise storage_error(path, error, "look into") from error
     if not empty:
@@ -68,7 +68,7 @@ def require_free_file(path: Path, what: str) -> None:
         folder = next(above for above in path.absolute().parents if above.exists())
         probed = not taken and folder.is_dir()
     except OSError as error:
-        if disk_remedy_of(error) is None:
+        if disk_remedy(error) is None:
             raise
         raise storage_error(path, error, "look at") from error
     if taken:
@@ -95,7 +95,7 @@ def publish_folder(folder: Path, path: Path, what: str) -> None:
 
 
 @contextmanager
-def whole_folder(path: Path, what: str) -> Generator[Path]:
+def atomic_folder(path: Path, what: str) -> Generator[Path]:
     """Build a folder under a hidden name and give it its final name when the block ends well.
 
     `path`: the final name; must be free, or an empty folder.
@@ -111,7 +111,7 @@ def whole_folder(path: Path, what: str) -> Generator[Path]:
         publish_folder(partial, path, what)
     except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
-        if is_about_writing(error, path):
+        if is_write_error(error, path):
             raise storage_error(path, error) from error
         raise
 
@@ -120,7 +120,7 @@ FSTAB: Final = Path("/etc/fstab")
 MOUNTS: Final = Path("/proc/self/mounts")  # Tables of disks, and of mounted ones, of Linux
 
 
-def unmounted_at(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
+def unmounted_folder(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
     """Return the folder at or above `path` where a disk of `fstab` is not mounted; None where each is, or none is told.
 
     `fstab`, `mounts`: the table of disks and that of mounted ones (fstab(5), proc(5)).
@@ -162,7 +162,7 @@ _log = logging.getLogger(__name__)
 
 
 class FolderLock:
-    """The hold on a folder; given by `held_folder`.
+    """The hold on a folder; given by `locked_folder`.
 
     `handle`: open file descriptor of what is locked; None where the file system has no locks.
     """
@@ -178,17 +178,17 @@ class FolderLock:
 
 
 @contextmanager
-def held_folder(
-    folder: Path, busy: str, share_if: Callable[[], bool] | None = None, of: Path | None = None
+def locked_folder(
+    folder: Path, busy: str, share_if: Callable[[], bool] | None = None, target: Path | None = None
 ) -> Generator[FolderLock]:
     """Hold a folder while the block runs; it is made if it is not there.
 
     `share_if`: where given, another program's hold is waited for until it is shared (`FolderLock.share`), and joined if
-    this returns true then; if not, the attempt begins anew. `of`: what is made in the folder, named in the messages of
-    errors; the folder itself if None.
+    this returns true then; if not, the attempt begins anew. `target`: what is made in the folder, named in the messages
+    of errors; the folder itself if None.
     """
     for _ in range(FOLDER_ATTEMPTS):
-        make_folder(folder, of)
+        make_folder(folder, target)
         with ExitStack() as opened:
             try:
                 place = _opened(folder, opened)
@@ -199,12 +199,12 @@ def held_folder(
             except BlockingIOError as error:
                 raise InputError(busy) from error
             except OSError as error:
-                raise storage_error(folder if of is None else of, error) from error
+                raise storage_error(folder if target is None else target, error) from error
             if not there or (together and share_if is not None and not share_if()):
                 continue
             yield FolderLock(handle)
             return
-    place = folder if of is None else of
+    place = folder if target is None else target
     raise StorageError(f"cannot write {place}: its folder is made and not there; name a place on an ordinary disk")
 
 

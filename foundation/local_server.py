@@ -196,7 +196,7 @@ class LocalServer(ABC, ThreadingHTTPServer):
     """Serves one page; not yet serving when it is made. An InputError says why it cannot listen there."""
 
     command: ClassVar[str]  # The command that serves, as messages name it
-    most_bytes: ClassVar[int] = 0  # Bytes of the largest body of a PUT that is taken; 0 takes none
+    max_bytes: ClassVar[int] = 0  # Bytes of the largest body of a PUT that is taken; 0 takes none
 
     daemon_threads = True
     request_queue_size = MOST_CONNECTIONS
@@ -297,7 +297,7 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET  # noqa: N815
 
     def do_PUT(self) -> None:  # the name is http.server's
-        if not self.server.most_bytes:
+        if not self.server.max_bytes:
             self._refuse()
             return
         asked = self.server.access.judge(self.path, self.headers.get("Host"), self.headers.get("Origin"))
@@ -305,8 +305,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(asked, close=True)
             return
         length = self.headers.get("Content-Length", "")
-        if not (length.isascii() and length.isdigit() and 0 < int(length) <= self.server.most_bytes):
-            most = self.server.most_bytes >> 20
+        if not (length.isascii() and length.isdigit() and 0 < int(length) <= self.server.max_bytes):
+            most = self.server.max_bytes >> 20
             self._send(Refusal(413, f"expected up to {most} MiB, and their number in the head"), close=True)
             return
         self.request.expect(BODY_S)

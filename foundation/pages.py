@@ -42,13 +42,13 @@ def render(
     *,
     scripts: Sequence[str] = (),
     styles: Sequence[str] = (),
-    connects: bool = False,
+    uses_server: bool = False,
     **values: Any,
 ) -> RenderedPage:
     """Return the page that a template of a package makes of values, among them its `title`.
 
     `scripts` and `styles` are files beside the template, put into the page in that order, the styles after the common
-    sheet. `connects`: whether the page asks the server that it came from.
+    sheet. `uses_server`: whether the page asks the server that it came from.
     """
     script = Markup("".join(_text(package, name) for name in scripts))
     sheets = (("foundation", "colours.css"), ("foundation", "style.css"), *((package, name) for name in styles))
@@ -57,7 +57,7 @@ def render(
     policy = (
         f"default-src 'none'; {f'script-src {_hash(script)}; ' if script else ''}"
         f"style-src {_hash(style) if script else repr('unsafe-inline')}; base-uri 'none'; form-action 'none'; "
-        f"{'''connect-src 'self'; img-src 'self' data:''' if connects else 'img-src data:'}"
+        f"{'''connect-src 'self'; img-src 'self' data:''' if uses_server else 'img-src data:'}"
     )
     found = _environment(package).get_template(template)
     return RenderedPage(found.render(script=script, style=style, policy=Markup(policy), **values), policy)
@@ -126,9 +126,9 @@ def row(parts: Sequence[Markup]) -> Markup:
     return _piece("row", parts)
 
 
-def fold(summary: str, parts: Sequence[Markup], open_at_first: bool = False) -> Markup:
+def fold(summary: str, parts: Sequence[Markup], is_open: bool = False) -> Markup:
     """Return pieces that a click on their summary shows and hides."""
-    return _piece("fold", summary, parts, open_at_first)
+    return _piece("fold", summary, parts, is_open)
 
 
 @cache

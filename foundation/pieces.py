@@ -40,7 +40,7 @@ class Piece:
         rest = "\t".join((self.name, self.inputs, json.dumps(dict(self.files)), self.values)).encode()
         return b"\n%s\t%s\n" % (sha256_of(rest).encode(), rest)
 
-    def is_whole(self, open_file: Callable[[str], AbstractContextManager[BinaryIO]]) -> bool:
+    def is_complete(self, open_file: Callable[[str], AbstractContextManager[BinaryIO]]) -> bool:
         """Return whether each of its files is there with its hash; `open_file` opens one by its name."""
         try:
             for name, sha256 in self.files.items():
@@ -52,7 +52,7 @@ class Piece:
         return True
 
 
-def pieces_of(data: bytes, inputs: str | None = None) -> dict[str, Piece]:
+def read_pieces(data: bytes, inputs: str | None = None) -> dict[str, Piece]:
     """Return the pieces in a record file's bytes by their names, the last of each name; damaged lines are left out.
 
     `inputs`: what the pieces must be made of; None for any.

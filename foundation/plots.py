@@ -95,7 +95,7 @@ def legend_label(name: str) -> str:
     return f" {name}" if name.startswith("_") else name
 
 
-def png_of(draw: Callable[..., None], *arguments: Any) -> bytes:
+def draw_png(draw: Callable[..., None], *arguments: Any) -> bytes:
     """Return the PNG of a figure that `draw(figure, *arguments)` fills and gives its size; it has plain numbers."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -114,7 +114,7 @@ def png_of(draw: Callable[..., None], *arguments: Any) -> bytes:
     return cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGR), _PNG_SETTINGS)[1].tobytes()
 
 
-def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, float] = (7.2, 4.0)) -> bytes:
+def draw_svg(draw: Callable[..., None], *arguments: Any, inches: tuple[float, float] = (7.2, 4.0)) -> bytes:
     """Return the SVG of a figure that `draw(figure, *arguments)` fills.
 
     `INK`, `FAINT`, `GRID` and `PAPER` in it become the page's colours of that name, which a dark screen exchanges, so
@@ -138,8 +138,8 @@ def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, floa
     return text.encode()
 
 
-def standalone(svg: bytes) -> bytes:
-    """Return an SVG of `svg_of` as a file of its own: with a page's colours, light or dark as the reader likes.
+def standalone_svg(svg: bytes) -> bytes:
+    """Return an SVG of `draw_svg` as a file of its own: with a page's colours, light or dark as the reader likes.
 
     Examples
     --------

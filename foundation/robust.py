@@ -18,7 +18,7 @@ MEDIAN_ERROR: Final = 1.2533  # Standard error of the median of many normal valu
 _HUBER_SIGMAS: Final = 2.0  # Residuals up to twice their usual size keep full weight; 95 % of normal ones do
 
 
-def sigma_of(residual: npt.NDArray[np.floating]) -> float:
+def robust_sigma(residual: npt.NDArray[np.floating]) -> float:
     """Return the standard deviation of normal residuals about zero, float of any shape, by their median size."""
     return MAD_TO_SIGMA * float(np.median(np.abs(residual)))
 
@@ -26,10 +26,10 @@ def sigma_of(residual: npt.NDArray[np.floating]) -> float:
 def sigma_by_level(
     residual: npt.NDArray[np.float64], level: npt.NDArray[np.float64], groups: int
 ) -> npt.NDArray[np.float64]:
-    """Return `sigma_of` residuals (N,) in groups of like levels (N,), (N,) float64."""
+    """Return `robust_sigma` residuals (N,) in groups of like levels (N,), (N,) float64."""
     found = np.empty(len(residual))
     for part in np.array_split(np.argsort(level, kind="stable"), groups):
-        found[part] = sigma_of(residual[part])
+        found[part] = robust_sigma(residual[part])
     return found
 
 

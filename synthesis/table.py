@@ -31,7 +31,7 @@ from experiment.lights import Illumination
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
 from foundation.compiled import ordered_map
 from foundation.errors import QualityError, StorageError
-from foundation.folders import require_free, whole_folder
+from foundation.folders import atomic_folder, require_free
 from foundation.version import software
 from sim.spectral import printed_reflectance
 from sim.world.rendering import Print
@@ -198,7 +198,7 @@ def compute_table(task: TableTask, out: Path, threads: int, progress: ReportLigh
     _require_room(out, task.sample_bytes + SPARE_BYTES)
     measurement = _measurement(task)
     lights, cells = len(task.illuminations), task.chart.colour_count
-    with whole_folder(out, "the table") as folder:
+    with atomic_folder(out, "the table") as folder:
         writer = LutWriter(folder, lights, cells, task.window**2)
 
         def compute(light: int) -> ComputedFrame:

@@ -24,7 +24,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, Colour
 from drivers.raw.rawfile import camera_matrix
 from drivers.tiff import CFA, D65, Tags, TiffTag, ValueType, head, rationals, text
-from foundation.clock import OPENING
+from foundation.clock import SIM_START
 from foundation.errors import DeviceRefused
 from sim.world.disturbances import CALM, Disturbances, Moment
 from sim.world.sensors import Body
@@ -218,7 +218,7 @@ class WorldFilm:
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
         """Photograph the world as it is lit now."""
         colour = self._look()
-        seconds = (released_at - OPENING).total_seconds()
+        seconds = (released_at - SIM_START).total_seconds()
         moment = Moment(len(self._before), seconds, colour, tuple(self._before))
         lamp = self._light() * (1 - self._world.room.lamp_drift_per_hour * seconds / 3600)
         # The noise is that of the frame that was ordered, whatever there is to see.

@@ -171,7 +171,7 @@ def blank_pictures() -> Generator[None]:
 
     with pytest.MonkeyPatch.context() as patched:
         for page in ("calibration.report.report", "calibration.comparison.report"):
-            patched.setattr(f"{page}.png_of", blank)
+            patched.setattr(f"{page}.draw_png", blank)
         yield
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
 
-from foundation.clock import SET_S, Clock, SteadyClock, SystemClock, elapsed_s
+from foundation.clock import MIN_STEP_S, Clock, SteadyClock, SystemClock, elapsed_s
 
 NOON = datetime(2026, 1, 1, 12, tzinfo=UTC)
 
@@ -47,14 +47,14 @@ def test_a_clock_that_is_set_back_or_forward_does_not_move_a_session_s_time() ->
 def test_that_a_clock_was_set_is_told_once() -> None:
     machine = SetClock()
     clock = steady(machine, NOON + timedelta(hours=2))
-    assert clock.set_by_s() == 0, "it was behind at the start, and is told of that"
+    assert clock.step_s() == 0, "it was behind at the start, and is told of that"
     machine.date += timedelta(hours=1)
     clock.sleep(5)
-    assert clock.set_by_s() == 3600
-    machine.date -= timedelta(seconds=SET_S - 1)
-    assert clock.set_by_s() == 0
+    assert clock.step_s() == 3600
+    machine.date -= timedelta(seconds=MIN_STEP_S - 1)
+    assert clock.step_s() == 0
     machine.date -= timedelta(minutes=2)
-    assert clock.set_by_s() == -120 - (SET_S - 1)
+    assert clock.step_s() == -120 - (MIN_STEP_S - 1)
 
 
 def test_a_clock_that_is_behind_the_last_frame_goes_on_from_there() -> None:

@@ -18,7 +18,7 @@ import pytest
 
 from foundation import errors
 from foundation.console import (
-    Ending,
+    EndRequest,
     new_app,
     orderly_end,
     progress,
@@ -88,7 +88,7 @@ def test_interruption_is_130(capsys: pytest.CaptureFixture[str]) -> None:
 
     assert run(interrupt) == 130
     assert capsys.readouterr().err == "error: interrupted; run the same command again to go on\n"
-    assert run(interrupt, keeps=False) == 130
+    assert run(interrupt, is_resumable=False) == 130
     assert capsys.readouterr().err == "error: interrupted; nothing of it was kept\n"
 
 
@@ -227,25 +227,25 @@ def test_nobody_reads_the_error_any_more(monkeypatch: pytest.MonkeyPatch) -> Non
 
 class TestEnding:
     def test_a_request_ends_at_once_what_promises_nothing(self) -> None:
-        ending = Ending()
+        ending = EndRequest()
         with pytest.raises(KeyboardInterrupt):
-            ending.ask()
+            ending.request()
 
     def test_what_is_being_finished_is_told_once_and_cut_by_the_second_request(self) -> None:
         said: list[str] = []
-        ending = Ending(said.append)
-        with ending.finishing("ending soon"):
-            ending.ask()
-            assert ending.asked
+        ending = EndRequest(said.append)
+        with ending.postponed("ending soon"):
+            ending.request()
+            assert ending.is_requested
             with pytest.raises(KeyboardInterrupt):
-                ending.ask()
+                ending.request()
         assert said == ["ending soon"]
 
     def test_a_wait_within_ends_at_once_and_does_not_begin_when_the_end_was_asked_for(self) -> None:
-        ending = Ending(lambda sentence: None)
-        with ending.finishing("ending soon"):
+        ending = EndRequest(lambda sentence: None)
+        with ending.postponed("ending soon"):
             with pytest.raises(KeyboardInterrupt), ending.at_once():
-                ending.ask()
+                ending.request()
             with pytest.raises(KeyboardInterrupt), ending.at_once():
                 raise AssertionError("begun")
 
@@ -253,9 +253,9 @@ class TestEnding:
         # A shell that is not interactive starts what it puts in the background with SIGINT ignored.
         inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
         before = signal.getsignal(signal.SIGINT)
-        with orderly_end() as ending, ending.finishing("ending soon"):
+        with orderly_end() as ending, ending.postponed("ending soon"):
             signal.raise_signal(signal.SIGINT)
-            assert ending.asked
+            assert ending.is_requested
         assert "ending soon" in capfd.readouterr().err
         assert signal.getsignal(signal.SIGINT) == before
         signal.signal(signal.SIGINT, inherited)

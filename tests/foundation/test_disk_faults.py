@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from foundation.errors import StorageError
-from foundation.files import write_whole
-from foundation.folders import held_folder, require_free, whole_folder
+from foundation.files import write_atomic
+from foundation.folders import atomic_folder, locked_folder, require_free
 from tests.failing_calls import DISK_FAULTS, FailingCalls, Ran, failing_calls, why_not
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(why_not() != "", reason=why_not())]
@@ -84,14 +84,14 @@ def test_a_call_that_fails_is_seen_to_fail(disk: FailingCalls, tmp_path: Path) -
 
 
 def save_old(path: Path) -> None:
-    write_whole(path, "old")
+    write_atomic(path, "old")
     assert [other.name for other in path.parent.iterdir()] == [path.name]
 
 
 def test_saving_a_file_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Path) -> None:
     path = tmp_path / "frames.csv"
     faults = 0
-    for ran, _, _ in each_call(disk, lambda: write_whole(path, "new" * 5000), lambda: save_old(path)):
+    for ran, _, _ in each_call(disk, lambda: write_atomic(path, "new" * 5000), lambda: save_old(path)):
         assert path.read_text() in ("old", "new" * 5000)
         if ran.error is None:
             assert path.read_text() == "new" * 5000
@@ -104,9 +104,9 @@ def test_saving_a_folder_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Pa
     path = tmp_path / "in" / "lut"
 
     def save() -> None:
-        with whole_folder(path, "the table") as folder:
-            write_whole(folder / "a", "1")
-            write_whole(folder / "b", "2")
+        with atomic_folder(path, "the table") as folder:
+            write_atomic(folder / "a", "1")
+            write_atomic(folder / "b", "2")
 
     def clear() -> None:
         shutil.rmtree(path.parent, ignore_errors=True)
@@ -135,7 +135,7 @@ def test_holding_a_folder_or_a_sentence(
     held: list[bool] = []
 
     def hold() -> None:
-        with held_folder(tmp_path / "session", "busy"):
+        with locked_folder(tmp_path / "session", "busy"):
             held.append(True)
 
     for ran, _, _ in each_call(disk, hold, held.clear, (errno.EIO, errno.ESTALE)):

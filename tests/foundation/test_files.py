@@ -19,16 +19,16 @@ from foundation import files as storage
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import (
     HashingWriter,
+    atomic_file,
     file_sha256,
     is_partial,
     open_inside,
     partial_path,
+    read_buffer,
     read_csv,
-    read_whole,
-    whole_file,
-    write_whole,
+    write_atomic,
 )
-from foundation.folders import require_free_file, whole_folder
+from foundation.folders import atomic_folder, require_free_file
 
 
 def names(folder: Path) -> list[str]:
@@ -52,7 +52,7 @@ def small_disk(limit: int) -> Generator[None]:
 class TestWholeFile:
     def test_appears_at_the_end_and_whole(self, tmp_path: Path) -> None:
         path = tmp_path / "new" / "frame.dng"
-        with whole_file(path) as stream:
+        with atomic_file(path) as stream:
             stream.write(b"first half, ")
             stream.flush()
             assert names(path.parent) == [".frame.dng.partial"]
@@ -65,7 +65,7 @@ class TestWholeFile:
             assert partial_path(tmp_path / "frame").read_bytes() == b"raw"
             return tmp_path / "frame.CR2"
 
-        with whole_file(tmp_path / "frame", named) as stream:
+        with atomic_file(tmp_path / "frame", named) as stream:
             stream.write(b"raw")
             assert stream.tell() == 3
             stream.seek(0)
@@ -74,8 +74,8 @@ class TestWholeFile:
 
     def test_replaces_only_at_the_end(self, tmp_path: Path) -> None:
         path = tmp_path / "frames.csv"
-        write_whole(path, "old")
-        with whole_file(path) as stream:
+        write_atomic(path, "old")
+        with atomic_file(path) as stream:
             stream.write(b"new")
             stream.flush()
             assert path.read_text() == "old"
@@ -83,7 +83,7 @@ class TestWholeFile:
 
     def test_a_folder_that_is_gone_is_not_made_anew_where_it_must_be_there(self, tmp_path: Path) -> None:
         with pytest.raises(StorageError):  # noqa: SIM117
-            with whole_file(tmp_path / "disk" / "frame", make=False) as stream:
+            with atomic_file(tmp_path / "disk" / "frame", make=False) as stream:
                 stream.write(b"raw")
         assert names(tmp_path) == []
 
@@ -92,8 +92,8 @@ class TestWholeFile:
         self, tmp_path: Path, error: BaseException
     ) -> None:
         path = tmp_path / "a.csv"
-        write_whole(path, "old")
-        with pytest.raises(type(error)), whole_file(path) as stream:  # noqa: PT012
+        write_atomic(path, "old")
+        with pytest.raises(type(error)), atomic_file(path) as stream:  # noqa: PT012
             stream.write(b"new")
             raise error
         assert path.read_text() == "old"
@@ -104,7 +104,7 @@ class TestWholeFile:
         with (
             pytest.raises(StorageError, match=r"big\.dng: .*so large"),
             small_disk(10_000),
-            whole_file(path) as stream,
+            atomic_file(path) as stream,
         ):
             stream.write(bytes(50_000))
         assert names(tmp_path) == []
@@ -115,17 +115,17 @@ class TestWholeFile:
             raise OSError(number, os.strerror(number))
 
         path = tmp_path / "a.csv"
-        write_whole(path, "old")
+        write_atomic(path, "old")
         monkeypatch.setattr(storage.os, "fsync", fail)
         with pytest.raises(StorageError, match=os.strerror(number)) as caught:
-            write_whole(path, "new")
+            write_atomic(path, "new")
         assert isinstance(caught.value.__cause__, OSError)
         assert path.read_text() == "old"
         assert names(tmp_path) == ["a.csv"]
 
     def test_a_disk_that_was_taken_away_is_not_taken_for_one_that_takes_no_files(self, tmp_path: Path) -> None:
         """The empty folder it was mounted on is there; what was written is not."""
-        with pytest.raises(StorageError), whole_file(tmp_path / "a.csv"):
+        with pytest.raises(StorageError), atomic_file(tmp_path / "a.csv"):
             (tmp_path / ".a.csv.partial").unlink()
 
     def test_a_folder_whose_names_cannot_be_flushed_is_a_fault_where_the_disk_fails(
@@ -144,24 +144,24 @@ class TestWholeFile:
         storage.sync_folder(tmp_path)
 
     def test_a_killed_writer_leaves_only_a_hidden_leftover(self, tmp_path: Path) -> None:
-        write_whole(tmp_path / "a", "old")
+        write_atomic(tmp_path / "a", "old")
         program = (
-            "import os, sys, pathlib; from foundation.files import whole_file\n"
-            "with whole_file(pathlib.Path(sys.argv[1])) as stream:\n"
+            "import os, sys, pathlib; from foundation.files import atomic_file\n"
+            "with atomic_file(pathlib.Path(sys.argv[1])) as stream:\n"
             "    stream.write(b'half'); stream.flush(); os.kill(os.getpid(), 9)\n"
         )
         done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "a")], check=False)
         assert done.returncode == -signal.SIGKILL
         assert (tmp_path / "a").read_text() == "old"
         assert [is_partial(name) for name in names(tmp_path)] == [True, False]
-        write_whole(tmp_path / "a", "new")
+        write_atomic(tmp_path / "a", "new")
         assert names(tmp_path) == ["a"]
 
 
 class TestWholeFolder:
     def test_appears_at_the_end_and_whole(self, tmp_path: Path) -> None:
         path = tmp_path / "deep" / "lut"
-        with whole_folder(path, "the table") as folder:
+        with atomic_folder(path, "the table") as folder:
             (folder / "samples.npy").write_bytes(b"1")
             assert not path.exists()
             assert is_partial(folder.name)
@@ -170,43 +170,43 @@ class TestWholeFolder:
 
     def test_takes_an_empty_folder(self, tmp_path: Path) -> None:
         (tmp_path / "lut").mkdir()
-        with whole_folder(tmp_path / "lut", "the table") as folder:
-            write_whole(folder / "a", "1")
+        with atomic_folder(tmp_path / "lut", "the table") as folder:
+            write_atomic(folder / "a", "1")
         assert names(tmp_path / "lut") == ["a"]
 
     def test_never_overwrites(self, tmp_path: Path) -> None:
         (tmp_path / "full").mkdir()
-        write_whole(tmp_path / "full" / "mine", "precious")
-        write_whole(tmp_path / "file", "precious")
+        write_atomic(tmp_path / "full" / "mine", "precious")
+        write_atomic(tmp_path / "file", "precious")
         (tmp_path / "link").symlink_to(tmp_path / "nowhere")
         for name in ("full", "file", "link"):
             with pytest.raises(InputError, match=f"{name} already exists"):  # noqa: SIM117
-                with whole_folder(tmp_path / name, "the table"):
+                with atomic_folder(tmp_path / name, "the table"):
                     pytest.fail("the block must not begin")
         assert (tmp_path / "full" / "mine").read_text() == "precious"
 
     def test_a_place_taken_meanwhile_is_left_alone(self, tmp_path: Path) -> None:
         path = tmp_path / "lut"
-        with pytest.raises(InputError), whole_folder(path, "the table") as folder:  # noqa: PT012
-            write_whole(folder / "a", "ours")
+        with pytest.raises(InputError), atomic_folder(path, "the table") as folder:  # noqa: PT012
+            write_atomic(folder / "a", "ours")
             path.mkdir()
-            write_whole(path / "a", "theirs")
+            write_atomic(path / "a", "theirs")
         assert (path / "a").read_text() == "theirs"
         assert names(tmp_path) == ["lut"]
 
     @pytest.mark.parametrize("error", [ValueError("ours"), KeyboardInterrupt()])
     def test_a_block_that_fails_leaves_nothing(self, tmp_path: Path, error: BaseException) -> None:
-        with pytest.raises(type(error)), whole_folder(tmp_path / "lut", "the table") as folder:  # noqa: PT012
-            write_whole(folder / "deep" / "a", "1")
+        with pytest.raises(type(error)), atomic_folder(tmp_path / "lut", "the table") as folder:  # noqa: PT012
+            write_atomic(folder / "deep" / "a", "1")
             raise error
         assert names(tmp_path) == []
 
     def test_a_leftover_is_cleared(self, tmp_path: Path) -> None:
         leftover = partial_path(tmp_path / "lut")
         leftover.mkdir()
-        write_whole(leftover / "stale", "x")
-        with whole_folder(tmp_path / "lut", "the table") as folder:
-            write_whole(folder / "fresh", "x")
+        write_atomic(leftover / "stale", "x")
+        with atomic_folder(tmp_path / "lut", "the table") as folder:
+            write_atomic(folder / "fresh", "x")
         assert names(tmp_path / "lut") == ["fresh"]
 
 
@@ -223,7 +223,7 @@ def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
 def test_a_file_is_read_whole_and_cannot_be_written_through(tmp_path: Path, size: int) -> None:
     written = os.urandom(size)
     (tmp_path / "frame").write_bytes(written)
-    data = read_whole(tmp_path / "frame")
+    data = read_buffer(tmp_path / "frame")
     assert data == written
     assert data.readonly
     assert bool(data) == bool(written)
@@ -240,7 +240,7 @@ def test_a_file_of_another_size_than_the_system_told_is_read_to_its_end(
         return os.stat_result((0,) * 6 + (told, 0, 0, 0))
 
     monkeypatch.setattr(storage.os, "fstat", fstat)
-    assert read_whole(tmp_path / "frame") == b"ten bytes."
+    assert read_buffer(tmp_path / "frame") == b"ten bytes."
 
 
 def test_a_folder_that_is_there_and_not_there_is_not_waited_for(

@@ -18,7 +18,7 @@ import pytest
 
 from foundation import folders
 from foundation.errors import InputError, StorageError
-from foundation.folders import LOCK_FILE, held_folder
+from foundation.folders import LOCK_FILE, locked_folder
 
 BUSY = "another program is at it; wait for it"
 Flock = Callable[[int, int], None]
@@ -43,18 +43,18 @@ def locks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> st
 @pytest.mark.usefixtures("locks")
 def test_a_folder_is_made_and_held_alone(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "table"
-    with held_folder(folder, BUSY):
+    with locked_folder(folder, BUSY):
         assert folder.is_dir()
-        with pytest.raises(InputError, match=BUSY), held_folder(folder, BUSY):
+        with pytest.raises(InputError, match=BUSY), locked_folder(folder, BUSY):
             pytest.fail("two hold it")
-    with held_folder(folder, BUSY):
+    with locked_folder(folder, BUSY):
         pass
 
 
 @pytest.mark.usefixtures("locks")
 def test_nothing_stays_in_a_folder_that_was_published_meanwhile(tmp_path: Path) -> None:
     folder, final = tmp_path / ".table.partial", tmp_path / "table"
-    with held_folder(folder, BUSY):
+    with locked_folder(folder, BUSY):
         (folder / "lut.json").touch()
         folder.rename(final)
     assert [path.name for path in final.iterdir()] == ["lut.json"]
@@ -63,22 +63,22 @@ def test_nothing_stays_in_a_folder_that_was_published_meanwhile(tmp_path: Path) 
 @pytest.mark.usefixtures("locks")
 def test_a_file_that_a_killed_program_left_holds_nobody_up(tmp_path: Path) -> None:
     (tmp_path / LOCK_FILE).touch()
-    with held_folder(tmp_path, BUSY):
+    with locked_folder(tmp_path, BUSY):
         pass
 
 
 @pytest.mark.usefixtures("locks")
 def test_programs_that_ask_for_a_share_are_there_together(tmp_path: Path) -> None:
     plan = tmp_path / "plan"
-    with held_folder(tmp_path, BUSY, share_if=plan.exists) as first:
+    with locked_folder(tmp_path, BUSY, share_if=plan.exists) as first:
         plan.touch()
         first.share()
-        with held_folder(tmp_path, BUSY, share_if=plan.exists), pytest.raises(InputError, match=BUSY):
-            held_folder(tmp_path, BUSY).__enter__()
+        with locked_folder(tmp_path, BUSY, share_if=plan.exists), pytest.raises(InputError, match=BUSY):
+            locked_folder(tmp_path, BUSY).__enter__()
         # The second to leave took nothing away from the first.
-        with pytest.raises(InputError, match=BUSY), held_folder(tmp_path, BUSY):
+        with pytest.raises(InputError, match=BUSY), locked_folder(tmp_path, BUSY):
             pytest.fail("one holds it alone, another shares it")
-    with held_folder(tmp_path, BUSY):
+    with locked_folder(tmp_path, BUSY):
         pass
 
 
@@ -88,11 +88,11 @@ def test_who_asks_for_a_share_waits_until_there_is_one(tmp_path: Path) -> None:
     plan, joined = tmp_path / "plan", threading.Event()
 
     def join() -> None:
-        with held_folder(tmp_path, BUSY, share_if=plan.exists):
+        with locked_folder(tmp_path, BUSY, share_if=plan.exists):
             assert plan.exists()
             joined.set()
 
-    with held_folder(tmp_path, BUSY, share_if=plan.exists) as first:
+    with locked_folder(tmp_path, BUSY, share_if=plan.exists) as first:
         second = threading.Thread(target=join)
         second.start()
         assert not joined.wait(0.1)
@@ -110,10 +110,10 @@ def test_who_waited_in_vain_begins_anew(tmp_path: Path) -> None:
 
     def join() -> None:
         waits.set()
-        with held_folder(folder, BUSY, share_if=(folder / "plan").exists):
+        with locked_folder(folder, BUSY, share_if=(folder / "plan").exists):
             held.append(folder.is_dir())
 
-    with held_folder(folder, BUSY):
+    with locked_folder(folder, BUSY):
         second = threading.Thread(target=join)
         second.start()
         assert waits.wait(10)
@@ -135,7 +135,7 @@ def test_a_folder_that_was_finished_between_opening_and_locking_is_made_anew(
         now(handle, operation)
 
     monkeypatch.setattr(folders.fcntl, "flock", finished_first)
-    with held_folder(folder, BUSY):
+    with locked_folder(folder, BUSY):
         assert folder.is_dir()
     assert list(final.iterdir()) == []
 
@@ -151,9 +151,9 @@ def test_a_lock_file_that_its_holder_removed_is_no_lock(tmp_path: Path, monkeypa
             (tmp_path / LOCK_FILE).unlink()
 
     monkeypatch.setattr(folders.fcntl, "flock", removed_first)
-    with held_folder(tmp_path, BUSY):
+    with locked_folder(tmp_path, BUSY):
         assert (tmp_path / LOCK_FILE).exists()
-        with pytest.raises(InputError, match=BUSY), held_folder(tmp_path, BUSY):
+        with pytest.raises(InputError, match=BUSY), locked_folder(tmp_path, BUSY):
             pytest.fail("two hold it")
 
 
@@ -165,7 +165,7 @@ def test_without_locks_the_work_goes_on_with_a_warning(
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(folders.fcntl, "flock", none)
-    with caplog.at_level(logging.WARNING), held_folder(tmp_path, BUSY) as lock:
+    with caplog.at_level(logging.WARNING), locked_folder(tmp_path, BUSY) as lock:
         lock.share()
         assert list(tmp_path.iterdir()) == []
     assert [record.getMessage() for record in caplog.records] == [
@@ -182,6 +182,6 @@ def test_a_folder_that_is_made_and_never_there_is_not_waited_for(
     monkeypatch.setattr("foundation.folders.make_folder", make_nothing)
     with (
         pytest.raises(StorageError),
-        held_folder(tmp_path / "x", "busy"),
+        locked_folder(tmp_path / "x", "busy"),
     ):
         pass

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from foundation import pages
-from foundation.plots import INK, svg_of
+from foundation.plots import INK, draw_svg
 
 VOID = {"meta", "img", "br", "link"}
 
@@ -63,7 +63,7 @@ def test_a_page_holds_all_and_fetches_nothing() -> None:
             pages.verdict("accept", "good & well"),
             pages.table("<t>", ("<a>", "b"), (("<x> & y", "1.00"),), (False, True), notes=("<n>",)),
             pages.fold("more <", [pages.note("inside &")]),
-            pages.row([pages.figure(b"\x89PNG\r\n", "a 'quoted' caption"), pages.figure(svg_of(draw), "drawn")]),
+            pages.row([pages.figure(b"\x89PNG\r\n", "a 'quoted' caption"), pages.figure(draw_svg(draw), "drawn")]),
         ],
     )
     found = checked(text)
@@ -98,7 +98,7 @@ def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
     (folder / "own.css").write_text("p > b { color: red }\n")
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     made = pages.render(
-        "pages_of_a_test", "own.html", scripts=("one.js", "two.js"), styles=("own.css",), connects=True,
+        "pages_of_a_test", "own.html", scripts=("one.js", "two.js"), styles=("own.css",), uses_server=True,
         title="T", name="<i>",
     )  # fmt: skip
     script, style = (re.search(f"(?s)<{name}>(.*)</{name}>", made.text) for name in ("script", "style"))

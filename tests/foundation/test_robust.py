@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR, biweight, huber_weights, sigma_of
+from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR, biweight, huber_weights, robust_sigma
 
 
 def test_the_constants_are_those_of_the_normal_distribution() -> None:
@@ -20,9 +20,9 @@ def test_the_constants_are_those_of_the_normal_distribution() -> None:
 
 def test_sigma_of_normal_residuals_is_theirs_whatever_a_few_are() -> None:
     residual = np.random.default_rng(1).normal(0, 3.0, (100, 200))
-    assert sigma_of(residual) == pytest.approx(3.0, rel=0.02)
+    assert robust_sigma(residual) == pytest.approx(3.0, rel=0.02)
     residual[:10] = 1e6
-    assert sigma_of(residual) == pytest.approx(3.0, rel=0.2)
+    assert robust_sigma(residual) == pytest.approx(3.0, rel=0.2)
 
 
 def test_huber_weights_fall_in_inverse_proportion_beyond_two_sigmas() -> None:

@@ -17,7 +17,7 @@ import pytest
 from typer.main import get_command
 
 from croplab import COMMANDS
-from foundation.console import JsonOutput, json_output, plain, with_json
+from foundation.console import JsonOutput, json_output, json_value, with_json
 from foundation.errors import QualityError
 from tests.json_of import json_of
 
@@ -104,8 +104,8 @@ class TestOutput:
         assert sys.stdout is before
 
     def test_objects_are_plain(self) -> None:
-        assert plain(JsonOutput) == str(JsonOutput)
-        assert plain({1: {2.5}}) == {"1": [2.5]}
+        assert json_value(JsonOutput) == str(JsonOutput)
+        assert json_value({1: {2.5}}) == {"1": [2.5]}
 
 
 def _refuse(**figures: Any) -> None:
