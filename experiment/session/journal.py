@@ -106,7 +106,7 @@ class IncomingFile:
         self._path = path
         self._final = path
         # A folder that is gone means a disk that was unmounted: what lies under its name is another one.
-        self._file = atomic_file(path, lambda: self._final, make=False)
+        self._file = atomic_file(path, lambda: self._final, make_parents=False)
         self._open = True
         self.stream: BinaryIO = self._file.__enter__()
 

@@ -1,4 +1,4 @@
-"""Every system call of saving and of holding a folder fails once, and from there on: one sentence, and nothing half."""
+"""Each system call of saving a file and of locking a folder fails, once or always: one message, no incomplete file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ REMEDIES = {
     errno.EIO: "check its cable",
     errno.ENOSPC: "free space",
     errno.EROFS: "mount it for writing",
-    errno.EDQUOT: "what this user may use",
+    errno.EDQUOT: "quota on the disk",
     errno.ENODEV: "connect and mount it",
     errno.ESTALE: "mount it again here",
 }
@@ -37,21 +37,18 @@ def disk(tmp_path: Path) -> Generator[FailingCalls]:
 def each_call(
     disk: FailingCalls,
     action: Callable[[], object],
-    before: Callable[[], object] = lambda: None,
+    restore: Callable[[], object] = lambda: None,
     numbers: Sequence[int] = DISK_FAULTS,
 ) -> Generator[tuple[Ran, int, bool]]:
-    """Yield how `action` ended for each of its calls, each fault, once and lasting; what it raises is a sentence.
-
-    `before` makes everything as it was; `numbers` are the faults.
-    """
-    before()
+    """Yield the result of `action` for each of its calls and each error, once and lasting; `restore` resets it."""
+    restore()
     first = disk.run(action)
     assert first.error is None
     assert first.calls
     for number in numbers:
         for lasting in (False, True):
             for at in range(200):
-                before()
+                restore()
                 ran = disk.run(action, at, number, lasting=lasting)
                 if ran.error is not None:
                     assert isinstance(ran.error, StorageError), f"{ran.failed}: {ran.error!r}"
@@ -68,8 +65,8 @@ def each_call(
                 pytest.fail("it makes more than 200 calls")
 
 
-def test_a_call_that_fails_is_seen_to_fail(disk: FailingCalls, tmp_path: Path) -> None:
-    """The tool itself: the named call of the thread gets the error, and no other."""
+def test_injected_error_hits_one_call(disk: FailingCalls, tmp_path: Path) -> None:
+    """Test of the tool: only the named call of the thread fails."""
 
     def write() -> None:
         with (tmp_path / "a").open("wb", buffering=0) as stream:
@@ -88,7 +85,7 @@ def save_old(path: Path) -> None:
     assert [other.name for other in path.parent.iterdir()] == [path.name]
 
 
-def test_saving_a_file_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Path) -> None:
+def test_file_is_complete_or_error_is_reported(disk: FailingCalls, tmp_path: Path) -> None:
     path = tmp_path / "frames.csv"
     faults = 0
     for ran, _, _ in each_call(disk, lambda: write_atomic(path, "new" * 5000), lambda: save_old(path)):
@@ -100,7 +97,7 @@ def test_saving_a_file_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Path
     assert faults > 50
 
 
-def test_saving_a_folder_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Path) -> None:
+def test_folder_is_complete_or_error_is_reported(disk: FailingCalls, tmp_path: Path) -> None:
     path = tmp_path / "in" / "lut"
 
     def save() -> None:
@@ -119,7 +116,7 @@ def test_saving_a_folder_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Pa
 
 
 @pytest.mark.parametrize("locks", [True, False])
-def test_holding_a_folder_or_a_sentence(
+def test_folder_is_locked_or_error_is_reported(
     disk: FailingCalls, tmp_path: Path, locks: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flock = fcntl.flock
@@ -142,7 +139,7 @@ def test_holding_a_folder_or_a_sentence(
         assert len(held) == (ran.error is None)
 
 
-def test_looking_whether_a_place_is_free_or_a_sentence(disk: FailingCalls, tmp_path: Path) -> None:
+def test_path_is_checked_or_error_is_reported(disk: FailingCalls, tmp_path: Path) -> None:
     place = tmp_path / "out"
     place.mkdir()
     for _ in each_call(disk, lambda: require_free(place, "the table")):

@@ -1,4 +1,4 @@
-"""Pages: one file with all in it, elements that close, text that stays text."""
+"""Pages are one file, have closed elements, and escape text."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VOID = {"meta", "img", "br", "link"}
 
 
 class Checker(HTMLParser):
-    """Follows which elements are open, and collects text and addresses."""
+    """Parser that tracks open elements, and collects text and addresses."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ def draw(figure: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_page_holds_all_and_fetches_nothing() -> None:
+def test_page_is_complete_and_fetches_nothing() -> None:
     text = pages.page(
         "A <b> & 'c'",
         [
@@ -86,9 +86,7 @@ def test_a_page_holds_all_and_fetches_nothing() -> None:
     assert "default-src 'none'" in text
 
 
-def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_policy_allows_only_own_script_and_style(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "pages_of_a_test" / "templates"
     folder.mkdir(parents=True)
     (folder.parent / "__init__.py").touch()
@@ -115,6 +113,6 @@ def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
     assert rules["connect-src"] == "'self'"
 
 
-def test_what_is_no_picture_is_refused() -> None:
+def test_refuses_other_data_than_pictures() -> None:
     with pytest.raises(ValueError, match="GIF89a"):
         pages.figure(b"GIF89a", "")

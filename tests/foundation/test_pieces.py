@@ -1,4 +1,4 @@
-"""Records of finished pieces: what counts of one that was cut, changed or made of something else."""
+"""Records of finished pieces: damaged lines, other inputs, missing files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TWO = Piece("two", "of these", {}, "[]")
 FOREIGN = Piece("one", "of others", {}, "{}")
 
 
-def test_pieces_come_back_as_they_were() -> None:
+def test_restores_pieces() -> None:
     record = ONE.to_line() + TWO.to_line()
     assert read_pieces(record) == read_pieces(record, "of these") == {"one": ONE, "two": TWO}
     assert read_pieces(record + FOREIGN.to_line())["one"] == FOREIGN, "the last of a name"
@@ -26,7 +26,7 @@ def test_pieces_come_back_as_they_were() -> None:
 
 
 @given(st.data())
-def test_no_damaged_line_counts_and_the_others_do(data: st.DataObject) -> None:
+def test_ignores_damaged_lines_only(data: st.DataObject) -> None:
     line = ONE.to_line()
     place = data.draw(st.integers(1, len(line) - 2))
     byte = data.draw(st.integers(0, 255).filter(lambda byte: byte != line[place]))
@@ -36,7 +36,7 @@ def test_no_damaged_line_counts_and_the_others_do(data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize("content", [b"other", None])
-def test_a_piece_without_its_files_is_not_whole(tmp_path: Path, content: bytes | None) -> None:
+def test_piece_without_its_files_is_incomplete(tmp_path: Path, content: bytes | None) -> None:
     files = {"a": b"1", "b": b"22"}
     piece = Piece("one", "", {name: sha256_of(data) for name, data in files.items()}, "{}")
     for name, data in files.items():
