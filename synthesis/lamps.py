@@ -41,8 +41,8 @@ from sim.spectral import (
     daylight,
     printed_reflectance,
     published_spectra,
-    regridded,
     require_grid,
+    resampled,
     sensitivities,
 )
 from sim.world.rendering import PAPER
@@ -149,7 +149,7 @@ def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
                 f"{where}: {name!r} is {table[row, column]:g} at {table[row, 0]:g} nm, 0 or more expected; "
                 "replace negative values of measurement noise by 0"
             )
-    powers = regridded(table[:, 0], table[:, 1:], WAVELENGTHS_NM)
+    powers = resampled(table[:, 0], table[:, 1:], WAVELENGTHS_NM)
     return tuple(_light(name, power, None, where) for name, power in zip(headings[1:], powers.T, strict=True))
 
 
@@ -214,7 +214,7 @@ def _as_light(name: str, spectrum: PublishedSpectrum, cct_k: float | None = None
     require_grid(spectrum.wavelengths_nm, name)
     if spectrum.power.min() < 0:
         raise FormatError(f"{name!r} has published values below 0, expected 0 or more; name another illuminant")
-    power = regridded(spectrum.wavelengths_nm, spectrum.power[:, None], WAVELENGTHS_NM)[:, 0]
+    power = resampled(spectrum.wavelengths_nm, spectrum.power[:, None], WAVELENGTHS_NM)[:, 0]
     return _light(name, power, cct_k, "published spectra")
 
 

@@ -220,7 +220,7 @@ def rendered_once() -> Generator[None]:
 
     The same charts hang in the same rooms in hundreds of tests.
     """
-    render = World._lit
+    render = World._render_new
 
     def kept(self: World, situation: Situation) -> Rendering:
         sheet = self.sheet
@@ -241,7 +241,7 @@ def rendered_once() -> Generator[None]:
         return found
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(World, "_lit", kept)
+        patched.setattr(World, "_render_new", kept)
         patched.setattr("calibration.pipeline.measuring.register", registered_once)
         yield
 
