@@ -24,9 +24,9 @@ from foundation.console import (
     progress,
     with_json,
 )
-from foundation.errors import DeviceError, InputError, QualityError, StorageError, counted, first_of
-from foundation.files import make_folder, write_whole
-from foundation.folders import held_folder, require_free, whole_folder
+from foundation.errors import DeviceError, InputError, QualityError, StorageError, counted, first_few
+from foundation.files import make_folder, write_atomic
+from foundation.folders import atomic_folder, locked_folder, require_free
 
 if TYPE_CHECKING:
     from experiment.config import LabSettings
@@ -76,7 +76,7 @@ def init(
         chart(print_folder, tiff=False)
     if not lights.exists():
         illuminations(lights)
-    write_whole(settings, files("acquisition").joinpath("data", f"{rig.value}.toml").read_text("utf-8"))
+    write_atomic(settings, files("acquisition").joinpath("data", f"{rig.value}.toml").read_text("utf-8"))
     then = "name your devices in it" if rig is Rig.LAB else "change it as you like"
     print(f"{settings}: {then}, then: acquire check {shlex.quote(str(settings))}")
 
@@ -117,7 +117,7 @@ def chart(
     from experiment.framing.finding import small_parts_warning
 
     design = paper_chart(_page(page), bits) if arrangement is Arrangement.PAPER else design_chart(bits, _page(page))
-    with whole_folder(out, "the chart") as folder:
+    with atomic_folder(out, "the chart") as folder:
         save_preview(design, folder / "preview.png")
         save_pdf(design, folder / "chart.pdf")
         if tiff:
@@ -257,7 +257,7 @@ def check(
             corners=given,
             linearity=linearity,
         )
-    if output.asked:
+    if output.is_requested:
         output.add(**report.values())
     else:
         for line in report.lines():
@@ -362,7 +362,7 @@ def status(
     journal_path(session)
     now = datetime.now(UTC)
     view = read_status(session, now)
-    if output.asked:
+    if output.is_requested:
         output.add(**status_json(view, now))
     else:
         print("\n".join(status_lines(view, now)))
@@ -383,7 +383,7 @@ def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) ->
     from experiment.session.folder import busy_sentence, rebuild_journal
     from experiment.session.journal import JOURNAL_FILE
 
-    with held_folder(session, busy_sentence(session)):
+    with locked_folder(session, busy_sentence(session)):
         attempts = rebuild_journal(session)
     print(f"{session / JOURNAL_FILE}: made anew, {attempts} attempts; next: acquire status {session}")
 
@@ -459,7 +459,7 @@ def import_(
         print(f"  {line}")
     if imported.left:
         raise QualityError(
-            f"{session}: {len(imported.left)} are without an accepted frame: {first_of(imported.left)}; list other "
+            f"{session}: {len(imported.left)} are without an accepted frame: {first_few(imported.left)}; list other "
             "files and import them into a new folder"
         )
 

@@ -29,7 +29,7 @@ from experiment.config import LabSettings, SimulatedSettings
 from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from sim.world.sensors import find_body
-from synthesis.settings import TableSettings, room_of
+from synthesis.settings import TableSettings, table_room
 from synthesis.table import TableTask, compute_table
 
 LEAST_COUNTS = 30.0
@@ -100,7 +100,7 @@ def small_tables(folder: Path) -> tuple[Lut, Lut]:
     run_session(settings, folder / "session", lambda done, total: None)
     with Session.open(folder / "session") as session:
         build(session, folder / "photographed")
-    room = replace(room_of(TableSettings(), "here"), waviness_mm=0.5, vignetting=0.08)
+    room = replace(table_room(TableSettings(), "here"), waviness_mm=0.5, vignetting=0.08)
     task = TableTask(
         chart, find_body("Test"), room, settings.camera.exposure, lights, None, 5, {"by": "benchmarks.computed"}
     )

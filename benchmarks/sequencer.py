@@ -53,7 +53,7 @@ from experiment.lights import Illumination, plan_illuminations
 from experiment.session.folder import Session
 from experiment.session.journal import Journal
 from experiment.session.records import Judgement, SessionStep, plan_steps
-from foundation.clock import OPENING, Clock, SimulatedClock, SystemClock
+from foundation.clock import SIM_START, Clock, SimulatedClock, SystemClock
 from sim.world.sensors import BODIES
 from tests.drivers.raw.raw_files import write_cr2
 
@@ -172,7 +172,7 @@ class PacedCamera:
         self.downloading_s: list[float] = []
         self.frames = 0
         self._frame = b""
-        self._released = OPENING
+        self._released = SIM_START
 
     def identity(self) -> CameraIdentity:
         """Return a name."""

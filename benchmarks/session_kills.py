@@ -52,7 +52,7 @@ from experiment.session.folder import Session, rebuild_journal
 from experiment.session.journal import IncomingFile, Journal, ledger_path, settled_frames
 from experiment.session.records import ACCEPTED, VOIDED, Check, Judgement, SessionStep, plan_steps
 from experiment.session.repair import unsound_files
-from foundation.clock import OPENING, SimulatedClock
+from foundation.clock import SIM_START, SimulatedClock
 from foundation.errors import DeviceError, FormatError
 from sim.projectors.projector import SimulatedProjector
 from tests.end_to_end.conftest import make_lab
@@ -84,10 +84,10 @@ class SmallLab:
         colours = {step.number: step.colour for step in session.steps}
         self.exposed = Counter(colours[attempt.step] for attempt in attempts)
         ends = [attempt.ended_at for attempt in attempts if attempt.ended_at is not None]
-        self.clock = SimulatedClock(max(ends, default=OPENING))
+        self.clock = SimulatedClock(max(ends, default=SIM_START))
         self.colour = BLACK
         self._frame = b""
-        self._released = OPENING
+        self._released = SIM_START
 
     @property
     def devices(self) -> Devices:

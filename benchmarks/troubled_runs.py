@@ -48,7 +48,7 @@ from experiment.config import LabSettings, load_lab
 from experiment.lights import plan_illuminations, save_illuminations
 from experiment.session.folder import Session
 from experiment.session.records import ACCEPTED, REFUSED, VOIDED
-from foundation.clock import OPENING, SimulatedClock, SteadyClock
+from foundation.clock import SIM_START, SimulatedClock, SteadyClock
 from foundation.errors import CropError, LinkClosed, QualityError
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
 from sim.camera.eos import SimulatedEos
@@ -92,7 +92,7 @@ class EventfulClock(SteadyClock):
         self.time = SimulatedClock(start)
         self.machine = _Machine(self.time)
         self._lab = lab
-        self._before_s = (start - OPENING).total_seconds()
+        self._before_s = (start - SIM_START).total_seconds()
         super().__init__(self.machine, None, self.time.monotonic)
 
     def lab_s(self) -> float:
@@ -159,7 +159,7 @@ class TroubledLab:
         self._bus: SimulatedBus | None = None
         self._device: PtpUsbDevice | None = None
         self._line: Link | None = None
-        self.clock = EventfulClock(self, OPENING)
+        self.clock = EventfulClock(self, SIM_START)
         self.projector = SimulatedProjector(self.clock)
         self.eos: _Eos | None = None
 
@@ -548,7 +548,7 @@ def night(scratch: Path, grid: int, night_s: float = NIGHT_S) -> Night:
         for what, (word, said) in STORY.items()
         if not any(event.what == word and re.search(said, event.detail, re.IGNORECASE) for event in events)
     )
-    hours = (attempts[-1].started_at - OPENING).total_seconds() / HOUR_S
+    hours = (attempts[-1].started_at - SIM_START).total_seconds() / HOUR_S
     times = [attempt.started_at for attempt in attempts]
     assert times == sorted(times), "time never goes back"
     return Night(untold, len(attempts), len(done) - len(set(done)), hours, [e.what for e in events].count("paused"))

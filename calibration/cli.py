@@ -29,7 +29,7 @@ _others = new_app()
 
 
 class _BuildLut(MainCommand):
-    others = _others
+    subcommands = _others
 
 
 Corners = Annotated[
@@ -128,7 +128,7 @@ def build_lut(
             result = make(opened, lut, shown, write_report, options, linearity)
     except QualityError:
         # A report of an earlier build says nothing of this one.
-        if output.asked and kept.is_file() and kept.stat().st_mtime_ns != before:
+        if output.is_requested and kept.is_file() and kept.stat().st_mtime_ns != before:
             output.add(**json.loads(kept.read_text(encoding="utf-8")))
         raise
     if isinstance(result, TableProgress):
@@ -305,7 +305,7 @@ def compare(
         table_of(places[1], shown) as b,
     ):
         found = compare_tables(a, b, shown, places)
-    if output.asked:
+    if output.is_requested:
         output.add(**comparison_json(found))
     else:
         print("\n".join(lines(found)))
@@ -378,7 +378,7 @@ def _print_result(result: BuildResult, output: JsonOutput) -> None:
     from calibration.report.report import report_json, summary
     from calibration.verdict import remark
 
-    if output.asked:
+    if output.is_requested:
         output.add(**report_json(result))
         return
     rows = [row for row in summary(result.figures) if row.brief]

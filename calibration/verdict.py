@@ -19,7 +19,7 @@ from calibration.figures.figure import Figure, Outcome, worst_outcome
 from calibration.measurements import TableMeasurements
 from experiment.session.records import FrameRecord
 from experiment.session.repair import lights_text
-from foundation.errors import counted, first_of
+from foundation.errors import counted, first_few
 
 COMMAND = "acquire run LAB.toml SESSION --retake bad"  # What takes frames again, as the report names them
 
@@ -267,7 +267,7 @@ def places_text(finding: ProbableCause | None) -> str:
     if finding is None:
         return ""
     files = [frame.file for frame in finding.frames]
-    described = [f"in {first_of(files)}"] if files else []
+    described = [f"in {first_few(files)}"] if files else []
     if finding.places:
         place = finding.places[0]
         described.append(f"about {place.x_mm:.0f}, {place.y_mm:.0f} mm from the sheet's top-left corner")

@@ -12,7 +12,7 @@ from evaluation.commands import run as run_command
 from evaluation.commands import train as train_command
 from evaluation.commands import transfer as transfer_command
 from evaluation.commands import tune as tune_command
-from foundation.console import EXIT_CODES, is_common, new_app, run
+from foundation.console import EXIT_CODES, is_common_option, new_app, run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,13 +37,13 @@ app.command("tune", help=tune_command.HELP)(tune_command.tune)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with `argv`, by default the process's own, and return one of `foundation.console.EXIT_CODES`."""
     whole = _with_command(sys.argv[1:] if argv is None else argv)
-    return run(lambda: app(whole, prog_name="evaluate"), keeps=False)
+    return run(lambda: app(whole, prog_name="evaluate"), is_resumable=False)
 
 
 def _with_command(given: Sequence[str]) -> list[str]:
     commands = {command.name for command in app.registered_commands} | {group.name for group in app.registered_groups}
     own = ("-h", "--help", "--version", "--install-completion", "--show-completion")
-    first = next((at for at, word in enumerate(given) if not is_common(word)), len(given))
+    first = next((at for at, word in enumerate(given) if not is_common_option(word)), len(given))
     short = first < len(given) and given[first] not in commands and given[first] not in own
     return [*given[:first], *(["run"] if short else []), *given[first:]]
 

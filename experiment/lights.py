@@ -20,7 +20,7 @@ import numpy.typing as npt
 from drivers.presenter import Colour
 from foundation.colorimetry import decode_srgb, encode_srgb, linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
-from foundation.files import csv_text, read_csv, whole_file, write_whole
+from foundation.files import atomic_file, csv_text, read_csv, write_atomic
 
 Kind = Literal["uniform", "blackbody", "spectrum"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")  # Columns of `illuminations.csv` (docs/formats.md)
@@ -103,7 +103,7 @@ def illuminations_to_csv(illuminations: Sequence[Illumination]) -> str:
 
 def save_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:
     """Write `illuminations.csv`."""
-    write_whole(path, illuminations_to_csv(illuminations))
+    write_atomic(path, illuminations_to_csv(illuminations))
 
 
 def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illumination, ...]:
@@ -232,5 +232,5 @@ def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
     axes.set_title(f"rb-chromaticities of {len(lit)} illuminations")
     # The day of writing is kept out of the file, so that the same lights give the same PNG.
     metadata = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}[ending]
-    with whole_file(path) as stream:
+    with atomic_file(path) as stream:
         figure.savefig(stream, format=ending, dpi=150, metadata=metadata)

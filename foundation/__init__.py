@@ -1,1 +1,1 @@
-"""What every package stands on: errors, time, the terminal, whole files, and numerics that belong to no floor."""
+"""Basics for all packages: errors, clocks, command line, atomic files and folders, pages, plots, colorimetry."""

@@ -1,7 +1,7 @@
-"""Time is handed in, so that a simulated lab need not wait.
+"""Clocks, real and simulated.
 
-Whoever waits or stamps a time takes a `Clock`. `SystemClock` is the real one, `SteadyClock` one whose date is not set
-back, `SimulatedClock` the simulated lab's, whose time passes only when somebody waits for it.
+Code that waits or records a time takes a `Clock` as a parameter. `SystemClock` is the clock of the machine,
+`SteadyClock` a clock whose date never goes back, `SimulatedClock` the clock of the simulated laboratory.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from typing import Final, Protocol
 
 
 class Clock(Protocol):
-    """The interface of a clock: the date, seconds that pass, and waiting."""
+    """Interface of a clock: date, elapsed seconds, waiting."""
 
     def now(self) -> datetime:
-        """Return the wall-clock time, timezone-aware, UTC."""
+        """Return the date, timezone-aware, UTC."""
 
     def monotonic(self) -> float:
-        """Return seconds since an arbitrary origin; never goes back."""
+        """Return seconds since an arbitrary origin; they never decrease."""
 
     def sleep(self, seconds: float) -> None:
-        """Let `seconds` (≥ 0) pass."""
+        """Wait for `seconds` (≥ 0)."""
 
 
 class SystemClock:
-    """The machine's own time."""
+    """Clock of the machine."""
 
     def now(self) -> datetime:
-        """Return the wall-clock time, timezone-aware, UTC."""
+        """Return the date, timezone-aware, UTC."""
         return datetime.now(UTC)
 
     def monotonic(self) -> float:
@@ -41,24 +41,27 @@ class SystemClock:
         time.sleep(seconds)
 
 
-SYSTEM_CLOCK: Final = SystemClock()  # The clock of whoever is given none
+SYSTEM_CLOCK: Final = SystemClock()  # Default clock
 
 
 def elapsed_s() -> float:
-    """Return seconds since an arbitrary origin that nobody sets; those of a suspended machine count on Linux."""
-    # time.monotonic() stands still there while the machine is suspended.
+    """Return seconds since an arbitrary origin, on Linux with the time during which the machine was suspended."""
+    # time.monotonic() stops while a Linux machine is suspended.
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
-SET_S = 10.0  # A date that is off by more was set: what keeps clocks right over a network moves them by less in a night
+# Smallest step of the system date that counts as set by hand, s: network time corrections are smaller in one night.
+MIN_STEP_S = 10.0
 
 
 class SteadyClock:
-    """A clock whose date goes on as seconds pass, and never back, whatever the machine's clock is set to meanwhile.
+    """Clock whose date advances with elapsed time and never goes back, even if the system date is set.
 
-    White frames are interpolated in time: where that clock is set back during a session, lights would lie between the
-    wrong ones. `clock` tells the date once, which is `not_before` (with a time zone) at least, and makes every pause;
-    `elapsed` returns seconds since any origin, and never goes back.
+    White frames are interpolated in time. If the system date were set back during a session, illuminants would be
+    interpolated between the wrong white frames.
+
+    `clock` gives the date at the start, which is at least `not_before`, and waits. `elapsed` returns seconds since any
+    origin, which never decrease. `behind_s`: seconds by which `clock` was behind `not_before` at the start, or 0.
     """
 
     def __init__(
@@ -70,43 +73,43 @@ class SteadyClock:
         self._start = date if not_before is None else max(date, not_before)
         self._origin = elapsed()
         self.behind_s = (self._start - date).total_seconds()
-        """Seconds by which `clock` was behind `not_before` at the start; 0 where it was not."""
-        self._set_by_s = -self.behind_s
+        self._offset_s = -self.behind_s
 
-    def set_by_s(self) -> float:
-        """Return the seconds by which the date of `clock` was set since this was asked last; 0 below `SET_S`."""
-        set_by_s = (self._clock.now() - self.now()).total_seconds()
-        moved_s = set_by_s - self._set_by_s
-        if abs(moved_s) < SET_S:
+    def step_s(self) -> float:
+        """Return the seconds by which the date of `clock` was set since the last call; 0 below `MIN_STEP_S`."""
+        offset_s = (self._clock.now() - self.now()).total_seconds()
+        step_s = offset_s - self._offset_s
+        if abs(step_s) < MIN_STEP_S:
             return 0.0
-        self._set_by_s = set_by_s
-        return moved_s
+        self._offset_s = offset_s
+        return step_s
 
     def now(self) -> datetime:
-        """Return the date at the start and what has passed since, timezone-aware, UTC."""
+        """Return the date at the start plus the elapsed time, timezone-aware, UTC."""
         return self._start + timedelta(seconds=self._elapsed() - self._origin)
 
     def monotonic(self) -> float:
-        """Return seconds of the clock that was handed in."""
+        """Return seconds of `clock`."""
         return self._clock.monotonic()
 
     def sleep(self, seconds: float) -> None:
-        """Let `seconds` (≥ 0) pass."""
+        """Wait for `seconds` (≥ 0)."""
         self._clock.sleep(seconds)
 
 
-OPENING = datetime(2026, 1, 1, 8, 0, 0, tzinfo=UTC)  # When the simulated lab opens for a session that has not begun
+# Start of simulated time for a new session.
+SIM_START = datetime(2026, 1, 1, 8, 0, 0, tzinfo=UTC)
 
 
 class SimulatedClock:
-    """A clock that stands still until `sleep` moves it."""
+    """Clock whose time advances only in `sleep`."""
 
-    def __init__(self, start: datetime = OPENING) -> None:
+    def __init__(self, start: datetime = SIM_START) -> None:
         self._start = start
         self._elapsed = timedelta()
 
     def now(self) -> datetime:
-        """Return the simulated wall-clock time, UTC."""
+        """Return the simulated date, UTC."""
         return self._start + self._elapsed
 
     def monotonic(self) -> float:
@@ -114,7 +117,7 @@ class SimulatedClock:
         return self._elapsed.total_seconds()
 
     def sleep(self, seconds: float) -> None:
-        """Let `seconds` (≥ 0) of simulated time pass at once."""
+        """Advance simulated time by `seconds` (≥ 0) and return at once."""
         if seconds < 0:
-            raise ValueError(f"cannot sleep {seconds} s")
+            raise ValueError(f"cannot sleep {seconds} s; expected 0 s or more")
         self._elapsed += timedelta(seconds=seconds)

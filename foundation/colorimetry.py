@@ -1,8 +1,7 @@
-"""Light as colour: spectra to CIE XYZ, XYZ to linear sRGB and its codes, black bodies, and angles between colours.
+"""Conversions between spectra, CIE XYZ, linear sRGB and sRGB codes; black bodies; angles between colours.
 
-The colour-matching functions are those of the CIE 1931 2° standard observer at 1 nm (ISO/CIE 11664-1), in
-`foundation/data/cie_1931_2_degree.csv`; that folder's README says where they are from. The transfer function is that of
-sRGB (IEC 61966-2-1:1999, clauses 5.2 and 5.3).
+Colour-matching functions: CIE 1931 2° standard observer at 1 nm (ISO/CIE 11664-1). Their source is given in
+`foundation/data/README.md`. Transfer function: sRGB (IEC 61966-2-1:1999, clauses 5.2 and 5.3).
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ import numpy.typing as npt
 
 _C1_W_M2: Final = 3.741771e-16  # First radiation constant of Planck's law, W m² (CODATA)
 
-# Second radiation constant as CIE 15:2018 has it for black bodies, m K; CODATA's has more places.
+# Second radiation constant of Planck's law, m K, with the digits of CIE 15:2018; CODATA gives more.
 _C2_M_K: Final = 1.4388e-2
 
-# (3, 3) float64, CIE XYZ to linear sRGB (IEC 61966-2-1:1999, equation 7).
+# Matrix from CIE XYZ to linear sRGB, (3, 3) float64 (IEC 61966-2-1:1999, equation 7).
 XYZ_TO_SRGB: Final = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 
 _Array = npt.NDArray[np.float64]
@@ -27,7 +26,7 @@ _Array = npt.NDArray[np.float64]
 
 @cache
 def observer_cie_1931() -> tuple[_Array, _Array]:
-    """Return the wavelengths (471,) float64, 360 … 830 nm by 1, and x̄, ȳ, z̄ there, (471, 3) float64; read-only."""
+    """Return wavelengths (471,) float64, 360 to 830 nm, and x̄, ȳ, z̄ (471, 3) float64; both read-only."""
     with resources.files("foundation").joinpath("data/cie_1931_2_degree.csv").open(encoding="utf-8") as file:
         table = np.loadtxt(file, delimiter=",", skiprows=1)
     table.flags.writeable = False
@@ -35,18 +34,18 @@ def observer_cie_1931() -> tuple[_Array, _Array]:
 
 
 def planck(wavelengths_nm: npt.ArrayLike, temperature_k: float) -> _Array:
-    """Return the spectral radiance of a black body in vacuum, W sr⁻¹ m⁻² nm⁻¹, as the shape given, float64.
+    """Return the spectral radiance of a black body in vacuum (Planck's law), W sr⁻¹ m⁻² nm⁻¹, float64.
 
-    `wavelengths_nm`: of any shape, float64, above 0, nm.
+    `wavelengths_nm`: above 0, nm, of any shape, which is the shape of the result.
     """
     metres = np.asarray(wavelengths_nm, dtype=np.float64) * 1e-9
     return _C1_W_M2 * metres**-5 / np.pi / np.expm1(_C2_M_K / (metres * temperature_k)) * 1e-9
 
 
 def xyz_of(wavelengths_nm: _Array, power: _Array) -> _Array:
-    """Return CIE XYZ, (3,) float64, of a light of relative power (W,) per nm at wavelengths (W,), ascending; Y is 1.
+    """Return CIE XYZ (3,) float64 of a spectrum, scaled to Y = 1.
 
-    Joined by straight lines, and 0 beyond the wavelengths given.
+    `power` (W,) is relative power per nm at ascending wavelengths (W,), interpolated linearly and 0 outside of them.
     """
     grid, functions = observer_cie_1931()
     xyz = np.interp(grid, wavelengths_nm, power, left=0, right=0) @ functions
@@ -54,35 +53,34 @@ def xyz_of(wavelengths_nm: _Array, power: _Array) -> _Array:
 
 
 def linear_srgb(xyz: npt.ArrayLike) -> _Array:
-    """Return linear sRGB (..., 3) float64 of CIE XYZ (..., 3), Y 1 white; what lies outside the gamut is below 0."""
+    """Return linear sRGB (..., 3) float64 of CIE XYZ (..., 3), white Y = 1; out-of-gamut values may be negative."""
     return np.asarray(xyz, dtype=np.float64) @ XYZ_TO_SRGB.T
 
 
 def encode_srgb(linear: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return sRGB code values 0 … 1 of linear light 0 … 1, of any shape; float64."""
+    """Return sRGB code values 0 to 1, float64, of linear values 0 to 1 of any shape."""
     linear = np.asarray(linear, dtype=np.float64)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def decode_srgb(code: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return linear light 0 … 1 of sRGB code values 0 … 1, of any shape; float64."""
+    """Return linear values 0 to 1, float64, of sRGB code values 0 to 1 of any shape."""
     code = np.asarray(code, dtype=np.float64)
     return np.where(code <= 0.04045, code / 12.92, ((np.maximum(code, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_codes(linear: npt.ArrayLike) -> npt.NDArray[np.uint8]:
-    """Return sRGB codes 0 … 255 of linear light, clipped to 0 … 1, of any shape; uint8."""
+    """Return sRGB codes 0 to 255, uint8, of linear values of any shape, clipped to 0 to 1."""
     return np.rint(255 * encode_srgb(np.clip(linear, 0.0, 1.0))).astype(np.uint8)
 
 
-def angles_deg(one: npt.ArrayLike, other: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return the angles between colours and others, degrees.
+def angles_deg(first: npt.ArrayLike, second: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return the angles (...) float64 between pairs of colours, 0 to 180 degrees.
 
-    `one`, `other`: (..., 3) float or int each, broadcast against each other; linear RGB of any length above 0. Returns
-    (...) float64, 0 … 180. By W. Kahan's formula of the half angle, which keeps its digits at every angle; the arc
-    cosine loses half of them at small ones.
+    `first`, `second`: linear RGB (..., 3), not zero, broadcast against each other.
     """
-    a, b = _unit(one), _unit(other)
+    # Half-angle formula by W. Kahan: accurate at every angle. The arc cosine loses half of the digits at small angles.
+    a, b = _unit(first), _unit(second)
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 

@@ -1,15 +1,13 @@
-"""The terminal's side of every command: errors become one sentence and an exit code, figures one JSON object.
+"""Common parts of all commands: error messages, exit codes, signals, progress, log options, JSON output.
 
-Commands are thin: parse, build, call, print. `run` is the one place where an error turns into text.
+A command parses its arguments, calls a function, and prints. `run` alone converts errors to text.
 
-Each command of an app takes -h, --version, -v and -q, in one style of help; `new_app` adds them, and a command's
-signature has none of them. Log records go to stderr, warnings and above unless the options say otherwise. ``-v`` adds
-each step (``INFO``), ``-vv`` every exchange with a device (``DEBUG``), and ``-q`` leaves errors alone: no warnings and
-no progress bars.
+`new_app` adds the options -h, --version, -v and -q to each command; they are not in the signature of the command. Log
+records go to stderr, by default warnings and errors. ``-v`` adds steps (``INFO``), ``-vv`` all communication with
+devices (``DEBUG``), ``-q`` removes warnings and progress bars.
 
-Commands with figures take ``--json`` (`with_json`): the figures are then one JSON object, alone on standard output, and
-text for a reader goes to standard error. `docs/reference/json.md` says which keys each command has; later versions
-add keys and keep those that there are. Numbers that are not known, or not finite, are null.
+`with_json` adds ``--json``: the command then prints one JSON object to stdout, and text to stderr.
+`docs/reference/json.md` lists the keys; later versions may only add keys. Unknown and infinite numbers are null.
 """
 
 from __future__ import annotations
@@ -38,91 +36,91 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
-from foundation.files import disk_remedy_of, remedy_of
+from foundation.files import disk_remedy, path_remedy
 from foundation.secret_texts import masked, printable
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 EXIT_CODES = (
-    "Exit codes: 0 done; 2 something given cannot be used; 3 a device failed; 4 the data are not good enough; "
+    "Exit codes: 0 done; 2 input cannot be used; 3 a device failed; 4 the data are not good enough; "
     "5 the disk is full or read-only; 130 interrupted."
 )
 
-# Said in place of what it causes: every path of a user depends on that folder.
-_LOST = "the folder in which this was started is gone; change to one that is there (cd), then run it again"
-_WRITING_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+# Printed instead of the errors that it causes: all relative paths depend on that folder.
+_NO_WORKING_FOLDER = "the current folder does not exist any more; change to an existing one (cd), then run it again"
+_WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
-def say_error(message: str) -> None:
-    """Print one error line to stderr, secrets of addresses masked; where nobody reads it, the exit code says enough.
-
-    Names of foreign files may hold what a terminal obeys, or what is no text: both are printed as escapes.
-    """
+def print_error(message: str) -> None:
+    """Print one error line to stderr, with secrets masked and control characters escaped."""
+    # If stderr is closed, the exit code reports the error.
     with suppress(OSError):
         print(f"error: {printable(masked(message))}", file=sys.stderr)
 
 
-def run(command: Callable[[], object], *, keeps: bool = True, loads: bool = False) -> int:
-    """Call `command` and return the exit code; a foreseeable fault is one line on stderr, no traceback."""
+def run(command: Callable[[], object], *, is_resumable: bool = True, pause_gc: bool = False) -> int:
+    """Call `command` and return its exit code; foreseeable errors are printed as one line to stderr.
+
+    `is_resumable`: whether the same command resumes after an interruption, for the message. `pause_gc`: pause garbage
+    collection until `resume_gc`, which makes imports faster.
+    """
     _make_printable()
-    collects = gc.isenabled()
-    if loads:
+    was_enabled = gc.isenabled()
+    if pause_gc:
         gc.disable()
     try:
-        with logging_as_before():
-            code = _outcome(command, keeps)
+        with preserved_logging():
+            code = _exit_code(command, is_resumable)
     finally:
-        if collects:
+        if was_enabled:
             gc.enable()
     try:
-        # What is still to be printed fails here, where it can be judged, and not while the interpreter ends.
+        # Errors of the last output are handled here; otherwise they would occur at the end of the interpreter.
         sys.stdout.flush()
     except OSError as error:
-        say_error(f"cannot print: {error.strerror}; give the output another place and run again")
-        _abandon(sys.stdout.fileno())
+        print_error(f"cannot print: {error.strerror}; redirect the output to another place and run again")
+        _discard_output(sys.stdout.fileno())
         return code or StorageError.exit_code
     return code
 
 
 def _make_printable() -> None:
-    """Have output say what it can: closed streams take it silently, and what their encoding lacks becomes a mark."""
+    """Replace closed streams by /dev/null, and characters that an encoding lacks by a question mark."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
-            # The interpreter found the descriptor closed; what is opened now lives as long as the process.
+            # The descriptor was closed at the start of the interpreter. The new one stays open until the end.
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
         elif isinstance(stream, TextIOWrapper):
             if stream.errors == "strict":
                 stream.reconfigure(errors="replace")
-            # Unbuffered (python -u), its buffer is the descriptor's own.
+            # With python -u, the buffer is the unbuffered file itself.
             buffer: Any = cast("Any", stream).buffer
             if type(getattr(buffer, "raw", buffer)) is FileIO:
-                setattr(sys, name, _patient(stream))
+                setattr(sys, name, _tolerant(stream))
 
 
-# What the descriptors are called where they cannot take what is printed.
+# Names of the descriptors in error messages.
 _OUTPUTS = {1: "standard output", 2: "standard error"}
 
 
 class _Output(FileIO):
-    """A descriptor that takes what is printed also when the reader has left (head, a closed pager).
-
-    That is no fault, and no reason to leave a job half done that ends with 0. Where it is full the error names it.
-    """
+    """Output that discards everything after its reader has ended (head, a closed pager); other errors have its name."""
 
     def write(self, data: ReadableBuffer) -> int:
         """Write bytes; return their number."""
         try:
             return super().write(data)
         except BrokenPipeError:
-            _abandon(self.fileno())
+            # Not an error: the job must be completed, although nobody reads its output.
+            _discard_output(self.fileno())
             return super().write(data)
         except OSError as error:
             raise OSError(error.errno, error.strerror, _OUTPUTS.get(self.fileno())) from error
 
 
-def _patient(stream: Any) -> TextIOWrapper:
+def _tolerant(stream: Any) -> TextIOWrapper:
     stream.flush()
     output = _Output(stream.fileno(), "w", closefd=False)
     return TextIOWrapper(
@@ -134,168 +132,163 @@ def _patient(stream: Any) -> TextIOWrapper:
     )
 
 
-def loaded() -> None:
-    """Say that the modules of a command that `loads` are there: from here on garbage is looked for, if new."""
+def resume_gc() -> None:
+    """Enable garbage collection after the imports of a command, without searching the imported objects."""
     if not gc.isenabled():
-        _set_apart()
+        _freeze_once()
     gc.enable()
 
 
 @functools.cache
-def _set_apart() -> None:
-    """Set what is there apart from what is looked through for garbage: once a process, so that garbage is not kept."""
+def _freeze_once() -> None:
+    # Once in a process: a second call would keep garbage for ever.
     gc.freeze()
 
 
-def _outcome(command: Callable[[], object], keeps: bool) -> int:
+def _exit_code(command: Callable[[], object], is_resumable: bool) -> int:
     try:
         command()
     except CropError as error:
-        say_error(_LOST if error.exit_code == InputError.exit_code and _has_lost_its_folder() else str(error))
+        is_consequence = error.exit_code == InputError.exit_code and _lacks_working_folder()
+        print_error(_NO_WORKING_FOLDER if is_consequence else str(error))
         return error.exit_code
     except KeyboardInterrupt:
-        return _interrupted(keeps)
+        return _report_interruption(is_resumable)
     except OSError as error:
-        named = isinstance(error.filename, str | bytes)
-        remedy = disk_remedy_of(error)
-        # A file that is not there, and a socket that is not connected, are no fault of a disk.
+        has_name = isinstance(error.filename, str | bytes)
+        remedy = disk_remedy(error)
+        # A missing file and an unconnected socket are not faults of a disk.
         if remedy is not None and error.errno not in (errno.ENOENT, errno.ENOTCONN):
-            about = os.fsdecode(error.filename) if named else "the disk"
+            about = os.fsdecode(error.filename) if has_name else "the disk"
             if about in _OUTPUTS.values():
-                _abandon(next(number for number, name in _OUTPUTS.items() if name == about))
-            doing = "write" if error.errno in _WRITING_FAULTS else "use"
-            say_error(f"cannot {doing} {about}: {error.strerror}; {remedy}")
+                _discard_output(next(number for number, name in _OUTPUTS.items() if name == about))
+            action = "write" if error.errno in _WRITE_FAULTS else "use"
+            print_error(f"cannot {action} {about}: {error.strerror}; {remedy}")
             return StorageError.exit_code
-        if _has_lost_its_folder():
-            say_error(_LOST)
+        if _lacks_working_folder():
+            print_error(_NO_WORKING_FOLDER)
             return InputError.exit_code
-        remedy = remedy_of(error)
-        if remedy is None or not named:
+        remedy = path_remedy(error)
+        if remedy is None or not has_name:
             raise
-        say_error(f"cannot use {os.fsdecode(error.filename)}: {error.strerror}; {remedy}")
+        print_error(f"cannot use {os.fsdecode(error.filename)}: {error.strerror}; {remedy}")
         return InputError.exit_code
     except MemoryError as error:
-        say_error(f"not enough memory ({str(error) or 'none is left'}); use fewer --workers, or smaller pictures")
+        print_error(f"not enough memory ({str(error) or 'all is used'}); use fewer --workers, or smaller pictures")
         return InputError.exit_code
     except SystemExit as error:
         if error.code == EXIT_INTERRUPTED:
-            return _interrupted(keeps)
+            return _report_interruption(is_resumable)
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0
 
 
-def _has_lost_its_folder() -> bool:
+def _lacks_working_folder() -> bool:
     try:
-        os.getcwd()  # noqa: PTH109  the same, without an object
+        os.getcwd()  # noqa: PTH109  as Path.cwd(), without an object
     except OSError:
         return True
     return False
 
 
-def _abandon(descriptor: int) -> None:
-    """Print into nothing from now on: what is printed there cannot be written."""
+def _discard_output(descriptor: int) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
 
 
-def _interrupted(keeps: bool) -> int:
-    say_error(f"interrupted; {'run the same command again to go on' if keeps else 'nothing of it was kept'}")
+def _report_interruption(is_resumable: bool) -> int:
+    print_error(f"interrupted; {'run the same command again to continue' if is_resumable else 'no results were kept'}")
     return EXIT_INTERRUPTED
 
 
-def _say(sentence: str) -> None:
-    # A signal may come while a line is being printed; Python's own streams cannot be used then.
+def _print_in_handler(message: str) -> None:
+    # A signal may come while a line is printed; the streams of Python must not be used then.
     with suppress(OSError):
-        os.write(2, f"\n{sentence}\n".encode())
+        os.write(2, f"\n{message}\n".encode())
 
 
-class Ending:
-    """Whether the process was asked to end, and whether it may end at once.
+class EndRequest:
+    """Request to end the process, usually by a signal.
 
-    A request comes as a signal, in the midst of anything. A block of work that must not be cut says so with
-    `finishing`; a request that comes meanwhile is noted, answered with a sentence, and seen by the block where it can
-    end. A second request ends it at once.
+    By default, a request raises KeyboardInterrupt. In a `postponed` block, the first request sets `is_requested` and
+    prints a message; the block ends when it can. A second request raises KeyboardInterrupt.
     """
 
-    def __init__(self, say: Callable[[str], object] = _say) -> None:
-        self._say = say
-        self._promise = ""
-        self.asked = False
-        """Whether somebody asked for the end."""
+    def __init__(self, report: Callable[[str], object] = _print_in_handler) -> None:
+        self._report = report
+        self._message = ""
+        self.is_requested = False
 
-    def ask(self) -> None:
-        """Ask for the end, as a signal does."""
-        first, self.asked = not self.asked, True
-        if not (first and self._promise):
+    def request(self) -> None:
+        """Request the end, as a signal does."""
+        is_first, self.is_requested = not self.is_requested, True
+        if not (is_first and self._message):
             raise KeyboardInterrupt
-        self._say(self._promise)
+        self._report(self._message)
 
     @contextmanager
-    def finishing(self, promise: str) -> Generator[None]:
-        """Let the first request wait for the end of the block; the block ends early where `asked` says so."""
-        before, self._promise = self._promise, promise
+    def postponed(self, message: str) -> Generator[None]:
+        """Postpone the first request in a block, which checks `is_requested` and ends early; print `message` then."""
+        outer, self._message = self._message, message
         try:
             yield
         finally:
-            self._promise = before
+            self._message = outer
 
     @contextmanager
     def at_once(self) -> Generator[None]:
-        """Let the first request end the block at once: nothing has begun in it that could be finished."""
-        before, self._promise = self._promise, ""
+        """End this part of a `postponed` block at the first request; it has nothing to complete."""
+        outer, self._message = self._message, ""
         try:
-            if self.asked:
+            if self.is_requested:
                 raise KeyboardInterrupt
             yield
         finally:
-            self._promise = before
+            self._message = outer
 
 
 @contextmanager
-def orderly_end() -> Generator[Ending]:
-    """End as by Ctrl-C, devices closed, where the process is asked to end: by `kill`, or by a terminal that went away.
-
-    A signal that is ignored already, as a hang-up is under `nohup`, stays ignored.
-    """
-    ending = Ending()
+def orderly_end() -> Generator[EndRequest]:
+    """Handle `kill` and a closed terminal like Ctrl-C, so that devices are closed; ignored signals stay ignored."""
+    ending = EndRequest()
     if threading.current_thread() is not threading.main_thread():
         yield ending
         return
 
-    from_outside = False
+    is_external = False
 
     def end(number: int, frame: object) -> None:
-        nonlocal from_outside
-        from_outside = from_outside or number != signal.SIGINT
-        ending.ask()
+        nonlocal is_external
+        is_external = is_external or number != signal.SIGINT
+        ending.request()
 
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    taken = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
-    for number in taken:
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    replaced = {number: handler for number, handler in handlers.items() if handler != signal.SIG_IGN}
+    for number in replaced:
         signal.signal(number, end)
     try:
         yield ending
     except OSError as error:
-        if not from_outside:
+        if not is_external:
             raise
-        # A terminal that went away does not take the last state of a bar either.
+        # A closed terminal does not accept the last state of a progress bar.
         raise KeyboardInterrupt from error
     finally:
-        for number, handler in taken.items():
+        for number, handler in replaced.items():
             signal.signal(number, handler)
 
 
 class ReportProgress(Protocol):
-    """What is called with the numbers done and in all, and perhaps the present work."""
+    """Function that is called with the number of completed items, their total, and optionally the current work."""
 
-    def __call__(self, done: int, total: int, work: str = ..., /) -> None:
-        """Show the numbers."""
+    def __call__(self, completed: int, total: int, work: str = ..., /) -> None:
+        """Show the progress."""
 
 
 @contextmanager
 def progress(unit: str) -> Generator[ReportProgress]:
-    """Show a progress bar with the time left on stderr, from the first number reported to the end of the block.
+    """Show a progress bar on stderr, from the first report to the end of the block.
 
-    `unit`: what is counted, or done at first; each report may name the present work in its place.
+    `unit`: name of the counted items, shown if a report has no `work`.
     """
     from rich.console import Console
     from rich.progress import (
@@ -315,7 +308,7 @@ def progress(unit: str) -> Generator[ReportProgress]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    # What is printed meanwhile appears above the bar, but not on the terminal where standard output goes elsewhere.
+    # Printed text appears above the bar, unless stdout is redirected.
     bar = Progress(
         *columns,
         console=Console(stderr=True),
@@ -323,45 +316,45 @@ def progress(unit: str) -> Generator[ReportProgress]:
         disable=not shows_progress(),
     )
     task = bar.add_task(unit, total=None)
-    with ExitStack() as shown:
+    with ExitStack() as stack:
 
-        def tell(done: int, total: int, work: str = unit) -> None:
-            # What is refused before there is anything to count gets no bar.
+        def report(completed: int, total: int, work: str = unit) -> None:
+            # The bar starts here, so a command that is refused before the first report has none.
             if not bar.live.is_started:
-                shown.enter_context(bar)
-            bar.update(task, completed=done, total=total, description=work)
+                stack.enter_context(bar)
+            bar.update(task, completed=completed, total=total, description=work)
 
-        yield tell
+        yield report
 
 
-# Of a log record on stderr, with the time to the millisecond: answers of devices are matched with what was asked.
+# Format of log records. Milliseconds help to match answers of devices with requests.
 _FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
+def _print_version(is_requested: bool) -> None:
+    if is_requested:
         from importlib.metadata import version
 
         print(f"croplab {version('croplab')}")
         raise typer.Exit
 
 
-def _tell_more(times: int) -> None:
-    if times:
-        _log_from(logging.INFO if times == 1 else logging.DEBUG)
+def _log_more(count: int) -> None:
+    if count:
+        _set_log_level(logging.INFO if count == 1 else logging.DEBUG)
 
 
-def _tell_errors(asked: bool) -> None:
-    if asked:
-        _log_from(logging.ERROR)
+def _log_errors_only(is_requested: bool) -> None:
+    if is_requested:
+        _set_log_level(logging.ERROR)
 
 
-def _log_from(level: int) -> None:
+def _set_log_level(level: int) -> None:
     root, handler = logging.getLogger(), logging.StreamHandler(sys.stderr)
     handler.set_name(_HANDLER)
     handler.setFormatter(logging.Formatter(_FORMAT))
-    # A group and its command may each have the option; a record is printed once.
-    root.handlers[:] = [other for other in root.handlers if other.name != _HANDLER] + [handler]
+    # A group and its command may both have the option, but each record is printed once.
+    root.handlers[:] = [present for present in root.handlers if present.name != _HANDLER] + [handler]
     root.setLevel(level)
 
 
@@ -373,47 +366,47 @@ _VERSION = Annotated[
     bool,
     typer.Option(
         "--version", callback=_print_version, is_eager=True, rich_help_panel=_COMMON_PANEL,
-        help="Print the version and end.",
+        help="Print the version and exit.",
     ),
 ]  # fmt: skip
 _VERBOSE = Annotated[
     int,
     typer.Option(
-        "-v", "--verbose", count=True, callback=_tell_more, show_default=False, metavar="",
-        rich_help_panel=_COMMON_PANEL, help="Tell on stderr what is done; -vv each exchange with a device too.",
+        "-v", "--verbose", count=True, callback=_log_more, show_default=False, metavar="",
+        rich_help_panel=_COMMON_PANEL, help="Print each step to stderr; -vv also the communication with devices.",
     ),
 ]  # fmt: skip
 _QUIET = Annotated[
     bool,
     typer.Option(
-        "-q", "--quiet", callback=_tell_errors, rich_help_panel=_COMMON_PANEL,
-        help="No progress bars and no warnings: errors alone.",
+        "-q", "--quiet", callback=_log_errors_only, rich_help_panel=_COMMON_PANEL,
+        help="Print errors only, no progress bars or warnings.",
     ),
 ]  # fmt: skip
 _AS_JSON = Annotated[
     bool,
     typer.Option(
-        "--json", rich_help_panel=_COMMON_PANEL, help="Print one JSON object, for programs; all else goes to stderr."
+        "--json", rich_help_panel=_COMMON_PANEL, help="Print one JSON object to stdout and all other text to stderr."
     ),
 ]
 
-# The options of every command and their defaults, by the names of their parameters. Each acts by its callback.
+# Options of all commands and their defaults, by parameter name. Their callbacks do the work.
 COMMON = {"verbose": (_VERBOSE, 0), "quiet": (_QUIET, False), "version": (_VERSION, False)}
 
 _COMMON_WORD = re.compile(r"-v+|-q|--verbose|--quiet")
 
 
-def is_common(word: str) -> bool:
-    """Return whether an argument is a common option that may stand before the name of a command."""
+def is_common_option(word: str) -> bool:
+    """Return whether an argument is a common option, which may precede the name of a command."""
     return _COMMON_WORD.fullmatch(word) is not None
 
 
-# What stands for a value of an option, by its type; an option whose value is of a kind of its own says it itself.
+# Placeholders for values of options in the help, by type; options with special values give their own placeholder.
 _METAVARS = {"int": "N", "integer": "N", "float": "X", "str": "TEXT", "text": "TEXT", "path": "PATH"}
 
 
-def _in_one_style(command: Any) -> None:
-    """Give a command's help the style of all: values in capitals, no types of Python, paragraphs without line ends."""
+def _apply_style(command: Any) -> None:
+    """Set the style of a command's help: placeholders in capitals, no Python types, paragraphs without line ends."""
     for parameter in command.params:
         if getattr(parameter, "is_flag", False) or getattr(parameter, "count", False):
             parameter.metavar = ""
@@ -428,21 +421,21 @@ def _in_one_style(command: Any) -> None:
 
 
 def _type_name(parameter: Any) -> str:
-    """Return the name of an option's type, whichever way this version of typer keeps it; empty of a choice."""
-    described = getattr(parameter, "type_descriptor", None)
-    if described is None:
+    # The attributes depend on the version of typer. The name of a choice is empty.
+    descriptor = getattr(parameter, "type_descriptor", None)
+    if descriptor is None:
         name = str(parameter.type.name)
     else:
-        name = "" if described.is_choice else str(parameter.display_type(None)).strip("<>")
+        name = "" if descriptor.is_choice else str(parameter.display_type(None)).strip("<>")
     return name.removesuffix(" range")
 
 
 class _Styled:
-    """What gives a command of typer's its help in the style of all."""
+    """Base class of commands with our style of help."""
 
-    def __init__(self, *arguments: Any, **named: Any) -> None:
-        super().__init__(*arguments, **named)
-        _in_one_style(self)
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        _apply_style(self)
 
     def get_help_option(self, ctx: Any) -> Any:
         """Return the option ``--help`` without a type."""
@@ -453,28 +446,29 @@ class _Styled:
 
 
 class StyledCommand(_Styled, TyperCommand):
-    """A command whose help is in the style of all."""
+    """Command with our style of help."""
 
-    def make_context(self, *arguments: Any, **named: Any) -> Any:
-        """Return the context of parsed arguments; what is wrong with a value is said without a library's words."""
+    def make_context(self, *arguments: Any, **keywords: Any) -> Any:
+        """Return the context of parsed arguments."""
         try:
-            return super().make_context(*arguments, **named)
+            return super().make_context(*arguments, **keywords)
         except typer.BadParameter as error:
+            # Prefix of pydantic.
             error.message = error.message.removeprefix("Value error, ")
             raise
 
 
 class _StyledGroup(_Styled, TyperGroup):
-    """A command with others below it, whose help is in the style of all."""
+    """Group of commands with our style of help."""
 
 
 class _StyledTyper(typer.Typer):
-    """An app of commands with help in the style of all, each with the common options."""
+    """App of commands with our style of help and the common options."""
 
-    def command(self, name: str | None = None, **more: Any) -> Callable[[Any], Any]:
+    def command(self, name: str | None = None, **options: Any) -> Callable[[Any], Any]:
         """Register a command."""
-        named: dict[str, Any] = {"cls": StyledCommand, **more}
-        register = super().command(name, **named)
+        keywords: dict[str, Any] = {"cls": StyledCommand, **options}
+        register = super().command(name, **keywords)
 
         def decorate(function: Callable[..., None]) -> Callable[..., None]:
             register(_with_common(function))
@@ -493,20 +487,20 @@ def _with_common(function: Callable[..., None]) -> Callable[..., None]:
         for name, (kind, default) in COMMON.items()
     ]
 
-    def command(*arguments: Any, **named: Any) -> None:
-        function(*arguments, **{name: value for name, value in named.items() if name not in COMMON})
+    def command(*arguments: Any, **keywords: Any) -> None:
+        function(*arguments, **{name: value for name, value in keywords.items() if name not in COMMON})
 
-    return _declared(command, function, [*own, *common])
-
-
-def _nothing() -> None:
-    """Do nothing: the common options of a group act by themselves."""
+    return _with_signature(command, function, [*own, *common])
 
 
-def new_app(help_text: str | None = None, **more: Any) -> typer.Typer:
-    """Return an app in the style of all commands.
+def _no_action() -> None:
+    """Do nothing: the common options of a group work by their callbacks."""
 
-    `help_text`: what ``--help`` of a group of commands prints; None for an app that is one command.
+
+def new_app(help_text: str | None = None, **options: Any) -> typer.Typer:
+    """Return an app with our style of help and the common options.
+
+    `help_text`: help of a group of commands; None for an app with one command.
     """
     app = _StyledTyper(
         cls=_StyledGroup,
@@ -514,52 +508,48 @@ def new_app(help_text: str | None = None, **more: Any) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
         pretty_exceptions_enable=False,
         rich_markup_mode="rich",
-        **more,
+        **options,
     )
     if help_text is not None:
-        app.callback()(_with_common(_nothing))
+        app.callback()(_with_common(_no_action))
     return app
 
 
 class MainCommand(StyledCommand):
-    """A command with others beside it: its first word may name one of them in place of its own first argument.
+    """Command whose first argument may be the name of a subcommand instead; its help lists the subcommands."""
 
-    Its help lists the others. `others` is the app of the others.
-    """
+    subcommands: ClassVar[typer.Typer]
 
-    others: ClassVar[typer.Typer]
-
-    def __init__(self, *arguments: Any, **named: Any) -> None:
-        super().__init__(*arguments, **named)
-        listed = [f"{self.name} {name}: {other.help.partition('.')[0]}." for name, other in self.commands.items()]
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        lines = [f"{self.name} {name}: {command.help.partition('.')[0]}." for name, command in self.commands.items()]
         first = next(iter(self.commands))
-        beside = f"Commands in place of the first argument, each with its --help; a folder of such a name is ./{first}:"
-        self.help = "\n\n".join((self.help or "", beside, *listed))
+        heading = f"Subcommands in place of the first argument, each with --help; write ./{first} for such a folder:"
+        self.help = "\n\n".join((self.help or "", heading, *lines))
 
     @cached_property
     def commands(self) -> Mapping[str, Any]:
-        """The others by their names."""
-        return get_group(self.others).commands
+        """Subcommands by name."""
+        return get_group(self.subcommands).commands
 
-    # The others are passed on by name.
     def main(  # pyrefly: ignore[bad-override]
-        self, args: Sequence[str] | None = None, prog_name: str | None = None, **more: Any
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, **options: Any
     ) -> Any:
-        """Run the command that the arguments name."""
+        """Run the command or the subcommand that the arguments name."""
         words = list(sys.argv[1:] if args is None else args)
-        place = next((place for place, word in enumerate(words) if not is_common(word)), len(words))
-        name = words[place] if place < len(words) else ""
+        index = next((index for index, word in enumerate(words) if not is_common_option(word)), len(words))
+        name = words[index] if index < len(words) else ""
         if name in self.commands:
-            named = {**self.context_settings, **more}
-            return self.commands[name].main([*words[:place], *words[place + 1 :]], f"{prog_name} {name}", **named)
+            keywords = {**self.context_settings, **options}
+            return self.commands[name].main([*words[:index], *words[index + 1 :]], f"{prog_name} {name}", **keywords)
         if name.removeprefix("--") in self.commands:
             raise InputError(f"{name} is a command, not an option: {prog_name} {name[2:]}; see its --help")
-        return super().main(words, prog_name, **more)
+        return super().main(words, prog_name, **options)
 
 
 @contextmanager
-def logging_as_before() -> Generator[None]:
-    """Leave logging as it was found: a program may call several commands, each with options of its own."""
+def preserved_logging() -> Generator[None]:
+    """Restore the log settings after the block: a program may call several commands with different options."""
     root = logging.getLogger()
     level, handlers = root.level, list(root.handlers)
     try:
@@ -570,42 +560,41 @@ def logging_as_before() -> Generator[None]:
 
 
 def shows_progress() -> bool:
-    """Return whether progress is shown: it is not where errors alone are wanted."""
+    """Return whether progress is shown, which ``-q`` switches off."""
     return logging.getLogger().isEnabledFor(logging.WARNING)
 
 
 class JsonOutput:
-    """Figures of a command, gathered for the object that is printed at its end."""
+    """Values of the JSON object that a command prints at its end."""
 
-    def __init__(self, command: str, asked: bool) -> None:
-        self.asked = asked
+    def __init__(self, command: str, is_requested: bool) -> None:
+        self.is_requested = is_requested
         self._command = command
         self._values: dict[str, Any] = {}
 
     def add(self, **values: Any) -> None:
-        """Add values; any that `plain` takes."""
+        """Add values, of the types of `json_value`."""
         self._values.update(values)
 
     def append(self, key: str, value: Any) -> None:
-        """Add a value to the end of the list `key`, which is begun where it is not there."""
+        """Append a value to the list `key`, which is added if missing."""
         self._values.setdefault(key, []).append(value)
 
     def write(self, stream: TextIO) -> None:
-        """Print the object, if there is anything in it."""
+        """Print the object unless it is empty."""
         if self._values:
-            whole = plain({"command": self._command, **self._values})
-            print(json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False), file=stream)
+            document = json_value({"command": self._command, **self._values})
+            print(json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False), file=stream)
 
 
 @contextmanager
-def json_output(command: str, asked: bool) -> Generator[JsonOutput]:
-    """Gather figures in the block, and print them at its end if asked; what the block prints is for a reader.
+def json_output(command: str, is_requested: bool) -> Generator[JsonOutput]:
+    """Collect values in the block and, if requested, print them at its end; other output of the block goes to stderr.
 
-    What was gathered is printed also where data are not good enough or something else ends the command: the exit code
-    says so, and standard error why.
+    The values are also printed if an error ends the block. The exit code and stderr report the error.
     """
-    output = JsonOutput(command, asked)
-    if not asked:
+    output = JsonOutput(command, is_requested)
+    if not is_requested:
         yield output
         return
     stdout = sys.stdout
@@ -618,16 +607,16 @@ def json_output(command: str, asked: bool) -> Generator[JsonOutput]:
     output.write(stdout)
 
 
-def option(metavar: str | None, text: str, *names: str, panel: str | None = None, **more: Any) -> Any:
-    """Return typer's option; `names` are its own where that of its parameter, or a --no- beside it, would not do."""
-    return typer.Option(*names, metavar=metavar, help=text, rich_help_panel=panel, **more)
+def option(metavar: str | None, text: str, *names: str, panel: str | None = None, **options: Any) -> Any:
+    """Return an option of typer; `names` replace the name of the parameter and its ``--no-`` form."""
+    return typer.Option(*names, metavar=metavar, help=text, rich_help_panel=panel, **options)
 
 
-def grouped(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a command for typer in which options stand in the place of each parameter that is a group of them.
+def with_option_groups(function: Callable[..., None]) -> Callable[..., None]:
+    """Replace each parameter of a command that is a group of options by these options.
 
-    A group is a frozen dataclass, whose fields are ``Annotated`` with typer's ``Option`` or ``Argument`` and have
-    defaults. No two of a command's groups share a field's name.
+    A group is a frozen dataclass. Its fields are ``Annotated`` with ``Option`` or ``Argument`` of typer and have
+    defaults; their names are unique within the command.
     """
     hints = get_type_hints(function, include_extras=True)
     parameters: list[inspect.Parameter] = []
@@ -644,17 +633,17 @@ def grouped(function: Callable[..., None]) -> Callable[..., None]:
             for field in dataclasses.fields(group)
         ]
 
-    def command(*arguments: Any, **given: Any) -> None:
+    def command(*arguments: Any, **values: Any) -> None:
         groups = {
-            name: hints[name](**{field: given.pop(field) for field in fields if field in given})
+            name: hints[name](**{field: values.pop(field) for field in fields if field in values})
             for name, fields in members.items()
         }
-        function(*arguments, **given, **groups)
+        function(*arguments, **values, **groups)
 
-    return _declared(command, function, parameters)
+    return _with_signature(command, function, parameters)
 
 
-def _declared(
+def _with_signature(
     command: Callable[..., None], function: Callable[..., None], parameters: Sequence[inspect.Parameter]
 ) -> Callable[..., None]:
     functools.update_wrapper(command, function)
@@ -664,31 +653,31 @@ def _declared(
 
 
 def with_json(command: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return a decorator of a typer command whose one parameter of type `JsonOutput` becomes the option ``--json``."""
+    """Return a decorator that replaces the parameter of type `JsonOutput` of a command by the option ``--json``."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(function, include_extras=True)
         output_name = next((name for name, kind in hints.items() if kind is JsonOutput), None)
         if output_name is None:
-            raise ValueError(f"{command} has no parameter of type JsonOutput to put the option in the place of")
-        option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_AS_JSON)
-        others = [
+            raise ValueError(f"{command} has no parameter of type JsonOutput, expected one; add it")
+        json_option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_AS_JSON)
+        parameters = [
             parameter.replace(annotation=hints[name])
             for name, parameter in inspect.signature(function).parameters.items()
             if name != output_name
         ]
 
-        def with_option(*arguments: Any, as_json: bool = False, **named: Any) -> None:
+        def with_option(*arguments: Any, as_json: bool = False, **keywords: Any) -> None:
             with json_output(command, as_json) as output:
-                function(*arguments, **named, **{output_name: output})
+                function(*arguments, **keywords, **{output_name: output})
 
-        return _declared(with_option, function, [*others, option])
+        return _with_signature(with_option, function, [*parameters, json_option])
 
     return decorate
 
 
-def plain(value: Any) -> Any:
-    """Return a value as JSON has it: paths and other objects as text, numbers of numpy as numbers, no infinities.
+def json_value(value: Any) -> Any:
+    """Convert a value for JSON: numpy numbers to numbers, NaN and infinity to None, other objects to text.
 
     Examples
     --------
@@ -701,10 +690,10 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {field.name: json_value(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in cast("Mapping[Any, Any]", value).items()}
+        return {str(key): json_value(item) for key, item in cast("Mapping[Any, Any]", value).items()}
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [plain(item) for item in cast("list[Any]", value)]
-    listed: Callable[[], Any] | None = getattr(value, "tolist", None)
-    return str(value) if listed is None else plain(listed())
+        return [json_value(item) for item in cast("list[Any]", value)]
+    to_list: Callable[[], Any] | None = getattr(value, "tolist", None)
+    return str(value) if to_list is None else json_value(to_list())

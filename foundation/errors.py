@@ -1,26 +1,25 @@
-"""Every error that a user of CroP can meet, in one tree.
+"""All errors that a user of CroP can meet, and phrases for their messages.
 
-The tree says whose move it is::
+The classes form one tree::
 
-    CropError                 1   anything foreseeable; never raised itself
-    ├── InputError            2   what the user gave cannot be used: arguments, files, folders
-    │   ├── ConfigurationError    LAB.toml: a key, a value
-    │   └── FormatError           a file is not what it should be: raw, chart, session, table, picture
+    CropError                 1   any foreseeable error; never raised itself
+    ├── InputError            2   input of the user cannot be used: arguments, files, folders
+    │   ├── ConfigurationError    settings file: a key, a value
+    │   └── FormatError           a file has another format or is damaged: raw, chart, session, LUT, picture
     ├── DeviceError           3   a device or its cable
-    │   ├── LinkError             the cable: nothing comes through
-    │   │   ├── LinkTimeout       nothing came in time; the device may still be there
-    │   │   └── LinkClosed        the other side hung up; a new connection is needed
-    │   ├── ProtocolError         the device said something that its standard does not allow
-    │   ├── DeviceRefused         the device understood and said no
+    │   ├── LinkError             the cable
+    │   │   ├── LinkTimeout       no answer in time; the device may still be connected
+    │   │   └── LinkClosed        the device closed the connection; connect again
+    │   ├── ProtocolError         the device sent bytes that its standard does not allow
+    │   ├── DeviceRefused         the device refused a command
     │   └── DeviceFault           the device reports a defect: lamp, temperature, fan, cover
-    ├── QualityError          4   the data are not good enough to go on
-    │   └── RegistrationError     the chart cannot be found, or is not the one expected
-    └── StorageError          5   the disk: full, read-only, gone
+    ├── QualityError          4   the data are not good enough to continue
+    │   └── RegistrationError     the chart was not detected, or is another chart
+    └── StorageError          5   the disk: full, read-only, disconnected
 
-The number is the exit code of a command that ends with it (0 success, 130 interrupted). A sentence holds the value,
-what was expected, the file or device it is about, and the remedy: ``about: problem; remedy``. What a program asks of an
-error stands in attributes of its own, so that sentences can be worded anew. Errors of libraries are raised again as one
-of these at the place where the library is called, with ``from error``.
+The number is the exit code of a command that ends with the error (0 success, 130 interrupted). A message has the form
+``about: problem; remedy``. Programs use the attributes of an error, never its text. Errors of libraries are converted
+to one of these classes where the library is called, with ``from error``.
 """
 
 from __future__ import annotations
@@ -33,35 +32,34 @@ from typing import Final
 
 from foundation.secret_texts import masked
 
-EXIT_INTERRUPTED = 130  # Exit code of a command that Ctrl-C ended; 128 + SIGINT, as shells have it
+# Exit code of a command that was ended by Ctrl-C: 128 + SIGINT, as in shells.
+EXIT_INTERRUPTED = 130
 
-
-# What ends a remedy that a command did not wait for; one that waits goes on by itself (`CropError.while_waiting`).
+# Last part of a remedy, if the command ended. A command that waits resumes automatically (`CropError.while_waiting`).
 RUN_AGAIN: Final = "then run the same command again"
 
-# Longest sentence of an error: names and values that stand in it may be a stranger's, and as long as he likes.
-_LONGEST = 8000
+# Longest message, in characters: names and values of files from others can have any length.
+_MAX_LENGTH = 8000
 
 
 class CropError(Exception):
-    """Root of the tree: a foreseeable fault, described in one sentence that holds no secret of an address.
+    """Root of the tree: a foreseeable error with a message of one sentence.
 
     Parameters
     ----------
     problem
-        What is wrong, with the value and what was expected.
+        Fault, with the value found and the value expected.
     about
-        File, folder or device that it is about: the sentence begins with it. None where the problem names it.
+        File, folder or device, first part of the message; None if `problem` names it.
     remedy
-        What to do, an imperative: the sentence ends with it. Where it is not given apart, it is what stands behind the
-        first semicolon of the problem; "" where nothing does.
+        Instruction, last part of the message. If empty, the part of `problem` after its first semicolon.
     value, expected
-        What was found and what should have been, for programs; the problem says both in words.
+        Value found and value expected, for programs.
 
     Examples
     --------
-    >>> str(FormatError("its version is 7, 1 is read", about="lut.json", remedy="build the table again", value=7))
-    'lut.json: its version is 7, 1 is read; build the table again'
+    >>> str(FormatError("version 7, expected 1", about="lut.json", remedy="build the LUT again", value=7))
+    'lut.json: version 7, expected 1; build the LUT again'
     """
 
     exit_code = 1
@@ -82,25 +80,25 @@ class CropError(Exception):
         self.about, self.value, self.expected = about, value, expected
 
     def __str__(self) -> str:
-        """Return the sentence, users, passwords and tokens of addresses in it masked; cut where it has no end."""
-        return self._sentence(self.remedy)
+        """Return the message; users, passwords and tokens in addresses are masked, very long texts shortened."""
+        return self._message(self.remedy)
 
     def without_remedy(self) -> str:
-        """Return the sentence up to its remedy: what is wrong."""
-        return self._sentence("")
+        """Return the message without its remedy."""
+        return self._message("")
 
     def while_waiting(self) -> str:
-        """Return the sentence for where the command waits and goes on by itself: without the order to run it again."""
-        return self._sentence(self.remedy.removesuffix(RUN_AGAIN).rstrip(" ,;"))
+        """Return the message without the instruction to run the command again, for a command that waits."""
+        return self._message(self.remedy.removesuffix(RUN_AGAIN).rstrip(" ,;"))
 
-    def _sentence(self, remedy: str) -> str:
-        begin = "" if self.about is None else f"{self.about}: "
-        text = masked(f"{begin}{self.problem}{f'; {remedy}' if remedy else ''}")
-        return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 4 :]}"
+    def _message(self, remedy: str) -> str:
+        prefix = "" if self.about is None else f"{self.about}: "
+        text = masked(f"{prefix}{self.problem}{f'; {remedy}' if remedy else ''}")
+        return text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH // 2]} … {text[-_MAX_LENGTH // 4 :]}"
 
 
 class InputError(CropError):
-    """What the user gave cannot be used; nothing has been changed."""
+    """Input of the user cannot be used; nothing has been changed."""
 
     exit_code = 2
 
@@ -110,25 +108,25 @@ class ConfigurationError(InputError):
 
 
 class FormatError(InputError):
-    """A file or folder is not in the format expected of it, or is damaged."""
+    """A file or folder has another format than expected, or is damaged."""
 
 
 class DeviceError(CropError):
-    """A device cannot do its part; data already taken are safe."""
+    """A device cannot be used; data recorded earlier are safe."""
 
     exit_code = 3
 
 
 class LinkError(DeviceError):
-    """The cable to a device fails; see the two kinds for what helps."""
+    """The connection to a device failed."""
 
 
 class LinkTimeout(LinkError):
-    """Nothing came through within the time limit."""
+    """No data within the time limit."""
 
 
 class LinkClosed(LinkError):
-    """The other side closed the connection, or it could not be opened."""
+    """The device closed the connection, or it could not be opened."""
 
 
 class ProtocolError(DeviceError):
@@ -136,66 +134,66 @@ class ProtocolError(DeviceError):
 
 
 class DeviceRefused(DeviceError):
-    """A device understood the command and declined it."""
+    """A device refused a command."""
 
 
 class DeviceFault(DeviceError):
-    """A device reports a defect of its own."""
+    """A device reports a defect."""
 
 
 class QualityError(CropError):
-    """The data were taken and read, but are not good enough."""
+    """The data were recorded and read, but are not good enough."""
 
     exit_code = 4
 
 
 class RegistrationError(QualityError):
-    """The chart was not found in a frame, or is not the chart expected."""
+    """The chart was not detected in a frame, or is another chart."""
 
 
 class StorageError(CropError):
-    """The disk is full, read-only or gone; what was complete before is untouched."""
+    """The disk is full, read-only or disconnected; files that were complete before are unchanged."""
 
     exit_code = 5
 
 
-def counted(number: int, what: str, plural: str | None = None) -> str:
-    """Return a number with what is counted, in the plural but for one.
+def counted(number: int, noun: str, plural: str | None = None) -> str:
+    """Return a number and its noun; the plural, by default with -s, is used for all numbers but 1.
 
     Examples
     --------
     >>> counted(1, "image"), counted(0, "image"), counted(2, "is left", "are left")
     ('1 image', '0 images', '2 are left')
     """
-    return f"{number} {what if number == 1 else plural or what + 's'}"
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
-def nearest_names(wanted: str, known: Iterable[str], most: int = 1) -> str:
-    """Return the question whether one of the known names was meant, ending with a mark; empty where none is near.
+def nearest_names(name: str, candidates: Iterable[str], limit: int = 1) -> str:
+    """Return a question that names the most similar candidates, at most `limit`; empty if none is similar.
 
-    Capitals, spaces, hyphens and underscores make no difference.
+    Capitals, spaces, hyphens and underscores are ignored.
 
     Examples
     --------
     >>> nearest_names("Grey_World", ["gray-world", "white-patch"])
     "did you mean 'gray-world'?"
     """
-    plain = {re.sub(r"[\s_-]+", "", name).lower(): name for name in known}
-    near = difflib.get_close_matches(re.sub(r"[\s_-]+", "", wanted).lower(), plain, n=most, cutoff=0.5)
-    return f"did you mean {' or '.join(repr(plain[name]) for name in near)}?" if near else ""
+    candidate_of = {re.sub(r"[\s_-]+", "", candidate).lower(): candidate for candidate in candidates}
+    similar = difflib.get_close_matches(re.sub(r"[\s_-]+", "", name).lower(), candidate_of, n=limit, cutoff=0.5)
+    return f"did you mean {' or '.join(repr(candidate_of[key]) for key in similar)}?" if similar else ""
 
 
-def first_of(things: Sequence[object], most: int = 10) -> str:
-    """Return things between commas as a message names them: the first ones, and an ellipsis where there are more."""
-    return ", ".join(map(str, things[:most])) + (" …" if len(things) > most else "")
+def first_few(items: Sequence[object], limit: int = 10) -> str:
+    """Return the first items, separated by commas, and an ellipsis if there are more than `limit`."""
+    return ", ".join(map(str, items[:limit])) + (" …" if len(items) > limit else "")
 
 
-def kind_of(value: object) -> str:
-    """Return what a value is, for a message about a wrong argument: type and shape of an array, the text of a text.
+def value_text(value: object) -> str:
+    """Describe a wrong argument in a message: its type, and the text of a string or the shape of an array.
 
     Examples
     --------
-    >>> kind_of("cat.png"), kind_of(3.5), kind_of([1, 2])
+    >>> value_text("cat.png"), value_text(3.5), value_text([1, 2])
     ("the text 'cat.png'", 'float 3.5', 'a list')
     """
     if isinstance(value, str | PurePath):

@@ -1,18 +1,15 @@
-"""Files: how they appear whole; and the gate to files and folders that somebody else made.
+"""Atomic writing of files, and safe reading of files and folders from other people.
 
-Every file that CroP writes under a final name goes through here, folders through `foundation.folders`: written beside
-its place under a hidden name, flushed to the disk, then renamed. A crash leaves a hidden leftover, never a half file;
-nothing is ever overwritten that the caller did not mean to replace. What is hashed is hashed by SHA-256 (FIPS 180-4).
+Files are written next to their place under a hidden name, flushed to the disk, then renamed. After a crash, a hidden
+partial file may remain, never an incomplete file under the final name. Hashes are SHA-256 (FIPS 180-4).
 
-Any file of a folder that came from others may hold anything; all that is refused is a `FormatError` that names the
-file:
+Reading functions raise a `FormatError` with the name of a file that breaks one of these rules:
 
-- A name that stands in a file leads to a file inside the folder, or nowhere: no ``..``, no root, no link that leads
-  out.
-- What is opened is a regular file: a device or a pipe never ends, and some do something when they are read.
-- What is read whole has a size that its reader has stated; what is read by lines has lines that end.
+- A file name in a file leads to a file inside the folder: no ``..``, no absolute path, no link to the outside.
+- Only regular files are opened. A device or pipe may never end, and reading some devices has effects.
+- Files that are read at once have a size limit; files that are read line by line have a limit for the line.
 
-Folders are looked at once, when they are opened: who may change one while it is read may change what it says, too.
+A folder is checked once, when it is opened. A person who can change it later can change its content anyway.
 """
 
 from __future__ import annotations
@@ -35,33 +32,33 @@ from typing import Any, BinaryIO, Final, TypeGuard, cast
 from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError
 
 _PARTIAL = ".partial"
-_A_LINK = "it is a link to a place that is not there: make or mount that place, or name another"
-_PART_IS_A_FILE = "a part of that path is a file, not a folder; name another"
+_BROKEN_LINK = "it is a link to a place that does not exist: create or mount that place, or choose another path"
+_PART_IS_A_FILE = "a part of that path is a file, not a folder; choose another path"
 _REMEDIES = {
-    errno.EACCES: "ask its owner for permission, or name another place",
-    errno.EPERM: "ask its owner for permission, or name another place",
-    errno.EISDIR: "a folder is called so; name a file",
+    errno.EACCES: "ask its owner for permission, or choose another path",
+    errno.EPERM: "ask its owner for permission, or choose another path",
+    errno.EISDIR: "it is a folder; name a file",
     errno.ENOTDIR: _PART_IS_A_FILE,
-    errno.ENAMETOOLONG: "name it shorter",
-    errno.ELOOP: "links there lead in a circle; name the place that is meant",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ELOOP: "its links form a circle; give the path without links",
 }
-_GONE = f"the disk is gone: connect and mount it, {RUN_AGAIN}"
-_SERVER = f"the server of that folder does not answer: see to the network and to the server, {RUN_AGAIN}"
-# What helps against each fault of a disk, by the names of errno(3); not every system knows all of them.
+_DISCONNECTED = f"the disk is disconnected: connect and mount it, {RUN_AGAIN}"
+_SERVER = f"the server of that folder does not answer: check the network and the server, {RUN_AGAIN}"
+# Remedies for errors of a disk, by the names of errno(3); not every system defines all of them.
 _DISK_REMEDIES = {
     "ENOSPC": f"free space or choose another disk, {RUN_AGAIN}",
-    "EDQUOT": f"what this user may use of the disk is used up: remove files there, or ask for more, {RUN_AGAIN}",
-    "EFBIG": f"no file may be so large there (FAT32 ends at 4 GiB; ulimit -f): choose another disk, {RUN_AGAIN}",
-    "EROFS": f"name another place, or mount it for writing (dmesg says if it was errors), {RUN_AGAIN}",
+    "EDQUOT": f"this user's quota on the disk is used up: remove files there, or ask for a larger quota, {RUN_AGAIN}",
+    "EFBIG": f"the file is too large there (FAT32 allows 4 GiB; ulimit -f): choose another disk, {RUN_AGAIN}",
+    "EROFS": f"choose another path, or mount it for writing (dmesg lists disk errors), {RUN_AGAIN}",
     "EIO": (
-        "the disk fails: see what dmesg says, check its cable, copy what is on it to another while it can be read, "
-        f"{RUN_AGAIN}"
+        "the disk fails: look at the output of dmesg, check its cable, copy its files to another disk while they can "
+        f"be read, {RUN_AGAIN}"
     ),
-    "ENODEV": _GONE,
-    "ENXIO": _GONE,
-    "ENOMEDIUM": _GONE,
-    "ENOENT": f"its folder is gone: connect and mount the disk it was on, {RUN_AGAIN}",
-    "ESTALE": f"the folder was taken away or mounted anew on its server: mount it again here, {RUN_AGAIN}",
+    "ENODEV": _DISCONNECTED,
+    "ENXIO": _DISCONNECTED,
+    "ENOMEDIUM": _DISCONNECTED,
+    "ENOENT": f"its folder is missing: connect and mount its disk, {RUN_AGAIN}",
+    "ESTALE": f"the folder was removed or mounted again on its server: mount it again here, {RUN_AGAIN}",
     "ENOTCONN": _SERVER,
     "EREMOTEIO": _SERVER,
     "EHOSTDOWN": _SERVER,
@@ -70,144 +67,140 @@ _DISK_REMEDIES = {
     "ENFILE": f"close other programs, {RUN_AGAIN}",
 }
 _DISK_FAULTS = {getattr(errno, name): remedy for name, remedy in _DISK_REMEDIES.items() if hasattr(errno, name)}
-# Faults of a write to an open file, of which the system does not say which one: these cannot be a socket's, nor a
-# file's that somebody reads meanwhile.
+# Errors of a write to an open file, which come without a file name. Errors that a socket, or a file that is read at the
+# same time, can also cause are excluded.
 _NAMELESS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT, errno.ENOTCONN}
 
-# How often a folder is made anew that another program takes away meanwhile: programs do so once or twice, special
-# file systems (/proc) for ever.
+# Attempts to make a folder that another program removes at the same time. Programs do so once or twice; on special
+# file systems (/proc) no number is enough.
 FOLDER_ATTEMPTS = 1000
 
 
 def partial_path(path: Path) -> Path:
-    """Return the hidden name under which `path` is written before it is complete."""
+    """Return the hidden name of `path` while it is incomplete."""
     return path.with_name(f".{path.name}{_PARTIAL}")
 
 
 def is_partial(name: str) -> bool:
-    """Return whether a file or folder called `name` is a leftover of a write that never finished."""
+    """Return whether a file or folder with this name is the rest of an unfinished write."""
     return name.startswith(".") and name.endswith(_PARTIAL)
 
 
-def remedy_of(error: OSError) -> str | None:
-    """Return what helps against a fault of the path that was named; None if the fault is another."""
+def path_remedy(error: OSError) -> str | None:
+    """Return the remedy for an error caused by the path; None for other errors."""
     return _REMEDIES.get(error.errno or 0)
 
 
-def disk_remedy_of(error: OSError) -> str | None:
-    """Return what helps against a fault of the disk, not of the path; None if the fault is another."""
+def disk_remedy(error: OSError) -> str | None:
+    """Return the remedy for an error caused by the disk; None for other errors."""
     return _DISK_FAULTS.get(error.errno or 0)
 
 
-def storage_error(path: Path, error: OSError, what: str = "write") -> InputError | StorageError:
-    """Return what went wrong at `path` as one sentence with its remedy; an InputError if the name is to blame."""
-    remedy = remedy_of(error)
-    by_name = remedy is not None and not isinstance(error, PermissionError)
-    return (InputError if by_name else StorageError)(
-        f"cannot {what} {path}: {error.strerror or error}; "
-        f"{remedy or disk_remedy_of(error) or f'see to the disk, or choose another, {RUN_AGAIN}'}"
+def storage_error(path: Path, error: OSError, action: str = "write") -> InputError | StorageError:
+    """Return an error with remedy for a failed `action` on `path`: an InputError if the path is the cause."""
+    remedy = path_remedy(error)
+    is_path_fault = remedy is not None and not isinstance(error, PermissionError)
+    return (InputError if is_path_fault else StorageError)(
+        f"cannot {action} {path}: {error.strerror or error}; "
+        f"{remedy or disk_remedy(error) or f'check the disk, or choose another, {RUN_AGAIN}'}"
     )
 
 
-def _making_error(path: Path, error: OSError) -> InputError | StorageError:
-    """Return why `path` cannot be made: where its folder is there, no disk is gone that would have to be mounted."""
-    made = error.filename if error.errno == errno.ENOENT and error.filename2 is None else None
-    if isinstance(made, str | bytes) and Path(os.fsdecode(made)).parent.is_dir():
+def _write_error(path: Path, error: OSError) -> InputError | StorageError:
+    # If the folder exists, no disk is missing: the file system, such as /proc, allows no new files.
+    missing = error.filename if error.errno == errno.ENOENT and error.filename2 is None else None
+    if isinstance(missing, str | bytes) and Path(os.fsdecode(missing)).parent.is_dir():
         return InputError(
-            f"cannot write {path}: {error.strerror}; the system lets nobody make files there; name a place on an "
+            f"cannot write {path}: {error.strerror}; the system allows no new files there; choose a path on an "
             "ordinary disk"
         )
     return storage_error(path, error)
 
 
-def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> FormatError | StorageError:
-    """Return why `path` cannot be read: the disk's fault with its own remedy, else the file's with `remedy`."""
-    of_disk = disk_remedy_of(error) if error.errno != errno.ENOENT else None
-    named = f"{what} {path}" if what else str(path)
-    kind = StorageError if of_disk else FormatError
-    return kind(f"cannot read {named}: {error.strerror or error}", remedy=of_disk or remedy)
+def reading_error(path: Path, error: OSError, remedy: str, description: str = "") -> FormatError | StorageError:
+    """Return the error for a file that cannot be read: a StorageError if the disk is the cause, else a FormatError.
+
+    `remedy` is the remedy if the disk is not the cause. `description` precedes the path in the message.
+    """
+    of_disk = disk_remedy(error) if error.errno != errno.ENOENT else None
+    file = f"{description} {path}" if description else str(path)
+    error_class = StorageError if of_disk else FormatError
+    return error_class(f"cannot read {file}: {error.strerror or error}", remedy=of_disk or remedy)
 
 
-def read_text(path: Path, remedy: str, what: str = "") -> str:
-    """Return a file's text, UTF-8; else raise a FormatError, or a StorageError where the disk is to blame."""
+def read_text(path: Path, remedy: str, description: str = "") -> str:
+    """Return a file's text, UTF-8; errors as in `reading_error`."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise reading_error(path, error, remedy, what) from error
+        raise reading_error(path, error, remedy, description) from error
     except UnicodeDecodeError as error:
         raise _not_utf_8(path, error, remedy) from error
 
 
 def _not_utf_8(path: Path, error: UnicodeDecodeError, remedy: str) -> FormatError:
-    """Return what to tell of a file that is a text in another encoding, or none."""
-    begin, before = error.object[:4], error.object[: error.start]
-    if begin.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        problem = "a text in UTF-16, UTF-8 was expected"
+    start, valid = error.object[:4], error.object[: error.start]
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        problem = "text in UTF-16, expected UTF-8"
     elif b"\0" in error.object:
-        return FormatError("no text", about=path, remedy=remedy)
+        return FormatError("binary data, expected text in UTF-8", about=path, remedy=remedy)
     else:
         problem = (
-            f"no text in UTF-8: line {before.count(10) + 1} has the byte 0x{error.object[error.start]:02x}, as letters "
-            "with accents have in Latin-1 (Windows-1252)"
+            f"line {valid.count(10) + 1} has the byte 0x{error.object[error.start]:02x}, expected text in UTF-8; the "
+            "file may be in Latin-1 (Windows-1252)"
         )
-    return FormatError(problem, about=path, remedy="save it as UTF-8, which editors offer at Save as")
+    return FormatError(problem, about=path, remedy="save it as UTF-8 (Save as in most editors)")
 
 
-def read_csv(path: Path, remedy: str, what: str = "") -> tuple[list[str], list[dict[str, str]]]:
-    """Return the columns that the first line of a CSV file names, and its rows by them; errors as of `read_text`.
-
-    Cells that a short line lacks are empty.
-    """
-    table = csv.DictReader(io.StringIO(read_text(path, remedy, what)), restval="")
+def read_csv(path: Path, remedy: str, description: str = "") -> tuple[list[str], list[dict[str, str]]]:
+    """Return the column names of a CSV file and its rows; missing cells are empty. Errors as in `read_text`."""
+    table = csv.DictReader(io.StringIO(read_text(path, remedy, description)), restval="")
     try:
         return list(table.fieldnames or ()), list(table)
     except csv.Error as error:
-        raise FormatError(f"no CSV: {error}", about=path, remedy=remedy) from error
+        raise FormatError(f"not a CSV file: {error}", about=path, remedy=remedy) from error
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Return rows as CSV text, RFC 4180 with lines that end with LF; None is left empty."""
+    """Return rows as CSV text (RFC 4180, lines end with LF); None becomes an empty cell."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
-def is_about_writing(error: BaseException, path: Path) -> TypeGuard[OSError]:
-    """Return whether `error` is about writing `path`, rather than about something that the caller read meanwhile."""
+def is_write_error(error: BaseException, path: Path) -> TypeGuard[OSError]:
+    """Return whether `error` was raised by writing `path`, not by something else that the caller did."""
     if not isinstance(error, OSError):
         return False
     if not isinstance(error.filename, str | bytes):
         return error.errno in _NAMELESS
-    about, partial = Path(os.fsdecode(error.filename)), partial_path(path)
-    return about in (path, partial, *path.parents) or partial in about.parents
+    file, partial = Path(os.fsdecode(error.filename)), partial_path(path)
+    return file in (path, partial, *path.parents) or partial in file.parents
 
 
-def make_folder(folder: Path, of: Path | None = None) -> None:
-    """Make a folder and those above it, where they are missing.
-
-    `of`: what the folder is made for, named in the messages; the folder itself if None.
-    """
-    path = folder if of is None else of
+def make_folder(folder: Path, target: Path | None = None) -> None:
+    """Make a folder and its missing parents; messages name `target`, by default the folder."""
+    path = folder if target is None else target
     for _ in range(FOLDER_ATTEMPTS):
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
-            # Another program may have taken it away between two calls.
+            # Another program may have removed it between two calls.
             if os.path.lexists(folder) and not folder.is_dir():
                 raise InputError(
-                    f"cannot write {path}: {_A_LINK if folder.is_symlink() else _PART_IS_A_FILE}"
+                    f"cannot write {path}: {_BROKEN_LINK if folder.is_symlink() else _PART_IS_A_FILE}"
                 ) from error
         except NotADirectoryError as error:
             raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
         except OSError as error:
-            raise _making_error(path, error) from error
+            raise _write_error(path, error) from error
         else:
             return
-    raise StorageError(f"cannot write {path}: its folder is there and not there; name a place on an ordinary disk")
+    raise StorageError(f"cannot write {path}: its folder cannot be made; choose a path on an ordinary disk")
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in `folder` durable; does nothing where the system cannot."""
+    """Flush the names in `folder` to the disk, if the system can."""
     try:
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -215,19 +208,21 @@ def sync_folder(folder: Path) -> None:
         finally:
             os.close(handle)
     except OSError as error:
-        # Systems that cannot flush a folder say EINVAL, ENOTSUP or EACCES.
-        if disk_remedy_of(error):
+        # Systems that cannot flush a folder raise EINVAL, ENOTSUP or EACCES.
+        if disk_remedy(error):
             raise storage_error(folder, error) from error
 
 
 @contextmanager
-def whole_file(path: Path, final: Callable[[], Path] | None = None, *, make: bool = True) -> Generator[BufferedRandom]:
-    """Open `path` for writing (and reading back) so that it appears complete, or not at all.
+def atomic_file(
+    path: Path, final: Callable[[], Path] | None = None, *, make_parents: bool = True
+) -> Generator[BufferedRandom]:
+    """Open a file for writing (and reading back) that gets its final name, `path` or `final()`, when the block ends.
 
-    An existing file of that name is replaced at the very end.
+    An existing file is replaced. If the block raises an error, the new file is removed.
     """
     partial = partial_path(path)
-    if make:
+    if make_parents:
         make_folder(path.parent, path)
     try:
         with partial.open("w+b") as stream:
@@ -239,32 +234,32 @@ def whole_file(path: Path, final: Callable[[], Path] | None = None, *, make: boo
     except BaseException as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
-        if is_about_writing(error, path):
-            raise _making_error(path, error) from error
+        if is_write_error(error, path):
+            raise _write_error(path, error) from error
         raise
 
 
-def read_whole(path: Path) -> memoryview:
-    """Return a large file's bytes, read only: for a `bytes` object the system clears each page of memory first."""
+def read_buffer(path: Path) -> memoryview:
+    """Return the bytes of a large file, read-only."""
     import numpy as np
 
     with path.open("rb", buffering=0) as stream:
-        # Large arrays are of large pages, a five-hundredth of the faults.
-        room = np.empty(os.fstat(stream.fileno()).st_size, np.uint8).data
+        # Faster than `bytes`, whose pages the system clears first. numpy uses large pages: 1/500 of the page faults.
+        buffer = np.empty(os.fstat(stream.fileno()).st_size, np.uint8).data
         filled = 0
-        while filled < len(room) and (count := stream.readinto(room[filled:])):
+        while filled < len(buffer) and (count := stream.readinto(buffer[filled:])):
             filled += count
         rest = stream.read()
-    return memoryview(bytes(room[:filled]) + rest) if rest else room[:filled].toreadonly()
+    return memoryview(bytes(buffer[:filled]) + rest) if rest else buffer[:filled].toreadonly()
 
 
-def write_whole(path: Path, data: bytes | str) -> None:
-    """Write `data` (text as UTF-8) to `path`, complete or not at all; see `whole_file`."""
-    with whole_file(path) as stream:
+def write_atomic(path: Path, data: bytes | str) -> None:
+    """Write `data`, text as UTF-8, to `path`; see `atomic_file`."""
+    with atomic_file(path) as stream:
         stream.write(data.encode() if isinstance(data, str) else data)
 
 
-_BLOCK: Final = 1 << 20  # Bytes read at a time: a block stays in the processor's second cache
+_BLOCK: Final = 1 << 20  # Bytes read at a time: one block fits into the second-level cache of the processor
 
 
 def sha256_of(data: Any) -> str:
@@ -273,7 +268,7 @@ def sha256_of(data: Any) -> str:
 
 
 def stream_sha256(stream: BinaryIO) -> str:
-    """Return the SHA-256 of what is left to read of an open file."""
+    """Return the SHA-256 of the rest of an open file."""
     digest = hashlib.sha256()
     while block := stream.read(_BLOCK):
         digest.update(block)
@@ -287,10 +282,7 @@ def file_sha256(path: Path) -> str:
 
 
 class HashingWriter(io.RawIOBase):
-    """A stream that is written in order, hashed and counted meanwhile.
-
-    `stream`: takes all bytes of every write, as a buffered file does; it is not closed by this one.
-    """
+    """Stream that hashes and counts the bytes written to `stream`, a buffered file, which stays open."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -298,11 +290,11 @@ class HashingWriter(io.RawIOBase):
         self._written = 0
 
     def writable(self) -> bool:
-        """Return True."""
+        """Return whether the stream can be written."""
         return True
 
     def write(self, data: Any) -> int:
-        """Write bytes, or an object with a contiguous buffer; return the number of bytes."""
+        """Write bytes, or an object with a contiguous buffer, and return the number of bytes."""
         size = memoryview(data).nbytes
         self._digest.update(data)
         self._stream.write(data)
@@ -315,28 +307,30 @@ class HashingWriter(io.RawIOBase):
 
     @property
     def sha256(self) -> str:
-        """Hash of all that was written so far."""
+        """SHA-256 of the bytes written so far."""
         return self._digest.hexdigest()
 
 
-# JSON is read as far as this: the description of a data set of a million pictures, all skipped, is a third of it.
-MOST_JSON_BYTES: Final = 256 << 20
+# Largest JSON file, in bytes: the description of a data set that skips a million pictures has a third of it.
+MAX_JSON_BYTES: Final = 256 << 20
 
-# Longest line of a file that is read by lines: the longest of ours are some hundred bytes, names of files 4096.
-MOST_LINE_BYTES: Final = 1 << 20
+# Longest line of a file that is read line by line, in bytes. Our longest lines have some hundred, file names 4096.
+MAX_LINE_BYTES: Final = 1 << 20
 
-_MOST_NAME: Final = 4096  # Longest name, as PATH_MAX of Linux has it
+_MAX_NAME_LENGTH: Final = 4096  # PATH_MAX of Linux, in characters
 
-# Bytes of a file that its disk need not hold: black pictures are copied with holes, though smaller ones.
-_MOST_HOLES: Final = 1 << 30
-_LOOKED_AT: Final = 4096  # Holes of a file that are counted; whoever makes more of them has filled as many blocks
+# Bytes of a file that may be holes, without blocks on the disk. Copies of black pictures have smaller holes.
+_MAX_HOLE_BYTES: Final = 1 << 30
 
-_COPY_REMEDY: Final = "ask who made the folder for a copy without it, or copy it with its links resolved (cp -rL)"
+# Number of holes that are counted. A file with more of them has as many blocks with data.
+_MAX_HOLES: Final = 4096
+
+_COPY_REMEDY: Final = "ask the author of the folder for a copy without it, or copy it with links resolved (cp -rL)"
 
 
 @lru_cache(8192)
 def is_inside_name(name: str) -> bool:
-    """Return whether a name that stands in a file leads to a place below its folder, without looking at the disk.
+    """Return whether a name from a file is a path below the file's folder; the disk is not read.
 
     Examples
     --------
@@ -344,21 +338,21 @@ def is_inside_name(name: str) -> bool:
     [True, False, False, False, False, False]
     """
     return (
-        0 < len(name) <= _MOST_NAME
+        0 < len(name) <= _MAX_NAME_LENGTH
         and "\0" not in name
-        and not any(part in ("", ".", "..") for part in name.split("/"))
+        and not any(component in ("", ".", "..") for component in name.split("/"))
     )
 
 
 @contextmanager
 def open_inside(root: Path, name: str) -> Generator[BinaryIO]:
-    """Open a file below a folder to be read."""
+    """Open a file below a folder for reading; links are followed if they stay inside."""
     if not is_inside_name(name):
-        raise FormatError(f"{root}: {name!r} is no name of a file inside the folder; {_COPY_REMEDY}")
-    handle = _opened_below(root, name)
+        raise FormatError(f"{root}: {name!r}, expected the name of a file inside the folder; {_COPY_REMEDY}")
+    handle = _open_without_links(root, name)
     if handle is None:
         inside = _target_inside(root, name)
-        handle = _opened_below(root, inside)
+        handle = _open_without_links(root, inside)
         if handle is None:
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(root / name))
     with open(handle, "rb") as stream:  # noqa: PTH123  a descriptor
@@ -366,37 +360,35 @@ def open_inside(root: Path, name: str) -> Generator[BinaryIO]:
         yield stream
 
 
-def require_plain_folder(
-    folder: Path, most_bytes: Mapping[str, int] | None = None, below: tuple[str, ...] = ()
-) -> None:
-    """Refuse a folder that holds anything but folders, regular files and links that stay inside."""
+def require_plain_folder(folder: Path, max_bytes: Mapping[str, int] | None = None, below: tuple[str, ...] = ()) -> None:
+    """Raise a FormatError unless a folder has only folders, regular files and links that stay inside.
+
+    `max_bytes`: size limits of files by name. `below`: subfolders that are checked too.
+    """
     try:
         for inner in ("", *below):
             with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder / inner) as entries:
                 for entry in entries:
                     _require_plain(folder, f"{inner}/{entry.name}" if inner else entry.name, entry)
-        for name, most in (most_bytes or {}).items():
-            _require_size(folder / name, most)
+        for name, limit in (max_bytes or {}).items():
+            _require_size(folder / name, limit)
     except OSError as error:
-        raise reading_error(folder, error, "see that it may be read") from error
+        raise reading_error(folder, error, "allow reading it") from error
 
 
-def _require_size(path: Path, most: int) -> None:
+def _require_size(path: Path, limit: int) -> None:
     try:
-        found = path.stat()
+        status = path.stat()
     except (FileNotFoundError, NotADirectoryError):
         return
-    if stat.S_ISREG(found.st_mode) and found.st_size > most:
+    if stat.S_ISREG(status.st_mode) and status.st_size > limit:
         raise FormatError(
-            f"{path} has {found.st_size} bytes, at most {most} expected; it is not what it is called, or damaged"
+            f"{path} has {status.st_size} bytes, expected at most {limit}; it is damaged or another file: restore it"
         )
 
 
 def require_plain_tree(folder: Path) -> None:
-    """Refuse a folder that holds, at any depth, anything but folders and regular files.
-
-    For folders of others' formats.
-    """
+    """Raise a FormatError unless a folder has only folders and regular files, at any depth."""
     for path, folders, files in os.walk(folder):
         for name in (*folders, *files):
             mode = (Path(path) / name).lstat().st_mode
@@ -404,29 +396,29 @@ def require_plain_tree(folder: Path) -> None:
                 raise FormatError(f"{Path(path) / name} is {_kind(mode)}, a regular file expected; {_COPY_REMEDY}")
 
 
-def bounded_lines(stream: BinaryIO, what: str) -> Iterator[bytes]:
-    """Yield the lines of a stream; a FormatError that names `what` if one is longer than `MOST_LINE_BYTES`."""
-    while line := stream.readline(MOST_LINE_BYTES + 1):
-        if len(line) > MOST_LINE_BYTES:
-            raise FormatError(f"{what} has a line of more than {MOST_LINE_BYTES} bytes; it is damaged")
+def bounded_lines(stream: BinaryIO, name: str) -> Iterator[bytes]:
+    """Yield the lines of a stream; raise a FormatError, with `name`, for a line longer than `MAX_LINE_BYTES`."""
+    while line := stream.readline(MAX_LINE_BYTES + 1):
+        if len(line) > MAX_LINE_BYTES:
+            raise FormatError(f"{name} has a line of more than {MAX_LINE_BYTES} bytes; it is damaged: restore it")
         yield line
 
 
-def _parse_json(data: bytes | str, what: str) -> Any:
-    """Return the value of a JSON text (RFC 8259), whose texts can be written as UTF-8; a FormatError names `what`."""
+def _parse_json(data: bytes | str, name: str) -> Any:
     import pydantic_core
 
+    # pydantic refuses lone surrogates, which the standard library accepts and which cannot be written as UTF-8.
     try:
         return pydantic_core.from_json(data)
     except ValueError as error:
-        raise FormatError(f"{what} is no JSON that can be read: {error}; it is damaged") from error
+        raise FormatError(f"{name} is not valid JSON: {error}; it is damaged: restore it") from error
 
 
-def parse_json_object(data: bytes | str, what: str) -> dict[str, Any]:
-    """Return the object of a JSON text, as `_parse_json`; a FormatError if it is something else."""
-    value = _parse_json(data, what)
+def parse_json_object(data: bytes | str, name: str) -> dict[str, Any]:
+    """Return the object of a JSON text (RFC 8259); a FormatError, with `name`, if it is not a JSON object."""
+    value = _parse_json(data, name)
     if not isinstance(value, dict):
-        raise FormatError(f"{what} holds {type(value).__name__}, a JSON object expected; it is damaged")
+        raise FormatError(f"{name} has a value of type {type(value).__name__}, expected a JSON object; restore it")
     return cast("dict[str, Any]", value)
 
 
@@ -448,14 +440,14 @@ def _require_regular(mode: int, path: Path) -> None:
 
 
 def _require_filled(handle: int, path: Path) -> None:
-    """Refuse a file that is mostly holes (lseek(2), SEEK_HOLE): a few bytes can claim more than anybody can read."""
+    # A small archive can unpack to a file of any size that is mostly holes (lseek(2), SEEK_HOLE).
     size = os.fstat(handle).st_size
-    if size <= _MOST_HOLES:
+    if size <= _MAX_HOLE_BYTES:
         return
     holes = data = 0
     with suppress(OSError):
-        # A file system that knows of no holes says that the first one is at the end.
-        for _ in range(_LOOKED_AT):
+        # File systems without holes report the first one at the end of the file.
+        for _ in range(_MAX_HOLES):
             hole = os.lseek(handle, data, os.SEEK_HOLE)
             if hole >= size:
                 break
@@ -463,8 +455,8 @@ def _require_filled(handle: int, path: Path) -> None:
             data = os.lseek(handle, hole, os.SEEK_DATA)
             holes -= size - data
     os.lseek(handle, 0, os.SEEK_SET)
-    if holes > _MOST_HOLES:
-        raise FormatError(f"{path} claims {size} bytes and holds at most {size - holes}; {_COPY_REMEDY}")
+    if holes > _MAX_HOLE_BYTES:
+        raise FormatError(f"{path} has a size of {size} bytes, of which {size - holes} are data; {_COPY_REMEDY}")
 
 
 def _kind(mode: int) -> str:
@@ -474,11 +466,11 @@ def _kind(mode: int) -> str:
         (stat.S_ISFIFO, "a pipe"),
         (stat.S_ISSOCK, "a socket"),
     )
-    return next((name for known, name in kinds if known(mode)), "a device")
+    return next((name for is_kind, name in kinds if is_kind(mode)), "a device")
 
 
-def _opened_below(root: Path, name: str) -> int | None:
-    """Return a descriptor of a file, opened step by step without following a link; None where there is a link."""
+def _open_without_links(root: Path, name: str) -> int | None:
+    """Return a descriptor of a file that is opened without following links; None if a part of its path is a link."""
     *folders, file = name.split("/")
     handle = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -501,20 +493,20 @@ def _opened_below(root: Path, name: str) -> int | None:
 
 def _has_link(root: Path, name: str) -> bool:
     path = root
-    for part in name.split("/"):
-        path = path / part
+    for component in name.split("/"):
+        path = path / component
         if path.is_symlink():
             return True
     return False
 
 
 def _target_inside(root: Path, name: str) -> str:
-    """Return the name, without links, of the file that a name leads to by links; a FormatError if that is outside."""
+    """Return the name below `root` to which a name with links leads."""
     top = root.resolve()
     try:
         target = (top / name).resolve(strict=True)
     except (OSError, RuntimeError) as error:
-        raise FormatError(f"{root / name} is a link that leads nowhere; {_COPY_REMEDY}") from error
+        raise FormatError(f"{root / name} is a link to a file that does not exist; {_COPY_REMEDY}") from error
     if not target.is_relative_to(top) or target == top:
-        raise FormatError(f"{root / name} is a link that leads out of {root}; {_COPY_REMEDY}")
+        raise FormatError(f"{root / name} is a link to a place outside {root}; {_COPY_REMEDY}")
     return target.relative_to(top).as_posix()

@@ -1,8 +1,8 @@
-"""Folders: whether a place is free, how they are published whole and emptied, who holds one, which disk is missing.
+"""Folders: atomic creation, locks, unmounted disks, the user's cache.
 
-A folder appears whole as a file does (`foundation.files`): filled beside its place under a hidden name, flushed to the
-disk, then renamed. One that is held is locked by the system, so that a program which ends leaves no lock behind; where
-a disk locks no folders, a file in it is locked. Also where the user's cache is.
+A folder is filled next to its place under a hidden name, then renamed, as files are (`foundation.files`). Locks are
+locks of the system, so a program that ends leaves none behind. If a file system cannot lock folders, a file in the
+folder is locked.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from typing import Final
 from foundation.errors import InputError, StorageError
 from foundation.files import (
     FOLDER_ATTEMPTS,
-    disk_remedy_of,
-    is_about_writing,
+    disk_remedy,
+    is_write_error,
     make_folder,
     partial_path,
     storage_error,
@@ -34,14 +34,14 @@ from foundation.files import (
 
 
 def cache_folder() -> Path | None:
-    """Return the user's folder for what can be computed again, or None if there is no home.
+    """Return the user's cache folder of CroP, or None if the user has no home folder.
 
-    `$XDG_CACHE_HOME/croplab` or `~/.cache/croplab` (XDG Base Directory Specification 0.8, which has a relative one
-    ignored), on macOS `~/Library/Caches/croplab`.
+    `$XDG_CACHE_HOME/croplab` or `~/.cache/croplab`, on macOS `~/Library/Caches/croplab`.
     """
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if given.is_absolute():
-        return given / "croplab"
+    # XDG Base Directory Specification 0.8: relative paths are ignored.
+    cache_home = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if cache_home.is_absolute():
+        return cache_home / "croplab"
     try:
         home = Path.home()
     except RuntimeError:
@@ -49,44 +49,44 @@ def cache_folder() -> Path | None:
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "croplab"
 
 
-def require_free(path: Path, what: str) -> None:
-    """Refuse when `path` exists and is not an empty folder."""
+def require_free(path: Path, content: str) -> None:
+    """Raise an error if `path` exists and is not an empty folder, or cannot be written.
+
+    `content`: noun for the message, such as "the LUT".
+    """
     try:
-        empty = path.is_dir() and not any(path.iterdir())
+        is_empty = path.is_dir() and not any(path.iterdir())
     except OSError as error:
-        if disk_remedy_of(error) is None:
+        if disk_remedy(error) is None:
             raise
-        raise storage_error(path, error, "look into") from error
-    if not empty:
-        require_free_file(path, what)
+        raise storage_error(path, error, "read") from error
+    if not is_empty:
+        require_free_file(path, content)
 
 
-def require_free_file(path: Path, what: str) -> None:
-    """Refuse when `path` exists, be it an empty folder, or nothing can be written there."""
+def require_free_file(path: Path, content: str) -> None:
+    """Raise an error if `path` exists, even as an empty folder, or cannot be written."""
     try:
-        taken = path.exists() or path.is_symlink()
-        folder = next(above for above in path.absolute().parents if above.exists())
-        probed = not taken and folder.is_dir()
+        exists = path.exists() or path.is_symlink()
+        folder = next(parent for parent in path.absolute().parents if parent.exists())
+        is_probed = not exists and folder.is_dir()
     except OSError as error:
-        if disk_remedy_of(error) is None:
+        if disk_remedy(error) is None:
             raise
-        raise storage_error(path, error, "look at") from error
-    if taken:
-        raise InputError(f"{path} already exists; name another place for {what}, or remove what is there")
-    if probed:
+        raise storage_error(path, error, "read") from error
+    if exists:
+        raise InputError(f"{path} already exists; name another place for {content}, or remove it")
+    if is_probed:
         try:
-            # What permissions and mounts say is not always so: only a file that was made says that one can be.
+            # Permissions and mount options can be misleading: only writing a file is a reliable test.
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             raise storage_error(path, error) from error
 
 
-def publish_folder(folder: Path, path: Path, what: str) -> None:
-    """Give a folder that is complete its final name, durably.
-
-    `path`: the final name; must be free, or an empty folder.
-    """
-    require_free(path, what)
+def publish_folder(folder: Path, path: Path, content: str) -> None:
+    """Rename a complete folder to `path`, which must be free or an empty folder, and flush it to the disk."""
+    require_free(path, content)
     try:
         folder.replace(path)
     except OSError as error:
@@ -95,12 +95,12 @@ def publish_folder(folder: Path, path: Path, what: str) -> None:
 
 
 @contextmanager
-def whole_folder(path: Path, what: str) -> Generator[Path]:
-    """Build a folder under a hidden name and give it its final name when the block ends well.
+def atomic_folder(path: Path, content: str) -> Generator[Path]:
+    """Make a folder under a hidden name, and rename it to `path` when the block ends without an error.
 
-    `path`: the final name; must be free, or an empty folder.
+    `path` must be free or an empty folder. If the block raises an error, the folder is removed.
     """
-    require_free(path, what)
+    require_free(path, content)
     partial = partial_path(path)
     make_folder(path.parent, path)
     try:
@@ -108,42 +108,42 @@ def whole_folder(path: Path, what: str) -> Generator[Path]:
             shutil.rmtree(partial)
         partial.mkdir()
         yield partial
-        publish_folder(partial, path, what)
+        publish_folder(partial, path, content)
     except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
-        if is_about_writing(error, path):
+        if is_write_error(error, path):
             raise storage_error(path, error) from error
         raise
 
 
 FSTAB: Final = Path("/etc/fstab")
-MOUNTS: Final = Path("/proc/self/mounts")  # Tables of disks, and of mounted ones, of Linux
+MOUNTS: Final = Path("/proc/self/mounts")  # Linux lists disks in FSTAB and mounted disks in MOUNTS
 
 
-def unmounted_at(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
-    """Return the folder at or above `path` where a disk of `fstab` is not mounted; None where each is, or none is told.
+def unmounted_folder(path: Path, fstab: Path = FSTAB, mounts: Path = MOUNTS) -> Path | None:
+    """Return the folder at or above `path` whose disk is not mounted; None if all are mounted or nothing is known.
 
-    `fstab`, `mounts`: the table of disks and that of mounted ones (fstab(5), proc(5)).
+    `fstab`, `mounts`: lists of disks and mounted disks (fstab(5), proc(5)).
     """
     try:
-        known, mounted = ({_place(line) for line in table.read_text().splitlines()} for table in (fstab, mounts))
+        disks, mounted = ({_mount_point(line) for line in table.read_text().splitlines()} for table in (fstab, mounts))
     except OSError:
         return None
-    whole = path.absolute()
-    missing = [place for place in known - mounted if place is not None and whole.is_relative_to(place)]
-    return max(missing, key=lambda place: len(place.parts), default=None)
+    absolute = path.absolute()
+    missing = [folder for folder in disks - mounted if folder is not None and absolute.is_relative_to(folder)]
+    return max(missing, key=lambda folder: len(folder.parts), default=None)
 
 
-def _place(line: str) -> Path | None:
-    """Return the second field of a line of such a table; None of a comment and of what is mounted nowhere."""
+def _mount_point(line: str) -> Path | None:
     fields = line.split()
     if len(fields) < 3 or fields[0].startswith("#") or not fields[1].startswith("/") or fields[1] == "/":
         return None
+    # Spaces and other special characters are octal escapes.
     return Path(re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), fields[1]))
 
 
 def clear_folder(folder: Path) -> None:
-    """Remove what lies in a folder that is held, but for its lock."""
+    """Remove all files and folders in a locked folder, except the lock file."""
     for path in folder.iterdir():
         if path.name == LOCK_FILE:
             continue
@@ -153,95 +153,92 @@ def clear_folder(folder: Path) -> None:
             path.unlink()
 
 
-LOCK_FILE: Final = ".lock"  # Name of the file that is locked where a folder cannot be
+LOCK_FILE: Final = ".lock"  # File that is locked if the folder cannot be
 
-# What a file system answers that cannot lock what it was asked to (flock(2); NFS, Lustre, FUSE, SMB, macOS).
+# Errors of file systems that cannot lock a file or folder (flock(2); NFS, Lustre, FUSE, SMB, macOS).
 _NO_LOCKS: Final = {errno.ENOLCK, errno.EBADF, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL}
 
 _log = logging.getLogger(__name__)
 
 
 class FolderLock:
-    """The hold on a folder; given by `held_folder`.
-
-    `handle`: open file descriptor of what is locked; None where the file system has no locks.
-    """
+    """Lock on a folder, from `locked_folder`; `handle` is the locked file descriptor, None without locks."""
 
     def __init__(self, handle: int | None) -> None:
         self._handle = handle
 
     def share(self) -> None:
-        """Let others hold the folder too, who ask for no more than a share of it."""
+        """Allow other programs to share the lock (`share_if` of `locked_folder`)."""
         if self._handle is not None:
             with contextlib.suppress(OSError):
                 fcntl.flock(self._handle, fcntl.LOCK_SH)
 
 
 @contextmanager
-def held_folder(
-    folder: Path, busy: str, share_if: Callable[[], bool] | None = None, of: Path | None = None
+def locked_folder(
+    folder: Path, busy: str, share_if: Callable[[], bool] | None = None, target: Path | None = None
 ) -> Generator[FolderLock]:
-    """Hold a folder while the block runs; it is made if it is not there.
+    """Lock a folder while the block runs; it is made if missing.
 
-    `share_if`: where given, another program's hold is waited for until it is shared (`FolderLock.share`), and joined if
-    this returns true then; if not, the attempt begins anew. `of`: what is made in the folder, named in the messages of
-    errors; the folder itself if None.
+    `busy` is the message of the InputError if another program has the lock. With `share_if`, wait until the other
+    program shares its lock (`FolderLock.share`), then share it if the function returns true, otherwise try again.
+    Messages name `target`, by default the folder.
     """
     for _ in range(FOLDER_ATTEMPTS):
-        make_folder(folder, of)
-        with ExitStack() as opened:
+        make_folder(folder, target)
+        with ExitStack() as resources:
             try:
-                place = _opened(folder, opened)
-                handle, together = _locked(place, folder, share_if is not None, opened)
-                there = _is_at(place, folder)
+                folder_handle = _open_folder(folder, resources)
+                handle, is_shared = _lock_folder(folder_handle, folder, share_if is not None, resources)
+                is_current = _is_at(folder_handle, folder)
             except FileNotFoundError:
-                continue  # Another program gave the folder its final name between two calls.
+                continue  # Another program renamed the folder to its final name between two calls.
             except BlockingIOError as error:
                 raise InputError(busy) from error
             except OSError as error:
-                raise storage_error(folder if of is None else of, error) from error
-            if not there or (together and share_if is not None and not share_if()):
+                raise storage_error(folder if target is None else target, error) from error
+            if not is_current or (is_shared and share_if is not None and not share_if()):
                 continue
             yield FolderLock(handle)
             return
-    place = folder if of is None else of
-    raise StorageError(f"cannot write {place}: its folder is made and not there; name a place on an ordinary disk")
+    path = folder if target is None else target
+    raise StorageError(f"cannot write {path}: its folder disappears when made; choose a path on an ordinary disk")
 
 
-def _opened(folder: Path, opened: ExitStack) -> int:
+def _open_folder(folder: Path, resources: ExitStack) -> int:
     handle = os.open(folder, os.O_RDONLY)
-    opened.callback(_close, handle)
+    resources.callback(_close, handle)
     return handle
 
 
 def _close(handle: int) -> None:
-    # Nothing was written to it: what a failing disk says now, it says of something else, too.
+    # Nothing was written to it, so an error of the disk is not about this folder.
     with contextlib.suppress(OSError):
         os.close(handle)
 
 
-def _locked(place: int, folder: Path, wait: bool, opened: ExitStack) -> tuple[int | None, bool]:
-    """Lock the open folder, else a file in it; return what is locked, and whether it is held together with others."""
-    with _lockless_suppressed():
-        return place, _lock(place, wait)
+def _lock_folder(folder_handle: int, folder: Path, wait: bool, resources: ExitStack) -> tuple[int | None, bool]:
+    """Lock the open folder, else a file in it; return the locked descriptor, and whether the lock is shared."""
+    with _ignore_missing_locks():
+        return folder_handle, _lock(folder_handle, wait)
     while True:
-        file = os.open(LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666, dir_fd=place)
-        opened.callback(_close, file)
-        together = None
-        with _lockless_suppressed():
-            together = _lock(file, wait)
-        if together is None:
-            _remove_lock_file(place)
-            _log.warning("%s: this file system has no locks; see to it that no other program works there", folder)
+        file = os.open(LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666, dir_fd=folder_handle)
+        resources.callback(_close, file)
+        is_shared = None
+        with _ignore_missing_locks():
+            is_shared = _lock(file, wait)
+        if is_shared is None:
+            _remove_lock_file(folder_handle)
+            _log.warning("%s: this file system has no locks; make sure that no other program uses the folder", folder)
             return None, False
-        if _is_lock_file(file, place):
-            opened.callback(_leave_lock_file, file, place)
-            return file, together
+        # The previous owner of the lock may have removed the file before we locked it.
+        if _is_lock_file(file, folder_handle):
+            resources.callback(_release_lock_file, file, folder_handle)
+            return file, is_shared
 
 
 @contextmanager
-def _lockless_suppressed() -> Generator[None]:
-    """Suppress the errors of a file system that cannot lock what it was asked to."""
+def _ignore_missing_locks() -> Generator[None]:
     try:
         yield
     except OSError as error:
@@ -249,28 +246,27 @@ def _lockless_suppressed() -> Generator[None]:
             raise
 
 
-def _is_lock_file(file: int, place: int) -> bool:
-    """Return whether the locked file is still the one in the folder; who held it last has removed it."""
+def _is_lock_file(file: int, folder_handle: int) -> bool:
     try:
-        return os.path.samestat(os.fstat(file), os.stat(LOCK_FILE, dir_fd=place))
+        return os.path.samestat(os.fstat(file), os.stat(LOCK_FILE, dir_fd=folder_handle))
     except FileNotFoundError:
         return False
 
 
-def _leave_lock_file(file: int, place: int) -> None:
-    """Remove the locked file, wherever its folder is by now, unless others hold it too."""
+def _release_lock_file(file: int, folder_handle: int) -> None:
+    # Fails if another program shares the lock. The folder may have been renamed, so it is addressed by its handle.
     with contextlib.suppress(OSError):
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        _remove_lock_file(place)
+        _remove_lock_file(folder_handle)
 
 
-def _remove_lock_file(place: int) -> None:
+def _remove_lock_file(folder_handle: int) -> None:
     with contextlib.suppress(OSError):
-        os.unlink(LOCK_FILE, dir_fd=place)
+        os.unlink(LOCK_FILE, dir_fd=folder_handle)
 
 
 def _lock(handle: int, wait: bool) -> bool:
-    """Hold alone, or together with others where `wait`; return whether it is held together."""
+    """Lock alone, or after waiting together with others; return whether the lock is shared."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -282,7 +278,7 @@ def _lock(handle: int, wait: bool) -> bool:
 
 
 def _is_at(handle: int, folder: Path) -> bool:
-    """Return whether the open folder is still the one of that name; another program may have finished it."""
+    # Another program may have renamed the folder.
     try:
         return os.path.samestat(os.fstat(handle), folder.stat())
     except FileNotFoundError:

@@ -1,8 +1,7 @@
-"""Holds on what only one program may use at a time and nothing locks by itself: a display, a lab.
+"""Locks for things that only one process may use at a time but no system locks, such as a display.
 
-A hold is a socket in Linux's abstract namespace (unix(7)): there is no file that could be left behind, or that another
-user could not open, it goes with its process however that ends, and who asks is told which process has it. Other
-systems have no such namespace: there nothing is held, and nothing refused.
+A lock is a socket in the abstract namespace of Linux (unix(7)). It leaves no file behind, ends with its process, and
+reports the process that holds it. Other systems have no such namespace; there, nothing is locked or refused.
 """
 
 from __future__ import annotations
@@ -17,14 +16,16 @@ from contextlib import contextmanager, suppress
 
 from foundation.errors import DeviceRefused
 
-_WAITING = 128  # Programs that may ask for the holder at a time; one more is not told the process
+# Length of the queue of processes that ask for the holder; a process beyond it gets no process number.
+_QUEUE_LENGTH = 128
 
 
 @contextmanager
-def hold(what: str, key: str) -> Generator[None]:
-    """Hold `what` against other processes while the block runs; DeviceRefused names the process that has it already.
+def hold(noun: str, key: str) -> Generator[None]:
+    """Lock a thing against other processes while the block runs; a process may lock it several times.
 
-    `key`: tells it from others of this machine. A process that holds it already may hold it again.
+    `noun` names the thing in messages, `key` identifies it on this machine. The DeviceRefused has the
+    number of the locking process as `value`, None if unknown.
     """
     if sys.platform != "linux":
         yield
@@ -33,13 +34,13 @@ def hold(what: str, key: str) -> Generator[None]:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC) as own:
         try:
             own.bind(name)
-            own.listen(_WAITING)
+            own.listen(_QUEUE_LENGTH)
         except OSError as error:
             holder = _holder(name)
             if holder != os.getpid():
-                who = "" if holder is None else f" (process {holder})"
+                process = "" if holder is None else f" (process {holder})"
                 raise DeviceRefused(
-                    f"another command of CroP{who} is at work with {what}",
+                    f"another command of CroP{process} is using {noun}",
                     remedy="wait until it has ended, or end it",
                     value=holder,
                 ) from error
@@ -47,7 +48,6 @@ def hold(what: str, key: str) -> Generator[None]:
 
 
 def _holder(name: bytes) -> int | None:
-    """Return the process that listens at a name; None if it does not say."""
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC) as link:
         link.setblocking(False)
         link.connect(name)

@@ -1,13 +1,12 @@
-"""A page's own server on this machine: a few addresses, answered to anybody whom `Access` lets look.
+"""HTTP server of one page on this machine; `Access` decides which requests are answered.
 
-A page on this machine's loopback needs no token: who is logged in here may read the files anyway. Names that another
-site has made to point here are still refused there (DNS rebinding), and so is what another site's page sends: browsers
-ask before a PUT, and say where the page is from. For other machines the address itself holds a token, as its first
-part, so that the page's relative addresses carry it on; a QR code (ISO/IEC 18004) in the terminal gives it to a phone.
+A page on the loopback address needs no token, because users of this machine can read the files anyway. Requests under
+foreign host names (DNS rebinding) and data sent by pages of other sites are refused. For other machines, the first part
+of the address is a token, so that relative addresses of the page contain it. A QR code in the terminal passes the
+address to a phone.
 
-Everybody can connect, with or without a token, so connections cost little and give way: a request's head must be there
-in `HEAD_S` from its first byte; and where there are as many connections as there may be, a new one takes the place of
-one that asks for nothing, of the address that has the most.
+Everybody can connect, with or without a token, so connections are limited. The head of a request must be complete
+`HEAD_S` after its first byte. If the maximum number is reached, a new connection replaces an inactive one.
 """
 
 from __future__ import annotations
@@ -32,111 +31,103 @@ from urllib.parse import parse_qs
 
 from foundation.errors import InputError
 
-# Random bytes of a token: 128 bits cannot be guessed, and still make a QR code that a terminal has room for.
+# Random bytes of a token: 128 bits cannot be guessed, and their QR code fits on a terminal.
 TOKEN_BYTES = 16
 
 
-QUIET_MODULES = 4  # Light modules around a code, as ISO/IEC 18004 asks for
+QUIET_MODULES = 4  # Width of the light border of a QR code, in modules (ISO/IEC 18004)
 
 
-MOST_CONNECTIONS = 64  # Connections at once; a page holds one or two
+MAX_CONNECTIONS = 64  # At the same time; a page uses one or two
 
-# A request whose head is not whole so long after its first byte, or after the connection was made, is none.
+# Time limit for the head of a request, s, from its first byte or from the start of the connection.
 HEAD_S = 5.0
 
-BODY_S = 30.0  # What is sent along must be there in this time behind the head
+BODY_S = 30.0  # Time limit for the body of a request, s, after its head
 
-ANSWER_S = 2.0  # A viewer who has not taken an answer in this time may lose the place to another, in seconds
+ANSWER_S = 2.0  # A viewer who has not received an answer in this time, s, may be disconnected for a new one
 
-# A connection on which nothing is asked for so long is closed; a page that is hidden asks every ten seconds.
+# A connection without requests is closed after this time, s. A hidden page sends one every 10 s.
 IDLE_S = 30.0
 
-GZIP_FROM_BYTES = 2048  # A smaller answer is one packet or two either way
+GZIP_FROM_BYTES = 2048  # Smaller answers fit into two packets without compression
 
 _TEXT = "text/plain; charset=utf-8"
 
-# Kinds of answers that gzip does not make smaller: pictures, and numbers with noise.
-_PICTURES = frozenset({"image/jpeg", "image/png", "application/octet-stream"})
+# Media types that gzip does not make smaller: pictures, and numbers with noise.
+_INCOMPRESSIBLE = frozenset({"image/jpeg", "image/png", "application/octet-stream"})
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for.
+    """An accepted request."""
 
-    - `path`: the address behind the server's own, without a slash before it; empty for the page.
-    - `query`: the first value of each name behind the question mark.
-    - `body`: what was sent along by a PUT; None where something is asked for.
-    """
-
-    path: str
-    query: Mapping[str, str] = field(default_factory=dict[str, str])
-    body: bytes | None = None
+    path: str  # Address below the server's address, without a leading slash; empty for the page
+    query: Mapping[str, str] = field(default_factory=dict[str, str])  # First value of each query parameter
+    body: bytes | None = None  # Body of a PUT; None for a GET
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a request is not answered: HTTP status and sentence."""
+    """HTTP status and message of a refused request."""
 
     status: int
-    sentence: str
+    message: str
 
 
 @dataclass(frozen=True)
 class Response:
-    """What a request is answered: media type, bytes, further headers; without a type, that nothing is new."""
+    """Media type, body and additional headers of an answer; an empty media type means "no change" (status 204)."""
 
-    kind: str
+    media_type: str
     body: bytes
     headers: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
 class Connections:
-    """Who is connected, and who gives way where there is no room.
+    """Open connections, limited to `limit` (1 or more); `now` returns the time in seconds."""
 
-    `most`: connections at once, 1 or more. `now`: time, seconds.
-    """
-
-    def __init__(self, most: int, now: Callable[[], float] = time.monotonic) -> None:
-        self._most = most
+    def __init__(self, limit: int, now: Callable[[], float] = time.monotonic) -> None:
+        self._limit = limit
         self._now = now
-        self._guard = threading.Lock()
+        self._lock = threading.Lock()
         self._open: dict[int, _Connection] = {}
 
     def admit(self, link: socket.socket, address: str) -> bool:
-        """Return whether there is room for a connection; another is closed for it if need be."""
-        with self._guard:
-            if len(self._open) >= self._most:
-                gives_way = self._who_gives_way()
-                if gives_way is None:
+        """Add a connection, if necessary in place of another; return whether it was added."""
+        with self._lock:
+            if len(self._open) >= self._limit:
+                replaceable = self._replaceable()
+                if replaceable is None:
                     return False
-                del self._open[id(gives_way.link)]
-                _hang_up(gives_way.link)
+                del self._open[id(replaceable.link)]
+                _shut_down(replaceable.link)
             self._open[id(link)] = _Connection(link, address, "new", self._now())
             return True
 
     def mark(self, link: socket.socket, state: Literal["idle", "answered"]) -> None:
-        """Note that a connection waits for its next request, or that one is being answered."""
-        with self._guard:
-            if known := self._open.get(id(link)):
-                known.state, known.since = state, self._now()
+        """Record that a connection waits for its next request ("idle"), or that a request is being answered."""
+        with self._lock:
+            if connection := self._open.get(id(link)):
+                connection.state, connection.since = state, self._now()
 
-    def forget(self, link: socket.socket) -> None:
-        """Note that a connection has ended."""
-        with self._guard:
+    def remove(self, link: socket.socket) -> None:
+        """Remove a connection that has ended."""
+        with self._lock:
             self._open.pop(id(link), None)
 
-    def _who_gives_way(self) -> _Connection | None:
-        """Return a connection that may be closed: first those that never asked, then idle ones, then the slow."""
+    def _replaceable(self) -> _Connection | None:
+        # From the address with most connections: first those without a request, then idle ones, then slow viewers.
         late = self._now() - ANSWER_S
         ranks = {"new": 0, "idle": 1, "answered": 2}
-        could = [one for one in self._open.values() if one.state != "answered" or one.since < late]
-        held = Counter(one.address for one in self._open.values())
-        return min(could, key=lambda one: (-held[one.address], ranks[one.state], one.since), default=None)
+        connections = [c for c in self._open.values() if c.state != "answered" or c.since < late]
+        counts = Counter(connection.address for connection in self._open.values())
+        return min(connections, key=lambda c: (-counts[c.address], ranks[c.state], c.since), default=None)
 
 
 @dataclass(eq=False)
 class _Connection:
-    """`state`: "new" before its first request; `since`: when it came to be in that state."""
+    """`state` is "new" before the first request; `since` is the time when the state began."""
 
     link: socket.socket
     address: str
@@ -144,75 +135,75 @@ class _Connection:
     since: float
 
 
-def _hang_up(link: socket.socket) -> None:
+def _shut_down(link: socket.socket) -> None:
     try:
         link.shutdown(socket.SHUT_RDWR)
     except OSError:
-        # It has gone by itself.
+        # The other side has closed it already.
         return
 
 
-class _PatientLink(io.RawIOBase):
-    """A connection as `http.server` takes it, read with patience: `idle_s` for a first byte, then `head_s`."""
+class _TimedLink(io.RawIOBase):
+    """Connection for `http.server` with time limits: `idle_s` for the first byte of a request, then `head_s`."""
 
     def __init__(self, link: socket.socket, head_s: float, idle_s: float) -> None:
         self.link = link
         self._head_s = head_s
         self._idle_s = idle_s
-        self._until: float | None = time.monotonic() + head_s
+        self._deadline: float | None = time.monotonic() + head_s
         link.settimeout(idle_s)
         self.sendall = link.sendall
         self.fileno = link.fileno
         self.setsockopt = link.setsockopt
 
     def makefile(self, mode: str, size: int) -> io.BufferedReader:
-        """Return what is read from."""
+        """Return a buffered reader of this connection."""
         del mode, size
         return io.BufferedReader(self)
 
     def expect(self, within_s: float | None = None) -> None:
-        """Begin to wait for the next request; or for what must be there in so many seconds."""
-        self._until = None if within_s is None else time.monotonic() + within_s
+        """Wait for the next request, or for data that must arrive within `within_s`."""
+        self._deadline = None if within_s is None else time.monotonic() + within_s
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, buffer: Any) -> int:
-        until = time.monotonic() + self._idle_s if self._until is None else self._until
-        left = until - time.monotonic()
-        if left <= 0:
-            raise TimeoutError("the request's head is not whole in time")
-        self.link.settimeout(left)
+        deadline = time.monotonic() + self._idle_s if self._deadline is None else self._deadline
+        remaining_s = deadline - time.monotonic()
+        if remaining_s <= 0:
+            raise TimeoutError("the head of the request is incomplete at its time limit")
+        self.link.settimeout(remaining_s)
         try:
             count = self.link.recv_into(buffer)
         finally:
             self.link.settimeout(self._idle_s)
-        if self._until is None:
-            self._until = time.monotonic() + self._head_s
+        if self._deadline is None:
+            self._deadline = time.monotonic() + self._head_s
         return count
 
 
 class LocalServer(ABC, ThreadingHTTPServer):
-    """Serves one page; not yet serving when it is made. An InputError says why it cannot listen there."""
+    """Server of one page, started by `serve`; the constructor raises an InputError if it cannot listen."""
 
-    command: ClassVar[str]  # The command that serves, as messages name it
-    most_bytes: ClassVar[int] = 0  # Bytes of the largest body of a PUT that is taken; 0 takes none
+    command: ClassVar[str]  # Name of the serving command in messages
+    max_bytes: ClassVar[int] = 0  # Size limit for the body of a PUT; 0 refuses all
 
     daemon_threads = True
-    request_queue_size = MOST_CONNECTIONS
+    request_queue_size = MAX_CONNECTIONS
 
     def __init__(
         self,
         host: str,
         port: int,
         *,
-        most: int = MOST_CONNECTIONS,
+        max_connections: int = MAX_CONNECTIONS,
         head_s: float = HEAD_S,
         idle_s: float = IDLE_S,
     ) -> None:
-        self.access = Access.to(host, self.command)
+        self.access = Access.for_host(host, self.command)
         self._host = host
-        self.connections = Connections(most)
+        self.connections = Connections(max_connections)
         self._head_s = head_s
         self._idle_s = idle_s
         if ":" in host:
@@ -221,25 +212,25 @@ class LocalServer(ABC, ThreadingHTTPServer):
             super().__init__((host, port), _Handler)
         except (OSError, OverflowError) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-            own = "" if is_loopback(host) else " or an address of this machine with --host"
-            raise InputError(f"cannot serve on {host} port {port}: {reason}; name another with --port{own}") from error
+            hint = "" if is_loopback(host) else " or an address of this machine with --host"
+            raise InputError(f"cannot serve on {host} port {port}: {reason}; name another with --port{hint}") from error
 
     @abstractmethod
     def answer(self, request: Request) -> Response | Refusal:
-        """Return the answer to a request; called from any number of threads."""
+        """Return the answer to a request; called from several threads."""
 
-    def serve(self, shows: str, warning: str) -> None:
-        """Print the page's address and serve until interrupted.
+    def serve(self, content: str, warning: str) -> None:
+        """Print the address of the page and serve it until interrupted.
 
-        `shows`: what the page shows. `warning`: what everybody who has the address can do, where others reach it.
+        `content`: what the page shows. `warning`: what other people can do if the server is reachable for them.
         """
         with suppress(KeyboardInterrupt):
             addresses = [f"http://{name}:{self.port}/{self.path}" for name in reachable_addresses(self._host)]
-            print(f"{' and '.join(addresses)} shows {shows}; Ctrl-C ends it", flush=True)
+            print(f"{' and '.join(addresses)} shows {content}; Ctrl-C ends it", flush=True)
             if not is_loopback(self._host):
                 print(
-                    f"warning: everybody who has this address and can reach this machine {warning}, and what is sent "
-                    "is not encrypted; use it in your own network only",
+                    f"warning: everybody who has this address and can reach this machine {warning}, and data are sent "
+                    "without encryption; use it only in your own network",
                     file=sys.stderr,
                 )
                 if sys.stdout.isatty() and "utf" in sys.stdout.encoding.lower():
@@ -248,40 +239,40 @@ class LocalServer(ABC, ThreadingHTTPServer):
 
     @property
     def port(self) -> int:
-        """The port that it listens on."""
+        """Port of the server."""
         return self.server_address[1]
 
     @property
     def path(self) -> str:
-        """What stands behind the first slash of the page's address: its token and a slash, or nothing."""
+        """Token with a slash, or an empty text: the part of the page's address after the first slash."""
         return f"{self.access.token}/" if self.access.token else ""
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread of its own, unless there are too many that are being answered."""
+        """Answer a connection in a new thread, or close it if all connections are being answered."""
         if self.connections.admit(request, str(client_address[0])):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer one connection, and make room for the next."""
+        """Answer a connection and remove it."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self.connections.forget(request)
+            self.connections.remove(request)
 
     def finish_request(self, request: Any, client_address: Any) -> None:
-        """Answer what a connection asks, which has a deadline."""
-        super().finish_request(_PatientLink(request, self._head_s, self._idle_s), client_address)  # pyrefly: ignore[bad-argument-type]
+        """Answer the requests of a connection, with time limits."""
+        super().finish_request(_TimedLink(request, self._head_s, self._idle_s), client_address)  # pyrefly: ignore[bad-argument-type]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of viewers that went away: the terminal is the user's."""
+        """Print nothing about viewers that disconnect."""
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: LocalServer  # pyrefly: ignore[bad-override-mutable-attribute]  # the handler's own server, by construction
+    server: LocalServer  # pyrefly: ignore[bad-override-mutable-attribute]  # http.server sets it to the LocalServer
     protocol_version = "HTTP/1.1"
-    # Head and body are written one after the other: the second would wait for the first to be acknowledged, 40 ms.
+    # Head and body are written separately. Otherwise the body would wait 40 ms for the acknowledgement of the head.
     disable_nagle_algorithm = True
 
     def handle_one_request(self) -> None:
@@ -289,109 +280,108 @@ class _Handler(BaseHTTPRequestHandler):
         self.server.connections.mark(self.request.link, "idle")
         self.request.expect()
 
-    def do_GET(self) -> None:  # the name is http.server's
+    def do_GET(self) -> None:  # name of http.server
         self.server.connections.mark(self.request.link, "answered")
-        asked = self.server.access.judge(self.path, self.headers.get("Host"))
-        self._send(asked if isinstance(asked, Refusal) else self.server.answer(asked))
+        request = self.server.access.check(self.path, self.headers.get("Host"))
+        self._send(request if isinstance(request, Refusal) else self.server.answer(request))
 
     do_HEAD = do_GET  # noqa: N815
 
-    def do_PUT(self) -> None:  # the name is http.server's
-        if not self.server.most_bytes:
+    def do_PUT(self) -> None:  # name of http.server
+        if not self.server.max_bytes:
             self._refuse()
             return
-        asked = self.server.access.judge(self.path, self.headers.get("Host"), self.headers.get("Origin"))
-        if isinstance(asked, Refusal):
-            self._send(asked, close=True)
+        request = self.server.access.check(self.path, self.headers.get("Host"), self.headers.get("Origin"))
+        if isinstance(request, Refusal):
+            self._send(request, close=True)
             return
         length = self.headers.get("Content-Length", "")
-        if not (length.isascii() and length.isdigit() and 0 < int(length) <= self.server.most_bytes):
-            most = self.server.most_bytes >> 20
-            self._send(Refusal(413, f"expected up to {most} MiB, and their number in the head"), close=True)
+        if not (length.isascii() and length.isdigit() and 0 < int(length) <= self.server.max_bytes):
+            limit = self.server.max_bytes >> 20
+            self._send(Refusal(413, f"expected a body of at most {limit} MiB, with Content-Length"), close=True)
             return
         self.request.expect(BODY_S)
         body = self.rfile.read(int(length))
         self.server.connections.mark(self.request.link, "answered")
-        self._send(self.server.answer(replace(asked, body=body)))
+        self._send(self.server.answer(replace(request, body=body)))
 
     def _refuse(self) -> None:
-        # A body that comes along is not read: what follows on this connection would be taken for a request.
-        more = {"Allow": "GET, HEAD", "Connection": "close"}
-        self._answer(405, _TEXT, b"this server only shows; ask with GET\n", more)
+        # The connection is closed: a body that is not read would be taken for the next request.
+        headers = {"Allow": "GET, HEAD", "Connection": "close"}
+        self._answer(405, _TEXT, b"method not allowed; use GET\n", headers)
 
     do_POST = do_DELETE = do_PATCH = do_OPTIONS = _refuse  # noqa: N815
 
     def _send(self, answer: Response | Refusal, close: bool = False) -> None:
         if isinstance(answer, Refusal):
-            more = {"Connection": "close"} if close else {}
-            self._answer(answer.status, _TEXT, f"{answer.sentence}\n".encode(), more)
+            headers = {"Connection": "close"} if close else {}
+            self._answer(answer.status, _TEXT, f"{answer.message}\n".encode(), headers)
         else:
-            self._answer(200 if answer.kind else 204, answer.kind, answer.body, answer.headers)
+            self._answer(200 if answer.media_type else 204, answer.media_type, answer.body, answer.headers)
 
-    def _answer(self, status: int, kind: str, body: bytes, more: Mapping[str, str]) -> None:
-        headers = {"Content-Type": kind} if kind else {}
+    def _answer(self, status: int, media_type: str, body: bytes, extra_headers: Mapping[str, str]) -> None:
+        headers = {"Content-Type": media_type} if media_type else {}
         headers |= {
             "Cache-Control": "no-store",
             "X-Content-Type-Options": "nosniff",
             "Referrer-Policy": "no-referrer",
             "Cross-Origin-Resource-Policy": "same-origin",
         }
-        if kind not in _PICTURES and len(body) >= GZIP_FROM_BYTES and "gzip" in self.headers.get("Accept-Encoding", ""):
+        accepts_gzip = "gzip" in self.headers.get("Accept-Encoding", "")
+        if media_type not in _INCOMPRESSIBLE and len(body) >= GZIP_FROM_BYTES and accepts_gzip:
             body = gzip.compress(body, 5, mtime=0)
             headers["Content-Encoding"] = "gzip"
         if status != 204:
             headers["Content-Length"] = str(len(body))
         self.send_response(status)
-        for name, value in (headers | dict(more)).items():
+        for name, value in (headers | dict(extra_headers)).items():
             self.send_header(name, value)
         self.end_headers()
         if self.command != "HEAD":
             self.wfile.write(body)
 
     def version_string(self) -> str:
-        """Return what the Server header says: no versions for strangers."""
+        """Return the Server header, without versions."""
         return self.server.command
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing: the terminal is the user's."""
+        """Log nothing: the terminal belongs to the user."""
 
 
 @dataclass(frozen=True)
 class Access:
-    """The rule of one server: the token that addresses must begin with, empty on loopback, and the names it goes by.
+    """Rule that decides which requests are answered."""
 
-    `command`: what printed the server's address, as messages name it.
-    """
-
-    token: str
-    names: frozenset[str]
-    command: str
+    token: str  # First part of all addresses; empty on the loopback address
+    names: frozenset[str]  # Host names of this server
+    command: str  # Command that printed the address, for messages
 
     @classmethod
-    def to(cls, host: str, command: str) -> Access:
-        """Return the rule of a server that listens on `host`, with a new token unless that is loopback."""
+    def for_host(cls, host: str, command: str) -> Access:
+        """Return the rule of a server that listens on `host`, with a new token unless it is a loopback address."""
         own = socket.gethostname().lower()
         names = frozenset({"localhost", host.lower(), own, f"{own}.local"})
         return cls("" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES), names, command)
 
-    def judge(self, target: str, host: str | None, origin: str | None = None) -> Request | Refusal:
-        """Return what a request asks for, or why it is refused.
+    def check(self, target: str, host: str | None, origin: str | None = None) -> Request | Refusal:
+        """Return the accepted request, or the refusal.
 
-        `host`: the Host header; None if there is none. `origin`: the Origin header, where something is sent.
+        `host`: Host header, None if missing. `origin`: Origin header of a PUT, None if missing.
         """
-        if not self._knows(host):
-            return Refusal(421, f"this server does not go by that name; open the address that {self.command} printed")
+        if not self._is_own_name(host):
+            return Refusal(421, f"unknown host name; open the address that {self.command} printed")
+        # Browsers send the origin of the page with a PUT.
         if origin is not None and origin.lower() != f"http://{host}".lower():
-            return Refusal(403, "only this server's own page may send something; use the page")
+            return Refusal(403, "data from a page of another server; use the page of this server")
         path, _, query = target.removeprefix("/").partition("?")
         if self.token:
             token, slash, path = path.partition("/")
             if not slash or not hmac.compare_digest(token.encode(), self.token.encode()):
-                return Refusal(403, f"the address lacks its token; open the one that {self.command} printed, whole")
+                return Refusal(403, f"wrong or missing token; open the complete address that {self.command} printed")
         return Request(path, {name: values[0] for name, values in parse_qs(query).items()})
 
-    def _knows(self, host: str | None) -> bool:
-        """Return whether a Host header (RFC 9110, 7.2) names this server: an address by number cannot be rebound."""
+    def _is_own_name(self, host: str | None) -> bool:
+        # Host header: RFC 9110, 7.2. Numeric addresses are accepted, since DNS rebinding needs a name.
         if not host:
             return False
         name = host.lower()
@@ -404,7 +394,7 @@ class Access:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host to listen on can be reached from this machine alone."""
+    """Return whether a host address is reachable from this machine only."""
     if host.lower() == "localhost":
         return True
     try:
@@ -414,10 +404,9 @@ def is_loopback(host: str) -> bool:
 
 
 def reachable_addresses(host: str) -> tuple[str, ...]:
-    """Return the names and numbers, for a URL, under which others reach a server that listens on `host`.
+    """Return the host names or addresses, for a URL, under which others reach a server that listens on `host`.
 
-    For a server on all interfaces: the address with which this machine would send into its network (nothing is sent),
-    else its name.
+    For a server on all interfaces, these are the addresses of the default routes, or else the name of the machine.
     """
     try:
         number = ipaddress.ip_address(host)
@@ -425,23 +414,24 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
         return (host,)
     if not number.is_unspecified:
         return (f"[{host}]" if number.version == 6 else host,)
-    found: list[str] = []
-    # TEST-NET-1 (RFC 5737) and its counterpart (RFC 3849): addresses of nobody, reached by the default route.
-    for family, nobody in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
+    addresses: list[str] = []
+    # Connecting a datagram socket sends nothing, but selects an address of this machine. The destinations are reserved
+    # for documentation (RFC 5737, RFC 3849), so they are reached by the default route.
+    for family, destination in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
         if family == socket.AF_INET6 and number.version == 4:
             continue
         try:
             with socket.socket(family, socket.SOCK_DGRAM) as probe:
-                probe.connect((nobody, 9))
-                own = str(probe.getsockname()[0])
+                probe.connect((destination, 9))
+                address = str(probe.getsockname()[0])
         except OSError:
             continue
-        found.append(f"[{own}]" if ":" in own else own)
-    return tuple(found) or (socket.gethostname(),)
+        addresses.append(f"[{address}]" if ":" in address else address)
+    return tuple(addresses) or (socket.gethostname(),)
 
 
 def qr_text(text: str) -> str:
-    """Return a QR code of `text` as lines of half blocks, dark on light on any terminal: two rows of modules a line."""
+    """Return a QR code (ISO/IEC 18004) as lines of half-block characters, with two rows of modules in each line."""
     import cv2
     import numpy as np
 
@@ -450,7 +440,7 @@ def qr_text(text: str) -> str:
     code = np.pad(code[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], QUIET_MODULES)
     if len(code) % 2:
         code = np.pad(code, ((0, 1), (0, 0)))
-    # Light modules are drawn, in white on black, whatever the terminal's own colours are.
+    # Light modules are drawn in white on black, independent of the colours of the terminal.
     blocks = {(False, False): "█", (False, True): "▀", (True, False): "▄", (True, True): " "}
     lines = (
         "".join(blocks[bool(upper), bool(lower)] for upper, lower in zip(above, below, strict=True))

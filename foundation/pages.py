@@ -1,10 +1,11 @@
-"""Pages as one HTML file that can be mailed: Jinja2 templates, one style sheet, figures inside, nothing fetched.
+"""HTML pages in one file, with style, scripts and figures inside, made from Jinja2 templates.
 
-A page follows the reader's choice of a light or dark screen and fits a telephone. Templates escape whatever they are
-given but what is markup already. A package keeps its own in a folder `templates`; they extend `base.html` and take
-pieces from `parts.html`, both here. Pages that are a row of headings, tables and figures need none: `page` puts them
-together. The content security policy in each page lets a browser run its own script and no other, so that a name out of
-a file cannot become code even if it reached the page as markup.
+Pages support light and dark screens and phones. Templates escape all values except `Markup`. A package has its
+templates in a folder `templates`; they extend `base.html` and use the macros of `parts.html`, both in this package. A
+page of headings, tables and figures needs no template (`page`).
+
+The content security policy of a page allows only its own script. A name from a file cannot become code, even if it is
+inserted without escaping.
 """
 
 from __future__ import annotations
@@ -21,16 +22,16 @@ from typing import Any, Final, Literal
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-_LEAST_SVG: Final = "36rem"  # Width below which a drawing scrolls in its place, since its letters would be too small
+# A drawing narrower than this is scrolled sideways instead of scaled, because its text would be too small.
+_MIN_SVG_WIDTH: Final = "36rem"
 
-# An option of a command and an interval, in escaped text: browsers break lines behind each hyphen and dash, whatever
-# space follows.
+# Options of commands and intervals in escaped text. Browsers break lines after hyphens and dashes.
 _UNBROKEN = re.compile(r"(?<![\w-])--[a-z][\w-]*|[-−]?\d[\d.]* – [-−]?\d[\d.]*")
 
 
 @dataclass(frozen=True)
 class RenderedPage:
-    """A page: its text, and its content security policy for a server that sends it."""
+    """HTML text of a page, and its content security policy for the header of a server."""
 
     text: str
     policy: str
@@ -42,29 +43,29 @@ def render(
     *,
     scripts: Sequence[str] = (),
     styles: Sequence[str] = (),
-    connects: bool = False,
+    uses_server: bool = False,
     **values: Any,
 ) -> RenderedPage:
-    """Return the page that a template of a package makes of values, among them its `title`.
+    """Render a template of a package with values, which include `title`.
 
-    `scripts` and `styles` are files beside the template, put into the page in that order, the styles after the common
-    sheet. `connects`: whether the page asks the server that it came from.
+    `scripts` and `styles` are files next to the template that are inserted into the page, styles after the common style
+    sheet. `uses_server`: whether the page sends requests to its server.
     """
     script = Markup("".join(_text(package, name) for name in scripts))
     sheets = (("foundation", "colours.css"), ("foundation", "style.css"), *((package, name) for name in styles))
     style = Markup("".join(_text(*sheet) for sheet in sheets))
-    # A page without a script may style its elements, as figures do: nothing in it can run.
+    # Inline styles, which figures have, are allowed in pages without scripts: there is no code to inject.
     policy = (
         f"default-src 'none'; {f'script-src {_hash(script)}; ' if script else ''}"
         f"style-src {_hash(style) if script else repr('unsafe-inline')}; base-uri 'none'; form-action 'none'; "
-        f"{'''connect-src 'self'; img-src 'self' data:''' if connects else 'img-src data:'}"
+        f"{'''connect-src 'self'; img-src 'self' data:''' if uses_server else 'img-src data:'}"
     )
-    found = _environment(package).get_template(template)
-    return RenderedPage(found.render(script=script, style=style, policy=Markup(policy), **values), policy)
+    loaded = _environment(package).get_template(template)
+    return RenderedPage(loaded.render(script=script, style=style, policy=Markup(policy), **values), policy)
 
 
 def page(title: str, parts: Sequence[Markup]) -> str:
-    r"""Return the text of an HTML file that shows the pieces made by the functions below.
+    r"""Return the HTML of a page with a title and parts, which are made by the functions below.
 
     Examples
     --------
@@ -75,7 +76,7 @@ def page(title: str, parts: Sequence[Markup]) -> str:
 
 
 def heading(text: str, level: int = 2) -> Markup:
-    """Return a heading; level 1 is the page's title and not to be given."""
+    """Return a heading of level 2 or more; level 1 is the title of the page."""
     return _piece("heading", text, level)
 
 
@@ -85,12 +86,12 @@ def paragraph(text: str) -> Markup:
 
 
 def note(text: str) -> Markup:
-    """Return a paragraph in small, faint type."""
+    """Return a paragraph in small grey type."""
     return _piece("note", text)
 
 
 def verdict(kind: Literal["accept", "remark", "refuse"], sentence: str) -> Markup:
-    """Return a sentence in a box of the verdict's colour."""
+    """Return a sentence in a box with the colour of the verdict."""
     return _piece("verdict", kind, sentence)
 
 
@@ -101,9 +102,9 @@ def table(
     numeric: Sequence[bool],
     notes: Sequence[str] = (),
 ) -> Markup:
-    """Return a table with its title and notes; it scrolls sideways where the screen is narrow.
+    """Return a table with title and notes, which scrolls sideways on narrow screens.
 
-    `numeric` says of each column whether it is of numbers; an interval of numbers is not broken over two lines.
+    `numeric`: whether each column has numbers, which are aligned to the right.
 
     Examples
     --------
@@ -114,27 +115,27 @@ def table(
 
 
 def figure(picture: bytes, caption: str, alt: str | None = None, wide: bool = False) -> Markup:
-    """Return a figure of the bytes of an SVG, PNG or JPEG file; SVG stands in the page and takes its colours.
+    """Return a figure from the bytes of an SVG, PNG or JPEG file; an SVG uses the colours of the page.
 
-    A `wide` one, of several panels side by side, scrolls sideways on a phone, where it would be too small to read.
+    `wide`: scroll it sideways on a phone instead of scaling it; for several panels in a row.
     """
     return _piece("figure", picture, caption, alt, None, wide)
 
 
 def row(parts: Sequence[Markup]) -> Markup:
-    """Return pieces side by side, as many as the screen is wide for."""
+    """Return parts next to each other, wrapped at the width of the screen."""
     return _piece("row", parts)
 
 
-def fold(summary: str, parts: Sequence[Markup], open_at_first: bool = False) -> Markup:
-    """Return pieces that a click on their summary shows and hides."""
-    return _piece("fold", summary, parts, open_at_first)
+def fold(summary: str, parts: Sequence[Markup], is_open: bool = False) -> Markup:
+    """Return parts that a click on the summary shows or hides."""
+    return _piece("fold", summary, parts, is_open)
 
 
 @cache
 def _environment(package: str) -> Environment:
     packages = dict.fromkeys((package, "foundation"))
-    made = Environment(
+    environment = Environment(
         loader=ChoiceLoader([PackageLoader(name) for name in packages]),
         autoescape=True,
         undefined=StrictUndefined,
@@ -142,9 +143,9 @@ def _environment(package: str) -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    filters: dict[str, Any] = made.filters
+    filters: dict[str, Any] = environment.filters
     filters.update(element=_element, unbroken=_unbroken)
-    return made
+    return environment
 
 
 def _piece(name: str, *values: Any) -> Markup:
@@ -162,20 +163,20 @@ def _hash(text: str) -> str:
 
 
 def _unbroken(text: str) -> Markup:
-    """Return a text whose intervals and options of commands stay on one line; what is copied of it is the text."""
+    # By style, not by special characters, so that copied text is unchanged.
     return Markup(_UNBROKEN.sub(r"<span class='unbroken'>\g<0></span>", str(escape(text))))
 
 
 def _element(picture: bytes, alt: str) -> Markup:
-    """Return the element of a picture: SVG stands in the page, PNG and JPEG as data URLs."""
+    """Return the HTML element of a picture: SVG is inserted, PNG and JPEG become data URLs."""
     for start, kind in ((b"\x89PNG", "png"), (b"\xff\xd8", "jpeg")):
         if picture.startswith(start):
             data = base64.b64encode(picture).decode()
             return Markup("<img alt='{}' src='data:image/{};base64,{}'>").format(alt, kind, data)
-    found = re.search(r"<svg\b.*</svg>", picture.decode("utf-8", errors="replace"), re.DOTALL)
-    if not found:
-        raise ValueError(f"a picture that begins with {picture[:8]!r} is none; expected PNG, JPEG or SVG")
-    # No drawing is made larger than it is, so that its letters are those of the others on the page.
-    own = re.search(r'<svg\b[^>]* width="([\d.]+)pt"', found[0])
-    style = f" style='min-width: min({_LEAST_SVG}, {own[1]}pt)'" if own else ""
-    return Markup(found[0].replace("<svg", f"<svg role='img' aria-label='{escape(alt)}'{style}", 1))
+    svg = re.search(r"<svg\b.*</svg>", picture.decode("utf-8", errors="replace"), re.DOTALL)
+    if not svg:
+        raise ValueError(f"picture data begin with {picture[:8]!r}; expected PNG, JPEG or SVG")
+    # Drawings are never enlarged, so that all drawings of a page have the same text size.
+    width = re.search(r'<svg\b[^>]* width="([\d.]+)pt"', svg[0])
+    style = f" style='min-width: min({_MIN_SVG_WIDTH}, {width[1]}pt)'" if width else ""
+    return Markup(svg[0].replace("<svg", f"<svg role='img' aria-label='{escape(alt)}'{style}", 1))

@@ -1,11 +1,11 @@
-"""Finished pieces of long work: the record from which a program that was killed goes on.
+"""Record file of the finished pieces of a long job, with which a killed program resumes.
 
-A record file has one line for each finished piece: the SHA-256 of the rest of the line, then the piece's name, the
-hash of its inputs, its files as a JSON object of names and SHA-256, and its values as JSON, separated by tabs.
+A line has the SHA-256 of the rest of the line, the name of a piece, the hash of its inputs, its files as a JSON object
+of names and SHA-256, and its values as JSON, separated by tabs.
 
 - A line is written after the files of its piece.
-- A line that was cut or changed is left out, and so is a piece of other inputs: that piece is made again.
-- A file that was not synchronised with the disk before its line was written counts only if it has its hash.
+- Damaged lines, and pieces made from other inputs, are ignored, so these pieces are made again.
+- A file that was not flushed to the disk before its line was written is used only if its hash is correct.
 """
 
 from __future__ import annotations
@@ -22,26 +22,21 @@ from foundation.files import sha256_of, stream_sha256
 
 @dataclass(frozen=True)
 class Piece:
-    """A finished piece.
+    """A finished piece of a job."""
 
-    - `name`: what it is; without tabs and line ends.
-    - `inputs`: hash, or identifier, of all that it was made of.
-    - `files`: SHA-256 of each file that it consists of, by the file's name.
-    - `values`: all else that it gave, JSON on one line.
-    """
-
-    name: str
-    inputs: str
-    files: Mapping[str, str]
-    values: str
+    name: str  # Without tabs and line ends
+    inputs: str  # Hash or identifier of the inputs
+    files: Mapping[str, str]  # SHA-256 by file name
+    values: str  # Other results, as JSON on one line
 
     def to_line(self) -> bytes:
-        """Return its line of a record file; it may follow a line that was cut."""
+        """Return its line of a record file."""
+        # Begins with a line end, because the last line of the file may be incomplete.
         rest = "\t".join((self.name, self.inputs, json.dumps(dict(self.files)), self.values)).encode()
         return b"\n%s\t%s\n" % (sha256_of(rest).encode(), rest)
 
-    def is_whole(self, open_file: Callable[[str], AbstractContextManager[BinaryIO]]) -> bool:
-        """Return whether each of its files is there with its hash; `open_file` opens one by its name."""
+    def is_complete(self, open_file: Callable[[str], AbstractContextManager[BinaryIO]]) -> bool:
+        """Return whether all its files exist with the recorded hashes; `open_file` opens a file by name."""
         try:
             for name, sha256 in self.files.items():
                 with open_file(name) as stream:
@@ -52,16 +47,16 @@ class Piece:
         return True
 
 
-def pieces_of(data: bytes, inputs: str | None = None) -> dict[str, Piece]:
-    """Return the pieces in a record file's bytes by their names, the last of each name; damaged lines are left out.
+def read_pieces(data: bytes, inputs: str | None = None) -> dict[str, Piece]:
+    """Return the pieces of a record file by name, the last one of each name.
 
-    `inputs`: what the pieces must be made of; None for any.
+    `inputs`: if given, only pieces made from these inputs.
     """
-    found: dict[str, Piece] = {}
+    pieces: dict[str, Piece] = {}
     for line in data.split(b"\n"):
         sha256, _, rest = line.partition(b"\t")
         fields = rest.decode("utf-8", "replace").split("\t")
         if sha256 == sha256_of(rest).encode() and len(fields) == 4 and inputs in (None, fields[1]):
-            name, made_of, files, values = fields
-            found[name] = Piece(name, made_of, json.loads(files), values)
-    return found
+            name, piece_inputs, files, values = fields
+            pieces[name] = Piece(name, piece_inputs, json.loads(files), values)
+    return pieces

@@ -1,9 +1,6 @@
-"""Figures by Matplotlib: SVG that takes a page's colours, PNG on white, the same bytes every time.
+"""Matplotlib figures as SVG with the colours of the page, or as PNG on white; the same data give the same bytes.
 
-The series colours are those of M. Okabe and K. Ito, "Color universal design", 2008, which the colour-blind tell apart;
-black and yellow, which vanish on a dark and a light screen, are replaced by grey and left out. Line styles change with
-every round of the colours. Matplotlib is imported where a figure is made, and used through its objects only: no window
-is opened and no state left behind.
+Matplotlib is imported when a figure is drawn, and used through its objects only, without windows and global state.
 """
 
 from __future__ import annotations
@@ -18,29 +15,30 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-# Colours of text, of axes and notes, of rules, and of the page itself; an SVG's are exchanged on a dark screen.
+# Colours of text, of axes and notes, of grid lines, and of the background. In an SVG, a dark screen replaces them.
 INK, FAINT, GRID, PAPER = "#22262b", "#5b636d", "#e3e6ea", "#fdfdfe"
 
-# Colour of what is marked in a picture.
+# Colour of marks in a picture.
 MARK = "#e8502a"
 
-# Colours of lines of R, G and B.
+# Colours of the lines for R, G and B.
 CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
 
-# Colours of series, in the order of their use.
+# Colours of series: M. Okabe, K. Ito, "Color universal design", 2008, distinguishable for colour-blind people. Black is
+# replaced by grey and yellow omitted, since they are invisible on a dark and a light screen.
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f8790")
 
-DASHES = ("-", "--", ":", "-.")  # Line styles: the first for the first round of colours, and so on
+DASHES = ("-", "--", ":", "-.")  # Line styles: the first one for the first seven series, and so on
 
-# Variables of `templates/colours.css` that the colours of an SVG become.
-_NAMES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
+# Variables of `templates/colours.css` that replace the colours of an SVG.
+_CSS_VARIABLES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
 
-_PNG_DPI = 110  # Pictures 10 inches wide fill a page's 1100 pixels
+_PNG_DPI = 110  # A picture of 10 inches fills the page width of 1100 pixels
 
-# Photographs are as large as at Matplotlib's own 6, and written in a third of the time.
+# Level 4 gives photographs of the same size as Matplotlib's level 6 in a third of the time.
 _PNG_SETTINGS: Final = (cv2.IMWRITE_PNG_COMPRESSION, 4)
 
-# Resolution of what is drawn as a picture within an SVG, pixels an inch: sharp on a screen of twice the usual.
+# Resolution of raster parts of an SVG, pixels per inch: sharp on a screen with twice the usual resolution.
 _RASTER_DPI = 180
 
 _STYLE = {
@@ -55,7 +53,7 @@ _STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.titlesize": 10,
-    # Names of methods, images and data sets are the user's: "$" begins no mathematics.
+    # Names of methods, images and data sets may contain "$", which is not mathematics there.
     "text.parse_math": False,
 }
 
@@ -68,13 +66,13 @@ _SVG_STYLE = _STYLE | {
     "grid.color": GRID,
     "legend.frameon": False,
     "svg.fonttype": "none",
-    # Names of parts come from a hash; without a salt of its own each run draws another.
+    # Names of SVG elements come from a hash. Without a fixed salt they differ in each run.
     "svg.hashsalt": "crop",
 }
 
 
 def series_style(number: int) -> dict[str, str]:
-    """Return Matplotlib's `color` and `linestyle` of the series of that number, counted from 0.
+    """Return the Matplotlib keywords `color` and `linestyle` of a series, numbered from 0.
 
     Examples
     --------
@@ -85,7 +83,7 @@ def series_style(number: int) -> dict[str, str]:
 
 
 def legend_label(name: str) -> str:
-    """Return a name as Matplotlib's legends show it, which leave out what begins with an underscore.
+    """Return a name for a legend of Matplotlib, which omits names with a leading underscore.
 
     Examples
     --------
@@ -95,30 +93,29 @@ def legend_label(name: str) -> str:
     return f" {name}" if name.startswith("_") else name
 
 
-def png_of(draw: Callable[..., None], *arguments: Any) -> bytes:
-    """Return the PNG of a figure that `draw(figure, *arguments)` fills and gives its size; it has plain numbers."""
+def draw_png(draw: Callable[..., None], *arguments: Any) -> bytes:
+    """Return the PNG of a figure; `draw(figure, *arguments)` sets its size and draws it."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    # Matplotlib's own types leave the keyword arguments of every method unknown.
+    # `Any`, since the types of Matplotlib do not describe keyword arguments.
     library: Any = matplotlib
     with library.rc_context(_STYLE):
         figure: Any = Figure(layout="constrained", dpi=_PNG_DPI)
         canvas: Any = FigureCanvasAgg(figure)
         draw(figure, *arguments)
         _write_plain_numbers(figure)
-        # Figure.savefig draws all of it twice, once for the layout alone.
+        # Faster than Figure.savefig, which draws everything twice, once for the layout.
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())
     return cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGR), _PNG_SETTINGS)[1].tobytes()
 
 
-def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, float] = (7.2, 4.0)) -> bytes:
-    """Return the SVG of a figure that `draw(figure, *arguments)` fills.
+def draw_svg(draw: Callable[..., None], *arguments: Any, inches: tuple[float, float] = (7.2, 4.0)) -> bytes:
+    """Return the SVG of a figure that `draw(figure, *arguments)` draws, for use in a page (`foundation.pages.figure`).
 
-    `INK`, `FAINT`, `GRID` and `PAPER` in it become the page's colours of that name, which a dark screen exchanges, so
-    the SVG is to stand in a page (`foundation.pages.figure`). Text stays text; logarithmic axes have plain numbers.
+    The colours `INK`, `FAINT`, `GRID` and `PAPER` become CSS variables, which the page defines. Text remains text.
     """
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -133,13 +130,13 @@ def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, floa
         stream = BytesIO()
         figure.savefig(stream, format="svg", dpi=_RASTER_DPI, metadata={"Date": None})
     text = stream.getvalue().decode()
-    for colour, name in _NAMES.items():
+    for colour, name in _CSS_VARIABLES.items():
         text = re.sub(re.escape(colour), f"var(--{name})", text, flags=re.IGNORECASE)
     return text.encode()
 
 
-def standalone(svg: bytes) -> bytes:
-    """Return an SVG of `svg_of` as a file of its own: with a page's colours, light or dark as the reader likes.
+def standalone_svg(svg: bytes) -> bytes:
+    """Add the colours of a page, light and dark, to an SVG of `draw_svg`, so that it can be a separate file.
 
     Examples
     --------
@@ -148,36 +145,34 @@ def standalone(svg: bytes) -> bytes:
     """
     colours = (resources.files("foundation") / "templates" / "colours.css").read_text(encoding="utf-8")
     style = f"<style>{colours}svg {{ background: var(--paper); font-family: system-ui, sans-serif }}</style>"
-    return re.sub(rb"(<svg\b[^>]*>)", lambda found: found[1] + style.encode(), svg, count=1)
+    return re.sub(rb"(<svg\b[^>]*>)", lambda match: match[1] + style.encode(), svg, count=1)
 
 
 def draw_squares(
     axes: Any,
     page_mm: tuple[float, float],
-    places_mm: npt.NDArray[np.float64],
+    positions_mm: npt.NDArray[np.float64],
     side_mm: float,
     values: npt.NDArray[np.float64],
     inches: float,
     **colours: Any,
 ) -> Any:
-    """Draw values (N,) as squares where they lie on a page, (N, 2) mm from its top left; return them for a colour bar.
+    """Draw values (N,) as squares at positions (N, 2) on the chart page; return the squares, for a colour bar.
 
-    `inches`: width of the axes, about. `colours`: `cmap`, `vmin`, `vmax`.
+    `inches` is the approximate width of the axes, `colours` are the keywords `cmap`, `vmin`, `vmax` of Matplotlib.
     """
     width, height = page_mm
-    # A marker's size is an area in points, 72 to an inch.
+    # The size of a marker is an area in square points; 72 points are an inch.
     points = max(72 * inches / width * side_mm, 1.2)
     axes.set(xlabel="mm", xlim=(0, width), ylim=(height, 0), aspect="equal")
-    return axes.scatter(*places_mm.T, c=values, s=points**2, marker="s", linewidths=0, **colours)
+    return axes.scatter(*positions_mm.T, c=values, s=points**2, marker="s", linewidths=0, **colours)
 
 
 def _write_plain_numbers(figure: Any) -> None:
-    """Give logarithmic axes numbers: Matplotlib writes powers of ten in mathematics, which is not set here."""
+    # Matplotlib labels logarithmic axes with mathematics, which `text.parse_math` switches off.
     from matplotlib.ticker import LogFormatter
 
     class PlainLogFormatter(LogFormatter):
-        """Numbers where Matplotlib's own formatter has them."""
-
         def __call__(self, x: float, pos: int | None = None) -> str:
             return f"{x:g}" if super().__call__(x, pos) else ""
 

@@ -1,7 +1,7 @@
-"""What is written as JSON or TOML and read again: typed, frozen records, made and checked by pydantic.
+"""Typed, frozen records that are written as JSON or TOML and read again, with checks by pydantic.
 
-A record's fields are the file's keys. Files of later versions may have more keys, those of earlier ones fewer: what was
-added has a default. Arrays are lists in the file, numbers that are not finite are null.
+The fields of a record are the keys of the file. Files of later versions may have more keys, files of earlier versions
+fewer, so new fields need a default. Arrays are lists in the file; NaN and infinite numbers are null.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def _as_lists(values: npt.NDArray[Any]) -> Any:
 
 
 def _finite(value: Any) -> Any:
-    """Return lists and numbers with None in place of what JSON cannot say."""
+    # JSON has no NaN and infinity.
     if isinstance(value, list):
         return [_finite(item) for item in cast("list[Any]", value)]
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -54,45 +54,45 @@ FloatArray = Annotated[npt.NDArray[np.float64], PlainValidator(_as_floats), Plai
 
 
 class Record(BaseModel):
-    """A frozen record; a key that is not known is passed over, as later versions may have more."""
+    """Frozen record; unknown keys are ignored, because later versions may add keys."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
 
 @cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
+def _adapter(record_type: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(record_type)
 
 
-def to_plain(record: Any, kind: Any = None) -> Any:
-    """Return a record, or a dataclass with typed fields, as JSON's objects, lists and numbers.
+def to_plain(record: Any, record_type: Any = None) -> Any:
+    """Convert a record, or a dataclass with typed fields, to dictionaries, lists and numbers for JSON.
 
-    `kind` is its type, where it is not that of the object alone (`tuple[Frame, ...]`).
+    `record_type` is needed if the type of the object is incomplete (`tuple[Frame, ...]`).
     """
-    return _adapter(kind or cast("Any", type(record))).dump_python(record, mode="json")
+    return _adapter(record_type or cast("Any", type(record))).dump_python(record, mode="json")
 
 
-def from_plain(kind: type[T], value: Any, about: object, remedy: str) -> T:
-    """Return the record of a type, or a dataclass, from JSON or TOML objects; a FormatError says which key is wrong.
+def from_plain(record_type: type[T], value: Any, about: object, remedy: str) -> T:
+    """Make a record, or a dataclass, from JSON or TOML objects; a FormatError names a wrong key.
 
-    `about`: the file; `remedy`: what helps.
+    `about` (the file) and `remedy` are for the message.
     """
     try:
-        return _adapter(kind).validate_python(value)
+        return _adapter(record_type).validate_python(value)
     except ValidationError as error:
-        raise damaged(error, about, remedy) from error
+        raise damaged_error(error, about, remedy) from error
 
 
-def from_json(kind: type[T], text: bytes | str, about: object, remedy: str) -> T:
-    """Return the record of a type, or a dataclass, from the text of a JSON file; errors as of `from_plain`."""
+def from_json(record_type: type[T], text: bytes | str, about: object, remedy: str) -> T:
+    """Make a record, or a dataclass, from the text of a JSON file; see `from_plain`."""
     try:
-        return _adapter(kind).validate_json(text)
+        return _adapter(record_type).validate_json(text)
     except ValidationError as error:
-        raise damaged(error, about, remedy) from error
+        raise damaged_error(error, about, remedy) from error
 
 
-def damaged(error: ValidationError, about: object, remedy: str) -> FormatError:
-    """Return what to tell a user of a file that pydantic refused: the first key that is wrong, its value, and why."""
+def damaged_error(error: ValidationError, about: object, remedy: str) -> FormatError:
+    """Return the error for a file that pydantic refused, with the first wrong key, its value and the reason."""
     first = error.errors(include_url=False)[0]
     key = ".".join(map(str, first["loc"]))
     reason = first["msg"].removeprefix("Value error, ")
@@ -106,19 +106,19 @@ def damaged(error: ValidationError, about: object, remedy: str) -> FormatError:
 
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
-    """Return the tables of a TOML text; `where` names it in errors."""
+    """Return the tables of a TOML text; messages name it `where`."""
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise ConfigurationError(
-            f"{where} is not TOML: {error}; correct that line: a text stands in quotation marks"
+            f"{where} is not TOML: {error}; correct that line: texts need quotation marks"
         ) from error
 
 
-def list_mistakes(found: Collection[str]) -> str:
-    """Return one mistake after a space, several on lines of their own."""
-    lines = "".join(f"\n  {mistake}" for mistake in found)
-    return f" {next(iter(found))}" if len(found) == 1 else f" {len(found)} mistakes:{lines}"
+def list_mistakes(mistakes: Collection[str]) -> str:
+    """Return one mistake after a space, or several in separate lines."""
+    lines = "".join(f"\n  {mistake}" for mistake in mistakes)
+    return f" {next(iter(mistakes))}" if len(mistakes) == 1 else f" {len(mistakes)} mistakes:{lines}"
 
 
 def find_mistakes(
@@ -126,83 +126,83 @@ def find_mistakes(
     document: Mapping[str, Any],
     error: ValidationError,
     is_secret: Callable[[str], bool] = lambda key: False,
-    not_to_choose: str = "",
+    hidden_choice: str = "",
 ) -> list[str]:
-    """Return each mistake in a settings file: key, value and what was expected.
+    """Return each mistake in a settings file: key, value found, value expected.
 
-    `is_secret`: whether the value of a key is masked. `not_to_choose`: a word that is not named among the known ones.
+    `is_secret` returns whether the value of a key must be masked. `hidden_choice` is an allowed value that messages do
+    not list.
     """
     errors = error.errors()
-    unknown = [one["loc"] for one in errors if one["type"] == "extra_forbidden"]
-    found: dict[str, str] = {}
-    for one in errors:
-        place, table = one["loc"], _table_at(model, one["loc"][:-1])
-        key, value = _key_of(place, document), one["input"]
-        if one["type"] == "extra_forbidden" and table is not None:
-            found[key] = unknown_key(key, table.model_fields)
-        elif one["type"] == "missing" and table is not None:
-            # A key that is misspelt is not missing as well.
-            near = (nearest_names(str(other[-1]), table.model_fields) for other in unknown if other[:-1] == place[:-1])
-            if f"did you mean {place[-1]!r}?" not in near:
-                found[key] = _missing(key, _table_at(model, place))
+    unknown = [detail["loc"] for detail in errors if detail["type"] == "extra_forbidden"]
+    mistakes: dict[str, str] = {}
+    for detail in errors:
+        location, table = detail["loc"], _table_at(model, detail["loc"][:-1])
+        key, value = _file_key(location, document), detail["input"]
+        if detail["type"] == "extra_forbidden" and table is not None:
+            mistakes[key] = unknown_key(key, table.model_fields)
+        elif detail["type"] == "missing" and table is not None:
+            # A misspelt key is reported once, not also as missing.
+            siblings = (loc for loc in unknown if loc[:-1] == location[:-1])
+            questions = (nearest_names(str(loc[-1]), table.model_fields) for loc in siblings)
+            if f"did you mean {location[-1]!r}?" not in questions:
+                mistakes[key] = _missing(key, _table_at(model, location))
         else:
-            expected = _expectation(key, one, is_secret(key), not_to_choose)
+            expected = _expectation(key, detail, is_secret(key), hidden_choice)
             # A whole table is too long for a message.
-            shown = "" if isinstance(value, dict) else f" = {MASK if is_secret(key) else repr(value)}"
-            begin = f"{key}{shown}: " if key else ""
-            # A value that may be of several types has an error for each of them.
-            found[key] = f"{found[key]}, or {expected}" if key in found else f"{begin}{expected}"
-    return list(found.values())
+            value_text = "" if isinstance(value, dict) else f" = {MASK if is_secret(key) else repr(value)}"
+            prefix = f"{key}{value_text}: " if key else ""
+            # A value that may have several types has an error for each of them.
+            mistakes[key] = f"{mistakes[key]}, or {expected}" if key in mistakes else f"{prefix}{expected}"
+    return list(mistakes.values())
 
 
-def _key_of(place: tuple[int | str, ...], document: Any) -> str:
-    """Return the key as it is in the file, without what pydantic adds.
-
-    It adds a number if a single value is read as a list, the type if there are several, and "[key]" if the key of a
-    table is wrong.
-    """
-    parts: list[str] = []
-    for part in place:
-        if part == "[key]" or not isinstance(document, list if isinstance(part, int) else dict):
+def _file_key(location: tuple[int | str, ...], document: Any) -> str:
+    # Omits the additions of pydantic: a number if a single value is read as a list, the type if several are allowed,
+    # and "[key]" if the key of a table is wrong.
+    components: list[str] = []
+    for component in location:
+        if component == "[key]" or not isinstance(document, list if isinstance(component, int) else dict):
             break
-        parts.append(str(part))
-        # A key that is missing ends the place.
-        document = cast("Any", document)[part] if isinstance(part, int) or part in document else None
-    return ".".join(parts)
+        components.append(str(component))
+        # A missing key ends the location.
+        is_present = isinstance(component, int) or component in document
+        document = cast("Any", document)[component] if is_present else None
+    return ".".join(components)
 
 
 def _missing(key: str, table: type[BaseModel] | None) -> str:
     if table is None:
         return f"{key} is missing; add it"
-    needed = [name for name, field in table.model_fields.items() if field.is_required()]
-    others = [name for name in table.model_fields if name not in needed]
-    may = f"; it may also have {', '.join(others)}" if others else ""
-    return f"the table [{key}] is missing; add it, with {', '.join(needed) or 'at least one key'}{may}"
+    required = [name for name, field in table.model_fields.items() if field.is_required()]
+    optional = [name for name in table.model_fields if name not in required]
+    option_text = f"; it may also have {', '.join(optional)}" if optional else ""
+    return f"the table [{key}] is missing; add it, with {', '.join(required) or 'at least one key'}{option_text}"
 
 
-def _expectation(key: str, error: ErrorDetails, secret: bool = False, not_to_choose: str = "") -> str:
-    """Return what was expected of a key's value, in place of pydantic's words."""
+def _expectation(key: str, error: ErrorDetails, is_secret: bool = False, hidden_choice: str = "") -> str:
+    """Return the expected value of a key in our words instead of pydantic's."""
     value, limits = error["input"], error.get("ctx", {})
     match error["type"]:
         case "literal_error" | "enum":
-            known = [name for name in re.findall(r"'([^']+)'", error["msg"]) if name != not_to_choose]
-            return f"expected one of {', '.join(map(repr, known))}" if known else error["msg"]
+            choices = [name for name in re.findall(r"'([^']+)'", error["msg"]) if name != hidden_choice]
+            return f"expected one of {', '.join(map(repr, choices))}" if choices else error["msg"]
         case "tuple_type" | "list_type":
             if isinstance(value, dict):
                 return f"a list of tables was expected: write [[{key}]]"
-            meant = f": [{json.dumps(value, ensure_ascii=False)}]" if isinstance(value, str) and not secret else ""
-            return f"a list was expected, in square brackets{meant}"
+            example = f": [{json.dumps(value, ensure_ascii=False)}]" if isinstance(value, str) and not is_secret else ""
+            return f"a list was expected, in square brackets{example}"
         case "float_parsing" | "float_type" | "int_parsing" | "int_type" | "int_from_float":
-            what = "a whole number" if error["type"].startswith("int") else "a number"
+            noun = "a whole number" if error["type"].startswith("int") else "a number"
             unit = " of seconds" if key.endswith("_s") else ""
-            is_number = isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d+)?", value) and not secret
-            return f"{what}{unit} was expected{f', without quotation marks: {value}' if is_number else ''}"
+            is_number = isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d+)?", value) and not is_secret
+            return f"{noun}{unit} was expected{f', without quotation marks: {value}' if is_number else ''}"
         case "bool_parsing" | "bool_type":
             return "true or false was expected, without quotation marks"
         case "string_type" | "path_type":
             is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            meant = f': "{MASK if secret else value}"' if is_number else ""
-            return f"a text was expected, in quotation marks{meant}"
+            example = f': "{MASK if is_secret else value}"' if is_number else ""
+            return f"a text was expected, in quotation marks{example}"
         case "model_type" | "dict_type":
             return f"a table was expected, as in {key.rsplit('.', 1)[-1]} = {{ … }} or [{key}]"
         case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal":
@@ -216,7 +216,7 @@ def _expectation(key: str, error: ErrorDetails, secret: bool = False, not_to_cho
             return error["msg"].removeprefix("Value error, ")
 
 
-# What a number is to be, by the name of its bound in an error of pydantic.
+# Expectation for a number, by the name of the bound in an error of pydantic.
 _BOUNDS: Final = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of at most"}
 
 
@@ -226,11 +226,11 @@ def _length(value: Any, limit: int) -> str:
 
 
 def _table_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel] | None:
-    """Return the table at a location of a model: names of keys, and places in lists; None if no table is there."""
-    for part in location:
-        if isinstance(part, int):
+    """Return the model of the table at a location (keys and list indices); None if it is not a table."""
+    for component in location:
+        if isinstance(component, int):
             continue
-        annotation = model.model_fields[part].annotation
+        annotation = model.model_fields[component].annotation
         options = [option for option in (annotation, *getattr(annotation, "__args__", ())) if isinstance(option, type)]
         table = next((option for option in options if issubclass(option, BaseModel)), None)
         if table is None:
@@ -239,26 +239,27 @@ def _table_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[B
     return model
 
 
-def unknown_key(key: str, known: Iterable[str]) -> str:
-    """Return that a key is unknown, and the nearest one that is known."""
-    names = sorted(known)
+def unknown_key(key: str, known_keys: Iterable[str]) -> str:
+    """Return a message about an unknown key, with the most similar known key or all known keys."""
+    names = sorted(known_keys)
     hint = nearest_names(key.rsplit(".", 1)[-1], names) or f"known are {', '.join(names)}"
     return f"unknown key {key!r}; {hint}"
 
 
 def from_settings(
-    kind: type[T], given: Mapping[str, Any], where: str, key: str, known: Collection[str], **fixed: Any
+    record_type: type[T], values: Mapping[str, Any], where: str, key: str, known_names: Collection[str], **fixed: Any
 ) -> T:
-    """Return a dataclass of what a user gives for some of its fields; a ConfigurationError says what cannot be used.
+    """Make a dataclass from a user's `values` for fields in `known_names`, and from `fixed` values of other fields.
 
-    `given`: by names that are `known`, of the table `key` of a file, or a command line, `where`. `fixed`: other fields.
+    A ConfigurationError reports an unknown name or a wrong value, with the file `where` and its table `key`.
     """
-    for name in given:
-        if name not in known:
-            raise ConfigurationError(f"{where}: {unknown_key(f'{key}.{name}', known)}")
+    for name in values:
+        if name not in known_names:
+            raise ConfigurationError(f"{where}: {unknown_key(f'{key}.{name}', known_names)}")
     try:
-        return _adapter(kind).validate_python({**fixed, **given})
+        return _adapter(record_type).validate_python({**fixed, **values})
     except ValidationError as error:
         first = error.errors()[0]
-        at = ".".join([key, *(str(part) for part in first["loc"][:1])])
-        raise ConfigurationError(f"{where}: {at}: {_expectation(at, first)}, got {first['input']!r}") from error
+        full_key = ".".join([key, *(str(component) for component in first["loc"][:1])])
+        message = f"{where}: {full_key}: {_expectation(full_key, first)}, got {first['input']!r}"
+        raise ConfigurationError(message) from error

@@ -1,8 +1,7 @@
-"""What may be shown of a text: addresses without their secrets, foreign names without what a terminal obeys.
+"""Masking of passwords and tokens in texts, and escaping of control characters.
 
-A session, a data set, a report and a terminal's log are copied, shown and published. So no password and no token gets
-into any of them: whoever writes or prints an address masks it first, and `foundation.console` masks every error once
-more.
+Sessions, data sets, reports and logs are copied and published, so they must not contain secrets. Code that writes or
+prints an address masks it first; `foundation.console` masks all error messages again.
 """
 
 from __future__ import annotations
@@ -12,29 +11,29 @@ import shlex
 from typing import Any, Final, cast
 from urllib.parse import urlsplit
 
-MASK: Final = "…"  # What stands for a secret
+MASK: Final = "…"  # Replaces a secret
 
-# User name and password of a URL (RFC 3986, 3.2.1), the last @ before the path: passwords may hold one.
+# User name and password of a URL (RFC 3986, 3.2.1), up to the last @ before the path: passwords may contain an @.
 _USER = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*://)[^\s/?#'\"<>]+@")
 
-# Parameters of a URL that prove who asks: those of signed addresses of object stores (``X-Amz-Signature``, ``sig``,
-# ``X-Goog-Credential``), and what services call their tokens.
+# Secret parameters of a URL: signatures of object stores (``X-Amz-Signature``, ``sig``, ``X-Goog-Credential``), and
+# tokens of services under various names.
 _PARAMETER = re.compile(
     r"(?P<name>[?&;](?:[^=&;\s'\"]*(?:auth|credential|key|passw|secret|sig|token)[^=&;\s'\"]*)=)[^&;\s'\"<>]+",
     re.IGNORECASE,
 )
 
-# Control characters (Unicode category Cc), separators and marks that reorder a line, and halves of surrogates, as
-# names have them whose bytes are no UTF-8.
+# Control characters (Unicode category Cc), line separators, marks that change the text direction, and lone surrogates,
+# which Python uses in file names that are not UTF-8.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-# A host with a dot and a path or a port: no command has such a name.
+# A host name with a dot and a path or port. Names of commands do not look like this.
 _ADDRESS = re.compile(r"[A-Za-z0-9-]+(?:\.[A-Za-z0-9-]+)+(?::\d+)?/\S*|[A-Za-z0-9.-]+\.[a-z]{2,}:\d+")
 
 
 def masked(text: str) -> str:
-    """Return a text with the user, the password and the secret parameters of every URL in it masked.
+    """Replace user, password and secret parameters of all URLs in a text by `MASK`.
 
     Examples
     --------
@@ -49,7 +48,7 @@ def masked(text: str) -> str:
 
 
 def masked_values(value: Any) -> Any:
-    """Return a value for JSON with `masked` applied to every text in it, keys left as they are."""
+    """Apply `masked` to all texts in a JSON value, except keys."""
     if isinstance(value, str):
         return masked(value)
     if isinstance(value, dict):
@@ -60,23 +59,23 @@ def masked_values(value: Any) -> Any:
 
 
 def printable(text: str) -> str:
-    r"""Return a text with control characters and lone surrogates as escapes; tabs and line ends stay.
+    r"""Replace control characters and lone surrogates by escapes, except tabs and line ends.
 
     Examples
     --------
     >>> printable("no\x1b[2J.png is missing")
     'no\\x1b[2J.png is missing'
     """
-    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+    return _UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode("ascii"), text)
 
 
 def is_webhook(target: str) -> bool:
-    """Return whether a target is a URL to post to, rather than a command."""
+    """Return whether a notification target is a URL, not a command."""
     return target.lower().startswith(("http://", "https://"))
 
 
 def is_address(target: str) -> bool:
-    """Return whether a target that is no URL looks like one without its scheme.
+    """Return whether a notification target looks like a URL without scheme.
 
     Examples
     --------
@@ -87,9 +86,9 @@ def is_address(target: str) -> bool:
 
 
 def target_label(target: str) -> str:
-    """Return what may be shown of a target: a URL's scheme and host, also where that lacks, or a command's first word.
+    """Return the public part of a notification target: scheme and host of a URL, or the first word of a command.
 
-    The rest may be a secret: a webhook's path is one, and so are user names, queries and most arguments.
+    All other parts may be secret: path, user name and query of a URL, arguments of a command.
 
     Examples
     --------

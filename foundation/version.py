@@ -1,8 +1,4 @@
-"""What this software is: its name and version, as files record what wrote them, and its packages.
-
-The packages' names are short and common: a file `generator.py` beside a user's program is imported in place of the
-package, and whether one is hidden is said here.
-"""
+"""Name, version and packages of this software, and a check that no user file hides one of the packages."""
 
 from __future__ import annotations
 
@@ -23,7 +19,7 @@ def software() -> str:
     return f"{DISTRIBUTION} {version(DISTRIBUTION)}"
 
 
-# From the lowest to the highest.
+# Packages from the lowest layer to the highest.
 PACKAGES: Final = (
     "foundation",
     "drivers",
@@ -40,12 +36,13 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 
 
 def require_own_packages() -> None:
-    """Import each package, so that no file that is found later can hide it; an InputError names one that does."""
+    """Import each package; raise an InputError with the name of a file that hides one."""
+    # The package names are short: a user's generator.py next to a program is imported in place of our package.
     for name in PACKAGES:
         module = import_module(name)
-        found = module.__file__ or next(iter(getattr(module, "__path__", [])), "something without a file")
-        if Path(found).resolve().parent != _ROOT / name:
+        location = module.__file__ or next(iter(getattr(module, "__path__", [])), "a module without a file")
+        if Path(location).resolve().parent != _ROOT / name:
             raise InputError(
-                f"{found} hides the package {name} of CroP, expected {_ROOT / name}; rename it, or start from another "
+                f"{location} hides the package {name} of CroP, expected {_ROOT / name}; rename it, or start in another "
                 "folder"
             )

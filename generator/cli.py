@@ -17,13 +17,13 @@ from foundation.console import (
     EXIT_CODES,
     JsonOutput,
     MainCommand,
-    grouped,
-    loaded,
     new_app,
     orderly_end,
     progress,
+    resume_gc,
     run,
     with_json,
+    with_option_groups,
 )
 from foundation.errors import InputError, QualityError, StorageError, counted
 from foundation.secret_texts import masked, printable
@@ -78,12 +78,12 @@ generate lut/ test/ --sources photographs/ --lights-per-image 2 --masks smooth -
 
 
 class _Generate(MainCommand):
-    others = _explore_app
+    subcommands = _explore_app
 
 
 @app.command(help=_HELP, cls=_Generate)
 @with_json("generate")
-@grouped
+@with_option_groups
 def generate(
     output: JsonOutput,
     places: Places,
@@ -101,7 +101,7 @@ def generate(
     if sheet is not None:
         _check_sheet(sheet, work.verify or places.out, work.shard, again=work.verify is None)
     if work.verify is not None:
-        loaded()
+        resume_gc()
         _draw_sheet(_verify(work.verify, work.workers, output), work.verify, sheet)
     else:
         if places.lut is None or places.out is None:
@@ -113,7 +113,7 @@ def generate(
             )
         from generator.dataset.making import made_before
 
-        loaded()
+        resume_gc()
         workers = work.makers()
         plan = _plan(places.lut, places.out, pictures, light, rendering, variation, images, work)
         there = made_before(plan, places.out)
@@ -157,7 +157,7 @@ def explore(
     from generator.explore.explorer import MAX_SIDE, Explorer, ExploreServer, sample_folder
     from generator.pictures.sources import Preparation, find_pictures
 
-    loaded()
+    resume_gc()
     table = open_lut(table_folder(lut))
     found = find_pictures(sources or [str(sample_folder())], Preparation(max_side=MAX_SIDE))
     with ExploreServer(Explorer(str(lut), table, found), host, port) as server:
@@ -382,7 +382,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     `foundation.console.EXIT_CODES` lists the codes.
     """
-    return run(lambda: app(None if argv is None else list(argv), prog_name="generate"), loads=True)
+    return run(lambda: app(None if argv is None else list(argv), prog_name="generate"), pause_gc=True)
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""The laboratory without hardware: a room in which what is shown decides what is photographed."""
+"""The simulated laboratory: the displayed colour decides the photograph."""

@@ -1,4 +1,4 @@
-"""`sim`: simulated devices on real cables, for trying the suite, or other software, without hardware."""
+"""Command `sim`: simulated devices on real connections, to try this or other software without hardware."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ app = new_app(
 
 
 def main(argv: Sequence[str] | None = None, read_chart: Callable[[Path], Print] | None = None) -> int:
-    """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
+    """Run `sim` with `argv`, by default the arguments of the process, and return the exit code (`EXIT_CODES`)."""
     return console.run(lambda: app(args=argv, prog_name="sim", obj=read_chart))
 
 
@@ -54,10 +54,10 @@ def projector(
 ) -> None:
     """Serve a simulated projector: standby, 30 s of warm-up, on, 60 s of cooling.
 
-    Reads a language file if --serial names one; writes no file. With --pjlink it listens on the network, with --serial
-    at a pseudo-terminal, which any serial software can open (Linux and macOS). Prints the address or the port's path,
-    then serves until interrupted (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such
-    language or not exactly one cable, 3 when the port is taken.
+    Reads a language file if --serial names one; writes no file. With --pjlink, it listens on a TCP port. With --serial,
+    it uses a pseudo-terminal (Linux and macOS), which serial software can open. Prints its address or path, then serves
+    until Ctrl-C, with exit code 0. Exit code 2 if the language is unknown, or unless exactly one of --pjlink and
+    --serial is given; 3 if the port is in use.
     """
     from drivers.pjlink import MAX_PASSWORD
     from drivers.projector import Power
@@ -81,10 +81,10 @@ def projector(
             _until_interrupted("PJLink projector at {}:{}".format(*server.address))
 
 
-def _serve_serial(device: SimulatedProjector, named: str) -> None:
+def _serve_serial(device: SimulatedProjector, language_name: str) -> None:
     from drivers.serial_projectors.language import load_language
 
-    language = load_language(named)
+    language = load_language(language_name)
     try:
         from sim.buses.serial import PseudoTerminal
     except ImportError as error:
@@ -112,17 +112,17 @@ def camera(
         str | None, option("HOST:PORT", "PJLink projector that throws it; a steady lamp else.")
     ] = None,
 ) -> None:
-    """Serve a simulated Canon EOS on a network: it photographs grey squares under white light.
+    """Serve a simulated Canon EOS on a TCP port; by default it photographs grey squares under white light.
 
-    With --watch-screen it photographs the chart as the pixels of that screen light it while the shutter is open, in
-    real time: a window in front lights its place, for its share of the exposure. With --watch-projector the projector's
-    power, mute, freeze and input count, too. So `acquire` can be rehearsed as in a lab (docs/how-to/rehearsal.md).
+    With --watch-screen, it photographs the chart under the light of that screen during the exposure, in real time: a
+    window on the screen affects the frame for its share of the exposure. With --watch-projector, power, mute, freeze
+    and input of the projector are also simulated. So `acquire` can be rehearsed (docs/how-to/rehearsal.md).
 
-    Reads CHART where --chart names one; writes no file. Prints the address it listens on, and what each exposure of a
-    watched screen saw; serves until interrupted (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there
-    is no such model, chart, room or screen, 3 when the port is taken or the screen cannot be reached.
+    Reads CHART if --chart names one; writes no file. Prints its address, and a line for each exposure of a watched
+    screen. Serves until Ctrl-C, with exit code 0. Exit code 2 if the model, chart, room or screen is wrong; 3 if the
+    port is in use or the screen cannot be read.
 
-    Any software that speaks PTP/IP can use it, for instance (both connections go to one port):
+    Any software with PTP/IP can use it, for example (both connections use one port):
 
     gphoto2 --camera "PTP/IP Camera" --port ptpip:127.0.0.1:15740:15740 --capture-image-and-download
     """
@@ -138,7 +138,7 @@ def camera(
         raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
     if watch_screen is None and watch_projector is not None:
         raise ConfigurationError("a projector throws a screen's picture: --watch-projector needs --watch-screen")
-    changes = dict(_setting("--room", given) for given in room or ())
+    changes = dict(_setting("--room", text) for text in room or ())
     # A lamp that ages would be dark by now: unless asked for, its drift counts from no day at all.
     world = World(
         _grey_squares() if chart is None else _print(context, chart),
@@ -155,8 +155,7 @@ def camera(
             _until_interrupted("PTP/IP camera {} at {}:{}".format(eos.body.model, *server.address))
 
 
-# Of everything that chance decides in the simulated room: paper, lamp, noise.
-_SEED = 1
+_SEED = 1  # Seed of all random values of the simulated room: paper, lamp, noise.
 
 
 @contextmanager
@@ -195,18 +194,17 @@ def _film(world: World, screen: str | None, projector: str | None) -> Generator[
 
 
 def _print(context: typer.Context, chart: Path) -> Print:
-    """Return the print of a chart, by the reader that `main` was given."""
     read: Callable[[Path], Print] | None = context.obj
     if read is None:
         raise ConfigurationError(f"--chart {chart}: charts are read by the program sim; this is sim.cli alone")
     return read(chart)
 
 
-def _setting(option: str, given: str) -> tuple[str, Any]:
-    """Return name and value of ``name=value``; the value as TOML has it, text also without quotes."""
-    name, equals, value = given.partition("=")
+def _setting(option: str, text: str) -> tuple[str, Any]:
+    # Values are in TOML syntax; texts may be without quotes.
+    name, equals, value = text.partition("=")
     if not name or not equals:
-        raise InputError(f"{option} {given!r}: NAME=VALUE expected, such as waviness_mm=1.5")
+        raise InputError(f"{option} {text!r}: NAME=VALUE expected, such as waviness_mm=1.5")
     try:
         return name, tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
@@ -214,7 +212,7 @@ def _setting(option: str, given: str) -> tuple[str, Any]:
 
 
 def _grey_squares() -> Print:
-    """Return an A4 sheet with five by three squares from black to paper white."""
+    # An A4 sheet with 5 × 3 squares from black to paper white.
     import numpy as np
 
     from sim.world.rendering import Print
@@ -235,7 +233,7 @@ def _host_and_port(text: str) -> tuple[str, int]:
 
 
 def _until_interrupted(announcement: str) -> None:
-    """Say where the device is, and serve until Ctrl-C or a request to end, also where a shell had them ignored."""
+    """Print the address and serve until Ctrl-C or SIGTERM, even if a shell ignores these signals."""
     asked = queue.SimpleQueue[int]()
     for request in (signal.SIGINT, signal.SIGTERM):
         signal.signal(request, lambda number, _: asked.put(number))

@@ -1,58 +1,44 @@
-"""Spectra: of cameras (ISO 17321-1) and published lights as measured, and models of projectors, inks and papers.
+"""Spectra of cameras and published illuminants, and models of projectors, inks and papers.
 
-**Sensitivities** are read from files in the layout of rawtoaces. It is that of
-AcademySoftwareFoundation/rawtoaces-data, schema 0.1.0: ``spectral_data.units`` is ``relative``,
-``spectral_data.index.main`` names the channels, and ``spectral_data.data.main`` has their responses to light of equal
-power by wavelength in nanometres. Only proportions matter: exposure is set elsewhere.
+**Sensitivities** (ISO 17321-1) have the format of AcademySoftwareFoundation/rawtoaces-data, schema 0.1.0:
+``spectral_data.units`` is ``relative``, ``spectral_data.index.main`` has the channels, ``spectral_data.data.main`` has
+their responses to equal power by wavelength in nm. Only proportions matter. Some cameras are included (`sim.data`) and
+selected by name, others by the path of their file.
 
-Files of some cameras come with the suite (`sim.data`) and are known by name; any other is named by its path.
+**Published illuminants** are in `sim/data` (sources in its README): illuminants of CIE 15:2018 and ISO 7589, and
+measured light sources.
 
-**Grids.** What stands on a finer grid is not picked at the new grid's wavelengths but gathered: a line of a lamp that
-lies between two of them must not be lost. What stands on a coarser or the same grid is joined by straight lines.
+**Models** cover 380 to 780 nm in steps of 5 nm. They are parametric; only sensitivities are measured. Spectra are
+relative; `sim.world.world` sets the exposure. Functions have no state.
 
-**Published lights**, by their names. The tables are in `sim/data`, whose README says where they are from: the
-illuminants of CIE 15:2018 and ISO 7589, and measured light sources.
+Projector ``uhp``: a mercury arc lamp (200 bar) behind the dichroic red, green and blue segments of a colour wheel. A
+continuum, and the lines 405, 436, 546 and 577/579 nm broadened by pressure (Derra et al., "UHP lamp systems for
+projection applications", J. Phys. D 38 (2005) 2995, figure 4). Projector ``led``: three asymmetric Gaussians with peaks
+at 633, 515 and 451 nm and full widths of 19, 34 and 22 nm. A measured LED projector has peaks at 632, 516 and 452 nm
+and widths of 19, 34 and 21 nm.
 
-**Models**, 380 to 780 nm in steps of 5 nm, of projectors and prints: parametric, each with its source; only the
-camera's sensitivities are measured data (`sim.data`). All spectra are relative: the exposure's scale is
-`sim.world.world`'s business. Pure functions, no state.
+Print: Yule-Nielsen spectral Neugebauer model (Yule and Nielsen 1951; Viggiano 1985). The sixteen overprints of cyan,
+magenta, yellow and black are mixed by Demichel's weights in the power 1/n. Solid inks are density bands that follow
+measured ramps on photo paper within about 0.1: yellow 1.25 below 480 nm, half at 490 nm; magenta 1.17 at 540 nm, 0.2 at
+450 nm; cyan 1.0 at three quarters at 600 nm, half at 700 nm. The reflection of the surface is added.
 
-Projector. ``uhp``: a short-arc mercury lamp of about 200 bar behind the dichroic red, green and blue segments of a
-colour wheel: a continuum, and the lines 405, 436, 546 and 577/579 nm broadened by pressure (Derra et al., "UHP lamp
-systems for projection applications", J. Phys. D 38 (2005) 2995, figure 4). ``led``: three light-emitting diodes, each
-an asymmetric Gaussian; peaks 633, 515 and 451 nm and full widths of 19, 34 and 22 nm, as three primaries of a
-measured LED projector have them (peaks 632, 516, 452 nm; widths at half maximum 19, 34, 21 nm).
+Papers ``matt`` and ``glossy`` follow prints of an Epson XP-960 without colour management, measured with a ColorMunki
+(olemagnp/print_profiles on GitHub; no data are copied). Solid inks and overprints on PermaJet Matt Plus 240 and Ilford
+Galerie Smooth Pearl, 400 to 730 nm, fit within 2.5 CIEDE2000 on average. Densities of black in that collection and on
+an Epson P800 (metebalci/profiling-an-epson-p800-printer) are 1.63 to 1.79 on four matt and 2.11 to 2.51 on ten satin to
+glossy photo papers. A review of more papers gives 1.6 to 1.7 and 2.0 to 2.2 (M. McNamee, "The whole range", swpp.co.uk,
+2010). Convex hulls of printed colours in CIELAB (D50) have 460 000 to 540 000 units on matt and 580 000 to 790 000 on
+glossy paper; ours have 466 000 and 596 000, with four inks instead of six or more. Black is constant over wavelength,
+like measured pigment blacks (P800, Canon Pro-300).
 
-Print. Yule-Nielsen spectral Neugebauer model (Yule and Nielsen 1951; Viggiano 1985): the sixteen overprints of cyan,
-magenta, yellow and black mixed by Demichel's weights in the power 1/n. A solid ink is a density band; peak
-wavelengths, widths and the secondary absorption follow measured ramps on photo paper (yellow: density 1.25 below 480
-nm, half at 490; magenta 1.17 at 540, 0.2 at 450; cyan 1.0 at three quarters at 600 nm, half of it left at 700), which
-our solids match within about 0.1 in density. The surface's own reflection (matte paper) is added after.
-
-Papers. ``poster`` is what stands above. ``matt`` and ``glossy`` follow prints that an Epson XP-960 made without
-colour management, measured with a ColorMunki (olemagnp/print_profiles on GitHub, Argyll .ti3 files with spectra; none
-is copied): solid inks and their overprints, 400 to 730 nm, on PermaJet Matt Plus 240 and Ilford Galerie Smooth Pearl,
-which one set of inks over two surfaces matches within 2.5 CIEDE2000 on average. Over that collection, and an Epson
-P800's glossy print (metebalci/profiling-an-epson-p800-printer), the density of black is 1.63 to 1.79 on four matt
-photo papers, 2.11 to 2.51 on ten from satin to glossy, 1.46 on an art and 1.28 on an office paper; the convex hulls
-of printed colours in CIELAB under D50 have 460 000 to 540 000, 580 000 to 790 000, 402 000 and 245 000 units. A
-review of many more papers has 1.6 to 1.7 and 2.0 to 2.2 (M. McNamee, "The whole range", swpp.co.uk, 2010). Ours have
-hulls of 466 000 and 596 000: four inks, where such printers have six and more. Black is even over wavelength, as
-pigment blacks measure (P800, Canon Pro-300); the XP-960's dye black lets red beyond 680 nm through, which is left
-out.
-
-**Profile.** Which ink codes print an sRGB file so that its greys are grey: ``unmanaged`` sends the file's codes to
-the inks as they are, which is what the publication does: the grey axis then has the tint that equal codes of the inks
-give. ``managed`` is what a print shop's ICC profile does: sRGB (IEC 61966-2-1) → CIE XYZ of D50 (Bradford, as in
-ICC.1:2022 annex E) → relative colorimetric with black point compensation → ink codes of the paper. White is bare
-paper; black is the darkest neutral that the inks reach; in between, luminance over that of paper is linear between
-the two, as Adobe's black point compensation has it (ISO 18619). What no ink reaches goes to the nearest colour that
-one does, in CIELAB of the CIE 1931 observer under D50 relative to paper, differences of hue counted twice (chosen:
-profiles keep hue before chroma).
-
-As in an ICC profile the table has 33 nodes a channel, is found by inverting the model of the print
-(Levenberg-Marquardt from the nearest node of a coarse grid) and interpolated in tetrahedra, in
-which grey codes depend on grey nodes alone (Kasson and others, J. Electronic Imaging 4 (1995) 226).
+**Profiles.** ``unmanaged``: codes of the file are ink codes, as in the publication, so greys have the tint of equal
+inks. ``managed``: like an ICC profile of a print shop. sRGB (IEC 61966-2-1) → CIE XYZ under D50 (Bradford, ICC.1:2022
+annex E) → relative colorimetric with black point compensation (ISO 18619) → ink codes of the paper. White is bare
+paper, black is the darkest neutral print, and relative luminance between them is linear. Colours out of gamut go to the
+nearest printable colour in CIELAB relative to paper; differences of hue count twice, because profiles preserve hue
+before chroma (chosen). The table has 33 nodes per channel like an ICC profile, made by inversion of the print model
+(Levenberg-Marquardt from the nearest node of a coarse grid). It is interpolated in tetrahedra, so grey codes depend on
+grey nodes only (Kasson and others, J. Electronic Imaging 4 (1995) 226).
 """
 
 from __future__ import annotations
@@ -77,21 +63,17 @@ from foundation.errors import FormatError, InputError, nearest_names
 from foundation.files import sha256_of
 from foundation.records import Record
 
-# Wavelengths that must be covered: beyond them a camera with its infrared filter sees under 2 % of its light.
+# Required range, nm. A camera with infrared filter gets less than 2 % of its signal outside.
 NEEDED_NM: Final = (400.0, 700.0)
 
-# Distance of two wavelengths that may be bridged by a straight line: filters' edges rise over some 40 nm, and bench
-# measurements are taken every 5 or 10 nm.
+# Widest allowed gap, nm: edges of filters rise over about 40 nm, and measurements have steps of 5 or 10 nm.
 WIDEST_STEP_NM: Final = 20.0
 
 _Array = npt.NDArray[np.float64]
 
 
 def require_grid(wavelengths_nm: _Array, where: str) -> None:
-    """Refuse wavelengths (W,), ascending, that do not cover the visible range without gaps.
-
-    `wavelengths_nm`: (W,) float64.
-    """
+    """Raise a FormatError unless ascending wavelengths (W,) float64 cover the visible range without gaps."""
     low, high = NEEDED_NM
     if len(wavelengths_nm) < 2 or wavelengths_nm[0] > low or wavelengths_nm[-1] < high:
         span = "none" if not len(wavelengths_nm) else f"{wavelengths_nm[0]:g} to {wavelengths_nm[-1]:g}"
@@ -111,18 +93,18 @@ def require_grid(wavelengths_nm: _Array, where: str) -> None:
         )
 
 
-def regridded(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array:
-    """Return curves on another grid.
+def resampled(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array:
+    """Resample curves to another grid.
 
-    `wavelengths_nm`: (W,) float64, ascending. `curves`: (W, N) float64, per nanometre. `onto_nm`: (M,) float64,
-    ascending in even steps. Returns (M, N) float64; 0 beyond the given wavelengths. If some of these are nearer to each
-    other than those of the new grid, each of its values is the mean of the curve weighted by a triangle that reaches to
-    the neighbouring wavelengths, which leaves the curve's integral as it is; else the curve's own value.
+    `wavelengths_nm`: (W,) float64, ascending. `curves`: (W, N) float64, per nm. `onto_nm`: (M,) float64, ascending in
+    equal steps. Returns (M, N) float64; 0 outside of the wavelengths. If the given grid is finer than the new one
+    anywhere, values are means with triangular weights that reach to the neighbouring wavelengths, which preserves the
+    integral: a lamp line between two wavelengths is not lost. Otherwise they are interpolated linearly.
 
     Examples
     --------
     >>> line = np.zeros((401, 1)); line[202] = 5.0  # 582 nm, on a grid of 1 nm
-    >>> on_5 = regridded(np.arange(380.0, 781.0), line, np.arange(380.0, 781.0, 5.0))
+    >>> on_5 = resampled(np.arange(380.0, 781.0), line, np.arange(380.0, 781.0, 5.0))
     >>> on_5[40:42, 0].round(3).tolist(), round(float(on_5.sum() * 5), 3)
     ([0.6, 0.4], 5.0)
     """
@@ -134,7 +116,7 @@ def regridded(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array
         return found
     if float(np.diff(wavelengths_nm).max()) > 0.999 * step:
         # Where steps are wider, a wavelength would stand for nodes that lie between it and the next.
-        wavelengths_nm, curves = _filled(wavelengths_nm, curves, step)
+        wavelengths_nm, curves = _densified(wavelengths_nm, curves, step)
     # Each wavelength stands for half the way to its neighbours.
     edges = np.concatenate([wavelengths_nm[:1], (wavelengths_nm[1:] + wavelengths_nm[:-1]) / 2, wavelengths_nm[-1:]])
     share = np.clip(1 - np.abs(onto_nm[:, None] - wavelengths_nm[None]) / step, 0, None)
@@ -142,12 +124,12 @@ def regridded(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array
     return np.asarray(weights @ curves, dtype=np.float64)
 
 
-def _filled(wavelengths_nm: _Array, curves: _Array, step: float) -> tuple[_Array, _Array]:
-    """Return wavelengths (V,) and curves (V, N) with the gaps of an uneven grid filled to steps below `step` / 4."""
-    parts = np.maximum(np.ceil(4 * np.diff(wavelengths_nm) / step), 1).astype(np.int64)
-    starts = np.repeat(wavelengths_nm[:-1], parts)
-    widths = np.repeat(np.diff(wavelengths_nm) / parts, parts)
-    within = np.arange(len(starts)) - np.repeat(np.cumsum(parts) - parts, parts)
+def _densified(wavelengths_nm: _Array, curves: _Array, step: float) -> tuple[_Array, _Array]:
+    """Interpolate an uneven grid to steps below `step` / 4; return wavelengths (V,) and curves (V, N)."""
+    counts = np.maximum(np.ceil(4 * np.diff(wavelengths_nm) / step), 1).astype(np.int64)
+    starts = np.repeat(wavelengths_nm[:-1], counts)
+    widths = np.repeat(np.diff(wavelengths_nm) / counts, counts)
+    within = np.arange(len(starts)) - np.repeat(np.cumsum(counts) - counts, counts)
     filled = np.append(starts + within * widths, wavelengths_nm[-1])
     found = np.empty((len(filled), curves.shape[1]))
     for number in range(curves.shape[1]):
@@ -157,26 +139,22 @@ def _filled(wavelengths_nm: _Array, curves: _Array, step: float) -> tuple[_Array
 
 @dataclass(frozen=True, eq=False)
 class PublishedSpectrum:
-    """A spectrum as it was published.
+    """A published spectrum."""
 
-    - `wavelengths_nm`: (W,) float64, ascending in even steps.
-    - `power`: (W,) float64, relative, per nm.
-    """
-
-    wavelengths_nm: _Array
-    power: _Array
+    wavelengths_nm: _Array  # (W,) float64, ascending in equal steps
+    power: _Array  # (W,) float64, relative, per nm
 
 
 @cache
 def published_spectra() -> Mapping[str, PublishedSpectrum]:
-    """Return every published light by its name, such as ``D65``, ``FL2``, ``LED-B3``, ``Kinoton 75P``."""
+    """Return all published spectra by name, such as ``D65``, ``FL2``, ``LED-B3``, ``Kinoton 75P``."""
     return MappingProxyType(_read("published_lights.csv"))
 
 
 def daylight(cct_k: float) -> PublishedSpectrum:
-    """Return the CIE daylight of a correlated colour temperature (CIE 15:2018, 4.1.2), K, 4000 … 25 000.
+    """Return CIE daylight (CIE 15:2018, 4.1.2) of a correlated colour temperature of 4000 to 25 000 K.
 
-    From the components S₀, S₁ and S₂, their factors rounded to three places as the CIE does.
+    Computed from S₀, S₁ and S₂ with factors rounded to three decimals, as the CIE does.
     """
     inverse = 1000 / cct_k
     low = (0.244063, 0.09911, 2.9678, -4.6070)
@@ -197,7 +175,7 @@ def _components() -> dict[str, PublishedSpectrum]:
 
 
 def _read(name: str) -> dict[str, PublishedSpectrum]:
-    """Return the spectra of a table in `sim.data`: a line each, name, first wavelength, step, values."""
+    # One line per spectrum: name, first wavelength, step, values.
     found: dict[str, PublishedSpectrum] = {}
     text = resources.files("sim").joinpath("data", name).read_text("utf-8")
     for line in text.splitlines()[1:]:
@@ -207,11 +185,11 @@ def _read(name: str) -> dict[str, PublishedSpectrum]:
     return found
 
 
-# What the names of the files in `sim.data` end in: first and last wavelength, and the step (as rawtoaces-data).
+# End of the file names in `sim.data`: first and last wavelength and step, as in rawtoaces-data.
 SUFFIX: Final = "_380_780_5.json"
 
-# Share of a channel's peak that may be left at the first and the last wavelength of a file, beyond which the channel
-# is taken to be blind (judgement): what is cut off there is below a hundredth of its light.
+# Highest relative response at the first and last wavelength of a file (judgement): less than 1 % of the light is then
+# missing.
 EDGE_SHARE: Final = 0.05
 
 _CHANNELS: Final = ("R", "G", "B")
@@ -235,34 +213,27 @@ class _Document(Record):
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """A camera's spectral sensitivities.
+    """Spectral sensitivities of a camera."""
 
-    - `name`: the file's, without its suffix.
-    - `maker`, `model`: as the file names the camera; empty where it does not.
-    - `wavelengths_nm`: (W,) float64, ascending.
-    - `curves`: (W, 3) float64 ≥ 0, R, G, B, response to light of equal power per nm, relative.
-    - `sha256`: of the file.
-    """
-
-    name: str
-    maker: str
-    model: str
-    wavelengths_nm: _Array
-    curves: _Array
-    sha256: str
+    name: str  # File name without suffix
+    maker: str  # From the file; may be empty
+    model: str  # From the file; may be empty
+    wavelengths_nm: _Array  # (W,) float64, ascending
+    curves: _Array  # (W, 3) float64 ≥ 0, relative response of R, G, B to equal power per nm
+    sha256: str  # Hash of the file
 
     @property
     def camera(self) -> str:
-        """Maker and model as raw files have them, e.g. ``Canon EOS 5DS``; the name where the file states no model."""
+        """Maker and model as in raw files, for example ``Canon EOS 5DS``; the name if the model is empty."""
         return " ".join(f"{self.maker} {self.model}".split()) if self.model else self.name
 
     def at(self, wavelengths_nm: _Array) -> _Array:
-        """Return the curves (N, 3) float64 on another grid (N,) nm of even steps (`regridded`), 0 beyond their own."""
-        return regridded(self.wavelengths_nm, self.curves, wavelengths_nm)
+        """Return the curves (N, 3) float64 on a grid (N,) nm with equal steps (`resampled`)."""
+        return resampled(self.wavelengths_nm, self.curves, wavelengths_nm)
 
 
 def known_sensitivities() -> tuple[str, ...]:
-    """Return the names of the cameras whose sensitivities come with the suite, in alphabetical order.
+    """Return the names of the included sensitivities in alphabetical order.
 
     Examples
     --------
@@ -274,7 +245,7 @@ def known_sensitivities() -> tuple[str, ...]:
 
 
 def read_sensitivities(name: str, more: Sequence[str] = ()) -> Sensitivities:
-    """Return the sensitivities that a name or a path stands for; `more` are names that an error lists, too."""
+    """Return the sensitivities of a name or file; error messages also list the names `more`."""
     if name in known_sensitivities():
         data = resources.files("sim").joinpath("data", name + SUFFIX).read_bytes()
         return parse_sensitivities(data, name, name)
@@ -285,23 +256,23 @@ def read_sensitivities(name: str, more: Sequence[str] = ()) -> Sensitivities:
         known = [*known_sensitivities(), *more]
         near = f"{nearest_names(name, known)} ".lstrip()
         raise InputError(
-            f"no camera {name!r}: {_unread(error)}; {near}known by name are "
+            f"no camera {name!r}: {_reading_problem(error)}; {near}known by name are "
             f"{', '.join(known)}; name one of them, or a file of spectral sensitivities"
         ) from error
     return parse_sensitivities(data, path.name.removesuffix(SUFFIX).removesuffix(".json"), str(path))
 
 
-def _unread(error: OSError) -> str:
+def _reading_problem(error: OSError) -> str:
     return "there is no such file" if isinstance(error, FileNotFoundError) else f"cannot read it ({error.strerror})"
 
 
 def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:
-    """Return the sensitivities in the bytes of a file."""
+    """Return the sensitivities of a file from its bytes; messages name it `where`."""
     try:
-        document = _Document.model_validate(json.loads(data, object_pairs_hook=_unlike))
+        document = _Document.model_validate(json.loads(data, object_pairs_hook=_unique_keys))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise FormatError(f"{where} is no JSON: {error}; expected a file of rawtoaces-data's layout") from error
-    except _TwiceError as error:
+    except _DuplicateKeyError as error:
         raise FormatError(f"{where}: {error.args[0]!r} stands there twice; leave one out") from error
     except ValidationError as error:
         first = error.errors()[0]
@@ -327,22 +298,22 @@ def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:
     return Sensitivities(name, header.manufacturer, header.model, wavelengths, curves, sha256_of(data))
 
 
-class _TwiceError(Exception):
-    """A key of a JSON object is there twice; its argument is the key."""
+class _DuplicateKeyError(Exception):
+    """A key occurs twice in a JSON object; the argument is the key."""
 
 
-def _unlike(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a JSON object whose keys differ; of two alike `json` would take the last without a word."""
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    # json would silently use the last of two equal keys.
     found: dict[str, Any] = {}
     for key, value in pairs:
         if key in found:
-            raise _TwiceError(key)
+            raise _DuplicateKeyError(key)
         found[key] = value
     return found
 
 
 def _sorted(table: Mapping[str, list[float]], where: str) -> tuple[_Array, _Array]:
-    """Return wavelengths (W,), ascending, and curves (W, 3)."""
+    # Wavelengths (W,), ascending, and curves (W, 3).
     rows: list[tuple[float, list[float]]] = []
     for text, values in table.items():
         try:
@@ -379,58 +350,54 @@ def _require_camera(wavelengths: _Array, curves: _Array, where: str) -> None:
 
 
 def describe_sensitivities(found: Sensitivities) -> dict[str, Any]:
-    """Return what a record says of sensitivities: name, camera, and the file's hash."""
+    """Return name, camera and hash for a record."""
     return {"name": found.name, "camera": found.camera, "sha256": found.sha256}
 
 
-# (81,) float64, the wavelengths of every spectrum here.
+# Wavelengths of all spectra of the models, (81,) float64.
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 5.0)
 
 LampSpectrum = Literal["uhp", "led"]
 
-PaperName = Literal["poster", "matt", "glossy"]  # Papers of the simulated print
+PaperName = Literal["poster", "matt", "glossy"]  # Papers of the simulated print.
 
-SURFACE_REFLECTANCE = 0.03  # Light that plain matte paper returns before it meets ink (share of the incident)
+SURFACE_REFLECTANCE = 0.03  # Relative light that the surface of plain matt paper reflects.
 
-# The same of coated matt photo paper: the measured matt black is 0.016 to 0.026 from 400 to 660 nm.
-MATT_SURFACE = 0.0165
+MATT_SURFACE = 0.0165  # The same for coated matt photo paper, whose black measures 0.016 to 0.026 from 400 to 660 nm.
 
-# The same of glossy paper, lit off the mirror's angle: the measured glossy black falls to 0.0038.
-GLOSSY_SURFACE = 0.0035
+GLOSSY_SURFACE = 0.0035  # The same for glossy paper outside of the mirror angle; its black measures 0.0038 at least.
 
-# Density of solid matt black below the surface, so that the density of black is that of the measured paper.
-MATT_BLACK = 1.8
+MATT_BLACK = 1.8  # Density of solid matt black below the surface; the total density is then as measured.
 
-GLOSSY_BLACK = 2.0  # Density of solid photo black below the surface, for the same reason
+GLOSSY_BLACK = 2.0  # Density of solid photo black below the surface, for the same reason.
 
-YULE_NIELSEN_N = 2.0  # Yule-Nielsen factor; 2 is full optical dot gain
+YULE_NIELSEN_N = 2.0  # Yule-Nielsen factor; 2 is full optical dot gain.
 
-DOT_GAIN = 0.14  # Mechanical dot gain: how much a coverage of one half grows
+DOT_GAIN = 0.14  # Mechanical dot gain: increase of a coverage of 0.5.
 
-# Coverage of black on poster paper where all three inks are full; below 1, so that black never hides them wholly
-# (chosen, not measured).
+# Coverage of black on poster paper at full coverage of the other inks; below 1, so that these stay visible (chosen).
 _BLACK_GENERATION = 0.9
 
-# Share of the black by which each of the three inks is reduced; partial, so that dark cells keep their inks (chosen).
+# Share of black by which the other inks are reduced, so that dark patches keep their inks (chosen).
 _UNDERCOLOUR_REMOVAL = 0.4
 
 
 def _gauss(centre_nm: float, left_nm: float, right_nm: float | None = None) -> NDArray[np.float64]:
-    """Return a bell of height 1 with standard deviations left and right of its centre."""
+    # Height 1, with different standard deviations on both sides.
     distance = WAVELENGTHS_NM - centre_nm
     width = np.where(distance < 0, left_nm, left_nm if right_nm is None else right_nm)
     return np.exp(-0.5 * (distance / width) ** 2)
 
 
 def _rise(centre_nm: float, width_nm: float) -> NDArray[np.float64]:
-    """Return an edge from 0 (short waves) to 1 (long waves)."""
+    # From 0 at short to 1 at long wavelengths.
     return 1 / (1 + np.exp(-(WAVELENGTHS_NM - centre_nm) / width_nm))
 
 
 def projector_primaries(lamp: LampSpectrum = "uhp") -> NDArray[np.float64]:
-    """Return the light of each primary at full drive.
+    """Return the light (3, 81) float64 of the primaries red, green, blue at full brightness, relative power per nm.
 
-    Returns (3, 81) float64, red, green, blue; relative power per nm. White is near D65: CIE 1931 x, y within 0.02.
+    White is near D65: CIE 1931 x, y within 0.02.
     """
     if lamp == "led":
         power = np.stack([_gauss(633, 8.5, 7.5), _gauss(515, 13, 16), _gauss(451, 9, 10)])
@@ -447,30 +414,24 @@ def projector_primaries(lamp: LampSpectrum = "uhp") -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class InkedPaper:
-    """A paper and the inks on it.
+    """A paper and its inks."""
 
-    - `white`: (81,) float64, reflectance of the bare paper.
-    - `inks`: (4, 81) float64, optical density of solid cyan, magenta, yellow and black over white, surface left out.
-    - `surface`: share of the incident light that the surface sends to the camera before it meets ink.
-    - `black_generation`: coverage of black where all three inks are full.
-    - `undercolour_removal`: share of the black by which each of the three inks is reduced.
-    """
-
-    white: NDArray[np.float64]
+    white: NDArray[np.float64]  # (81,) float64, reflectance of bare paper
+    # (4, 81) float64, optical density of solid cyan, magenta, yellow and black, without the surface
     inks: NDArray[np.float64]
-    surface: float
-    black_generation: float
-    undercolour_removal: float
+    surface: float  # Relative light that the surface reflects to the camera
+    black_generation: float  # Coverage of black at full coverage of the other inks
+    undercolour_removal: float  # Share of black by which the other inks are reduced
 
     def overprints(self) -> NDArray[np.float64]:
-        """Return (16, 81) float64, reflectance below the surface of the overprints, in the order of `shares`."""
+        """Return the reflectance (16, 81) float64 of the overprints below the surface, in the order of `shares`."""
         densities = np.zeros((1, len(WAVELENGTHS_NM)))
         for density in self.inks:
             densities = np.concatenate([densities, densities + density], axis=0)
         return (self.white - self.surface) / (1 - self.surface) * 10.0**-densities
 
     def shares(self, coverage: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (N, 16) float64, Demichel's share of each overprint where inks are set to cover (N, 4)."""
+        """Return Demichel's weights (N, 16) float64 of the overprints for nominal coverages (N, 4)."""
         covered = coverage + 4 * DOT_GAIN * coverage * (1 - coverage)
         weights = np.ones((len(covered), 1))
         for ink in covered.T:
@@ -479,15 +440,15 @@ class InkedPaper:
 
 
 def paper_white() -> NDArray[np.float64]:
-    """Return (81,) float64, the reflectance of bare paper: slightly blue by its brightener, absorbing near ultraviolet.
+    """Return the reflectance (81,) float64 of bare paper, slightly blue by its brightener.
 
-    The measured photo paper rises from 0.64 at 400 nm to 0.93 at 450 nm and falls to 0.85 at 600 nm; so does this one.
+    Measured photo paper rises from 0.64 at 400 nm to 0.93 at 450 nm and falls to 0.85 at 600 nm, as this one does.
     """
     return (0.45 + 0.405 * _rise(402, 9)) + 0.075 * _gauss(452, 22, 50) + 0.03 * _rise(680, 15)
 
 
 def _poster_inks() -> NDArray[np.float64]:
-    """Return (4, 81) float64: optical density of solid cyan, magenta, yellow and black over white."""
+    # (4, 81), optical density of solid cyan, magenta, yellow and black.
     cyan = 1.40 * _gauss(606, 48, 85) + 0.12 * _gauss(380, 30)
     magenta = 1.17 * _gauss(542, 45, 29) + 0.10 * _gauss(400, 40)
     yellow = 1.27 * (1 - _rise(491, 11))
@@ -496,10 +457,8 @@ def _poster_inks() -> NDArray[np.float64]:
 
 
 def _photo_inks(black: float) -> NDArray[np.float64]:
-    """Return (4, 81) float64: the same of a photo printer, with a black of even density as pigment blacks have it.
-
-    Least squares over cyan, magenta, yellow and their overprints, 400 … 730 nm, on a glossy and a matt paper.
-    """
+    # Least squares over inks and overprints, 400 to 730 nm, on a glossy and a matt paper. Black is constant, like
+    # pigments.
     cyan = 1.85 * (_gauss(596, 37, 81) + 0.14 * _gauss(380, 75))
     magenta = 1.77 * (_gauss(548, 59, 29) + 0.10 * _gauss(397, 20))
     yellow = 1.84 * (1 - _rise(492, 11))
@@ -520,73 +479,65 @@ def paper(name: PaperName) -> InkedPaper:
 
 
 def ink_coverage(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
-    """Return the share of the paper that each ink is set to cover.
+    """Return the nominal coverage (..., 4) float64, 0 to 1, of cyan, magenta, yellow and black for ink codes (..., 3).
 
-    Returns (..., 4) float64 in 0 … 1, cyan, magenta, yellow, black: the complement of the code, with grey component
-    replacement: black grows with the square of the least of the three, which lose a share of it.
+    The complement of the code with grey component replacement. Black is proportional to the square of the smallest of
+    the three inks, which are reduced by a share of it.
     """
-    chosen = paper(on)
+    inked = paper(on)
     cmy = 1 - np.asarray(rgb, dtype=np.float64) / 255
-    black = chosen.black_generation * cmy.min(axis=-1, keepdims=True) ** 2
-    return np.concatenate([cmy - chosen.undercolour_removal * black, black], axis=-1)
+    black = inked.black_generation * cmy.min(axis=-1, keepdims=True) ** 2
+    return np.concatenate([cmy - inked.undercolour_removal * black, black], axis=-1)
 
 
 def print_reflectance(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
-    """Return the reflectance of printed ink codes; (255, 255, 255) is bare paper.
-
-    `rgb`: (N, 3) float or int codes 0 … 255. Returns (N, 81) float64, 0 … 1, never below the reflectance of the paper's
-    surface.
-    """
-    chosen = paper(on)
-    weights = chosen.shares(ink_coverage(rgb, on))
-    mixed = (weights @ chosen.overprints() ** (1 / YULE_NIELSEN_N)) ** YULE_NIELSEN_N
-    return chosen.surface + (1 - chosen.surface) * mixed
+    """Return the reflectance (N, 81) float64 of printed ink codes (N, 3), 0 to 255; (255, 255, 255) is bare paper."""
+    inked = paper(on)
+    weights = inked.shares(ink_coverage(rgb, on))
+    mixed = (weights @ inked.overprints() ** (1 / YULE_NIELSEN_N)) ** YULE_NIELSEN_N
+    return inked.surface + (1 - inked.surface) * mixed
 
 
 @cache
 def sensitivities(name: str) -> NDArray[np.float64]:
-    """Return a camera's measured spectral sensitivities.
+    """Return the measured sensitivities (81, 3) float64 of a camera, relative; read-only.
 
-    Returns (81, 3) float64, R, G, B, relative; read-only. Those of `sim.data` are relative to the peak of G.
+    Included sensitivities are relative to the maximum of G.
     """
     curves = read_sensitivities(name).at(WAVELENGTHS_NM)
     curves.setflags(write=False)
     return curves
 
 
-ProfileName = Literal["unmanaged", "managed"]  # What is done to codes before they are inks
+ProfileName = Literal["unmanaged", "managed"]  # Conversion of codes to ink codes.
 
-NODES = 33  # Nodes a channel of the table, as ICC profiles for output have them
+NODES = 33  # Nodes per channel of the table, as in ICC output profiles.
 
-_HUE_WEIGHT = 2.0  # Weight of differences of hue where a colour cannot be printed (chosen)
+_HUE_WEIGHT = 2.0  # Weight of hue differences for colours out of gamut (chosen).
 
-# CIELAB units within which a print counts as neutral when its black point is looked for; the eye sees 1. The smaller,
-# the paler the black: all inks together are not neutral, and what makes them so is left out.
+# Largest colour difference (CIELAB) of a neutral print in the search for the black point; 1 is visible. A smaller value
+# gives a paler black, because the mix of all inks is not neutral.
 _NEUTRAL = 0.7
 
-# Linear sRGB to CIE XYZ under D50, Bradford adapted; its rows' sums are D50.
+# Linear sRGB to CIE XYZ under D50, Bradford adapted; sums of rows are D50.
 _SRGB_TO_D50 = np.array(
     [[0.4360747, 0.3850649, 0.1430804], [0.2225045, 0.7168786, 0.0606169], [0.0139322, 0.0971045, 0.7141733]]
 )
 
-_STEPS = 40  # Iterations of the inversion at most; inside the gamut it ends after five to ten
+_STEPS = 40  # Maximum number of iterations of the inversion; inside the gamut, five to ten are enough.
 
 
 def printed_reflectance(
     rgb: ArrayLike, profile: ProfileName = "unmanaged", on: PaperName = "poster"
 ) -> NDArray[np.float64]:
-    """Return the reflectance of an sRGB file's codes as printed.
-
-    `rgb`: (N, 3) float or int codes 0 … 255 of the file. Returns (N, 81) float64, 0 … 1, at
-    `sim.spectral.WAVELENGTHS_NM`; (255, 255, 255) is bare paper.
-    """
+    """Return the reflectance (N, 81) float64 of printed sRGB codes (N, 3), 0 to 255, at `WAVELENGTHS_NM`."""
     if profile not in get_args(ProfileName):
         raise ValueError(f"profile {profile!r}: known are {', '.join(get_args(ProfileName))}")
     return print_reflectance(ink_codes(rgb, on) if profile == "managed" else rgb, on)
 
 
 def ink_codes(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
-    """Return the ink codes (N, 3) float64, 0 … 255, that the managed profile of a paper makes of sRGB codes (N, 3)."""
+    """Return the ink codes (N, 3) float64, 0 to 255, of the managed profile of a paper for sRGB codes (N, 3)."""
     table = _table(on)
     place = np.clip(np.asarray(rgb, dtype=np.float64), 0, 255) / 255 * (NODES - 1)
     corner = np.minimum(place.astype(np.int64), NODES - 2)
@@ -605,7 +556,7 @@ def ink_codes(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
 
 @cache
 def _observer() -> _Array:
-    """Return (81, 3): CIE 1931 colour-matching functions times D50."""
+    # (81, 3), CIE 1931 colour-matching functions times D50.
     wavelengths, functions = observer_cie_1931()
     light = published_spectra()["D50"]
     matching = functions[np.searchsorted(wavelengths, WAVELENGTHS_NM)]
@@ -613,40 +564,40 @@ def _observer() -> _Array:
 
 
 def _lab(xyz: _Array) -> _Array:
-    """Return CIELAB (CIE 15:2018, 8.2.1) of XYZ over white."""
+    # CIELAB (CIE 15:2018, 8.2.1) of XYZ relative to white.
     root = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
     x, y, z = np.moveaxis(root, -1, 0)
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
 
 
-def _wanted(share: _Array, black: float) -> _Array:
-    """Return XYZ over white of sRGB codes 0 … 1, black point compensated."""
+def _target_xyz(share: _Array, black: float) -> _Array:
+    # XYZ relative to white for sRGB codes 0 to 1, with black point compensation.
     linear = decode_srgb(share)
     return black + (1 - black) * (linear @ _SRGB_TO_D50.T) / _SRGB_TO_D50.sum(axis=1)
 
 
 class _Inks:
-    """What ink codes of a paper look like, exact for a Yule-Nielsen factor of 2: XYZ is a square form of the shares."""
+    """Colours of ink codes on a paper. With a Yule-Nielsen factor of 2, XYZ is a quadratic form of the weights."""
 
     def __init__(self, on: PaperName) -> None:
         if YULE_NIELSEN_N != 2:
             raise ValueError(f"the Yule-Nielsen factor is {YULE_NIELSEN_N}; the square form holds for 2 alone")
-        chosen, observer = paper(on), _observer()
-        roots = np.sqrt(chosen.overprints())
-        white = chosen.white @ observer
+        inked, observer = paper(on), _observer()
+        roots = np.sqrt(inked.overprints())
+        white = inked.white @ observer
         self._on: PaperName = on
-        self._paper = chosen
-        self._floor = chosen.surface * observer.sum(axis=0) / white
-        forms = np.einsum("il,lc,jl->cij", roots, observer, roots) * (1 - chosen.surface)
+        self._paper = inked
+        self._floor = inked.surface * observer.sum(axis=0) / white
+        forms = np.einsum("il,lc,jl->cij", roots, observer, roots) * (1 - inked.surface)
         self._forms = forms / white[:, None, None]
 
     def xyz(self, share: _Array) -> _Array:
-        """Return (N, 3) XYZ over paper of ink codes (N, 3), 0 … 1."""
+        """Return XYZ (N, 3) relative to paper of ink codes (N, 3), 0 to 1."""
         weights = self._paper.shares(ink_coverage(share * 255, self._on))
         return self._floor + np.stack([((weights @ form) * weights).sum(axis=1) for form in self._forms], axis=1)
 
-    def matching(self, lab: _Array) -> _Array:
-        """Return the ink codes (N, 3), 0 … 1, that look most like CIELAB (N, 3)."""
+    def codes_of_lab(self, lab: _Array) -> _Array:
+        """Return the ink codes (N, 3), 0 to 1, that are nearest to CIELAB (N, 3)."""
         from scipy.spatial import cKDTree
 
         axis = np.linspace(0, 1, 9)
@@ -660,40 +611,40 @@ class _Inks:
         turn[:, 1, 1:] = along
         turn[:, 2, 1:] = _HUE_WEIGHT * along[:, ::-1] * [-1, 1]
         damping = np.full(len(lab), 1e-2)
-        error = self._off(share, lab, turn)
-        going = np.arange(len(lab))
+        error = self._difference(share, lab, turn)
+        active = np.arange(len(lab))
         for _ in range(_STEPS):
-            here, off, matrix = share[going], error[going], turn[going]
-            slope = np.empty((len(going), 3, 3))
+            codes, difference, matrix = share[active], error[active], turn[active]
+            slope = np.empty((len(active), 3, 3))
             for channel in range(3):
                 # Away from the border that is nearer, so that no code leaves 0 … 1.
-                nudge = np.where(here[:, channel] < 0.5, 1e-5, -1e-5)
-                moved = here.copy()
+                nudge = np.where(codes[:, channel] < 0.5, 1e-5, -1e-5)
+                moved = codes.copy()
                 moved[:, channel] += nudge
-                slope[:, :, channel] = (self._off(moved, lab[going], matrix) - off) / nudge[:, None]
-            downhill = (off[:, None] @ slope)[:, 0]
+                slope[:, :, channel] = (self._difference(moved, lab[active], matrix) - difference) / nudge[:, None]
+            downhill = (difference[:, None] @ slope)[:, 0]
             # A code at its border that wants beyond it stays there.
-            held = ((here <= 0) & (downhill > 0)) | ((here >= 1) & (downhill < 0))
-            slope = np.where(held[:, None], 0, slope)
+            fixed = ((codes <= 0) & (downhill > 0)) | ((codes >= 1) & (downhill < 0))
+            slope = np.where(fixed[:, None], 0, slope)
             curvature = slope.swapaxes(1, 2) @ slope
-            scale = damping[going] * (1 + np.trace(curvature, axis1=1, axis2=2))
+            scale = damping[active] * (1 + np.trace(curvature, axis1=1, axis2=2))
             curvature += scale[:, None, None] * np.eye(3)
-            wish = np.where(held, 0, downhill)[..., None]
-            step: _Array = np.asarray(-np.linalg.solve(curvature, wish)[..., 0], dtype=np.float64)
-            tried: _Array = np.clip(here + step, 0, 1)
-            found = self._off(tried, lab[going], matrix)
-            gain = (off**2).sum(axis=1) - (found**2).sum(axis=1)
-            better = gain > 0
-            share[going[better]], error[going[better]] = tried[better], found[better]
-            damping[going] *= np.where(better, 0.2, 8)
-            done = ((found**2).sum(axis=1) < 1e-6) | (better & (gain < 1e-7)) | (damping[going] > 1e6)
-            going = going[~done]
-            if len(going) == 0:
+            gradient = np.where(fixed, 0, downhill)[..., None]
+            step: _Array = np.asarray(-np.linalg.solve(curvature, gradient)[..., 0], dtype=np.float64)
+            candidates: _Array = np.clip(codes + step, 0, 1)
+            found = self._difference(candidates, lab[active], matrix)
+            gain = (difference**2).sum(axis=1) - (found**2).sum(axis=1)
+            is_better = gain > 0
+            share[active[is_better]], error[active[is_better]] = candidates[is_better], found[is_better]
+            damping[active] *= np.where(is_better, 0.2, 8)
+            is_done = ((found**2).sum(axis=1) < 1e-6) | (is_better & (gain < 1e-7)) | (damping[active] > 1e6)
+            active = active[~is_done]
+            if len(active) == 0:
                 break
         return share
 
-    def _off(self, share: _Array, lab: _Array, turn: _Array) -> _Array:
-        """Return (N, 3) differences in lightness, chroma and weighted hue."""
+    def _difference(self, share: _Array, lab: _Array, turn: _Array) -> _Array:
+        # Differences (N, 3) in lightness, chroma and weighted hue.
         return (turn @ (_lab(self.xyz(share)) - lab)[..., None])[..., 0]
 
 
@@ -701,18 +652,18 @@ class _Inks:
 def _black(on: PaperName) -> float:
     inks = _Inks(on)
     darkest = float(inks.xyz(np.zeros((1, 3)))[0, 1])
-    tried = darkest * np.geomspace(1, 2, 41)
-    lab = _lab(np.repeat(tried[:, None], 3, axis=1))
-    off = np.linalg.norm(_lab(inks.xyz(inks.matching(lab))) - lab, axis=1)
-    return float(tried[np.argmax(off < _NEUTRAL)])
+    candidates = darkest * np.geomspace(1, 2, 41)
+    lab = _lab(np.repeat(candidates[:, None], 3, axis=1))
+    difference = np.linalg.norm(_lab(inks.xyz(inks.codes_of_lab(lab))) - lab, axis=1)
+    return float(candidates[np.argmax(difference < _NEUTRAL)])
 
 
 @cache
 def _table(on: PaperName) -> _Array:
-    """Return (33, 33, 33, 3) ink codes 0 … 255 by the codes of the file."""
+    # (33, 33, 33, 3) ink codes 0 to 255 by sRGB codes.
     axis = np.linspace(0, 1, NODES)
     codes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    share = _Inks(on).matching(_lab(_wanted(codes.reshape(-1, 3), _black(on))))
+    share = _Inks(on).codes_of_lab(_lab(_target_xyz(codes.reshape(-1, 3), _black(on))))
     table = 255 * share.reshape(codes.shape)
     table[-1, -1, -1] = 255
     table.setflags(write=False)

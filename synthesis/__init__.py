@@ -1,1 +1,1 @@
-"""Synthesis: a table without a laboratory, computed from spectra and a model of the sensor."""
+"""Look-up tables computed from spectra and a model of the sensor, without a laboratory."""

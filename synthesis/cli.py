@@ -1,6 +1,6 @@
-"""`sim`: simulated devices on real cables, and tables computed without any. Parse, build, call, print; nothing else.
+"""Command `sim`: the simulated devices of `sim.cli`, and `sim table`, which computes a look-up table (LUT).
 
-The devices are `sim.cli`'s; a table needs calibration's functions and format besides, so the command stands above both
+A LUT also needs the functions and the format of calibration, so this command is in a higher package than `sim.cli`
 (docs/decisions/0020-a-floor-for-computed-tables.md).
 """
 
@@ -22,49 +22,49 @@ if TYPE_CHECKING:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
+    """Run `sim` with `argv`, by default the arguments of the process, and return the exit code (`EXIT_CODES`)."""
     return devices.main(argv, read_print)
 
 
 def read_print(chart: Path) -> Print:
-    """Return the print of a chart.json, as the simulated room hangs it up."""
+    """Return the printed sheet of a chart.json for the simulated room."""
     from experiment.chart.model import load_chart
     from experiment.chart.printing import drawing
     from sim.world.rendering import Print
 
-    drawn = drawing(load_chart(chart))
-    return Print(drawn.page_mm, drawn.rectangles_mm, drawn.rgb)
+    sheet = drawing(load_chart(chart))
+    return Print(sheet.page_mm, sheet.rectangles_mm, sheet.rgb)
 
 
 @app.command(epilog=EXIT_CODES)
 @with_json("sim table")
 def table(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the table.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the LUT.")],
     camera: Annotated[
         str,
         typer.Option(
-            help="Spectral sensitivities: a name (Canon_EOS_5DS) or a JSON file of rawtoaces' layout; or a body of the "
-            "simulated lab (EOS 550D)."
+            help="Spectral sensitivities: a name (Canon_EOS_5DS), a JSON file in the format of rawtoaces, or a camera "
+            "of the simulated laboratory (EOS 550D)."
         ),
     ] = "Canon_EOS_600D",
     lights: Annotated[
         str | None,
         typer.Option(
-            help="CSV of spectra (wavelength, then a column each), or published ones: D65,A,FL2,cie-led,5600K,"
-            "2000:10000:200K,daylight:4000:10000:500; else the 707 lights of the simulated projector."
+            help="CSV file of spectra (wavelength, then one column each), or published spectra: D65,A,FL2,cie-led,"
+            "5600K,2000:10000:200K,daylight:4000:10000:500; by default the 707 illuminants of the simulated projector."
         ),
     ] = None,
     settings: Annotated[
-        Path | None, typer.Option(help="TOML file: body, exposure, room with paper and print, chart, seed, citation.")
+        Path | None, typer.Option(help="TOML file: camera, exposure, room with paper and print, chart, seed, citation.")
     ] = None,
     *,
     output: JsonOutput,
 ) -> None:
-    """Compute a whole table from spectra and the sensor's noise model, without a frame.
+    """Compute a look-up table (LUT) from spectra and the noise model of the sensor, without frames.
 
-    Reads the sensitivities, the spectra of lights and the settings. Writes OUT/samples.npy, illuminations.csv,
-    references.csv and lut.json, which records that the table was computed. It is a table for generate like one that
-    build-lut makes of a session in the simulated lab, in minutes.
+    Reads the sensitivities, the spectra of the illuminants and the settings. Writes OUT/samples.npy, illuminations.csv,
+    references.csv and lut.json, which records that the LUT was computed. generate can use it like a LUT that build-lut
+    makes from a session in the simulated laboratory. It takes minutes.
     """
     from synthesis.lamps import read_lights
     from synthesis.settings import load_settings, table_task
@@ -72,12 +72,12 @@ def table(
 
     spectra = None if lights is None else read_lights(lights)
     task = table_task(camera, load_settings(settings), str(settings or "the command line"), spectra)
-    with orderly_end(), progress("lights") as shown:
-        done = compute_table(task, out, processor_count(), shown)
-    output.add(table=out, lights=done.lights, colours=done.cells, samples=task.window**2, unfit=done.unfit)
+    with orderly_end(), progress("lights") as report:
+        result = compute_table(task, out, processor_count(), report)
+    output.add(table=out, lights=result.lights, colours=result.cells, samples=task.window**2, unfit=result.unfit)
     print(
-        f"{out}: computed, {done.lights} lights, {done.cells} colours, {task.window**2} samples each; "
-        f"{done.unfit} cells unfit for use"
+        f"{out}: computed, {result.lights} illuminants, {result.cells} colours, {task.window**2} samples each; "
+        f"{result.unfit} patches unfit for use"
     )
 
 

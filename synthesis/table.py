@@ -1,9 +1,9 @@
-"""A whole table, lights by cells by samples, computed light by light and written as `build-lut` writes one.
+"""Compute a look-up table (LUT) and write it in the format of `build-lut`.
 
-The same camera, lights, settings and seed give the same bytes, on any number of threads. A light's frame is treated as
-`calibration.pipeline.measuring` treats a photographed one that lies exactly where it was registered: black subtracted,
-field and white read from the white references, samples divided by the field, and by how much the field of a cell
-differs from that of paper. So the ground truth has the error that a photographed one has.
+The same camera, illuminants, settings and seed give the same bytes with any number of threads. Computed frames are
+evaluated like photographs in `calibration.pipeline.measuring`: the black level is subtracted, flat field and white are
+measured on the white references, samples are divided by the flat field of their colour. Therefore the ground truth has
+the error of a photographed one.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from experiment.lights import Illumination
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
 from foundation.compiled import ordered_map
 from foundation.errors import QualityError, StorageError
-from foundation.folders import require_free, whole_folder
+from foundation.folders import atomic_folder, require_free
 from foundation.version import software
 from sim.spectral import printed_reflectance
 from sim.world.rendering import Print
@@ -44,84 +44,68 @@ _Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ComputedFrame:
-    """What the frame of one light shows; C cells of S samples, G levels of grey.
+    """Measurements of the frame under one illuminant; C patches with S samples each, G grey levels."""
 
-    - `light`: number of the light.
-    - `values`: (C, S, 3) uint16, the table's samples.
-    - `share_at_zero`: of the samples, how many are 0.
-    - `highest`: (C,) uint16, the highest raw count of each cell.
-    - `black`: (2, 2) float64 counts, the black level that was subtracted.
-    - `paper`: field, ground truth and its standard error.
-    - `greys`, `grey_errors`: (G, 3) float64 counts of each level of grey, field divided out, and their standard errors.
-    """
-
-    light: int
-    values: npt.NDArray[np.uint16]
-    share_at_zero: float
-    highest: npt.NDArray[np.uint16]
-    black: _Array
-    paper: Paper
-    greys: _Array
-    grey_errors: _Array
+    light: int  # Index of the illuminant
+    values: npt.NDArray[np.uint16]  # (C, S, 3), samples of the LUT
+    share_at_zero: float  # Share of samples that are 0
+    highest: npt.NDArray[np.uint16]  # (C,), highest raw count of each patch
+    black: _Array  # (2, 2) float64, subtracted black level in counts
+    paper: Paper  # Flat field, ground truth and its standard error
+    greys: _Array  # (G, 3) float64, counts of each grey level, divided by the flat field
+    grey_errors: _Array  # (G, 3) float64, their standard errors
 
 
 @dataclass(frozen=True, eq=False)
 class PatchMeasurement:
-    """What holds for the frames of all lights; made by `PatchMeasurement.of`.
+    """Measurement of the frames of all illuminants; made by `PatchMeasurement.of`."""
 
-    - `points`: the chart's cells and references.
-    - `sensor`: the photosites under them: cells first, then white, then grey references.
-    - `lamp`: what lights them.
-    - `iso`: ISO speed.
-    - `reader`: reads field and white, with the field of the even frame as base.
-    - `primaries`: how the field of coloured cells differs from that of paper; None where the light has no primaries.
-    """
-
-    points: ChartPoints
-    sensor: PatchSensor
+    points: ChartPoints  # Patches and references of the chart
+    sensor: PatchSensor  # Their photosites: patches, white references, grey references
     lamp: ChartLamp
     iso: int
-    reader: PaperReader
-    primaries: Primaries | None = None
+    reader: PaperReader  # Measures flat field and white; its base is the flat field of the white frame
+    primaries: Primaries | None = None  # Correction of the flat field for coloured patches; None for spectra
 
     @staticmethod
     def of(
-        points: ChartPoints, page_mm: tuple[float, float], among: bool, sensor: PatchSensor, lamp: ChartLamp, iso: int
+        points: ChartPoints, page_mm: tuple[float, float], tagged: bool, sensor: PatchSensor, lamp: ChartLamp, iso: int
     ) -> PatchMeasurement:
-        """Return what holds for all lights, from an even frame and those of the primaries."""
+        """Measure a white frame and the frames of the primaries."""
         reader = PaperReader(points.whites_mm, points.cells_mm, page_mm)
         first = PatchMeasurement(points, sensor, lamp, iso, reader)
-        order = MAX_ORDER if among else MAX_ORDER_AROUND
-        base = first._paper_of_even_frame().field
-        plain = replace(first, reader=PaperReader(points.whites_mm, points.cells_mm, page_mm, base, order))
-        pure = lamp.pure()
-        if pure is None:
-            return plain
-        frames = [plain.measure(light) for light in pure]
+        # Charts with tags have white references among the patches, other charts only around them.
+        order = MAX_ORDER if tagged else MAX_ORDER_AROUND
+        base = first._white_frame_paper().field
+        uncorrected = replace(first, reader=PaperReader(points.whites_mm, points.cells_mm, page_mm, base, order))
+        primaries = lamp.primary_indices()
+        if primaries is None:
+            return uncorrected
+        frames = [uncorrected.measure(light) for light in primaries]
         papers, cells = [frame.paper for frame in frames], [patch_means(frame.values) for frame in frames]
-        return replace(plain, primaries=Primaries.of(pure, papers, cells, points.cells_mm))
+        return replace(uncorrected, primaries=Primaries.of(primaries, papers, cells, points.cells_mm))
 
     def measure(self, light: int) -> ComputedFrame:
-        """Return what the frame of a light shows; any thread may ask for any light."""
-        mosaic, black = self.sensor.expose(*self.lamp.lit(light), self.iso, light + 1)
+        """Compute and measure the frame under an illuminant; may be called by several threads."""
+        mosaic, black = self.sensor.expose(*self.lamp.illuminate(light), self.iso, light + 1)
         cells, references = self._sites()
         samples, highest = gather(mosaic, black, references)
-        seen = usable_means(samples, highest, references, mosaic.saturation())
-        whites, greys = np.split(seen, [len(self.points.whites_mm)])
-        _require_unclipped(whites, f"light {light}")
-        paper, shape = self.reader.read(whites, f"light {light}")
+        means = usable_means(samples, highest, references, mosaic.saturation())
+        whites, greys = np.split(means, [len(self.points.whites_mm)])
+        _require_unclipped(whites, f"illuminant {light}")
+        paper, shape = self.reader.read(whites, f"illuminant {light}")
         if self.primaries is not None:
             shape = shape * self.primaries.field_ratio(paper.white)
         grey_values, grey_errors = self.points.levels.read(greys, paper.field.at(self.points.greys_mm))
         values, highest = gather_values(mosaic, black, cells, shape)
-        at_zero = 1 - int(np.count_nonzero(values)) / values.size
-        return ComputedFrame(light, values, at_zero, highest, black, paper, grey_values, grey_errors)
+        share_at_zero = 1 - int(np.count_nonzero(values)) / values.size
+        return ComputedFrame(light, values, share_at_zero, highest, black, paper, grey_values, grey_errors)
 
-    def _paper_of_even_frame(self) -> Paper:
-        mosaic, black = self.sensor.expose(*self.lamp.even(), self.iso, 0)
+    def _white_frame_paper(self) -> Paper:
+        mosaic, black = self.sensor.expose(*self.lamp.illuminate_evenly(), self.iso, 0)
         _, references = self._sites()
-        seen = usable_means(*gather(mosaic, black, references), references, mosaic.saturation())
-        whites = seen[: len(self.points.whites_mm)]
+        means = usable_means(*gather(mosaic, black, references), references, mosaic.saturation())
+        whites = means[: len(self.points.whites_mm)]
         _require_unclipped(whites, "the frame of white")
         return self.reader.read(whites, "the frame of white")[0]
 
@@ -133,55 +117,46 @@ class PatchMeasurement:
         )
 
 
-def _require_unclipped(whites: _Array, what: str) -> None:
-    """Refuse white references (W, 3), NaN where clipped, of which too few are left."""
-    left = int(np.isfinite(whites).all(axis=1).sum())
-    if left < MIN_REFERENCES:
+def _require_unclipped(whites: _Array, frame_name: str) -> None:
+    # Clipped references are NaN.
+    usable = int(np.isfinite(whites).all(axis=1).sum())
+    if usable < MIN_REFERENCES:
         raise QualityError(
-            f"{what}: bare paper is clipped in {len(whites) - left} of {len(whites)} white references; expose less: a "
-            "smaller room.white_level_share in the settings, or under the projector exposure.shutter_s"
+            f"{frame_name}: bare paper is clipped in {len(whites) - usable} of {len(whites)} white references, "
+            f"expected {MIN_REFERENCES} or more unclipped; expose less: reduce room.white_level_share, or "
+            "with the projector exposure.shutter_s, in the settings"
         )
 
 
-ReportLights = Callable[[int, int], None]  # Called with the number of lights computed, and the number of all
+ReportLights = Callable[[int, int], None]  # Called with the number of completed illuminants and their total
 
-# Room for a table's text files: `lut.json` holds 2.2 kB a light (707 lights take 1.6 MB), `references.csv` a third.
+# Disk space for text files, bytes: lut.json has 2.2 kB per illuminant (1.6 MB for 707), references.csv a third of it.
 SPARE_BYTES: Final = 16 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class TableTask:
-    """A table that is to be computed.
-
-    - `chart`: the chart that is thought to hang there.
-    - `body`, `room`: the camera and the room.
-    - `exposure`: of every frame.
-    - `powers`: (L, 81) float64, their spectra, relative power per nm (`synthesis.lamps.SpectralLamp`); None for those
-      that the simulated projector shows.
-    - `window`: half-size pixels along a window's side.
-    - `record`: what the provenance says under `computed`.
-    - `origin`: title, authors, licence, note and address of the table; None if the settings have none.
-    """
+    """A LUT to compute."""
 
     chart: Chart
     body: Body
     room: Room
     exposure: ExposureSettings
     illuminations: tuple[Illumination, ...]
-    powers: _Array | None
-    window: int
-    record: dict[str, Any]
-    origin: OriginRecord | None = None
+    powers: _Array | None  # (L, 81) float64, spectra in relative power per nm; None for the simulated projector
+    window: int  # Side of the window of a patch, in half-size pixels
+    record: dict[str, Any]  # Written to lut.json under `computed`
+    origin: OriginRecord | None = None  # Citation; None if the settings have none
 
     @property
     def sample_bytes(self) -> int:
-        """Bytes of `samples.npy`, but for its header."""
+        """Size of `samples.npy` without its header, in bytes."""
         return len(self.illuminations) * self.chart.colour_count * self.window**2 * 6
 
 
 @dataclass(frozen=True, eq=False)
 class ComputedTable:
-    """What came of it: where it is, how many lights and cells it has, and how many cells are listed as unfit."""
+    """Folder of a computed LUT, and the numbers of illuminants, patches and unfit patches."""
 
     folder: Path
     lights: int
@@ -190,36 +165,33 @@ class ComputedTable:
 
 
 def compute_table(task: TableTask, out: Path, threads: int, progress: ReportLights | None = None) -> ComputedTable:
-    """Compute a table and write it.
-
-    `threads`: how many lights are computed at a time; without effect on the bytes.
-    """
-    require_free(out, "the table")
-    _require_room(out, task.sample_bytes + SPARE_BYTES)
+    """Compute a LUT with `threads` threads, and write it to the folder `out`."""
+    require_free(out, "the LUT")
+    _require_disk_space(out, task.sample_bytes + SPARE_BYTES)
     measurement = _measurement(task)
     lights, cells = len(task.illuminations), task.chart.colour_count
-    with whole_folder(out, "the table") as folder:
+    with atomic_folder(out, "the LUT") as folder:
         writer = LutWriter(folder, lights, cells, task.window**2)
 
         def compute(light: int) -> ComputedFrame:
-            """Return all of a light's frame but its samples, which are written."""
+            # The samples are written, and not kept in memory.
             frame = measurement.measure(light)
             writer.put(light, frame.values)
             return replace(frame, values=frame.values[:0].copy())
 
-        kept: list[ComputedFrame] = []
-        for one in ordered_map(compute, range(lights), threads):
-            kept.append(one)
+        frames: list[ComputedFrame] = []
+        for frame in ordered_map(compute, range(lights), threads):
+            frames.append(frame)
             if progress is not None:
-                progress(len(kept), lights)
-        unfit = _clipped_cells(kept, task.body.saturation)
-        white = np.array([one.paper.white for one in kept])
-        provenance = _provenance(task, measurement, kept, white, unfit)
+                progress(len(frames), lights)
+        unfit = _clipped_cells(frames, task.body.saturation)
+        white = np.array([frame.paper.white for frame in frames])
+        provenance = _provenance(task, measurement, frames, white, unfit)
         levels = measurement.points.levels.names
         files: dict[str, str] = {}
         if levels:
-            errors = np.array([one.paper.error for one in kept])
-            greys, grey_errors = (np.array([getattr(one, name) for one in kept]) for name in ("greys", "grey_errors"))
+            errors = np.array([frame.paper.error for frame in frames])
+            greys, grey_errors = (np.array([getattr(f, name) for f in frames]) for name in ("greys", "grey_errors"))
             files[REFERENCES] = references_csv(levels, white, errors, greys, grey_errors)
         writer.finish(task.illuminations, white, provenance, files=files)
     return ComputedTable(out, lights, cells, len(unfit))
@@ -235,50 +207,50 @@ def _measurement(task: TableTask) -> PatchMeasurement:
             np.array([reference.rgb for reference in (*chart.white_references, *greys)], dtype=np.uint8),
         ]
     )
-    places = np.concatenate([points.cells_mm, points.references_mm])
+    positions_mm = np.concatenate([points.cells_mm, points.references_mm])
     sensor = PatchSensor.of(task.body, len(codes), task.window, task.room, task.exposure.shutter_s)
     blank = Print(chart.page_mm, np.zeros((0, 4)), np.zeros((0, 3), dtype=np.uint8))
     world = World(blank, task.body, task.room)
     lamp: ChartLamp
     if task.powers is None:
-        light = sensor.light(world.of_primaries(codes, places))
+        light = sensor.light(world.of_primaries(codes, positions_mm))
         lamp = ProjectorLamp(world, task.exposure, task.illuminations, light)
     else:
         reflectance = printed_reflectance(codes, task.room.profile, task.room.paper)
-        lamp = SpectralLamp(world, task.powers, sensor, reflectance, world.field(places)[:, 1])
+        lamp = SpectralLamp(world, task.powers, sensor, reflectance, world.field(positions_mm)[:, 1])
     return PatchMeasurement.of(points, chart.page_mm, bool(chart.tags), sensor, lamp, task.exposure.iso)
 
 
-def _clipped_cells(kept: Sequence[ComputedFrame], saturation: int) -> list[Unfit]:
+def _clipped_cells(frames: Sequence[ComputedFrame], saturation: int) -> list[Unfit]:
     allowed = CLIPPING_SHARE * saturation
-    highest = np.array([one.highest for one in kept])
-    found: list[Unfit] = []
+    highest = np.array([frame.highest for frame in frames])
+    unfit: list[Unfit] = []
     for colour in np.flatnonzero(highest.max(axis=0) >= allowed).tolist():
         light = int(highest[:, colour].argmax())
         cause = f"clipped: {int(highest[light, colour])} counts under light {light}, below {allowed:.0f} allowed"
-        found.append(Unfit(colour=colour, cause=cause))
-    return found
+        unfit.append(Unfit(colour=colour, cause=cause))
+    return unfit
 
 
 def _provenance(
-    task: TableTask, measurement: PatchMeasurement, kept: Sequence[ComputedFrame], white: _Array, unfit: list[Unfit]
+    task: TableTask, measurement: PatchMeasurement, frames: Sequence[ComputedFrame], white: _Array, unfit: list[Unfit]
 ) -> Provenance:
-    black = np.array([one.black for one in kept])
-    done = corrections(
+    black = np.array([frame.black for frame in frames])
+    records = corrections(
         task.chart.page_mm,
         black,
         task.body.saturation,
-        [one.paper.field for one in kept],
+        [frame.paper.field for frame in frames],
         saturation_from="settings",
-        at_zero=np.array([one.share_at_zero for one in kept]),
+        at_zero=np.array([frame.share_at_zero for frame in frames]),
     )
     if measurement.primaries is not None:
-        done.append(measurement.primaries.correction(white))
+        records.append(measurement.primaries.correction(white))
     return Provenance(
         camera=task.body.camera,
         bits=task.chart.bits,
         white_level=round(task.body.saturation - float(black.mean())),
-        corrections=done,
+        corrections=records,
         session_sha256=frames_sha256(()),
         chart_sha256=task.chart.sha256,
         software=software(),
@@ -288,13 +260,13 @@ def _provenance(
     )
 
 
-def _require_room(out: Path, needed: int) -> None:
-    there = out.absolute()
-    while not there.exists():
-        there = there.parent
-    free = shutil.disk_usage(there).free
+def _require_disk_space(out: Path, needed: int) -> None:
+    folder = out.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    free = shutil.disk_usage(folder).free
     if free < needed:
         raise StorageError(
-            f"{out}: the table takes {needed / 1e9:.2f} GB, the disk has {free / 1e9:.2f} GB left; free space, or name "
-            "a place on another disk"
+            f"{out}: the LUT needs {needed / 1e9:.2f} GB, the disk has {free / 1e9:.2f} GB left; free space, or choose "
+            "another disk"
         )

@@ -61,7 +61,7 @@ from experiment.measures.paper import falloff
 from experiment.measures.pose import keystone, off_level_deg
 from experiment.session.folder import Session
 from foundation.errors import RegistrationError, StorageError, counted
-from foundation.files import write_whole
+from foundation.files import write_atomic
 
 # White at the settings' shutter time, of saturation, at which trial frames are taken so; else with a better time.
 USABLE = (0.3, 0.9)
@@ -154,7 +154,7 @@ def check_lab(
     outcome = None if trial.table is None or first_s is not None else trial.verdict.outcome
     report = CheckReport(tuple(lines), tuple(findings), outcome, values, trial.not_known, first_s)
     if picture is not None:
-        write_whole(picture, check_png(trial, chart, report))
+        write_atomic(picture, check_png(trial, chart, report))
     return report
 
 

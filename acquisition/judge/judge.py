@@ -69,7 +69,7 @@ from experiment.measures.frame import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measure
 from experiment.session.records import REFERENCES, Check, Judgement, SessionStep
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import FormatError, RegistrationError
-from foundation.robust import sigma_of
+from foundation.robust import robust_sigma
 
 _BESIDE = "it was under way when the frames before it were found to contradict each other; they are taken again first"
 
@@ -1176,7 +1176,7 @@ def _wrong_rows(basis: Basis, rest: Residuals, moved_px: _Array) -> npt.NDArray[
     seen = np.isfinite(rest.relative)
     if not seen.any():
         return np.zeros(len(seen), dtype=np.bool_)
-    usual = max(sigma_of(rest.signed[seen]), 1e-6)
+    usual = max(robust_sigma(rest.signed[seen]), 1e-6)
     # A row at the print's edge changes with the least movement.
     assert basis.strip_maps is not None
     strength = np.linalg.norm(basis.strip_maps.sum(axis=0), axis=1).reshape(-1, SEGMENTS)

@@ -42,7 +42,7 @@ from acquisition.judge.measure import Anchor, Frame
 from calibration.figures.light import OFF_BRIGHTNESS
 from experiment.measures.frame import SEGMENTS, Measured, Noise, strip_blocks
 from experiment.session.records import PRIMARIES, REFERENCES, TOP, SessionStep
-from foundation.robust import huber_weights, sigma_of
+from foundation.robust import huber_weights, robust_sigma
 
 # Codes at which tone curves are known; between them a curve bends by less than a thousandth.
 _NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 184, 200, 216, 232, 255.0])
@@ -434,7 +434,7 @@ class Basis:
         amounts: _Array = np.median(each, axis=0)
         for _ in range(_ROUNDS):
             off = np.sqrt(((seen - np.einsum("p,ptc->tc", amounts, design)) ** 2 / variance).sum(axis=1))
-            trust = lit * huber_weights(off, max(sigma_of(off[lit]), 1e-9)) ** 2
+            trust = lit * huber_weights(off, max(robust_sigma(off[lit]), 1e-9)) ** 2
             weights = trust[:, None] / variance
             gram = np.einsum("ptc,tc,qtc->pq", design, weights, design)
             inverse = np.asarray(np.linalg.inv(gram + 1e-12 * np.trace(gram) * np.eye(3)), dtype=np.float64)

@@ -57,8 +57,8 @@ from experiment.session.records import (
     time_left,
 )
 from foundation.colorimetry import decode_srgb
-from foundation.errors import CropError, FormatError, first_of
-from foundation.files import write_whole
+from foundation.errors import CropError, FormatError, first_few
+from foundation.files import write_atomic
 
 RUN_STARTS = "start"  # The event with which a run begins to take frames
 
@@ -347,7 +347,7 @@ def _state_of(
     if over and total and not left:
         return "complete", f"complete, {total} frames; next: build-lut {shlex.quote(view.given)} LUT/"
     if over and view.lost:
-        gone = first_of(list(view.lost.values()), 3)
+        gone = first_few(list(view.lost.values()), 3)
         return "incomplete", f"{gone}: gone or cut since taken; restore from a copy, or {AGAIN}, which takes it again"
     if heartbeat is None:
         return "unknown", f"{left} of {total} frames are left, and the journal has no sign of life of a run"
@@ -701,7 +701,7 @@ def write_session_report(folder: Path, path: Path | None = None) -> Path:
         policy=f'<meta http-equiv="Content-Security-Policy" content="{_policy("img-src data:")}">',
         data=f'<script type="application/json" id="embedded">{to_bytes(state).decode()}</script>',
     )
-    write_whole(path, text)
+    write_atomic(path, text)
     return path
 
 

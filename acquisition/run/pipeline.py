@@ -66,9 +66,9 @@ from experiment.session.records import (
     preview_path,
 )
 from foundation.clock import SteadyClock
-from foundation.console import Ending
-from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted, first_of
-from foundation.files import write_whole
+from foundation.console import EndRequest
+from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted, first_few
+from foundation.files import write_atomic
 
 # Frames whose verdict is not known when the next is exposed. A frame is judged while the next is exposed and
 # downloaded, which takes several times as long; with more frames ahead, more would be lost where one is refused.
@@ -170,7 +170,7 @@ class Pipeline:
     """Moves the devices; `saving` is the thread that completes files and judges them, one after another."""
 
     def __init__(
-        self, job: Job, saving: ThreadPoolExecutor, observe: Callable[[Taken], object], ending: Ending
+        self, job: Job, saving: ThreadPoolExecutor, observe: Callable[[Taken], object], ending: EndRequest
     ) -> None:
         self._job, self._saving, self._observe, self._ending = job, saving, observe, ending
         self._lasting = LastingCause(job)
@@ -188,7 +188,7 @@ class Pipeline:
         Whatever ends it, frames that the camera has given are completed, judged and journalled first.
         """
         try:
-            with self._ending.finishing(PROMISE):
+            with self._ending.postponed(PROMISE):
                 light = self._next_light()
                 while light is not None:
                     light = self._take(light)
@@ -198,7 +198,7 @@ class Pipeline:
 
     def _next_light(self) -> ShownLight | None:
         """Show the next light; wait for verdicts where it depends on them; None where nothing more is to be taken."""
-        while not self._ending.asked:
+        while not self._ending.is_requested:
             if self._verdicts.is_spent:
                 self._collect(0)
                 self._verdicts.require_budget()
@@ -218,7 +218,7 @@ class Pipeline:
     def _take(self, light: ShownLight) -> ShownLight | None:
         """Take the frame of the light that is on the screen; return the next one that is."""
         settling_s = self._settle(light)
-        if self._ending.asked:
+        if self._ending.is_requested:
             return self._next_light()
         frame = self._expose(light, settling_s)
         if frame is None:
@@ -250,7 +250,7 @@ class Pipeline:
 
     def _show_following(self) -> ShownLight | None:
         """Show the next light if it is known; a presenter that fails is met when no frame waits in the camera."""
-        step = None if self._ending.asked else self._job.queue.next()
+        step = None if self._ending.is_requested else self._job.queue.next()
         if step is None:
             return None
         try:
@@ -295,7 +295,7 @@ class Pipeline:
         A date that was set meanwhile is told, too.
         """
         clock = self._job.devices.clock
-        if isinstance(clock, SteadyClock) and (set_by_s := clock.set_by_s()):
+        if isinstance(clock, SteadyClock) and (set_by_s := clock.step_s()):
             way = "ahead" if set_by_s > 0 else "back"
             by = f"{way} by {duration_text(abs(set_by_s))}"
             self._job.retry.report("clock", f"the machine's clock was set {by}; the session's time goes on as before")
@@ -438,7 +438,7 @@ def _save(job: Job, complete: Callable[[], ReceivedFile], frame: Exposed) -> Sav
         if seen.preview:
             # It is derived and may be lost; flushing it would cost the devices' thread as much as a row.
             try:
-                write_whole(preview_path(job.session.folder, received.path.name), seen.preview)
+                write_atomic(preview_path(job.session.folder, received.path.name), seen.preview)
             except CropError as error:
                 preview_fault = str(error)
     return Saved(received, judgement, saved - begun, time.perf_counter() - saved, preview_fault)
@@ -511,7 +511,7 @@ class Verdicts:
         queue, found = self._job.queue, self._job.on_disk(self._job.session.lost_files)
         lost = [frame for frame in found if not queue.is_open(frame.step)]
         if lost:
-            reason = f"{first_of([frame.file for frame in lost])}: gone or cut while the run was at work"
+            reason = f"{first_few([frame.file for frame in lost])}: gone or cut while the run was at work"
             queue.void([frame.step for frame in lost], reason)
             self._void([frame.attempt for frame in lost], reason)
         return bool(lost)

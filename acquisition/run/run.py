@@ -79,8 +79,8 @@ from experiment.session.records import (
     time_left,
 )
 from foundation.clock import Clock, SteadyClock
-from foundation.console import Ending, shows_progress
-from foundation.errors import CropError, DeviceRefused, InputError, StorageError, first_of
+from foundation.console import EndRequest, shows_progress
+from foundation.errors import CropError, DeviceRefused, InputError, StorageError, first_few
 from foundation.secret_texts import is_webhook, target_label
 from foundation.version import software
 
@@ -433,7 +433,7 @@ def run_session(
     observe: Callable[[int, int], object],
     announce: Callable[[str], object] = lambda sentence: None,
     retake: str | None = None,
-    ending: Ending | None = None,
+    ending: EndRequest | None = None,
     taken: Callable[[Taken], object] = lambda taken: None,
     state: Callable[[str], object] = lambda sentence: None,
 ) -> RunOutcome:
@@ -455,7 +455,7 @@ def run_session(
                 alive(f"{BEGINS}; frame {done} of {total}")
 
             if session.journal.accepted_files() and (damaged := session.verify(checking)):
-                announce(f"voided: {first_of(damaged, 5)}")
+                announce(f"voided: {first_few(damaged, 5)}")
             total = len(session.steps)
             if len(session.done_steps()) == total:
                 observe(total, total)
@@ -607,7 +607,7 @@ def take_session(
     observe: Callable[[Taken], object] = lambda taken: None,
     announce: Callable[[str], object] = lambda sentence: None,
     state: Callable[[str], object] = lambda sentence: None,
-    ending: Ending | None = None,
+    ending: EndRequest | None = None,
     first: Sequence[int] = (),
 ) -> RunOutcome:
     """Take every step of the session's plan that has no accepted frame yet.
@@ -618,7 +618,7 @@ def take_session(
     """
     sequence = settings.sequence
     reports = _Reports(session, devices.clock, announce, state, settings)
-    asked = ending or Ending()
+    asked = ending or EndRequest()
     retry = RetryPolicy(
         devices.clock,
         sequence.patience_s,
@@ -646,7 +646,7 @@ def take_session(
         session.journal.require_whole()
         doubts = tuple(doubts_of(session.journal.events()))
         outcome = RunOutcome(len(session.steps), len(job.queue), job.queue.given_up, doubts)
-        if asked.asked and not outcome.complete:
+        if asked.is_requested and not outcome.complete:
             raise KeyboardInterrupt
         leave_lab(devices, RunEnd.COMPLETE if outcome.complete else RunEnd.UNFINISHED, sequence, reports.tell)
     except BaseException as error:

@@ -37,7 +37,7 @@ from experiment.measures.least_squares import (
     product,
 )
 from experiment.session.records import FrameRecord
-from foundation.robust import huber_weights, sigma_of
+from foundation.robust import huber_weights, robust_sigma
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -267,7 +267,7 @@ class ConsistencyCheck:
         solution = least_squares(design, seen, weights)
         for _ in range(_ROUNDS):
             residual = np.abs(seen - product(design, solution)) / sigma
-            usual = max(sigma_of(residual), 1e-9)
+            usual = max(robust_sigma(residual), 1e-9)
             solution = least_squares(design, seen, weights * huber_weights(residual, usual) ** 2)
         expected, there = product(known.terms, solution) * known.level, known.there
         there = there[expected[there] > LEAST_COUNTS]
@@ -275,7 +275,7 @@ class ConsistencyCheck:
             return None
         deviation = np.full(len(mean) + 1, np.nan)
         deviation[there] = np.clip(mean[there] / expected[there] - 1, -1, 1)
-        spread2 = sigma_of(deviation[there] - np.median(deviation[there])) ** 2
+        spread2 = robust_sigma(deviation[there] - np.median(deviation[there])) ** 2
         noise2 = float(np.median(variance[there] / expected[there] ** 2))
         # That of a square is twice that of its root.
         error = _CERTAIN * 2 * float(np.sqrt(_SPREAD_ERROR2 / len(there)))

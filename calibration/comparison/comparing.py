@@ -34,8 +34,8 @@ from experiment.session.folder import Session
 from experiment.session.journal import JOURNAL_FILE
 from foundation.colorimetry import angles_deg
 from foundation.compiled import ordered_map, processor_count
-from foundation.errors import FormatError, first_of
-from foundation.files import write_whole
+from foundation.errors import FormatError, first_few
+from foundation.files import write_atomic
 
 _Array = npt.NDArray[np.float64]
 _Numbers = npt.NDArray[np.int64]
@@ -180,7 +180,7 @@ def table_of(place: Path, progress: Callable[[int, int, str], None] | None = Non
             # `acquire run --retake bad`, which the message of a refused frame names, looks for it beside the session.
             refused = refused_folder(table) / REPORT_JSON
             if refused.is_file():
-                write_whole(refused_folder(place.resolve()) / REPORT_JSON, refused.read_bytes())
+                write_atomic(refused_folder(place.resolve()) / REPORT_JSON, refused.read_bytes())
         yield open_lut(table)
 
 
@@ -235,7 +235,7 @@ def _answer(name: str, said: str, *beyond: str) -> NoiseAnswer:
 
 
 def _named(numbers: _Numbers, what: str) -> str:
-    return f"{len(numbers)} {what}: {first_of(numbers.tolist())}" if len(numbers) else ""
+    return f"{len(numbers)} {what}: {first_few(numbers.tolist())}" if len(numbers) else ""
 
 
 def _colour_answer(lights: LightDifferences) -> NoiseAnswer:

@@ -18,11 +18,11 @@ from calibration.comparison.comparing import (
     differing_lights,
 )
 from experiment.chart.model import Chart
-from foundation.console import plain
-from foundation.files import write_whole
-from foundation.folders import whole_folder
+from foundation.console import json_value
+from foundation.files import write_atomic
+from foundation.folders import atomic_folder
 from foundation.pages import figure, note, page, table, verdict
-from foundation.plots import INK, MARK, draw_squares, png_of
+from foundation.plots import INK, MARK, draw_png, draw_squares
 
 _ANSWERS = {True: "yes", False: "no"}
 
@@ -40,7 +40,7 @@ def lines(comparison: TableComparison) -> list[str]:
 def comparison_json(comparison: TableComparison) -> dict[str, Any]:
     """Return the content of `comparison.json` (docs/formats.md)."""
     lights, cells = comparison.lights, comparison.cells
-    return plain(
+    return json_value(
         {
             "format": "crop.comparison",
             "version": 1,
@@ -86,10 +86,10 @@ def draw_map(figure: Any, chart: Chart, cells: CellDifferences) -> None:
 def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | None = None) -> None:
     """Write a comparison into a new folder, whole or not at all; with a map of the print if its chart is given."""
     (one, other), cells, same = comparison.places, comparison.cells, comparison.same_within_noise
-    pictures = [figure(png_of(draw_lights, comparison.lights), "Light by light.", wide=True)]
+    pictures = [figure(draw_png(draw_lights, comparison.lights), "Light by light.", wide=True)]
     if chart is not None:
         caption = "The cells on the print. Noise is a fine grain; a stain, a shadow or another field has a shape."
-        pictures.append(figure(png_of(draw_map, chart, cells), caption, wide=True))
+        pictures.append(figure(draw_png(draw_map, chart, cells), caption, wide=True))
     answers = [(_ANSWERS[each.same_within_noise], each.name, each.said) for each in comparison.answers]
     kind, sentence = ("accept", "The same within noise.") if same else ("remark", "They differ by more than noise.")
     parts = [
@@ -101,11 +101,11 @@ def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | N
     columns = {"colour": np.arange(len(cells.mean)), "lights": cells.lights.max(axis=1)}
     for name in ("mean", "noise"):
         columns |= dict(zip((f"{name}_{letter}" for letter in "rgb"), getattr(cells, name).T, strict=True))
-    with whole_folder(folder, "the comparison") as partial:
+    with atomic_folder(folder, "the comparison") as partial:
         _write_columns(partial / "lights.csv", vars(comparison.lights))
         _write_columns(partial / "cells.csv", columns)
-        write_whole(partial / "report.html", page(f"{one.name} and {other.name} compared", parts))
-        write_whole(partial / "comparison.json", json.dumps(comparison_json(comparison), indent=2) + "\n")
+        write_atomic(partial / "report.html", page(f"{one.name} and {other.name} compared", parts))
+        write_atomic(partial / "comparison.json", json.dumps(comparison_json(comparison), indent=2) + "\n")
 
 
 def _write_columns(path: Path, columns: dict[str, Any]) -> None:

@@ -30,7 +30,7 @@ from calibration.figures.figure import (
 )
 from calibration.radiometry.superposition import NODES
 from foundation.colorimetry import angles_deg
-from foundation.errors import first_of
+from foundation.errors import first_few
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -83,7 +83,7 @@ def _repeated_files(table: TableMeasurements, accepted: float) -> str:
         for frame in table.frames
         if seen.setdefault(frame.record.sha256, frame.record.file) != frame.record.file
     ]
-    return first_of(again)
+    return first_few(again)
 
 
 REPEATED_FILES = Figure(
@@ -378,7 +378,7 @@ def _exchanges(table: TableMeasurements, accepted: float) -> str:
 
 def _off_lights(table: TableMeasurements, accepted: float) -> str:
     lights, exchanged = table.lights.lights_off_codes(accepted), _exchanges(table, accepted)
-    return f"{len(lights)} lights: {first_of(lights)}{f'; {exchanged}' if exchanged else ''}"
+    return f"{len(lights)} lights: {first_few(lights)}{f'; {exchanged}' if exchanged else ''}"
 
 
 def _frames_off_codes(table: TableMeasurements, limit: float) -> list[FrameRecord]:
@@ -415,7 +415,7 @@ def _brightness_text(table: TableMeasurements, accepted: float) -> str:
         return ""
     order = sorted(range(len(codes.off_brightness)), key=lambda light: -codes.off_brightness[light])
     found = [f"light {k} by {100 * codes.brightness[k]:+.0f} %" for k in order if codes.off_brightness[k] > accepted]
-    return first_of(found)
+    return first_few(found)
 
 
 def _frames_off_brightness(table: TableMeasurements, limit: float) -> list[FrameRecord] | None:
@@ -522,7 +522,7 @@ WHITE_FRAME_DEG = Figure(
     source=SIMULATED + ": 0 in random healthy rooms",
     remedy="correct the list of frames that was imported, or take the white frame again",
     foremost=True, measure=_white_frames(lambda white: white.off_deg),
-    where=lambda table, accepted: first_of([one.file for one in _beyond_deg(table, accepted)]), retake=_beyond_deg,
+    where=lambda table, accepted: first_few([one.file for one in _beyond_deg(table, accepted)]), retake=_beyond_deg,
     cause=Explanation("names", name_evidence), drawing="course",
 )  # fmt: skip
 
@@ -533,7 +533,7 @@ WHITE_FRAME_BRIGHTNESS = Figure(
     source=JUDGEMENT + ": lamps flicker by some per cent, the next shutter time is 26 % off",
     remedy="keep one exposure for the session, and take the white frame again",
     measure=_white_frames(lambda white: white.off_brightness),
-    where=lambda table, accepted: first_of([one.file for one in _beyond_brightness(table, accepted)]),
+    where=lambda table, accepted: first_few([one.file for one in _beyond_brightness(table, accepted)]),
     retake=_beyond_brightness, cause=Explanation("brightness", light_evidence), drawing="course",
 )  # fmt: skip
 

@@ -31,7 +31,7 @@ from calibration.figures.figure import (
 )
 from experiment.measures.sensor import MAX_BLACK_DRIFT
 from experiment.measures.stains import added_light
-from foundation.errors import counted, first_of
+from foundation.errors import counted, first_few
 
 if TYPE_CHECKING:
     from calibration.checks.frame_consistency import ForeignFrame
@@ -217,7 +217,7 @@ REREGISTERED_FRAMES = Figure(
 def _foreign(frames: tuple[ForeignFrame, ...]) -> str:
     if not frames:
         return ""
-    names = first_of([frame.record.file for frame in frames])
+    names = first_few([frame.record.file for frame in frames])
     return f"{counted(len(frames), 'frame')}: {names}, with {frames[0].found} instead of {frames[0].expected}"
 
 

@@ -50,7 +50,7 @@ from experiment.framing.pictures import STILL_PX
 from experiment.measures.least_squares import code_polynomial, code_powers, least_squares, page_polynomial
 from experiment.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, FlatField, Paper, PaperReader
 from foundation.errors import RegistrationError
-from foundation.robust import huber_weights, sigma_of
+from foundation.robust import huber_weights, robust_sigma
 
 _Array = npt.NDArray[np.float64]
 
@@ -303,7 +303,7 @@ def field_of_cells(
         for _ in range(_ROUNDS):
             solution = least_squares(rows, value, weights)
             off = np.abs(value - rows @ solution)
-            spread = max(sigma_of(off), 1e-6)
+            spread = max(robust_sigma(off), 1e-6)
             weights = trust * huber_weights(off, spread) ** 2
         shape = np.exp(light[:, 1:] @ solution[codes.shape[1] : -1])
         smooth = least_squares(np.ascontiguousarray(light), shape, np.ones(len(shape)))

@@ -83,8 +83,8 @@ from experiment.framing.finding import annotated_png
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.compiled import processor_count
-from foundation.errors import CropError, FormatError, QualityError, RegistrationError, counted, first_of
-from foundation.files import write_whole
+from foundation.errors import CropError, FormatError, QualityError, RegistrationError, counted, first_few
+from foundation.files import write_atomic
 from foundation.folders import clear_folder
 from foundation.records import to_plain
 from foundation.version import software
@@ -135,7 +135,7 @@ def build(
     if selected.lights_without:
         raise FormatError(
             f"{session.folder}: {len(selected.lights_without)} of {len(session.illuminations)} lights have no accepted "
-            f"frame: {first_of(selected.lights_without)}; finish the session with acquire run, then build the table; "
+            f"frame: {first_few(selected.lights_without)}; finish the session with acquire run, then build the table; "
             "or take in what there is with build-lut --append"
         )
     _require_dark_frames(session, options)
@@ -210,10 +210,10 @@ def check(
     except RegistrationError as error:
         if picture is None:
             raise RegistrationError(f"{error}; see what is there with --picture PNG") from error
-        write_whole(picture, annotated_png(first.mosaic, session.chart, None))
+        write_atomic(picture, annotated_png(first.mosaic, session.chart, None))
         raise RegistrationError(f"{error}; see {picture}") from error
     if picture is not None:
-        write_whole(picture, annotated_png(first.mosaic, session.chart, baseline.first.registration.framing))
+        write_atomic(picture, annotated_png(first.mosaic, session.chart, baseline.first.registration.framing))
     located = LocatedFrame(first, baseline.first, baseline.first, IN_PLACE, reregistered=False)
     done = Accumulator.empty(session, selected, baseline, first.saturation)
     done = done.with_frame(measure(baseline, sample(baseline, located, dark=None, keep_samples=True)))
@@ -343,7 +343,7 @@ def _stopped_by(
     """Return why the build ends at a frame, after naming it in a report that `acquire run --retake bad` reads."""
     says = {"format": REPORT_FORMAT, "version": REPORT_VERSION, "verdict": "refuse", "reason": str(error)}
     says |= {"session": done.session.folder.name, **retake_json((record,), record.sha256, done.selected.newest.sha256)}
-    write_whole(refused_folder(out) / REPORT_JSON, json.dumps(says, indent=2) + "\n")
+    write_atomic(refused_folder(out) / REPORT_JSON, json.dumps(says, indent=2) + "\n")
     return type(error)(f"{error}; or take {record.file} again: {COMMAND}")
 
 
@@ -420,7 +420,7 @@ def _refused(result: BuildResult, out: Path, folder: Path) -> QualityError:
     refused = refused_folder(out)
     kept = [name for name in (REPORT_PAGE, REPORT_JSON) if (folder / name).exists()]
     for name in kept:
-        write_whole(refused / name, (folder / name).read_bytes())
+        write_atomic(refused / name, (folder / name).read_bytes())
     where = f"; see {refused / kept[0]}" if kept else ""
     figures = result.figures
     return QualityError(

@@ -21,9 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.table.lut import SAMPLES
-from foundation.files import partial_path, sha256_of, storage_error, sync_folder, write_whole
-from foundation.folders import held_folder, publish_folder, require_free
-from foundation.pieces import Piece, pieces_of
+from foundation.files import partial_path, sha256_of, storage_error, sync_folder, write_atomic
+from foundation.folders import locked_folder, publish_folder, require_free
+from foundation.pieces import Piece, read_pieces
 
 RECORD = "checkpoint"  # Name of the record file in the hidden folder, and the beginning of the names of files of arrays
 
@@ -62,10 +62,10 @@ class UnfinishedTable:
         record = self.folder / RECORD
         if not record.is_file() or not (self.folder / SAMPLES).is_file():
             return None
-        for name, piece in pieces_of(record.read_bytes()).items():
+        for name, piece in read_pieces(record.read_bytes()).items():
             begun = frames[: int(name)]
             same = begun and piece.inputs == _hash_of(identity, begun)
-            if same and piece.is_whole(lambda file: (self.folder / file).open("rb")):
+            if same and piece.is_complete(lambda file: (self.folder / file).open("rb")):
                 with np.load(self.folder / _arrays_of(begun), allow_pickle=False) as stored:
                     arrays: dict[str, npt.NDArray[Any]] = {key: stored[key] for key in stored.files}
                 return Checkpoint(identity, begun, json.loads(piece.values), arrays)
@@ -76,11 +76,11 @@ class UnfinishedTable:
         stream = io.BytesIO()
         np.savez(stream, allow_pickle=False, **checkpoint.arrays)
         arrays, data = _arrays_of(checkpoint.frames), stream.getvalue()
-        write_whole(self.folder / arrays, data)
+        write_atomic(self.folder / arrays, data)
         inputs = _hash_of(checkpoint.identity, checkpoint.frames)
         files = {arrays: sha256_of(data)}
         piece = Piece(str(len(checkpoint.frames)), inputs, files, json.dumps(checkpoint.values))
-        write_whole(self.folder / RECORD, piece.to_line())
+        write_atomic(self.folder / RECORD, piece.to_line())
         self._remove(kept={RECORD, arrays})
 
     def publish(self) -> None:
@@ -113,7 +113,7 @@ def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
     require_free(out, "the table")
     folder = partial_path(out)
     busy = f"{out} is being made by another program; wait for it, or name another place"
-    with held_folder(folder, busy, of=out):
+    with locked_folder(folder, busy, target=out):
         unfinished = UnfinishedTable(folder, out)
         try:
             yield unfinished

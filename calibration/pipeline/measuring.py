@@ -62,7 +62,7 @@ from experiment.measures.paper import Paper, PaperReader
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.errors import FormatError
-from foundation.files import read_whole
+from foundation.files import read_buffer
 from foundation.robust import MAD_TO_SIGMA
 
 _Array = npt.NDArray[np.float64]
@@ -189,7 +189,7 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
     """Return a frame as read from its file, whose SHA-256 is checked first."""
     path = session.folder / record.file
     try:
-        data = read_whole(path)
+        data = read_buffer(path)
     except FileNotFoundError as error:
         raise ChangedFrame(
             f"{path} is missing, but the session's journal counts it; restore the file from a copy, {_TAKEN_AGAIN}"

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from experiment.chart.model import Chart
 from experiment.measures.least_squares import code_powers, least_squares
-from foundation.robust import MAD_TO_SIGMA, huber_weights, sigma_of
+from foundation.robust import MAD_TO_SIGMA, huber_weights, robust_sigma
 
 MIN_COLOURS = 64  # Colours below which none is called mismatched: a model fitted on fewer is no judge of one of them
 
@@ -204,7 +204,7 @@ def fit_colours(
             flat = terms @ model
             field = least_squares(page * flat[:, None], value, weights)
             residual = np.abs(value - flat * (page @ field))
-            spread = max(sigma_of(residual), 1e-9)
+            spread = max(robust_sigma(residual), 1e-9)
             weights = huber_weights(residual, spread)
         level = float((page @ field).mean())
         coefficients[:, channel], light[:, channel] = model * level, field / level

@@ -26,7 +26,7 @@ from experiment.framing.finding import MIN_CELL_PX, Framing, find_chart
 from experiment.framing.homography import rms
 from experiment.framing.sharpness import blur_px
 from foundation.errors import RegistrationError
-from foundation.robust import sigma_of
+from foundation.robust import robust_sigma
 
 # What the place of a cell of 10 px may be off by, at most (`Registration.expanded_px`): at 0.5 px the outermost of
 # its 25 pixels, rounding included, has 0.1 % of its light from the next cell at a blur of 0.7 px
@@ -288,7 +288,7 @@ def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
     for _ in range(2):
         size = field.off_run_px(residual)
-        fits = size <= max(_APART * sigma_of(size), _APART_PX)
+        fits = size <= max(_APART * robust_sigma(size), _APART_PX)
         kept[kept] = fits
         field = replace(
             field,

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from experiment.chart.model import TAG_MODULES, Tag
-from foundation.robust import sigma_of
+from foundation.robust import robust_sigma
 
 _Array = npt.NDArray[np.float64]
 
@@ -282,7 +282,7 @@ def compare_tiles(
         gain = common / np.maximum(power, np.float32(1e-6))
         error = values - gain * model
         magnitude = np.abs(error)
-        noise = np.float32(sigma_of(magnitude[::3, ::3][weight[::3, ::3] > 0]) + 1e-3)
+        noise = np.float32(robust_sigma(magnitude[::3, ::3][weight[::3, ::3] > 0]) + 1e-3)
         agreeing += common / noise**2
         expected_power += power / noise**2
         seen_power += box_mean(values * values, window) / noise**2

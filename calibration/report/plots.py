@@ -1,4 +1,4 @@
-"""The pictures of the report, each drawn on a Matplotlib figure of its own (`foundation.plots.png_of`).
+"""The pictures of the report, each drawn on a Matplotlib figure of its own (`foundation.plots.draw_png`).
 
 A frame is drawn at half size, linear camera RGB: one pixel for each 2×2 block, nothing interpolated (the paper's
 "simple subsampling and debayering", section 3.3).

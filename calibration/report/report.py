@@ -56,10 +56,10 @@ from calibration.verdict import (
 )
 from drivers.raw.rawfile import read_raw
 from experiment.session.folder import Session
-from foundation.errors import counted, first_of
-from foundation.files import write_whole
+from foundation.errors import counted, first_few
+from foundation.files import write_atomic
 from foundation.pages import render
-from foundation.plots import png_of
+from foundation.plots import draw_png
 
 # Points across and down the page whose places are told: enough to see how it hung, and how it bent, roughly.
 PLACES = (7, 5)
@@ -217,8 +217,8 @@ MOST_FRAMES = 4  # Frames that are drawn with their places: each is read again, 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
     """Write `report.html` and `report.json` into a table's folder; costs some seconds."""
     pictures = _pictures(result, session)
-    write_whole(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session)))
-    write_whole(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
+    write_atomic(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session)))
+    write_atomic(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
 
 
 def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
@@ -238,7 +238,7 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
             "Residuals of the registration",
             "Left: how far the cells moved the map from what the tags and the lens alone give, which is the paper's "
             "waviness. Right: the residual of each block of cells, magnified; short arrows without order are noise.",
-            png_of(draw_residuals, chart, registration),
+            draw_png(draw_residuals, chart, registration),
             "geometry",
             "residuals",
         ),
@@ -246,7 +246,7 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
             "The light on the print",
             "Shape of the light under the frame that was registered, from its white references; it is divided out of "
             f"samples and ground truth. Contours are 2 % apart. {primaries}",
-            png_of(draw_field, chart, table.registered_frame.paper.field),
+            draw_png(draw_field, chart, table.registered_frame.paper.field),
             "light",
             "field",
         ),
@@ -255,7 +255,7 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
             "Black level, movement and blur of the chart, bare paper under white, how far cells are off their codes' "
             "colours, and the white references used, frame by frame; the worst frame of each is ringed. All cells are "
             "off where the focus is lost, a block of them where a hand or a shadow lies on the print.",
-            png_of(draw_course, table),
+            draw_png(draw_course, table),
             "radiometry",
             "course",
         ),
@@ -264,7 +264,7 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
             f"Left: the expanded uncertainty (k = {COVERAGE:g}) of each light's direction, shared out among its causes "
             "by their squares; lights in the order of it, the worst first. Right: that of each cell's mean by its "
             "level, noise apart. " + "; ".join(f"{one.title}: {one.source}" for one in table.budget.components) + ".",
-            png_of(draw_budget, table.budget, table.cells.levels),
+            draw_png(draw_budget, table.budget, table.cells.levels),
             "truth",
             "budget",
         ),
@@ -286,28 +286,28 @@ def _first_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np
             "The chart as registered",
             f"{table.session.registered_file}, contrast stretched, with the tags as found; below, magnified: the "
             f"outline of every cell and the pixels of its {window**2} samples, in the corners and in the middle.",
-            png_of(draw_registration, frame, chart, registration, window),
+            draw_png(draw_registration, frame, chart, registration, window),
             name="chart",
         ),
         _Picture(
             "The lights",
             "rb-chromaticities of the lights as projected, as the camera sees them on bare paper (the ground truth), "
             f"and the latter in their colours. Rings are black bodies.{ringed}",
-            png_of(draw_chromaticities, codes, black_body, table.lights.white, seen, truth),
+            draw_png(draw_chromaticities, codes, black_body, table.lights.white, seen, truth),
             name="lights",
         ),
         _Picture(
             "Where cells err",
             "Left: how far cells and their neighbours are off their codes' colours elsewhere on the sheet. Right: how "
             "well the place of each cell is known. The worst cell of each is ringed.",
-            png_of(draw_errors, table, chart),
+            draw_png(draw_errors, table, chart),
             name="errors",
         ),
         _Picture(
             "The noise",
             "Left: variance of one sample over its level, medians of cells of like levels and the fitted curve (read "
             "noise, photons, unequal photosites). Right: what that makes of signal over noise.",
-            png_of(draw_noise, cell_noise(frame, chart, registration, window), table.sensor.transfer, window**2),
+            draw_png(draw_noise, cell_noise(frame, chart, registration, window), table.sensor.transfer, window**2),
             name="noise",
         ),
     ]
@@ -322,7 +322,7 @@ def _place_pictures(result: BuildResult, session: Session) -> list[_Picture]:
     pictures: list[_Picture] = []
     for file, places in list(by_file.items())[:MOST_FRAMES]:
         picture = half_size(read_raw(session.folder / file))
-        drawn = png_of(draw_places, picture, session.chart, result.figures.registration, places)
+        drawn = draw_png(draw_places, picture, session.chart, result.figures.registration, places)
         caption = (
             f"{file}, contrast stretched, with what is beyond its limits circled; places lie as in the frame that was "
             "registered first."
@@ -450,7 +450,7 @@ def _again(result: BuildResult) -> dict[str, Any] | None:
         return None
     return {
         "count": counted(len(records), "frame"),
-        "files": first_of([record.file for record in records]),
+        "files": first_few([record.file for record in records]),
         "command": COMMAND,
         "mends": is_mended_by_retaking(result.verdict, result.figures),
     }

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from calibration.citation import OriginRecord
 from experiment.lights import Illumination, load_illuminations
-from foundation.errors import FormatError, InputError, kind_of
+from foundation.errors import FormatError, InputError, value_text
 from foundation.files import file_sha256, partial_path, read_text, reading_error, require_plain_folder, sha256_of
 from foundation.records import Record, from_json
 
@@ -504,4 +504,4 @@ def _load_white(path: Path) -> npt.NDArray[np.float64]:
 def require_lut(given: object) -> None:
     """Refuse what is no table, such as the path of one, or a picture in its place."""
     if not isinstance(given, Lut):
-        raise InputError(f"the table is {kind_of(given)}, expected a Lut, which open_lut(FOLDER) returns, as first")
+        raise InputError(f"the table is {value_text(given)}, expected a Lut, which open_lut(FOLDER) returns, as first")

@@ -19,7 +19,7 @@ from calibration.table.lut import (
     known_sums,
     samples_sha256,
 )
-from foundation.errors import FormatError, first_of
+from foundation.errors import FormatError, first_few
 
 
 def _uncertainty(lut: Lut) -> str:
@@ -111,7 +111,7 @@ def find_faults(lut: Lut, progress: Callable[[int, int], None] | None = None) ->
         return [*faults, f"{PROVENANCE}: it has hashes of {len(recorded)} lights, the table has {len(lights)}"]
     changed = [light for light, (now, then) in enumerate(zip(lights, recorded, strict=True)) if now != then]
     if changed:
-        named = first_of(changed, 20)
+        named = first_few(changed, 20)
         faults.append(f"{SAMPLES}: the samples of {len(changed)} of {len(lights)} lights have changed: {named}")
     elif whole != sums[SAMPLES]:
         faults.append(f"{SAMPLES}: its first bytes, before the samples, have changed")
@@ -142,7 +142,7 @@ def require_match(one: Lut, other: Lut) -> None:
         pairs = zip(one.illuminations, other.illuminations, strict=True)
         differing = [light.index for light, counterpart in pairs if light != counterpart]
         if differing:
-            found.append(f"other codes under {len(differing)} lights: {first_of(differing)}")
+            found.append(f"other codes under {len(differing)} lights: {first_few(differing)}")
     if found:
         raise FormatError(
             f"{one.folder} and {other.folder} do not correspond: {'; '.join(found)}; "

@@ -28,7 +28,7 @@ from calibration.table.lut import (
 )
 from experiment.lights import COLUMNS, NAME, Illumination
 from foundation.errors import StorageError
-from foundation.files import csv_text, sha256_of, storage_error, write_whole
+from foundation.files import csv_text, sha256_of, storage_error, write_atomic
 
 _Array = npt.NDArray[np.float64]
 
@@ -120,11 +120,11 @@ class LutWriter:
                 "written; check the disk, then build the table on another"
             )
         truth = _ground_truth_csv(illuminations, white)
-        write_whole(self._folder / ILLUMINATIONS, truth)
+        write_atomic(self._folder / ILLUMINATIONS, truth)
         if frames:
-            write_whole(self._folder / FRAMES, frames_csv(frames))
+            write_atomic(self._folder / FRAMES, frames_csv(frames))
         for name, text in files.items():
-            write_whole(self._folder / name, text)
+            write_atomic(self._folder / name, text)
         hashes = {
             "files_sha256": {name: sha256_of(text.encode()) for name, text in files.items()},
             "samples_sha256": whole,
@@ -133,8 +133,8 @@ class LutWriter:
             "has_sums": True,
         }
         described = provenance.model_copy(update=hashes).to_json()
-        write_whole(self._folder / SUMS, sums_of(self._folder, whole, sha256_of(described.encode())))
-        write_whole(self._folder / PROVENANCE, described)
+        write_atomic(self._folder / SUMS, sums_of(self._folder, whole, sha256_of(described.encode())))
+        write_atomic(self._folder / PROVENANCE, described)
 
 
 def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[np.float64]) -> str:

@@ -46,8 +46,8 @@ from calibration.table.lut import (
 )
 from experiment.lights import load_illuminations
 from foundation.errors import CropError, FormatError, InputError, StorageError
-from foundation.files import file_sha256, parse_json_object, require_plain_tree, storage_error, write_whole
-from foundation.folders import require_free, whole_folder
+from foundation.files import file_sha256, parse_json_object, require_plain_tree, storage_error, write_atomic
+from foundation.folders import atomic_folder, require_free
 
 FORMAT: Final = "crop.lut.published"
 
@@ -249,10 +249,10 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
             f"{url} is published in version {attributes.get('version')!r}, this software reads {VERSION}; update it"
         )
     files = texts_of(attributes, url)
-    with whole_folder(folder, "the table") as partial:
+    with atomic_folder(folder, "the table") as partial:
         for name in TEXTS:
             if name in files:
-                write_whole(partial / name, files[name])
+                write_atomic(partial / name, files[name])
         known = parse_provenance(files[PROVENANCE].encode(), partial / PROVENANCE)
         require_expected(partial, expect, url)
         lights = len(load_illuminations(partial / ILLUMINATIONS, computed=True))

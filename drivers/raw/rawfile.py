@@ -52,7 +52,7 @@ from drivers.raw.storage import (
 )
 from drivers.tiff import CFA, Directory, Tags, TiffDamaged, TiffTag, ValueType, head, is_tiff, read_directories, text
 from foundation.errors import FormatError
-from foundation.files import read_whole
+from foundation.files import read_buffer
 from foundation.robust import MAD_TO_SIGMA
 
 if TYPE_CHECKING:
@@ -686,7 +686,7 @@ def _made(
 
 def _read_bytes(path: Path) -> memoryview:
     try:
-        data = read_whole(path)
+        data = read_buffer(path)
     except FileNotFoundError as error:
         raise FormatError(f"there is no raw file {path}; check the name") from error
     except IsADirectoryError as error:

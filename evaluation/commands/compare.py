@@ -74,7 +74,7 @@ def compare(
     show_tables(output, [comparing.tests_table(comparisons)])
     for sentence in verdicts:
         print(sentence)
-    if output.asked or len(comparisons) <= _FEW:
+    if output.is_requested or len(comparisons) <= _FEW:
         show_tables(output, [comparing.statistics_table(comparisons)])
         show_tables(output, [comparing.images_table(made, 5) for made in comparisons])
     if out is not None:

@@ -19,7 +19,7 @@ from evaluation.commands.options import (
 from evaluation.commands.train import LEARNERS_HELP
 from foundation.compiled import processor_count
 from foundation.console import EXIT_CODES, JsonOutput, option, orderly_end, with_json
-from foundation.errors import counted, first_of
+from foundation.errors import counted, first_few
 from foundation.folders import require_free
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def cv(
         if out is not None:
             write_run(made, found.scenes, out, error, threads)
     output.add(data_set=found.name, images=count, folds=len(set(parts.tolist())), seed=seed, error=error)
-    show_tables(output, [summary_table(made.subject, results, error, output.asked)])
+    show_tables(output, [summary_table(made.subject, results, error, output.is_requested)])
     show_notes(output, made.notes, made.treatment)
 
 
@@ -110,6 +110,6 @@ def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
     if not apart:
         return []
     return [
-        f"{counted(len(apart), 'image is a copy', 'images are copies')} of images of other folds ({first_of(apart)}): "
+        f"{counted(len(apart), 'image is a copy', 'images are copies')} of images of other folds ({first_few(apart)}): "
         "tested on what was trained on"
     ]

@@ -291,7 +291,7 @@ def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None, ou
         write_report(report, out)
     show_notes(output, conditions)
     for table in report.tables:
-        if not output.asked:
+        if not output.is_requested:
             print()
         show_tables(output, [table])
     if out is not None:

@@ -76,7 +76,7 @@ def run(
         made = run_methods(found, [*chosen, *given], threads, step)
         if out is not None:
             write_run(made, found.scenes, out, error, threads)
-    if output.asked:
+    if output.is_requested:
         table = statistics_rows(made.subject, made.results)
         output.add(data_set=made.subject.name, images=len(made.subject.images))
         output.add(errors=[dict(zip(table.columns, row, strict=True)) for row in table.rows])

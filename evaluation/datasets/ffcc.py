@@ -16,7 +16,7 @@ from pathlib import Path
 from evaluation.datasets.files import Folder, PaintedScene, decode_image
 from evaluation.datasets.options import DataOptions, stated
 from evaluation.scene import Image, SceneSet
-from foundation.errors import FormatError, first_of
+from foundation.errors import FormatError, first_few
 
 _DEPTH = 4  # Folders below the one given that are searched: more than the toolbox's own data sets have
 _SAMPLE = 100  # Names of a folder that are looked at to tell the layout
@@ -64,8 +64,8 @@ def open_ffcc(place: str, options: DataOptions, listed: Folder | None = None) ->
     if without or (alone and not options.partial) or not scenes:
         raise FormatError(
             f"{place} has {len(scenes)} thumbnails with a light, {len(without)} without "
-            f"({first_of(without) or 'none'}) and {len(alone)} text files without a thumbnail "
-            f"({first_of(alone) or 'none'}), expected NAME.png with NAME.txt; complete or remove them"
+            f"({first_few(without) or 'none'}) and {len(alone)} text files without a thumbnail "
+            f"({first_few(alone) or 'none'}), expected NAME.png with NAME.txt; complete or remove them"
         )
     return SceneSet(
         name=folder.path.resolve().name,

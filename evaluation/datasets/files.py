@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from evaluation.scene import Image
 from foundation import files
-from foundation.errors import FormatError, InputError, first_of
+from foundation.errors import FormatError, InputError, first_few
 from generator.files import decode_png, decode_tiff
 
 IMAGE_ENDINGS = (".png", ".tif", ".tiff", ".npy")  # Of files that hold linear images of 16 bits or more
@@ -146,12 +146,12 @@ def present(
     superfluous = [name for name in images if name not in wanted]
     if superfluous:
         raise FormatError(
-            f"{folder} has {len(superfluous)} images that {source} does not know ({first_of(superfluous)}), expected "
+            f"{folder} has {len(superfluous)} images that {source} does not know ({first_few(superfluous)}), expected "
             f"its {len(names)} and no other; remove them, or complete {source}"
         )
     if missing and (not partial or len(missing) == len(names)):
         raise FormatError(
-            f"{folder} lacks {len(missing)} of the {len(names)} images of {source} ({first_of(missing)}); complete "
+            f"{folder} lacks {len(missing)} of the {len(names)} images of {source} ({first_few(missing)}); complete "
             "the copy" + ("" if len(missing) == len(names) else ", or take what is there with --read partial")
         )
     kept = [number for number, name in enumerate(names) if name in images]

@@ -25,7 +25,7 @@ from evaluation.datasets.published.lsmi import is_lsmi, open_lsmi
 from evaluation.datasets.published.nus8 import is_nus8, open_nus8
 from evaluation.datasets.thumbnails import open_thumbnails
 from evaluation.scene import SceneSet
-from foundation.errors import FormatError, InputError, first_of
+from foundation.errors import FormatError, InputError, first_few
 
 _LEVELS = ("black", "saturation")
 
@@ -227,7 +227,7 @@ def _refuse_pictures(folder: Folder, place: str) -> None:
     pictures = [name for name in folder.files if name.lower().endswith((*IMAGE_ENDINGS, ".jpg", ".jpeg"))]
     if pictures and not any(name.endswith((".csv", ".mat", ".txt", ".json")) for name in folder.files):
         raise FormatError(
-            f"{place} is no dataset: pictures ({first_of(pictures)}) without ground truths; name a published set's "
+            f"{place} is no dataset: pictures ({first_few(pictures)}) without ground truths; name a published set's "
             "whole folder, put a .csv with image,r,g,b beside images of 16 bits, or make a dataset of pictures: "
             f"generate LUT OUT --sources {place}"
         )

@@ -27,7 +27,7 @@ import numpy as np
 from evaluation.datasets.files import IMAGE_ENDINGS, Folder, Light, Mask, RawScene, light_of, number_of, read_rows
 from evaluation.datasets.options import DataOptions, stated
 from evaluation.scene import Image, SceneSet
-from foundation.errors import FormatError, InputError, first_of
+from foundation.errors import FormatError, InputError, first_few
 
 COLUMNS = ("image", "r", "g", "b")  # What the table must have
 
@@ -115,12 +115,12 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
         remedy = "complete the folder" + (", or take what is there with --read partial" if scenes else "")
         raise FormatError(
             f"{folder} lacks {len(missing)} of the {len(seen)} images of {path.name} "
-            f"({first_of(missing) or 'it is empty'}); {remedy}"
+            f"({first_few(missing) or 'it is empty'}); {remedy}"
         )
     if "fold" in given and min(folds) < 0:
         raise FormatError(f"{path}: some rows have a fold and others none, expected one in each; complete the column")
     if both := sorted(masks & paths.keys()):
-        raise FormatError(f"{path} has a row for {first_of(both)}, which is a mask too; rename one of the two")
+        raise FormatError(f"{path} has a row for {first_few(both)}, which is a mask too; rename one of the two")
     left_out = _without_row(Path(place), path, listings, paths.keys(), masks, options.partial)
     return SceneSet(
         name=folder.resolve().name,
@@ -160,7 +160,7 @@ def _table_of(place: Path, listed: Folder | None) -> Path:
     if not tables:
         raise FormatError(f"{place} has no table with the columns {','.join(COLUMNS)}; write one, a row an image")
     if len(tables) > 1:
-        raise InputError(f"{place} has several tables of lights ({first_of(tables)}); name the one that is meant")
+        raise InputError(f"{place} has several tables of lights ({first_few(tables)}); name the one that is meant")
     return place / tables[0]
 
 
@@ -304,7 +304,7 @@ def _without_row(
     if among and not (partial or chosen):
         raise FormatError(
             f"{path} has no row for {len(among)} of the images beside those that it names "
-            f"({first_of([os.path.relpath(file, root.path) for file in among])}), expected one for each; add what is "
+            f"({first_few([os.path.relpath(file, root.path) for file in among])}), expected one for each; add what is "
             "missing, take the files away, or leave them out with --read partial"
         )
     notes = ((among, "beside them"), (elsewhere, "in other folders there"))

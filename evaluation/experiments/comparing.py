@@ -27,9 +27,9 @@ from evaluation.results.files import MethodErrors
 from evaluation.results.tables import PAPER_COLUMNS, Cell, Table, table_to_csv
 from foundation import pages
 from foundation.colorimetry import angles_deg
-from foundation.errors import InputError, counted, first_of
-from foundation.folders import whole_folder
-from foundation.plots import FAINT, SERIES, svg_of
+from foundation.errors import InputError, counted, first_few
+from foundation.folders import atomic_folder
+from foundation.plots import FAINT, SERIES, draw_svg
 
 # Smaller errors are drawn here: a logarithmic axis has no zero, and no ground truth is known better.
 _FLOOR_DEG: Final = 0.01
@@ -139,7 +139,7 @@ def match(one: MethodErrors, other: MethodErrors, names: tuple[str, str], kind: 
         missing = [image for image in side.images if image not in common]
         if missing:
             notes.append(
-                f"{lacking} lacks {counted(len(missing), 'image')} of {whose}, left out here: {first_of(missing)}"
+                f"{lacking} lacks {counted(len(missing), 'image')} of {whose}, left out here: {first_few(missing)}"
             )
     known = groups if len(set(groups)) < len(groups) else None
     return Matched(names, kind, images, one.errors[kind][mine], other.errors[kind][its], known, tuple(notes))
@@ -271,7 +271,7 @@ def error_scatter(matched: Matched) -> bytes:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_major_formatter("{x:g}")
 
-    return svg_of(draw, inches=(5.6, 5.4))
+    return draw_svg(draw, inches=(5.6, 5.4))
 
 
 def comparison_page(comparisons: Sequence[Comparison], notes: Sequence[str]) -> str:
@@ -297,6 +297,6 @@ def write_comparisons(folder: Path, comparisons: Sequence[Comparison], notes: Se
     texts = {name: table_to_csv(table) for name, table in tables.items()}
     texts["tables.tex"] = "\n".join(map(table_to_latex, tables.values()))
     texts["report.html"] = comparison_page(comparisons, notes)
-    with whole_folder(folder, "the comparison") as place:
+    with atomic_folder(folder, "the comparison") as place:
         for name, text in texts.items():
             (place / name).write_text(text, encoding="utf-8")

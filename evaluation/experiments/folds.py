@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from evaluation.datasets.identity import first_copies
 from evaluation.scene import Scene, SceneSet
-from foundation.errors import FormatError, InputError, counted, first_of
+from foundation.errors import FormatError, InputError, counted, first_few
 from foundation.files import csv_text, read_csv
 from generator.named_numbers import is_number
 
@@ -118,10 +118,10 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     strange = sorted(set(given) - set(names))
     for wrong, what in ((twice, "more than once"), (missing, "without a fold"), (strange, "which the data set lacks")):
         if wrong:
-            raise FormatError(f"{path} has images {what}: {first_of(wrong)}; expected each image of the data set once")
+            raise FormatError(f"{path} has images {what}: {first_few(wrong)}; expected each image of the data set once")
     kinds, folds = np.unique([given[name] for name in names], return_inverse=True)
     if len(kinds) < _LEAST:
-        raise FormatError(f"{path} has the fold {first_of(list(kinds))} only; expected at least two")
+        raise FormatError(f"{path} has the fold {first_few(list(kinds))} only; expected at least two")
     return folds.astype(np.int64)
 
 

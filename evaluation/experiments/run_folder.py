@@ -25,9 +25,9 @@ from evaluation.results.result import Result, Run, Subject, indistinct
 from evaluation.results.tables import lights_tables, statistics_rows, summary_table, table_to_csv
 from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.compiled import ordered_map
-from foundation.errors import InputError, first_of
-from foundation.files import write_whole
-from foundation.folders import whole_folder
+from foundation.errors import InputError, first_few
+from foundation.files import write_atomic
+from foundation.folders import atomic_folder
 from foundation.version import software
 
 
@@ -57,9 +57,9 @@ def write_run(
     run: Run, scenes: Sequence[Scene], folder: Path, kind: ErrorKind = "reproduction", workers: int = 1
 ) -> None:
     """Write results to a new results folder."""
-    with whole_folder(folder, "the results") as partial:
+    with atomic_folder(folder, "the results") as partial:
         for name, text in _files(run, kind, _pictures(run, scenes, kind, workers)).items():
-            write_whole(partial / name, text)
+            write_atomic(partial / name, text)
 
 
 def describe_run(
@@ -104,7 +104,7 @@ def _trained_on(name: str, record: TrainingRecord, data: SceneSet, sha256: str) 
     if common:
         return (
             f"{name}: {len(common)} of {len(data.scenes)} images were trained on, by name and light or by source "
-            f"picture: {first_of(common, 3)}; their errors say nothing of images that it has not seen"
+            f"picture: {first_few(common, 3)}; their errors say nothing of images that it has not seen"
         )
     if record.data_name != data.name:
         return ""

@@ -28,7 +28,7 @@ from evaluation.methods.method import Method
 from evaluation.scene import Scene, SceneSet
 from foundation.clock import Clock
 from foundation.errors import FormatError, InputError
-from foundation.files import sha256_of, whole_file
+from foundation.files import atomic_file, sha256_of
 from foundation.folders import require_free_file
 from foundation.records import from_plain, to_plain
 from foundation.version import software
@@ -150,7 +150,7 @@ def save_model(path: Path, method: Method, provenance: TrainingRecord) -> None:
         _TRAINED: provenance.images,
         **method.model.arrays(),
     }
-    with whole_file(path) as stream:
+    with atomic_file(path) as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
 
 

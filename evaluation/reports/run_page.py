@@ -24,7 +24,7 @@ from evaluation.scene import MixedScene, Scene
 from foundation import pages
 from foundation.colorimetry import srgb_codes
 from foundation.errors import counted
-from foundation.plots import FAINT, legend_label, series_style, svg_of
+from foundation.plots import FAINT, draw_svg, legend_label, series_style
 
 # Percentile of all methods' errors at which the axis of errors ends: a few wild ones would squeeze the others.
 _SHOWN_PERCENTILE = 98
@@ -44,7 +44,7 @@ _BRIGHTEST_PERCENTILE = 95  # Percentile of all methods' errors at which the sca
 def error_curves(results: Sequence[Result], kind: ErrorKind) -> bytes:
     """Return the cumulative error curves of methods as SVG: the share of images up to each error."""
     rows = math.ceil(len(results) / 2)
-    return svg_of(_draw_curves, results, kind, inches=(8.6, 3.9 + 0.19 * rows))
+    return draw_svg(_draw_curves, results, kind, inches=(8.6, 3.9 + 0.19 * rows))
 
 
 def _draw_curves(figure: Any, results: Sequence[Result], kind: ErrorKind) -> None:
@@ -70,7 +70,7 @@ def error_planes(results: Sequence[Result], truths: npt.NDArray[np.float64], kin
     shown = results[:_PANELS]
     columns = _columns(len(shown))
     wide, high = (4.6, 3.6) if len(shown) == 1 else (8.6, 0.7 + (7.8 / columns) * math.ceil(len(shown) / columns))
-    return svg_of(_draw_planes, shown, truths, kind, inches=(wide, high))
+    return draw_svg(_draw_planes, shown, truths, kind, inches=(wide, high))
 
 
 def _columns(panels: int) -> int:
@@ -285,7 +285,7 @@ def _images(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]
                 pages.row([_image(run, number, place, kind, pictures) for place in places]),
             )
         ]
-        found.append(pages.fold(result.method, rows, open_at_first=number == 0))
+        found.append(pages.fold(result.method, rows, is_open=number == 0))
     return found
 
 

@@ -54,7 +54,7 @@ def print_table(table: Table) -> None:
 def show_tables(output: JsonOutput, tables: Sequence[Table], between: str | None = None) -> None:
     """Print tables, or add them to `tables` of the JSON object where one is asked for."""
     for table in tables:
-        if output.asked:
+        if output.is_requested:
             rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
             whole = {"title": table.title, "columns": table.columns, "rows": rows, "notes": table.notes}
             output.append("tables", whole)
@@ -66,7 +66,7 @@ def show_tables(output: JsonOutput, tables: Sequence[Table], between: str | None
 
 def show_notes(output: JsonOutput, notes: Sequence[str], treatment: Mapping[str, str] | None = None) -> None:
     """Print notes and what was done to the images, or add them to the JSON object where one is asked for."""
-    if output.asked:
+    if output.is_requested:
         output.add(notes=list(notes))
         if treatment is not None:
             output.add(treatment=dict(treatment))

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from evaluation.metrics import ErrorKind
 from evaluation.results.result import Result
 from evaluation.scene import Scene
-from foundation.errors import FormatError, InputError, counted, first_of
+from foundation.errors import FormatError, InputError, counted, first_few
 from foundation.files import csv_text, file_sha256, read_text
 
 ERRORS_FILE = "errors.csv"  # Its name in a results folder
@@ -230,7 +230,7 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
             found[image] = light
     missing = [image for image in images if image not in found]
     faults = [
-        f"{counted(len(those), one, several)} ({first_of(those)})"
+        f"{counted(len(those), one, several)} ({first_few(those)})"
         for those, one, several in (
             (missing, "image of the data set is missing", "images of the data set are missing"),
             (unknown, "line is of no image of the data set", "lines are of no image of the data set"),

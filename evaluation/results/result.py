@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from evaluation.methods.prepared import GREY
 from evaluation.metrics import ErrorKind, MapError, Summary, recovery_error, reproduction_error, summarise
-from foundation.errors import first_of
+from foundation.errors import first_few
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +216,6 @@ def indistinct(results: Sequence[Result], uncertainty_deg: float | None) -> tupl
     ]
     told = (
         f"ground truths may be off by {uncertainty_deg:.2g} degrees (k = 2), more than the medians of "
-        f"{first_of(pairs, 3)} differ by: they do not tell these apart"
+        f"{first_few(pairs, 3)} differ by: they do not tell these apart"
     )
     return (told,) if pairs else ()

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from evaluation.metrics import ErrorKind, MapError, summarise
 from evaluation.results.result import NO_PIXEL, Result, Subject
-from foundation.errors import first_of
+from foundation.errors import first_few
 from foundation.files import csv_text
 
 Cell = str | float | None  # A name, a number (an `int` stays one), or nothing known
@@ -250,9 +250,9 @@ def _notes(subject: Subject, result: Result) -> Iterable[str]:
         counted = f"{len(blind)} of {count} images"
         yield f"{result.method}: no usable pixel in {counted} ({_NO_PIXEL_CAUSES}); {taken}"
     if wrong:
-        named = first_of([f"{subject.images[number]} {causes[number]}" for number in wrong], _NAMED)
+        named = first_few([f"{subject.images[number]} {causes[number]}" for number in wrong], _NAMED)
         yield f"{result.method}: no light for {len(wrong)} of {count} images ({named}); {taken}"
     partly = [number for number in causes if not result.guessed[number]]
     if partly:
-        named = first_of([f"{subject.images[number]}: {causes[number]}" for number in partly], _NAMED)
+        named = first_few([f"{subject.images[number]}: {causes[number]}" for number in partly], _NAMED)
         yield f"{result.method}: no light for pixels of {len(partly)} images ({named}); they were taken to be grey"

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from foundation.errors import FormatError
-from foundation.files import reading_error, write_whole
+from foundation.files import reading_error, write_atomic
 from foundation.records import from_json
 
 FORMAT = "crop.chart"
@@ -161,7 +161,7 @@ class Chart:
 
     def save(self, path: Path) -> None:
         """Write `chart.json`."""
-        write_whole(path, self.to_json())
+        write_atomic(path, self.to_json())
 
 
 class _Strict(BaseModel):

@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.colorimetry import decode_srgb, encode_srgb
-from foundation.files import whole_file
+from foundation.files import atomic_file
 
 # The date that the metadata must have: one for all, so that the same chart gives the same bytes.
 DATE = "2000-01-01T00:00:00+00:00"
@@ -117,7 +117,7 @@ def save_page(path: Path, size_pt: tuple[float, float], content: bytes, title: s
         f"trailer\n<< /Size {len(objects) + 1} /Root 1 0 R /Info {len(objects)} 0 R "
         f"/ID [<{name[:32]}> <{name[:32]}>] >>\nstartxref\n{start}\n%%EOF\n"
     ).encode("ascii")
-    with whole_file(path) as stream:
+    with atomic_file(path) as stream:
         stream.write(bytes(text))
 
 

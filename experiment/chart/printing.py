@@ -25,7 +25,7 @@ from experiment.chart.margins import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, marg
 from experiment.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Tag
 from experiment.chart.pdf_x import filled, save_page, srgb_display_profile
 from foundation.errors import InputError
-from foundation.files import whole_file, write_whole
+from foundation.files import atomic_file, write_atomic
 
 POINTS_PER_MM = 72 / MM_PER_INCH  # Points of a PDF's user space, 72 to the inch (ISO 32000-1, 8.3.2.3)
 
@@ -238,7 +238,7 @@ def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI, tagged: bool = Fa
     sheet = drawing(chart)
     width, height = (round(side * dpi / MM_PER_INCH) for side in chart.page_mm)
     bands = _bands(sheet, dpi / MM_PER_INCH, (width, height))
-    with whole_file(path) as stream, tifffile.TiffWriter(stream) as writer:
+    with atomic_file(path) as stream, tifffile.TiffWriter(stream) as writer:
         writer.write(
             _packed_strips(bands, height),
             shape=(height, width, 3),
@@ -314,4 +314,4 @@ def save_preview(chart: Chart, path: Path, width_px: int = 2400) -> None:
     import cv2
 
     _, png = cv2.imencode(".png", np.ascontiguousarray(preview(chart, width_px)[:, :, ::-1]))
-    write_whole(path, png.tobytes())
+    write_atomic(path, png.tobytes())

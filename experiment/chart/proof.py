@@ -25,7 +25,7 @@ from experiment.chart.printing import (
     label_lines,
     save_drawing,
 )
-from foundation.files import write_whole
+from foundation.files import write_atomic
 
 PAGE_MM = (297.0, 210.0)  # A4, landscape (ISO 216): every printer takes it
 
@@ -164,4 +164,4 @@ Keep            This folder: chart.json is what the photographs are read with. I
 
 def save_instructions(chart: Chart, path: Path, tiff: bool = True) -> None:
     """Write `instructions` as text, UTF-8."""
-    write_whole(path, instructions(chart, tiff))
+    write_atomic(path, instructions(chart, tiff))

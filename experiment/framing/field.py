@@ -24,7 +24,7 @@ from drivers.raw.rawfile import Plane
 from experiment.chart.model import Chart
 from experiment.framing.homography import fit_homography, project
 from foundation.errors import InputError, RegistrationError
-from foundation.robust import biweight, huber_weights, sigma_of
+from foundation.robust import biweight, huber_weights, robust_sigma
 
 # Counts above black that the brightest parts of the strongest plane must have for a chart to be looked for.
 MIN_SIGNAL = 12.0
@@ -339,7 +339,7 @@ def _robust(design: _Points, values: npt.NDArray[np.float64]) -> tuple[float, np
         gram = np.einsum("ni,nj->ij", weighted, design) + ridge
         solution = np.asarray(np.linalg.solve(gram, np.einsum("ni,n->i", weighted, values)), dtype=np.float64)
         residual = np.abs(values - design @ solution)
-        spread = sigma_of(residual) + 1e-9
+        spread = robust_sigma(residual) + 1e-9
         weights = huber_weights(residual, spread)
     return spread, solution
 
@@ -602,14 +602,14 @@ def robust_curve(along: _Points, off: _Points, order: int) -> tuple[_Points, npt
     float64, the series' coefficients on −1 … 1; (N,) bool.
     """
     basis = np.polynomial.legendre.legvander(2 * along - 1, order)
-    scale = max(sigma_of(off - np.median(off)), 0.5)
+    scale = max(robust_sigma(off - np.median(off)), 0.5)
     weights = 1 / np.maximum(np.abs(off - np.median(off)), scale)
     solution = np.zeros(order + 1)
     for _ in range(8):
         root = np.sqrt(weights)
         solution = np.linalg.lstsq(basis * root[:, None], off * root, rcond=None)[0]
         residual = np.abs(off - basis @ solution)
-        scale = max(sigma_of(residual), 0.15)
+        scale = max(robust_sigma(residual), 0.15)
         weights = biweight(residual, scale) + 1e-6
     return solution.astype(np.float64), np.asarray(np.abs(off - basis @ solution) < 3 * scale)
 

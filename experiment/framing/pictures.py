@@ -19,7 +19,7 @@ import numpy.typing as npt
 from drivers.raw.rawfile import CHANNELS, Channel, Mosaic, Plane, channel_offset_px, phases
 from experiment.framing.field import FoundField
 from experiment.framing.finding import AMBER, FONT, GREEN, RED, FoundTag, Framing
-from foundation.robust import huber_weights, sigma_of
+from foundation.robust import huber_weights, robust_sigma
 
 # Half-size px that are measured at most: an edge that moved further has left the crop around its tag or its strip.
 MAX_SHIFT_PX = 3.0
@@ -263,7 +263,7 @@ def _similarity(
         root = np.sqrt(weights * trust)
         motion = np.linalg.lstsq(design * root[:, None], moved * root, rcond=None)[0].astype(np.float64)
         off = np.abs(moved - design @ motion) * np.sqrt(weights)
-        scale = sigma_of(off) + 1e-9
+        scale = robust_sigma(off) + 1e-9
         trust = huber_weights(off, scale)
     dx, dy, turn, growth = motion.tolist()
     corners = (field.corners_px - centre) / np.abs(field.corners_px - centre).max()

@@ -32,7 +32,7 @@ from experiment.measures.least_squares import (
 )
 from foundation.errors import QualityError
 from foundation.records import FloatArray
-from foundation.robust import sigma_of
+from foundation.robust import robust_sigma
 
 # Where a polynomial that is extrapolated falls below this share of the mean light, the field is taken to be this:
 # samples are divided by it, and no print is lit so unevenly.
@@ -343,7 +343,7 @@ def _best_fit(
 def _residual(left: _Array, places_mm: _Array, page_mm: tuple[float, float], channel: int) -> FieldResidual:
     """Return where and how residuals (N, 3), shares, are large, judged in one channel."""
     here = left[:, channel]
-    usual = max(sigma_of(here), 1e-9)
+    usual = max(robust_sigma(here), 1e-9)
     worst = int(np.argmax(np.abs(here)))
     away = ((places_mm - places_mm[worst]) ** 2).sum(axis=1)
     near = np.argsort(away)[:_NEAR]

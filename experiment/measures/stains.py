@@ -29,7 +29,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from experiment.measures.least_squares import least_absolute_line
-from foundation.robust import sigma_of
+from foundation.robust import robust_sigma
 
 NEIGHBOURS = 13  # A cell and the twelve within two cells of it: a tenth of a thumb's stain at 5 mm a cell
 
@@ -166,7 +166,7 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
 def _usual(log_ratios: _Array) -> _Array:
     """Return (3,) the standard deviation of single cells, by the median of their sizes."""
     there = np.isfinite(log_ratios)
-    return np.array([sigma_of(log_ratios[there[:, c], c]) if there[:, c].any() else 0 for c in range(3)])
+    return np.array([robust_sigma(log_ratios[there[:, c], c]) if there[:, c].any() else 0 for c in range(3)])
 
 
 def _beyond(deviation: _Array, error: _Array, least: float) -> _Mask:

@@ -51,9 +51,9 @@ from foundation.files import (
     reading_error,
     require_plain_folder,
     storage_error,
-    write_whole,
+    write_atomic,
 )
-from foundation.folders import held_folder, require_free, unmounted_at, whole_folder
+from foundation.folders import atomic_folder, locked_folder, require_free, unmounted_folder
 
 # Columns of `frames.csv` (docs/formats.md).
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
@@ -125,9 +125,9 @@ class Session:
 
         `steps`: the plan: every frame to take, in order.
         """
-        with whole_folder(folder, "the session") as new:
+        with atomic_folder(folder, "the session") as new:
             (new / "frames").mkdir()
-            write_whole(new / "session.toml", settings)
+            write_atomic(new / "session.toml", settings)
             chart.save(new / "chart.json")
             save_illuminations(illuminations, new / "illuminations.csv")
             Journal.create(new / JOURNAL_FILE, steps)
@@ -159,7 +159,7 @@ class Session:
         if not _is_file(path) and not _is_file(ledger_path(folder)):
             journal_path(folder)
         with ExitStack() as opened:
-            opened.enter_context(held_folder(folder, busy_sentence(folder)))
+            opened.enter_context(locked_folder(folder, busy_sentence(folder)))
             if not _is_file(path):
                 rebuild_journal(folder)
                 announce(f"journal: {path} was gone, and was made anew from {ledger_path(folder)}")
@@ -276,7 +276,7 @@ class Session:
             ]
             for frame in self.frames()
         )
-        write_whole(self.folder / "frames.csv", csv_text([FRAME_COLUMNS, *rows]))
+        write_atomic(self.folder / "frames.csv", csv_text([FRAME_COLUMNS, *rows]))
 
     def set_aside_strays(self) -> list[Path]:
         """Clear what a crash left: hidden partial files go, complete files that no row counts are renamed."""
@@ -345,7 +345,7 @@ def journal_path(folder: Path) -> Path:
 
 
 def _require_mounted(folder: Path) -> None:
-    if place := unmounted_at(folder):
+    if place := unmounted_folder(folder):
         raise StorageError(
             f"nothing is mounted at {place}, where /etc/fstab has a disk, so that {folder} is not the folder on it",
             remedy="mount it, or name a folder on another disk",

@@ -67,6 +67,7 @@ from experiment.session.records import (
 )
 from foundation.errors import DeviceError, FormatError, StorageError, counted
 from foundation.files import (
+    atomic_file,
     is_inside_name,
     open_inside,
     partial_path,
@@ -74,8 +75,7 @@ from foundation.files import (
     storage_error,
     stream_sha256,
     sync_folder,
-    whole_file,
-    write_whole,
+    write_atomic,
 )
 
 JOURNAL_FILE = "journal.sqlite"  # Name of the journal in a session's folder
@@ -106,7 +106,7 @@ class IncomingFile:
         self._path = path
         self._final = path
         # A folder that is gone means a disk that was unmounted: what lies under its name is another one.
-        self._file = whole_file(path, lambda: self._final, make=False)
+        self._file = atomic_file(path, lambda: self._final, make_parents=False)
         self._open = True
         self.stream: BinaryIO = self._file.__enter__()
 
@@ -863,7 +863,7 @@ class _Ledger:
         except OSError as error:
             raise storage_error(path, error, "look at") from error
         if not is_there or not self._is_of(rows):
-            write_whole(path, _ledger_lines(rows))
+            write_atomic(path, _ledger_lines(rows))
         self._handle, self._end = self._opened()
         self._next = self._end
 
@@ -902,7 +902,7 @@ class _Ledger:
     def restore(self, rows: Rows) -> None:
         """Write the file anew, which was removed or changed while it was open."""
         self.close()
-        write_whole(self._path, _ledger_lines(rows))
+        write_atomic(self._path, _ledger_lines(rows))
         self._handle, self._end = self._opened()
         self._next = self._end
 

@@ -26,7 +26,7 @@ from urllib.parse import quote
 from experiment.session.heartbeat import file_system_of
 from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError
 from foundation.files import (
-    disk_remedy_of,
+    disk_remedy,
     is_inside_name,
     partial_path,
     reading_error,
@@ -371,7 +371,7 @@ def reading_fault(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
     code = _primary_code(error)
     fault = _disk_fault(path)
     # Where permissions are in the way, the disk is not.
-    openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy_of(fault) is not None)
+    openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy(fault) is not None)
     failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and openable)
     if fault is not None and (failed or fault.errno not in _READABLE_FAULTS):
         return reading_error(path, fault, "check the permissions of its folder")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from foundation.files import write_whole
+from foundation.files import write_atomic
 from generator.dataset.reader import Dataset
 from generator.dataset.records import Entry, Light, Triple
 from generator.files import preview_of
@@ -52,7 +52,7 @@ def save_contact_sheet(dataset: Dataset, path: Path) -> None:
     import cv2
 
     sheet = contact_sheet(dataset)
-    write_whole(path, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
+    write_atomic(path, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
 def _even(count: int, most: int) -> list[int]:

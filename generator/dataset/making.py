@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from foundation.errors import CropError, DeviceError, FormatError, InputError
 from foundation.files import partial_path, storage_error
-from foundation.folders import clear_folder, held_folder, require_free
+from foundation.folders import clear_folder, locked_folder, require_free
 from generator.dataset.plan import DatasetOptions, Plan
 from generator.dataset.reader import Dataset, load_description, open_dataset
 from generator.dataset.shards import (
@@ -488,7 +488,7 @@ def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Ge
     folder = partial_path(path).absolute()
     busy = f"{path} is being made by another program; wait for it, or name another place"
     planned = None if alone else (folder / "plan" / PLAN).is_file
-    with held_folder(folder, busy, share_if=planned, of=path) as lock:
+    with locked_folder(folder, busy, share_if=planned, target=path) as lock:
         notes = LocalStore(folder / "plan")
         plan_id = _plan_id(identity)
         place = Workplace(LocalStore(folder / f"dataset-{plan_id}"), notes, str(path), plan_id)

@@ -24,7 +24,7 @@ from pydantic import ValidationError
 
 from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError, counted
-from foundation.files import MOST_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object, stream_sha256
+from foundation.files import MAX_JSON_BYTES, bounded_lines, is_inside_name, parse_json_object, stream_sha256
 from generator.dataset.layouts import LAYOUTS, require_library
 from generator.dataset.records import (
     COMPLETED_BY_HAND,
@@ -391,7 +391,7 @@ def load_description(store: Store) -> Description:
     """Return the content of a dataset's `dataset.json`; a FormatError says why it cannot be used."""
     name = f"{store.place}/{DESCRIPTION}"
     try:
-        content = parse_json_object(read_bounded(store, DESCRIPTION, MOST_JSON_BYTES), name)
+        content = parse_json_object(read_bounded(store, DESCRIPTION, MAX_JSON_BYTES), name)
         description = Description.model_validate(content)
         ReadingOptions.model_validate(description.options)
     except ValidationError as error:

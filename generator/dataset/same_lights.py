@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from foundation.errors import FormatError, InputError, first_of
+from foundation.errors import FormatError, InputError, first_few
 from generator.dataset.layouts import LAYOUTS, FileLayout
 from generator.dataset.reader import Dataset
 from generator.dataset.records import GROUND_TRUTH, Description, Light
@@ -168,7 +168,7 @@ def scenes_of(dataset: Dataset, found: Sequence[Source]) -> tuple[Source, ...]:
     if missing:
         raise InputError(
             f"{len(missing)} of the {len(dataset.sources)} pictures of {dataset.store.place} are not found: "
-            f"{first_of(missing, 3)}; name the folder that it was made of with --sources"
+            f"{first_few(missing, 3)}; name the folder that it was made of with --sources"
         )
     return tuple(sources[position] for position in sorted(sources))
 
@@ -203,7 +203,7 @@ def _same_lights(used: Sequence[Light], lut: Lut, place: str) -> dict[int, int]:
             numbers[light.illumination] = number
     if missing:
         raise InputError(
-            f"the table {lut.folder} lacks {len(missing)} of the {len(used)} lights of {place}: {first_of(missing, 3)}"
+            f"the table {lut.folder} lacks {len(missing)} of the {len(used)} lights of {place}: {first_few(missing, 3)}"
             "; take a table of the same projector, or of the same spectra, and the same list of lights"
         )
     return numbers

@@ -44,7 +44,7 @@ from foundation.compiled import ordered_map
 from foundation.errors import FormatError, InputError
 from foundation.files import HashingWriter, csv_text
 from foundation.folders import publish_folder, require_free
-from foundation.pieces import Piece, pieces_of
+from foundation.pieces import Piece, read_pieces
 from foundation.records import from_json
 from foundation.version import software
 from generator.dataset.cards import card, datasheet
@@ -876,16 +876,16 @@ class Workplace:
     def pieces(self, shard: int) -> dict[str, Piece]:
         """Return the finished pieces of a shard by their names."""
         name = self._record_name(shard)
-        return pieces_of(self.notes.get(name), self.plan_id) if self.notes.has(name) else {}
+        return read_pieces(self.notes.get(name), self.plan_id) if self.notes.has(name) else {}
 
     def image_of(self, piece: Piece) -> FinishedImage | None:
         """Return the image that a piece is; None if a file of it is not as it was written."""
-        return _record_in(piece, FinishedImage) if piece.is_whole(self.files.open) else None
+        return _record_in(piece, FinishedImage) if piece.is_complete(self.files.open) else None
 
     def has_finished(self, shard: bool = False) -> bool:
         """Return whether an image is finished, or a `shard`, of this plan or of another one."""
         names = self.notes.names(RECORDS)
-        return any(not shard or _WHOLE in pieces_of(self.notes.get(name)) for name in names)
+        return any(not shard or _WHOLE in read_pieces(self.notes.get(name)) for name in names)
 
     def discard(self) -> None:
         """Remove the records of the shards that are done, since to continue would end the same."""

@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from foundation.colorimetry import srgb_codes
 from foundation.errors import CropError, FormatError, InputError
-from foundation.files import sha256_of, write_whole
+from foundation.files import sha256_of, write_atomic
 from foundation.folders import cache_folder
 from foundation.local_server import LocalServer, Refusal, Request, Response
 from foundation.pages import render
@@ -260,14 +260,14 @@ class ExploreServer(LocalServer):
     """
 
     command = "generate explore"
-    most_bytes: ClassVar[int] = MOST_BYTES
+    max_bytes: ClassVar[int] = MOST_BYTES
 
     def __init__(self, explorer: Explorer, host: str, port: int) -> None:
         self._explorer = explorer
         title = f"Explore {explorer.lut.provenance.camera}"
         scripts = ("plane.js", "picture.js", "explore.js")
         self._page = render(
-            "generator.explore", "explore.html", scripts=scripts, styles=("explore.css",), connects=True, title=title
+            "generator.explore", "explore.html", scripts=scripts, styles=("explore.css",), uses_server=True, title=title
         )
         super().__init__(host, port)
 
@@ -363,7 +363,7 @@ def sample_folder(cache: Path | None = None) -> Path:
     for name, picture in pictures.items():
         path = folder / f"{name}.png"
         if not path.is_file():
-            write_whole(path, cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+            write_atomic(path, cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
     return folder
 
 

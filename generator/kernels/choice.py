@@ -34,7 +34,7 @@ from llvmlite import ir
 from numpy import uint32, uint64
 
 from foundation.compiled import inlined
-from foundation.errors import InputError, kind_of
+from foundation.errors import InputError, value_text
 from generator.kernels.vector import (
     ADDRESS,
     EIGHT,
@@ -305,7 +305,8 @@ def check_picture(picture: Any) -> None:
     """Check that `picture` is uint8 (H, W, 3)."""
     if getattr(picture, "dtype", None) != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
         raise InputError(
-            f"the picture is {kind_of(picture)}, expected an array uint8 (height, width, 3), such as read_picture(FILE)"
+            f"the picture is {value_text(picture)}, expected an array uint8 (height, width, 3), such as "
+            "read_picture(FILE)"
         )
 
 

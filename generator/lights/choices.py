@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import InputError, first_of, kind_of, nearest_names
+from foundation.errors import InputError, first_few, nearest_names, value_text
 from generator import philox
 from generator.kernels.rendering import known_light
 from generator.lights.distributions import Distribution
@@ -224,7 +224,7 @@ def _no_light(text: str, names: Sequence[str]) -> str:
     known = _WHITE_BALANCES.get(text.lower())
     near = f"write {known}K for a black body like it" if known else nearest_names(text, names)
     usual = "write a light such as 12, 12:0.25+40:0.75, 5600K or r=.3,b=.25"
-    of_these = f", or a name: {first_of(names)}" if names else ""
+    of_these = f", or a name: {first_few(names)}" if names else ""
     return f"{text!r} is no light; {near or usual + of_these}"
 
 
@@ -283,7 +283,7 @@ def light_of(given: int | str | Mixture, lut: Lut) -> Mixture:
 def listed_lights(given: Iterable[int | str | Mixture] | str | float | Mixture, lut: Lut) -> ListedLights:
     """Return the same lights for every picture, each given as `light_of` takes it."""
     if isinstance(given, str | int | float | Mixture):
-        raise InputError(f"the lights are {kind_of(given)}, expected a list, such as [0, 3] or ['D65']")
+        raise InputError(f"the lights are {value_text(given)}, expected a list, such as [0, 3] or ['D65']")
     # Numbers stay numbers: a dataset is the same by whatever way its lights were given.
     return ListedLights(
         tuple(light_of(light, lut) if isinstance(light, str | Mixture) else known_light(lut, light) for light in given)

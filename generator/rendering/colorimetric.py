@@ -39,7 +39,7 @@ import numpy.typing as npt
 
 from foundation.colorimetry import angles_deg, decode_srgb
 from foundation.errors import CropError, InputError, QualityError
-from foundation.files import sha256_of, whole_file
+from foundation.files import atomic_file, sha256_of
 from foundation.folders import cache_folder
 from generator.kernels import printing
 from generator.kernels.choice import channels_of
@@ -192,7 +192,7 @@ def _keep(found: PrintMap, path: Path | None) -> None:
     np.savez_compressed(stream, **arrays)
     # Workers may come here at the same time: each writes a file of its own, and the last to finish names it.
     own = path.with_name(f"{path.stem}-{uuid.uuid4().hex}")
-    with contextlib.suppress(CropError, OSError), whole_file(own, lambda: path) as file:
+    with contextlib.suppress(CropError, OSError), atomic_file(own, lambda: path) as file:
         file.write(stream.getvalue())
 
 

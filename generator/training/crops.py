@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.table.lut import open_lut, require_lut
-from foundation.errors import InputError, kind_of
+from foundation.errors import InputError, value_text
 from generator import philox
 from generator.kernels.planar import draw_batch, scales_of
 from generator.kernels.printed_crops import draw_printed_crops
@@ -399,15 +399,15 @@ def _require_kinds(gallery: object, size: object, lights: object, black_point: o
     """Refuse arguments of another kind than expected, each with what makes one of that kind."""
     if not isinstance(gallery, Gallery):
         raise InputError(
-            f"the gallery is {kind_of(gallery)}, expected one of gallery_of([picture, …]) or open_gallery(FOLDER)"
+            f"the gallery is {value_text(gallery)}, expected one of gallery_of([picture, …]) or open_gallery(FOLDER)"
         )
     if np.shape(size) != (2,) or isinstance(size, str):  # pyrefly: ignore[no-matching-overload]
-        raise InputError(f"the size of crops is {kind_of(size)}, expected height and width, such as (128, 128)")
+        raise InputError(f"the size of crops is {value_text(size)}, expected height and width, such as (128, 128)")
     if isinstance(lights, int | str | Mixture):
-        raise InputError(f"the lights are {kind_of(lights)}, expected a list, such as [0, 3] or ['D65']")
+        raise InputError(f"the lights are {value_text(lights)}, expected a list, such as [0, 3] or ['D65']")
     if not isinstance(black_point, BlackPoint):
         raise InputError(
-            f"the black point is {kind_of(black_point)}, expected 'keep', 'compensate', 'random' or 'random:MAX'"
+            f"the black point is {value_text(black_point)}, expected 'keep', 'compensate', 'random' or 'random:MAX'"
         )
 
 

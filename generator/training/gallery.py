@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from foundation.errors import FormatError, InputError, kind_of
-from foundation.files import storage_error, write_whole
-from foundation.folders import whole_folder
+from foundation.errors import FormatError, InputError, value_text
+from foundation.files import storage_error, write_atomic
+from foundation.folders import atomic_folder
 from foundation.records import Record
 from generator.kernels.choice import check_picture
 from generator.pictures.sources import Picture, Source
@@ -113,7 +113,7 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
     (2, (84,), (2, 2, 3))
     """
     if isinstance(pictures, str) or not len(pictures):
-        raise InputError(f"a gallery of {kind_of(pictures)} was asked for, expected a list of 1 or more pictures")
+        raise InputError(f"a gallery of {value_text(pictures)} was asked for, expected a list of 1 or more pictures")
     if names is not None and len(names) != len(pictures):
         raise InputError(f"{len(pictures)} pictures of a gallery have {len(names)} names, expected one each")
     for picture in pictures:
@@ -165,7 +165,7 @@ def save_gallery(
     """
     entries: list[_Entry] = []
     skipped: list[str] = []
-    with whole_folder(folder, "the gallery") as partial:
+    with atomic_folder(folder, "the gallery") as partial:
         path = partial / "codes.u8"
         try:
             with path.open("wb") as stream:
@@ -185,7 +185,7 @@ def save_gallery(
         if not entries:
             raise FormatError(f"none of the {len(sources)} pictures can be read; name other pictures")
         head = _Head(pictures=entries, skipped=skipped)
-        write_whole(partial / "gallery.json", head.model_dump_json(indent=2) + "\n")
+        write_atomic(partial / "gallery.json", head.model_dump_json(indent=2) + "\n")
     return open_gallery(folder)
 
 

@@ -1,1 +1,1 @@
-"""The simulated ends of cables, USB, PTP/IP, serial and memory, and what goes wrong on them."""
+"""Simulated ends of cables: USB, PTP/IP, serial port and memory."""

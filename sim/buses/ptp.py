@@ -1,9 +1,7 @@
-"""A PTP device on a TCP port, for one initiator at a time (PTP/IP).
+"""PTP/IP server on a TCP port, for one initiator at a time (CIPA DC-005-2005, PTP-IP, clauses 2.2 and 2.3).
 
-The responder is asked by one thread only, that of the command connection: for events after each operation, before the
-response goes out, and 20 times a second between operations.
-
-Source: CIPA DC-005-2005, PTP-IP, clauses 2.2 and 2.3.
+Only the thread of the command connection calls the responder. It asks for events after each operation, before the
+response, and 20 times per second between operations.
 """
 
 from __future__ import annotations
@@ -33,36 +31,33 @@ from drivers.ptp.ip import (
 from drivers.ptp.protocol import Answer, NoAnswer, PtpRequest, PtpResponse, Responder
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
-GUID = bytes(range(16))  # Identifier of a simulated device
-# What a simulated device calls itself unless another is given; ptpy fails on names of more than 19 characters.
-NAME = "CroP camera"
-DATA_PIECE = 256 * 1024  # Bytes of data in a packet to the initiator; what fits goes out in one EndData
+GUID = bytes(range(16))  # Identifier of a simulated device.
+NAME = "CroP camera"  # Default name of a simulated device; ptpy fails on names of more than 19 characters.
+DATA_PIECE = 256 * 1024  # Bytes of data per packet to the initiator; smaller data are sent in one EndData.
 
-_TICK_S = 0.05  # Between two looks for events while no command comes: soon enough for a host, and hardly any load
-# For the first packet, a data phase under way, and a host that reads slowly; long beside a transfer on one machine.
+_TICK_S = 0.05  # Interval between two requests for events, s.
+
+# Limit for the first packet, for a data phase, and for a slow host, s; transfers on one machine are much faster.
 _TIMEOUT_S = 10.0
 
 
 def serve_ptpip(responder: Responder, port: int = PORT, *, name: str = NAME) -> TcpServer:
-    """Put a device on a TCP port; 0 picks a free one.
-
-    Use the result in a ``with`` block; its `address` is host and port, both connections go there.
-    """
+    """Serve a device on a TCP port, 0 for a free one; use the result, with its `address`, in a ``with`` block."""
     return TcpServer(PtpIpService(responder, name).handle, port)
 
 
 class PtpIpService:
-    """Speaks PTP/IP for a responder on connections that it is given."""
+    """PTP/IP protocol of a responder, on any number of connections."""
 
     def __init__(self, responder: Responder, name: str) -> None:
         self._responder = responder
         self._name = name
         self._numbers = itertools.count(1)
-        self._guard = threading.Lock()
+        self._lock = threading.Lock()
         self._initiator: _Initiator | None = None
 
     def handle(self, link: TcpLink) -> None:
-        """Serve one connection, command or event, until it ends."""
+        """Serve one command or event connection until it ends."""
         channel = Channel(link)
         try:
             match channel.next(_TIMEOUT_S):
@@ -77,11 +72,11 @@ class PtpIpService:
 
     def _serve_commands(self, channel: Channel) -> None:
         initiator = _Initiator(next(self._numbers), channel)
-        with self._guard:
-            free = self._initiator is None
-            if free:
+        with self._lock:
+            is_free = self._initiator is None
+            if is_free:
                 self._initiator = initiator
-        if not free:
+        if not is_free:
             _send(channel, InitFail(FailReason.BUSY))
             return
         try:
@@ -103,11 +98,11 @@ class PtpIpService:
         finally:
             initiator.hang_up()
             self._responder.unplugged()
-            with self._guard:
+            with self._lock:
                 self._initiator = None
 
     def _serve_events(self, channel: Channel, link: TcpLink, number: int) -> None:
-        with self._guard:
+        with self._lock:
             initiator = self._initiator
         if initiator is None or initiator.number != number:
             _send(channel, InitFail(FailReason.REJECTED))
@@ -133,7 +128,7 @@ class PtpIpService:
         if sends_data:
             data = _collect(command)
             if data is None:
-                self._call_off(command, request)
+                self._cancel(command, request)
                 return
         if data is None and self._responder.takes_data(request):
             answer = Answer(PtpResponse(ResponseCode.GENERAL_ERROR, request.transaction))
@@ -145,13 +140,13 @@ class PtpIpService:
         self._send_events(initiator)
         if answer.data is not None:
             for _ in command.send_data(request.transaction, answer.data, DATA_PIECE, _TIMEOUT_S):
-                if initiator.gave_up(request.transaction):
+                if initiator.is_cancelled(request.transaction):
                     _send(command, EndData(request.transaction))
-                    self._call_off(command, request)
+                    self._cancel(command, request)
                     return
         _send(command, answer.response)
 
-    def _call_off(self, command: Channel, request: PtpRequest) -> None:
+    def _cancel(self, command: Channel, request: PtpRequest) -> None:
         self._responder.cancelled(request.transaction)
         _send(command, PtpResponse(ResponseCode.TRANSACTION_CANCELLED, request.transaction))
 
@@ -161,7 +156,7 @@ class PtpIpService:
 
 
 class _Initiator:
-    """Who is connected: the number and the two connections that it joins, and the transaction that it gave up last."""
+    """A connected initiator: its number, its two connections, and the transaction that it cancelled last."""
 
     def __init__(self, number: int, command: Channel) -> None:
         self.number = number
@@ -170,35 +165,35 @@ class _Initiator:
         self._event: Channel | None = None
         self._event_link: TcpLink | None = None
         self._is_over = False
-        self._waiting: list[Packet] = []
-        self._guard = threading.Lock()
+        self._pending: list[Packet] = []
+        self._lock = threading.Lock()
 
-    def gave_up(self, transaction: int) -> bool:
-        """Return whether this transaction was given up."""
+    def is_cancelled(self, transaction: int) -> bool:
+        """Return whether a transaction was cancelled."""
         return self.cancelled == transaction
 
     def join(self, event: Channel, link: TcpLink) -> None:
-        """Take the second connection, and send on it what came up before."""
-        with self._guard:
+        """Set the event connection, and send the pending events."""
+        with self._lock:
             self._event, self._event_link = event, link
             if self._is_over:
                 link.hang_up()
                 return
-            for packet in self._waiting:
+            for packet in self._pending:
                 _send(event, packet)
-            self._waiting.clear()
+            self._pending.clear()
 
     def send_event(self, packet: Packet) -> None:
-        """Send on the event connection, once there is one."""
-        with self._guard:
+        """Send a packet on the event connection, as soon as it exists."""
+        with self._lock:
             if self._event is None:
-                self._waiting.append(packet)
+                self._pending.append(packet)
             else:
                 _send(self._event, packet)
 
     def hang_up(self) -> None:
-        """End the event connection, which its handler, woken by it, closes; the command connection is its handler's."""
-        with self._guard:
+        """End the event connection. Its handler closes it; the command connection has its own handler."""
+        with self._lock:
             self._is_over = True
             if self._event_link is not None:
                 self._event_link.hang_up()

@@ -1,7 +1,7 @@
-"""A serial cable to a simulated device: a pseudo-terminal (Linux and macOS).
+"""Simulated serial port: a pseudo-terminal (Linux and macOS) whose other end is a simulated device.
 
-One thread serves a pseudo-terminal's device. To close it is to pull the cable out; what nobody reads is lost when the
-system's buffer is full, as on a cable without flow control.
+One thread serves the device. Closing the pseudo-terminal is like unplugging the cable. As on a cable without flow
+control, bytes are lost if the buffer of the system is full.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ from drivers.links.link import ClosedAtEnd, Peer
 from drivers.links.network import POLLING_S
 from foundation.errors import LinkClosed
 
-_WAKE: Final = b"w"
+_WAKE: Final = b"w"  # Signals to the thread: report when all input is processed, and end.
 _END: Final = b"e"  # What rings the serving thread: to say when it has caught up, and to end
 
-# Longest wait for the thread to catch up; it takes milliseconds unless the machine is overloaded.
-_TIMEOUT_S: Final = 10.0
+_TIMEOUT_S: Final = 10.0  # Limit for processing the input, s; it takes milliseconds unless the machine is overloaded.
 
 
 class PseudoTerminal(ClosedAtEnd):
-    """A serial port at `path` whose far end is `peer`, until closed; use it in a `with` block."""
+    """Serial port at `path`, connected to `peer` until closed; use it in a `with` block."""
 
     def __init__(self, peer: Peer) -> None:
         self._peer = peer
@@ -44,13 +43,13 @@ class PseudoTerminal(ClosedAtEnd):
         self._thread.start()
 
     def catch_up(self) -> None:
-        """Return when all that was sent has been answered and nothing more comes: before and after a clock leaps."""
+        """Wait until all input is processed and answered; call it before and after a step of the clock."""
         self._caught_up.clear()
         os.write(self._ringer, _WAKE)
         self._caught_up.wait(_TIMEOUT_S)
 
     def close(self) -> None:
-        """Pull the cable out and wait for the thread; a second call does nothing."""
+        """Disconnect the cable and wait for the thread; a second call does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -60,22 +59,22 @@ class PseudoTerminal(ClosedAtEnd):
             os.close(end)
 
     def _serve(self) -> None:
-        self._say(self._peer.connect())
-        awaited = False
+        self._send(self._peer.connect())
+        is_awaited = False
         while True:
             ready, _, _ = select.select([self._master, self._bell], [], [], POLLING_S)
-            rung = os.read(self._bell, 1) if self._bell in ready else b""
-            if rung == _END:
+            signal = os.read(self._bell, 1) if self._bell in ready else b""
+            if signal == _END:
                 return
-            awaited = awaited or rung == _WAKE
-            heard = os.read(self._master, 4096) if self._master in ready else b""
-            self._say(self._peer.receive(heard))
-            if awaited and not ready:
+            is_awaited = is_awaited or signal == _WAKE
+            received = os.read(self._master, 4096) if self._master in ready else b""
+            self._send(self._peer.receive(received))
+            if is_awaited and not ready:
                 # The system takes a moment to carry bytes across: only silence shows that none are on their way.
-                awaited = False
+                is_awaited = False
                 self._caught_up.set()
 
-    def _say(self, data: bytes) -> None:
+    def _send(self, data: bytes) -> None:
         with contextlib.suppress(BlockingIOError):
             while data:
                 data = data[os.write(self._master, data) :]

@@ -1,10 +1,10 @@
-"""USB without hardware: a device as a pure machine, and a bus for pyusb that opens it by the calls for real ones.
+"""Simulated USB: a still-image device without time or threads, and a bus that pyusb uses like a real one.
 
-Packets count, as on a wire: a transfer from the host has ended only with a packet that is not full, and one to the host
-is closed by a zero-length packet when it fills its last one. Nothing waits: a pipe without anything to say is a NAK, on
-the bus a timeout at once. A transfer that is no PTP halts the bulk pipes, until the host clears them.
+Transfers consist of packets. A transfer ends with a packet that is not full; if the last packet is full, an empty
+packet follows. Nothing waits: if a pipe has no data (NAK), a read times out at once. Data that are not PTP halt the
+bulk pipes until the host clears them.
 
-Sources: pyusb's `usb.backend`; libusb 1.0's error codes; USB 2.0, clauses 8.5 (transactions), 9.4 (standard requests)
+Sources: `usb.backend` of pyusb; error codes of libusb 1.0; USB 2.0, clauses 8.5 (transactions), 9.4 (standard requests)
 and 9.6 (descriptors); USB Still Image Capture Device Definition 1.0, clauses 5 to 7.
 """
 
@@ -42,41 +42,40 @@ from foundation.clock import SimulatedClock
 from foundation.errors import ProtocolError
 
 PACKET = HIGH_SPEED_PACKET
-INTERRUPT_PACKET = 8  # wMaxPacketSize of the interrupt pipe: an EOS splits its events over packets of 8 bytes
-BULK_IN = 0x81  # Endpoint address of a real EOS; bit 7 is the direction, to the host (USB 2.0, 9.6.6)
-BULK_OUT = 0x02  # Endpoint address of a real EOS
-INTERRUPT_IN = 0x83  # Endpoint address of a real EOS; bit 7 as in `BULK_IN`
+INTERRUPT_PACKET = 8  # wMaxPacketSize of the interrupt pipe, bytes: an EOS splits its events into such packets.
+BULK_IN = 0x81  # Endpoint addresses of a real EOS. Bit 7 set: to the host (USB 2.0, 9.6.6).
+BULK_OUT = 0x02  # From the host.
+INTERRUPT_IN = 0x83  # To the host.
 
-_BULK, _INTERRUPT = 2, 3  # Transfer types in an endpoint's bmAttributes (USB 2.0, 9.6.6)
+_BULK, _INTERRUPT = 2, 3  # Transfer types in bmAttributes of an endpoint (USB 2.0, 9.6.6).
 # Types of descriptors (USB 2.0, 9.4, table 9-5).
 _DEVICE, _CONFIGURATION, _STRING, _INTERFACE, _ENDPOINT = 1, 2, 3, 4, 5
-# The one language of the string descriptors: LANGID of English, United States (USB 2.0, 9.6.7).
-_LANGUAGE_ENGLISH = 0x0409
+_LANGUAGE_ENGLISH = 0x0409  # Language of the string descriptors: LANGID of English, United States (USB 2.0, 9.6.7).
 
 
 class Stalled(Exception):
-    """The pipe is halted, or declines this request."""
+    """The pipe is halted, or the request is refused."""
 
 
 class Overflowed(Exception):
-    """The host asked for less than the packet that comes."""
+    """The packet is larger than the buffer of the host."""
 
 
 @dataclass(frozen=True)
 class UsbIdentity:
-    """How a device identifies itself before PTP begins; the default is an EOS 550D's. `serial` None: it has none."""
+    """Identification of a device, by default of an EOS 550D; `serial` None means no serial number."""
 
     vendor: int = VENDOR_CANON_USB
     product: int = 0x31EA
     serial: str | None = "0123456789"
     manufacturer: str = "Canon Inc."
     name: str = "Canon Digital Camera"
-    version: int = 0x0200  # bcdUSB: high speed from 2.00 on
+    version: int = 0x0200  # bcdUSB: 2.00 or higher for high speed
 
 
 @dataclass(frozen=True)
 class Setup:
-    """The eight bytes that open a control transfer (USB 2.0, 9.3)."""
+    """The eight bytes at the start of a control transfer (USB 2.0, 9.3)."""
 
     request_type: int
     request: int
@@ -86,35 +85,31 @@ class Setup:
 
     @classmethod
     def decode(cls, data: bytes) -> Setup:
-        """Return the request in eight bytes."""
+        """Decode eight bytes."""
         return cls(*struct.unpack("<BBHHH", data))
 
 
 @dataclass
 class _Exchange:
-    """What a device remembers of its pipes, until the host or a pulled cable makes it start over.
+    """State of the pipes, until the host or a disconnection resets it."""
 
-    - `reader`: cuts what the host sends into containers.
-    - `request`, `payload`: the operation whose data phase comes in, and as much of it as has come.
-    - `complete`: an operation that is whole but for the end of its transfer, with its data phase.
-    - `outgoing`, `events`: transfers to the host on the bulk and on the interrupt pipe.
-    """
-
+    # Splits the bytes of the host into containers
     reader: ContainerReader = field(default_factory=lambda: ContainerReader(PACKET))
-    request: PtpRequest | None = None
-    payload: bytearray = field(default_factory=bytearray)
+    request: PtpRequest | None = None  # Operation whose data phase is being received
+    payload: bytearray = field(default_factory=bytearray)  # Data received so far
+    # Operation with its data phase, before the end of its transfer
     complete: tuple[PtpRequest, bytes | None] | None = None
-    outgoing: deque[memoryview] = field(default_factory=deque[memoryview])
-    events: deque[memoryview] = field(default_factory=deque[memoryview])
+    outgoing: deque[memoryview] = field(default_factory=deque[memoryview])  # Transfers to the host on the bulk pipe
+    events: deque[memoryview] = field(default_factory=deque[memoryview])  # Transfers to the host on the interrupt pipe
 
 
 def endpoint_descriptor(address: int, kind: int, packet: int, interval: int = 0) -> bytes:
-    """Return the 7 bytes that describe a pipe; `kind` 2 is bulk, 3 interrupt."""
+    """Return the 7-byte descriptor of an endpoint; `kind` is 2 for bulk, 3 for interrupt."""
     return struct.pack("<BBBBHB", 7, _ENDPOINT, address, kind, packet, interval)
 
 
 class PtpUsbDevice:
-    """A still image device, at high speed: its descriptors and standard requests, and its pipes."""
+    """Still-image device at high speed: descriptors, standard requests, pipes."""
 
     pipes: Final = frozenset({BULK_IN, BULK_OUT, INTERRUPT_IN})  # Addresses of its endpoints
 
@@ -126,7 +121,7 @@ class PtpUsbDevice:
         self._configuration = 1
 
     def device_descriptor(self) -> bytes:
-        """Return the 18 bytes that name the device."""
+        """Return the 18-byte device descriptor."""
         identity = self.identity
         serial = 0 if identity.serial is None else 3
         numbers = (identity.version, 0, 0, 0, 64, identity.vendor, identity.product, 0x0002, 1, 2, serial, 1)
@@ -138,7 +133,7 @@ class PtpUsbDevice:
         return struct.pack("<BBHBBBBB", 9, _CONFIGURATION, 9 + len(body), 1, 1, 0, 0xC0, 1) + body
 
     def control(self, setup: Setup, data: bytes = b"") -> bytes:
-        """Carry out a control request and return its data, if it goes to the host."""
+        """Process a control request; return the data for the host."""
         match setup.request_type & 0x60, setup.request_type & 0x1F:
             case 0x00, recipient:
                 answer = self._standard(setup, recipient)
@@ -149,7 +144,7 @@ class PtpUsbDevice:
         return answer[: setup.length]
 
     def halt(self, endpoint: int) -> None:
-        """Stall a pipe until the host clears it."""
+        """Halt a pipe until the host clears it."""
         self._halted.add(endpoint)
 
     def _standard(self, setup: Setup, recipient: int) -> bytes:
@@ -197,13 +192,13 @@ class PtpUsbDevice:
         return interface + bulk + endpoint_descriptor(INTERRUPT_IN, _INTERRUPT, INTERRUPT_PACKET, 6)
 
     def write(self, endpoint: int, data: bytes) -> None:
-        """Take packets from the host: `data` in full packets, the last perhaps short or, for b"", empty."""
+        """Receive packets: full ones, of which the last may be short or, for b"", empty."""
         if BULK_OUT in self._halted:
             raise Stalled
         exchange = self._exchange
         try:
             for message in exchange.reader.feed(data):
-                self._take(message)
+                self._handle_message(message)
         except ProtocolError as error:
             self._halted |= {BULK_OUT, BULK_IN}
             raise Stalled from error
@@ -214,7 +209,7 @@ class PtpUsbDevice:
             self._answer(request, payload)
 
     def read(self, endpoint: int, limit: int) -> bytes | None:
-        """Return up to `limit` bytes of a transfer to the host, None where there is nothing yet."""
+        """Return up to `limit` bytes of a transfer to the host, None if there are no data."""
         if endpoint == BULK_IN:
             return self._packets(BULK_IN, self._exchange.outgoing, PACKET, limit)
         for event in self._responder.events():
@@ -222,12 +217,12 @@ class PtpUsbDevice:
         return self._packets(INTERRUPT_IN, self._exchange.events, INTERRUPT_PACKET, limit)
 
     def unplugged(self) -> None:
-        """Forget everything: the cable was pulled, or the bus was reset."""
+        """Reset all state after a disconnection or a bus reset."""
         self._exchange = _Exchange()
         self._halted.clear()
         self._responder.unplugged()
 
-    def _take(self, message: Message) -> None:
+    def _handle_message(self, message: Message) -> None:
         exchange = self._exchange
         match message:
             case PtpRequest() if self._responder.takes_data(message):
@@ -261,28 +256,28 @@ class PtpUsbDevice:
             self._exchange.outgoing.append(memoryview(b""))
 
     def _packets(self, endpoint: int, queue: deque[memoryview], packet: int, limit: int) -> bytes | None:
-        """Return what one transfer of the host takes from `queue`: until a packet that is not full, or `limit`."""
+        # One transfer of the host ends with a packet that is not full, or at `limit`.
         if endpoint in self._halted:
             raise Stalled
         if not queue:
             return None
-        taken: list[memoryview] = []
-        room = limit
+        packets: list[memoryview] = []
+        space = limit
         while queue:
-            rest = queue.popleft()
-            if len(rest) <= room:
-                taken.append(rest)
-                room -= len(rest)
-                if not rest or len(rest) % packet:
+            transfer = queue.popleft()
+            if len(transfer) <= space:
+                packets.append(transfer)
+                space -= len(transfer)
+                if not transfer or len(transfer) % packet:
                     break
             else:
-                if room % packet:
-                    queue.appendleft(rest)
+                if space % packet:
+                    queue.appendleft(transfer)
                     raise Overflowed
-                taken.append(rest[:room])
-                queue.appendleft(rest[room:])
+                packets.append(transfer[:space])
+                queue.appendleft(transfer[space:])
                 break
-        return b"".join(taken)
+        return b"".join(packets)
 
     def _class_request(self, setup: Setup, data: bytes) -> bytes:
         match setup.request:
@@ -315,9 +310,10 @@ _ERRORS = {
     errno.EOVERFLOW: (-8, "Overflow"),
     errno.EPIPE: (-9, "Pipe error"),
 }
-_HIGH_SPEED = 3  # LIBUSB_SPEED_HIGH, 480 Mbit/s, as the real bodies
-# Fields of each type of descriptor behind length and type; what begins with w, id or bcd has two bytes, the rest one
-# (USB 2.0, 9.6).
+_HIGH_SPEED = 3  # LIBUSB_SPEED_HIGH, 480 Mbit/s, as in real bodies.
+
+# Fields of each descriptor type after length and type (USB 2.0, 9.6). Names with w, id or bcd have two bytes, others
+# one.
 _FIELDS = {
     _DEVICE: "bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol bMaxPacketSize0 idVendor idProduct bcdDevice "
     "iManufacturer iProduct iSerialNumber bNumConfigurations",
@@ -329,8 +325,8 @@ _FIELDS = {
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a device is plugged in, and since when: two places of one device differ in their address."""
+class Attachment:
+    """Port and address of a plugged-in device; the address changes when it is plugged in again."""
 
     device: PtpUsbDevice
     port: int
@@ -338,20 +334,20 @@ class Place:
 
 
 class Handle:
-    """One opening of a device; only the one that claimed the interface may use the pipes."""
+    """An opened device; only the handle that claimed the interface may use the pipes."""
 
-    def __init__(self, place: Place) -> None:
-        self.place = place
-        self.device = place.device
+    def __init__(self, attachment: Attachment) -> None:
+        self.attachment = attachment
+        self.device = attachment.device
 
 
 class SimulatedBus(IBackend):
-    """A bus with devices that can be plugged in and pulled out."""
+    """Bus with devices that can be plugged in and unplugged."""
 
     def __init__(self, *devices: PtpUsbDevice) -> None:
-        self._places: list[Place] = []
+        self._attachments: list[Attachment] = []
         self._addresses = 1
-        self._claims: dict[Place, Handle] = {}
+        self._claims: dict[Attachment, Handle] = {}
         self._held: set[PtpUsbDevice] = set()
         self._locked: set[PtpUsbDevice] = set()
         self._kernel: set[PtpUsbDevice] = set()
@@ -361,72 +357,72 @@ class SimulatedBus(IBackend):
     def plug(self, device: PtpUsbDevice, port: int = 1) -> None:
         """Plug a device in."""
         self._addresses += 1
-        self._places.append(Place(device, port, self._addresses))
+        self._attachments.append(Attachment(device, port, self._addresses))
 
     def unplug(self, device: PtpUsbDevice) -> None:
-        """Pull a device out; does nothing if it is not plugged in."""
-        for place in [place for place in self._places if place.device is device]:
-            self._places.remove(place)
-            self._claims.pop(place, None)
+        """Unplug a device; do nothing if it is not plugged in."""
+        for attachment in [attachment for attachment in self._attachments if attachment.device is device]:
+            self._attachments.remove(attachment)
+            self._claims.pop(attachment, None)
             device.unplugged()
 
     def replug(self, device: PtpUsbDevice) -> None:
-        """Pull a device out and plug it in again at its port, as it does itself when it restarts."""
-        port = next((place.port for place in self._places if place.device is device), 1)
+        """Unplug a device and plug it in at the same port, as a restart does."""
+        port = next((attachment.port for attachment in self._attachments if attachment.device is device), 1)
         self.unplug(device)
         self.plug(device, port)
 
-    def hold(self, device: PtpUsbDevice, held: bool = True) -> None:
-        """Have another program hold the device's interface, or let go of it."""
-        (self._held.add if held else self._held.discard)(device)
+    def hold(self, device: PtpUsbDevice, is_held: bool = True) -> None:
+        """Let another program claim or release the interface of the device."""
+        (self._held.add if is_held else self._held.discard)(device)
 
-    def lock(self, device: PtpUsbDevice, locked: bool = True) -> None:
-        """Take away the permission to open the device, or give it."""
-        (self._locked.add if locked else self._locked.discard)(device)
+    def lock(self, device: PtpUsbDevice, is_locked: bool = True) -> None:
+        """Remove or restore the permission to open the device."""
+        (self._locked.add if is_locked else self._locked.discard)(device)
 
     def bind_kernel_driver(self, device: PtpUsbDevice) -> None:
-        """Have the system's own driver sit on the interface."""
+        """Let a kernel driver use the interface."""
         self._kernel.add(device)
 
     def kernel_driver_sits_on(self, device: PtpUsbDevice) -> bool:
-        """Return whether the system's own driver sits on the interface."""
+        """Return whether a kernel driver uses the interface."""
         return device in self._kernel
 
     def is_claimed(self, device: PtpUsbDevice) -> bool:
         """Return whether the interface is claimed on this bus."""
-        return any(place.device is device for place in self._claims)
+        return any(attachment.device is device for attachment in self._claims)
 
     # What pyusb asks of a backend; see usb.backend.IBackend.
 
-    def enumerate_devices(self) -> list[Place]:
-        """Return what is plugged in."""
-        return list(self._places)
+    def enumerate_devices(self) -> list[Attachment]:
+        """Return the plugged-in devices."""
+        return list(self._attachments)
 
-    def get_parent(self, dev: Place) -> None:
-        """Return no parent: every port is the root's."""
+    def get_parent(self, dev: Attachment) -> None:
+        """Return None: all ports belong to the root hub."""
 
-    def get_device_descriptor(self, dev: Place) -> SimpleNamespace:
-        """Return the device's descriptor and its place."""
-        described = _described(dev.device.device_descriptor(), _DEVICE)
-        described.bus, described.address, described.speed = 1, dev.address, _HIGH_SPEED
-        described.port_number, described.port_numbers = dev.port, (dev.port,)
-        return described
+    def get_device_descriptor(self, dev: Attachment) -> SimpleNamespace:
+        """Return the device descriptor with bus, address and port."""
+        descriptor = _descriptor(dev.device.device_descriptor(), _DEVICE)
+        descriptor.bus, descriptor.address, descriptor.speed = 1, dev.address, _HIGH_SPEED
+        descriptor.port_number, descriptor.port_numbers = dev.port, (dev.port,)
+        return descriptor
 
-    def get_configuration_descriptor(self, dev: Place, config: int) -> SimpleNamespace:
-        """Return the only configuration's descriptor."""
-        return _described(dev.device.configuration_descriptor(), _CONFIGURATION, config)
+    def get_configuration_descriptor(self, dev: Attachment, config: int) -> SimpleNamespace:
+        """Return the descriptor of the only configuration."""
+        return _descriptor(dev.device.configuration_descriptor(), _CONFIGURATION, config)
 
-    def get_interface_descriptor(self, dev: Place, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """Return the only interface's descriptor."""
-        return _described(dev.device.configuration_descriptor(), _INTERFACE, intf + alt + config)
+    def get_interface_descriptor(self, dev: Attachment, intf: int, alt: int, config: int) -> SimpleNamespace:
+        """Return the descriptor of the only interface."""
+        return _descriptor(dev.device.configuration_descriptor(), _INTERFACE, intf + alt + config)
 
-    def get_endpoint_descriptor(self, dev: Place, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """Return an endpoint's descriptor."""
-        described = _described(dev.device.configuration_descriptor(), _ENDPOINT, ep)
-        described.bRefresh = described.bSynchAddress = 0
-        return described
+    def get_endpoint_descriptor(self, dev: Attachment, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
+        """Return the descriptor of an endpoint."""
+        descriptor = _descriptor(dev.device.configuration_descriptor(), _ENDPOINT, ep)
+        descriptor.bRefresh = descriptor.bSynchAddress = 0
+        return descriptor
 
-    def open_device(self, dev: Place) -> Handle:
+    def open_device(self, dev: Attachment) -> Handle:
         """Open a device."""
         handle = Handle(dev)
         self._check(handle)
@@ -435,39 +431,39 @@ class SimulatedBus(IBackend):
         return handle
 
     def close_device(self, dev_handle: Handle) -> None:
-        """Close a device, and let go of its interface."""
-        if self._claims.get(dev_handle.place) is dev_handle:
-            del self._claims[dev_handle.place]
+        """Close a device and release its interface."""
+        if self._claims.get(dev_handle.attachment) is dev_handle:
+            del self._claims[dev_handle.attachment]
 
     def set_configuration(self, dev_handle: Handle, config_value: int) -> None:
-        """Choose the configuration."""
+        """Select the configuration."""
         self._control(dev_handle, Setup(0x00, 9, config_value, 0, 0))
 
     def get_configuration(self, dev_handle: Handle) -> int:
-        """Return the configuration chosen."""
+        """Return the selected configuration."""
         return self._control(dev_handle, Setup(0x80, 8, 0, 0, 1))[0]
 
     def set_interface_altsetting(self, dev_handle: Handle, intf: int, altsetting: int) -> None:
-        """Choose the interface's setting."""
+        """Select the alternate setting of the interface."""
         self._control(dev_handle, Setup(0x01, 11, altsetting, intf, 0))
 
     def claim_interface(self, dev_handle: Handle, intf: int) -> None:
-        """Take the interface for this program."""
+        """Claim the interface for this program."""
         self._check(dev_handle)
         if intf:
             raise _error(errno.ENOENT)
-        if dev_handle.device in self._held | self._kernel or dev_handle.place in self._claims:
+        if dev_handle.device in self._held | self._kernel or dev_handle.attachment in self._claims:
             raise _error(errno.EBUSY)
-        self._claims[dev_handle.place] = dev_handle
+        self._claims[dev_handle.attachment] = dev_handle
 
     def release_interface(self, dev_handle: Handle, intf: int) -> None:
-        """Give the interface back."""
+        """Release the interface."""
         self._check(dev_handle)
-        if self._claims.get(dev_handle.place) is dev_handle:
-            del self._claims[dev_handle.place]
+        if self._claims.get(dev_handle.attachment) is dev_handle:
+            del self._claims[dev_handle.attachment]
 
     def bulk_write(self, dev_handle: Handle, ep: int, intf: int, data: array[int], timeout: int) -> int:
-        """Send to a pipe."""
+        """Write to a pipe."""
         self._check_transfer(dev_handle, ep)
         try:
             dev_handle.device.write(ep, data.tobytes())
@@ -502,7 +498,7 @@ class SimulatedBus(IBackend):
         data: array[int],
         timeout: int,
     ) -> int:
-        """Carry out a control request."""
+        """Process a control request."""
         setup = Setup(bmRequestType, bRequest, wValue, wIndex, len(data))
         if bmRequestType & 0x80:
             answer = self._control(dev_handle, setup)
@@ -512,7 +508,7 @@ class SimulatedBus(IBackend):
         return len(data)
 
     def clear_halt(self, dev_handle: Handle, ep: int) -> None:
-        """End a stall."""
+        """Clear a halted pipe."""
         self._control(dev_handle, Setup(0x02, 1, 0, ep, 0))
 
     def reset_device(self, dev_handle: Handle) -> None:
@@ -521,29 +517,29 @@ class SimulatedBus(IBackend):
         dev_handle.device.unplugged()
 
     def is_kernel_driver_active(self, dev_handle: Handle, intf: int) -> bool:
-        """Return whether the system's own driver sits on the interface."""
+        """Return whether a kernel driver uses the interface."""
         self._check(dev_handle)
         return dev_handle.device in self._kernel
 
     def detach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
-        """Take the interface from the system's own driver."""
+        """Detach the kernel driver from the interface."""
         self._check(dev_handle)
         self._kernel.discard(dev_handle.device)
 
     def attach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
-        """Give the interface to the system's own driver."""
+        """Attach the kernel driver to the interface."""
         self._check(dev_handle)
         self._kernel.add(dev_handle.device)
 
     def _check(self, handle: Handle) -> None:
-        if handle.place not in self._places:
+        if handle.attachment not in self._attachments:
             raise _error(errno.ENODEV)
 
     def _check_transfer(self, handle: Handle, endpoint: int) -> None:
         self._check(handle)
         if endpoint not in handle.device.pipes:
             raise _error(errno.ENOENT)
-        if self._claims.get(handle.place) is not handle:
+        if self._claims.get(handle.attachment) is not handle:
             raise _error(errno.EIO)
 
     def _control(self, handle: Handle, setup: Setup, data: bytes = b"") -> bytes:
@@ -560,8 +556,8 @@ def _error(number: int) -> usb.core.USBError:
     return kind(text, code, number)
 
 
-def _described(descriptors: bytes, kind: int, index: int = 0) -> SimpleNamespace:
-    """Return the fields of the `index`-th descriptor of a kind."""
+def _descriptor(descriptors: bytes, kind: int, index: int = 0) -> SimpleNamespace:
+    """Return the fields of a descriptor of type `kind`, the one with number `index`."""
     names = _FIELDS[kind].split()
     layout = "<" + "".join("H" if name.startswith(("w", "id", "bcd")) else "B" for name in names)
     at = 0
@@ -569,15 +565,15 @@ def _described(descriptors: bytes, kind: int, index: int = 0) -> SimpleNamespace
         if descriptors[at + 1] == kind:
             if not index:
                 fields = struct.unpack_from(layout, descriptors, at + 2)
-                described = dict(zip(names, fields, strict=True))
-                return SimpleNamespace(bLength=descriptors[at], bDescriptorType=kind, **described, extra_descriptors=[])
+                values = dict(zip(names, fields, strict=True))
+                return SimpleNamespace(bLength=descriptors[at], bDescriptorType=kind, **values, extra_descriptors=[])
             index -= 1
         at += descriptors[at]
     raise IndexError(f"descriptor {index} of type {kind}")
 
 
 class MemoryTransport(UsbTransport):
-    """A `drivers.ptp.protocol.Transport` to a responder on a bus of its own: no cable, no thread and no wait."""
+    """Transport (`drivers.ptp.protocol.Transport`) to a responder on a separate bus, without threads or waiting."""
 
     def __init__(self, responder: Responder) -> None:
         self._device = PtpUsbDevice(responder, UsbIdentity(name="the simulated Canon Digital Camera"))
@@ -585,5 +581,5 @@ class MemoryTransport(UsbTransport):
         super().__init__(open_usb(backend=self._bus), SimulatedClock())
 
     def pull(self) -> None:
-        """Pull the cable."""
+        """Disconnect the cable."""
         self._bus.unplug(self._device)

@@ -1,1 +1,1 @@
-"""The simulated camera: sensor, raw files, and a Canon EOS that speaks PTP."""
+"""Simulated camera: raw files, and a Canon EOS that uses PTP."""

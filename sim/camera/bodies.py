@@ -1,11 +1,11 @@
-"""The EOS bodies that the simulated camera can be: how each identifies itself, its properties, its lists.
+"""EOS bodies of the simulated camera: identification, properties, and lists of allowed values.
 
-A body is a table of facts, without behaviour. Nobody has published a recording of an EOS 550D or a 6D Mark II on the
-wire, so that much is borrowed from the one body that was recorded, an EOS 60D; each table says what. Properties stand
-in the order in which the 60D sends them; one whose value is None is sent on request only, as by the 60D.
+No recording of an EOS 550D or 6D Mark II has been published. Unknown data are taken from the one recorded body, an EOS
+60D; comments say which. Properties are in the order in which the 60D sends them. A property with value None is sent on
+request only, as by the 60D.
 
-Sources: a recorded EOS 60D (firmware 1.1.0); the settings of an EOS 550D (firmware 1.0.9) and a 6D Mark II (1.0.2) as
-users of libgphoto2 have listed them; libgphoto2 2.5.34 for structures; specifications of Canon for battery and burst.
+Sources: a recorded EOS 60D (firmware 1.1.0); settings of an EOS 550D (firmware 1.0.9) and a 6D Mark II (1.0.2) listed
+by users of libgphoto2; libgphoto2 2.5.34 for structures; specifications of Canon for battery and burst.
 """
 
 from __future__ import annotations
@@ -32,65 +32,45 @@ from drivers.ptp.codes import (
 )
 from drivers.ptp.protocol import DeviceInfo
 
-NO_LIST = 1  # Kind of a list record: the property has no list; with few exceptions it cannot be set
-LIST = 3  # Kind of a list record: the property can be set to what the list holds; to nothing while it is empty
-FREE = 7  # Kind of a list record: no list; text, times and structures
+NO_LIST = 1  # Kind of a list record: no list; such a property can rarely be set.
+LIST = 3  # Kind of a list record: the values in the list are allowed; none if it is empty.
+FREE = 7  # Kind of a list record: no list, for texts, times and structures.
 
 
 @dataclass(frozen=True)
 class PropertySpec:
-    """A property as a body sends it when it is asked for everything.
+    """A property as a body reports it."""
 
-    - `code`: one of `drivers.ptp.codes.Property`, or a number without a name.
-    - `value`: as it travels; None where it is sent on request only, `b""` where the state machine computes it.
-    - `kind`: `NO_LIST`, `LIST` or `FREE`.
-    - `choices`: what it can be set to, in the body's order.
-    - `formats`: the same for image formats.
-    """
-
-    code: int
-    value: bytes | None
-    kind: int = NO_LIST
-    choices: tuple[int, ...] = ()
-    formats: tuple[ImageFormat, ...] = ()
+    code: int  # A `drivers.ptp.codes.Property`, or a number without name
+    value: bytes | None  # Encoded; None if sent on request only, `b""` if computed from the state
+    kind: int = NO_LIST  # `NO_LIST`, `LIST` or `FREE`
+    choices: tuple[int, ...] = ()  # Allowed values, in the order of the body
+    formats: tuple[ImageFormat, ...] = ()  # Allowed image formats
 
 
 @dataclass(frozen=True)
 class EosModel:
-    """An EOS body as the wire shows it.
+    """An EOS body as seen by PTP."""
 
-    - `info`: its DeviceInfo; operations and the serial number are the state machine's to add.
-    - `usb`: vendor and product.
-    - `properties`: every property, as the body stands when it is switched on with its dial at M and the lens on manual
-      focus.
-    - `shutter_codes`, `aperture_codes`: what the lists of shutter times and apertures hold where the dial lets them be
-      set; of apertures nothing where the lens has no contacts.
-    - `burst`: raw frames that its memory holds.
-    - `frame_bytes`: what it reckons with for one frame; sizes of real raw files vary.
-    - `write_s`: time from the end of an exposure until the file is ready.
-    - `shots_per_charge`: frames that a full battery lasts for.
-    - `wide_objects`: whether objects are announced by the records with sizes of 64 bits.
-    """
-
-    info: DeviceInfo
-    usb: tuple[int, int]
-    properties: tuple[PropertySpec, ...]
-    shutter_codes: tuple[int, ...]
-    aperture_codes: tuple[int, ...]
-    burst: int
-    frame_bytes: int
-    write_s: float
-    shots_per_charge: int
-    wide_objects: bool = False
+    info: DeviceInfo  # DeviceInfo, without operations and serial number
+    usb: tuple[int, int]  # USB vendor and product
+    properties: tuple[PropertySpec, ...]  # At power-on, with the dial at M and manual focus
+    shutter_codes: tuple[int, ...]  # Allowed shutter times if the dial lets them be set
+    aperture_codes: tuple[int, ...]  # Allowed apertures; empty for a lens without contacts
+    burst: int  # Raw frames in its memory
+    frame_bytes: int  # Expected size of a frame, for the number of free shots
+    write_s: float  # Time from the end of an exposure until the file is ready
+    shots_per_charge: int  # Frames per battery charge
+    wide_objects: bool = False  # Whether object events have sizes of 64 bits
 
     @property
     def model(self) -> str:
-        """Its name, as in DeviceInfo."""
+        """Model name in DeviceInfo."""
         return self.info.model
 
     @property
     def info_ex(self) -> DeviceInfoEx:
-        """Its answer to GetDeviceInfoEx."""
+        """Answer to GetDeviceInfoEx."""
         return DeviceInfoEx(EVENTS_EX, tuple(spec.code for spec in self.properties), (0, 1, 2, 4))
 
 
@@ -133,26 +113,25 @@ STANDARD_PROPERTIES = (
 
 
 def structure(*numbers: int) -> bytes:
-    """Return numbers of 32 bits behind their length in bytes, itself included: how Canon packs many structures."""
+    """Return 32-bit numbers after their total length in bytes, the layout of many Canon structures."""
     return struct.pack(f"<{1 + len(numbers)}I", 4 + 4 * len(numbers), *numbers)
 
 
-HALF_STOPS = 0x0101  # Custom function: exposure is set in half stops, not thirds
-# Custom function: the first press lifts the mirror, on bodies that do not have it in the menu (group 3).
-MIRROR_LOCKUP = 0x060F
+HALF_STOPS = 0x0101  # Custom function: exposure in half stops instead of third stops.
+MIRROR_LOCKUP = 0x060F  # Custom function: the first press raises the mirror, in bodies without a menu item (group 3).
 
 
 def custom_functions(group: int, functions: Mapping[int, int]) -> bytes:
-    """Return one group of custom functions (property 0xd1a0): number of a function → its setting."""
+    """Return one group of custom functions (property 0xd1a0), from settings by function number."""
     settings = [number for function, setting in functions.items() for number in (function, 1, setting)]
     return structure(1, group, 8 + 4 * len(settings), len(functions), *settings)
 
 
 def focus_points() -> bytes:
-    """Return the focus points of a body that is in focus at none of them (property 0xd1d3): nine in a cross.
+    """Return nine focus points, none of them in focus (property 0xd1d3).
 
-    The layout is the 60D's, as libgphoto2 reads it: length, length − 4, version, points, points in use, two frame
-    sizes, then of all points heights, widths, x and y from the frame's centre, then a bit for each that is in focus.
+    Layout of the 60D as read by libgphoto2: length, length − 4, version, points, points in use, two frame sizes. Then
+    heights, widths, x and y of all points from the centre of the frame, and a bit per point that is in focus.
     """
     xs = (-1720, -860, -860, 0, 0, 0, 860, 860, 1720)
     ys = (0, 489, -489, 792, 0, -792, 489, -489, 0)
@@ -202,13 +181,13 @@ _WHEEL = tuple(range(2500, 10001, 100))
 _SHIFT = tuple(number & 0xFFFFFFFF for number in range(-9, 10))
 
 
-def _thirds(least: int, most: int) -> tuple[int, ...]:
-    """Return the codes of corrections in thirds of a stop, an eighth of a stop a unit, between two numbers of stops."""
-    return tuple(code & 0xFF for code in range(8 * least, 8 * most + 1) if code % 8 in (0, 3, 5))
+def _thirds(first: int, last: int) -> tuple[int, ...]:
+    # Codes of corrections in thirds of a stop, from `first` to `last` stops; the unit is an eighth of a stop.
+    return tuple(code & 0xFF for code in range(8 * first, 8 * last + 1) if code % 8 in (0, 3, 5))
 
 
 def _jpegs(*sizes: tuple[int, bool]) -> tuple[ImageFile, ...]:
-    """Return JPEG files by size number; each fine and normal, or fine alone."""
+    # JPEG files by size number: fine and normal, or only fine.
     return tuple(ImageFile(1, size, quality) for size, both in sizes for quality in ((3, 2) if both else (3,)))
 
 
@@ -218,7 +197,7 @@ def _raw(size: int = 0) -> ImageFile:
 
 @dataclass(frozen=True)
 class _Choices:
-    """What differs between the bodies' tables; the lists are in the body's order."""
+    """Differences between the bodies; lists are in the order of the body."""
 
     model_id: int
     formats: tuple[ImageFormat, ...]
@@ -354,7 +333,7 @@ EOS_550D = EosModel(
     shots_per_charge=440,
 )
 
-# The EOS 550D whose owner listed its settings: half stops, no ISO 100 (highlight priority, it seems), f/4 at best.
+# The EOS 550D of the user who listed its settings: half stops, no ISO 100 (probably highlight priority), f/4 at most.
 EOS_550D_AS_LISTED = replace(
     EOS_550D,
     properties=_properties(
@@ -414,7 +393,7 @@ EOS_6D_MARK_II = EosModel(
     shots_per_charge=1200,
 )
 
-# A 550D with the small frames of the test sensor.
+# An EOS 550D with the small frames of the test sensor.
 TEST_BODY = replace(
     EOS_550D,
     info=replace(EOS_550D.info, model="CroP Test"),
@@ -422,7 +401,7 @@ TEST_BODY = replace(
     write_s=0.113,
 )
 
-# Every body by the name that settings and commands use, the same as in `sim.world.sensors.BODIES`.
+# Bodies by the name in settings and commands, as in `sim.world.sensors.BODIES`.
 EOS_BODIES: Mapping[str, EosModel] = MappingProxyType(
     {"EOS 550D": EOS_550D, "EOS 6D Mark II": EOS_6D_MARK_II, "Test": TEST_BODY}
 )

@@ -1,11 +1,10 @@
-"""The simulated EOS: a PTP responder that behaves as a Canon EOS body does, with a `Film` where the sensor would be.
+"""Simulated Canon EOS: a PTP responder that behaves like a body of the series, with a `Film` in place of the sensor.
 
-State moves with the time that is handed in, and only when somebody asks or touches the camera: what falls due in
-between happens then, in its order. With a `SimulatedClock` an initiator that waits must sleep by the same clock. What
-no public recording shows is marked "assumed" where it is decided; the rest follows the recorded EOS 60D. An initiator's
-side and the hand on the camera may be used from several threads.
+The state advances with the clock, and only at calls: due actions are then carried out in their order. With a
+`SimulatedClock`, an initiator must wait by the same clock. Behaviour follows a recorded EOS 60D; where no public
+recording exists, a comment says "assumed". Methods may be called by several threads.
 
-Source: a recorded EOS 60D; ISO 15740:2013 for what is standard; libgphoto2 2.5.34 for what initiators expect.
+Sources: a recorded EOS 60D; ISO 15740:2013 for the standard; libgphoto2 2.5.34 for expectations of initiators.
 """
 
 from __future__ import annotations
@@ -77,21 +76,21 @@ from foundation.errors import CropError, DeviceError, DeviceRefused, LinkClosed,
 from sim.camera.bodies import FREE, LIST, MIRROR_LOCKUP, EosModel, custom_functions
 from sim.camera.film import Film
 
-CARD = 0x00020001  # The store that is the card
-EMPTY_SLOT = 0x00020000  # The storage id while there is no card
-DCIM = 0x90000000  # Handle of the folder DCIM in the root of the card
-FOLDER = 0x91900000  # Handle of the folder 100CANON; files on the card are numbered from it, 16 apart
-# The shutter speed that lasts as long as the release is held; a press gives one frame of `_METERED_S` all the same.
-BULB = 0x0C
-# What a parameter or a time can hold at most; in GetObjectHandles any store, any format, or the root (ISO 15740).
+CARD = 0x00020001  # Storage id of the card.
+EMPTY_SLOT = 0x00020000  # Storage id without a card.
+DCIM = 0x90000000  # Handle of the folder DCIM on the card.
+FOLDER = 0x91900000  # Handle of the folder 100CANON; files on the card have handles from here, in steps of 16.
+BULB = 0x0C  # Shutter speed code "as long as the release is pressed"; a press gives one frame of `_METERED_S` here.
+
+# Largest value of a parameter or time; in GetObjectHandles any store, any format, or the root (ISO 15740).
 U32 = 0xFFFFFFFF
-_MEMORY = 0xA0000000  # Handles of objects in the camera's memory are numbered from here (assumed)
-_MOST_SHOTS = 0x7FFFFFFF  # Highest number of free shots that is reported: what a signed number of 32 bits holds
+_MEMORY = 0xA0000000  # First handle of objects in the camera's memory (assumed).
+_MOST_SHOTS = 0x7FFFFFFF  # Highest reported number of free shots: the largest signed 32-bit number.
 _TEXTS = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT)
 
 
 class OperationRefusal(Exception):
-    """Ends an operation with another response than OK."""
+    """Ends an operation with a response other than OK."""
 
     def __init__(self, code: int, *parameters: int) -> None:
         super().__init__(code)
@@ -100,24 +99,24 @@ class OperationRefusal(Exception):
 
 
 class OperationResult(NamedTuple):
-    """What an operation that was carried out answers."""
+    """Data and parameters of a successful operation."""
 
     data: bytes | None = None
     parameters: tuple[int, ...] = ()
 
 
 class Arguments(NamedTuple):
-    """What came with a request: three parameters, 0 where it had fewer, and the data phase."""
+    """Parameters of a request, 0 if missing, and its data phase."""
 
-    one: int
-    two: int
-    three: int
+    first: int
+    second: int
+    third: int
     data: bytes | None
 
 
 @dataclass
 class PropertyState:
-    """A property as it stands: what it is, and what it can be set to."""
+    """Value of a property and its allowed values."""
 
     value: bytes
     kind: int
@@ -128,7 +127,7 @@ class PropertyState:
 
 @dataclass(frozen=True)
 class StoredObject:
-    """A file or folder: on the card, or in the camera's memory where `storage` is 0."""
+    """A file or folder on the card, or in the camera's memory if `storage` is 0."""
 
     handle: int
     storage: int
@@ -140,7 +139,7 @@ class StoredObject:
 
     @property
     def entry(self) -> ObjectEntry:
-        """It as a body lists it, and announces it."""
+        """Its entry in lists and events."""
         return ObjectEntry(
             self.handle, self.storage, self.format, len(self.data), self.name, self.parent, self.handle,
             time=int(self.taken_at.timestamp()) & U32,
@@ -149,26 +148,26 @@ class StoredObject:
 
 @dataclass
 class Card:
-    """A memory card: its capacity in bytes, and the objects on it by handle."""
+    """Memory card: capacity in bytes, and objects by handle."""
 
     capacity: int
     objects: dict[int, StoredObject] = field(default_factory=dict[int, StoredObject])
 
     @property
-    def free(self) -> int:
-        """Bytes that still fit on it."""
+    def free_bytes(self) -> int:
+        """Free space in bytes."""
         return self.capacity - sum(len(item.data) for item in self.objects.values())
 
 
-_AUTO_ISO = 400  # ISO speed where the body may choose (assumed; there is no meter)
-_METERED_S = 1 / 60  # Shutter time where the body may choose (assumed; there is no meter)
-_METERED_APERTURE = 5.6  # Aperture where the body may choose (assumed; there is no meter)
+_AUTO_ISO = 400  # ISO speed chosen by the body (assumed; there is no light meter).
+_METERED_S = 1 / 60  # Shutter time chosen by the body, s (assumed).
+_METERED_APERTURE = 5.6  # Aperture chosen by the body (assumed).
 _FORMATS_BY_SUFFIX = {".crw": ObjectFormat.CRW, ".cr3": ObjectFormat.CR3}
-_JPEG_SIZE = (160, 240)  # Height and width, px: enough for the file's name, and next to nothing to encode
+_JPEG_SIZE = (160, 240)  # Height and width, px: enough for the file name, fast to encode.
 
 
 class _Refusal(Enum):
-    """Why a full press takes no picture: the response to RemoteReleaseOn, and the result of RemoteRelease."""
+    """Reasons to refuse a full press: response to RemoteReleaseOn, result of RemoteRelease."""
 
     BUSY = (ResponseCode.DEVICE_BUSY, 0x2019)
     MIRROR_LOCKUP = (ResponseCode.DEVICE_BUSY, 3)
@@ -184,28 +183,39 @@ class _Refusal(Enum):
 
 @dataclass(frozen=True)
 class _Frame:
-    """A picture under way: what the film makes of it (None where it failed) and where it goes."""
+    """A frame in progress."""
 
     number: int
     taken_at: datetime
-    raw: Future[bytes | None]
+    raw: Future[bytes | None]  # Raw file; None if the film failed
     formats: ImageFormat
     destination: int
 
 
 _FREELY_SET = (*_TEXTS, Property.EOS_CAMERA_TIME)
 
-_SHUTDOWN_WARNING_S = 10.0  # How long before it goes to sleep the camera says so (assumed)
+_SHUTDOWN_WARNING_S = 10.0  # Time between the warning and switching off, s (assumed).
 
 
 class SimulatedEos:
-    """An EOS body on a cable; a `drivers.ptp.protocol.Responder`.
+    """EOS body at a cable; a `drivers.ptp.protocol.Responder`.
 
-    `card_bytes`: capacity of the card; None for an empty slot. `auto_power_off_s`: idle seconds after which it goes to
-    sleep; 0 for never, None for the body's own setting. Asking for events keeps no body awake, KeepDeviceOn does.
-    `battery`: charge, 0 … 1. `executor`: where the film is developed. None does it while the release is answered, and
-    is what tests want; a camera on a real cable hands in an executor of one thread, so that a large frame does not hold
-    up the answers.
+    Parameters
+    ----------
+    card_bytes
+        Capacity of the card; None for an empty slot.
+    auto_power_off_s
+        Idle seconds before it switches off; 0 for never, None for the setting of the body. KeepDeviceOn resets the
+        time, asking for events does not.
+    battery
+        Charge, 0 to 1.
+    without
+        Operations that the body does not support.
+    forgetful
+        Whether frames in the memory are lost when the session ends.
+    executor
+        Develops the film, so that large frames do not delay answers. With None, the film is developed during the
+        release, as tests need.
     """
 
     def __init__(
@@ -223,7 +233,7 @@ class SimulatedEos:
         forgetful: bool = False,
         executor: Executor | None = None,
     ) -> None:
-        self._guard = threading.RLock()
+        self._lock = threading.RLock()
         self._operations = {code: answer for code, answer in self._handlers().items() if code not in set(without)}
         self.body = body
         self.serial = serial
@@ -239,7 +249,7 @@ class SimulatedEos:
         self._number = 0
         self._handles = itertools.count(_MEMORY + 1)
         self._mirror_lockup = False
-        self._asleep = False
+        self._is_asleep = False
         # What a session has and loses.
         self._session = 0
         self._last_transaction = 0
@@ -250,7 +260,7 @@ class SimulatedEos:
         self._host_bytes = 0
         self._hints: list[PtpEvent] = []
         self._idle_since = clock.monotonic()
-        self._warned = False
+        self._is_warned = False
         # What is under way: (when, order, what happens then), the earliest first.
         self._due: list[tuple[float, int, Callable[[], None]]] = []
         self._order = itertools.count()
@@ -274,16 +284,16 @@ class SimulatedEos:
     # Time.
 
     @contextmanager
-    def _moved(self) -> Generator[None]:
-        with self._guard:
-            self._move()
+    def _updated(self) -> Generator[None]:
+        with self._lock:
+            self._update()
             yield
 
-    def _move(self) -> None:
+    def _update(self) -> None:
         now = self._clock.monotonic()
         while self._due and self._due[0][0] <= now:
-            _, _, happen = heapq.heappop(self._due)
-            happen()
+            _, _, action = heapq.heappop(self._due)
+            action()
         limit = number_of(self._properties[Property.EOS_AUTO_POWER_OFF].value)
         if not self._session or not limit or self._is_busy:
             return
@@ -291,20 +301,20 @@ class SimulatedEos:
         if idle >= limit:
             self._end_session()
             self._memory.clear()
-            self._asleep = True
-        elif idle >= limit - min(_SHUTDOWN_WARNING_S, limit / 2) and not self._warned:
-            self._warned = True
+            self._is_asleep = True
+        elif idle >= limit - min(_SHUTDOWN_WARNING_S, limit / 2) and not self._is_warned:
+            self._is_warned = True
             self._record(Notice(EosEvent.WILL_SOON_SHUT_DOWN, int(limit - idle)))
 
     def _touch(self) -> None:
         self._idle_since = self._clock.monotonic()
-        if self._warned:
-            self._warned = False
+        if self._is_warned:
+            self._is_warned = False
             limit = number_of(self._properties[Property.EOS_AUTO_POWER_OFF].value)
             self._record(Notice(EosEvent.SHUTDOWN_TIMER_UPDATED, limit))
 
-    def _at(self, when: float, happen: Callable[[], None]) -> None:
-        heapq.heappush(self._due, (when, next(self._order), happen))
+    def _schedule(self, due_s: float, action: Callable[[], None]) -> None:
+        heapq.heappush(self._due, (due_s, next(self._order), action))
 
     @property
     def _is_busy(self) -> bool:
@@ -327,16 +337,16 @@ class SimulatedEos:
         self._queue.append(record)
 
     def _report_list(self, code: int) -> None:
-        known = self._properties[code]
+        state = self._properties[code]
         if code in IMAGE_FORMAT_PROPERTIES:
-            self._record(AvailableFormats(code, known.formats, known.kind))
+            self._record(AvailableFormats(code, state.formats, state.kind))
         else:
-            self._record(AvailableValues(code, known.choices, known.kind))
+            self._record(AvailableValues(code, state.choices, state.kind))
 
     # The values of properties.
 
     def _value(self, code: int) -> bytes:
-        """Return a property's value; some are never stored, for they follow from the camera's state."""
+        """Return the value of a property; some values are computed from the state."""
         match code:
             case Property.EOS_AVAILABLE_SHOTS:
                 return number_value(self._available_shots())
@@ -354,8 +364,8 @@ class SimulatedEos:
                 return self._properties[code].value
 
     def _number_of(self, code: int) -> int:
-        known = self._properties.get(code)
-        return 0 if known is None else number_of(known.value)
+        state = self._properties.get(code)
+        return 0 if state is None else number_of(state.value)
 
     def _report(self, *codes: int) -> None:
         for code in codes:
@@ -368,28 +378,28 @@ class SimulatedEos:
         self._properties[code].value = value
         self._report(code)
 
-    def _offer(self, code: int, choices: tuple[int, ...]) -> None:
+    def _set_choices(self, code: int, choices: tuple[int, ...]) -> None:
         if self._properties[code].choices != choices:
             self._properties[code].choices = choices
             self._report_list(code)
 
     def _renew_exposure_lists(self) -> None:
         mode = self._number_of(Property.EOS_AE_MODE)
-        timed = mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
-        shutter = () if not timed else self.body.shutter_codes
-        self._offer(Property.EOS_SHUTTER_SPEED, shutter)
-        apertured = mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
-        self._offer(Property.EOS_APERTURE, self.body.aperture_codes if apertured else ())
+        has_shutter_list = mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
+        shutter = () if not has_shutter_list else self.body.shutter_codes
+        self._set_choices(Property.EOS_SHUTTER_SPEED, shutter)
+        has_aperture_list = mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
+        self._set_choices(Property.EOS_APERTURE, self.body.aperture_codes if has_aperture_list else ())
         if mode == AeMode.BULB:
             self._change(Property.EOS_SHUTTER_SPEED, number_value(BULB))
         elif shutter and self._number_of(Property.EOS_SHUTTER_SPEED) not in shutter:
             self._change(Property.EOS_SHUTTER_SPEED, number_value(shutter[len(shutter) // 2]))
 
     def _renew_destinations(self) -> None:
-        """Offer the destinations that there are; without remote control frames go to the card."""
-        both = (CaptureDestination.CARD, CaptureDestination.HOST, CaptureDestination.CARD_AND_HOST)
-        choices = both if self._card is not None else (CaptureDestination.HOST,)
-        self._offer(Property.EOS_CAPTURE_DESTINATION, choices)
+        """Update the capture destinations; without remote control, frames are stored on the card."""
+        destinations = (CaptureDestination.CARD, CaptureDestination.HOST, CaptureDestination.CARD_AND_HOST)
+        choices = destinations if self._card is not None else (CaptureDestination.HOST,)
+        self._set_choices(Property.EOS_CAPTURE_DESTINATION, choices)
         if not self._session or self._number_of(Property.EOS_CAPTURE_DESTINATION) not in choices:
             # The 60D without a card reports the card as destination all the same.
             self._change(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.CARD))
@@ -397,7 +407,7 @@ class SimulatedEos:
 
     def _battery_code(self) -> int:
         return next(
-            code for least, code in ((0.88, 2), (0.63, 4), (0.38, 1), (0.1, 5), (-1, 0)) if self._battery > least
+            code for minimum, code in ((0.88, 2), (0.63, 4), (0.38, 1), (0.1, 5), (-1, 0)) if self._battery > minimum
         )
 
     # Who is in control, and what there is room for.
@@ -419,14 +429,14 @@ class SimulatedEos:
 
     def _available_shots(self) -> int:
         destination = self._number_of(Property.EOS_CAPTURE_DESTINATION)
-        card = 0 if self._card is None else self._card.free
+        card = 0 if self._card is None else self._card.free_bytes
         if destination == CaptureDestination.HOST:
-            free = self._host_bytes
+            free_bytes = self._host_bytes
         elif destination == CaptureDestination.CARD_AND_HOST:
-            free = min(card, self._host_bytes)
+            free_bytes = min(card, self._host_bytes)
         else:
-            free = card
-        return min(max(free, 0) // self.body.frame_bytes, _MOST_SHOTS)
+            free_bytes = card
+        return min(max(free_bytes, 0) // self.body.frame_bytes, _MOST_SHOTS)
 
     # What an initiator can ask of the files, and do with them.
 
@@ -434,10 +444,10 @@ class SimulatedEos:
         return OperationResult(encode_u32_array((EMPTY_SLOT if self._card is None else CARD,)))
 
     def _get_storage_info(self, arguments: Arguments) -> OperationResult:
-        self._require_store(arguments.one)
-        capacity, free = (0, 0) if self._card is None else (self._card.capacity, self._card.free)
+        self._require_store(arguments.first)
+        capacity, free_bytes = (0, 0) if self._card is None else (self._card.capacity, self._card.free_bytes)
         info = StorageInfo(
-            StorageType.REMOVABLE_RAM, FilesystemType.DCF, capacity=capacity, free=free, description="SD"
+            StorageType.REMOVABLE_RAM, FilesystemType.DCF, capacity=capacity, free=free_bytes, description="SD"
         )
         return OperationResult(info.encode())
 
@@ -453,30 +463,30 @@ class SimulatedEos:
             raise OperationRefusal(ResponseCode.INVALID_OBJECT_HANDLE)
         return [item for item in self._on_card().values() if item.parent == (0 if parent == U32 else parent)]
 
-    def _listed(self, arguments: Arguments) -> list[StoredObject]:
-        self._require_store(arguments.one)
-        everything = arguments.three == 0
-        found = list(self._on_card().values()) if everything else self._children(arguments.three)
-        return [item for item in found if arguments.two in (0, U32, item.format)]
+    def _matching_objects(self, arguments: Arguments) -> list[StoredObject]:
+        self._require_store(arguments.first)
+        all_folders = arguments.third == 0
+        objects = list(self._on_card().values()) if all_folders else self._children(arguments.third)
+        return [item for item in objects if arguments.second in (0, U32, item.format)]
 
     def _get_num_objects(self, arguments: Arguments) -> OperationResult:
-        return OperationResult(parameters=(len(self._listed(arguments)),))
+        return OperationResult(parameters=(len(self._matching_objects(arguments)),))
 
     def _get_object_handles(self, arguments: Arguments) -> OperationResult:
-        return OperationResult(encode_u32_array(item.handle for item in self._listed(arguments)))
+        return OperationResult(encode_u32_array(item.handle for item in self._matching_objects(arguments)))
 
     def _get_object_info_ex(self, arguments: Arguments) -> OperationResult:
-        self._require_store(arguments.one)
-        return OperationResult(encode_object_entries(item.entry for item in self._children(arguments.two)))
+        self._require_store(arguments.first)
+        return OperationResult(encode_object_entries(item.entry for item in self._children(arguments.second)))
 
     def _object(self, handle: int) -> StoredObject:
-        found = self._memory.get(handle) or self._on_card().get(handle)
-        if found is None:
+        item = self._memory.get(handle) or self._on_card().get(handle)
+        if item is None:
             raise OperationRefusal(ResponseCode.INVALID_OBJECT_HANDLE)
-        return found
+        return item
 
     def _get_object_info(self, arguments: Arguments) -> OperationResult:
-        item = self._object(arguments.one)
+        item = self._object(arguments.first)
         stamp = item.taken_at.strftime("%Y%m%dT%H%M%S")
         folder = item.format == ObjectFormat.ASSOCIATION
         return OperationResult(
@@ -487,24 +497,24 @@ class SimulatedEos:
         )  # fmt: skip
 
     def _get_object(self, arguments: Arguments) -> OperationResult:
-        item = self._object(arguments.one)
+        item = self._object(arguments.first)
         if item.format == ObjectFormat.ASSOCIATION:
             raise OperationRefusal(ResponseCode.INVALID_OBJECT_HANDLE)
         return OperationResult(item.data)
 
     def _get_partial_object(self, arguments: Arguments) -> OperationResult:
-        item = self._object(arguments.one)
-        if arguments.two > len(item.data):
+        item = self._object(arguments.first)
+        if arguments.second > len(item.data):
             raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
-        part = item.data[arguments.two : arguments.two + arguments.three]
-        return OperationResult(part, (len(part),))
+        piece = item.data[arguments.second : arguments.second + arguments.third]
+        return OperationResult(piece, (len(piece),))
 
     def _get_thumb(self, arguments: Arguments) -> OperationResult:
-        self._object(arguments.one)
+        self._object(arguments.first)
         raise OperationRefusal(ResponseCode.NO_THUMBNAIL_PRESENT)
 
     def _delete_object(self, arguments: Arguments) -> None:
-        item = self._object(arguments.one)
+        item = self._object(arguments.first)
         if item.format == ObjectFormat.ASSOCIATION:
             raise OperationRefusal(ResponseCode.OBJECT_WRITE_PROTECTED)
         if item.storage:
@@ -515,14 +525,14 @@ class SimulatedEos:
             del self._memory[item.handle]
 
     def _transfer_complete(self, arguments: Arguments) -> None:
-        if self._memory.pop(arguments.one, None) is None:
+        if self._memory.pop(arguments.first, None) is None:
             raise OperationRefusal(ResponseCode.INVALID_OBJECT_HANDLE)
 
     def _reset_transfer(self, _: Arguments) -> None:
         self._memory.clear()
 
     def _pc_hdd_capacity(self, arguments: Arguments) -> None:
-        self._host_bytes = arguments.one * arguments.two
+        self._host_bytes = arguments.first * arguments.second
         self._report(Property.EOS_AVAILABLE_SHOTS)
 
     def _frames_waiting(self) -> int:
@@ -537,18 +547,18 @@ class SimulatedEos:
 
     def _remote_release_on(self, arguments: Arguments) -> None:
         self._require_remote()
-        if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
+        if not 1 <= arguments.first <= ReleaseButton.HALF_AND_FULL:
             raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
         if self._is_busy:
             raise OperationRefusal(ResponseCode.DEVICE_BUSY)
-        if arguments.one & ReleaseButton.FULL:
+        if arguments.first & ReleaseButton.FULL:
             refusal = self._full_press()
             if refusal is not None:
                 raise OperationRefusal(refusal.response)
 
     def _remote_release_off(self, arguments: Arguments) -> None:
         self._require_remote()
-        if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
+        if not 1 <= arguments.first <= ReleaseButton.HALF_AND_FULL:
             raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
 
     def _remote_release(self, _: Arguments) -> OperationResult:
@@ -557,12 +567,12 @@ class SimulatedEos:
         return OperationResult(parameters=(0 if refusal is None else refusal.result,))
 
     def _full_press(self) -> _Refusal | None:
-        """Take one frame, whatever the drive mode, the bracket and the focus are set to."""
+        # One frame, independent of drive mode, bracketing and focus.
         settings = self._settings()
         refusal = self._refusal(settings)
         if refusal is None:
             self._plan(self._clock.monotonic(), settings)
-            self._move()
+            self._update()
         return refusal
 
     def _refusal(self, settings: ExposureSettings) -> _Refusal | None:
@@ -584,7 +594,7 @@ class SimulatedEos:
         return None
 
     def _settings(self) -> ExposureSettings:
-        """Return the exposure that is set, in nominal values; where the body would measure, what it is assumed to."""
+        """Return the nominal exposure settings; assumed values where the body would use its light meter."""
         iso = self._number_of(Property.EOS_ISO_SPEED)
         aperture = self._number_of(Property.EOS_APERTURE)
         shutter = self._number_of(Property.EOS_SHUTTER_SPEED)
@@ -612,7 +622,7 @@ class SimulatedEos:
             self._unfinished -= 1
             self._expose(settings, self._clock.now() - late, opens_at + settings.shutter_s)
 
-        self._at(opens_at, open_shutter)
+        self._schedule(opens_at, open_shutter)
 
     def _expose(self, settings: ExposureSettings, opened: datetime, closes_at: float) -> None:
         self._unfinished += 1
@@ -626,7 +636,7 @@ class SimulatedEos:
             ImageFormat.decode(self._properties[Property.EOS_IMAGE_FORMAT].value),
             self._number_of(Property.EOS_CAPTURE_DESTINATION),
         )
-        self._at(closes_at + self.body.write_s, lambda: self._written(frame))
+        self._schedule(closes_at + self.body.write_s, lambda: self._finish_frame(frame))
 
     def _develop(self, settings: ExposureSettings, opened: datetime) -> Future[bytes | None]:
         def develop() -> bytes | None:
@@ -641,14 +651,14 @@ class SimulatedEos:
 
         if self._executor is not None:
             return self._executor.submit(develop)
-        done: Future[bytes | None] = Future()
-        done.set_result(develop())
-        return done
+        future: Future[bytes | None] = Future()
+        future.set_result(develop())
+        return future
 
-    def _written(self, frame: _Frame) -> None:
-        """Announce a frame's files; where the film takes longer than the body would, look again soon."""
+    def _finish_frame(self, frame: _Frame) -> None:
+        # If the film takes longer than the body would, try again soon.
         if not frame.raw.done():
-            self._at(self._clock.monotonic() + 0.01, lambda: self._written(frame))
+            self._schedule(self._clock.monotonic() + 0.01, lambda: self._finish_frame(frame))
             return
         raw = frame.raw.result()
         self._unfinished -= 1
@@ -688,23 +698,23 @@ class SimulatedEos:
             setting = PropertySetting.decode(arguments.data or b"")
         except ProtocolError:
             raise OperationRefusal(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
-        known = self._properties.get(setting.code)
-        if known is None:
+        state = self._properties.get(setting.code)
+        if state is None:
             raise OperationRefusal(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
         # The recorded 60D answers 2019 to a value that its list does not hold, not 201c.
-        if self._is_busy or not self._allows(setting, known):
+        if self._is_busy or not self._allows(setting, state):
             raise OperationRefusal(ResponseCode.DEVICE_BUSY)
         self._store(setting.code, setting.value)
 
-    def _allows(self, setting: PropertySetting, known: PropertyState) -> bool:
+    def _allows(self, setting: PropertySetting, state: PropertyState) -> bool:
         try:
             if setting.code in IMAGE_FORMAT_PROPERTIES:
-                return ImageFormat.decode(setting.value) in known.formats
-            if known.kind == LIST:
-                return number_of(setting.value) in known.choices
+                return ImageFormat.decode(setting.value) in state.formats
+            if state.kind == LIST:
+                return number_of(setting.value) in state.choices
         except ProtocolError:
             raise OperationRefusal(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
-        return known.kind == FREE and setting.code in _FREELY_SET
+        return state.kind == FREE and setting.code in _FREELY_SET
 
     def _store(self, code: int, value: bytes) -> None:
         if code == Property.EOS_CAMERA_TIME:
@@ -722,9 +732,9 @@ class SimulatedEos:
             self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
 
     def _request_device_prop_value(self, arguments: Arguments) -> None:
-        if arguments.one not in self._properties:
+        if arguments.first not in self._properties:
             raise OperationRefusal(ResponseCode.GENERAL_ERROR)
-        self._report(arguments.one)
+        self._report(arguments.first)
 
     def _description(self, code: int) -> DevicePropDesc:
         match code:
@@ -744,14 +754,14 @@ class SimulatedEos:
                 raise OperationRefusal(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
 
     def _get_device_prop_desc(self, arguments: Arguments) -> OperationResult:
-        return OperationResult(self._description(arguments.one).encode())
+        return OperationResult(self._description(arguments.first).encode())
 
     def _get_device_prop_value(self, arguments: Arguments) -> OperationResult:
-        description = self._description(arguments.one)
+        description = self._description(arguments.first)
         return OperationResult(encode_value(description.data_type, description.current))
 
     def _set_device_prop_value(self, arguments: Arguments) -> None:
-        description = self._description(arguments.one)
+        description = self._description(arguments.first)
         if not description.writable:
             raise OperationRefusal(ResponseCode.ACCESS_DENIED)
         try:
@@ -763,7 +773,7 @@ class SimulatedEos:
     # The cable.
 
     def takes_data(self, request: PtpRequest) -> bool:
-        """Return whether the initiator sends a data phase with this operation."""
+        """Return whether this operation has a data phase from the initiator."""
         return request.code in (
             Operation.SET_DEVICE_PROP_VALUE,
             Operation.EOS_SET_DEVICE_PROP_VALUE_EX,
@@ -773,8 +783,8 @@ class SimulatedEos:
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Carry out a request."""
-        with self._moved():
-            if self._asleep:
+        with self._updated():
+            if self._is_asleep:
                 raise LinkClosed(f"the simulated {self.body.model} has switched itself off; wake it up")
             try:
                 reply = self._carry_out(request, data)
@@ -783,17 +793,17 @@ class SimulatedEos:
             return Answer(PtpResponse(ResponseCode.OK, request.transaction, reply.parameters), reply.data)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return hints that GetEvent has something to report, one for a queue that was empty."""
-        with self._moved():
+        """Return hints that GetEvent has events: one when an empty queue gets its first event."""
+        with self._updated():
             hints, self._hints = tuple(self._hints), []
             return hints
 
     def cancelled(self, transaction: int) -> None:
-        """Note that the initiator gave up a transaction: each is carried out at once, so nothing is left to undo."""
+        """Do nothing: operations are completed at once, so there is nothing to undo."""
 
     def unplugged(self) -> None:
-        """End the session; frames that wait in the camera's memory go on waiting, unless it is `forgetful`."""
-        with self._moved():
+        """End the session; frames in the memory are kept unless the camera is `forgetful`."""
+        with self._updated():
             self._end_session()
 
     # The hand on the camera.
@@ -801,35 +811,35 @@ class SimulatedEos:
     @property
     def asleep(self) -> bool:
         """Whether it has switched itself off."""
-        with self._moved():
-            return self._asleep
+        with self._updated():
+            return self._is_asleep
 
     @property
     def busy(self) -> bool:
-        """Whether a picture is being taken or written."""
-        with self._moved():
+        """Whether a frame is being exposed or written."""
+        with self._updated():
             return self._is_busy
 
     def wake(self) -> None:
         """Half-press the release of a sleeping camera."""
-        with self._moved():
-            self._asleep = False
+        with self._updated():
+            self._is_asleep = False
             self._touch()
 
     def turn_dial(self, mode: AeMode) -> None:
-        """Turn the mode dial; shutter time and aperture can be set where `mode` leaves them to the photographer."""
-        with self._moved():
+        """Turn the mode dial, which determines whether shutter time and aperture can be set."""
+        with self._updated():
             self._change(Property.EOS_AE_MODE, number_value(mode))
             self._renew_exposure_lists()
 
     def switch_focus(self, automatic: bool) -> None:
-        """Move the lens's switch to AF or MF."""
-        with self._moved():
+        """Set the switch of the lens to AF or MF."""
+        with self._updated():
             self._change(Property.EOS_FOCUS_MODE, number_value(FocusMode.ONE_SHOT if automatic else FocusMode.MANUAL))
 
     def switch_mirror_lockup(self, on: bool) -> None:
-        """Set mirror lockup in the menu or the custom functions, wherever the body has it."""
-        with self._moved():
+        """Set mirror lockup in the menu or in the custom functions of the body."""
+        with self._updated():
             self._mirror_lockup = on
             if Property.EOS_MIRROR_UP_SETTING in self._properties:
                 self._change(Property.EOS_MIRROR_UP_SETTING, number_value(int(on)))
@@ -837,13 +847,13 @@ class SimulatedEos:
                 self._report(Property.EOS_CUSTOM_FUNCTIONS)
 
     def set_menu(self, code: int, value: int | ImageFormat) -> None:
-        """Set a property by the camera's own menu, which no list restricts."""
-        with self._moved():
+        """Set a property in the menu of the camera, with any value."""
+        with self._updated():
             self._store(code, value.encode() if isinstance(value, ImageFormat) else number_value(value))
 
     def remove_card(self) -> None:
-        """Take the card out, with what is on it."""
-        with self._moved():
+        """Remove the card with its files."""
+        with self._updated():
             self._card = None
             self._record(Notice(EosEvent.STORE_REMOVED, CARD))
             self._renew_destinations()
@@ -862,11 +872,11 @@ class SimulatedEos:
             self._check_transaction(request.transaction)
         if request.code not in (Operation.EOS_GET_EVENT, Operation.GET_DEVICE_INFO):
             self._touch()
-        one, two, three, *_ = (*request.parameters, 0, 0, 0)
-        return operation(Arguments(one, two, three, data)) or OperationResult()
+        first, second, third, *_ = (*request.parameters, 0, 0, 0)
+        return operation(Arguments(first, second, third, data)) or OperationResult()
 
     def _check_transaction(self, transaction: int) -> None:
-        """Refuse a number that is none or was used: one may be skipped, for a request can be lost in transit."""
+        # Numbers may be skipped, because a request can be lost.
         advance = (transaction - self._last_transaction) & U32
         if transaction in (0, U32) or not 0 < advance < 1 << 31:
             raise OperationRefusal(ResponseCode.INVALID_TRANSACTION_ID)
@@ -887,11 +897,11 @@ class SimulatedEos:
         return OperationResult(parameters=(self._remote_mode,))
 
     def _open_session(self, arguments: Arguments) -> None:
-        if not arguments.one:
+        if not arguments.first:
             raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
         if self._session:
             raise OperationRefusal(ResponseCode.SESSION_ALREADY_OPEN, self._session)
-        self._session = arguments.one
+        self._session = arguments.first
         self._last_transaction = 0
         self._touch()
 
@@ -907,21 +917,21 @@ class SimulatedEos:
         if self._forgetful:
             self._memory.clear()
         self._host_bytes = 0
-        self._warned = False
+        self._is_warned = False
         self._renew_destinations()
 
     def _set_remote_mode(self, arguments: Arguments) -> None:
-        self._remote_mode = arguments.one
+        self._remote_mode = arguments.first
 
     def _set_event_mode(self, arguments: Arguments) -> None:
-        self._event_mode = arguments.one
+        self._event_mode = arguments.first
         self._queue.clear()
         if self._event_mode:
             self._report_everything()
 
     def _report_everything(self) -> None:
-        for code, known in self._properties.items():
-            if known.reported:
+        for code, state in self._properties.items():
+            if state.reported:
                 self._report(code)
         if self._card is not None:
             self._record(Notice(EosEvent.CTG_INFO_CHECK_COMPLETE, CARD))
@@ -932,10 +942,10 @@ class SimulatedEos:
             self._offer_transfer(item)
 
     def _do_nothing(self, _: Arguments) -> None:
-        """Answer that it is done."""
+        """Answer OK."""
 
     def _handlers(self) -> dict[int, Callable[[Arguments], OperationResult | None]]:
-        """Return what is answered, in the 60D's order; a real body has more (uploads, live view, formatting)."""
+        # In the order of the 60D. Real bodies support more (uploads, live view, formatting).
         return {
             Operation.GET_DEVICE_PROP_DESC: self._get_device_prop_desc,
             Operation.GET_DEVICE_PROP_VALUE: self._get_device_prop_value,
@@ -981,7 +991,7 @@ class SimulatedEos:
 
 
 def _small_jpeg(name: str) -> bytes:
-    """Return a JPEG file of a grey picture with its own name on it: what stands in for a rendered frame."""
+    # Replaces a rendered frame: grey, with the file name.
     import cv2
     import numpy as np
 

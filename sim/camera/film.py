@@ -1,10 +1,10 @@
-"""What is on a simulated camera's pictures, apart from how its body behaves, and the raw files that hold it.
+"""Frames of the simulated camera, and their raw files.
 
-`sim.camera.eos` has settings, names and time; a `Film` makes the picture: the `World` as it is lit now (`WorldFilm`)
-or by a real screen (`WatchedFilm`). Raw files are Adobe DNG 1.4, one uncompressed 16-bit mosaic of the whole sensor,
-with what raw converters need to read it as a camera's own file; `Software` says that no camera took the picture.
+`sim.camera.eos` simulates settings, file names and timing. A `Film` makes the frame: of the `World` under simulated
+light (`WorldFilm`) or under the picture of a real screen (`WatchedFilm`). Raw files are Adobe DNG 1.4 with one
+uncompressed 16-bit mosaic of the whole sensor; the tag `Software` says that the frame is simulated.
 
-Sources: DNG 1.4 chapter 2 and 4, Exif 2.32 section 4.6.
+Sources: DNG 1.4 chapters 2 and 4, Exif 2.32 section 4.6.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, Colour
 from drivers.raw.rawfile import camera_matrix
 from drivers.tiff import CFA, D65, Tags, TiffTag, ValueType, head, rationals, text
-from foundation.clock import OPENING
+from foundation.clock import SIM_START
 from foundation.errors import DeviceRefused
 from sim.world.disturbances import CALM, Disturbances, Moment
 from sim.world.sensors import Body
@@ -32,12 +32,13 @@ from sim.world.world import UNDISTURBED, World
 
 SOFTWARE = "CroP simulated camera"
 
-# dcraw 9.28 `adobe_coeff`: XYZ to camera RGB under D65, 1/10000; converters make a viewable picture with it.
+# XYZ to camera RGB under D65, in 1/10000, from dcraw 9.28 `adobe_coeff`; converters need it for a viewable picture.
 _COLOUR_MATRICES = {
     "Canon_EOS_600D": (6461, -907, -882, -4300, 12184, 2378, -819, 1944, 5931),
     "Canon_EOS_200D": (7377, -742, -998, -4235, 11981, 2549, -673, 1918, 5538),
 }
-# XYZ to linear sRGB (IEC 61966-2-1): neutral things stay neutral for a camera that no converter knows.
+
+# XYZ to linear sRGB, in 1/10000 (IEC 61966-2-1). Keeps neutral colours neutral for an unknown camera.
 _LINEAR_SRGB = (32406, -15372, -4986, -9689, 18758, 415, 557, -2040, 10570)
 
 
@@ -52,8 +53,8 @@ def write_dng(
 ) -> None:
     """Write one raw file.
 
-    `counts`: (rows, columns) uint16, the whole sensor's counts. `taken_at`: when, timezone-aware; written as UTC, to
-    the second.
+    `counts`: (rows, columns) uint16, the whole sensor. `taken_at`: date with time zone, written as UTC in whole
+    seconds.
     """
     if counts.shape != body.sensor:
         raise ValueError(f"counts are {counts.shape}; the sensor of the {body.model} is {body.sensor}")
@@ -95,7 +96,7 @@ def write_dng(
         TiffTag.CFA_LAYOUT: (ValueType.SHORT, [1]),  # rectangular
         TiffTag.BLACK_LEVEL: (ValueType.SHORT, [body.black]),
         TiffTag.WHITE_LEVEL: (ValueType.SHORT, [body.saturation]),
-        TiffTag.COLOR_MATRIX_1: (ValueType.SRATIONAL, [part for entry in matrix for part in (entry, 10000)]),
+        TiffTag.COLOR_MATRIX_1: (ValueType.SRATIONAL, [number for entry in matrix for number in (entry, 10000)]),
         TiffTag.AS_SHOT_NEUTRAL: rationals(*_neutral(matrix)),
         TiffTag.CAMERA_SERIAL_NUMBER: text(serial),
         TiffTag.CALIBRATION_ILLUMINANT_1: (ValueType.SHORT, [D65]),
@@ -111,47 +112,46 @@ def _edges(top: int, left: int, height: int, width: int) -> tuple[int, int, int,
 
 
 def _neutral(matrix: Sequence[int]) -> list[Fraction]:
-    """Return the camera RGB of D65 over its largest channel: what the matrix calls neutral."""
+    # AsShotNeutral: camera RGB of D65, relative to its largest channel.
     white = (Fraction(9505, 10000), Fraction(1), Fraction(10891, 10000))
-    seen = [sum(m * w for m, w in zip(matrix[i : i + 3], white, strict=True)) for i in (0, 3, 6)]
-    return [Fraction(value) / Fraction(max(seen)) for value in seen]
+    responses = [sum(m * w for m, w in zip(matrix[i : i + 3], white, strict=True)) for i in (0, 3, 6)]
+    return [Fraction(value) / Fraction(max(responses)) for value in responses]
 
 
 def _colour_matrix(body: Body) -> tuple[int, ...]:
-    """Return XYZ to camera RGB in ten-thousandths: of the known bodies, as LibRaw has it, or that of linear sRGB."""
-    known = _COLOUR_MATRICES.get(body.sensitivities)
-    if known is not None:
-        return known
+    # XYZ to camera RGB in 1/10000: from the table, else from LibRaw, else linear sRGB.
+    matrix = _COLOUR_MATRICES.get(body.sensitivities)
+    if matrix is not None:
+        return matrix
     rows = camera_matrix(body.camera)
     return _LINEAR_SRGB if rows is None else tuple(round(10_000 * value) for row in rows for value in row)
 
 
-_WATCHED = 256  # First part of the key of a watched frame's noise: no code, so that it is no other frame's
+_WATCHED = 256  # First component of the noise key of a watched frame: no colour code, so keys of other frames differ.
 
 
 class Film(Protocol):
-    """Where a simulated camera's pictures come from."""
+    """Source of the frames of a simulated camera."""
 
     @property
     def suffix(self) -> str:
-        """Suffix of the raw files, with its dot."""
+        """Suffix of the raw files, with dot."""
         ...
 
     def accept(self, settings: ExposureSettings) -> None:
-        """Refuse settings that no picture can be had with (DeviceRefused)."""
+        """Raise DeviceRefused for impossible settings."""
         ...
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> object:
-        """Write the raw file of a picture taken now."""
+        """Write the raw file of a frame that is exposed now."""
         ...
 
 
 class WatchedFilm:
-    """Pictures of a `World` lit by what falls on it from outside while the shutter is open, in real time.
+    """Frames of a `World` under light from outside, in real time.
 
-    `gather`: called with the number of the exposure, from 0, and its seconds; waits for them and returns the light that
-    fell on the chart meanwhile: the projected picture (h, w, 3) float32, 0 … 1 of each primary's full light, and the
-    share of the lamp's light.
+    `gather` is called with the number of the exposure, from 0, and its seconds. It waits for them and returns the mean
+    projected picture (h, w, 3) float32, 0 to 1 of the full light of each primary, and the relative lamp brightness.
     """
 
     suffix = ".dng"
@@ -170,11 +170,11 @@ class WatchedFilm:
         self._frames = itertools.count()
 
     def accept(self, settings: ExposureSettings) -> None:
-        """Refuse what no such body has."""
+        """Raise DeviceRefused for impossible settings."""
         _accept(settings)
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
-        """Photograph the world as it is lit from now on, for the exposure's time."""
+        """Expose the world to the light during the exposure time from now."""
         seconds = (released_at - self._opened).total_seconds()
         frame = next(self._frames)
         picture, lamp = self._gather(frame, settings.shutter_s)
@@ -185,9 +185,9 @@ class WatchedFilm:
 
 
 class WorldFilm:
-    """Pictures of a `World` lit by what the projector shows.
+    """Frames of a `World` under the light of the simulated projector.
 
-    `light`: tells the share of its light that leaves the projector now, 0 … 1.
+    `light` returns the relative light output of the projector now, 0 to 1.
     """
 
     suffix = ".dng"
@@ -200,7 +200,7 @@ class WorldFilm:
         serial: str,
         exposed: Mapping[Colour, int],
         disturbances: Disturbances = CALM,
-        before: Sequence[tuple[float, Colour]] = (),
+        earlier_frames: Sequence[tuple[float, Colour]] = (),
     ) -> None:
         self._world = world
         self._look = look
@@ -208,23 +208,23 @@ class WorldFilm:
         self._serial = serial
         self._exposed = Counter(dict(exposed))
         self._disturbances = disturbances
-        self._before = list(before)
+        self._earlier_frames = list(earlier_frames)
         self._last: tuple[datetime, NDArray[np.uint16]] | None = None
 
     def accept(self, settings: ExposureSettings) -> None:
-        """Refuse what no such body has."""
+        """Raise DeviceRefused for impossible settings."""
         _accept(settings)
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> None:
-        """Photograph the world as it is lit now."""
+        """Expose the world under its light now."""
         colour = self._look()
-        seconds = (released_at - OPENING).total_seconds()
-        moment = Moment(len(self._before), seconds, colour, tuple(self._before))
+        seconds = (released_at - SIM_START).total_seconds()
+        moment = Moment(len(self._earlier_frames), seconds, colour, tuple(self._earlier_frames))
         lamp = self._light() * (1 - self._world.room.lamp_drift_per_hour * seconds / 3600)
         # The noise is that of the frame that was ordered, whatever there is to see.
         key = (*colour, self._exposed[colour])
         self._exposed[colour] += 1
-        self._before.append((seconds, colour))
+        self._earlier_frames.append((seconds, colour))
         if self._disturbances.events:
             taken_at, counts = self._disturbed(settings, released_at, moment, key, lamp)
         else:
@@ -234,11 +234,11 @@ class WorldFilm:
     def _disturbed(
         self, settings: ExposureSettings, released_at: datetime, moment: Moment, key: tuple[int, ...], lamp: float
     ) -> tuple[datetime, NDArray[np.uint16]]:
-        """Return when the file says that it was taken, and its counts, where something may be wrong at a moment."""
+        """Return the date of the file and its counts, with the disturbances of the moment."""
         events, stale = self._disturbances, self._disturbances.stale(moment)
         if stale is None or self._last is None:
-            shown, situation = events.shown(moment), events.situation(moment)
-            counts = self._world.expose(shown, settings, key=key, lamp=lamp, situation=situation)
+            colour, situation = events.shown(moment), events.situation(moment)
+            counts = self._world.expose(colour, settings, key=key, lamp=lamp, situation=situation)
             taken_at, counts = released_at, events.counted(counts, moment)
         else:
             taken_at, counts = self._last

@@ -1,1 +1,1 @@
-"""The simulated projectors and screens, each speaking its own protocol."""
+"""Simulated projectors and screens with their protocols."""

@@ -1,4 +1,4 @@
-"""PJLink for the simulated projector: the far side of a connection, and a TCP port that speaks for it."""
+"""PJLink of the simulated projector: the other end of a connection, and a TCP server."""
 
 from __future__ import annotations
 
@@ -16,59 +16,53 @@ from sim.projectors.projector import INPUTS, SimulatedProjector
 
 @dataclass
 class _Connection:
-    """One connection.
+    """One connection."""
 
-    - `heard`: of a line that is not whole yet.
-    - `last_heard`: when the last command came, by the projector's clock, seconds.
-    - `expected_digest`: what proves the password; empty where none is wanted, or it has been proved.
-    - `closed`: whether the projector has hung up.
-    """
-
-    last_heard: float
-    heard: bytes = b""
-    expected_digest: str = ""
-    closed: bool = False
+    last_received_s: float  # Time of the last command, by the projector's clock
+    received: bytes = b""  # Bytes of an incomplete line
+    expected_digest: str = ""  # Digest of the password; empty if not required or already verified
+    closed: bool = False  # Whether the projector closed the connection
 
 
 class PjLinkPeer:
-    """The far side of one PJLink connection to a `SimulatedProjector`: bytes in, bytes out.
+    """Projector end of one PJLink connection: bytes in, bytes out.
 
-    `password`: asked of every connection; None for a projector without one. `seed`: eight characters for the greeting;
-    None draws new ones for each connection.
+    `password` is required on each connection; None for no password. `seed` are the eight characters of the greeting;
+    None for random ones.
     """
 
     def __init__(self, projector: SimulatedProjector, password: str | None = None, seed: str | None = None) -> None:
         self._projector = projector
         self._password = password
         self._fixed_seed = seed
-        self._connection, _ = self._begun()
+        self._connection, _ = self._new_connection()
         self._classes = _class_1(projector), _class_2(projector)
 
     def connect(self) -> bytes:
-        """Begin a new connection, forgetting the last, and return the greeting."""
-        self._connection, greeting = self._begun()
+        """Start a new connection in place of the last, and return the greeting."""
+        self._connection, greeting = self._new_connection()
         return greeting
 
     @property
     def closed(self) -> bool:
-        """Whether it has hung up: after 30 s without a command, a wrong password, or something that is no line."""
+        """Whether it closed the connection: after 30 s without a command, a wrong password, or invalid bytes."""
         connection = self._connection
-        if self._projector.clock.monotonic() - connection.last_heard >= wire.IDLE_LIMIT_S:
+        if self._projector.clock.monotonic() - connection.last_received_s >= wire.IDLE_LIMIT_S:
             connection.closed = True
         return connection.closed
 
     def receive(self, data: bytes) -> bytes:
-        """Take the next bytes and return the answers to the commands that they complete."""
+        """Process bytes and return the answers to complete commands."""
         if self.closed:
             return b""
         connection, answer = self._connection, b""
-        connection.heard += data
+        connection.received += data
         if data:
-            connection.last_heard = self._projector.clock.monotonic()
+            connection.last_received_s = self._projector.clock.monotonic()
         try:
-            while not connection.closed and (taken := wire.take_line(connection.heard, _LONGEST)) is not None:
-                line, length = taken
-                connection.heard = connection.heard[length:]
+            while not connection.closed and (next_line := wire.take_line(connection.received, _LONGEST)) is not None:
+                line, length = next_line
+                connection.received = connection.received[length:]
                 reply = self._reply(wire.parse_request(line))
                 answer += wire.encode_reply(reply)
                 connection.closed = isinstance(reply, Refused)
@@ -76,7 +70,7 @@ class PjLinkPeer:
             connection.closed = True
         return answer
 
-    def _begun(self) -> tuple[_Connection, bytes]:
+    def _new_connection(self) -> tuple[_Connection, bytes]:
         now = self._projector.clock.monotonic()
         if self._password is None:
             return _Connection(now), wire.encode_greeting(None)
@@ -100,9 +94,9 @@ class PjLinkPeer:
         return PjLinkReply(request.command, value, request.level)
 
     def _value(self, request: PjLinkRequest) -> str:
-        known = request.level <= self._projector.traits.pjlink_class
+        is_supported = request.level <= self._projector.traits.pjlink_class
         offered = self._classes[0 if request.level == 1 else 1]
-        answers = offered.get(request.command) if known else None
+        answers = offered.get(request.command) if is_supported else None
         if answers is None:
             return ErrorCode.UNDEFINED.value
         answer = answers.get(request.parameter.upper())
@@ -112,7 +106,7 @@ class PjLinkPeer:
         return value if isinstance(value, str) else wire.OK
 
 
-_LONGEST = wire.MAX_LINE + wire.DIGEST_LENGTH  # Bytes of a connection's first command
+_LONGEST = wire.MAX_LINE + wire.DIGEST_LENGTH  # Length limit of the first command of a connection, bytes.
 _INPUTS = tuple(kind + number for kind in "123456" for number in "123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ")
 _Answers = Mapping[str, Mapping[str, Callable[[], str | None]]]  # Command to parameter to what is done; None is OK
 
@@ -166,5 +160,5 @@ def _selecting(projector: SimulatedProjector, codes: Iterable[str]) -> dict[str,
 
 
 def serve_pjlink(projector: SimulatedProjector, port: int = 0, password: str | None = None) -> TcpServer:
-    """Return a running server that speaks PJLink for `projector`; close it, or use it in a `with` block."""
+    """Return a running PJLink server of the projector; use it in a `with` block or close it."""
     return serve_peer(lambda: PjLinkPeer(projector, password), port)

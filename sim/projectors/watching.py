@@ -1,8 +1,8 @@
-"""What a projector throws on the chart: the pixels of a real screen, through the lamp of a projector that is asked.
+"""Light on the chart from the pixels of a real screen and the lamp of a projector that is queried over PJLink.
 
-The screen is read as a screenshot program reads it, several times while the shutter is open; codes become light before
-they are averaged. A projector that does not answer gives no light; a screen that cannot be read is black. What only the
-monitor knows cannot be seen: power saving and gamma ramps act behind the screen's memory.
+The screen is read repeatedly during an exposure, like a screenshot; codes are converted to light before averaging. A
+projector that does not answer gives no light; a screen that cannot be read is black. Power saving and gamma tables of
+the monitor cannot be detected.
 """
 
 from __future__ import annotations
@@ -25,39 +25,33 @@ from drivers.projector import Power
 from foundation.clock import Clock
 from foundation.errors import DeviceError, InputError
 
-# Pause between two looks at the screen while the shutter is open: about a refresh, so that no window comes and goes
-# between two looks that a camera would have seen for more than a few per cent of its exposure.
+# Interval of screenshots during an exposure, s. About one frame period, so that a window that matters is seen.
 SAMPLE_S: Final = 0.02
 
-POLL_S: Final = 0.1  # Pause between two questions to the projector
+POLL_S: Final = 0.1  # Interval of queries of the projector, s.
 
-# Pixels across that a picture is averaged to, at most; on an A0 chart that is 2.6 mm, less than a cell.
-FINEST_PX: Final = 480
+FINEST_PX: Final = 480  # Maximum width of an averaged picture, px: 2.6 mm on an A0 chart, less than a patch.
 
-# Light of a lamp that warms up, over its full light: its control port does not tell how far it has come (chosen).
+# Relative light of a lamp during warm-up. Its control port does not report the progress (chosen).
 WARMING_SHARE: Final = 0.5
 
-_INSTANT_S: Final = 1e-4  # Time that clocks, which count in whole microseconds, need not tell from none
+_INSTANT_S: Final = 1e-4  # Shorter times than this, s, are treated as 0: clocks count in microseconds.
 
-_ALIKE: Final = 1e-3  # Difference of light below which a picture is called plain: a quarter of a code at the bright end
+_ALIKE: Final = 1e-3  # Largest difference of light in a uniform picture: a quarter of a code at the bright end.
 
 _PLACE = re.compile(r"(?P<display>[^,]*:\d+(?:\.\d+)?)?(?:,|^)?(?P<region>\d+x\d+\+\d+\+\d+)?")
 
 
 @dataclass(frozen=True)
 class ScreenPlace:
-    """Which part of which X screen is projected.
+    """Projected part of an X screen."""
 
-    - `display`: the server, such as ``:1``; None: what DISPLAY names.
-    - `region`: x, y, width and height, px; None: the whole screen, whatever its size is.
-    """
-
-    display: str | None = None
-    region: tuple[int, int, int, int] | None = None
+    display: str | None = None  # X server, such as ``:1``; None for the value of DISPLAY
+    region: tuple[int, int, int, int] | None = None  # x, y, width and height, px; None for the whole screen
 
     @classmethod
     def parse(cls, text: str) -> ScreenPlace:
-        """Return the place that ``:1``, ``1920x1080+2560+0``, or both with a comma between them name."""
+        """Parse ``:1``, ``1920x1080+2560+0``, or both with a comma."""
         found = _PLACE.fullmatch(text)
         if not text or found is None:
             raise InputError(
@@ -71,14 +65,14 @@ class ScreenPlace:
 
 
 class Screenshots:
-    """Pictures of an X screen. Reaches the server when it is first asked, and again after it was gone."""
+    """Pictures of an X screen; connects at the first call, and again after a failure."""
 
     def __init__(self, place: ScreenPlace) -> None:
         self._place = place
         self._screen: XScreen | None = None
 
     def take(self) -> NDArray[np.uint32]:
-        """Return what the screen shows: (height, width) uint32, 0xRRGGBB; the next call writes over it."""
+        """Return the pixels (height, width) uint32, 0xRRGGBB; the next call overwrites them."""
         if self._screen is None:
             self._screen = XScreen(self._place.display, keep_awake=False)
         try:
@@ -89,7 +83,7 @@ class Screenshots:
             raise
 
     def close(self) -> None:
-        """Hang up; the next look connects anew."""
+        """Disconnect; the next call connects again."""
         screen, self._screen = self._screen, None
         if screen is not None:
             screen.close()
@@ -97,22 +91,16 @@ class Screenshots:
 
 @dataclass(frozen=True)
 class LampState:
-    """What a projector says of itself.
+    """Reported state of a projector."""
 
-    - `share`: of its full light.
-    - `frozen`: whether its picture is.
-    - `source`: its input; None where it does not say.
-    - `trouble`: why it could not be asked, so that it gives no light; empty where it could.
-    """
-
-    share: float
-    frozen: bool = False
-    source: str | None = None
-    trouble: str = ""
+    share: float  # Relative light output
+    frozen: bool = False  # Whether the picture is frozen
+    source: str | None = None  # Input; None if not reported
+    trouble: str = ""  # Reason why it did not answer, and so gives no light; empty if it answered
 
 
 def ask(projector: PjLinkProjector) -> LampState:
-    """Return a projector's state; one that does not answer gives no light."""
+    """Return the state of a projector; without an answer, its light is 0."""
     try:
         power = projector.power()
         if power is Power.WARMING:
@@ -132,28 +120,23 @@ def ask(projector: PjLinkProjector) -> LampState:
 
 @dataclass(frozen=True, eq=False)
 class ThrownLight:
-    """What reached the chart while the shutter was open.
+    """Light on the chart during an exposure."""
 
-    - `picture`: (h, w, 3) float32, mean light of each primary, 0 … 1 of the full; (1, 1, 3) where it was plain
-      throughout.
-    - `lamp`: mean share of the lamp's light.
-    """
-
-    picture: NDArray[np.float32]
-    lamp: float
+    picture: NDArray[np.float32]  # (h, w, 3) float32, mean light of each primary, 0 to 1; (1, 1, 3) if always uniform
+    lamp: float  # Mean relative light of the lamp
 
     def __str__(self) -> str:
-        least, most = self.picture.min(axis=(0, 1)), self.picture.max(axis=(0, 1))
+        minimum, maximum = self.picture.min(axis=(0, 1)), self.picture.max(axis=(0, 1))
         mean = " ".join(f"{share:.3f}" for share in self.picture.mean(axis=(0, 1)))
-        shape = "plain" if float((most - least).max()) < _ALIKE else "not plain"
+        shape = "plain" if float((maximum - minimum).max()) < _ALIKE else "not plain"
         return f"{shape} picture, mean light {mean}, lamp {self.lamp:.2f}"
 
 
 class Beam:
-    """A screen's picture, through a projector's lamp; use it in a `with` block, which asks the projector all the time.
+    """Picture of a screen, projected by a lamp; in a `with` block, the projector is queried continuously.
 
-    `projector`: what is asked for the lamp; None: a lamp that always burns. `light_of`: returns the light (256,)
-    float64, 0 … 1, of the codes 0 … 255.
+    `projector` None is a lamp that is always on. `light_of` returns the light (256,) float64, 0 to 1, of the codes 0 to
+    255.
     """
 
     def __init__(
@@ -167,17 +150,17 @@ class Beam:
         self._projector = projector
         self._light = light_of(np.arange(256)).astype(np.float32)
         self._clock = clock
-        self._looking = threading.Lock()
+        self._lock = threading.Lock()
         self._ended = threading.Event()
         self._state = LampState(1.0)
-        self._wired: str | None = None
-        self._held: NDArray[np.float32] | None = None
-        self._seen: NDArray[np.float32] = _BLACK
-        self._thread = threading.Thread(target=self._ask_on, name="asking the projector", daemon=True)
+        self._screen_input: str | None = None
+        self._frozen_picture: NDArray[np.float32] | None = None
+        self._last_picture: NDArray[np.float32] = _BLACK
+        self._thread = threading.Thread(target=self._poll, name="asking the projector", daemon=True)
 
     def __enter__(self) -> Beam:
         if self._projector is not None:
-            self._ask_once(self._projector)
+            self._poll_once(self._projector)
             self._thread.start()
         return self
 
@@ -192,12 +175,12 @@ class Beam:
 
     @property
     def trouble(self) -> str:
-        """Why the projector could not be asked when it last was, so that it gives no light; empty where it could."""
-        with self._looking:
+        """Reason why the projector did not answer the last query; empty if it answered."""
+        with self._lock:
             return self._state.trouble
 
     def gather(self, seconds: float, halfway: Callable[[], None] = lambda: None) -> ThrownLight:
-        """Return what reaches the chart from now on, for so many seconds; returns when they are over."""
+        """Wait for the exposure time, and return the light on the chart during it; call `halfway` in the middle."""
         at = self._clock.monotonic()
         ends, half = at + seconds, at + seconds / 2
         total: NDArray[np.float64] = np.zeros((1, 1, 3))
@@ -206,48 +189,48 @@ class Beam:
             share, picture = self._thrown()
             self._clock.sleep(min(SAMPLE_S, max(ends - self._clock.monotonic(), 0.0)))
             # A look stands for the time until the next one.
-            until = min(self._clock.monotonic(), ends)
-            lit += share * (until - at)
-            total = _added(total, picture.astype(np.float64) * (share * (until - at)))
-            if at < half <= until:
+            end = min(self._clock.monotonic(), ends)
+            lit += share * (end - at)
+            total = _sum(total, picture.astype(np.float64) * (share * (end - at)))
+            if at < half <= end:
                 halfway()
-            at = until
+            at = end
         # What is dark has no picture.
         mean = total / lit if lit else total
         return ThrownLight(mean.astype(np.float32), lit / seconds)
 
     def _thrown(self) -> tuple[float, NDArray[np.float32]]:
-        with self._looking:
+        with self._lock:
             state = self._state
-            if self._held is not None:
-                return state.share, self._held
-            if state.source is not None and self._wired is not None and state.source != self._wired:
+            if self._frozen_picture is not None:
+                return state.share, self._frozen_picture
+            if state.source is not None and self._screen_input is not None and state.source != self._screen_input:
                 return state.share, _BLACK
             return state.share, self._look()
 
     def _look(self) -> NDArray[np.float32]:
         try:
-            self._seen = picture_light(self._pictures.take(), self._light)
+            self._last_picture = picture_light(self._pictures.take(), self._light)
         except DeviceError:
-            self._seen = _BLACK
-        return self._seen
+            self._last_picture = _BLACK
+        return self._last_picture
 
-    def _ask_on(self) -> None:
+    def _poll(self) -> None:
         assert self._projector is not None
         while not self._ended.wait(POLL_S):
-            self._ask_once(self._projector)
+            self._poll_once(self._projector)
 
-    def _ask_once(self, projector: PjLinkProjector) -> None:
+    def _poll_once(self, projector: PjLinkProjector) -> None:
         state = ask(projector)
-        with self._looking:
+        with self._lock:
             self._state = state
-            if self._wired is None:
+            if self._screen_input is None:
                 # The screen hangs at the input that is shown when the projector is first seen lit.
-                self._wired = state.source
+                self._screen_input = state.source
             if state.frozen:
-                self._held = self._seen if self._held is None else self._held
+                self._frozen_picture = self._last_picture if self._frozen_picture is None else self._frozen_picture
             else:
-                self._held = None
+                self._frozen_picture = None
                 self._look()
 
 
@@ -255,23 +238,23 @@ _BLACK: Final[NDArray[np.float32]] = np.zeros((1, 1, 3), dtype=np.float32)
 
 
 def picture_light(pixels: NDArray[np.uint32], light: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the light of a screen's pixels, averaged to `FINEST_PX` across at most.
+    """Return the light of the pixels of a screen, averaged to a width of `FINEST_PX` or less.
 
-    `pixels`: (height, width) uint32, 0xRRGGBB. `light`: (256,) float32, 0 … 1, of each code. Returns (h, w, 3) float32,
-    0 … 1; (1, 1, 3) where all pixels are alike.
+    `pixels`: (height, width) uint32, 0xRRGGBB. `light`: (256,) float32, 0 to 1, of each code. Returns (h, w, 3)
+    float32, 0 to 1; (1, 1, 3) if all pixels are equal.
     """
-    plain = bool((pixels == pixels[0, 0]).all())
-    some = pixels[:1, :1] if plain else pixels
-    picture = np.stack([light[some >> shift & 255] for shift in (16, 8, 0)], axis=-1)
-    height, width = some.shape
+    is_plain = bool((pixels == pixels[0, 0]).all())
+    region = pixels[:1, :1] if is_plain else pixels
+    picture = np.stack([light[region >> shift & 255] for shift in (16, 8, 0)], axis=-1)
+    height, width = region.shape
     if width <= FINEST_PX:
         return picture
     size = FINEST_PX, max(round(height * FINEST_PX / width), 1)
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def _added(total: NDArray[np.float64], part: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sum of two pictures; where a change of mode gave them different sizes, in the larger one's."""
+def _sum(total: NDArray[np.float64], part: NDArray[np.float64]) -> NDArray[np.float64]:
+    # A change of the screen mode may change the size; the larger size is used.
     if total.shape != part.shape and (1, 1) not in (total.shape[:2], part.shape[:2]):
         rows, columns = (max(one, other) for one, other in zip(total.shape[:2], part.shape[:2], strict=True))
         total, part = (np.asarray(cv2.resize(one, (columns, rows)), dtype=np.float64) for one in (total, part))

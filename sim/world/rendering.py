@@ -1,22 +1,17 @@
-"""From a drawing on the print to the light on every photosite.
+"""Geometry of the print and rendering of the light on each photosite.
 
-**Loops.** Compiled by numba on first use, single-threaded and without the interpreter's lock; `sim.world.world` calls
-them for blocks of rows from as many threads as there are processors. A row's result depends on its own arguments
-only, so neither blocks nor threads change a bit of it. Positions are photosites of the visible frame, centres at
-integers, unless said.
+**Geometry.** The print is a sheet whose point (x, y) mm has a `height` mm out of the plane, towards the camera. The
+sheet is rotated by roll, then tilt, then pan, and projected by a pinhole with Brown's lens distortion (D. C. Brown,
+"Close-range camera calibration", 1971; coordinates and coefficients as in OpenCV). Paper does not stretch, and heights
+are small against wavelengths, so points keep their x and y. A fold is a crease that stands off the plane; its flanks
+are inclined to the light.
 
-**Geometry.** The print is a sheet held at its middle: a point (x, y) mm on it stands `height` mm out of the plane,
-towards the camera. The sheet is turned by roll, then tilt, then pan, and seen through a pinhole and Brown's lens
-distortion (D. C. Brown, "Close-range camera calibration", 1971; normalised coordinates and coefficient order as
-OpenCV has them). The paper does not stretch: its heights are so small against their wavelengths that a point keeps
-its x and y. A fold is a crease that does not lie flat: the sheet rises towards it on both sides, so that the crease
-stands off the plane, and either flank is turned a little towards the light or away from it.
+**Rendering.** `light` is compiled by numba, single-threaded, without interpreter lock; `sim.world.world` calls it for
+blocks of rows from several threads. A row depends only on its arguments, so blocks and threads do not change the
+result.
 
-Pixels are half-size, centres at integers, x right, y down; millimetres on the print, origin at its top-left corner.
-Pure functions of frozen values; light is not treated here.
-
-**The print** is rectangles of plain colour on paper, and a map of them that is rendered. Millimetres on the print,
-origin at its top-left corner, x right, y down.
+Pixels are half-size, centres at integers, x right, y down. Millimetres are on the print, from its top left corner.
+Photosites are those of the visible frame.
 """
 
 from __future__ import annotations
@@ -30,36 +25,30 @@ from numpy.typing import NDArray
 
 from foundation.compiled import compiled
 
-_RIPPLE: Final = 0.1  # Height of each of the weaker short waves over that of the first; chosen
+_RIPPLE: Final = 0.1  # Height of the weaker short waves, relative to the first (chosen).
 
-_NEWTON_STEPS = 6  # An end to steps that do not converge; they stop earlier once every point is met within 10⁻⁷ px
-# Half the distance of the differences that stand for derivatives: short beside folds and waves, long beside rounding.
+_NEWTON_STEPS = 6  # Maximum number of steps; they end earlier if all errors are below 10⁻⁷ px.
+
+# Half step of the numerical derivatives, mm: short against folds and waves, long against rounding errors.
 _STEP_MM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Waviness:
-    """A smooth paper surface: the sum of a few standing waves.
+    """A smooth paper surface: the sum of some standing waves."""
 
-    - `cycles`: (M, 2) float64, cycles along x and y over the whole page.
-    - `phases`: (M,) float64, radians.
-    - `amplitudes_mm`: (M,) float64.
-    - `page_mm`: width and height of the page.
-    """
-
-    cycles: NDArray[np.float64]
-    phases: NDArray[np.float64]
-    amplitudes_mm: NDArray[np.float64]
-    page_mm: tuple[float, float]
+    cycles: NDArray[np.float64]  # (M, 2) float64, cycles along x and y over the page
+    phases: NDArray[np.float64]  # (M,) float64, radians
+    amplitudes_mm: NDArray[np.float64]  # (M,) float64
+    page_mm: tuple[float, float]  # Width and height
 
     @classmethod
     def random(
         cls, seed: int, peak_to_valley_mm: float, page_mm: tuple[float, float], modes: int = 7, wave_mm: float = 0.0
     ) -> Waviness:
-        """Draw a surface whose highest and lowest points lie `peak_to_valley_mm` apart.
+        """Draw a surface with a given distance between its highest and lowest points.
 
-        `wave_mm`: the waves' length, within 15 %; 0 for those long ones. One wave in any direction, and weak ones
-        across it.
+        `wave_mm`: wavelength, within 15 %, of one wave in a random direction with weak waves across; 0 for long waves.
         """
         random = np.random.default_rng([seed, 0x77617679])
         longer = max(page_mm)
@@ -76,7 +65,7 @@ class Waviness:
         return cls(shape.cycles, shape.phases, amplitudes * (peak_to_valley_mm / extent), page_mm)
 
     def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the height (...) in mm, towards the camera, of points (..., 2) mm on the print, or off the page."""
+        """Return the height (...) mm towards the camera at points (..., 2) mm, also off the page."""
         share = points_mm / np.array(self.page_mm)
         total = np.zeros(points_mm.shape[:-1])
         for (along_x, along_y), phase, amplitude in zip(self.cycles, self.phases, self.amplitudes_mm, strict=True):
@@ -84,55 +73,43 @@ class Waviness:
         return total
 
 
-ROUND_MM = 4.0  # Paper bends; a crease is no sharper than this
+ROUND_MM = 4.0  # Radius of a crease, mm: paper does not bend more sharply.
 
-FLANK_MM = 40.0  # From the crease to where the sheet lies flat again, to 1 / e
+FLANK_MM = 40.0  # Distance from the crease, mm, in which its height falls to 1 / e.
 
 
 @dataclass(frozen=True)
 class Fold:
-    """A crease across the sheet, from its upper to its lower edge.
+    """A crease from the upper to the lower edge of the sheet."""
 
-    - `at_mm`: A point of the crease.
-    - `along`: its direction, a unit vector.
-    - `height_mm`: how far the crease stands off the plane, towards the camera.
-    - `slant`: change of the light with a flank's slope: the tangent of the angle under which the light falls in.
-    """
+    at_mm: tuple[float, float]  # A point of the crease
+    along: tuple[float, float]  # Direction, a unit vector
+    height_mm: float  # Height towards the camera
+    slant: float  # Relative change of light per slope: tangent of the angle of incidence
 
-    at_mm: tuple[float, float]
-    along: tuple[float, float]
-    height_mm: float
-    slant: float
-
-    def _away(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the distance (...) of points from the crease, positive on its right."""
+    def _distance(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        # Positive on the right of the crease.
         x, y = np.moveaxis(points_mm - np.array(self.at_mm), -1, 0)
         return x * self.along[1] - y * self.along[0]
 
     def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the height (...) in mm of points (..., 2)."""
-        rounded = np.hypot(self._away(points_mm), ROUND_MM) - ROUND_MM
+        """Return the height (...) mm at points (..., 2)."""
+        rounded = np.hypot(self._distance(points_mm), ROUND_MM) - ROUND_MM
         return self.height_mm * np.exp(-rounded / FLANK_MM)
 
     def shade(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the light (...) on points (..., 2) over that on a flat sheet."""
-        away = self._away(points_mm)
-        slope = -self.height(points_mm) * away / np.hypot(away, ROUND_MM) / FLANK_MM
+        """Return the light (...) at points (..., 2), relative to a flat sheet."""
+        distance = self._distance(points_mm)
+        slope = -self.height(points_mm) * distance / np.hypot(distance, ROUND_MM) / FLANK_MM
         return 1 + self.slant * slope
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """The shape of a sheet of paper: waves, a curl and a crease, added.
-
-    - `waves`: its smooth waves.
-    - `curl_mm`: height of its left and right edges above its middle, towards the camera: a cylinder, to second order a
-      parabola.
-    - `fold`: its crease.
-    """
+    """Shape of a sheet of paper: the sum of waves, curl and fold."""
 
     waves: Waviness
-    curl_mm: float = 0.0
+    curl_mm: float = 0.0  # Height of the left and right edges above the centre, towards the camera; a parabola
     fold: Fold | None = None
 
     @property
@@ -141,7 +118,7 @@ class Sheet:
         return self.waves.page_mm
 
     def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the height (...) in mm, towards the camera, of points (..., 2) mm on the print, or off the page."""
+        """Return the height (...) mm towards the camera at points (..., 2) mm, also off the page."""
         height = self.waves.height(points_mm)
         if self.curl_mm:
             across = 2 * points_mm[..., 0] / self.page_mm[0] - 1
@@ -151,22 +128,15 @@ class Sheet:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera in front of a print.
-
-    - `surface`: the print's surface and size.
-    - `rotation`: (3, 3) float64, from the print's axes (x right, y down, z away from the camera) to the camera's.
-    - `distance_mm`: from the pinhole to the print's centre.
-    - `focal_px`: focal length.
-    - `centre_px`: where the optical axis meets the picture.
-    - `distortion`: k1, k2, p1, p2.
-    """
+    """Position of a camera in front of a print."""
 
     surface: Sheet
+    # (3, 3) float64, from axes of the print (x right, y down, z away from the camera) to axes of the camera
     rotation: NDArray[np.float64]
-    distance_mm: float
+    distance_mm: float  # From the pinhole to the centre of the print
     focal_px: float
-    centre_px: tuple[float, float]
-    distortion: tuple[float, float, float, float]
+    centre_px: tuple[float, float]  # Position of the optical axis in the image
+    distortion: tuple[float, float, float, float]  # k1, k2, p1, p2
 
     @classmethod
     def framed(
@@ -179,9 +149,9 @@ class View:
         turn_deg: tuple[float, float, float],
         distortion: tuple[float, float, float, float],
     ) -> View:
-        """Stand so far off that the print, were it not turned, fills a share of the frame.
+        """Choose the distance at which the print, without rotation, fills a share of the frame.
 
-        `turn_deg`: tilt (about the horizontal axis), pan (about the vertical), roll (about the optical axis), degrees.
+        `turn_deg`: tilt (about the horizontal axis), pan (vertical axis) and roll (optical axis), degrees.
         """
         width, height = frame_px
         focal = focal_diagonals * float(np.hypot(width, height))
@@ -190,51 +160,44 @@ class View:
         return cls(surface, _rotation(*turn_deg), distance, focal, centre, distortion)
 
     def project(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the half-size pixels where points of the print are seen.
-
-        `points_mm`: (..., 2) float64, millimetres; may lie off the page, where the surface goes on. Returns (..., 2)
-        float64, x then y.
-        """
+        """Return the half-size pixels (..., 2) float64, x and y, of points (..., 2) mm, also off the page."""
         page = np.array(self.surface.page_mm)
         flat = points_mm - page / 2
-        turned = flat @ self.rotation[:, :2].T - self.surface.height(points_mm)[..., None] * self.rotation[:, 2]
-        depth = turned[..., 2] + self.distance_mm
-        x, y = turned[..., 0] / depth, turned[..., 1] / depth
+        rotated = flat @ self.rotation[:, :2].T - self.surface.height(points_mm)[..., None] * self.rotation[:, 2]
+        depth = rotated[..., 2] + self.distance_mm
+        x, y = rotated[..., 0] / depth, rotated[..., 1] / depth
         k1, k2, p1, p2 = self.distortion
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * k2)
-        bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        seen = np.stack([bent_x, bent_y], axis=-1)
-        return seen * self.focal_px + np.array(self.centre_px)
+        distorted_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        distorted_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        distorted = np.stack([distorted_x, distorted_y], axis=-1)
+        return distorted * self.focal_px + np.array(self.centre_px)
 
     def locate(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the points of the print that are seen at half-size pixels: the inverse of `project`.
+        """Return the points (..., 2) float64 of the print, mm, at half-size pixels (..., 2): inverse of `project`.
 
-        Newton's method with central differences; the error is below a millionth of a pixel wherever the surface is
-        seen without a fold, which is everywhere for sheets that lie within a few millimetres.
-
-        `pixels`: (..., 2) float64. Returns (..., 2) float64, millimetres; off the page where the picture shows what
-        lies beyond it.
+        Newton's method with central differences; the error is below 10⁻⁶ px for sheets that are flat within a few
+        millimetres. Points may be off the page.
         """
         page = np.array(self.surface.page_mm)
         points = (pixels - np.array(self.centre_px)) * (self.distance_mm / self.focal_px) + page / 2
         along_x, along_y = np.array([_STEP_MM, 0]), np.array([0, _STEP_MM])
         for _ in range(_NEWTON_STEPS):
-            miss = pixels - self.project(points)
-            if float(np.abs(miss).max(initial=0)) < 1e-7:
+            error = pixels - self.project(points)
+            if float(np.abs(error).max(initial=0)) < 1e-7:
                 break
             by_x = (self.project(points + along_x) - self.project(points - along_x)) / (2 * _STEP_MM)
             by_y = (self.project(points + along_y) - self.project(points - along_y)) / (2 * _STEP_MM)
             determinant = by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0]
-            step_x = (miss[..., 0] * by_y[..., 1] - miss[..., 1] * by_y[..., 0]) / determinant
-            step_y = (by_x[..., 0] * miss[..., 1] - by_x[..., 1] * miss[..., 0]) / determinant
+            step_x = (error[..., 0] * by_y[..., 1] - error[..., 1] * by_y[..., 0]) / determinant
+            step_y = (by_x[..., 0] * error[..., 1] - by_x[..., 1] * error[..., 0]) / determinant
             points = points + np.stack([step_x, step_y], axis=-1)
         return points
 
 
 def _rotation(tilt_deg: float, pan_deg: float, roll_deg: float) -> NDArray[np.float64]:
-    """Return the (3, 3) rotation by roll, then tilt, then pan."""
+    # Roll first, then tilt, then pan.
     (ct, st), (cp, sp), (cr, sr) = ((np.cos(a), np.sin(a)) for a in np.radians([tilt_deg, pan_deg, roll_deg]))
     tilt = np.array([[1, 0, 0], [0, ct, -st], [0, st, ct]])
     pan = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
@@ -242,25 +205,20 @@ def _rotation(tilt_deg: float, pan_deg: float, roll_deg: float) -> NDArray[np.fl
     return pan @ tilt @ roll
 
 
-PAPER: Final = (255, 255, 255)  # The code that prints nothing
+PAPER: Final = (255, 255, 255)  # Code that prints nothing.
 
-_FINEST_MM: Final = 1e-3  # Coordinates nearer than a micrometre are one: rounding parts them, and no lens does
+_FINEST_MM: Final = 1e-3  # Closer coordinates are treated as equal; they differ by rounding only.
 
-_MOST_LINES: Final = 6000  # Distinct coordinates along an axis of the map, so that its labels stay below 150 MB
+_MAX_LINES: Final = 6000  # Maximum number of distinct coordinates per axis, so that labels need less than 150 MB.
 
 
 @dataclass(frozen=True, eq=False)
 class Print:
-    """A drawing on paper: rectangles of plain colour, each over those before it.
+    """A drawing: rectangles of uniform colour on paper, later ones on top."""
 
-    - `page_mm`: width and height of the sheet; bare paper where no rectangle lies.
-    - `rectangles_mm`: (N, 4) float64: left, top, right, bottom.
-    - `rgb`: (N, 3) uint8, the code printed; (255, 255, 255) prints nothing.
-    """
-
-    page_mm: tuple[float, float]
-    rectangles_mm: NDArray[np.float64]
-    rgb: NDArray[np.uint8]
+    page_mm: tuple[float, float]  # Width and height of the sheet; bare paper outside of rectangles
+    rectangles_mm: NDArray[np.float64]  # (N, 4) float64: left, top, right, bottom
+    rgb: NDArray[np.uint8]  # (N, 3) uint8, printed codes; (255, 255, 255) prints nothing
 
     def __post_init__(self) -> None:
         count = len(self.rectangles_mm)
@@ -274,22 +232,16 @@ class Print:
 
 @dataclass(frozen=True, eq=False)
 class LabelMap:
-    """A print as a map of labels between lines.
+    """A print as a grid of uniform intervals."""
 
-    - `x_lines`, `y_lines`: (M,) float64, ascending, mm: every x and every y at which the print changes.
-    - `labels`: (len(y_lines) + 1, len(x_lines) + 1) int32: row of `codes` between the lines; `len(codes)` beyond the
-      page.
-    - `codes`: (N, 3) int64, distinct codes of the print, ascending; bare paper is one of them.
-    """
-
-    x_lines: NDArray[np.float64]
-    y_lines: NDArray[np.float64]
-    labels: NDArray[np.int32]
-    codes: NDArray[np.int64]
+    x_lines: NDArray[np.float64]  # (A,) float64, ascending, mm: positions of vertical edges
+    y_lines: NDArray[np.float64]  # (B,) float64, ascending, mm: positions of horizontal edges
+    labels: NDArray[np.int32]  # (B + 1, A + 1) int32: row of `codes` in each interval; `len(codes)` off the page
+    codes: NDArray[np.int64]  # (N, 3) int64, distinct codes of the print, ascending, including bare paper
 
 
 def label_map(sheet: Print) -> LabelMap:
-    """Return the map of a print; what of a rectangle lies off the page is left out."""
+    """Return the map of a print; parts of rectangles off the page are omitted."""
     codes, label = np.unique(np.concatenate([sheet.rgb.astype(np.int64), [PAPER]]), axis=0, return_inverse=True)
     boxes = np.concatenate([sheet.rectangles_mm, [[0, 0, *sheet.page_mm]]])
     boxes = np.clip(boxes, 0, [*sheet.page_mm, *sheet.page_mm])
@@ -303,27 +255,26 @@ def label_map(sheet: Print) -> LabelMap:
 
 
 def _lines(ends: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
-    """Return the sorted distinct coordinates of (N, 2) ends, and the index of each beginning and each end among them.
+    """Return the sorted distinct coordinates of (N, 2) ends, and the indices of starts and ends in them.
 
-    Coordinates within a micrometre are one; where a drawing has more than a few thousand, nearer ones are joined, each
-    then standing at the mean of those it stands for.
+    Coordinates within 1 µm are merged. If there are more than `_MAX_LINES`, closer ones are merged to their mean.
     """
-    finest = _FINEST_MM
+    resolution = _FINEST_MM
     while True:
-        rounded, index = np.unique(np.round(ends / finest), return_inverse=True)
-        if len(rounded) <= _MOST_LINES:
+        rounded, index = np.unique(np.round(ends / resolution), return_inverse=True)
+        if len(rounded) <= _MAX_LINES:
             break
-        finest *= 1.5
+        resolution *= 1.5
     index = index.reshape(ends.shape)
     count = np.bincount(index.ravel())
     return np.bincount(index.ravel(), weights=ends.ravel()) / count, index[:, 0], index[:, 1]
 
 
-GRID_PX = 16  # Photosites between the nodes of the position grid
+GRID_PX = 16  # Photosites between the nodes of the position grid.
 
-REACH = 4.0  # Standard deviations after which the blur's tail (3·10⁻⁵) is dropped
+REACH = 4.0  # Radius of the blur in standard deviations; the rest, 3·10⁻⁵, is omitted.
 
-_PHI_STEPS = 1024  # Entries per standard deviation: the error of linear interpolation stays below 2·10⁻⁷
+_PHI_STEPS = 1024  # Table entries per standard deviation; the error of linear interpolation is below 2·10⁻⁷.
 _PHI: NDArray[np.float32] = np.array(
     [0.5 * (1 + math.erf((i / _PHI_STEPS) / math.sqrt(2))) for i in range(int(REACH * _PHI_STEPS) + 2)],
     dtype=np.float32,
@@ -332,7 +283,7 @@ _PHI: NDArray[np.float32] = np.array(
 
 @compiled
 def _phi(z: float) -> float:
-    """Return the normal distribution's share below z; error < 2·10⁻⁷ within `REACH`, 0 or 1 beyond it."""
+    # Normal distribution function; error < 2·10⁻⁷ within `REACH`, 0 or 1 outside.
     size = abs(z)
     if size >= REACH:
         return 1.0 if z > 0 else 0.0
@@ -344,7 +295,7 @@ def _phi(z: float) -> float:
 
 @compiled
 def _cubic(t: float, weights: NDArray[np.float64]) -> None:
-    """Write Lagrange's weights for nodes −1, 0, 1, 2 at 0 ≤ t ≤ 1."""
+    # Lagrange weights of the nodes −1, 0, 1, 2 for 0 ≤ t ≤ 1.
     weights[0] = -t * (t - 1) * (t - 2) / 6
     weights[1] = (t + 1) * (t - 1) * (t - 2) / 2
     weights[2] = -(t + 1) * t * (t - 2) / 2
@@ -352,8 +303,8 @@ def _cubic(t: float, weights: NDArray[np.float64]) -> None:
 
 
 @compiled
-def _reached(lines: NDArray[np.float64], centre: float, reach: float, near: int) -> tuple[int, int]:
-    """Return the first and the last interval between lines that `centre` ± `reach` touches, searching from `near`."""
+def _touched_intervals(lines: NDArray[np.float64], centre: float, reach: float, near: int) -> tuple[int, int]:
+    """Return the first and last interval that `centre` ± `reach` touches, searching from `near`."""
     first = near
     while first > 0 and lines[first - 1] > centre - reach:
         first -= 1
@@ -366,8 +317,8 @@ def _reached(lines: NDArray[np.float64], centre: float, reach: float, near: int)
 
 
 @compiled
-def _alike(labels: NDArray[np.int32], i: int, i1: int, j: int, j1: int) -> bool:
-    """Return whether all labels of rows j … j1 and columns i … i1 are the same."""
+def _is_uniform(labels: NDArray[np.int32], i: int, i1: int, j: int, j1: int) -> bool:
+    # Rows j to j1, columns i to i1.
     for b in range(j, j1 + 1):
         for a in range(i, i1 + 1):
             if labels[b, a] != labels[j, i]:
@@ -379,13 +330,13 @@ def _alike(labels: NDArray[np.int32], i: int, i1: int, j: int, j1: int) -> bool:
 def _shares(
     lines: NDArray[np.float64], centre: float, sigma: float, first: int, last: int, out: NDArray[np.float64]
 ) -> None:
-    """Write the share of a normal distribution that falls into each interval from first to last; they add up to 1."""
-    before = 0.0
+    # Share of a normal distribution in each interval; the sum is 1.
+    previous = 0.0
     for k in range(first, last):
         below = _phi((lines[k] - centre) / sigma)
-        out[k] = below - before
-        before = below
-    out[last] = 1.0 - before
+        out[k] = below - previous
+        previous = below
+    out[last] = 1.0 - previous
 
 
 @compiled
@@ -405,19 +356,32 @@ def light(
 ) -> None:
     """Write the signal of each photosite of some rows under each primary.
 
-    The blur and the photosite's aperture are one Gaussian, in print coordinates with axes along the print's; the
-    drawing is rectangles, so its integral over each is a product of two differences of normal distributions: exact,
-    however an edge lies to the photosites.
+    Blur and aperture of the photosite are one Gaussian whose axes are those of the print. The drawing consists of
+    rectangles, so its integrals are products of differences of normal distributions: exact for any position of edges.
 
-    `nodes`: (1 or 3, ny, nx, 2) float64, the place on the print in mm, of photosite (16 (i − 1), 16 (j − 1)) at [j, i]:
-    one for all camera channels, or one for each. `sigma_px`: blur and aperture, photosites. `x_lines`, `y_lines`: (A,)
-    and (B,) float64, every x and every y, ascending, at which the drawing changes, mm. `labels`: (B + 1, A + 1) int32,
-    row of `signals` between the lines. `signals`: (n, 3, 3) float32, signal of a colour [label, camera channel,
-    primary] in full light, DN. `channels`: (2, 2) int64, camera channel of a photosite by the parity of its row and
-    column. `vignetting`: (3,) float64: x, y and c; the lens passes 1 / (1 + c r²)² at r photosites from there.
-    `falloff`: (3, 4) float64, for each primary x, y, c and g: the projector gives g / (1 + c d²) at d mm from there.
-    `response`: (rows, columns) float32, response of each photosite, about 1. `out`: (3, rows, columns) float32,
-    written: signal under each primary, DN.
+    Parameters
+    ----------
+    first_row
+        First of the rows.
+    nodes
+        (1 or 3, ny, nx, 2) float64, point on the print, mm, of photosite (16 (i − 1), 16 (j − 1)) at [j, i], for
+        all channels or for each.
+    sigma_px
+        Blur and aperture, photosites.
+    x_lines, y_lines, labels
+        See `LabelMap`; labels are rows of `signals`.
+    signals
+        (n, 3, 3) float32, signal of a colour [label, camera channel, primary] in full light, DN.
+    channels
+        (2, 2) int64, camera channel by parity of row and column.
+    vignetting
+        (3,) float64: x, y and c; the lens transmits 1 / (1 + c r²)² at r photosites from there.
+    falloff
+        (3, 4) float64, x, y, c and g of each primary: the projector gives g / (1 + c d²) at d mm from there.
+    response
+        (rows, columns) float32, response of each photosite, about 1.
+    out
+        (3, rows, columns) float32, written: signal under each primary, DN.
     """
     rows, columns = out.shape[1], out.shape[2]
     views, node_columns = nodes.shape[0], nodes.shape[2]
@@ -468,23 +432,23 @@ def light(
                 u_sigma, v_sigma = u_sigmas[s], v_sigmas[s]
                 u = w[0] * u_row[s, c - 1] + w[1] * u_row[s, c] + w[2] * u_row[s, c + 1] + w[3] * u_row[s, c + 2]
                 v = w[0] * v_row[s, c - 1] + w[1] * v_row[s, c] + w[2] * v_row[s, c + 1] + w[3] * v_row[s, c + 2]
-                i, i1 = _reached(x_lines, u, REACH * u_sigma, i)
-                j, j1 = _reached(y_lines, v, REACH * v_sigma, j)
+                i, i1 = _touched_intervals(x_lines, u, REACH * u_sigma, i)
+                j, j1 = _touched_intervals(y_lines, v, REACH * v_sigma, j)
                 label = labels[j, i]
                 red, green, blue = signals[label, channel, 0], signals[label, channel, 1], signals[label, channel, 2]
-                if not _alike(labels, i, i1, j, j1):
+                if not _is_uniform(labels, i, i1, j, j1):
                     _shares(x_lines, u, u_sigma, i, i1, u_share)
                     _shares(y_lines, v, v_sigma, j, j1, v_share)
                     red, green, blue = np.float32(0), np.float32(0), np.float32(0)
                     # Unsigned, for whether a signed index counts from the end is asked at each of hundreds of shares.
                     for b in range(np.uintp(j), np.uintp(j1 + 1)):
-                        of_row = v_share[b]
+                        row_share = v_share[b]
                         for a in range(np.uintp(i), np.uintp(i1 + 1)):
-                            share = np.float32(u_share[a] * of_row)
-                            at = np.uintp(labels[b, a])
-                            red += share * signals[at, channel, 0]
-                            green += share * signals[at, channel, 1]
-                            blue += share * signals[at, channel, 2]
+                            share = np.float32(u_share[a] * row_share)
+                            entry = np.uintp(labels[b, a])
+                            red += share * signals[entry, channel, 0]
+                            green += share * signals[entry, channel, 1]
+                            blue += share * signals[entry, channel, 2]
                 off_x, off_y = x - vignetting[0], y - vignetting[1]
                 passed = 1 / (1 + vignetting[2] * (off_x * off_x + off_y * off_y))
                 passed *= passed * response[row, x]

@@ -1,15 +1,14 @@
-"""The camera bodies that the simulated room can be photographed with: sensors, colour filters, noise, light to counts.
+"""Cameras of the simulated room: sensor, colour filters, noise, and conversion of light to counts.
 
-A body is a table of facts, without behaviour; `counts` is what all sensors do. Photosites count from the sensor's
-top-left corner, masked borders included, unless said; a count is what the raw file holds (DN).
+A `Body` is data without behaviour; `counts` is common to all sensors. Photosites are numbered from the top left of the
+sensor, including masked borders. Counts (DN) are the values in the raw file.
 
-Sizes and margins: dcraw 9.28 (`adobe_coeff` and the Canon table in `identify`), masked rectangles: rawspeed's
-cameras.xml. Saturation: RawTherapee's camconst.json. Conversion gain and read noise: of the order that EMVA 1288
-photon transfer gives for sensors of these generations; plausible, not measured on these bodies.
+Sizes and margins: dcraw 9.28 (`adobe_coeff` and the Canon table in `identify`). Masked rectangles: cameras.xml of
+rawspeed. Saturation: camconst.json of RawTherapee. Conversion gain and read noise: typical of EMVA 1288 measurements of
+such sensors, not measured on these bodies.
 
-**Bodies for any sensitivities** have known facts by name and plausible ones for the rest. Sizes are the makers'
-numbers of recorded pixels. Borders, black, saturation, conversion gain and read noise are of the order that such
-sensors have: plausible, not measured on these bodies. Whoever knows better says so in a settings file.
+For bodies selected by sensitivities (`FACTS`), sizes are the recorded pixels of the makers. Their other values are
+typical of such sensors, not measured. A settings file can replace them.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from sim.spectral import Sensitivities, read_sensitivities
 
 
 class Rectangle(NamedTuple):
-    """A rectangle of photosites: first row and column, then the number of rows and columns."""
+    """Rectangle of photosites: first row and column, number of rows and columns."""
 
     top: int
     left: int
@@ -41,36 +40,22 @@ class Rectangle(NamedTuple):
 
 @dataclass(frozen=True)
 class Body:
-    """A camera body.
+    """A camera."""
 
-    - `maker`, `model`: as the body writes them into its files, e.g. ``Canon`` and ``Canon EOS 550D``.
-    - `sensor`: rows and columns of the raw frame, masked borders included.
-    - `visible`: the photosites that see light, as the raw converters have them.
-    - `pattern`: colour filters of the 2×2 block at the top-left of `visible`, row by row, e.g. ``RGGB``.
-    - `black`: count of a photosite without light, DN.
-    - `saturation`: count that no photosite exceeds, DN.
-    - `bits`: bits of a count.
-    - `electrons_per_dn`: electrons that raise the count by one at ISO 100; at another speed ×100/ISO.
-    - `read_noise_dn`: standard deviation of a dark count at ISO 100, DN.
-    - `sensor_noise_e`: the share of the read noise that arises before the amplifier, electrons: it grows with the ISO
-      speed in DN, the rest does not.
-    - `sensitivities`: name of the spectral sensitivities in `sim.data`, see `sim.spectral.sensitivities`.
-    - `masked`: rectangles of the sensor that are covered and measure black.
-    """
-
-    maker: str
-    model: str
-    sensor: tuple[int, int]
-    visible: Rectangle
-    pattern: str
-    black: int
-    saturation: int
-    bits: int
-    electrons_per_dn: float
-    read_noise_dn: float
+    maker: str  # As in its files, for example ``Canon``
+    model: str  # As in its files, for example ``Canon EOS 550D``
+    sensor: tuple[int, int]  # Rows and columns of the raw frame, including masked borders
+    visible: Rectangle  # Photosites that receive light, as defined by raw converters
+    pattern: str  # Colour filters of the 2×2 block at the top left of `visible`, by rows, for example ``RGGB``
+    black: int  # Count without light, DN
+    saturation: int  # Highest count, DN
+    bits: int  # Bits per count
+    electrons_per_dn: float  # Electrons per count at ISO 100; proportional to 100/ISO
+    read_noise_dn: float  # Standard deviation of dark counts at ISO 100, DN
+    # Part of the read noise before the amplifier, electrons; in DN, it increases with the ISO speed
     sensor_noise_e: float
-    sensitivities: str
-    masked: tuple[Rectangle, ...]
+    sensitivities: str  # Name in `sim.data`, or a file; see `sim.spectral.sensitivities`
+    masked: tuple[Rectangle, ...]  # Covered rectangles, which measure the black level
 
     def __post_init__(self) -> None:
         rows, columns = self.sensor
@@ -82,14 +67,14 @@ class Body:
 
     @property
     def camera(self) -> str:
-        """Maker and model, the maker once, as `drivers.raw.rawfile` reads them from the body's files."""
+        """Maker and model without repetition, as `drivers.raw.rawfile` reads them from its files."""
         words = self.model.split(" ")
         known = not self.maker or words[0].casefold() == self.maker.split(" ")[0].casefold()
         return self.model if known else f"{self.maker} {self.model}"
 
     @property
     def half_size(self) -> tuple[int, int]:
-        """Rows and columns of the half-size image, whole 2×2 blocks of the visible mosaic."""
+        """Rows and columns of the half-size image."""
         return self.visible.height // 2, self.visible.width // 2
 
     def gain_e(self, iso: int) -> float:
@@ -104,36 +89,32 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class HotPattern:
-    """Photosites whose dark current is out of proportion, the same ones in every frame.
+    """Photosites with high dark current, the same in all frames.
 
-    Their excess is proportional to the exposure time and to the gain, and has the shot noise of its electrons. How many
-    a body has grows with its age and falls with the size of its photosites: some 128 on a sensor of 20 million of
-    4 µm after 3.2 years, as they show at ISO 3200, in proportion to size⁻³ and √ISO (G. Chapman and others, DFT 2022,
-    doi 10.1109/DFT56152.2022.9962368; size⁻²·⁵ in Proc. SPIE 7875 (2011)). That makes for ISO 100 some 3 a million on
-    an EOS 550D (4.3 µm) of ten years and 0.4 on an EOS 6D Mark II (5.7 µm) of three, besides those that a body is
-    delivered with, which we did not find counted. Exponential distribution: chosen.
-
-    - `rows`, `columns`: (H,) int64, photosites of the sensor, by rising row.
-    - `dn_per_s`: (H,) float64, excess at ISO 100, DN per second.
+    Their excess is proportional to exposure time and gain, and has the shot noise of its electrons. Their number
+    increases with age and decreases with the size of photosites: about 128 in 20 million photosites of 4 µm after 3.2
+    years, detected at ISO 3200, proportional to size⁻³ and √ISO (G. Chapman and others, DFT 2022, doi
+    10.1109/DFT56152.2022.9962368; size⁻²·⁵ in Proc. SPIE 7875 (2011)). At ISO 100, this is about 3 per million on an
+    EOS 550D (4.3 µm) after ten years, and 0.4 on an EOS 6D Mark II (5.7 µm) after three. Hot photosites of new bodies
+    are not included. The exponential distribution is chosen.
     """
 
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
-    dn_per_s: NDArray[np.float64]
+    rows: NDArray[np.int64]  # (H,) int64, ascending rows of the sensor
+    columns: NDArray[np.int64]  # (H,) int64
+    dn_per_s: NDArray[np.float64]  # (H,) float64, excess at ISO 100, DN per second
 
     @classmethod
     def drawn(cls, random: np.random.Generator, sensor: tuple[int, int], per_million: float, dn_per_s: float) -> Self:
-        """Return hot photosites anywhere on a sensor, their excess exponentially distributed about a mean.
+        """Draw hot photosites at random positions, with exponentially distributed excess.
 
-        `per_million`: how many of a million photosites; rounded to whole photosites on the sensor. `dn_per_s`: mean
-        excess at ISO 100, DN per second.
+        `per_million`: number per million photosites. `dn_per_s`: mean excess at ISO 100, DN per second.
         """
         count = round(per_million * sensor[0] * sensor[1] / 1e6)
         place = np.sort(random.choice(sensor[0] * sensor[1], count, replace=False))
         return cls(place // sensor[1], place % sensor[1], random.exponential(dn_per_s, count))
 
     def within(self, first: int, last: int) -> HotPattern:
-        """Return those in rows first … last − 1, their rows counted from the first."""
+        """Return the hot photosites of rows first to last − 1, with rows numbered from `first`."""
         some = slice(*np.searchsorted(self.rows, [first, last]).tolist())
         return HotPattern(self.rows[some] - first, self.columns[some], self.dn_per_s[some])
 
@@ -146,11 +127,18 @@ class HotPattern:
         iso: int,
         shutter_s: float,
     ) -> None:
-        """Write the counts of hot photosites into a frame, by the photon transfer that ordinary ones have.
+        """Write the counts of hot photosites into a frame, with the noise of ordinary photosites.
 
-        `frame`: (rows, columns) uint16 counts, changed where a photosite is hot. `noise`: (rows, columns) float32, the
-        standard normal deviates that the frame was made with. `light_dn`: (H,) float64, what light alone gives each of
-        them, DN above black. `iso`, `shutter_s`: ISO speed, and exposure time in seconds.
+        Parameters
+        ----------
+        frame
+            (rows, columns) uint16, changed at hot photosites.
+        noise
+            (rows, columns) float32, the standard normal values of this frame.
+        light_dn
+            (H,) float64, signal of the light alone, DN above black.
+        iso, shutter_s
+            ISO speed, and exposure time in seconds.
         """
         signal = light_dn + self.excess_dn(iso, shutter_s)
         spread = np.sqrt(signal / body.gain_e(iso) + body.noise_dn(iso) ** 2)
@@ -158,7 +146,7 @@ class HotPattern:
         frame[self.rows, self.columns] = np.clip(count, 0, body.saturation).astype(np.uint16)
 
     def excess_dn(self, iso: int, shutter_s: float) -> NDArray[np.float64]:
-        """Return (H,) float64: DN above an ordinary photosite at an ISO speed and exposure time in seconds."""
+        """Return the excess (H,) float64 over ordinary photosites, DN, at an ISO speed and exposure time in seconds."""
         return self.dn_per_s * shutter_s * iso / 100
 
 
@@ -202,12 +190,11 @@ _TEST = replace(
     masked=(Rectangle(0, 0, 609, 44),),
 )
 
-# Every body by the name that settings use. ``Test`` is a small frame with the colours and noise of the EOS 550D.
+# Cameras by the name in settings. ``Test`` has a small frame with the colours and noise of the EOS 550D.
 BODIES: Mapping[str, Body] = MappingProxyType({"EOS 550D": _EOS_550D, "EOS 6D Mark II": _EOS_6D_MARK_II, "Test": _TEST})
 
 
-# Masked rows above and masked columns left of the picture, as Canon's sensors have about as many.
-_BORDER: Final = (50, 140)
+_BORDER: Final = (50, 140)  # Masked rows above and masked columns left of the image; Canon sensors have about as many.
 
 
 def _areas(width: int, height: int) -> dict[str, Any]:
@@ -223,7 +210,7 @@ def _areas(width: int, height: int) -> dict[str, Any]:
 def _body(
     name: str, size: tuple[int, int], black: int, saturation: int, gain_e: float, noise_dn: float, early_e: float
 ) -> Body:
-    """Return a Canon of `size` columns and rows that see light; the rest as `Body` has it."""
+    # A Canon with `size` columns and rows of visible photosites.
     return replace(
         _EOS_550D,
         model=name.replace("_", " "),
@@ -237,7 +224,7 @@ def _body(
     )
 
 
-# Bodies by the name of their sensitivities; the EOS 600D has the sensor generation of the EOS 550D, and its facts.
+# Cameras by the name of their sensitivities. The EOS 600D has a sensor of the same generation as the EOS 550D.
 FACTS: Final[Mapping[str, Body]] = MappingProxyType(
     {
         "Canon_EOS_600D": replace(BODIES["EOS 550D"], model="Canon EOS 600D"),
@@ -252,23 +239,26 @@ FACTS: Final[Mapping[str, Body]] = MappingProxyType(
 def find_body(
     camera: str, changes: Mapping[str, Any] = MappingProxyType({}), where: str = "--settings", key: str = "camera"
 ) -> Body:
-    """Return the body that a name or a file of sensitivities stands for."""
-    body = BODIES.get(camera) or _of_sensitivities(camera, read_sensitivities(camera, tuple(BODIES)))
-    given = dict(changes)
-    pixels = given.pop("pixels", None)
+    """Return the camera of a name, or of a file of sensitivities, with changed properties.
+
+    `where`, `key`: file or command line, and its table, for messages.
+    """
+    body = BODIES.get(camera) or _body_of_sensitivities(camera, read_sensitivities(camera, tuple(BODIES)))
+    values = dict(changes)
+    pixels = values.pop("pixels", None)
     if pixels is not None:
-        given = _areas(*_checked_pixels(pixels, where, key)) | given
+        values = _areas(*_checked_pixels(pixels, where, key)) | values
     facts = {field.name: getattr(body, field.name) for field in fields(Body)}
-    changed = from_settings(Body, given, where, key, [*facts, "pixels"], **facts)
+    changed = from_settings(Body, values, where, key, [*facts, "pixels"], **facts)
     _require_sensor(changed, where, key)
     return changed
 
 
-def _of_sensitivities(camera: str, found: Sensitivities) -> Body:
+def _body_of_sensitivities(camera: str, found: Sensitivities) -> Body:
     if camera in FACTS:
         return FACTS[camera]
-    usual = BODIES["EOS 550D"]
-    return replace(usual, maker=found.maker or "unknown", model=found.camera, sensitivities=camera)
+    default = BODIES["EOS 550D"]
+    return replace(default, maker=found.maker or "unknown", model=found.camera, sensitivities=camera)
 
 
 def _checked_pixels(pixels: Any, where: str, key: str) -> tuple[int, int]:
@@ -317,13 +307,27 @@ def counts(
 ) -> None:
     """Write the counts of some rows of the sensor.
 
-    Shot noise is taken as normal, of variance signal / gain; with the read noise that makes one normal deviate of
-    variance signal / gain + read noise²: the photon transfer of EMVA 1288 (release 4.0 linear, section 2.2).
+    Photon transfer of EMVA 1288 (release 4.0 linear, section 2.2): a normal distribution of variance signal / gain +
+    read noise².
 
-    `light`: (3, rows, visible columns) float32, from `light`; no columns at all for rows of the masked border.
-    `weights`: (3,) float32, drive of each primary. `noise`: (rows, sensor columns) float32, standard normal deviates.
-    `black`, `read_noise`: mean and standard deviation of a dark count, DN. `gain_e`: electrons per DN. `saturation`:
-    largest count. `out`: (rows, sensor columns) uint16, written.
+    Parameters
+    ----------
+    light
+        (3, rows, visible columns) float32, from `light`; no columns for rows of the masked border.
+    weights
+        (3,) float32, exposure to each primary.
+    noise
+        (rows, sensor columns) float32, standard normal values.
+    left
+        First visible column.
+    black, read_noise
+        Mean and standard deviation of a dark count, DN.
+    gain_e
+        Electrons per DN.
+    saturation
+        Highest count.
+    out
+        (rows, sensor columns) uint16, written.
     """
     rows, columns = out.shape
     right = left + light.shape[2]

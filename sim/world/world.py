@@ -1,22 +1,20 @@
-"""A lit print in front of a camera. What is shown decides what is photographed.
+"""A printed chart under projector light in front of a camera: the displayed colour decides the photograph.
 
-Light adds. The signal of a photosite is linear in the drives of the projector's three primaries, so the room is
-rendered once for each primary alone (`_render`), and a frame is their weighted sum, its noise, and black. The rules:
+Light is additive, and signals are linear in the brightness of the three primaries. So the room is rendered once under
+each primary (`_render`); a frame is their weighted sum, noise and black level. Rules:
 
-- the same print, body, room, colour, settings and key give the same counts, on any number of threads;
-- every frame's noise depends on the room's seed and the key alone;
-- `project`, `white`, `reflected`, `seen` and `field` are the truth that the counts were made from, for tests to compare
-  with. They are the print's and the light's, without point spread and veil: what a perfect table would hold.
+- The same print, camera, room, colour, settings and key give the same counts with any number of threads.
+- The noise of a frame depends only on the seed of the room and the key.
+- `project`, `white`, `reflected`, `seen` and `field` are the exact values without point spread and veiling glare, which
+an ideal LUT would contain; tests compare with them.
 
-Signal = ∫ primary × reflectance × sensitivity dλ, scaled so that bare paper under full white gives
-`Room.white_level_share` of the body's range in its strongest channel at 0.5 s, f/8, ISO 100.
-Millimetres on the print; half-size pixels unless said; DN are raw counts above black.
+Signal = ∫ primary × reflectance × sensitivity dλ. It is scaled so that bare paper under full white has
+`Room.white_level_share` of the range in its strongest channel at 0.5 s, f/8, ISO 100. Positions are millimetres on the
+print or half-size pixels; DN are counts above the black level.
 
-The lab around the camera is a `Room`: light, lens, print and what is wrong with them, as one frozen value. A stain on
-the print (`Stain`) is a filter on the paper, of one colour, with a soft rim.
-
-How one frame's circumstances differ from those of the undisturbed room is a `Situation`. Its places are shares of the
-page unless said: (0, 0) is its top-left corner, (1, 1) its bottom-right one, and what reaches beyond lies off the page.
+A `Room` describes light, lens and print. A `Situation` describes how one frame differs from the undisturbed room. Its
+positions are relative to the page: (0, 0) is the top left corner, (1, 1) the bottom right corner, other values lie off
+the page.
 """
 
 from __future__ import annotations
@@ -42,89 +40,109 @@ from sim.spectral import LampSpectrum, PaperName, ProfileName, printed_reflectan
 from sim.world.rendering import GRID_PX, PAPER, Fold, Print, Sheet, View, Waviness, label_map
 from sim.world.sensors import Body, HotPattern, counts
 
-_SLANT: Final = 0.36  # Tangent of 20°: a projector beside the camera
+_SLANT: Final = 0.36  # Tangent of 20°, for a projector next to the camera.
 
-RIM_MM = 1.0  # Over which a stain's edge fades
+RIM_MM = 1.0  # Width of the soft edge of a stain, mm.
 
-_BACKDROP_REFLECTANCE: Final = 0.04  # Of what lies behind the print, at every wavelength: dark, as a backdrop should be
+_BACKDROP_REFLECTANCE: Final = 0.04  # Reflectance of the dark backdrop behind the print, at all wavelengths.
 
-# Rows that one thread works at. Noise is drawn block by block, so that another number gives other frames.
-_BLOCK_ROWS: Final = 64
+_BLOCK_ROWS: Final = 64  # Rows per block of work. Noise is drawn for each block, so another number gives other frames.
 
-_A0_DIAGONAL_MM: Final = math.hypot(1189, 841)  # Of a sheet of A0 (ISO 216)
+_A0_DIAGONAL_MM: Final = math.hypot(1189, 841)  # Diagonal of an A0 sheet (ISO 216), mm.
 
 _CHANNELS: Final = "RGB"
 
-Place = tuple[float, float, float, float]  # A rectangle: left, top, right, bottom, shares of the page
+Place = tuple[float, float, float, float]  # Rectangle on the page: left, top, right, bottom, relative to the page.
 
-# Share of the page by which the projected picture reaches beyond it where it is nearest: an operator zooms until the
-# whole sheet is lit, and a little more.
+# Share of the page by which the projected picture extends beyond its nearest edge, as an operator sets the zoom.
 OVERSCAN: Final = 0.04
 
-# Share of a blob's radius over which its edge fades: what stands a metre before the chart is out of focus.
+# Width of the soft edge of a blob, relative to its radius: objects 1 m in front of the chart are out of focus.
 _BLOB_RIM: Final = 0.15
 
-REFERENCE_APERTURE: Final = 8.0  # Also what a lens without contacts is set to by hand in the simulated room
-# The exposure at which `Room.white_level_share` holds.
+REFERENCE_APERTURE: Final = 8.0  # f-number; also of lenses without contacts, which are set by hand.
+
+# Exposure for which `Room.white_level_share` is defined.
 REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=REFERENCE_APERTURE, shutter_s=0.5)
 
 
 @dataclass(frozen=True)
 class Room:
-    """Everything about the lab that is not the chart's drawing and not the camera's body.
+    """Parameters of the laboratory, except the drawing of the chart and the camera.
 
-    - `seed`: of the paper's shape, the photosites' response and the noise; 0 or more.
-    - `fill`: the print's extent over the frame's, along whichever axis is the tighter.
-    - `focal_diagonals`: focal length over the frame's diagonal; 1.3 is 35 mm on APS-C. With `fill` it gives the
-      distance.
-    - `tilt_deg`, `pan_deg`, `roll_deg`: how the print is turned against the camera.
-    - `k1`, `k2`, `p1`, `p2`: brown's distortion in normalised coordinates, as OpenCV has it.
-    - `waviness_mm`: peak-to-valley height of the paper's surface on an A0 sheet; on another in proportion to its
-      diagonal, so that small charts look like large ones.
-    - `wave_mm`: wavelength of the paper's waves on an A0 sheet, in proportion as above: short ones, as paper gets in
-      damp air; 150 is plausible. 0: long ones, up to three over the sheet's longer side.
-    - `curl_mm`: how far the sheet's left and right edges stand off its middle, towards the camera, as paper from a roll
-      does; on an A0 sheet, in proportion as above. Negative: away from the camera.
-    - `blur_px`: standard deviation of the lens's blur, half-size pixels; the photosite's aperture is added to it.
-    - `shoulder_share`, `shoulder_px`: share of the light that lies in the wide part of the lens's point spread, and
-      that part's standard deviation along each axis, half-size pixels: an exponential (`sim.optics`,
-      with the MTF and two lenses).
-    - `veil`: veiling glare: share of the frame's mean light, backdrop included, that lies evenly on all of it.
-    - `lateral_red_px`, `lateral_blue_px`: lateral chromatic aberration: how far out the channel sees the frame's corner
-      against green, half-size pixels; towards the axis it falls off as `sim.optics` says. Negative:
-      inwards.
-    - `vignetting`: share of the light that the lens loses at the frame's corner.
-    - `projector_falloff`: share of the projector's light that is missing a page's half diagonal from its brightest
-      point.
-    - `primary_difference`: how differently the primaries fall off: their `projector_falloff` spreads by this share of
-      itself, and their brightest points by as much of the page's half diagonal.
-    - `lamp_spectrum`: ``uhp`` (mercury lamp and colour wheel) or ``led``.
-    - `transfer`: from code to light: ``srgb`` (IEC 61966-2-1) or the exponent of a power law.
-    - `black_leak`: share of a primary's full light that is there at code 0: 1 / contrast.
-    - `ambient`: light from elsewhere, as a share of the projector's white; of its colour, for it is taken to be stray
-      light.
-    - `white_level_share`: signal of bare paper in full white at `REFERENCE_EXPOSURE`, strongest channel, over
-      saturation − black.
-    - `lamp_drift_per_hour`: share of its light that the lamp loses in an hour; the room has no time, so whoever does
-      applies it as `lamp`.
-    - `response_spread`: standard deviation of the photosites' response (PRNU).
-    - `wheel_hz`: turns of the projector's colour wheel per second, each a third red, green and blue; 0 for steady
-      light. With a wheel, an exposure that is no whole number of turns, or starts and ends unsteadily, gets more of one
-      primary than of another, and frames differ from `signal` and `white` by that.
-    - `shutter_jitter_s`: standard deviation of the exposure time; matters with a wheel only.
-    - `stain_mm`, `stain_depth`: diameter of a stain somewhere on the print, 0 for none, and the share of blue light
-      that it takes; of green it takes six tenths of that, of red three. A thumb's is 25 mm across.
-    - `fold_mm`: how far a crease across the print stands off its plane, 0 for none.
-    - `hot_per_million`: photosites of a million whose dark current is out of proportion, the same in all frames, 0 for
-      none. 20 is plausible for an EOS 550D of ten years, 2 for an EOS 6D Mark II of three (chosen: several times what
-      `sim.world.sensors.HotPattern` has from the literature, as bodies are not delivered without any). Where a session
-      has dark frames, `build-lut` lists the cells in which one stands out by 30 counts and more as unfit, and
-      `generate` replaces their colours; a table computed by `sim table` has none, and keeps them in its images.
-    - `hot_dn_per_s`: mean excess of such a photosite, DN per second at ISO 100; exponentially distributed. Chosen: at
-      half a second the hottest of a hundred is nearly saturated.
-    - `profile`: ``unmanaged``: the file's codes are ink codes. ``managed``: a print shop's profile makes ink codes of
-      them, so that greys are grey (`sim.world.world`).
-    - `paper`: ``poster``, ``matt`` or ``glossy`` (`sim.spectral.paper`).
+    Parameters
+    ----------
+    seed
+        Seed of the shape of the paper, the response of photosites and the noise; 0 or more.
+    fill
+        Extent of the print relative to the frame, along the tighter axis.
+    focal_diagonals
+        Focal length relative to the diagonal of the frame; 1.3 is 35 mm on APS-C.
+    tilt_deg, pan_deg, roll_deg
+        Rotation of the print against the camera.
+    k1, k2, p1, p2
+        Distortion by Brown in normalised coordinates, as in OpenCV.
+    waviness_mm
+        Peak-to-valley height of the paper on an A0 sheet; proportional to the diagonal of other sheets.
+    wave_mm
+        Wavelength of the paper on an A0 sheet, also proportional; 150 is plausible for damp paper. 0: long waves,
+        up to three on the longer side.
+    curl_mm
+        Height of the left and right edges above the centre, towards the camera, on an A0 sheet, also proportional.
+    blur_px
+        Standard deviation of the lens blur, half-size pixels, without the aperture of the photosite.
+    shoulder_share, shoulder_px
+        Share of the light in the wide part of the point spread, and its standard deviation along each axis,
+        half-size pixels (`sim.optics`).
+    veil
+        Veiling glare: share of the mean light of the frame that is uniform on it.
+    lateral_red_px, lateral_blue_px
+        Outward shift of the channel relative to green in the corner, half-size pixels (`sim.optics`).
+    vignetting
+        Share of the light that the lens loses in the corner of the frame.
+    projector_falloff
+        Share of the projector's light that is lost half a page diagonal from its brightest point.
+    primary_difference
+        Relative difference of `projector_falloff` between primaries, and distance of their brightest points in half
+        page diagonals.
+    lamp_spectrum
+        ``uhp`` (mercury lamp and colour wheel) or ``led``.
+    transfer
+        From code to light: ``srgb`` (IEC 61966-2-1) or the exponent of a power law.
+    black_leak
+        Relative light of a primary at code 0: 1 / contrast.
+    ambient
+        Ambient light of the projector's colour, relative to its white.
+    white_level_share
+        Signal of bare paper under full white at `REFERENCE_EXPOSURE`, strongest channel, relative to saturation −
+        black.
+    lamp_drift_per_hour
+        Relative loss of lamp brightness per hour. The room has no time; callers apply it as `lamp`.
+    response_spread
+        Standard deviation of the response of photosites (PRNU).
+    wheel_hz
+        Rotations of the colour wheel per second, a third each red, green and blue; 0 for steady light. Exposures
+        that are not a whole number of rotations get different amounts of the primaries.
+    shutter_jitter_s
+        Standard deviation of the exposure time; has an effect with a colour wheel only.
+    stain_mm, stain_depth
+        Diameter of a stain on the print, 0 for none (a thumb: 25), and its absorption of blue light; of green 0.6
+        and of red 0.3 times this.
+    fold_mm
+        Height of a crease across the print, 0 for none.
+    hot_per_million
+        Photosites per million with high dark current, the same in all frames. 20 is plausible for an EOS 550D after
+        ten years, 2 for an EOS 6D Mark II after three. These are several times the numbers in
+        `sim.world.sensors.HotPattern`, as new bodies also have some (chosen). With dark frames, `build-lut` lists
+        patches with 30 counts of excess or more as unfit; `sim table` does not.
+    hot_dn_per_s
+        Mean excess of such a photosite, DN per second at ISO 100; exponentially distributed. At 0.5 s, the hottest
+        of a hundred is nearly saturated (chosen).
+    profile
+        ``unmanaged``: codes of the file are ink codes. ``managed``: a profile converts them, so that greys are
+        neutral.
+    paper
+        ``poster``, ``matt`` or ``glossy`` (`sim.spectral.paper`).
     """
 
     seed: int = 0
@@ -167,15 +185,12 @@ class Room:
     paper: PaperName = "poster"
 
     def light_of(self, codes: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
-        """Return the light of primaries, any shape, 0 … 1 of the full, that codes 0 … 255 of any integer dtype give."""
+        """Return the light of primaries, 0 to 1 of the full light, of integer codes 0 to 255 of any shape."""
         share = codes / 255
         return decode_srgb(share) if self.transfer == "srgb" else share**self.transfer
 
     def wheel_light(self, shutter_s: float, random: np.random.Generator) -> NDArray[np.float64]:
-        """Return (3,) float64, the light of each primary that the wheel lets through over that of steady light.
-
-        `shutter_s`: exposure time, seconds.
-        """
+        """Return the light (3,) float64 of each primary through the colour wheel, relative to steady light."""
         if self.wheel_hz == 0:
             return np.ones(3)
         start = random.uniform()
@@ -205,36 +220,32 @@ class Room:
 
 
 def read_room(seed: int, changes: Mapping[str, Any], where: str, key: str) -> Room:
-    """Return the default room with a seed and the changes of a settings file or a command line."""
-    known = [field.name for field in fields(Room) if field.name != "seed"]
-    return from_settings(Room, changes, where, key, known, seed=seed)
+    """Return the default room with a seed and the changes of a settings file or command line."""
+    names = [field.name for field in fields(Room) if field.name != "seed"]
+    return from_settings(Room, changes, where, key, names, seed=seed)
 
 
 @dataclass(frozen=True)
 class Stain:
-    """A round stain.
+    """A round stain on the print with a soft edge."""
 
-    - `centre_mm`: its middle on the print.
-    - `transmittance`: share of red, green and blue light that comes back through it, over that of clean paper.
-    """
-
-    centre_mm: tuple[float, float]
+    centre_mm: tuple[float, float]  # Centre on the print
     diameter_mm: float
-    transmittance: tuple[float, float, float]
+    transmittance: tuple[float, float, float]  # Reflected red, green and blue light relative to clean paper
 
     def passed(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the share (..., 3) of red, green and blue light that comes back from points (..., 2)."""
-        away = np.linalg.norm(points_mm - np.array(self.centre_mm), axis=-1) - self.diameter_mm / 2
-        cover = 1 / (1 + np.exp(np.clip(4 * away / RIM_MM, -40, 40)))
+        """Return the transmittance (..., 3) at points (..., 2)."""
+        distance = np.linalg.norm(points_mm - np.array(self.centre_mm), axis=-1) - self.diameter_mm / 2
+        cover = 1 / (1 + np.exp(np.clip(4 * distance / RIM_MM, -40, 40)))
         return 1 - cover[..., None] * (1 - np.array(self.transmittance))
 
 
-def worn(room: Room, page_mm: tuple[float, float], random: np.random.Generator) -> tuple[Stain | None, Fold | None]:
-    """Return a room's stain and fold, somewhere on a sheet of a size, clear of its edges; None where it has none."""
+def wear(room: Room, page_mm: tuple[float, float], random: np.random.Generator) -> tuple[Stain | None, Fold | None]:
+    """Draw the stain and the fold of a room at random positions away from the edges; None if it has none."""
     page = np.array(page_mm)
     x, y = (page * random.uniform(0.25, 0.75, 2)).tolist()
-    taken = room.stain_depth * np.array([0.3, 0.6, 1.0])
-    red, green, blue = (1 - taken).tolist()
+    absorbed = room.stain_depth * np.array([0.3, 0.6, 1.0])
+    red, green, blue = (1 - absorbed).tolist()
     stain = Stain((x, y), room.stain_mm, (red, green, blue)) if room.stain_mm else None
     along = math.radians(random.uniform(-6, 6))
     crease = float(page[0] * random.uniform(0.3, 0.7)), float(page[1] / 2)
@@ -242,26 +253,22 @@ def worn(room: Room, page_mm: tuple[float, float], random: np.random.Generator) 
     return stain, Fold(crease, direction, room.fold_mm, _SLANT) if room.fold_mm else None
 
 
-def _from_middle(place: Place, at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return how far points (..., 2) lie from the middle of a place, across and down: 1 at its sides."""
+def _relative_position(place: Place, at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    # Position relative to the centre of a rectangle, across and down: ±1 at its sides.
     left, top, right, bottom = place
     return (2 * at[..., 0] - left - right) / (right - left), (2 * at[..., 1] - top - bottom) / (bottom - top)
 
 
 @dataclass(frozen=True)
 class Patch:
-    """A rectangle of another colour in the projected picture.
-
-    - `place`: where it falls.
-    - `share`: of the exposure's time that it is there, 0 … 1.
-    """
+    """A rectangle of another colour in the projected picture."""
 
     place: Place
     colour: Colour
-    share: float = 1.0
+    share: float = 1.0  # Share of the exposure time, 0 to 1
 
     def cover(self, at: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether points (..., 2) of the page, in shares of it, lie in the rectangle: (...) bool."""
+        """Return whether points (..., 2), relative to the page, are in the rectangle: (...) bool."""
         left, top, right, bottom = self.place
         x, y = at[..., 0], at[..., 1]
         return (x >= left) & (x < right) & (y >= top) & (y < bottom)
@@ -269,80 +276,59 @@ class Patch:
 
 @dataclass(frozen=True)
 class Blob:
-    """Something dark between the chart and the camera, with a soft edge: an ellipse that touches its place's sides.
-
-    - `place`: where it is seen.
-    - `left`: light that comes from there, over that of the chart behind it, 0 … 1.
-    """
+    """A dark object between chart and camera: an ellipse with a soft edge that fills a rectangle."""
 
     place: Place
-    left: float = 0.08
+    left: float = 0.08  # Relative light from there, 0 to 1
 
     def passed(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the share (...) of the chart's light that is seen at points (..., 2) of the page, shares of it."""
-        across, down = _from_middle(self.place, at)
+        """Return the relative light (...) at points (..., 2), relative to the page."""
+        across, down = _relative_position(self.place, at)
         inside = np.clip((1 + _BLOB_RIM / 2 - np.hypot(across, down)) / _BLOB_RIM, 0, 1)
         return 1 - (1 - self.left) * inside * inside * (3 - 2 * inside)
 
 
 @dataclass(frozen=True)
 class Glare:
-    """Light that the print's surface mirrors into the camera, unlike what ink and paper scatter: a broad, soft spot.
+    """Specular reflection of the print: a broad, soft ellipse with the colour of projector and ambient light."""
 
-    - `place`: where it is seen: an ellipse that touches the sides of its place at 1 / e² of its light in the middle.
-    - `share`: of the light that bare paper sends there; it has the colour of the projector's light, ambient light
-      included.
-    """
-
-    place: Place
-    share: float = 0.03
+    place: Place  # The ellipse touches its sides at 1 / e² of its maximum
+    share: float = 0.03  # Relative to the light from bare paper
 
     def added(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mirrored light (...) at points (..., 2) of the page, shares of it, over that of bare paper."""
-        across, down = _from_middle(self.place, at)
+        """Return the reflected light (...) at points (..., 2), relative to the page, relative to bare paper."""
+        across, down = _relative_position(self.place, at)
         return self.share * np.exp(-2 * (across**2 + down**2))
 
 
 @dataclass(frozen=True, eq=False)
 class Situation:
-    """What is otherwise than in the undisturbed room while one frame is exposed.
+    """Differences from the undisturbed room during one frame."""
 
-    - `lamp`: light of each primary over the undisturbed.
-    - `ambient`: light from elsewhere, of each primary's colour, as a share of its full light; added to the room's own.
-    - `picture`: (h, w, 3) float32, what the projector shows during the exposure: the mean over its time of each
-      primary's light, 0 … 1 of the full (the codes decoded, not the codes). None: one plain colour. `projected_mm` is
-      where it falls.
-    - `patches`: of other colours in the picture, each over those before it.
-    - `blobs`: what stands before the chart.
-    - `glares`: what the print mirrors into the camera.
-    - `bump_px`, `bump_mm`: how far the chart has moved in its plane, right and down, in half-size pixels at its middle
-      and in millimetres; both count.
-    - `turn_deg`: how far it has turned about its middle, clockwise as seen.
-    - `defocus_px`: standard deviation of further blur, half-size pixels.
-    - `black_dn`: how far the black level lies above the body's, DN.
-    """
-
-    lamp: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    lamp: tuple[float, float, float] = (1.0, 1.0, 1.0)  # Relative light of each primary
+    # Additional ambient light of each primary, relative to its full light
     ambient: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # (h, w, 3) float32, mean light of the projected picture, 0 to 1 of each primary; None: one uniform colour
     picture: NDArray[np.float32] | None = None
-    patches: tuple[Patch, ...] = ()
-    blobs: tuple[Blob, ...] = ()
-    glares: tuple[Glare, ...] = ()
+    patches: tuple[Patch, ...] = ()  # Rectangles of other colours in the picture, later ones on top
+    blobs: tuple[Blob, ...] = ()  # Objects in front of the chart
+    glares: tuple[Glare, ...] = ()  # Specular reflections of the print
+    # Shift of the chart in its plane, right and down, half-size pixels at its centre; adds to `bump_mm`
     bump_px: tuple[float, float] = (0.0, 0.0)
-    bump_mm: tuple[float, float] = (0.0, 0.0)
-    turn_deg: float = 0.0
-    defocus_px: float = 0.0
-    black_dn: float = 0.0
+    bump_mm: tuple[float, float] = (0.0, 0.0)  # Shift of the chart, right and down, mm
+    turn_deg: float = 0.0  # Rotation about the centre of the chart, clockwise
+    defocus_px: float = 0.0  # Standard deviation of additional blur, half-size pixels
+    black_dn: float = 0.0  # Increase of the black level, DN
 
     @property
     def is_even(self) -> bool:
-        """Whether every place of the chart gets, and shows, the same share of each primary's light."""
+        """Whether all positions of the chart have the same share of the light of each primary."""
         plain = self.picture is None or self.picture.shape[:2] == (1, 1)
         return plain and not self.patches and not self.blobs and not self.glares
 
     @property
     def view(self) -> tuple[float, ...]:
-        """What decides how the chart lies in the picture; equal values have one rendering."""
+        """Position and sharpness of the chart; situations with equal values share one rendering."""
         return (*self.bump_px, *self.bump_mm, self.turn_deg, self.defocus_px)
 
     def shown(
@@ -352,10 +338,10 @@ class Situation:
         plain: NDArray[np.float64],
         decoded: Callable[[Colour], NDArray[np.float64]],
     ) -> NDArray[np.float64]:
-        """Return how much of each primary the projected picture has at points of the print.
+        """Return the relative light (..., 3) float64 of each primary in the picture at points of the print.
 
-        `points_mm`: (..., 2) float64. `plain`: (3,) float64, 0 … 1, the plain colour, where there is no `picture`.
-        `decoded`: returns (3,) float64, 0 … 1, the light of a colour's codes. Returns (..., 3) float64, 0 … 1.
+        `points_mm`: (..., 2) float64. `plain`: (3,) float64, uniform colour, if there is no `picture`. `decoded`
+        returns the light (3,) of the codes of a colour.
         """
         if self.picture is None:
             light = np.broadcast_to(plain, (*points_mm.shape[:-1], 3)).copy()
@@ -370,7 +356,7 @@ class Situation:
         return light
 
     def passed(self, points_mm: NDArray[np.float64], page_mm: tuple[float, float]) -> NDArray[np.float64]:
-        """Return the share (...) float64 of the chart's light that gets past what stands before points (..., 2) mm."""
+        """Return the relative light (...) float64 that passes objects in front of points (..., 2) mm."""
         at = points_mm / np.array(page_mm)
         left = np.ones(points_mm.shape[:-1])
         for blob in self.blobs:
@@ -378,7 +364,7 @@ class Situation:
         return left
 
     def mirrored(self, points_mm: NDArray[np.float64], page_mm: tuple[float, float]) -> NDArray[np.float64]:
-        """Return the light (...) float64 that points (..., 2) mm of the print mirror, over what bare paper sends."""
+        """Return the specularly reflected light (...) float64 at points (..., 2) mm, relative to bare paper."""
         at = points_mm / np.array(page_mm)
         added = np.zeros(points_mm.shape[:-1])
         for glare in self.glares:
@@ -386,11 +372,11 @@ class Situation:
         return added
 
 
-UNDISTURBED: Final = Situation()  # Nothing is otherwise
+UNDISTURBED: Final = Situation()  # No differences.
 
 
 def projected_mm(page_mm: tuple[float, float], aspect: float) -> Place:
-    """Return where the projected picture falls, mm on the print: centred, covering the page and `OVERSCAN`."""
+    """Return the rectangle of the projected picture, mm on the print: centred, covering the page and `OVERSCAN`."""
     width, height = (side * (1 + 2 * OVERSCAN) for side in page_mm)
     width, height = max(width, height * aspect), max(height, width / aspect)
     x, y = page_mm[0] / 2, page_mm[1] / 2
@@ -398,10 +384,10 @@ def projected_mm(page_mm: tuple[float, float], aspect: float) -> Place:
 
 
 def sampled(picture: NDArray[np.float32], place_mm: Place, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a picture's values at points of the print, interpolated linearly; its edge goes on beyond it.
+    """Interpolate a picture linearly at points of the print; edge values continue outside.
 
-    `picture`: (h, w, 3) float32. `place_mm`: where its corners fall, mm. `points_mm`: (..., 2) float64. Returns (...,
-    3) float64.
+    `picture`: (h, w, 3) float32. `place_mm`: its rectangle, mm. `points_mm`: (..., 2) float64. Returns (..., 3)
+    float64.
     """
     from scipy.ndimage import map_coordinates
 
@@ -414,33 +400,33 @@ def sampled(picture: NDArray[np.float32], place_mm: Place, points_mm: NDArray[np
     return np.stack(channels, axis=-1)
 
 
-def moved(
+def displaced(
     points_mm: NDArray[np.float64], middle_mm: ArrayLike, by_mm: ArrayLike, turn_deg: float
 ) -> NDArray[np.float64]:
-    """Return where points of the chart are after it was turned about its middle and then pushed.
+    """Return the positions of points of the chart after a rotation about `middle_mm` and a shift `by_mm`.
 
-    `points_mm`: (..., 2) float64. `middle_mm`, `by_mm`: (2,) float64, where it turns, and how far it is pushed. Returns
-    (..., 2) float64, mm in the room's own coordinates, which are those of the chart before.
+    `points_mm`: (..., 2) float64. Returns (..., 2) float64, mm, in the coordinates of the chart before.
     """
-    return (points_mm - np.asarray(middle_mm)) @ _turned(turn_deg).T + np.asarray(middle_mm) + np.asarray(by_mm)
+    return (points_mm - np.asarray(middle_mm)) @ _rotation(turn_deg).T + np.asarray(middle_mm) + np.asarray(by_mm)
 
 
-def moved_back(
+def undisplaced(
     points_mm: NDArray[np.float64], middle_mm: ArrayLike, by_mm: ArrayLike, turn_deg: float
 ) -> NDArray[np.float64]:
-    """Return which points (..., 2) float64, mm, of the chart lie at places (..., 2) of the room: `moved` undone."""
-    return (points_mm - np.asarray(by_mm) - np.asarray(middle_mm)) @ _turned(turn_deg) + np.asarray(middle_mm)
+    """Return the points (..., 2) float64, mm, of the chart at positions (..., 2): inverse of `displaced`."""
+    return (points_mm - np.asarray(by_mm) - np.asarray(middle_mm)) @ _rotation(turn_deg) + np.asarray(middle_mm)
 
 
-def _turned(turn_deg: float) -> NDArray[np.float64]:
+def _rotation(turn_deg: float) -> NDArray[np.float64]:
     cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     return np.array([[cosine, -sine], [sine, cosine]])
 
 
 class World:
-    """A print, a body and a room; the rules stand at the head of this file.
+    """A print, a camera and a room.
 
-    The first frame takes a few seconds for the rendering, which is kept: 12 bytes a photosite. Any thread may ask.
+    The first frame takes some seconds for the rendering, which is kept: 12 bytes per photosite. Methods may be called
+    by several threads.
     """
 
     def __init__(self, sheet: Print, body: Body, room: Room) -> None:
@@ -448,7 +434,7 @@ class World:
         self.body = body
         self.room = room
         rows, columns = body.half_size
-        self.stain, self.fold = worn(room, sheet.page_mm, self._random(5))
+        self.stain, self.fold = wear(room, sheet.page_mm, self._random(5))
         self.view = View.framed(
             sheet_of(room, sheet.page_mm, self.fold),
             (columns, rows),
@@ -483,10 +469,20 @@ class World:
         lamp: float = 1.0,
         situation: Situation = UNDISTURBED,
     ) -> NDArray[np.uint16]:
-        """Return a frame.
+        """Return a frame: counts (rows, columns) uint16 of the whole sensor, including masked borders.
 
-        `settings`: light grows with shutter time and ISO speed and falls with the square of the f-number. Returns
-        (rows, columns) uint16, the whole sensor's counts, masked borders included; never above saturation.
+        Parameters
+        ----------
+        colour
+            Displayed colour.
+        settings
+            Exposure; the signal is proportional to shutter time, ISO speed and 1 / f-number².
+        key
+            Key of the noise.
+        lamp
+            Relative lamp brightness.
+        situation
+            Differences from the undisturbed room.
         """
         body, room = self.body, self.room
         of_lamp = lamp * room.wheel_light(settings.shutter_s, self._random(4, *key)) * np.array(situation.lamp)
@@ -505,12 +501,12 @@ class World:
                 part = light[:, top - visible.top : bottom - visible.top] if seen else light[:, : bottom - top, :0]
                 noise_rows, rows = noise[top - first : bottom - first], frame[top:bottom]
                 counts(part, weights, noise_rows, visible.left, black, noise_dn, gain_e, body.saturation, rows)
-            self._heat(frame[first:last], noise, light, weights, settings, first)
+            self._raise_hot_counts(frame[first:last], noise, light, weights, settings, first)
 
-        _in_blocks(body.sensor[0], block)
+        _run_in_blocks(body.sensor[0], block)
         return frame
 
-    def _heat(
+    def _raise_hot_counts(
         self,
         frame: NDArray[np.uint16],
         noise: NDArray[np.float32],
@@ -519,59 +515,59 @@ class World:
         settings: ExposureSettings,
         first: int,
     ) -> None:
-        """Raise the counts of hot photosites among some rows of a frame, the first of which is `first`."""
+        # `frame` has the rows of the sensor from `first`.
         hot, visible = self.hot.within(first, first + len(frame)), self.body.visible
         y, x = hot.rows + first - visible.top, hot.columns - visible.left
         seen = (y >= 0) & (y < visible.height) & (x >= 0) & (x < visible.width)
-        lit = np.zeros(len(hot.rows))
-        lit[seen] = drive.astype(np.float64) @ light[:, y[seen], x[seen]]
-        hot.raise_counts(frame, noise, lit, self.body, settings.iso, settings.shutter_s)
+        hot_light = np.zeros(len(hot.rows))
+        hot_light[seen] = drive.astype(np.float64) @ light[:, y[seen], x[seen]]
+        hot.raise_counts(frame, noise, hot_light, self.body, settings.iso, settings.shutter_s)
 
     def _lighting(
         self, colour: Colour, settings: ExposureSettings, lamp: NDArray[np.float64], situation: Situation
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return light (3, rows, columns) on the photosites and weights (3,), whose product is a frame's signal."""
+        """Return light (3, rows, columns) and weights (3,); their product is the signal of a frame."""
         (light, veil), ambient = self._render(situation), np.array(situation.ambient)
         plain = self.decoded(colour) if situation.picture is None else situation.picture[0, 0].astype(np.float64)
         if situation.is_even:
             return light, self._collected(plain, settings, lamp, ambient).astype(np.float32)
         nodes, page = self._nodes(UNDISTURBED), self.sheet.page_mm
-        falling = np.empty_like(light)
+        frame_light = np.empty_like(light)
 
         def block(first: int, last: int) -> None:
             points = self._points(nodes, first, last)
             shown = self._collected(situation.shown(points, page, plain, self.decoded), settings, lamp, ambient)
             shown *= situation.passed(points, page)[..., None]
-            there = self.lens.unveiled(light[:, first:last], veil, first)
+            patch_light = self.lens.unveiled(light[:, first:last], veil, first)
             if situation.glares:
-                there = there + self._mirrored(points, situation, first)
-            falling[:, first:last] = there * shown.transpose(2, 0, 1)
+                patch_light = patch_light + self._mirrored(points, situation, first)
+            frame_light[:, first:last] = patch_light * shown.transpose(2, 0, 1)
 
-        _in_blocks(self.body.visible.height, block)
-        self.lens.veiled(falling, self.body.pattern)
-        return falling, np.ones(3, dtype=np.float32)
+        _run_in_blocks(self.body.visible.height, block)
+        self.lens.veiled(frame_light, self.body.pattern)
+        return frame_light, np.ones(3, dtype=np.float32)
 
     def _mirrored(self, points: NDArray[np.float64], situation: Situation, first: int) -> NDArray[np.float32]:
-        """Return (3, rows, columns) float32: what photosites of rows from `first` on get by mirroring, as `_render`."""
+        """Return the specular reflection (3, rows, columns) float32 on rows from `first`, in the units of `_render`."""
         row, column = np.mgrid[first : first + len(points), : points.shape[1]]
         paper = self._signals(self._reflectance([PAPER]))[0][self._channels()[row % 2, column % 2]]
         added = situation.mirrored(points, self.sheet.page_mm)[..., None] * self.field(points) * paper
         return added.transpose(2, 0, 1).astype(np.float32)
 
     def _channels(self) -> NDArray[np.int64]:
-        """Return (2, 2) int64: the camera channel of a photosite by the parity of its row and column."""
+        # (2, 2) int64, camera channel by parity of row and column.
         return np.array([_CHANNELS.index(letter) for letter in self.body.pattern], dtype=np.int64).reshape(2, 2)
 
     def decoded(self, colour: Colour) -> NDArray[np.float64]:
-        """Return (3,) float64, 0 … 1: the light of each primary that a colour's codes stand for."""
+        """Return the light (3,) float64 of each primary for the codes of a colour, 0 to 1."""
         return self._light_of_code[list(colour)]
 
     def signal(
         self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0, situation: Situation = UNDISTURBED
     ) -> NDArray[np.float32]:
-        """Return what a frame would be without noise, black, hot photosites and clipping, by a wheel's mean light.
+        """Return the signal (rows, columns) float32 of the visible photosites, DN above black, with their response.
 
-        Returns (rows, columns) float32, DN above black, of the body's visible photosites, their response included.
+        Without noise, hot photosites, clipping and colour wheel.
         """
         light, drive = self._lighting(colour, settings, lamp * np.array(situation.lamp), situation)
         return np.tensordot(drive, light, 1)
@@ -579,26 +575,22 @@ class World:
     def project(
         self, points_mm: NDArray[np.float64], channel: str = "G", situation: Situation = UNDISTURBED
     ) -> NDArray[np.float64]:
-        """Return the half-size pixels where points of the print are seen.
-
-        `points_mm`: (..., 2) float64, millimetres. Returns (..., 2) float64, x then y.
-        """
+        """Return the half-size pixels (..., 2) float64, x and y, of points (..., 2) mm of the print."""
         points = np.asarray(points_mm, dtype=np.float64)
         if any(situation.view):
-            points = moved(points, np.array(self.sheet.page_mm) / 2, self._bumped(situation), situation.turn_deg)
+            points = displaced(points, np.array(self.sheet.page_mm) / 2, self._shift_mm(situation), situation.turn_deg)
         return self.lens.shifted(self.view.project(points), channel)
 
     def white(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
-        """Return (3,) float64: R, G, B of bare paper in DN above black, without clipping, where `field` is 1."""
+        """Return R, G, B (3,) float64 of bare paper where `field` is 1, DN above black, without clipping."""
         return self.reflected([PAPER], colour, settings, lamp)[0]
 
     def reflected(
         self, rgb: ArrayLike, colour: Colour, settings: ExposureSettings, lamp: float = 1.0
     ) -> NDArray[np.float64]:
-        """Return the true linear camera RGB of printed codes.
+        """Return the exact linear camera RGB (N, 3) float64 of printed codes where `field` is 1.
 
-        `rgb`: (N, 3) float or int codes 0 … 255. Returns (N, 3) float64, DN above black where `field` is 1, leak and
-        ambient light included, without clipping.
+        `rgb`: (N, 3) codes 0 to 255. In DN above black, with black leak and ambient light, without clipping.
         """
         return self._signals(self._reflectance(rgb)) @ self.drive(colour, settings, lamp)
 
@@ -610,20 +602,20 @@ class World:
         settings: ExposureSettings,
         lamp: float = 1.0,
     ) -> NDArray[np.float64]:
-        """Return the true linear camera RGB of printed codes at points of the print, in the light that falls there.
+        """Return the exact linear camera RGB (N, 3) float64 of printed codes at points of the print, without blur.
 
-        `rgb`: (N, 3) float or int codes 0 … 255. `points_mm`: (N, 2) float64. Returns (N, 3) float64, DN above black,
-        without clipping: what the photosites there get where nothing is blurred, stain and fold included.
+        `rgb`: (N, 3) codes 0 to 255. `points_mm`: (N, 2) float64. In DN above black, with stain and fold, without
+        clipping.
         """
         light = self.field(points_mm) * self.drive(colour, settings, lamp)
         return np.einsum("ncp,np->nc", self._signals(self._reflectance(rgb)), light) * self.worn(points_mm)
 
     def of_primaries(self, rgb: ArrayLike, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what printed codes at points of a clean flat print give under each primary alone, at full drive.
+        """Return the signal of printed codes at points of a clean flat print under each primary at full brightness.
 
-        `rgb`: (N, 3) float or int codes 0 … 255. `points_mm`: (N, 2) float64. Returns (N, 3, 3) float64, DN above black
-        at the reference exposure, [point, channel, primary], where nothing is blurred. Its product with `drive` is
-        `seen`, without stain and fold.
+        `rgb`: (N, 3) codes 0 to 255. `points_mm`: (N, 2) float64. Returns (N, 3, 3) float64 [point, channel, primary],
+        DN above black at the reference exposure, without blur. Its product with `drive` is `seen` without stain and
+        fold.
         """
         return self._signals(self._reflectance(rgb)) * self.field(points_mm)[:, None]
 
@@ -634,10 +626,10 @@ class World:
         lamp: float | NDArray[np.float64] = 1.0,
         ambient: float | NDArray[np.float64] = 0.0,
     ) -> NDArray[np.float64]:
-        """Return (3,) float64: how much of each primary's light at full drive a frame collects, gain included.
+        """Return the exposure (3,) float64 to each primary, relative to full brightness at the reference exposure.
 
-        Parameters are those of `expose`; `lamp` may be (3,), of each primary its own, and so may `ambient`, which is
-        added to the room's.
+        Parameters as in `expose`. `lamp` and `ambient`, which is added to the ambient light of the room, may have one
+        value per primary.
         """
         return self._collected(self.decoded(colour), settings, lamp, ambient)
 
@@ -657,11 +649,7 @@ class World:
         return shown * time * opening * (settings.iso / reference.iso)
 
     def worn(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what stain and fold leave of the light of a clean flat print.
-
-        `points_mm`: (..., 2) float64. Returns (..., 3) float64 for red, green and blue of the camera; 1 where the print
-        is clean and flat.
-        """
+        """Return the relative light (..., 3) float64 in R, G, B that stain and fold leave at points (..., 2) mm."""
         points = np.asarray(points_mm, dtype=np.float64)
         left = np.ones((*points.shape[:-1], 3))
         if self.stain is not None:
@@ -671,12 +659,12 @@ class World:
         return left
 
     def field(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the light at points of the print: lens vignetting times the projector's falloff.
+        """Return the light at points of the print: lens vignetting times fall-off of the projector.
 
-        `points_mm`: (..., 2) float64. Returns (..., 3) float64, for each primary of the projector (red, green, blue).
-        The lens is 1 on its axis and green 1 at its brightest point; red and blue are balanced so that the three have
-        one mean over the sheet. So `white` has the chromaticity of the light that the sheet receives on the whole. A
-        camera channel sees the mean of the three weighted by what it receives of each.
+        `points_mm`: (..., 2) float64. Returns (..., 3) float64 for each primary. The lens is 1 on its axis and green is
+        1 at its brightest point. Red and blue are balanced to the same mean over the sheet, so `white` has the
+        chromaticity of the mean light. A camera channel has the mean of the primaries, weighted by its signal from
+        each.
         """
         points = np.asarray(points_mm, dtype=np.float64)
         photosites = 2 * self.project(points) + 0.5
@@ -686,18 +674,17 @@ class World:
         return passed[..., None] * self._falloff[:, 3] / (1 + self._falloff[:, 2] * from_spot)
 
     def _balance(self) -> NDArray[np.float64]:
-        """Return (3,) the gains of the primaries that give all three green's mean over the sheet."""
+        # Gains of the primaries, so that all have the mean of green over the sheet.
         width, height = self.sheet.page_mm
         x, y = np.meshgrid((np.arange(60) + 0.5) * width / 60, (np.arange(40) + 0.5) * height / 40)
         means = self.field(np.stack([x, y], axis=-1)).mean(axis=(0, 1))
         return means[1] / means
 
     def _reflectance(self, rgb: ArrayLike) -> NDArray[np.float64]:
-        """Return (N, 81): reflectance of the chart's codes (N, 3) on this print."""
         return printed_reflectance(rgb, self.room.profile, self.room.paper)
 
     def _signals(self, reflectance: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (N, 3, 3): DN of (N, 81) reflectances at the reference exposure, [colour, channel, primary]."""
+        """Return DN (N, 3, 3) [colour, channel, primary] of reflectances (N, 81) at the reference exposure."""
         seen = self._primaries[None] * self._sensitivities.T[:, None] * self._dn
         return (reflectance @ seen.reshape(9, -1).T).reshape(-1, 3, 3)
 
@@ -705,19 +692,15 @@ class World:
         return np.random.Generator(np.random.SFC64([self.room.seed, *key]))
 
     def _render(self, situation: Situation = UNDISTURBED) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return (3, rows, columns) and (3, 2, 2) float32: DN of the visible photosites under each primary alone.
-
-        The second is the veil's part of it, by the parity of row and column. Kept are the undisturbed rendering and one
-        other: a chart is bumped once, then it stays.
-        """
+        """Return DN (3, rows, columns) float32 under each primary, and its veiling glare (3, 2, 2) by parity."""
         with self._lock:
             if situation.view not in self._rendered:
-                kept = self._rendered.get(UNDISTURBED.view)
-                self._rendered = {} if kept is None else {UNDISTURBED.view: kept}
-                self._rendered[situation.view] = self._lit(situation)
+                undisturbed = self._rendered.get(UNDISTURBED.view)
+                self._rendered = {} if undisturbed is None else {UNDISTURBED.view: undisturbed}
+                self._rendered[situation.view] = self._render_new(situation)
             return self._rendered[situation.view]
 
-    def _lit(self, situation: Situation) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _render_new(self, situation: Situation) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         from sim.world.rendering import light
 
         visible, room = self.body.visible, self.room
@@ -733,7 +716,7 @@ class World:
         out = np.empty((3, visible.height, visible.width), dtype=np.float32)
         # The projector stays where it is.
         falloff = self._falloff.copy()
-        falloff[:, :2] = self._moved_back(falloff[:, :2], situation)
+        falloff[:, :2] = self._undisplaced(falloff[:, :2], situation)
 
         places, lines, spread = np.stack(views), (drawing.x_lines, drawing.y_lines), room.shoulder_share > 0
 
@@ -748,33 +731,31 @@ class World:
         def respond(first: int, last: int) -> None:
             out[:, first:last] *= self._response(first, last)
 
-        _in_blocks(visible.height, block)
+        _run_in_blocks(visible.height, block)
         if spread:
             self.lens.spread(out)
-            _in_blocks(visible.height, respond)
+            _run_in_blocks(visible.height, respond)
         return out, self.lens.veiled(out, self.body.pattern)
 
     def _response(self, first: int, last: int) -> NDArray[np.float32]:
-        """Return (rows, columns) float32, about 1: the response of the photosites of a block of rows."""
+        # Response (rows, columns) float32 of the photosites of a block of rows.
         response = self._random(3, first).standard_normal((last - first, self.body.visible.width), dtype=np.float32)
         response *= np.float32(self.room.response_spread)
         response += np.float32(1)
         return response
 
-    def _moved_back(self, points_mm: NDArray[np.float64], situation: Situation) -> NDArray[np.float64]:
-        """Return which points of the chart lie where, undisturbed, points (..., 2) mm of it lie."""
+    def _undisplaced(self, points_mm: NDArray[np.float64], situation: Situation) -> NDArray[np.float64]:
         if not any(situation.view):
             # Rounding would make other counts of the undisturbed chart, here and there one.
             return points_mm
-        return moved_back(points_mm, np.array(self.sheet.page_mm) / 2, self._bumped(situation), situation.turn_deg)
+        return undisplaced(points_mm, np.array(self.sheet.page_mm) / 2, self._shift_mm(situation), situation.turn_deg)
 
-    def _bumped(self, situation: Situation) -> NDArray[np.float64]:
-        """Return (2,) float64 mm, how far the chart has been pushed."""
+    def _shift_mm(self, situation: Situation) -> NDArray[np.float64]:
         view = self.view
         return np.array(situation.bump_mm) + np.array(situation.bump_px) * (view.distance_mm / view.focal_px)
 
     def _points(self, nodes: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:
-        """Return (rows, columns, 2) float64, mm: the places on the print that some rows of photosites see."""
+        """Return the points (rows, columns, 2) float64 of the print, mm, at rows of photosites."""
         from scipy.ndimage import map_coordinates
 
         row, column = np.mgrid[first:last, : self.body.visible.width]
@@ -784,31 +765,31 @@ class World:
     def _worn_rows(
         self, nodes: NDArray[np.float64], channels: NDArray[np.int64], first: int, last: int
     ) -> NDArray[np.float32]:
-        """Return (rows, columns) float32: what stain and fold leave of the light on each photosite of some rows."""
+        # Relative light (rows, columns) float32 that stain and fold leave on the photosites of some rows.
         row, column = np.mgrid[first:last, : self.body.visible.width]
         points = self._points(nodes, first, last)
         channel = channels[row % 2, column % 2]
         return np.take_along_axis(self.worn(points), channel[..., None], axis=-1)[..., 0].astype(np.float32)
 
     def _nodes(self, situation: Situation, channel: str = "G") -> NDArray[np.float64]:
-        """Return (ny, nx, 2) float64: the place on the print of every 16th photosite, one node beyond on each side."""
+        # Points of the print (ny, nx, 2), mm, at every 16th photosite, with one more node on each side.
         visible = self.body.visible
         y, x = (np.arange(-1, (size - 1) // GRID_PX + 3) * GRID_PX for size in (visible.height, visible.width))
         photosites = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)
         seen = self.lens.unshifted((photosites - 0.5) / 2, channel)
-        return self._moved_back(self.view.locate(seen), situation)
+        return self._undisplaced(self.view.locate(seen), situation)
 
 
-def _in_blocks(rows: int, work: Callable[[int, int], None]) -> None:
-    """Call `work` for each block of rows (first, last + 1), on as many threads as there are processors."""
+def _run_in_blocks(rows: int, work: Callable[[int, int], None]) -> None:
+    # Calls `work(first, last + 1)` for each block of rows.
     firsts = range(0, rows, _BLOCK_ROWS)
     with ThreadPoolExecutor(processor_count()) as threads:
-        for done in [threads.submit(work, first, min(first + _BLOCK_ROWS, rows)) for first in firsts]:
-            done.result()
+        for future in [threads.submit(work, first, min(first + _BLOCK_ROWS, rows)) for first in firsts]:
+            future.result()
 
 
 def sheet_of(room: Room, page_mm: tuple[float, float], fold: Fold | None) -> Sheet:
-    """Return the shape of a room's sheet; waves and curl shrink with its size."""
+    """Return the shape of the sheet of a room; waves and curl are proportional to its size."""
     size = math.hypot(*page_mm) / _A0_DIAGONAL_MM
     waves = Waviness.random(room.seed, room.waviness_mm * size, page_mm, wave_mm=room.wave_mm * size)
     return Sheet(waves, room.curl_mm * size, fold)

@@ -171,7 +171,7 @@ def blank_pictures() -> Generator[None]:
 
     with pytest.MonkeyPatch.context() as patched:
         for page in ("calibration.report.report", "calibration.comparison.report"):
-            patched.setattr(f"{page}.png_of", blank)
+            patched.setattr(f"{page}.draw_png", blank)
         yield
 
 
@@ -220,7 +220,7 @@ def rendered_once() -> Generator[None]:
 
     The same charts hang in the same rooms in hundreds of tests.
     """
-    render = World._lit
+    render = World._render_new
 
     def kept(self: World, situation: Situation) -> Rendering:
         sheet = self.sheet
@@ -241,7 +241,7 @@ def rendered_once() -> Generator[None]:
         return found
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(World, "_lit", kept)
+        patched.setattr(World, "_render_new", kept)
         patched.setattr("calibration.pipeline.measuring.register", registered_once)
         yield
 

@@ -754,7 +754,7 @@ def test_what_a_body_has_left(lab: Lab) -> None:
     assert (supplies.battery, supplies.mains, supplies.saves_to_host) == (1.0, None, True)
     card = lab.eos._card
     assert card is not None
-    assert supplies.card_free_bytes == card.free
+    assert supplies.card_free_bytes == card.free_bytes
     lab.eos._card = None
     assert lab.camera.supplies().card_free_bytes is None
 

@@ -16,7 +16,7 @@ from drivers.links.usb import UsbPipes
 from drivers.ptp.codes import Operation, ResponseCode
 from drivers.ptp.protocol import Answer, NoAnswer, PtpRequest, PtpResponse, Responder
 from foundation.errors import DeviceError, DeviceRefused
-from foundation.files import whole_file
+from foundation.files import atomic_file
 from sim.camera.bodies import EOS_550D
 from tests.cable_faults import CutOff, TroubledResponder
 from tests.contracts.camera import SETTINGS
@@ -104,7 +104,7 @@ def test_a_series_on_a_bad_day_is_whole(tmp_path: Path, forgetful: bool) -> None
         for left in reversed(range(ATTEMPTS)):
             before = len(lab.film.frames)
             try:
-                with whole_file(tmp_path / f"{number:04d}.cr2") as stream:
+                with atomic_file(tmp_path / f"{number:04d}.cr2") as stream:
                     captured = capture(lab.camera, stream)
             except DeviceError as error:
                 failed += 1

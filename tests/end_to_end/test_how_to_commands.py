@@ -138,7 +138,7 @@ def unplotted() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patched:
         for page in ("reports.run_page", "experiments.comparing"):
-            patched.setattr(f"evaluation.{page}.svg_of", blank)
+            patched.setattr(f"evaluation.{page}.draw_svg", blank)
         yield
 
 

@@ -29,7 +29,7 @@ from drivers.serial_projectors.language import load_language
 from experiment.chart.model import load_chart
 from experiment.config import load_lab
 from experiment.session.folder import Session
-from foundation.clock import OPENING, Clock, SystemClock
+from foundation.clock import SIM_START, Clock, SystemClock
 from sim.buses.ptp import serve_ptpip
 from sim.buses.serial import PseudoTerminal
 from sim.buses.usb import PtpUsbDevice, SimulatedBus
@@ -126,7 +126,7 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
             one = read_raw(there.folder / ours.file)
             other = read_raw(real.folder / theirs.file)
             np.testing.assert_array_equal(one.sensor, other.sensor)
-            assert theirs.taken_at > OPENING
+            assert theirs.taken_at > SIM_START
 
 
 def test_check_reports_what_may_alter_the_light(

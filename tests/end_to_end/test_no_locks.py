@@ -13,7 +13,7 @@ import pytest
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("undrawn")]
 
-WARNING = "this file system has no locks; see to it that no other program works there"
+WARNING = "this file system has no locks; make sure that no other program uses the folder"
 
 
 def test_every_command_goes_on_without_locks(

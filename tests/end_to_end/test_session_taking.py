@@ -133,7 +133,7 @@ def test_a_run_that_is_told_to_end_closes_its_devices(
     with monkeypatch.context() as patched:
         patched.setattr(Journal, "commit", told_to_end)
         assert run("run", lab, session) == 130
-    assert "interrupted; run the same command again to go on" in capsys.readouterr().err
+    assert "interrupted; run the same command again to continue" in capsys.readouterr().err
     assert set(closed) == {"camera", "projector", "journal"}
     assert signal.getsignal(signal.SIGTERM) == before
     assert run("run", lab, session) == 0

@@ -1,16 +1,16 @@
-"""A session's time goes on, whatever the machine's clock is set to."""
+"""Dates of a session advance, even if the machine's clock is set."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
 
-from foundation.clock import SET_S, Clock, SteadyClock, SystemClock, elapsed_s
+from foundation.clock import MIN_STEP_S, Clock, SteadyClock, SystemClock, elapsed_s
 
 NOON = datetime(2026, 1, 1, 12, tzinfo=UTC)
 
 
 class SetClock:
-    """A machine's clock that somebody sets; seconds pass when told so."""
+    """Clock of a machine that is set by the test; its seconds pass only in the test."""
 
     def __init__(self) -> None:
         self.date = NOON
@@ -31,7 +31,7 @@ def steady(machine: SetClock, not_before: datetime | None = None) -> SteadyClock
     return SteadyClock(machine, not_before, machine.monotonic)
 
 
-def test_a_clock_that_is_set_back_or_forward_does_not_move_a_session_s_time() -> None:
+def test_setting_the_clock_does_not_change_session_time() -> None:
     machine = SetClock()
     clock: Clock = steady(machine)
     clock.sleep(5)
@@ -44,20 +44,20 @@ def test_a_clock_that_is_set_back_or_forward_does_not_move_a_session_s_time() ->
     assert clock.monotonic() == machine.seconds
 
 
-def test_that_a_clock_was_set_is_told_once() -> None:
+def test_reports_a_clock_step_once() -> None:
     machine = SetClock()
     clock = steady(machine, NOON + timedelta(hours=2))
-    assert clock.set_by_s() == 0, "it was behind at the start, and is told of that"
+    assert clock.step_s() == 0, "it was behind at the start, and is told of that"
     machine.date += timedelta(hours=1)
     clock.sleep(5)
-    assert clock.set_by_s() == 3600
-    machine.date -= timedelta(seconds=SET_S - 1)
-    assert clock.set_by_s() == 0
+    assert clock.step_s() == 3600
+    machine.date -= timedelta(seconds=MIN_STEP_S - 1)
+    assert clock.step_s() == 0
     machine.date -= timedelta(minutes=2)
-    assert clock.set_by_s() == -120 - (SET_S - 1)
+    assert clock.step_s() == -120 - (MIN_STEP_S - 1)
 
 
-def test_a_clock_that_is_behind_the_last_frame_goes_on_from_there() -> None:
+def test_starts_at_the_last_frame_if_the_clock_is_behind() -> None:
     last = NOON + timedelta(hours=3)
     clock = steady(SetClock(), last)
     assert clock.behind_s == 3 * 3600
@@ -68,7 +68,7 @@ def test_a_clock_that_is_behind_the_last_frame_goes_on_from_there() -> None:
     assert ahead.now() == NOON
 
 
-def test_the_machine_s_own_seconds_do_not_go_back() -> None:
+def test_elapsed_seconds_never_decrease() -> None:
     clock = SteadyClock(SystemClock())
     moments = [clock.now() for _ in range(100)]
     assert moments == sorted(moments)

@@ -1,4 +1,4 @@
-"""Colorimetry against colour-science, the standard's landmarks of sRGB, and angles that no formula may break."""
+"""Colorimetry compared with colour-science, values of the sRGB standard, and properties of angles."""
 
 from __future__ import annotations
 
@@ -27,14 +27,13 @@ WAVELENGTHS = np.arange(360.0, 781.0)
 
 @pytest.fixture(scope="module")
 def science() -> Any:
-    """Import colour-science, which takes more than a second."""
     import colour
 
     return colour
 
 
 @pytest.mark.slow
-def test_the_observer_is_the_cie_s_of_1931(science: Any) -> None:
+def test_observer_equals_cie_1931(science: Any) -> None:
     wavelengths, functions = observer_cie_1931()
     theirs = science.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     assert np.array_equal(wavelengths, theirs.wavelengths)
@@ -44,13 +43,13 @@ def test_the_observer_is_the_cie_s_of_1931(science: Any) -> None:
 
 
 @pytest.mark.slow
-def test_the_matrix_is_that_of_the_standard(science: Any) -> None:
+def test_matrix_equals_the_standard(science: Any) -> None:
     assert np.array_equal(XYZ_TO_SRGB, science.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB)
 
 
 @pytest.mark.slow
 @given(st.floats(1000, 25_000))
-def test_black_bodies_are_those_of_colour_science(science: Any, cct_k: float) -> None:
+def test_black_bodies_equal_colour_science(science: Any, cct_k: float) -> None:
     theirs = science.sd_blackbody(cct_k, science.SpectralShape(360, 780, 1))
     assert planck(WAVELENGTHS, cct_k) == pytest.approx(theirs.values, rel=1e-12)
     assert planck(WAVELENGTHS.astype(np.float32), cct_k) == pytest.approx(theirs.values, rel=1e-12)
@@ -58,7 +57,7 @@ def test_black_bodies_are_those_of_colour_science(science: Any, cct_k: float) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cct_k", CCTS_K)
-def test_the_plan_s_codes_are_those_that_colour_science_gives(science: Any, cct_k: float) -> None:
+def test_planned_codes_equal_colour_science(science: Any, cct_k: float) -> None:
     spectrum = science.sd_blackbody(cct_k, science.SpectralShape(360, 780, 1))
     xyz = np.asarray(science.sd_to_XYZ(spectrum, k=1.0))
     linear = np.asarray(science.XYZ_to_sRGB(xyz / xyz[1], apply_cctf_encoding=False))
@@ -66,12 +65,12 @@ def test_the_plan_s_codes_are_those_that_colour_science_gives(science: Any, cct_
     assert shown_colour(blackbody_light(cct_k)) == shown_colour(np.maximum(linear, 0))
 
 
-def test_a_light_that_is_scaled_has_the_same_xyz() -> None:
+def test_xyz_does_not_depend_on_the_scale_of_power() -> None:
     power = planck(WAVELENGTHS, 5000)
     assert xyz_of(WAVELENGTHS, 7 * power) == pytest.approx(xyz_of(WAVELENGTHS, power))
 
 
-def test_the_landmarks_of_the_standard() -> None:
+def test_transfer_function_has_the_values_of_the_standard() -> None:
     assert encode_srgb([0.0, 1.0]).tolist() == [0.0, pytest.approx(1.0)]
     assert encode_srgb(0.0031308) == pytest.approx(12.92 * 0.0031308)
     assert encode_srgb(0.18) == pytest.approx(0.4613561, abs=1e-7)
@@ -85,7 +84,7 @@ def test_decoding_undoes_encoding(linear: float) -> None:
     assert float(decode_srgb(encode_srgb(linear))) == pytest.approx(linear, abs=3e-8)
 
 
-def test_every_code_comes_back() -> None:
+def test_encoding_restores_every_code() -> None:
     codes = np.arange(256, dtype=np.uint8)
     back = srgb_codes(decode_srgb(codes / 255))
     assert back.dtype == np.uint8

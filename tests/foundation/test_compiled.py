@@ -1,4 +1,4 @@
-"""Machine code on disk is used again for the code it was made from only."""
+"""Cached machine code is used only for the sources and settings that it was compiled from."""
 
 from __future__ import annotations
 
@@ -60,32 +60,26 @@ ROOT = Path(__file__).parents[2]
 
 
 class Kernels:
-    """A copy of the decorator beside a kernel, and programs that call it.
+    """A copy of the decorator next to a kernel, and programs that call it; `cache` is the folder of compiled code."""
 
-    Attributes
-    ----------
-    cache
-        Where code is kept.
-    """
-
-    def __init__(self, folder: Path, forks: IO[str], said: IO[str]) -> None:
-        self.folder, self._forks, self._said = folder, forks, said
+    def __init__(self, folder: Path, forks: IO[str], errors: IO[str]) -> None:
+        self.folder, self._forks, self._errors = folder, forks, errors
         self.cache = folder / "cache"
 
     def write_power(self, exponent: int) -> None:
-        """Write the file that the kernel's code is in part compiled from."""
+        """Write the imported file on which the compiled code depends."""
         (self.folder / "kernels" / "power.py").write_text(POWER.format(exponent=exponent))
 
     def run(self, program: str, **settings: str) -> list[str]:
-        """Run a program, which is on no terminal, and return the lines that it prints and complains with."""
+        """Run a program without a terminal; return the lines of its stdout and stderr."""
         self._forks.write(json.dumps([program, settings]) + "\n")
         self._forks.flush()
-        lines = list(iter(lambda: self._said.readline().rstrip("\n"), "ended with 0"))
+        lines = list(iter(lambda: self._errors.readline().rstrip("\n"), "ended with 0"))
         assert not any(line.startswith("ended with") for line in lines), "the program failed"
         return lines
 
     def code(self) -> list[Path]:
-        """Return the files of kept code."""
+        """Return the files with cached code."""
         return list(self.cache.rglob("*.code"))
 
 
@@ -117,14 +111,14 @@ def process(folder: Path) -> Iterator[Kernels]:
 
 @pytest.fixture
 def kernels(process: Kernels) -> Kernels:
-    """Return the kernel as it was before anything was compiled."""
+    """Return the kernel before anything was compiled."""
     shutil.rmtree(process.cache, ignore_errors=True)
     process.write_power(2)
     return process
 
 
 @pytest.mark.slow
-def test_code_is_kept_for_its_very_sources_and_setting_while_it_is_whole(kernels: Kernels) -> None:
+def test_cached_code_depends_on_sources_settings_and_hash(kernels: Kernels) -> None:
     # Beside a copy of the decorator's files: numba by itself would go on with the old code.
     assert kernels.run(SQUARED) == ["25 True"]
     (kept,) = kernels.code()
@@ -148,7 +142,7 @@ print("numba" in sys.modules)
 
 
 @pytest.mark.slow
-def test_a_compiled_function_is_pickled_by_its_name_and_imported_without_numba(folder: Path) -> None:
+def test_pickles_by_name_without_importing_numba(folder: Path) -> None:
     program = [sys.executable, "-c", IMPORTED]
     assert subprocess.check_output(program, cwd=folder, env=environment(folder), text=True) == "False\n"
 
@@ -173,8 +167,8 @@ except RuntimeError as error:
 
 
 @pytest.mark.slow
-def test_a_compiled_function_is_there_where_nothing_can_be_kept(kernels: Kernels) -> None:
-    """Numba refuses to make a cached function where neither the package's folder nor the home folder is writable."""
+def test_compiles_without_a_writable_folder(kernels: Kernels) -> None:
+    """Numba cannot cache if neither the package's folder nor the home folder is writable."""
     assert kernels.run(NO_FOLDER) == ["25"]
     assert kernels.code() == []
 
@@ -190,7 +184,7 @@ def test_a_process_bound_to_one_processor_counts_one() -> None:
         os.sched_setaffinity(0, before)
 
 
-def test_where_nobody_can_say_all_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_counts_all_processors_without_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 7)
     assert processor_count() == 7
@@ -198,29 +192,29 @@ def test_where_nobody_can_say_all_are_counted(monkeypatch: pytest.MonkeyPatch) -
     assert processor_count() == 1
 
 
-def test_order_and_memory_are_bounded() -> None:
+def test_map_keeps_order_and_limits_its_queue() -> None:
     taken: list[int] = []
 
-    def things() -> Iterator[int]:
+    def items() -> Iterator[int]:
         for number in range(100):
             taken.append(number)
             yield number
 
-    for number, value in enumerate(ordered_map(lambda thing: thing**2, things(), 3)):
+    for number, value in enumerate(ordered_map(lambda item: item**2, items(), 3)):
         assert value == number**2
         assert len(taken) <= number + 7
 
 
-def test_what_has_not_begun_is_dropped_when_one_fails() -> None:
+def test_map_cancels_waiting_calls_after_an_error() -> None:
     begun: list[int] = []
     release = Event()
 
-    def work(thing: int) -> int:
-        begun.append(thing)
-        if thing == 0:
-            raise KeyError(thing)
+    def work(item: int) -> int:
+        begun.append(item)
+        if item == 0:
+            raise KeyError(item)
         release.wait()
-        return thing
+        return item
 
     pulling = ordered_map(work, range(1000), 2)
     release.set()

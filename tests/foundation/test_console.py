@@ -1,4 +1,4 @@
-"""Commands end with one line and a code, whatever happens; and what all of them take."""
+"""Exit codes, error lines, signals and common options of commands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
 
 from foundation import errors
 from foundation.console import (
-    Ending,
+    EndRequest,
     new_app,
     orderly_end,
     progress,
@@ -29,7 +29,7 @@ from foundation.errors import FormatError
 
 
 def failing(error: BaseException) -> Callable[[], None]:
-    """Return a command that ends with an error."""
+    """Return a command that raises an error."""
 
     def fail() -> None:
         raise error
@@ -48,9 +48,7 @@ def failing(error: BaseException) -> Callable[[], None]:
         (errors.DeviceError("run the same command again, it said"), *["run the same command again, it said"] * 2),
     ],
 )
-def test_an_error_knows_its_remedy_apart_however_it_was_given(
-    error: errors.CropError, problem: str, waiting: str
-) -> None:
+def test_error_has_its_remedy_as_attribute(error: errors.CropError, problem: str, waiting: str) -> None:
     assert error.without_remedy() == problem
     assert error.while_waiting() == waiting
     assert str(error).startswith(waiting)
@@ -77,50 +75,48 @@ def test_an_error_knows_its_remedy_apart_however_it_was_given(
         (errors.StorageError, 5),
     ],
 )
-def test_every_error_has_its_code(error: type[errors.CropError], code: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_error_has_a_code(error: type[errors.CropError], code: int, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(failing(error("lab.toml: shutter_s is -1, more than 0 was expected; correct it"))) == code
     assert capsys.readouterr() == ("", "error: lab.toml: shutter_s is -1, more than 0 was expected; correct it\n")
 
 
-def test_interruption_is_130(capsys: pytest.CaptureFixture[str]) -> None:
+def test_interruption_exits_with_130(capsys: pytest.CaptureFixture[str]) -> None:
     def interrupt() -> None:
         raise KeyboardInterrupt
 
     assert run(interrupt) == 130
-    assert capsys.readouterr().err == "error: interrupted; run the same command again to go on\n"
-    assert run(interrupt, keeps=False) == 130
-    assert capsys.readouterr().err == "error: interrupted; nothing of it was kept\n"
+    assert capsys.readouterr().err == "error: interrupted; run the same command again to continue\n"
+    assert run(interrupt, is_resumable=False) == 130
+    assert capsys.readouterr().err == "error: interrupted; no results were kept\n"
 
 
 @pytest.mark.parametrize(
     ("number", "beginning"),
     [
         (errno.ENOSPC, "cannot write /disk/samples.npy: No space left on device; free space or"),
-        (errno.EIO, "cannot use /disk/samples.npy: Input/output error; the disk fails: see what dmesg says"),
+        (errno.EIO, "cannot use /disk/samples.npy: Input/output error; the disk fails: look at the output of dmesg"),
     ],
 )
-def test_a_disk_fault_that_nobody_translated_is_5(
-    number: int, beginning: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_disk_error_exits_with_5(number: int, beginning: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(failing(OSError(number, os.strerror(number), "/disk/samples.npy"))) == 5
-    said = capsys.readouterr().err
-    assert said.startswith(f"error: {beginning}")
-    assert said.endswith("then run the same command again\n")
+    line = capsys.readouterr().err
+    assert line.startswith(f"error: {beginning}")
+    assert line.endswith("then run the same command again\n")
 
 
 @pytest.mark.parametrize("name", ["/theirs/dataset.json", b"/theirs/dataset.json"])
 @pytest.mark.parametrize(
     ("number", "remedy"),
     [
-        (errno.EACCES, "ask its owner for permission, or name another place"),
-        (errno.EPERM, "ask its owner for permission, or name another place"),
-        (errno.EISDIR, "a folder is called so; name a file"),
-        (errno.ENOTDIR, "a part of that path is a file, not a folder; name another"),
-        (errno.ENAMETOOLONG, "name it shorter"),
-        (errno.ELOOP, "links there lead in a circle; name the place that is meant"),
+        (errno.EACCES, "ask its owner for permission, or choose another path"),
+        (errno.EPERM, "ask its owner for permission, or choose another path"),
+        (errno.EISDIR, "it is a folder; name a file"),
+        (errno.ENOTDIR, "a part of that path is a file, not a folder; choose another path"),
+        (errno.ENAMETOOLONG, "choose a shorter name"),
+        (errno.ELOOP, "its links form a circle; give the path without links"),
     ],
 )
-def test_a_path_that_cannot_be_used_is_2(
+def test_unusable_path_exits_with_2(
     number: int, remedy: str, name: str | bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(failing(OSError(number, os.strerror(number), name))) == 2
@@ -129,9 +125,9 @@ def test_a_path_that_cannot_be_used_is_2(
 
 @pytest.mark.parametrize(
     ("error", "reason"),
-    [(MemoryError(), "none is left"), (MemoryError("Unable to allocate 9 TiB"), "Unable to allocate 9 TiB")],
+    [(MemoryError(), "all is used"), (MemoryError("Unable to allocate 9 TiB"), "Unable to allocate 9 TiB")],
 )
-def test_no_memory_is_2(error: MemoryError, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_memory_exits_with_2(error: MemoryError, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(failing(error)) == 2
     assert capsys.readouterr().err == (
         f"error: not enough memory ({reason}); use fewer --workers, or smaller pictures\n"
@@ -139,7 +135,7 @@ def test_no_memory_is_2(error: MemoryError, reason: str, capsys: pytest.CaptureF
 
 
 def ended(program: str, output: int) -> tuple[int, str]:
-    """Return code and stderr of a program that prints to `output`."""
+    """Return exit code and stderr of a program whose stdout is `output`."""
     # Buffered, as a user has it, whatever the surroundings of this test.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     text = f"from foundation.console import run\nimport sys\n{program}"
@@ -164,7 +160,7 @@ def ended(program: str, output: int) -> tuple[int, str]:
         "raise SystemExit(run(lambda: (print('as typer does'), sys.exit(0))))",
     ],
 )
-def test_a_reader_that_left_is_no_fault(program: str) -> None:
+def test_closed_reader_is_no_error(program: str) -> None:
     pipe = subprocess.Popen([sys.executable, "-c", ""], stdin=subprocess.PIPE)
     with pipe:
         assert pipe.stdin is not None
@@ -174,7 +170,7 @@ def test_a_reader_that_left_is_no_fault(program: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lines", [1, 10_000])
-def test_a_full_device_under_stdout_is_5(lines: int) -> None:
+def test_full_output_device_exits_with_5(lines: int) -> None:
     full = Path("/dev/full")
     if not full.exists():
         pytest.skip("this system has no /dev/full")
@@ -189,8 +185,8 @@ def test_a_full_device_under_stdout_is_5(lines: int) -> None:
 
 @pytest.mark.usefixtures("hang_up")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_hang_up_that_is_ignored_stays_ignored(number: int) -> None:
-    """As under nohup, which starts a program that way."""
+def test_ignored_hang_up_stays_ignored(number: int) -> None:
+    """As under nohup."""
     before = signal.signal(number, signal.SIG_IGN)
     try:
         with orderly_end():
@@ -201,7 +197,7 @@ def test_a_hang_up_that_is_ignored_stays_ignored(number: int) -> None:
 
 
 @pytest.mark.usefixtures("hang_up")
-def test_a_terminal_that_went_away_takes_no_last_line() -> None:
+def test_closed_terminal_exits_as_interrupted() -> None:
     def draw() -> None:
         raise OSError(errno.EIO, "Input/output error")
 
@@ -216,7 +212,7 @@ def test_a_terminal_that_went_away_takes_no_last_line() -> None:
         draw()
 
 
-def test_nobody_reads_the_error_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closed_stderr_keeps_the_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
     class Gone(io.StringIO):
         def write(self, text: str, /) -> int:
             raise OSError(errno.EIO, "Input/output error")
@@ -225,66 +221,66 @@ def test_nobody_reads_the_error_any_more(monkeypatch: pytest.MonkeyPatch) -> Non
     assert run(failing(errors.InputError("no such lab"))) == 2
 
 
-class TestEnding:
-    def test_a_request_ends_at_once_what_promises_nothing(self) -> None:
-        ending = Ending()
+class TestEndRequest:
+    def test_request_ends_an_ordinary_block_at_once(self) -> None:
+        ending = EndRequest()
         with pytest.raises(KeyboardInterrupt):
-            ending.ask()
+            ending.request()
 
-    def test_what_is_being_finished_is_told_once_and_cut_by_the_second_request(self) -> None:
-        said: list[str] = []
-        ending = Ending(said.append)
-        with ending.finishing("ending soon"):
-            ending.ask()
-            assert ending.asked
+    def test_second_request_ends_a_postponed_block(self) -> None:
+        messages: list[str] = []
+        ending = EndRequest(messages.append)
+        with ending.postponed("ending soon"):
+            ending.request()
+            assert ending.is_requested
             with pytest.raises(KeyboardInterrupt):
-                ending.ask()
-        assert said == ["ending soon"]
+                ending.request()
+        assert messages == ["ending soon"]
 
-    def test_a_wait_within_ends_at_once_and_does_not_begin_when_the_end_was_asked_for(self) -> None:
-        ending = Ending(lambda sentence: None)
-        with ending.finishing("ending soon"):
+    def test_waiting_in_a_postponed_block_ends_at_once(self) -> None:
+        ending = EndRequest(lambda sentence: None)
+        with ending.postponed("ending soon"):
             with pytest.raises(KeyboardInterrupt), ending.at_once():
-                ending.ask()
+                ending.request()
             with pytest.raises(KeyboardInterrupt), ending.at_once():
                 raise AssertionError("begun")
 
-    def test_ctrl_c_waits_for_what_is_being_finished(self, capfd: pytest.CaptureFixture[str]) -> None:
+    def test_ctrl_c_waits_for_a_postponed_block(self, capfd: pytest.CaptureFixture[str]) -> None:
         # A shell that is not interactive starts what it puts in the background with SIGINT ignored.
         inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
         before = signal.getsignal(signal.SIGINT)
-        with orderly_end() as ending, ending.finishing("ending soon"):
+        with orderly_end() as ending, ending.postponed("ending soon"):
             signal.raise_signal(signal.SIGINT)
-            assert ending.asked
+            assert ending.is_requested
         assert "ending soon" in capfd.readouterr().err
         assert signal.getsignal(signal.SIGINT) == before
         signal.signal(signal.SIGINT, inherited)
 
 
-def test_a_working_folder_that_is_gone_is_said(
+def test_reports_a_missing_working_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
     monkeypatch.chdir(gone)
     gone.rmdir()
-    said = "the folder in which this was started is gone; change to one that is there"
+    message = "the current folder does not exist any more; change to an existing one"
     assert run(lambda: Path("x").resolve()) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
     missing = FormatError("x is no session: it holds no journal.sqlite; name a folder made by acquire run or import")
     assert run(failing(missing)) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     monkeypatch.chdir(tmp_path)
 
 
-def test_errors_alone_means_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_shows_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
     from foundation import console as command_line
 
     seen: list[bool] = []
 
     def quiet() -> None:
-        command_line._tell_errors(True)
+        command_line._log_errors_only(True)
         seen.append(shows_progress())
         with progress("frames") as tell:
             tell(1, 2)
@@ -300,7 +296,7 @@ def test_errors_alone_means_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.slow
-def test_the_flags_may_stand_behind_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_accepts_flags_after_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from acquisition.cli import main
 
     out = tmp_path / "lights.csv"
@@ -309,7 +305,7 @@ def test_the_flags_may_stand_behind_the_command(tmp_path: Path, capsys: pytest.C
     assert "no such option" not in capsys.readouterr().err.lower()
 
 
-def test_a_flag_before_and_behind_the_command_prints_a_record_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_repeated_flag_prints_each_record_once(capsys: pytest.CaptureFixture[str]) -> None:
     app = new_app("A group.")
 
     @app.command()
@@ -332,7 +328,7 @@ PRINTING = "from foundation.console import run; import sys; sys.exit(run(lambda:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
-def test_a_terminal_gets_what_it_can_show(encoding: str) -> None:
+def test_replaces_characters_that_a_terminal_lacks(encoding: str) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": encoding}
     done = subprocess.run([sys.executable, "-c", PRINTING], capture_output=True, check=False, env=environment)
     assert (done.returncode, done.stderr) == (0, b"")
@@ -341,7 +337,7 @@ def test_a_terminal_gets_what_it_can_show(encoding: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", ["1", "2"])
-def test_closed_streams_are_no_fault(closed: str) -> None:
+def test_closed_streams_are_no_error(closed: str) -> None:
     words = ["sh", "-c", f'exec "$0" -c "$1" {closed}>&-', sys.executable, PRINTING]
     done = subprocess.run(words, capture_output=True, check=False)
     assert done.returncode == 0
@@ -350,8 +346,7 @@ def test_closed_streams_are_no_fault(closed: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_job_is_done_though_the_reader_of_its_output_left(tmp_path: Path, unbuffered: str) -> None:
-    """Ending with 0 and half of the work would be believed."""
+def test_completes_the_job_after_the_reader_ended(tmp_path: Path, unbuffered: str) -> None:
     job = "import pathlib; [print('x' * 9999, flush=True) for _ in range(9)]; pathlib.Path('done').touch()"
     program = f"import sys; from foundation.console import run; sys.exit(run(lambda: exec({job!r})))"
     reader, writer = os.pipe()

@@ -1,4 +1,4 @@
-"""Every system call of saving and of holding a folder fails once, and from there on: one sentence, and nothing half."""
+"""Each system call of saving a file and of locking a folder fails, once or always: one message, no incomplete file."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from foundation.errors import StorageError
-from foundation.files import write_whole
-from foundation.folders import held_folder, require_free, whole_folder
+from foundation.files import write_atomic
+from foundation.folders import atomic_folder, locked_folder, require_free
 from tests.failing_calls import DISK_FAULTS, FailingCalls, Ran, failing_calls, why_not
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(why_not() != "", reason=why_not())]
@@ -22,7 +22,7 @@ REMEDIES = {
     errno.EIO: "check its cable",
     errno.ENOSPC: "free space",
     errno.EROFS: "mount it for writing",
-    errno.EDQUOT: "what this user may use",
+    errno.EDQUOT: "quota on the disk",
     errno.ENODEV: "connect and mount it",
     errno.ESTALE: "mount it again here",
 }
@@ -37,21 +37,18 @@ def disk(tmp_path: Path) -> Generator[FailingCalls]:
 def each_call(
     disk: FailingCalls,
     action: Callable[[], object],
-    before: Callable[[], object] = lambda: None,
+    restore: Callable[[], object] = lambda: None,
     numbers: Sequence[int] = DISK_FAULTS,
 ) -> Generator[tuple[Ran, int, bool]]:
-    """Yield how `action` ended for each of its calls, each fault, once and lasting; what it raises is a sentence.
-
-    `before` makes everything as it was; `numbers` are the faults.
-    """
-    before()
+    """Yield the result of `action` for each of its calls and each error, once and lasting; `restore` resets it."""
+    restore()
     first = disk.run(action)
     assert first.error is None
     assert first.calls
     for number in numbers:
         for lasting in (False, True):
             for at in range(200):
-                before()
+                restore()
                 ran = disk.run(action, at, number, lasting=lasting)
                 if ran.error is not None:
                     assert isinstance(ran.error, StorageError), f"{ran.failed}: {ran.error!r}"
@@ -68,8 +65,8 @@ def each_call(
                 pytest.fail("it makes more than 200 calls")
 
 
-def test_a_call_that_fails_is_seen_to_fail(disk: FailingCalls, tmp_path: Path) -> None:
-    """The tool itself: the named call of the thread gets the error, and no other."""
+def test_injected_error_hits_one_call(disk: FailingCalls, tmp_path: Path) -> None:
+    """Test of the tool: only the named call of the thread fails."""
 
     def write() -> None:
         with (tmp_path / "a").open("wb", buffering=0) as stream:
@@ -84,14 +81,14 @@ def test_a_call_that_fails_is_seen_to_fail(disk: FailingCalls, tmp_path: Path) -
 
 
 def save_old(path: Path) -> None:
-    write_whole(path, "old")
+    write_atomic(path, "old")
     assert [other.name for other in path.parent.iterdir()] == [path.name]
 
 
-def test_saving_a_file_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Path) -> None:
+def test_file_is_complete_or_error_is_reported(disk: FailingCalls, tmp_path: Path) -> None:
     path = tmp_path / "frames.csv"
     faults = 0
-    for ran, _, _ in each_call(disk, lambda: write_whole(path, "new" * 5000), lambda: save_old(path)):
+    for ran, _, _ in each_call(disk, lambda: write_atomic(path, "new" * 5000), lambda: save_old(path)):
         assert path.read_text() in ("old", "new" * 5000)
         if ran.error is None:
             assert path.read_text() == "new" * 5000
@@ -100,13 +97,13 @@ def test_saving_a_file_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Path
     assert faults > 50
 
 
-def test_saving_a_folder_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Path) -> None:
+def test_folder_is_complete_or_error_is_reported(disk: FailingCalls, tmp_path: Path) -> None:
     path = tmp_path / "in" / "lut"
 
     def save() -> None:
-        with whole_folder(path, "the table") as folder:
-            write_whole(folder / "a", "1")
-            write_whole(folder / "b", "2")
+        with atomic_folder(path, "the table") as folder:
+            write_atomic(folder / "a", "1")
+            write_atomic(folder / "b", "2")
 
     def clear() -> None:
         shutil.rmtree(path.parent, ignore_errors=True)
@@ -119,7 +116,7 @@ def test_saving_a_folder_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Pa
 
 
 @pytest.mark.parametrize("locks", [True, False])
-def test_holding_a_folder_or_a_sentence(
+def test_folder_is_locked_or_error_is_reported(
     disk: FailingCalls, tmp_path: Path, locks: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flock = fcntl.flock
@@ -135,14 +132,14 @@ def test_holding_a_folder_or_a_sentence(
     held: list[bool] = []
 
     def hold() -> None:
-        with held_folder(tmp_path / "session", "busy"):
+        with locked_folder(tmp_path / "session", "busy"):
             held.append(True)
 
     for ran, _, _ in each_call(disk, hold, held.clear, (errno.EIO, errno.ESTALE)):
         assert len(held) == (ran.error is None)
 
 
-def test_looking_whether_a_place_is_free_or_a_sentence(disk: FailingCalls, tmp_path: Path) -> None:
+def test_path_is_checked_or_error_is_reported(disk: FailingCalls, tmp_path: Path) -> None:
     place = tmp_path / "out"
     place.mkdir()
     for _ in each_call(disk, lambda: require_free(place, "the table")):

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all, on disks that fill up, close and break."""
+"""Atomic files and folders, on disks that are full, closed or broken."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from foundation import files as storage
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import (
     HashingWriter,
+    atomic_file,
     file_sha256,
     is_partial,
     open_inside,
     partial_path,
+    read_buffer,
     read_csv,
-    read_whole,
-    whole_file,
-    write_whole,
+    write_atomic,
 )
-from foundation.folders import require_free_file, whole_folder
+from foundation.folders import atomic_folder, require_free_file
 
 
 def names(folder: Path) -> list[str]:
@@ -37,7 +37,7 @@ def names(folder: Path) -> list[str]:
 
 @contextmanager
 def small_disk(limit: int) -> Generator[None]:
-    """Let no file grow beyond `limit` bytes: the kernel answers EFBIG where a full disk would answer ENOSPC."""
+    """Limit the size of files: the kernel raises EFBIG, as a full disk raises ENOSPC."""
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -49,10 +49,10 @@ def small_disk(limit: int) -> Generator[None]:
         signal.signal(signal.SIGXFSZ, handler)
 
 
-class TestWholeFile:
-    def test_appears_at_the_end_and_whole(self, tmp_path: Path) -> None:
+class TestAtomicFile:
+    def test_appears_when_complete(self, tmp_path: Path) -> None:
         path = tmp_path / "new" / "frame.dng"
-        with whole_file(path) as stream:
+        with atomic_file(path) as stream:
             stream.write(b"first half, ")
             stream.flush()
             assert names(path.parent) == [".frame.dng.partial"]
@@ -65,7 +65,7 @@ class TestWholeFile:
             assert partial_path(tmp_path / "frame").read_bytes() == b"raw"
             return tmp_path / "frame.CR2"
 
-        with whole_file(tmp_path / "frame", named) as stream:
+        with atomic_file(tmp_path / "frame", named) as stream:
             stream.write(b"raw")
             assert stream.tell() == 3
             stream.seek(0)
@@ -74,63 +74,59 @@ class TestWholeFile:
 
     def test_replaces_only_at_the_end(self, tmp_path: Path) -> None:
         path = tmp_path / "frames.csv"
-        write_whole(path, "old")
-        with whole_file(path) as stream:
+        write_atomic(path, "old")
+        with atomic_file(path) as stream:
             stream.write(b"new")
             stream.flush()
             assert path.read_text() == "old"
         assert path.read_text() == "new"
 
-    def test_a_folder_that_is_gone_is_not_made_anew_where_it_must_be_there(self, tmp_path: Path) -> None:
+    def test_missing_parent_is_not_made_if_required(self, tmp_path: Path) -> None:
         with pytest.raises(StorageError):  # noqa: SIM117
-            with whole_file(tmp_path / "disk" / "frame", make=False) as stream:
+            with atomic_file(tmp_path / "disk" / "frame", make_parents=False) as stream:
                 stream.write(b"raw")
         assert names(tmp_path) == []
 
     @pytest.mark.parametrize("error", [ValueError("ours"), KeyboardInterrupt()])
-    def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(
-        self, tmp_path: Path, error: BaseException
-    ) -> None:
+    def test_failed_block_keeps_the_old_file(self, tmp_path: Path, error: BaseException) -> None:
         path = tmp_path / "a.csv"
-        write_whole(path, "old")
-        with pytest.raises(type(error)), whole_file(path) as stream:  # noqa: PT012
+        write_atomic(path, "old")
+        with pytest.raises(type(error)), atomic_file(path) as stream:  # noqa: PT012
             stream.write(b"new")
             raise error
         assert path.read_text() == "old"
         assert names(tmp_path) == ["a.csv"]
 
-    def test_a_disk_that_takes_no_more_is_one_sentence_and_leaves_nothing(self, tmp_path: Path) -> None:
+    def test_full_disk_leaves_no_file(self, tmp_path: Path) -> None:
         path = tmp_path / "big.dng"
         with (
-            pytest.raises(StorageError, match=r"big\.dng: .*so large"),
+            pytest.raises(StorageError, match=r"big\.dng: .*too large there"),
             small_disk(10_000),
-            whole_file(path) as stream,
+            atomic_file(path) as stream,
         ):
             stream.write(bytes(50_000))
         assert names(tmp_path) == []
 
     @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS])
-    def test_each_fault_of_a_disk(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    def test_reports_each_disk_error(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
         def fail(handle: int) -> None:
             raise OSError(number, os.strerror(number))
 
         path = tmp_path / "a.csv"
-        write_whole(path, "old")
+        write_atomic(path, "old")
         monkeypatch.setattr(storage.os, "fsync", fail)
         with pytest.raises(StorageError, match=os.strerror(number)) as caught:
-            write_whole(path, "new")
+            write_atomic(path, "new")
         assert isinstance(caught.value.__cause__, OSError)
         assert path.read_text() == "old"
         assert names(tmp_path) == ["a.csv"]
 
-    def test_a_disk_that_was_taken_away_is_not_taken_for_one_that_takes_no_files(self, tmp_path: Path) -> None:
-        """The empty folder it was mounted on is there; what was written is not."""
-        with pytest.raises(StorageError), whole_file(tmp_path / "a.csv"):
+    def test_reports_a_disconnected_disk(self, tmp_path: Path) -> None:
+        """The empty mount point remains; the file does not."""
+        with pytest.raises(StorageError), atomic_file(tmp_path / "a.csv"):
             (tmp_path / ".a.csv.partial").unlink()
 
-    def test_a_folder_whose_names_cannot_be_flushed_is_a_fault_where_the_disk_fails(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_reports_failed_folder_flush(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def fail(number: int) -> None:
             def fsync(handle: int) -> None:
                 raise OSError(number, os.strerror(number))
@@ -143,74 +139,74 @@ class TestWholeFile:
         fail(errno.EINVAL)
         storage.sync_folder(tmp_path)
 
-    def test_a_killed_writer_leaves_only_a_hidden_leftover(self, tmp_path: Path) -> None:
-        write_whole(tmp_path / "a", "old")
+    def test_killed_writer_leaves_a_partial_file(self, tmp_path: Path) -> None:
+        write_atomic(tmp_path / "a", "old")
         program = (
-            "import os, sys, pathlib; from foundation.files import whole_file\n"
-            "with whole_file(pathlib.Path(sys.argv[1])) as stream:\n"
+            "import os, sys, pathlib; from foundation.files import atomic_file\n"
+            "with atomic_file(pathlib.Path(sys.argv[1])) as stream:\n"
             "    stream.write(b'half'); stream.flush(); os.kill(os.getpid(), 9)\n"
         )
         done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "a")], check=False)
         assert done.returncode == -signal.SIGKILL
         assert (tmp_path / "a").read_text() == "old"
         assert [is_partial(name) for name in names(tmp_path)] == [True, False]
-        write_whole(tmp_path / "a", "new")
+        write_atomic(tmp_path / "a", "new")
         assert names(tmp_path) == ["a"]
 
 
-class TestWholeFolder:
-    def test_appears_at_the_end_and_whole(self, tmp_path: Path) -> None:
+class TestAtomicFolder:
+    def test_appears_when_complete(self, tmp_path: Path) -> None:
         path = tmp_path / "deep" / "lut"
-        with whole_folder(path, "the table") as folder:
+        with atomic_folder(path, "the table") as folder:
             (folder / "samples.npy").write_bytes(b"1")
             assert not path.exists()
             assert is_partial(folder.name)
         assert names(path) == ["samples.npy"]
         assert names(path.parent) == ["lut"]
 
-    def test_takes_an_empty_folder(self, tmp_path: Path) -> None:
+    def test_accepts_an_empty_folder(self, tmp_path: Path) -> None:
         (tmp_path / "lut").mkdir()
-        with whole_folder(tmp_path / "lut", "the table") as folder:
-            write_whole(folder / "a", "1")
+        with atomic_folder(tmp_path / "lut", "the table") as folder:
+            write_atomic(folder / "a", "1")
         assert names(tmp_path / "lut") == ["a"]
 
     def test_never_overwrites(self, tmp_path: Path) -> None:
         (tmp_path / "full").mkdir()
-        write_whole(tmp_path / "full" / "mine", "precious")
-        write_whole(tmp_path / "file", "precious")
+        write_atomic(tmp_path / "full" / "mine", "precious")
+        write_atomic(tmp_path / "file", "precious")
         (tmp_path / "link").symlink_to(tmp_path / "nowhere")
         for name in ("full", "file", "link"):
             with pytest.raises(InputError, match=f"{name} already exists"):  # noqa: SIM117
-                with whole_folder(tmp_path / name, "the table"):
+                with atomic_folder(tmp_path / name, "the table"):
                     pytest.fail("the block must not begin")
         assert (tmp_path / "full" / "mine").read_text() == "precious"
 
-    def test_a_place_taken_meanwhile_is_left_alone(self, tmp_path: Path) -> None:
+    def test_keeps_a_folder_made_by_another_program(self, tmp_path: Path) -> None:
         path = tmp_path / "lut"
-        with pytest.raises(InputError), whole_folder(path, "the table") as folder:  # noqa: PT012
-            write_whole(folder / "a", "ours")
+        with pytest.raises(InputError), atomic_folder(path, "the table") as folder:  # noqa: PT012
+            write_atomic(folder / "a", "ours")
             path.mkdir()
-            write_whole(path / "a", "theirs")
+            write_atomic(path / "a", "theirs")
         assert (path / "a").read_text() == "theirs"
         assert names(tmp_path) == ["lut"]
 
     @pytest.mark.parametrize("error", [ValueError("ours"), KeyboardInterrupt()])
-    def test_a_block_that_fails_leaves_nothing(self, tmp_path: Path, error: BaseException) -> None:
-        with pytest.raises(type(error)), whole_folder(tmp_path / "lut", "the table") as folder:  # noqa: PT012
-            write_whole(folder / "deep" / "a", "1")
+    def test_failed_block_leaves_no_folder(self, tmp_path: Path, error: BaseException) -> None:
+        with pytest.raises(type(error)), atomic_folder(tmp_path / "lut", "the table") as folder:  # noqa: PT012
+            write_atomic(folder / "deep" / "a", "1")
             raise error
         assert names(tmp_path) == []
 
-    def test_a_leftover_is_cleared(self, tmp_path: Path) -> None:
+    def test_removes_an_old_partial_folder(self, tmp_path: Path) -> None:
         leftover = partial_path(tmp_path / "lut")
         leftover.mkdir()
-        write_whole(leftover / "stale", "x")
-        with whole_folder(tmp_path / "lut", "the table") as folder:
-            write_whole(folder / "fresh", "x")
+        write_atomic(leftover / "stale", "x")
+        with atomic_folder(tmp_path / "lut", "the table") as folder:
+            write_atomic(folder / "fresh", "x")
         assert names(tmp_path / "lut") == ["fresh"]
 
 
-def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
+def test_empty_folder_is_not_free_for_a_file(tmp_path: Path) -> None:
     require_free_file(tmp_path / "new", "the lights")
     require_free_file(tmp_path / "no" / "such" / "new", "the lights")
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
@@ -220,32 +216,30 @@ def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 1, 70_000, 5 << 20])
-def test_a_file_is_read_whole_and_cannot_be_written_through(tmp_path: Path, size: int) -> None:
+def test_reads_a_file_into_a_read_only_buffer(tmp_path: Path, size: int) -> None:
     written = os.urandom(size)
     (tmp_path / "frame").write_bytes(written)
-    data = read_whole(tmp_path / "frame")
+    data = read_buffer(tmp_path / "frame")
     assert data == written
     assert data.readonly
     assert bool(data) == bool(written)
 
 
-@pytest.mark.parametrize("told", [0, 5, 20])
-def test_a_file_of_another_size_than_the_system_told_is_read_to_its_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: int
+@pytest.mark.parametrize("reported", [0, 5, 20])
+def test_reads_to_the_end_if_the_reported_size_is_wrong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reported: int
 ) -> None:
     (tmp_path / "frame").write_bytes(b"ten bytes.")
 
     def fstat(handle: int) -> os.stat_result:
         del handle
-        return os.stat_result((0,) * 6 + (told, 0, 0, 0))
+        return os.stat_result((0,) * 6 + (reported, 0, 0, 0))
 
     monkeypatch.setattr(storage.os, "fstat", fstat)
-    assert read_whole(tmp_path / "frame") == b"ten bytes."
+    assert read_buffer(tmp_path / "frame") == b"ten bytes."
 
 
-def test_a_folder_that_is_there_and_not_there_is_not_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gives_up_on_a_folder_that_cannot_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def mkdir(*arguments: object, **options: object) -> None:
         raise FileExistsError(errno.EEXIST, "File exists")
 
@@ -254,7 +248,7 @@ def test_a_folder_that_is_there_and_not_there_is_not_waited_for(
         storage.make_folder(tmp_path / "x")
 
 
-def test_a_table_is_read_whatever_its_mark_and_its_short_lines(tmp_path: Path) -> None:
+def test_reads_csv_with_byte_order_mark_and_short_lines(tmp_path: Path) -> None:
     path = tmp_path / "some.csv"
     path.write_bytes(b'\xef\xbb\xbfimage,fold\r\n"a\nb",1\r\nc\r\n')
     assert read_csv(path, "mend it") == (
@@ -266,7 +260,7 @@ def test_a_table_is_read_whatever_its_mark_and_its_short_lines(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("content", [b"image\n\xff\0\n", b"image\n" + b"a" * 200_000 + b"\n", None])
-def test_what_is_no_table_is_refused_with_what_helps(tmp_path: Path, content: bytes | None) -> None:
+def test_refuses_bad_csv_with_remedy(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "some.csv"
     if content is not None:
         path.write_bytes(content)
@@ -275,42 +269,41 @@ def test_what_is_no_table_is_refused_with_what_helps(tmp_path: Path, content: by
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "reported"),
     [("a\nglacé".encode("latin-1"), "line 2 has the byte 0xe9"), ("glacé".encode("utf-16"), "UTF-16")],
 )
-def test_a_text_in_another_encoding_is_to_be_saved_anew(tmp_path: Path, content: bytes, told: str) -> None:
+def test_reports_other_encodings(tmp_path: Path, content: bytes, reported: str) -> None:
     path = tmp_path / "some.csv"
     path.write_bytes(content)
-    with pytest.raises(FormatError, match=told) as caught:
+    with pytest.raises(FormatError, match=reported) as caught:
         read_csv(path, "mend it")
     assert "UTF-8" in caught.value.remedy
 
 
-@pytest.mark.parametrize(("number", "said"), [(errno.EROFS, "mount it for writing"), (errno.EACCES, "ask its owner")])
-def test_a_place_that_cannot_be_written_is_found_before_the_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, said: str
+@pytest.mark.parametrize(("number", "remedy"), [(errno.EROFS, "mount it for writing"), (errno.EACCES, "ask its owner")])
+def test_detects_an_unwritable_path_early(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, remedy: str
 ) -> None:
     def refused(dir: Path) -> None:
         raise OSError(number, os.strerror(number), str(dir))
 
     monkeypatch.setattr("tempfile.TemporaryFile", refused)
-    with pytest.raises(StorageError, match=said):
+    with pytest.raises(StorageError, match=remedy):
         require_free_file(tmp_path / "no" / "model.npz", "the model")
 
 
-BLOCK, MOST_HOLES = 1 << 16, 1 << 30
+BLOCK, MAX_HOLES = 1 << 16, 1 << 30
 
 
 @pytest.mark.parametrize(
     ("blocks", "size"),
     [
-        ([MOST_HOLES], MOST_HOLES + BLOCK),
-        ([MOST_HOLES // 2, MOST_HOLES + BLOCK], MOST_HOLES + 2 * BLOCK),
-        ([0], MOST_HOLES + BLOCK),
+        ([MAX_HOLES], MAX_HOLES + BLOCK),
+        ([MAX_HOLES // 2, MAX_HOLES + BLOCK], MAX_HOLES + 2 * BLOCK),
+        ([0], MAX_HOLES + BLOCK),
     ],
 )
-def test_a_file_may_have_holes_of_a_gibibyte_together(tmp_path: Path, blocks: list[int], size: int) -> None:
-    """A few bytes can claim more than anybody can read."""
+def test_refuses_files_with_holes_above_one_gibibyte(tmp_path: Path, blocks: list[int], size: int) -> None:
     path = tmp_path / "samples.npy"
     with path.open("wb") as stream:
         for block in blocks:
@@ -323,7 +316,7 @@ def test_a_file_may_have_holes_of_a_gibibyte_together(tmp_path: Path, blocks: li
         assert opened.tell() == 0
     os.truncate(path, size + BLOCK)
     with (
-        pytest.raises(FormatError, match=f"claims {size + BLOCK} bytes and holds at most {len(blocks) * BLOCK};"),
+        pytest.raises(FormatError, match=f"a size of {size + BLOCK} bytes, of which {len(blocks) * BLOCK} are data;"),
         open_inside(tmp_path, path.name),
     ):
         pass
@@ -344,7 +337,7 @@ def test_a_file_of_several_blocks(tmp_path: Path) -> None:
         file_sha256(tmp_path / "c")
 
 
-def test_what_is_written_is_hashed_counted_and_passed_on() -> None:
+def test_writer_hashes_and_counts_bytes() -> None:
     stream = io.BytesIO()
     writer = HashingWriter(stream)
     assert (writer.write(b"a"), writer.write(memoryview(b"bc"))) == (1, 2)

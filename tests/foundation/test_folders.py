@@ -1,6 +1,6 @@
-"""One program at a time in a folder: on disks that lock folders, on those that lock files alone, and on those without.
+"""Folder locks on file systems that lock folders, on those that lock files only, and on those without locks.
 
-What a file system cannot lock is said by a `flock` in place of the system's; what it can, the system locks.
+A replaced `flock` simulates what a file system cannot lock.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pytest
 
 from foundation import folders
 from foundation.errors import InputError, StorageError
-from foundation.folders import LOCK_FILE, held_folder
+from foundation.folders import LOCK_FILE, locked_folder
 
 BUSY = "another program is at it; wait for it"
 Flock = Callable[[int, int], None]
@@ -26,7 +26,7 @@ flock: Flock = fcntl.flock
 
 
 def refuse_folders(handle: int, operation: int) -> None:
-    """Lock as NFS does: files that are open for writing, and nothing else."""
+    """Lock as NFS does: only files that are open for writing."""
     if stat.S_ISDIR(os.fstat(handle).st_mode):
         raise OSError(errno.EBADF, os.strerror(errno.EBADF))
     flock(handle, operation)
@@ -34,65 +34,65 @@ def refuse_folders(handle: int, operation: int) -> None:
 
 @pytest.fixture(params=["folders", "files"])
 def locks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return what the file system locks."""
+    """Return what the file system can lock."""
     if request.param == "files":
         monkeypatch.setattr(folders.fcntl, "flock", refuse_folders)
     return request.param
 
 
 @pytest.mark.usefixtures("locks")
-def test_a_folder_is_made_and_held_alone(tmp_path: Path) -> None:
+def test_makes_and_locks_a_folder(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "table"
-    with held_folder(folder, BUSY):
+    with locked_folder(folder, BUSY):
         assert folder.is_dir()
-        with pytest.raises(InputError, match=BUSY), held_folder(folder, BUSY):
+        with pytest.raises(InputError, match=BUSY), locked_folder(folder, BUSY):
             pytest.fail("two hold it")
-    with held_folder(folder, BUSY):
+    with locked_folder(folder, BUSY):
         pass
 
 
 @pytest.mark.usefixtures("locks")
-def test_nothing_stays_in_a_folder_that_was_published_meanwhile(tmp_path: Path) -> None:
+def test_leaves_no_lock_file_in_a_published_folder(tmp_path: Path) -> None:
     folder, final = tmp_path / ".table.partial", tmp_path / "table"
-    with held_folder(folder, BUSY):
+    with locked_folder(folder, BUSY):
         (folder / "lut.json").touch()
         folder.rename(final)
     assert [path.name for path in final.iterdir()] == ["lut.json"]
 
 
 @pytest.mark.usefixtures("locks")
-def test_a_file_that_a_killed_program_left_holds_nobody_up(tmp_path: Path) -> None:
+def test_ignores_the_lock_file_of_a_killed_program(tmp_path: Path) -> None:
     (tmp_path / LOCK_FILE).touch()
-    with held_folder(tmp_path, BUSY):
+    with locked_folder(tmp_path, BUSY):
         pass
 
 
 @pytest.mark.usefixtures("locks")
-def test_programs_that_ask_for_a_share_are_there_together(tmp_path: Path) -> None:
+def test_programs_share_a_lock(tmp_path: Path) -> None:
     plan = tmp_path / "plan"
-    with held_folder(tmp_path, BUSY, share_if=plan.exists) as first:
+    with locked_folder(tmp_path, BUSY, share_if=plan.exists) as first:
         plan.touch()
         first.share()
-        with held_folder(tmp_path, BUSY, share_if=plan.exists), pytest.raises(InputError, match=BUSY):
-            held_folder(tmp_path, BUSY).__enter__()
+        with locked_folder(tmp_path, BUSY, share_if=plan.exists), pytest.raises(InputError, match=BUSY):
+            locked_folder(tmp_path, BUSY).__enter__()
         # The second to leave took nothing away from the first.
-        with pytest.raises(InputError, match=BUSY), held_folder(tmp_path, BUSY):
+        with pytest.raises(InputError, match=BUSY), locked_folder(tmp_path, BUSY):
             pytest.fail("one holds it alone, another shares it")
-    with held_folder(tmp_path, BUSY):
+    with locked_folder(tmp_path, BUSY):
         pass
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("locks")
-def test_who_asks_for_a_share_waits_until_there_is_one(tmp_path: Path) -> None:
+def test_waits_for_a_shared_lock(tmp_path: Path) -> None:
     plan, joined = tmp_path / "plan", threading.Event()
 
     def join() -> None:
-        with held_folder(tmp_path, BUSY, share_if=plan.exists):
+        with locked_folder(tmp_path, BUSY, share_if=plan.exists):
             assert plan.exists()
             joined.set()
 
-    with held_folder(tmp_path, BUSY, share_if=plan.exists) as first:
+    with locked_folder(tmp_path, BUSY, share_if=plan.exists) as first:
         second = threading.Thread(target=join)
         second.start()
         assert not joined.wait(0.1)
@@ -103,17 +103,17 @@ def test_who_asks_for_a_share_waits_until_there_is_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("locks")
-def test_who_waited_in_vain_begins_anew(tmp_path: Path) -> None:
-    """The first fails before it has planned anything, and takes its folder along."""
+def test_retries_after_a_useless_wait(tmp_path: Path) -> None:
+    """The first program fails before it has planned anything, and removes its folder."""
     folder, waits = tmp_path / "dataset", threading.Event()
     held: list[bool] = []
 
     def join() -> None:
         waits.set()
-        with held_folder(folder, BUSY, share_if=(folder / "plan").exists):
+        with locked_folder(folder, BUSY, share_if=(folder / "plan").exists):
             held.append(folder.is_dir())
 
-    with held_folder(folder, BUSY):
+    with locked_folder(folder, BUSY):
         second = threading.Thread(target=join)
         second.start()
         assert waits.wait(10)
@@ -123,9 +123,7 @@ def test_who_waited_in_vain_begins_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("locks")
-def test_a_folder_that_was_finished_between_opening_and_locking_is_made_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_makes_a_folder_again_that_was_renamed_before_locking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, final = tmp_path / "making", tmp_path / "made"
     now: Flock = folders.fcntl.flock
 
@@ -135,13 +133,13 @@ def test_a_folder_that_was_finished_between_opening_and_locking_is_made_anew(
         now(handle, operation)
 
     monkeypatch.setattr(folders.fcntl, "flock", finished_first)
-    with held_folder(folder, BUSY):
+    with locked_folder(folder, BUSY):
         assert folder.is_dir()
     assert list(final.iterdir()) == []
 
 
-def test_a_lock_file_that_its_holder_removed_is_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two wait; the first has the file that the last holder removed, the second made a new one."""
+def test_ignores_a_lock_file_removed_by_its_owner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two waiting programs, one has the removed lock file and the other a new one."""
     removed: list[bool] = []
 
     def removed_first(handle: int, operation: int) -> None:
@@ -151,37 +149,35 @@ def test_a_lock_file_that_its_holder_removed_is_no_lock(tmp_path: Path, monkeypa
             (tmp_path / LOCK_FILE).unlink()
 
     monkeypatch.setattr(folders.fcntl, "flock", removed_first)
-    with held_folder(tmp_path, BUSY):
+    with locked_folder(tmp_path, BUSY):
         assert (tmp_path / LOCK_FILE).exists()
-        with pytest.raises(InputError, match=BUSY), held_folder(tmp_path, BUSY):
+        with pytest.raises(InputError, match=BUSY), locked_folder(tmp_path, BUSY):
             pytest.fail("two hold it")
 
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL])
-def test_without_locks_the_work_goes_on_with_a_warning(
+def test_warns_without_locks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
 ) -> None:
     def none(handle: int, operation: int) -> None:
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(folders.fcntl, "flock", none)
-    with caplog.at_level(logging.WARNING), held_folder(tmp_path, BUSY) as lock:
+    with caplog.at_level(logging.WARNING), locked_folder(tmp_path, BUSY) as lock:
         lock.share()
         assert list(tmp_path.iterdir()) == []
     assert [record.getMessage() for record in caplog.records] == [
-        f"{tmp_path}: this file system has no locks; see to it that no other program works there"
+        f"{tmp_path}: this file system has no locks; make sure that no other program uses the folder"
     ]
 
 
-def test_a_folder_that_is_made_and_never_there_is_not_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gives_up_on_a_folder_that_disappears(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def make_nothing(folder: Path, of: Path | None = None) -> None:
         del folder, of
 
     monkeypatch.setattr("foundation.folders.make_folder", make_nothing)
     with (
         pytest.raises(StorageError),
-        held_folder(tmp_path / "x", "busy"),
+        locked_folder(tmp_path / "x", "busy"),
     ):
         pass

@@ -1,4 +1,4 @@
-"""Holds: one process has what it holds, and whoever asks for the same is told which."""
+"""One process has a lock; others are refused with its number."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="names of socket
 
 @contextmanager
 def held_elsewhere(key: str) -> Generator[int]:
-    """Let another process hold a key while the block runs; yield its number."""
+    """Let another process lock a key while the block runs; yield its number."""
     program = f"from foundation.holds import hold\nwith hold('it', {key!r}): print('held', flush=True), input()"
     with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -26,7 +26,7 @@ def held_elsewhere(key: str) -> Generator[int]:
         process.communicate(b"\n")
 
 
-def test_who_asks_for_what_is_held_is_told_which_process_has_it() -> None:
+def test_refusal_names_the_process() -> None:
     with held_elsewhere("test_holds one") as pid:
         for _ in range(3):
             with pytest.raises(DeviceRefused, match=f"process {pid}") as told, hold("the lab", "test_holds one"):
@@ -38,7 +38,7 @@ def test_who_asks_for_what_is_held_is_told_which_process_has_it() -> None:
         pass
 
 
-def test_a_process_that_is_killed_holds_nothing() -> None:
+def test_killed_process_releases_its_lock() -> None:
     with held_elsewhere("test_holds killed") as pid:
         subprocess.run(["kill", "-KILL", str(pid)], check=True)
         while True:
@@ -49,6 +49,6 @@ def test_a_process_that_is_killed_holds_nothing() -> None:
                 continue
 
 
-def test_a_process_may_hold_twice() -> None:
+def test_process_may_lock_twice() -> None:
     with hold("the lab", "test_holds twice"), hold("the lab", "test_holds twice"):
         pass

@@ -1,4 +1,4 @@
-"""A page that a command serves: who may look, who gives way to whom, and how long a request may take."""
+"""Server of a page: access, number of connections, time limits."""
 
 from __future__ import annotations
 
@@ -44,35 +44,35 @@ CLOSED = Access("secret", frozenset({"localhost"}), "acquire monitor")
         ("null", False),
     ],
 )
-def test_what_another_sites_page_sends_is_refused(origin: str | None, is_taken: bool) -> None:
-    assert isinstance(OPEN.judge("/", "localhost:8707", origin), Request) == is_taken
+def test_refuses_data_from_pages_of_other_sites(origin: str | None, is_taken: bool) -> None:
+    assert isinstance(OPEN.check("/", "localhost:8707", origin), Request) == is_taken
 
 
 @given(st.text(max_size=40), st.text(max_size=20))
-def test_without_the_token_nothing_is_shown(target: str, host: str) -> None:
-    for asked in (target, f"/{target}", "/" + target.replace("secret", "")):
-        assert isinstance(CLOSED.judge(asked, host), Refusal) or asked.startswith("/secret/")
+def test_refuses_requests_without_token(target: str, host: str) -> None:
+    for request_on in (target, f"/{target}", "/" + target.replace("secret", "")):
+        assert isinstance(CLOSED.check(request_on, host), Refusal) or request_on.startswith("/secret/")
 
 
 @given(st.text(max_size=60))
-def test_only_numbers_and_own_names_are_known(host: str) -> None:
-    answer = OPEN.judge("/", host)
+def test_accepts_only_numeric_and_own_host_names(host: str) -> None:
+    answer = OPEN.check("/", host)
     if answer == Request(""):
         name = host.lower().partition(":")[0] if not host.startswith("[") else host[1:].partition("]")[0]
         assert name == "localhost" or ipaddress.ip_address(name)
 
 
-def test_a_token_is_asked_for_wherever_others_reach_it() -> None:
-    assert Access.to("127.0.0.1", "x").token == ""
-    assert Access.to("localhost", "x").token == ""
-    assert Access.to("::1", "x").token == ""
+def test_requires_a_token_unless_on_loopback() -> None:
+    assert Access.for_host("127.0.0.1", "x").token == ""
+    assert Access.for_host("localhost", "x").token == ""
+    assert Access.for_host("::1", "x").token == ""
     for host in ("0.0.0.0", "::", "192.168.1.7", socket.gethostname() + ".example"):
-        assert len(Access.to(host, "x").token) >= 22
+        assert len(Access.for_host(host, "x").token) >= 22
     assert not is_loopback("127.0.0.1.example")
 
 
 class Probe:
-    """A socket of a machine whose routes lead to a network of both families."""
+    """A socket of a machine with routes to networks of both address families."""
 
     def __init__(self, family: socket.AddressFamily, kind: socket.SocketKind) -> None:
         assert kind == socket.SOCK_DGRAM, "nothing is to be sent"
@@ -90,7 +90,7 @@ class Probe:
         return self.own, 40000
 
 
-def test_who_listens_everywhere_is_reached_by_what_his_routes_lead_from(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_the_addresses_of_the_default_routes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket, "socket", Probe)
     assert reachable_addresses("0.0.0.0") == ("192.168.1.7",)
     assert reachable_addresses("::") == ("192.168.1.7", "[fd00::7]")
@@ -99,7 +99,7 @@ def test_who_listens_everywhere_is_reached_by_what_his_routes_lead_from(monkeypa
 ADDRESS = "http://192.168.178.123:8707/abcdefghijklmnopqrstuv/"
 
 
-def test_a_reader_finds_the_address_in_what_is_printed() -> None:
+def test_qr_code_has_the_printed_address() -> None:
     lines = [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in qr_text(ADDRESS).splitlines()]
     assert len({len(line) for line in lines}) == 1
     light = {"█": (1, 1), "▀": (1, 0), "▄": (0, 1), " ": (0, 0)}
@@ -128,8 +128,8 @@ def connect(server: LocalServer) -> socket.socket:
     return socket.create_connection(("127.0.0.1", server.port), timeout=20)
 
 
-def asked(link: socket.socket) -> bytes:
-    """Ask on a connection and return what comes, without its head."""
+def request_on(link: socket.socket) -> bytes:
+    """Send a request on a connection and return the body of the answer."""
     link.sendall(b"GET /here HTTP/1.1\r\nHost: localhost\r\n\r\n")
     answer = http.client.HTTPResponse(link)
     answer.begin()
@@ -137,20 +137,20 @@ def asked(link: socket.socket) -> bytes:
     return answer.read()
 
 
-def test_viewers_are_answered_beside_those_who_never_finish_their_request() -> None:
-    with served(most=8) as server, ExitStack() as held:
+def test_answers_viewers_despite_incomplete_requests() -> None:
+    with served(max_connections=8) as server, ExitStack() as held:
         for number in range(40):
             link = held.enter_context(connect(server))
             link.sendall(b"GET / HTTP/1.1\r\nX: "[: number % 3 * 9])
         viewer = held.enter_context(connect(server))
-        assert asked(viewer) == b"here"
-        # Whoever has asked stays where more come who do not.
+        assert request_on(viewer) == b"here"
+        # Whoever has request_on stays where more come who do not.
         for _ in range(20):
             held.enter_context(connect(server))
-        assert asked(viewer) == b"here"
+        assert request_on(viewer) == b"here"
 
 
-def test_a_head_that_trickles_ends_at_its_deadline() -> None:
+def test_ends_a_slow_request_at_its_time_limit() -> None:
     with served(head_s=0.05) as server, connect(server) as link:
         link.settimeout(0.005)
         while not is_closed(link):
@@ -159,17 +159,17 @@ def test_a_head_that_trickles_ends_at_its_deadline() -> None:
 
 
 @pytest.mark.slow
-def test_a_page_that_asks_now_and_then_keeps_its_connection() -> None:
+def test_keeps_a_connection_with_occasional_requests() -> None:
     with served(head_s=0.05) as server, connect(server) as link:
-        assert asked(link) == b"here"
-        # Nothing is asked for longer than a head may take.
+        assert request_on(link) == b"here"
+        # Nothing is request_on for longer than a head may take.
         link.settimeout(0.2)
         with pytest.raises(TimeoutError):
             link.recv(1)
         link.settimeout(20)
-        assert asked(link) == b"here"
+        assert request_on(link) == b"here"
     with served(idle_s=0.05) as server, connect(server) as link:
-        assert asked(link) == b"here"
+        assert request_on(link) == b"here"
         assert link.recv(1) == b"", "an idle one ends"
 
 
@@ -182,7 +182,7 @@ def is_closed(far: socket.socket) -> bool:
         return True
 
 
-def test_a_viewer_who_takes_nothing_loses_the_place() -> None:
+def test_replaces_a_viewer_that_reads_nothing() -> None:
     ended = threading.Event()
 
     class Flood(Echo):
@@ -193,7 +193,7 @@ def test_a_viewer_who_takes_nothing_loses_the_place() -> None:
             super().process_request_thread(request, client_address)
             ended.set()
 
-    with serving(Flood("127.0.0.1", 0, most=1, idle_s=0.05)) as server, connect(server) as link:
+    with serving(Flood("127.0.0.1", 0, max_connections=1, idle_s=0.05)) as server, connect(server) as link:
         link.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         answer = http.client.HTTPResponse(link)
         answer.begin()

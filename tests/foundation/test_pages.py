@@ -1,4 +1,4 @@
-"""Pages: one file with all in it, elements that close, text that stays text."""
+"""Pages are one file, have closed elements, and escape text."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 
 from foundation import pages
-from foundation.plots import INK, svg_of
+from foundation.plots import INK, draw_svg
 
 VOID = {"meta", "img", "br", "link"}
 
 
 class Checker(HTMLParser):
-    """Follows which elements are open, and collects text and addresses."""
+    """Parser that tracks open elements, and collects text and addresses."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ def draw(figure: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_page_holds_all_and_fetches_nothing() -> None:
+def test_page_is_complete_and_fetches_nothing() -> None:
     text = pages.page(
         "A <b> & 'c'",
         [
@@ -63,7 +63,7 @@ def test_a_page_holds_all_and_fetches_nothing() -> None:
             pages.verdict("accept", "good & well"),
             pages.table("<t>", ("<a>", "b"), (("<x> & y", "1.00"),), (False, True), notes=("<n>",)),
             pages.fold("more <", [pages.note("inside &")]),
-            pages.row([pages.figure(b"\x89PNG\r\n", "a 'quoted' caption"), pages.figure(svg_of(draw), "drawn")]),
+            pages.row([pages.figure(b"\x89PNG\r\n", "a 'quoted' caption"), pages.figure(draw_svg(draw), "drawn")]),
         ],
     )
     found = checked(text)
@@ -86,9 +86,7 @@ def test_a_page_holds_all_and_fetches_nothing() -> None:
     assert "default-src 'none'" in text
 
 
-def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_policy_allows_only_own_script_and_style(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "pages_of_a_test" / "templates"
     folder.mkdir(parents=True)
     (folder.parent / "__init__.py").touch()
@@ -98,7 +96,7 @@ def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
     (folder / "own.css").write_text("p > b { color: red }\n")
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     made = pages.render(
-        "pages_of_a_test", "own.html", scripts=("one.js", "two.js"), styles=("own.css",), connects=True,
+        "pages_of_a_test", "own.html", scripts=("one.js", "two.js"), styles=("own.css",), uses_server=True,
         title="T", name="<i>",
     )  # fmt: skip
     script, style = (re.search(f"(?s)<{name}>(.*)</{name}>", made.text) for name in ("script", "style"))
@@ -115,6 +113,6 @@ def test_the_policy_lets_a_page_s_own_script_and_style_run_and_nothing_else(
     assert rules["connect-src"] == "'self'"
 
 
-def test_what_is_no_picture_is_refused() -> None:
+def test_refuses_other_data_than_pictures() -> None:
     with pytest.raises(ValueError, match="GIF89a"):
         pages.figure(b"GIF89a", "")

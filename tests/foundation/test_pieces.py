@@ -1,4 +1,4 @@
-"""Records of finished pieces: what counts of one that was cut, changed or made of something else."""
+"""Records of finished pieces: damaged lines, other inputs, missing files."""
 
 from __future__ import annotations
 
@@ -9,40 +9,40 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.files import sha256_of
-from foundation.pieces import Piece, pieces_of
+from foundation.pieces import Piece, read_pieces
 
 ONE = Piece("one", "of these", {"a.png": "0" * 64}, '{"value": 0.1}')
 TWO = Piece("two", "of these", {}, "[]")
 FOREIGN = Piece("one", "of others", {}, "{}")
 
 
-def test_pieces_come_back_as_they_were() -> None:
+def test_restores_pieces() -> None:
     record = ONE.to_line() + TWO.to_line()
-    assert pieces_of(record) == pieces_of(record, "of these") == {"one": ONE, "two": TWO}
-    assert pieces_of(record + FOREIGN.to_line())["one"] == FOREIGN, "the last of a name"
-    assert pieces_of(record + FOREIGN.to_line(), "of these")["one"] == ONE
+    assert read_pieces(record) == read_pieces(record, "of these") == {"one": ONE, "two": TWO}
+    assert read_pieces(record + FOREIGN.to_line())["one"] == FOREIGN, "the last of a name"
+    assert read_pieces(record + FOREIGN.to_line(), "of these")["one"] == ONE
     other = b"a line\tof something else"
-    assert pieces_of(b"%s\t%s\n" % (sha256_of(other).encode(), other)) == pieces_of(b"") == {}
+    assert read_pieces(b"%s\t%s\n" % (sha256_of(other).encode(), other)) == read_pieces(b"") == {}
 
 
 @given(st.data())
-def test_no_damaged_line_counts_and_the_others_do(data: st.DataObject) -> None:
+def test_ignores_damaged_lines_only(data: st.DataObject) -> None:
     line = ONE.to_line()
     place = data.draw(st.integers(1, len(line) - 2))
     byte = data.draw(st.integers(0, 255).filter(lambda byte: byte != line[place]))
     changed = line[:place] + bytes([byte]) + line[place + 1 :]
     for damaged in (line[:place], changed):
-        assert pieces_of(damaged + TWO.to_line()) == {"two": TWO}
+        assert read_pieces(damaged + TWO.to_line()) == {"two": TWO}
 
 
 @pytest.mark.parametrize("content", [b"other", None])
-def test_a_piece_without_its_files_is_not_whole(tmp_path: Path, content: bytes | None) -> None:
+def test_piece_without_its_files_is_incomplete(tmp_path: Path, content: bytes | None) -> None:
     files = {"a": b"1", "b": b"22"}
     piece = Piece("one", "", {name: sha256_of(data) for name, data in files.items()}, "{}")
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)
-    assert piece.is_whole(lambda name: (tmp_path / name).open("rb"))
+    assert piece.is_complete(lambda name: (tmp_path / name).open("rb"))
     (tmp_path / "b").unlink()
     if content is not None:
         (tmp_path / "b").write_bytes(content)
-    assert not piece.is_whole(lambda name: (tmp_path / name).open("rb"))
+    assert not piece.is_complete(lambda name: (tmp_path / name).open("rb"))

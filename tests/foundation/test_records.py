@@ -1,4 +1,4 @@
-"""Records go to JSON and back the same, and what is damaged is said by its key."""
+"""Records are restored from JSON, and errors name the damaged key."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ class Written(Record):
 
 
 @given(st.lists(st.lists(st.floats(allow_infinity=False), min_size=3, max_size=3), max_size=4), st.text())
-def test_arrays_come_back_to_the_bit(rows: list[list[float]], name: str) -> None:
+def test_restores_arrays_exactly(rows: list[list[float]], name: str) -> None:
     counts = np.array(rows, dtype=np.float64)
     read = from_json(Measured, json.dumps(to_plain(Measured(counts, name))), "a.json", "make it again")
     np.testing.assert_array_equal(read.counts, counts)
     assert read.name == name
 
 
-def test_a_key_of_a_later_version_is_passed_over() -> None:
+def test_ignores_keys_of_later_versions() -> None:
     assert from_plain(Written, {"light": 3, "newer": 1}, "a.json", "") == Written(light=3)
 
 
-def test_what_is_not_finite_is_null() -> None:
+def test_writes_nan_and_infinity_as_null() -> None:
     assert to_plain(Measured(np.array([1.0, np.nan, np.inf])))["counts"] == [1.0, None, None]
 
 
 @pytest.mark.parametrize(
     ("text", "key"), [('{"light": "x"}', "light"), ("{}", "light"), ('{"light": 1, "seen": 2}', "seen")]
 )
-def test_what_is_damaged_is_said_by_its_key(text: str, key: str) -> None:
+def test_error_names_the_damaged_key(text: str, key: str) -> None:
     with pytest.raises(FormatError, match=f"^a.json: .*{key}") as caught:
         from_json(Written, text, "a.json", "restore it from a copy")
     assert (caught.value.about, caught.value.remedy) == ("a.json", "restore it from a copy")

@@ -1,4 +1,4 @@
-"""No address shows who asks, whatever the message it stands in."""
+"""Messages contain no secrets of addresses and no control characters."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from foundation.secret_texts import masked, masked_values, printable
         ("mail a@b.example, key=3", "mail a@b.example, key=3"),
     ],
 )
-def test_addresses_lose_their_secrets(text: str, shown: str) -> None:
+def test_masks_secrets_of_addresses(text: str, shown: str) -> None:
     assert masked(text).startswith(shown)
     assert "s3cret" not in masked(text)
     assert masked(masked(text)) == masked(text)
 
 
-def test_values_for_json_keep_their_shape() -> None:
+def test_masks_values_for_json() -> None:
     value = {"a": ["ftp://u:p@h/x", 3, None], "b": ("ftp://u:p@h/x",), "ftp://u:p@h": True}
     assert masked_values(value) == {"a": ["ftp://…@h/x", 3, None], "b": ["ftp://…@h/x"], "ftp://u:p@h": True}
 
 
 @pytest.mark.parametrize("sign", ["\u2028", "\u202e", "\u2066", "\u2069", "\x9b", "\x7f"])
-def test_no_sign_that_reorders_or_obeys_is_printed(sign: str) -> None:
+def test_escapes_control_characters(sign: str) -> None:
     assert printable(f"a{sign}b") == f"a{sign.encode('unicode_escape').decode()}b"
 
 
-def test_every_error_is_masked(capsys: pytest.CaptureFixture[str]) -> None:
+def test_masks_errors(capsys: pytest.CaptureFixture[str]) -> None:
     def fails() -> None:
         raise StorageError("cannot write ftp://lab:s3cret@h/x")
 
@@ -51,7 +51,7 @@ def test_every_error_is_masked(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == "error: cannot write ftp://…@h/x\n"
 
 
-def test_a_terminal_obeys_no_name(capsys: pytest.CaptureFixture[str]) -> None:
+def test_escapes_control_characters_in_errors(capsys: pytest.CaptureFixture[str]) -> None:
     def fails() -> None:
         raise InputError("no \x1b]0;title\x07\udcff.png")
 

@@ -1,4 +1,4 @@
-"""Files of users that have a name of one of our packages."""
+"""User files with the name of one of our packages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run code as a program in a folder that comes before all others."""
+    """Run code as a program in a folder that precedes all others in the search path."""
     environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
     program = [sys.executable, "-c", code]
     return subprocess.run(program, capture_output=True, text=True, check=False, env=environment, cwd=folder)
@@ -21,7 +21,7 @@ def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hidden", ["generator", "evaluation", "foundation"])
-def test_a_file_that_hides_a_package_is_named(tmp_path: Path, hidden: str) -> None:
+def test_names_a_file_that_hides_a_package(tmp_path: Path, hidden: str) -> None:
     (tmp_path / f"{hidden}.py").write_text("x = 1\n")
     done = run("import croplab; croplab.open_lut", tmp_path)
     assert f"{tmp_path / hidden}.py hides the package {hidden} of CroP" in done.stderr.splitlines()[-1]
@@ -31,7 +31,7 @@ def test_a_file_that_hides_a_package_is_named(tmp_path: Path, hidden: str) -> No
 
 
 @pytest.mark.slow
-def test_the_name_of_its_own_has_what_the_packages_have_and_loads_late(tmp_path: Path) -> None:
+def test_croplab_exports_the_public_names_lazily(tmp_path: Path) -> None:
     code = """
 import sys, croplab
 assert not {"numpy", "typer", "generator"} & sys.modules.keys()
@@ -48,7 +48,7 @@ except AttributeError:
 
 
 @pytest.mark.slow
-def test_a_method_beside_such_a_file_is_loaded_and_hides_nothing(tmp_path: Path) -> None:
+def test_loads_a_method_next_to_such_a_file(tmp_path: Path) -> None:
     (tmp_path / "generator.py").write_text("raise SystemExit('hidden')\n")
     method = tmp_path / "mine.py"
     lines = (

@@ -130,7 +130,7 @@ def test_a_sheet_that_could_not_be_written_is_made_alone(
         raise StorageError(f"cannot write {path}") from OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr(contact, "write_whole", full)
+        patched.setattr(contact, "write_atomic", full)
         assert generate("lut", "out", *wish) == 5
     assert (
         "error: out is complete, but its contact sheet sheet.png cannot be written: No space left on device; free "

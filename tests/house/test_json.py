@@ -17,7 +17,7 @@ import pytest
 from typer.main import get_command
 
 from croplab import COMMANDS
-from foundation.console import JsonOutput, json_output, plain, with_json
+from foundation.console import JsonOutput, json_output, json_value, with_json
 from foundation.errors import QualityError
 from tests.json_of import json_of
 
@@ -66,7 +66,7 @@ def test_nothing_else_is_described() -> None:
 
 class TestOutput:
     def test_what_is_printed_goes_elsewhere(self, capsys: pytest.CaptureFixture[str]) -> None:
-        with json_output("generate", asked=True) as told:
+        with json_output("generate", is_requested=True) as told:
             print("for a reader")
             told.add(
                 images=3, share=math.nan, most=math.inf, place=Path("a"), levels=np.arange(2), mean=np.float32(0.5)
@@ -80,7 +80,7 @@ class TestOutput:
         assert said.err == "for a reader\n"
 
     def test_nothing_changes_unless_asked(self, capsys: pytest.CaptureFixture[str]) -> None:
-        with json_output("generate", asked=False) as told:
+        with json_output("generate", is_requested=False) as told:
             print("for a reader")
             told.add(images=3)
         assert capsys.readouterr().out == "for a reader\n"
@@ -99,17 +99,17 @@ class TestOutput:
 
     def test_standard_output_is_given_back(self) -> None:
         before = sys.stdout
-        with json_output("x", asked=True):
+        with json_output("x", is_requested=True):
             pass
         assert sys.stdout is before
 
     def test_objects_are_plain(self) -> None:
-        assert plain(JsonOutput) == str(JsonOutput)
-        assert plain({1: {2.5}}) == {"1": [2.5]}
+        assert json_value(JsonOutput) == str(JsonOutput)
+        assert json_value({1: {2.5}}) == {"1": [2.5]}
 
 
 def _refuse(**figures: Any) -> None:
-    with json_output("build-lut", asked=True) as told:
+    with json_output("build-lut", is_requested=True) as told:
         told.add(**figures)
         raise QualityError("bad")
 

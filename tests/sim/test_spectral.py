@@ -29,8 +29,8 @@ from sim.spectral import (
     projector_primaries,
     published_spectra,
     read_sensitivities,
-    regridded,
     require_grid,
+    resampled,
 )
 from tests.data_files import available
 from tests.sim.world.lab import intended_lab, relative_lab
@@ -40,7 +40,7 @@ NODES = np.arange(380.0, 781.0, 5.0)
 
 def test_a_coarser_grid_is_joined_by_straight_lines() -> None:
     coarse = np.arange(390.0, 731.0, 10.0)
-    found = regridded(coarse, coarse[:, None] ** 1, NODES)[:, 0]
+    found = resampled(coarse, coarse[:, None] ** 1, NODES)[:, 0]
     inside = (NODES >= 390) & (NODES <= 730)
     assert found[inside] == pytest.approx(NODES[inside])
     assert np.count_nonzero(found[~inside]) == 0
@@ -50,7 +50,7 @@ def test_a_coarser_grid_is_joined_by_straight_lines() -> None:
 def test_a_narrow_line_between_the_nodes_keeps_its_light_and_its_place(at: float) -> None:
     fine = np.arange(380.0, 780.05, 0.1)
     line = np.exp(-0.5 * ((fine - at) / 0.3) ** 2)[:, None]
-    found = regridded(fine, line, NODES)[:, 0]
+    found = resampled(fine, line, NODES)[:, 0]
     light = float(line.sum()) * 0.1
     assert found.sum() * 5 == pytest.approx(light, rel=1e-3)
     assert (found * NODES).sum() * 5 / light == pytest.approx(at, abs=0.02)
@@ -59,7 +59,7 @@ def test_a_narrow_line_between_the_nodes_keeps_its_light_and_its_place(at: float
 def test_a_line_among_coarse_steps_leaves_the_rest_smooth() -> None:
     # Measured every 10 nm, and every 1 nm about a line: nodes between the coarse steps must not stay dark.
     grid = np.unique(np.concatenate([np.arange(380.0, 781.0, 10.0), np.arange(540.0, 551.0)]))
-    found = regridded(grid, grid[:, None] / 500, NODES)[:, 0]
+    found = resampled(grid, grid[:, None] / 500, NODES)[:, 0]
     assert found[1:-1] == pytest.approx(NODES[1:-1] / 500, rel=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""`sim table`: what it takes and prints; the devices beside it."""
+"""The command `sim table`: arguments and output."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def settings(tmp_path: Path) -> str:
 
 
 @pytest.mark.slow
-def test_a_table_comes_of_one_command(settings: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_computes_a_lut(settings: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "lut"
     Path(settings).write_text("seed = 4\n[room]\npaper = 'matt'\nhot_per_million = 5.0\n" + SMALL)
-    given = ["--camera", "Canon_EOS-1Ds_Mark_III", "--lights", "D65,A"]
-    assert main(["table", str(out), "--settings", settings, *given]) == 0
+    options = ["--camera", "Canon_EOS-1Ds_Mark_III", "--lights", "D65,A"]
+    assert main(["table", str(out), "--settings", settings, *options]) == 0
     assert capsys.readouterr().out == (
-        f"{out}: computed, 2 lights, 8 colours, 25 samples each; 0 cells unfit for use\n"
+        f"{out}: computed, 2 illuminants, 8 colours, 25 samples each; 0 patches unfit for use\n"
     )
     computed = open_lut(out).provenance.computed
     assert computed is not None
@@ -36,9 +36,7 @@ def test_a_table_comes_of_one_command(settings: str, tmp_path: Path, capsys: pyt
 
 
 @pytest.mark.slow
-def test_a_table_says_what_it_is_told_of_itself(
-    settings: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_records_and_prints_the_citation(settings: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "lut"
     citation = "note = 'for a course'\nlicence = 'CC-BY-4.0'\nauthors = ['Lovelace, Ada', 'An Institute']\n"
     Path(settings).write_text(f"{SMALL}[citation]\n{citation}")
@@ -64,7 +62,7 @@ def test_a_table_says_what_it_is_told_of_itself(
         (["--settings", "nowhere.toml"], "nowhere.toml"),
     ],
 )
-def test_what_cannot_be_computed_is_one_sentence(
+def test_refuses_bad_arguments(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["table", str(tmp_path / "lut"), *arguments]) == 2
@@ -72,6 +70,6 @@ def test_what_cannot_be_computed_is_one_sentence(
     assert not (tmp_path / "lut").exists()
 
 
-def test_the_devices_are_beside_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_also_has_the_device_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["projector"]) == 2
     assert "one projector has one cable" in capsys.readouterr().err

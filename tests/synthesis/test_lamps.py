@@ -1,4 +1,4 @@
-"""Lights by their spectra: files, published ones, black bodies, and what is refused."""
+"""Spectra of illuminants: files, published spectra, black bodies, refusals; computed sensor."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from foundation.errors import FormatError, InputError
 from sim.spectral import WAVELENGTHS_NM
 from sim.world.sensors import BODIES, Rectangle
 from sim.world.world import Room
-from synthesis.lamps import PatchSensor, illuminations_of, parse_spectra, read_lights
+from synthesis.lamps import PatchSensor, parse_spectra, read_lights, table_illuminations
 
 
 def table(step: int = 5, low: int = 380, high: int = 780, **lights: float) -> str:
-    """Return a file of flat spectra of these powers."""
+    """Return a CSV file of constant spectra with these powers."""
     rows = [",".join(["wavelength", *lights])]
     rows += [",".join([str(at), *map(str, lights.values())]) for at in range(low, high + 1, step)]
     return "\n".join(rows) + "\n"
 
 
-def test_a_file_has_a_light_in_every_column(tmp_path: Path) -> None:
+def test_reads_a_light_from_each_column(tmp_path: Path) -> None:
     path = tmp_path / "lamps.csv"
     path.write_text(table(hall=2.0, stage=7.0), encoding="utf-8-sig")
     found = read_lights(str(path))
@@ -36,7 +36,7 @@ def test_a_file_has_a_light_in_every_column(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("step", "low", "high"), [(1, 380, 780), (5, 400, 700), (10, 350, 900), (20, 400, 700)])
-def test_any_grid_gives_the_same_light_where_it_is_given(step: int, low: int, high: int) -> None:
+def test_light_does_not_depend_on_the_grid(step: int, low: int, high: int) -> None:
     (light,) = parse_spectra(table(step, low, high, hall=3.0).encode(), "lamps.csv")
     inside = (max(low, 380) + 5 < WAVELENGTHS_NM) & (min(high, 780) - 5 > WAVELENGTHS_NM)
     assert light.power[inside] == pytest.approx(np.ones(int(inside.sum())))
@@ -44,7 +44,7 @@ def test_any_grid_gives_the_same_light_where_it_is_given(step: int, low: int, hi
     assert not light.power[beyond].any()
 
 
-def test_published_illuminants_are_those_of_the_cie() -> None:
+def test_published_illuminants_equal_the_cie() -> None:
     found = {light.name: light for light in read_lights("A,D65,FL2,LED-B3").lights}
     # CIE 15, illuminants A and D65: relative power at 400, 500, 560 and 700 nm, over that at 560 nm.
     at = np.searchsorted(WAVELENGTHS_NM, [400, 500, 560, 700])
@@ -55,13 +55,13 @@ def test_published_illuminants_are_those_of_the_cie() -> None:
     assert all(light.cct_k is None for light in found.values())
 
 
-def test_a_black_body_is_plancks_and_keeps_its_temperature() -> None:
+def test_black_body_follows_planck_and_keeps_its_temperature() -> None:
     lights = read_lights("2000:10000:4000K").lights
     assert [light.cct_k for light in lights] == [2000, 6000, 10_000]
     planck = [w**-5 / np.expm1(1.4387769e7 / (w * 6000)) for w in (450.0, 650.0)]
     at = np.searchsorted(WAVELENGTHS_NM, [450, 650])
     assert lights[1].power[at[0]] / lights[1].power[at[1]] == pytest.approx(planck[0] / planck[1], rel=2e-3)
-    shown = illuminations_of(lights)
+    shown = table_illuminations(lights)
     assert [light.kind for light in shown] == ["blackbody"] * 3
     # The projector's black body of the same temperature has the same codes, to rounding.
     for light, cct_k in zip(shown, (2000, 6000, 10_000), strict=True):
@@ -69,7 +69,7 @@ def test_a_black_body_is_plancks_and_keeps_its_temperature() -> None:
         assert np.abs(np.subtract(light.colour, (expected.red, expected.green, expected.blue))).max() <= 1
 
 
-def test_a_set_names_several_and_daylight_any_temperature() -> None:
+def test_accepts_sets_and_daylight_of_any_temperature() -> None:
     assert [light.name for light in read_lights("cie-hp").lights] == ["HP1", "HP2", "HP3", "HP4", "HP5"]
     assert len(read_lights("cie").lights) == 52
     (light,) = read_lights("daylight:6504").lights
@@ -78,7 +78,7 @@ def test_a_set_names_several_and_daylight_any_temperature() -> None:
 
 
 @pytest.mark.parametrize(("at", "is_light"), [(395, False), (400, True), (700, True), (705, False)])
-def test_a_light_has_power_somewhere_from_400_to_700_nm(at: int, is_light: bool) -> None:
+def test_requires_power_from_400_to_700_nm(at: int, is_light: bool) -> None:
     text = table(hall=0.0).replace(f"{at},0.0", f"{at},3.0")
     if is_light:
         (light,) = parse_spectra(text.encode(), "lamps.csv")
@@ -88,7 +88,7 @@ def test_a_light_has_power_somewhere_from_400_to_700_nm(at: int, is_light: bool)
         parse_spectra(text.encode(), "lamps.csv")
 
 
-def test_a_file_that_is_not_there_is_named() -> None:
+def test_names_a_missing_file() -> None:
     with pytest.raises(InputError, match=r"spectra nowhere\.csv"):
         read_lights("nowhere.csv")
 
@@ -99,24 +99,24 @@ def test_a_file_that_is_not_there_is_named() -> None:
         ("nm,hall\n400,1\n", "its first line is 'nm,hall'"),
         (
             table(hall=1.0).replace("hall", "12"),
-            "a light is called '12', which generate --light would take for a number",
+            "the name of an illuminant is '12', expected a name with a letter",
         ),
         (table(hall=1.0).replace("500,1.0", "500,-0.1"), "'hall' is -0.1 at 500 nm, 0 or more expected"),
         (table(hall=1.0).replace("500,1.0", "500,"), "line 26: 2 numbers expected"),
         (table(hall=1.0).replace("500,1.0", "500"), "line 26: 2 numbers expected"),
-        (table(hall=1.0).replace("500,1.0", "500,nan"), "a number is not finite"),
-        (table(hall=1.0, cellar=0.0), "'cellar' is dark from 400 to 700 nm"),
+        (table(hall=1.0).replace("500,1.0", "500,nan"), "a value is NaN or infinite"),
+        (table(hall=1.0, cellar=0.0), "'cellar' has no power from 400 to 700 nm"),
         (table(low=410, hall=1.0), "its wavelengths are 410 to 780"),
         (table(step=40, hall=1.0), "a gap from 380 to 420 nm"),
         (table(hall=1.0) + "500,2\n", "500 nm stands there twice"),
     ],
 )
-def test_what_cannot_be_a_spectrum_is_refused(text: str, message: str) -> None:
+def test_refuses_bad_spectra(text: str, message: str) -> None:
     with pytest.raises(FormatError, match=rf"lamps\.csv.*{message}"):
         parse_spectra(text.encode(), "lamps.csv")
 
 
-def test_what_is_no_text_is_refused() -> None:
+def test_refuses_binary_data() -> None:
     with pytest.raises(FormatError):
         parse_spectra(b"\xff\xfe\x00", "lamps.csv")
 
@@ -127,7 +127,7 @@ BODY = BODIES["Test"]
 EVEN = Room(response_spread=0.0, hot_per_million=0.0)
 
 
-def test_every_photosite_has_the_light_of_its_own_channel_of_its_patch() -> None:
+def test_photosite_has_the_light_of_its_channel_and_patch() -> None:
     sensor = PatchSensor.of(BODY, 2, 3, EVEN, 0.5)
     signals = np.array([[[10.0, 1], [20, 2], [30, 3]], [[40, 4], [50, 5], [60, 6]]])
     found = sensor.light(signals)
@@ -141,7 +141,7 @@ def test_every_photosite_has_the_light_of_its_own_channel_of_its_patch() -> None
     assert (sensor.sites.rows.tolist(), sensor.sites.columns.tolist(), sensor.sites.window) == ([1, 4], [1, 1], 3)
 
 
-def test_photosites_differ_by_the_spread_of_the_room() -> None:
+def test_response_has_the_spread_of_the_room() -> None:
     response = PatchSensor.of(BODY, 100, 5, replace(EVEN, response_spread=0.02), 0.5).response
     # 10 000 photosites: the mean is known to a hundredth of the spread, the spread to .7 %.
     assert response.mean() == pytest.approx(1, abs=5 * 0.0002)
@@ -158,8 +158,8 @@ def test_photosites_differ_by_the_spread_of_the_room() -> None:
         ((Rectangle(0, 0, 20, 14), Rectangle(0, 20, 10, 8)), (20 * 10 + 10 * 4) / 4),
     ],
 )
-def test_black_is_known_by_the_masked_photosites(masked: tuple[Rectangle, ...], photosites: float | None) -> None:
-    """But for the four columns beside each border, and a quarter of them for each place of the pattern."""
+def test_black_level_error_depends_on_masked_area(masked: tuple[Rectangle, ...], photosites: float | None) -> None:
+    """Four columns at each border are not used; each position of the pattern has a quarter."""
     body = replace(BODY, masked=masked, read_noise_dn=0.3, sensor_noise_e=0.0)
     sensor = PatchSensor.of(body, 1, 3, EVEN, 0.5)
     dark = np.zeros((3, 6, 6), np.float32)

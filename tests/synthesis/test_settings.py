@@ -1,4 +1,4 @@
-"""Settings of computed tables: what a file says, and what is refused."""
+"""Settings of computed LUTs: values of a file, and refusals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from foundation.errors import ConfigurationError
 from sim.world.sensors import FACTS, find_body
-from synthesis.settings import TableSettings, load_settings, origin_of, parse_settings, room_of
+from synthesis.settings import TableSettings, citation_record, load_settings, parse_settings, table_room
 
 FILE = """
 seed = 3
@@ -29,12 +29,12 @@ profile = "managed"
 """
 
 
-def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
+def test_file_changes_the_named_settings(tmp_path: Path) -> None:
     path = tmp_path / "table.toml"
     path.write_text(FILE)
     settings = load_settings(path)
     assert (settings.seed, settings.window, settings.exposure.iso, settings.exposure.shutter_s) == (3, 7, 400, 0.5)
-    room = room_of(settings, "here")
+    room = table_room(settings, "here")
     assert (room.seed, room.vignetting, room.profile, room.lamp_drift_per_hour) == (3, 0.1, "managed", 0)
     body = find_body("Canon_EOS_5DS", settings.camera, "here")
     assert (body.model, body.electrons_per_dn, body.saturation) == ("Maker M2", 2.5, FACTS["Canon_EOS_5DS"].saturation)
@@ -43,14 +43,14 @@ def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("section", "name", "least", "most"),
+    ("section", "name", "minimum", "maximum"),
     [("exposure", "iso", 50, 25600), ("chart", "bits", 1, 5), ("chart", "seed", 0, None), ("", "seed", 0, None)],
 )
-def test_numbers_at_their_limits_and_beyond(section: str, name: str, least: int, most: int | None) -> None:
+def test_checks_the_limits_of_numbers(section: str, name: str, minimum: int, maximum: int | None) -> None:
     def parsed(number: int) -> TableSettings:
         return parse_settings({section: {name: number}} if section else {name: number}, "here")
 
-    for limit, beyond in ((least, least - 1), *([(most, most + 1)] if most else [])):
+    for limit, beyond in ((minimum, minimum - 1), *([(maximum, maximum + 1)] if maximum else [])):
         settings = parsed(limit)
         assert getattr(getattr(settings, section) if section else settings, name) == limit
         with pytest.raises(ConfigurationError, match=rf"{name} = {beyond}"):
@@ -65,7 +65,7 @@ def test_numbers_at_their_limits_and_beyond(section: str, name: str, least: int,
         ({"exposure": {"shutter_s": float("inf")}}, r"exposure\.shutter_s = inf"),
     ],
 )
-def test_what_cannot_be_set_is_refused(document: dict[str, Any], message: str) -> None:
+def test_refuses_unknown_settings(document: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         parse_settings(document, "here")
 
@@ -86,18 +86,18 @@ def test_what_cannot_be_set_is_refused(document: dict[str, Any], message: str) -
         ({"pattern": "RGBW"}, "pattern is 'RGBW'"),
     ],
 )
-def test_what_no_sensor_has_is_refused(camera: dict[str, Any], message: str) -> None:
+def test_refuses_impossible_sensors(camera: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         find_body("Canon_EOS_600D", camera, "here")
 
 
-def test_a_citation_is_recorded_and_devices_have_no_place_in_it() -> None:
+def test_records_the_citation_without_devices() -> None:
     stated = {"authors": ["Lovelace, Ada"], "licence": "cc-by-4.0", "title": "A table"}
-    origin = origin_of(parse_settings({"citation": stated}, "here"), "here")
+    origin = citation_record(parse_settings({"citation": stated}, "here"), "here")
     assert origin is not None
     assert (origin.authors, origin.licence, origin.title) == (["Lovelace, Ada"], "CC-BY-4.0", "A table")
-    assert origin_of(TableSettings(), "here") is None
+    assert citation_record(TableSettings(), "here") is None
     for key in ("lens", "projector", "camera_serial"):
         document = {"citation": {key: "plain"}}
         with pytest.raises(ConfigurationError, match=rf"here: citation\.{key}"):
-            origin_of(parse_settings(document, "here"), "here")
+            citation_record(parse_settings(document, "here"), "here")

@@ -1,4 +1,4 @@
-"""A computed table is a table, says that it was computed, and equals a photographed one within its noise."""
+"""A computed LUT is complete, records that it was computed, and equals a photographed one within noise."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def task_of(bits: int = 3, page: str = "A5", window: int = 5, **room: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Cells of two tables, light by light: how far means and spreads differ, in units of what noise allows."""
+    """Differences of two LUTs, in units of the noise."""
 
     normal: npt.NDArray[np.float64]
     """(L, C, 3), difference of the means over its standard error."""
@@ -63,7 +63,7 @@ def compared(one: Lut, other: Lut) -> Comparison:
 
 @pytest.fixture(scope="module")
 def photographed(tmp_path_factory: pytest.TempPathFactory) -> Lut:
-    """Return a table of frames, built as build-lut does; the lens is sharp, so that no light leaks between cells."""
+    """Return a LUT of frames, built as build-lut does; with a sharp lens, so that no light leaks between patches."""
     folder = tmp_path_factory.mktemp("photographed")
     with take(hang(room=replace(ROOM, blur_px=0.05)), folder / "session", LIGHTS) as session:
         build(session, folder / "lut")
@@ -78,7 +78,7 @@ def computed(tmp_path_factory: pytest.TempPathFactory) -> Lut:
 
 
 @pytest.mark.slow
-def test_a_computed_table_equals_a_photographed_one_within_its_noise(computed: Lut, photographed: Lut) -> None:
+def test_equals_a_photographed_lut_within_noise(computed: Lut, photographed: Lut) -> None:
     found = compared(computed, photographed)
     lit = np.asarray(photographed.samples).mean(axis=(1, 2)) > 20
     # Student's t of 48 degrees of freedom has a standard deviation of 1.02; 512 cells tell it to 3 %.
@@ -94,7 +94,7 @@ def test_a_computed_table_equals_a_photographed_one_within_its_noise(computed: L
 
 
 @pytest.mark.slow
-def test_the_ground_truths_differ_by_no_more_than_their_errors(computed: Lut, photographed: Lut) -> None:
+def test_ground_truths_agree_within_their_errors(computed: Lut, photographed: Lut) -> None:
     bright = photographed.white > 500
     assert float(np.abs(compared(computed, photographed).white)[bright].max()) < 2e-3
 
@@ -103,7 +103,7 @@ def test_the_ground_truths_differ_by_no_more_than_their_errors(computed: Lut, ph
 @pytest.mark.parametrize(
     "changes", [{"electrons_per_dn": 1.5}, {"read_noise_dn": 9.0}, {"sensitivities": "Canon_EOS_200D"}]
 )
-def test_the_comparison_sees_another_sensor(photographed: Lut, tmp_path: Path, changes: dict[str, float | str]) -> None:
+def test_comparison_detects_another_sensor(photographed: Lut, tmp_path: Path, changes: dict[str, float | str]) -> None:
     body = replace(BODIES["Test"], **changes)  # pyrefly: ignore[bad-argument-type]
     compute_table(replace(task_of(), body=body), tmp_path / "lut", threads=2)
     found = compared(open_lut(tmp_path / "lut"), photographed)
@@ -111,7 +111,7 @@ def test_the_comparison_sees_another_sensor(photographed: Lut, tmp_path: Path, c
 
 
 @pytest.mark.slow
-def test_a_computed_table_is_whole_and_says_that_it_was_computed(computed: Lut) -> None:
+def test_is_complete_and_recorded_as_computed(computed: Lut) -> None:
     assert find_faults(computed) == []
     assert computed.provenance.computed == {"by": "test"}
     assert computed.frames == ()
@@ -120,7 +120,7 @@ def test_a_computed_table_is_whole_and_says_that_it_was_computed(computed: Lut) 
 
 
 @pytest.mark.slow
-def test_threads_do_not_change_the_bytes_and_the_seed_does(computed: Lut, tmp_path: Path) -> None:
+def test_bytes_depend_on_seed_not_on_threads(computed: Lut, tmp_path: Path) -> None:
     alone = compute_table(task_of(), tmp_path / "alone", threads=1)
     assert open_lut(alone.folder).sha256 == computed.sha256
     other = compute_table(replace(task_of(), room=replace(ROOM, seed=7)), tmp_path / "other", threads=2)
@@ -128,7 +128,7 @@ def test_threads_do_not_change_the_bytes_and_the_seed_does(computed: Lut, tmp_pa
 
 
 @pytest.mark.slow
-def test_overexposed_cells_are_unfit_and_overexposed_paper_is_refused(tmp_path: Path, pinned: Pinned) -> None:
+def test_lists_clipped_cells_and_refuses_clipped_paper(tmp_path: Path, pinned: Pinned) -> None:
     # The middle of the page is brighter than its corners, where enough references are still below the limit.
     done = compute_table(
         task_of(white_level_share=2.0, projector_falloff=0.7, vignetting=0.25), tmp_path / "bright", threads=2
@@ -144,7 +144,7 @@ def test_overexposed_cells_are_unfit_and_overexposed_paper_is_refused(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_taken_place_and_a_small_disk_are_refused_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_existing_folder_and_small_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "file").touch()
     with pytest.raises(InputError):
@@ -156,7 +156,7 @@ def test_a_taken_place_and_a_small_disk_are_refused_first(tmp_path: Path, monkey
 
 
 @pytest.mark.slow
-def test_where_a_file_of_sensitivities_lies_is_not_recorded(tmp_path: Path) -> None:
+def test_does_not_record_the_path_of_sensitivities(tmp_path: Path) -> None:
     data = resources.files("sim").joinpath("data", "Canon_EOS_5DS_380_780_5.json").read_bytes()
     records: list[dict[str, Any]] = []
     for place in ("here", "there"):
@@ -169,7 +169,7 @@ def test_where_a_file_of_sensitivities_lies_is_not_recorded(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_hot_photosites_are_in_the_samples_of_every_light_and_in_no_list(computed: Lut, tmp_path: Path) -> None:
+def test_samples_contain_hot_photosites(computed: Lut, tmp_path: Path) -> None:
     task = task_of(hot_per_million=100.0, hot_dn_per_s=4000.0)
     hot = open_lut(compute_table(task, tmp_path / "lut", threads=2).folder)
     apart = np.asarray(hot.samples, dtype=np.float64) - np.asarray(computed.samples, dtype=np.float64)
@@ -202,7 +202,7 @@ def lut(lights: LightSpectra, tmp_path_factory: pytest.TempPathFactory) -> Lut:
 
 
 @pytest.mark.slow
-def test_the_ground_truth_is_what_the_camera_sees_of_bare_paper(lut: Lut, lights: LightSpectra) -> None:
+def test_ground_truth_is_the_response_to_bare_paper(lut: Lut, lights: LightSpectra) -> None:
     powers = np.array([light.power for light in lights.lights])
     seen = np.einsum("lw,w,wc->lc", powers, print_reflectance([(255, 255, 255)])[0], sensitivities(CAMERA))
     truth = seen / seen.sum(axis=1, keepdims=True)
@@ -211,7 +211,7 @@ def test_the_ground_truth_is_what_the_camera_sees_of_bare_paper(lut: Lut, lights
 
 
 @pytest.mark.slow
-def test_every_cell_is_what_the_camera_sees_of_its_ink(lut: Lut, lights: LightSpectra) -> None:
+def test_patches_are_the_response_to_their_ink(lut: Lut, lights: LightSpectra) -> None:
     codes = np.stack(np.meshgrid(*[np.arange(4) * 64] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     for number, light in enumerate(lights.lights):
         curves = light.power[:, None] * sensitivities(CAMERA)
@@ -222,19 +222,19 @@ def test_every_cell_is_what_the_camera_sees_of_its_ink(lut: Lut, lights: LightSp
 
 
 @pytest.mark.slow
-def test_every_light_is_exposed_alike(lut: Lut) -> None:
+def test_all_lights_have_equal_exposure(lut: Lut) -> None:
     brightest = lut.white.max(axis=1)
     assert float(brightest.max() / brightest.min()) == pytest.approx(1, abs=3e-3)
 
 
 @pytest.mark.slow
-def test_a_session_cannot_be_planned_with_spectra(lut: Lut) -> None:
+def test_refuses_spectra_in_a_session_plan(lut: Lut) -> None:
     with pytest.raises(FormatError, match=r"'spectrum'.* blackbody"):
         load_illuminations(lut.folder / "illuminations.csv")
 
 
 @pytest.mark.slow
-def test_another_print_gives_another_table(lights: LightSpectra, tmp_path: Path) -> None:
+def test_lut_depends_on_the_print(lights: LightSpectra, tmp_path: Path) -> None:
     task = table_task(CAMERA, SMALL, "here", lights)
     managed = replace(task, room=replace(task.room, profile="managed", paper="glossy"))
     compute_table(managed, tmp_path / "lut", threads=2)
@@ -245,7 +245,7 @@ def test_another_print_gives_another_table(lights: LightSpectra, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_datasets_and_results_say_that_the_table_was_computed(lut: Lut, tmp_path: Path) -> None:
+def test_datasets_record_that_the_lut_was_computed(lut: Lut, tmp_path: Path) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     Image.fromarray(np.random.default_rng(1).integers(0, 256, (24, 32, 3), dtype=np.uint8)).save(pictures / "a.png")
@@ -280,8 +280,8 @@ CASES: dict[str, tuple[str, dict[str, Any], str | None]] = {
 }
 
 
-def held_by(folder: Path) -> dict[str, Any]:
-    """Return what a table holds, but for the software that wrote it, and hashes of what names it."""
+def content_of(folder: Path) -> dict[str, Any]:
+    """Return the content of a LUT, without software versions and hashes that depend on them."""
     described = json.loads((folder / "lut.json").read_text())
     kept = (
         "camera",
@@ -306,17 +306,17 @@ def held_by(folder: Path) -> dict[str, Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_a_table_of_spectra(name: str, tmp_path: Path, pinned: Pinned) -> None:
+def test_pinned_luts_of_spectra(name: str, tmp_path: Path, pinned: Pinned) -> None:
     camera, document, lights = CASES[name]
     citation = {"note": "a note", "licence": "CC0-1.0", "authors": ["One"]}
     settings = parse_settings({**document, "citation": citation}, "here")
     task = table_task(camera, settings, "here", None if lights is None else read_lights(lights))
     done = compute_table(task, tmp_path / "lut", 1)
-    pinned(f"computed table, {name}", [done.unfit, done.cells, held_by(done.folder)])
+    pinned(f"computed table, {name}", [done.unfit, done.cells, content_of(done.folder)])
 
 
 @pytest.mark.slow
-def test_a_table_under_the_projector(tmp_path: Path, pinned: Pinned) -> None:
+def test_pinned_lut_of_the_projector(tmp_path: Path, pinned: Pinned) -> None:
     task = task_of(bits=1, page="A6", hot_per_million=200.0)
     done = compute_table(replace(task, illuminations=task.illuminations[:3]), tmp_path / "lut", 1)
-    pinned("computed table, the projector", held_by(done.folder))
+    pinned("computed table, the projector", content_of(done.folder))

@@ -22,7 +22,7 @@ from experiment.chart.printing import drawing
 from experiment.config import LabSettings
 from experiment.session.folder import Session
 from experiment.session.records import last_moment
-from foundation.clock import OPENING, SimulatedClock
+from foundation.clock import SIM_START, SimulatedClock
 from foundation.errors import ConfigurationError
 from sim.buses.usb import MemoryTransport
 from sim.camera.bodies import EOS_BODIES
@@ -47,7 +47,7 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     before = _taken_before(session)
     exposed = Counter(colour for _, colour in before)
     last = None if session is None else last_moment(session.journal.attempts())
-    clock = SimulatedClock(last or OPENING)
+    clock = SimulatedClock(last or SIM_START)
     screen = Screen()
     simulated = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)
     sensor = simulated_body(settings)
@@ -103,7 +103,7 @@ def _taken_before(session: Session | None) -> list[tuple[float, Colour]]:
         return []
     colours = {step.number: step.colour for step in session.steps}
     return [
-        ((attempt.started_at - OPENING).total_seconds(), colours[attempt.step])
+        ((attempt.started_at - SIM_START).total_seconds(), colours[attempt.step])
         for attempt in session.journal.attempts()
         if attempt.has_frame
     ]

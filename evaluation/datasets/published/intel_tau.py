@@ -20,7 +20,7 @@ from pathlib import Path
 from evaluation.datasets.files import Folder, PaintedScene, read_text
 from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.scene import SceneSet
-from foundation.errors import FormatError, first_of
+from foundation.errors import FormatError, first_few
 
 # The parts of each camera, as its folders are named.
 SUBSETS = ("field_1_cameras", "field_3_cameras", "lab_printouts", "lab_realscene")
@@ -92,13 +92,13 @@ def _scenes(folder: Folder, prefix: str, black: float, white: float, partial: bo
     without = [name for key, name in known.items() if key not in lights]
     if without:
         raise FormatError(
-            f"{folder.path} lacks the .wp files of {len(without)} images ({first_of(without)}), expected one beside "
+            f"{folder.path} lacks the .wp files of {len(without)} images ({first_few(without)}), expected one beside "
             "each; restore them"
         )
     alone = [name for key, name in lights.items() if key not in known]
     if alone and not partial:
         raise FormatError(
-            f"{folder.path} lacks the .tiff files of {len(alone)} lights ({first_of(alone)}), expected one beside "
+            f"{folder.path} lacks the .tiff files of {len(alone)} lights ({first_few(alone)}), expected one beside "
             "each; complete the copy, or take what is there with --read partial"
         )
     return [

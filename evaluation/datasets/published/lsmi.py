@@ -35,7 +35,7 @@ import numpy.typing as npt
 from evaluation.datasets.files import Folder, Light, Mask, RawScene, chart_mask, check_light, read_text
 from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.scene import Image, Scene, SceneSet
-from foundation.errors import FormatError, InputError, first_of
+from foundation.errors import FormatError, InputError, first_few
 from generator.files import decode_png
 
 _SONY: Final = (128.0, 4095.0)  # Black level and saturation of Sony's .tiff files (1_make_mixture_map.py)
@@ -290,7 +290,7 @@ class _Camera:
         if missing and not self.options.partial:
             raise FormatError(
                 f"{self.folder.path} lacks the .tiff files of {len(missing)} of {len(places)} places "
-                f"({first_of(missing)}); make them with 0_cvt2tiff.py, or take what is there with --read partial"
+                f"({first_few(missing)}); make them with 0_cvt2tiff.py, or take what is there with --read partial"
             )
 
     def _scene(

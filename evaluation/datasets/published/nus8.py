@@ -31,7 +31,7 @@ from evaluation.datasets.files import Folder, Mask, RawScene, box_mask, check_li
 from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.datasets.published.matlab import read_mat, scalar, strings, table
 from evaluation.scene import Image, SceneSet
-from foundation.errors import FormatError, first_of
+from foundation.errors import FormatError, first_few
 
 # First and last row, first and last column of a chart, px counted from 1, both ends included.
 Box = tuple[int, int, int, int]
@@ -54,7 +54,7 @@ def charts(
         if missing:
             raise FormatError(
                 f"{path} has no {_COORDS}, and {len(missing)} of its images have no {_MASKS}/…_mask.txt "
-                f"({first_of(missing)}), expected the chart of every image in one of them; fetch GROUNDTRUTH or MASK "
+                f"({first_few(missing)}), expected the chart of every image in one of them; fetch GROUNDTRUTH or MASK "
                 "from the data set's page"
             )
         read = {number: read_mask(masks[names[number]]) for number in kept}

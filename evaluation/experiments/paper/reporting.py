@@ -32,8 +32,8 @@ from evaluation.metrics import ErrorKind
 from evaluation.reports.table_output import table_part, table_to_latex, tables_to_latex
 from evaluation.results.tables import Table, table_to_csv
 from foundation import pages
-from foundation.folders import whole_folder
-from foundation.plots import FAINT, INK, legend_label, series_style, standalone, svg_of
+from foundation.folders import atomic_folder
+from foundation.plots import FAINT, INK, draw_svg, legend_label, series_style, standalone_svg
 from generator.lights.choices import nearest_lights
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ class PaperReport:
 
 def write_report(report: PaperReport, folder: Path) -> None:
     """Write a report to a new folder, whole or not at all; its page is `report.html`."""
-    with whole_folder(folder, "the report") as partial:
+    with atomic_folder(folder, "the report") as partial:
         (partial / "report.html").write_text(pages.page(report.title, report.parts), encoding="utf-8")
         for name, content in report.files.items():
             (partial / name).write_bytes(content)
@@ -232,10 +232,10 @@ def table1_report(
     ]
     tables = [*first, noise, prints]
     if sizes:
-        drawn = svg_of(_draw_sizes, sizes, "White-Patch", inches=(7.6, 4.8))
+        drawn = draw_svg(_draw_sizes, sizes, "White-Patch", inches=(7.6, 4.8))
         table = size_table(sizes)
         tables.append(table)
-        files |= {"sizes.csv": table_to_csv(table).encode(), "sizes.svg": standalone(drawn)}
+        files |= {"sizes.csv": table_to_csv(table).encode(), "sizes.svg": standalone_svg(drawn)}
         caption = (
             "White-Patch takes the largest of all values, of which a larger image has more: of noise, and of whites."
         )
@@ -263,9 +263,9 @@ def table2_report(tables: Sequence[Table], conditions: Sequence[str]) -> PaperRe
 
 def bits_report(found: BitsResult, kind: ErrorKind, name: str, conditions: Sequence[str]) -> PaperReport:
     """Return the report of bits removal on a data set of that name."""
-    drawn, table = svg_of(_draw_bits, found, kind, inches=(6.4, 3.8)), bits_table(found, kind, name)
+    drawn, table = draw_svg(_draw_bits, found, kind, inches=(6.4, 3.8)), bits_table(found, kind, name)
     caption = "Medians against the bits of each sRGB code that were set to zero; dotted, the linear images as they are."
-    files = {"bits.svg": standalone(drawn), **_table_files("bits", table)}
+    files = {"bits.svg": standalone_svg(drawn), **_table_files("bits", table)}
     parts = (*map(pages.paragraph, conditions), pages.figure(drawn, caption), table_part(table))
     return PaperReport("The effect of colour reduction on illumination estimation", (table,), parts, files)
 
@@ -287,14 +287,14 @@ def reduction_report(picture: npt.NDArray[np.uint8], name: str) -> PaperReport:
 def chromaticities_report(luts: Sequence[Lut], sets: Sequence[Truths]) -> PaperReport:
     """Return the report of the lights of tables, beside the ground truths of data sets."""
     truths = {found.name: found.lights for found in sets}
-    drawn = svg_of(_draw_chromaticities, luts, truths, inches=(4.6 * len(luts), 4.7))
+    drawn = draw_svg(_draw_chromaticities, luts, truths, inches=(4.6 * len(luts), 4.7))
     caption = (
         "rb-chromaticities, r = R / (R + G + B) and b = B / (R + G + B) in linear RGB of each table's camera, of the "
         "white under each light of the table; in colour the ground truths of data sets, each in its own camera's RGB."
     )
     parts, tables = [pages.figure(drawn, caption)], list[Table]()
     files = {
-        "chromaticities.svg": standalone(drawn),
+        "chromaticities.svg": standalone_svg(drawn),
         "chromaticities.csv": table_to_csv(chromaticity_rows(luts)).encode(),
     }
     if truths:

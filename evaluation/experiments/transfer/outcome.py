@@ -37,9 +37,9 @@ from evaluation.results.result import Result
 from evaluation.results.tables import PAPER_COLUMNS, Table, finite_or_none, table_to_csv
 from evaluation.scene import SceneSet
 from foundation import pages
-from foundation.files import write_whole
-from foundation.folders import whole_folder
-from foundation.plots import legend_label, series_style, standalone, svg_of
+from foundation.files import write_atomic
+from foundation.folders import atomic_folder
+from foundation.plots import draw_svg, legend_label, series_style, standalone_svg
 from foundation.version import software
 
 Floats = npt.NDArray[np.float64]
@@ -334,7 +334,7 @@ def beside_plot(found: TransferFigures) -> bytes:
         for label, points in panels.get(each.row.method, {}).items():
             if not each.row.way and label.startswith(f"{each.row.material}, "):
                 points[0] = each.statistics[0]
-    return svg_of(
+    return draw_svg(
         _draw_beside, panels, found.error, inches=(max(4.6, 3.1 * len(panels) + 0.4), 5.2 if len(panels) == 1 else 4.4)
     )
 
@@ -409,17 +409,17 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
     """
     names = [scene.name for scene in outcome.test.scenes]
     truths = np.stack([scene.truth for scene in outcome.test.scenes])
-    with whole_folder(folder, "the results") as partial:
+    with atomic_folder(folder, "the results") as partial:
         groups = groups_of(outcome.test.scenes)
-        write_whole(partial / "errors.csv", errors_csv(names, truths, labelled_results(outcome.rows), groups))
+        write_atomic(partial / "errors.csv", errors_csv(names, truths, labelled_results(outcome.rows), groups))
         for seed, folds in enumerate(outcome.folds):
-            write_whole(partial / f"folds_{seed}.csv", folds_to_csv(names, folds))
-        write_whole(partial / "results.csv", table_to_csv(long_table(outcome.figures)))
-        write_whole(partial / "tables.tex", "\n".join(map(table_to_latex, outcome.tables())))
-        write_whole(partial / "report.html", report_page(outcome))
+            write_atomic(partial / f"folds_{seed}.csv", folds_to_csv(names, folds))
+        write_atomic(partial / "results.csv", table_to_csv(long_table(outcome.figures)))
+        write_atomic(partial / "tables.tex", "\n".join(map(table_to_latex, outcome.tables())))
+        write_atomic(partial / "report.html", report_page(outcome))
         if outcome.figures.to_better:
-            write_whole(partial / "beside_real.svg", standalone(beside_plot(outcome.figures)))
-        write_whole(partial / "run.json", json.dumps(_provenance(outcome), indent=2, ensure_ascii=False) + "\n")
+            write_atomic(partial / "beside_real.svg", standalone_svg(beside_plot(outcome.figures)))
+        write_atomic(partial / "run.json", json.dumps(_provenance(outcome), indent=2, ensure_ascii=False) + "\n")
 
 
 def report_page(outcome: TransferOutcome) -> str:

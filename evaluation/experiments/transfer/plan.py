@@ -30,7 +30,7 @@ from evaluation.datasets.identity import source_marks
 from evaluation.experiments.transfer.rows import TrainingSet
 from evaluation.scene import Scene, SceneSet
 from foundation.colorimetry import decode_srgb
-from foundation.errors import FormatError, InputError, first_of
+from foundation.errors import FormatError, InputError, first_few
 from foundation.files import file_sha256, sha256_of
 from generator.dataset.reader import Dataset
 from generator.dataset.same_lights import preparation_of
@@ -90,7 +90,7 @@ def trainable_images(
         return training.scenes, ""
     shared = (
         f"{len(common)} of {len(training.scenes)} images of {training.name} are also in {called}, by {common[0].by}: "
-        f"{first_of([one.name for one in common], 3)}"
+        f"{first_few([one.name for one in common], 3)}"
     )
     if leave_out:
         dropped = {one.position for one in common}
@@ -379,7 +379,7 @@ def plan_transfer(
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(
-            f"two training sets are called {first_of(twice)}; rename the folder of one: names head the rows"
+            f"two training sets are called {first_few(twice)}; rename the folder of one: names head the rows"
         )
     training: list[TrainingSet] = []
     notes: list[str] = []
@@ -433,12 +433,12 @@ def _with_naive(name: str, made: Sequence[GeneratedScene], pictures: Path | str,
     if not kept:
         raise InputError(
             f"none of the {len(missing)} pictures of {name} is in {pictures}, by name and hash: "
-            f"{first_of(missing, 3)}; name the folder that the data set was made from"
+            f"{first_few(missing, 3)}; name the folder that the data set was made from"
         )
     if missing:
         notes.append(
             f"{name}: {len(missing)} of {len(missing) + len(found)} pictures are not in {pictures}: "
-            f"{first_of(missing)}; {len(made) - len(kept)} images of them are left out of its every row"
+            f"{first_few(missing)}; {len(made) - len(kept)} images of them are left out of its every row"
         )
     sets = [
         TrainingSet(name, "generated", kept),

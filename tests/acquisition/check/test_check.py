@@ -25,7 +25,7 @@ from drivers.raw.rawfile import Mosaic
 from drivers.raw.storage import Area
 from experiment.chart.layout import paper_chart
 from experiment.config import LabSettings, load_lab
-from foundation.console import plain
+from foundation.console import json_value
 from foundation.errors import DeviceError, StorageError
 from sim.world.world import Room
 from tests.acquisition.check.conftest import Check, lab_toml
@@ -59,7 +59,7 @@ def test_a_good_room_has_nothing_to_remark_on_and_names_what_is_not_known_yet(ch
     assert "not known before the session: " in report.lines()[-1]
     # What is to be taken is named before the devices that take it.
     assert [line.split()[0] for line in report.devices] == ["lights", "camera", "projector"]
-    table = plain(report.values())["table"]
+    table = json_value(report.values())["table"]
     assert table["outcome"] == "accept"
     assert table["figures"]["cell_px"] > 8.6
 

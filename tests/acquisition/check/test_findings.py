@@ -6,7 +6,7 @@ import pytest
 
 from acquisition.check.findings import CheckReport, judged, not_checked
 from calibration.figures.figure import Limit
-from foundation.console import plain
+from foundation.console import json_value
 
 LIMIT = Limit("thing", "A thing", "light", "share", "at least", 0.2, 0.1, why="it breaks", source="", remedy="mend it")
 
@@ -33,7 +33,7 @@ def test_faults_are_told_first_and_what_was_not_checked_is_never_good() -> None:
 
 def test_json_holds_every_finding_and_no_number_that_is_none() -> None:
     report = CheckReport((), (judged(LIMIT, float("nan"), "bad", "mend it", {"each": [1.0, float("inf")]}),))
-    document = plain(report.values())
+    document = json_value(report.values())
     assert document["faults"] == 1
     (found,) = document["findings"]
     assert found["value"] is None

@@ -379,6 +379,6 @@ def test_a_run_that_writes_it_counts_as_ended_and_others_do_not(finished_run: Ma
 def test_a_full_disk_is_said_and_leaves_the_session_as_it_was(
     finished_run: MadeUpRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(view, "write_whole", Mock(side_effect=StorageError("no space")))
+    monkeypatch.setattr(view, "write_atomic", Mock(side_effect=StorageError("no space")))
     assert main(["report", str(finished_run.folder)]) == StorageError.exit_code
     assert not (finished_run.folder / "report.html").exists()

@@ -18,7 +18,7 @@ from experiment.lights import Illumination
 from experiment.session.folder import Session
 from experiment.session.journal import IncomingFile, Journal
 from experiment.session.records import Check, FrameKind, Judgement, SessionStep, link_steps, plan_steps
-from foundation.console import Ending
+from foundation.console import EndRequest
 from foundation.errors import DeviceError, DeviceFault, LinkTimeout, QualityError, StorageError
 from tests.acquisition.run.scripted import DOWNLOAD_S, EXPOSE_S, GLARE, LIGHTS, NIGHT, SETTINGS, TURNED, WELL, Lab
 
@@ -200,11 +200,11 @@ class TestRefusals:
     @pytest.mark.slow
     def test_a_response_frame_voids_what_the_run_has_taken(self, folder: Path) -> None:
         lab = Lab(folder, lights=FOUR, reference_every=2)
-        ending = Ending(lambda sentence: None)
+        ending = EndRequest(lambda sentence: None)
 
         def end_after(frames: int) -> Callable[[object], None]:
             left = iter(range(frames - 1))
-            return lambda taken: None if next(left, None) is not None else ending.ask()
+            return lambda taken: None if next(left, None) is not None else ending.request()
 
         with pytest.raises(KeyboardInterrupt):
             run(lab, ScriptedJudge(), ending=ending, observe=end_after(3))
@@ -361,8 +361,8 @@ class TestEnding:
     def test_the_first_request_ends_after_the_running_frame(self, folder: Path) -> None:
         lab = Lab(folder)
         said: list[str] = []
-        ending = Ending(said.append)
-        lab.camera.after[3] = ending.ask
+        ending = EndRequest(said.append)
+        lab.camera.after[3] = ending.request
         with pytest.raises(KeyboardInterrupt):
             run(lab, ending=ending)
         assert said == ["ending after this frame; press Ctrl-C again to end at once"]
@@ -374,13 +374,13 @@ class TestEnding:
 
     def test_a_request_while_a_light_settles_exposes_no_more(self, folder: Path) -> None:
         lab = Lab(folder)
-        ending = Ending(lambda sentence: None)
+        ending = EndRequest(lambda sentence: None)
         sleep = lab.clock.sleep
 
         def sleeping(seconds: float) -> None:
             sleep(seconds)
-            if lab.camera.captures == 2 and seconds < SETTLE_S - DOWNLOAD_S + 1e-6 and not ending.asked:
-                ending.ask()
+            if lab.camera.captures == 2 and seconds < SETTLE_S - DOWNLOAD_S + 1e-6 and not ending.is_requested:
+                ending.request()
 
         lab.clock.sleep = sleeping  # type: ignore[method-assign]
         with pytest.raises(KeyboardInterrupt):
@@ -390,14 +390,14 @@ class TestEnding:
 
     def test_the_second_request_ends_at_once_and_loses_nothing_that_is_on_the_disk(self, folder: Path) -> None:
         lab = Lab(folder)
-        ending = Ending(lambda sentence: None)
+        ending = EndRequest(lambda sentence: None)
         download = lab.camera.download
 
         def asked(into: Any) -> Any:
             captured = download(into)
             if lab.camera.captures == 3:
-                ending.ask()
-                ending.ask()
+                ending.request()
+                ending.request()
             return captured
 
         lab.camera.download = asked  # type: ignore[method-assign]
@@ -410,12 +410,12 @@ class TestEnding:
 
     def test_a_pause_ends_at_once(self, folder: Path) -> None:
         lab = Lab(folder, dict.fromkeys(range(2, 1000), LinkTimeout("no answer")))
-        ending = Ending(lambda sentence: None)
+        ending = EndRequest(lambda sentence: None)
         sleep = lab.clock.sleep
 
         def sleeping(seconds: float) -> None:
             if seconds == PAUSE_S:
-                ending.ask()
+                ending.request()
             sleep(seconds)
 
         lab.clock.sleep = sleeping  # type: ignore[method-assign]

@@ -56,7 +56,7 @@ from experiment.session.folder import Session
 from experiment.session.journal import Journal
 from experiment.session.records import ACCEPTED, REFUSED, Check, Judgement, SessionStep, link_steps, plan_steps
 from foundation.clock import SimulatedClock
-from foundation.console import Ending
+from foundation.console import EndRequest
 from foundation.errors import DeviceError, DeviceRefused, QualityError
 from sim.projectors.projector import SimulatedProjector
 from tests.acquisition.run.scripted import EXPOSE_S, LIGHTS, SETTINGS, WELL, Hurried, Lab, ScriptedCamera
@@ -82,8 +82,8 @@ def lab_with_response(folder: Path) -> Lab:
 
 def interrupt_after(lab: Lab, frames: int, first: tuple[int, ...] = ()) -> None:
     """Take some frames and end the run."""
-    ending = Ending(lambda sentence: None)
-    lab.camera.after[lab.camera.captures + frames] = ending.ask
+    ending = EndRequest(lambda sentence: None)
+    lab.camera.after[lab.camera.captures + frames] = ending.request
     with pytest.raises(KeyboardInterrupt):
         take_session(lab.session, lab.devices, SETTINGS, ending=ending, first=first)
 

@@ -42,7 +42,7 @@ FORKS.set_forkserver_preload([__name__])
 PLACES = {
     "putting": (writing.LutWriter, "put"),
     "saving": (checkpoint.UnfinishedTable, "save"),
-    "finishing": (writing, "write_whole"),
+    "finishing": (writing, "write_atomic"),
     "publishing": (Path, "replace"),
 }
 

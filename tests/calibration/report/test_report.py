@@ -21,7 +21,7 @@ from calibration.report.plots import draw_places
 from calibration.report.report import write_report
 from calibration.verdict import BuildResult
 from experiment.session.folder import Session
-from foundation.plots import png_of
+from foundation.plots import draw_png
 from tests.calibration.causes.rooms import HAND, nth_white, taken
 from tests.calibration.lab import Lab
 from tests.calibration.whole import LIMITS
@@ -40,7 +40,7 @@ def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path, monkeypat
         circled[:] = arguments[-1] if draw is draw_places else circled
         return b"\x89PNG\r\n\x1a\n"
 
-    monkeypatch.setattr("calibration.report.report.png_of", blank)
+    monkeypatch.setattr("calibration.report.report.draw_png", blank)
     out = tmp_path / "lut"
     limits = [limit for limit in FIGURES if limit.name == "block_deviation"]
     with (
@@ -75,9 +75,9 @@ def test_every_picture_of_a_report_is_drawn(
             draw(figure, *given)
             shown.setdefault(draw.__name__, []).append(drawn(figure))
 
-        return png_of(drawing, *arguments)
+        return draw_png(drawing, *arguments)
 
-    monkeypatch.setattr("calibration.report.report.png_of", kept)
+    monkeypatch.setattr("calibration.report.report.draw_png", kept)
     write_report(built, session, tmp_path)
     # That of noise hangs on which cells are left out.
     del shown["draw_noise"]

@@ -80,7 +80,7 @@ def test_a_camera_held_by_the_desktop_says_how_to_free_it() -> None:
     bus.hold(device)
     with pytest.raises(DeviceRefused, match="gvfs-gphoto2-volume-monitor"):
         open_usb(backend=bus)
-    bus.hold(device, held=False)
+    bus.hold(device, is_held=False)
     open_usb(backend=bus)
 
 

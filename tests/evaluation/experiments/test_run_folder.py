@@ -53,17 +53,17 @@ def test_the_same_run_gives_the_same_bytes_whatever_the_workers(tmp_path: Path) 
 
 
 def test_a_folder_whose_writing_ends_early_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, write_whole = tmp_path / "out", run_folder.write_whole
+    folder, write_atomic = tmp_path / "out", run_folder.write_atomic
     run = run_methods(mixed_set(), METHODS)
     left = iter(range(4))
 
     def writes(path: Path, text: str) -> None:
         if next(left, None) is None:
             raise Killed
-        write_whole(path, text)
+        write_atomic(path, text)
 
     with monkeypatch.context() as patched:
-        patched.setattr(run_folder, "write_whole", writes)
+        patched.setattr(run_folder, "write_atomic", writes)
         with pytest.raises(Killed):
             write_run(run, mixed_set().scenes, folder)
     assert not folder.exists()

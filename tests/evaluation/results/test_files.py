@@ -55,7 +55,7 @@ def test_other_files(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         read_errors(tmp_path)
     (tmp_path / "errors.csv").write_bytes(b"\xff\xfe\x80")
-    with pytest.raises(FormatError, match="UTF-8 was expected"):
+    with pytest.raises(FormatError, match="expected UTF-8"):
         read_errors(tmp_path)
 
 

@@ -22,7 +22,7 @@ from experiment.lights import Illumination, save_illuminations
 from experiment.session.folder import Session, journal_path, session_exists
 from experiment.session.records import Judgement, plan_steps
 from foundation.errors import FormatError, InputError, StorageError
-from foundation.folders import unmounted_at
+from foundation.folders import unmounted_folder
 from tests.failing_calls import DISK_FAULTS, FailingCalls, failing_calls, why_not
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
@@ -154,18 +154,18 @@ def test_what_was_left_below_a_mount_point_is_no_session(tmp_path: Path, monkeyp
     disks = ("# <disk>", "UUID=1 / ext4 defaults 0 1", f"UUID=2 {tmp_path} ext4 noauto 0 0", "UUID=3 none swap sw 0 0")
     tables[0].write_text("\n".join(disks))
     tables[1].write_text("/dev/sda1 / ext4 rw 0 0\n")
-    assert unmounted_at(folder, *tables) == tmp_path
+    assert unmounted_folder(folder, *tables) == tmp_path
     monkeypatch.setattr(
-        "experiment.session.folder.unmounted_at", partial(unmounted_at, fstab=tables[0], mounts=tables[1])
+        "experiment.session.folder.unmounted_folder", partial(unmounted_folder, fstab=tables[0], mounts=tables[1])
     )
     for look in (session_exists, journal_path):
         with pytest.raises(StorageError):
             look(folder)
     tables[1].write_text(f"/dev/sda1 / ext4 rw 0 0\n/dev/sdb1 {tmp_path} ext4 rw 0 0\n")
-    assert unmounted_at(folder, *tables) is None
-    assert unmounted_at(folder, tmp_path / "none", tables[1]) is None
+    assert unmounted_folder(folder, *tables) is None
+    assert unmounted_folder(folder, tmp_path / "none", tables[1]) is None
     tables[0].write_text(f"UUID=2 {tmp_path}/two\\040words ext4 rw 0 0\n")
-    assert unmounted_at(tmp_path / "two words" / "night", *tables) == tmp_path / "two words"
+    assert unmounted_folder(tmp_path / "two words" / "night", *tables) == tmp_path / "two words"
 
 
 def test_a_journal_that_cannot_be_looked_for_is_not_missing(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:

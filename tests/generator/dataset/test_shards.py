@@ -24,7 +24,7 @@ from evaluation.datasets.generated import open_generated
 from evaluation.scene import MixedScene
 from foundation.errors import FormatError, InputError
 from foundation.files import partial_path
-from foundation.folders import FolderLock, held_folder
+from foundation.folders import FolderLock, locked_folder
 from generator.cli import main
 from generator.dataset import layouts as plain_files
 from generator.dataset import shards
@@ -469,9 +469,9 @@ def test_a_share_that_waited_for_the_whole_is_refused(
 
     def finished_meanwhile(*arguments: Any, **named: Any) -> contextlib.AbstractContextManager[FolderLock]:
         (tmp_path / "whole").rename(out)
-        return held_folder(*arguments, **named)
+        return locked_folder(*arguments, **named)
 
-    monkeypatch.setattr("generator.dataset.making.held_folder", finished_meanwhile)
+    monkeypatch.setattr("generator.dataset.making.locked_folder", finished_meanwhile)
     with pytest.raises(InputError):
         make_share(plan_of(lut), out, (0, 2))
     assert not (tmp_path / ".out.partial").exists()

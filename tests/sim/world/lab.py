@@ -11,7 +11,7 @@ from sim.spectral import PaperName
 
 def intended_lab(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
     """Return (N, 3) float64: CIELAB under D50, relative to paper, that the managed profile wants of codes (N, 3)."""
-    return spectral._lab(spectral._wanted(np.asarray(rgb, dtype=np.float64) / 255, spectral._black(on)))
+    return spectral._lab(spectral._target_xyz(np.asarray(rgb, dtype=np.float64) / 255, spectral._black(on)))
 
 
 def relative_lab(reflectance: NDArray[np.float64], on: PaperName = "poster") -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import read_raw
-from foundation.clock import OPENING
+from foundation.clock import SIM_START
 from foundation.errors import ConfigurationError
 from sim.camera.film import WorldFilm
 from sim.world.disturbances import (
@@ -170,7 +170,7 @@ def test_a_stale_file_is_the_one_before(plain_world: World, tmp_path: Path) -> N
     files: list[bytes] = []
     for number in range(4):
         into = io.BytesIO()
-        film.expose(REFERENCE_EXPOSURE, OPENING + timedelta(seconds=10 * number), into)
+        film.expose(REFERENCE_EXPOSURE, SIM_START + timedelta(seconds=10 * number), into)
         files.append(into.getvalue())
         shown.append(shown.pop(0))
     assert files[1] == files[0]
