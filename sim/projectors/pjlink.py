@@ -66,7 +66,7 @@ class PjLinkPeer:
         if data:
             connection.last_heard = self._projector.clock.monotonic()
         try:
-            while not connection.closed and (taken := wire.take_line(connection.heard, _LONGEST)) is not None:
+            while not connection.closed and (taken := wire.split_line(connection.heard, _LONGEST)) is not None:
                 line, length = taken
                 connection.heard = connection.heard[length:]
                 reply = self._reply(wire.parse_request(line))

@@ -94,7 +94,7 @@ def test_a_web_server_at_a_projectors_port_is_named() -> None:
     with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         projector = PjLinkProjector(lambda: TcpLink.connect("127.0.0.1", server.server_port, 10.0), timeout=0.05)
-        with pytest.raises(DeviceRefused, match=r"^the projector: an HTTP server answers at its .* as port 4352"):
+        with pytest.raises(DeviceRefused, match=r"^the projector: an HTTP server answers at its .* port 4352"):
             projector.power()
         server.shutdown()
 
@@ -138,10 +138,10 @@ def test_health_and_name() -> None:
 @pytest.mark.parametrize(
     ("code", "error", "words"),
     [
-        (b"ERR1", DeviceRefused, "does not know this command"),
+        (b"ERR1", DeviceRefused, "does not support this command"),
         (b"ERR2", DeviceRefused, "does not offer this value"),
         (b"ERR3", DeviceRefused, "warming up, cooling down or in standby"),
-        (b"ERR4", DeviceFault, "failure of its own"),
+        (b"ERR4", DeviceFault, "internal failure"),
     ],
 )
 def test_each_error_has_its_sentence(code: bytes, error: type[Exception], words: str) -> None:
@@ -590,7 +590,7 @@ def test_any_split_gives_the_same_lines(data: st.DataObject) -> None:
     found, rest = list[bytes](), b""
     for start, stop in zip([0, *cuts], [*cuts, len(stream)], strict=True):
         rest += stream[start:stop]
-        while (taken := wire.take_line(rest)) is not None:
+        while (taken := wire.split_line(rest)) is not None:
             found.append(taken[0])
             rest = rest[taken[1] :]
     assert found == lines
@@ -599,11 +599,11 @@ def test_any_split_gives_the_same_lines(data: st.DataObject) -> None:
 def test_the_longest_line_passes_and_one_byte_more_does_not() -> None:
     longest = b"%1NAME=" + b"x" * 128
     assert len(longest) + 1 == wire.MAX_LINE
-    assert wire.take_line(longest + b"\r") == (longest, 136)
-    assert wire.take_line(longest) is None
+    assert wire.split_line(longest + b"\r") == (longest, 136)
+    assert wire.split_line(longest) is None
     for longer in (longest + b"y\r", longest + b"y"):
         with pytest.raises(ProtocolError):
-            wire.take_line(longer)
+            wire.split_line(longer)
 
 
 MAC = "00:11:22:aa:bb:cc"
@@ -623,7 +623,7 @@ def test_the_standards_datagrams(datagram: bytes, command: str, value: str) -> N
     reply = PjLinkReply(command, value, 2)
     assert wire.encode_reply(reply) == datagram
     for received in (datagram, datagram.lower() + b"\n", datagram[:-1], b"\r" + datagram + b"\0\0\0\0"):
-        (found,) = wire.replies_in(received)
+        (found,) = wire.parse_datagram(received)
         assert (found.command, found.value.upper(), found.level) == (command, value.upper(), 2)
 
 
@@ -634,17 +634,17 @@ def test_the_standards_datagrams(datagram: bytes, command: str, value: str) -> N
     ],
 )  # fmt: skip
 def test_what_is_none_of_ours_is_passed_over(datagram: bytes) -> None:
-    assert wire.replies_in(datagram) == ()
+    assert wire.parse_datagram(datagram) == ()
 
 
 def test_several_in_one_datagram_keep_their_order() -> None:
-    found = wire.replies_in(b"%2POWR=3\r%2what\r%2INPT=31\r")
+    found = wire.parse_datagram(b"%2POWR=3\r%2what\r%2INPT=31\r")
     assert found == (PjLinkReply("POWR", "3", 2), PjLinkReply("INPT", "31", 2))
 
 
 @given(st.binary(max_size=300))
 def test_any_datagram_is_read_without_complaint(datagram: bytes) -> None:
-    assert len(wire.replies_in(datagram)) <= len(datagram)
+    assert len(wire.parse_datagram(datagram)) <= len(datagram)
 
 
 class PaperNetwork(UdpSocket):
@@ -724,7 +724,7 @@ def test_junk_without_end_does_not_prolong_the_search() -> None:
 
 
 def test_a_taken_port_is_told_with_its_remedy() -> None:
-    with UdpSocket(host="127.0.0.1") as taken, pytest.raises(LinkClosed, match="end the other program"):
+    with UdpSocket(host="127.0.0.1") as taken, pytest.raises(LinkClosed, match="close the other program"):
         search(listen_port=taken.address[1])
 
 

@@ -111,7 +111,7 @@ def test_a_port_that_is_not_there_lists_those_that_are(monkeypatch: pytest.Monke
     [
         (serial.SerialException(errno.EACCES, "Permission denied"), DeviceRefused, "dialout"),
         (serial.SerialException(errno.EIO, "Could not configure port"), LinkClosed, "check that it is a serial port"),
-        (ValueError("Not a valid baudrate: 12"), ConfigurationError, "choose another speed"),
+        (ValueError("Not a valid baudrate: 12"), ConfigurationError, "set another speed"),
     ],
 )
 def test_a_port_that_cannot_be_opened_names_the_remedy(

@@ -88,7 +88,7 @@ def bench_of(
 
     def repair() -> None:
         device.repair()
-        if language.faults is None and language.has_news:
+        if language.faults is None and language.reports_unasked:
             # That it is well again, it cannot say: only that its lamp is struck again.
             device.switch_on()
         catch_up()

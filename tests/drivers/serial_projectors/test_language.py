@@ -26,7 +26,9 @@ EPSON, BENQ, OPTOMA = (load_language(name) for name in ("epson", "benq", "optoma
 def test_languages_are_found_in_any_case_and_unknown_ones_name_the_known() -> None:
     assert {"benq", "epson", "optoma"} <= set(built_in_languages())
     assert load_language("Epson") == EPSON
-    with pytest.raises(ConfigurationError, match=f"'klingon'; expected {', '.join(built_in_languages())}, or "):
+    with pytest.raises(
+        ConfigurationError, match=f"'klingon' does not exist; expected {', '.join(built_in_languages())}, or "
+    ):
         load_language("klingon")
     with pytest.raises(ConfigurationError, match="did you mean 'epson'"):
         load_language("epsn")
@@ -74,32 +76,44 @@ def test_a_file_of_ones_own_is_read(tmp_path: Path) -> None:
         ("baud = 19200", 'baud = "9600"', "line.baud = '9600': a whole number was expected"),
         ("baud = 19200", "baud = 19200\necho = 'yes'", "line.echo = 'yes': true or false was expected"),
         ('busy = ["BUSY"]', "busy = 5", "refusals.busy = 5: a list was expected"),
-        ('answer = "POWER {}"', 'answer = "POWER"', "power.answer = 'POWER': a text with {}"),
-        ('on = "POWER ON"', 'on = "POWER {}"', "power.on = 'POWER {}': a text without {}"),
+        ('answer = "POWER {}"', 'answer = "POWER"', "power.answer = 'POWER': expected a text with {}"),
+        ('on = "POWER ON"', 'on = "POWER {}"', "power.on = 'POWER {}': expected a text without {}"),
         ('off = "POWER OFF"', 'off = "Power On"', "power: on and off are both 'POWER ON'"),
-        ('done = "POWER {}"', 'done = "BUSY"', "power.done = 'BUSY' is one of the refusals"),
-        ("stopped = { HOT", "stopped = { Off", "power: OFF: a value either of states or of stopped"),
-        ("{ NO = true, YES = false }", "{ NO = true, no = false }", "mute.states: values that differ in more"),
-        ("states = { NO = true, YES = false }", "", "mute: states with a value for true and one for false"),
-        ("states = { NO = true, YES = false }", "states = { NO = true }", "mute: states with a value for true and"),
+        ('done = "POWER {}"', 'done = "BUSY"', "power.done = 'BUSY' is also one of the refusals"),
+        ("stopped = { HOT", "stopped = { Off", "power: OFF: expected each value in only one"),
+        ("{ NO = true, YES = false }", "{ NO = true, no = false }", "mute.states: expected values that differ in more"),
+        ("states = { NO = true, YES = false }", "", "mute: ask is given: expected states with a value"),
+        (
+            "states = { NO = true, YES = false }",
+            "states = { NO = true }",
+            "mute: ask is given: expected states with a value",
+        ),
         ('ask = "SHOW?"', "", "mute: answer is given without ask"),
-        ('healthy = "NONE"', 'healthy = "NO FAULT"', "faults: 'NO FAULT': one word was expected"),
-        ('healthy = "NONE"', 'healthy = "f"', "faults: healthy = 'f': a value that is none of the parts"),
-        ('healthy = "NONE"', 'healthy = "NONE"\ndigits = 1', "faults: 'NONE': 1 hexadecimal digits were expected"),
+        ('healthy = "NONE"', 'healthy = "NO FAULT"', "faults: 'NO FAULT': expected one word"),
+        ('healthy = "NONE"', 'healthy = "f"', "faults: healthy = 'f': expected a value that is not in parts"),
+        ('healthy = "NONE"', 'healthy = "NONE"\ndigits = 1', "faults: 'NONE': expected 1 hexadecimal digits"),
         ('{ F = "fan", L = "lamp", T = "temperature" }', "{}", "faults.parts: at least 1 value was expected"),
-        ('command = "@{}\\r\\n"', 'command = "@{}"', "line: command = '@{}': characters that end a command"),
-        ('ends = "\\r"', 'ends = "#"', "one of the characters of ends = '#' was expected"),
-        ('answer = "@{}\\r\\n"', 'answer = "@{}#\\r\\n"', "one of the characters of ends = '\\r' was expected"),
-        ('ends = "\\r"', 'ends = "S\\r"', "mute.answer has 'SHOW {}': a text without the characters of line.ends"),
-        ("[name]", '[[unasked]]\ntext = "{}"\n[name]', "power.answer = 'POWER {}' is one of the unasked messages"),
+        (
+            'command = "@{}\\r\\n"',
+            'command = "@{}"',
+            "line: command = '@{}': expected the characters that end a command",
+        ),
+        ('ends = "\\r"', 'ends = "#"', "expected one of the characters of ends = '#'"),
+        ('answer = "@{}\\r\\n"', 'answer = "@{}#\\r\\n"', "expected one of the characters of ends = '\\r'"),
+        (
+            'ends = "\\r"',
+            'ends = "S\\r"',
+            "mute.answer has 'SHOW {}': expected a text without the characters of line.ends",
+        ),
+        ("[name]", '[[unasked]]\ntext = "{}"\n[name]', "power.answer = 'POWER {}' is also one of the unasked messages"),
         ("[name]", '[unasked]\ntext = "BYE"\n[name]', "unasked: a list of tables was expected: write [[unasked]]"),
         ("baud = 19200", "baud = 20", "line.baud = 20: "),
         ('HEATING = "warm-up"', 'HEATING = "warm"', "power.states.HEATING = 'warm': "),
-        ('OFF = "standby"', 'OFF = "cooling"', 'power: a value for "standby" was expected'),
+        ('OFF = "standby"', 'OFF = "cooling"', 'power: expected a value for "standby"'),
         ('command = "@{}', 'command = "@', "line.command = "),
         ('F = "fan"', 'F = "fans"', f"faults.parts.F = 'fans': expected one of {', '.join(FAULT_PARTS)}"),
-        ('on = "POWER ON"', 'on = "MARCHÉ"', "power.on = 'MARCHÉ': ASCII characters were expected"),
-        ('busy = ["BUSY"]\nunknown = ["WHAT"]', "", "refusals: at least one answer that refuses was expected"),
+        ('on = "POWER ON"', 'on = "MARCHÉ"', "power.on = 'MARCHÉ': expected only ASCII characters"),
+        ('busy = ["BUSY"]\nunknown = ["WHAT"]', "", "refusals: expected at least one refusing reply"),
     ],
 )
 def test_a_mistake_names_file_key_and_expectation(before: str, after: str, said: str) -> None:
@@ -136,7 +150,7 @@ def test_a_state_behind_the_end_of_the_answer_is_refused() -> None:
     handshake = (
         '[network.handshake]\nsend = "hi"\nanswer_begins = "h"\nanswer_length = 2\nstate_at = 2\naccepted = "00"\n'
     )
-    with pytest.raises(ConfigurationError, match="state_at = 2 was expected below answer_length = 2"):
+    with pytest.raises(ConfigurationError, match="state_at = 2: expected a value below answer_length = 2"):
         parse_language(TEXT.replace("[refusals]", f"{handshake}[refusals]"), "lantern.toml")
 
 
