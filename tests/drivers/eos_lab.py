@@ -66,7 +66,7 @@ class Lab:
 
     def pull(self) -> None:
         """Pull the cable out, and put it back."""
-        self.camera._drop(None)
+        self.camera._drop_connection(None)
 
     def download(self) -> bytes:
         """Return what the camera writes of the frame exposed last."""

@@ -108,7 +108,7 @@ def test_any_split_gives_the_same_packets(packets: list[Packet], cuts: list[int]
     [
         ("08000000 00000000", "type 0"),
         ("08000000 0f000000", "type 15"),
-        ("07000000 0d000000", "PING packet of 7 bytes; 8 to 4096"),
+        ("07000000 0d000000", "PING packet of 7 bytes, 8 to 4096"),
         ("01100000 0d000000", "PING packet of 4097 bytes"),
         ("ffffffff 01000000", "INIT_COMMAND_REQUEST packet of 4294967295 bytes"),
         ("0b000000 0a000000", "DATA packet of 11 bytes"),
@@ -251,7 +251,7 @@ def test_does_not_wait_for_it_for_ever() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reason", "remedy"), [(1, "pair the two anew"), (2, "another program"), (3, "off and on"), (9, "reason 9")]
+    ("reason", "remedy"), [(1, "pair it again"), (2, "another program"), (3, "off and on"), (9, "reason 9")]
 )
 def test_a_refusal_says_what_helps(reason: int, remedy: str) -> None:
     refusal = packet(5, reason.to_bytes(4, "little"))
@@ -261,7 +261,7 @@ def test_a_refusal_says_what_helps(reason: int, remedy: str) -> None:
 
 
 def test_what_is_no_camera_is_named() -> None:
-    with pytest.raises(ProtocolError, match="PTP/IP connection gives"):
+    with pytest.raises(ProtocolError, match="PTP/IP stream has"):
         FarEnd(b"SSH-2.0-OpenSSH_9.6\r\n").connect()
     with pytest.raises(ProtocolError):
         FarEnd(packet(14)).connect()

@@ -20,7 +20,7 @@ from drivers.ptp import usb as container
 from drivers.ptp.codes import DataType, ObjectFormat, Operation, Property, ResponseCode
 from drivers.ptp.protocol import (
     OPEN_TRIES,
-    PASSING_LIMIT_S,
+    TRANSIENT_LIMIT_S,
     DeviceInfo,
     DevicePropDesc,
     ObjectInfo,
@@ -245,7 +245,7 @@ def test_patience_ends_by_the_clock() -> None:
     with pytest.raises(OperationDeclined) as caught:
         session.call(Operation.EOS_KEEP_DEVICE_ON)
     assert caught.value.code == 0x2019
-    assert clock.monotonic() == pytest.approx(PASSING_LIMIT_S)
+    assert clock.monotonic() == pytest.approx(TRANSIENT_LIMIT_S)
 
 
 def test_every_other_answer_is_told_by_its_name_at_once() -> None:
