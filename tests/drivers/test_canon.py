@@ -39,8 +39,8 @@ from drivers.canon import (
     TransferRequest,
     decode_events,
     encode_events,
-    number_value,
     find_setting_faults,
+    number_value,
 )
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import (
@@ -176,9 +176,9 @@ class TestOverNetwork(CameraContract):
 SPOILS: list[tuple[Callable[[SimulatedEos], None], str]] = [
     (
         lambda eos: eos.turn_dial(AeMode.APERTURE_PRIORITY),
-        "the mode dial stands at aperture priority: turn it to M",
+        "the mode dial is set to aperture priority: turn it to M",
     ),
-    (lambda eos: eos.turn_dial(AeMode.BULB), "the mode dial stands at bulb"),
+    (lambda eos: eos.turn_dial(AeMode.BULB), "the mode dial is set to bulb"),
     (lambda eos: eos.switch_focus(automatic=True), "autofocus is on: set the lens to MF"),
     (lambda eos: eos.set_menu(Property.EOS_DRIVE_MODE, 1), "the drive mode is continuous: set single shooting"),
     (lambda eos: eos.set_menu(Property.EOS_DRIVE_MODE, 0x11), "the drive mode is timer 2 s"),
@@ -255,7 +255,7 @@ class Stuck(faults.TroubledResponder):
 
 
 @pytest.mark.parametrize(
-    ("result", "said"), [(1, "autofocus failed"), (3, "mirror is up"), (7, "is full"), (8, "read-only"), (25, "result 0x19")]
+    ("result", "said"), [(1, "autofocus"), (3, "mirror is up"), (7, "is full"), (8, "read-only"), (25, "result 0x19")]
 )
 def test_a_release_of_the_older_kind_tells_why_there_is_none(result: int, said: str) -> None:
     lab = Lab(without=(Operation.EOS_REMOTE_RELEASE_ON,))
@@ -633,7 +633,7 @@ def test_no_call_is_silent_for_long(kind: str) -> None:
         "busy": "answers DEVICE_BUSY",
         "silent": "sent nothing for 20 s; no connection for",
         "gone": "no camera on USB; no connection for",
-        "never announced": "has announced no frame in time, and holds none in its memory",
+        "never announced": "announced no frame in time, and its memory holds none",
     }[kind]
     with pytest.raises(DeviceError, match=rf"^(Canon Digital Camera .* at USB port 1-1 )?{cause}"):
         lab.camera.expose()

@@ -15,7 +15,7 @@ import pytest
 
 from drivers.raw import rawfile
 from drivers.raw.rawfile import CHANNELS, Mosaic, decode_raw, filled_fault, frame_black, plane_of
-from drivers.raw.storage import Stored
+from drivers.raw.storage import StoredFrame
 from drivers.tiff import TiffDamaged, TiffTag, read_directories
 from foundation.errors import FormatError
 from tests.data_files import shipped
@@ -40,7 +40,7 @@ def said(ask: Callable[[], Any]) -> Any:
         return {"refused": 1}
 
 
-def stored(frame: Stored) -> dict[str, Any]:
+def stored(frame: StoredFrame) -> dict[str, Any]:
     """Return the fields of a stored frame without its directory."""
     return {one.name: getattr(frame, one.name) for one in fields(frame) if one.name != "directory"}
 
@@ -49,10 +49,10 @@ def contents(data: bytes) -> Any:
     """Return the numbers of a file's frames and directories."""
 
     def ask() -> Any:
-        found = rawfile._examined(Path("case"), data)
+        found = rawfile._read_contents(Path("case"), data)
         fault = rawfile._lossless_fault(data, found)
         if fault is not None:
-            raise rawfile._unreadable(Path("case"), fault)
+            raise rawfile._unreadable_error(Path("case"), fault)
         values = [value for one in found.directories for _, value in sorted(one.values.items())]
         return {"frames": [*map(stored, found.frames)], "values": values}
 

@@ -21,11 +21,11 @@ from drivers.raw import rawfile
 from drivers.raw.rawfile import (
     LAYOUT_START,
     Mosaic,
-    body_and_lens,
     decode_raw,
     filled_fault,
     layout_is_known,
     read_raw,
+    read_serial_and_lens,
     stored_frames,
 )
 from drivers.raw.storage import Area
@@ -334,7 +334,7 @@ def canon_file(serial: int, lens: bytes) -> bytes:
 @pytest.mark.slow
 def test_serial_number_and_lens_of_a_canon_before_exif_2_3() -> None:
     data = canon_file(330101234, b"EF-S18-55mm f/3.5-5.6 IS\0")
-    assert body_and_lens(data, read_directories(data)) == ("330101234", "EF-S18-55mm f/3.5-5.6 IS")
+    assert read_serial_and_lens(data, read_directories(data)) == ("330101234", "EF-S18-55mm f/3.5-5.6 IS")
 
 
 SIDE = 128
@@ -435,19 +435,19 @@ def test_what_real_cameras_state_is_believed(model: str) -> None:
 @pytest.mark.parametrize(
     ("more", "reason"),
     [
-        ({256: longs(3664), 257: longs(2754), 278: longs(2754)}, "photosites"),
-        ({257: longs(SIDE + 1)}, "photosites|parts"),
-        ({324: longs(0xFFFFFFFF), 325: longs(9), 322: longs(2 * SIDE), 323: longs(SIDE)}, "has only|9 bytes"),
-        ({324: longs(600, 700), 325: longs(99999, 99999), 322: longs(SIDE), 323: longs(SIDE)}, "has only|upon each"),
-        ({324: longs(600, 900), 325: longs(200)}, "2 places of its pixels and 1 sizes"),
-        ({278: longs(16)}, "1 parts, 8 expected"),
+        ({256: longs(3664), 257: longs(2754), 278: longs(2754)}, "rows of 3664 px"),
+        ({257: longs(SIDE + 1)}, "photosites|tiles"),
+        ({324: longs(0xFFFFFFFF), 325: longs(9), 322: longs(2 * SIDE), 323: longs(SIDE)}, "the file has|9 bytes"),
+        ({324: longs(600, 700), 325: longs(99999, 99999), 322: longs(SIDE), 323: longs(SIDE)}, "the file has|overlap"),
+        ({324: longs(600, 900), 325: longs(200)}, "2 offsets and 1 sizes"),
+        ({278: longs(16)}, "1 strips or tiles, 8 expected"),
         ({258: shorts(0)}, "0 bits"),
-        ({339: shorts(3)}, "no integers"),
-        ({262: shorts(34892)}, "not of a Bayer sensor: its pixels hold all colours"),
+        ({339: shorts(3)}, "not integers"),
+        ({262: shorts(34892)}, "not from a Bayer sensor: its pixels have all colours"),
         ({277: shorts(2)}, "2 samples"),
-        ({50712: shorts(64)}, "table of tones does not rise"),
-        ({50712: shorts(0, 9, 8)}, "table of tones does not rise"),
-        ({322: longs(0), 323: longs(0), 324: longs(600), 325: longs(65536)}, "parts of 0×0"),
+        ({50712: shorts(64)}, "linearisation table does not rise"),
+        ({50712: shorts(0, 9, 8)}, "linearisation table does not rise"),
+        ({322: longs(0), 323: longs(0), 324: longs(600), 325: longs(65536)}, "have 0×0 px"),
     ],
 )
 def test_extents_that_hold_no_frame_are_refused(more: Tags, reason: str) -> None:
@@ -528,7 +528,7 @@ def test_lossless_jpeg_in_strips_is_refused() -> None:
 
 def test_a_jpeg_of_another_size_is_refused() -> None:
     strip = lossless_jpeg(frame()[:-2])
-    with pytest.raises(FormatError, match="no JPEG of 128 rows"):
+    with pytest.raises(FormatError, match="not a JPEG of 128 rows"):
         decode_raw(dng_bytes(frame(), {259: shorts(7), 258: shorts(14)}, strip), WHERE)
 
 
@@ -536,7 +536,7 @@ def test_codes_of_a_maker_that_decode_to_nonsense_are_refused(capfd: pytest.Capt
     """Pentax's codes are Huffman's; noise in their place decodes to samples beyond their precision."""
     noise = np.random.default_rng(5).bytes(48 * 80 * 8)
     data = in_maker_tiff("PENTAX", "PENTAX K-1", noise, {258: shorts(14), 259: shorts(65535)})
-    with pytest.raises(FormatError, match="LibRaw says 'Data error"):
+    with pytest.raises(FormatError, match="LibRaw reports 'Data error"):
         decode_raw(data, WHERE)
     assert capfd.readouterr() == ("", "")
 
@@ -544,7 +544,7 @@ def test_codes_of_a_maker_that_decode_to_nonsense_are_refused(capfd: pytest.Capt
 @pytest.mark.parametrize("hole", [np.s_[100:101], np.s_[64:96, :256], np.s_[100:]], ids=["row", "tile", "end"])
 @pytest.mark.parametrize(
     ("black", "filling", "reason"),
-    [(64, 0, "half of its black level"), (0, 0, "do not reach one count"), (64, 65535, "nothing but the count 65535")],
+    [(64, 0, "half of its black level"), (0, 0, "do not reach one count"), (64, 65535, "only the count 65535")],
 )
 def test_a_frame_that_was_filled_is_told(
     tmp_path: Path, hole: tuple[slice, ...], black: int, filling: int, reason: str
@@ -589,7 +589,7 @@ SIGNED: Callable[[float], tuple[int, int, bytes]] = lambda number: (12, 1, struc
         ({50714: SIGNED(-1e9)}, "black level is"),
         ({50714: longs(4095)}, "black level is"),
         ({50716: (10, 1, struct.pack("<ii", -90, 1))}, "black level is -26"),
-        ({50714: (5, 1, struct.pack("<II", 64, 0))}, "divided by zero"),
+        ({50714: (5, 1, struct.pack("<II", 64, 0))}, "denominator 0"),
     ],
 )
 def test_levels_that_no_sensor_has_are_refused(levels: Tags, reason: str, more: Tags, strip: bytes | None) -> None:

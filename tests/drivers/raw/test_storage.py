@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.raw import rawfile
 from drivers.raw.rawfile import read_raw
-from drivers.raw.storage import Area, Cr3, RawDamaged, Stored, read_cr3
+from drivers.raw.storage import Area, Cr3, RawDamaged, StoredFrame, read_cr3
 from foundation.errors import FormatError
 from tests.drivers.raw.maker_files import PIXELS, SIDES, areas, box, cr3, large_box, track
 
@@ -20,7 +20,7 @@ def test_the_camera_and_where_its_sensor_is_black() -> None:
     said = read_cr3(cr3())
     assert (said.maker, said.model) == ("Canon", "Canon EOS M50")
     assert said.black == (Area(0, 0, 4056, 256), Area(0, 264, 28, 6024))
-    assert said.frames == (Stored(4056, 6288, ((900, PIXELS),)),) * 2
+    assert said.frames == (StoredFrame(4056, 6288, ((900, PIXELS),)),) * 2
 
 
 @pytest.mark.parametrize(
@@ -110,11 +110,11 @@ SMALL = box(b"stsz", struct.pack(">III", 0, 400, 1)), box(b"co64", struct.pack("
 
 def test_a_file_that_libraw_cannot_decode_is_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for name, data, says in (
-        ("whole.CR3", cr3("R", track(areas(), b"CRAW", (64, 48), *SMALL)), "LibRaw says"),
-        ("stub.CR3", cr3(), "its pixels reach from byte 900 to 5000900"),
-        ("cut.CR3", cr3()[:-10], "its part 'mdat' reaches to byte"),
+        ("whole.CR3", cr3("R", track(areas(), b"CRAW", (64, 48), *SMALL)), "LibRaw reports"),
+        ("stub.CR3", cr3(), "its pixels extend to byte 5000900"),
+        ("cut.CR3", cr3()[:-10], "its box 'mdat' extends to byte"),
         ("head.CR3", cr3()[:40], "cannot be read as a raw file"),
-        ("brand.CR3", b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", "no description of its pictures"),
+        ("brand.CR3", b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", "no description of its images"),
     ):
         path = tmp_path / name
         path.write_bytes(data)
