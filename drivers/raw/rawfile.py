@@ -959,9 +959,7 @@ def filled_fault(counts: NDArray[np.uint16], black: NDArray[np.float64], white_l
     bright_part = _extent_text(np.flatnonzero(darkest == _LARGEST), counts.shape)
     if bright_part is None:
         bright_part = _extent_text(np.argwhere(darkest_of_tiles == _LARGEST), counts.shape)
-    return (
-        None if bright_part is None else f"{bright_part} have only the count {_LARGEST}, as if lost bytes were all ones"
-    )
+    return None if bright_part is None else f"{bright_part} have only the count {_LARGEST}, as if bytes were lost"
 
 
 def _tile_size(shape: tuple[int, ...]) -> tuple[int, int]:

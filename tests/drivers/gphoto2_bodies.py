@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from drivers.camera import ExposureSettings
-from drivers.gphoto2_camera import BodySetting, number_of
+from drivers.gphoto2_camera import BodySetting, parse_number
 from foundation.clock import Clock
 from tests.contracts.camera import SeededFilm
 
@@ -245,7 +245,7 @@ class FakeBody:
         """Return how a frame is exposed now."""
         speed = self.tree.get("shutterspeed2", self.tree["shutterspeed"]).value
         iso, aperture, shutter = (
-            number_of(text) for text in (self.tree["iso"].value, self.tree["f-number"].value, speed)
+            parse_number(text) for text in (self.tree["iso"].value, self.tree["f-number"].value, speed)
         )
         assert iso is not None
         assert aperture is not None

@@ -18,7 +18,7 @@ import pytest
 
 from drivers import gphoto2_camera
 from drivers.camera import CameraIdentity, ExposureSettings, ReportsSupplies, Supplies, capture
-from drivers.gphoto2_camera import BodySetting, Gphoto2Camera, number_of, plan
+from drivers.gphoto2_camera import BodySetting, Gphoto2Camera, parse_number, plan_settings
 from foundation.clock import SimulatedClock, SystemClock
 from foundation.errors import ConfigurationError, DeviceError, DeviceRefused, LinkError
 from tests.contracts.camera import SETTINGS, Bench, CameraContract, SeededFilm
@@ -125,8 +125,8 @@ def test_no_camera_is_said_with_what_helps() -> None:
 @pytest.mark.parametrize(
     ("port", "model", "words"),
     [
-        (None, "Nonsense 5", r"knows no model 'Nonsense 5' \(gphoto2 --list-cameras .*found: "),
-        ("nonsense", None, r"knows no port 'nonsense' \(such as usb:001,004.*found: "),
+        (None, "Nonsense 5", r"has no model 'Nonsense 5' \(gphoto2 --list-cameras .*detected: "),
+        ("nonsense", None, r"has no port 'nonsense' \(such as usb:001,004.*detected: "),
     ],
 )
 def test_what_libgphoto2_does_not_know_is_a_mistake_of_the_settings(
@@ -166,7 +166,7 @@ class Fake:
         self.film = NoisyFilm()
         self.body = FakeBody(dict(BODIES[name]), self.film, self.clock, **given)  # pyrefly: ignore[bad-argument-type]
         module = fake_module(self.body)
-        patch.setattr(gphoto2_camera, "library", lambda: module)
+        patch.setattr(gphoto2_camera, "load_library", lambda: module)
         self.camera = Gphoto2Camera(clock=self.clock)
 
 
@@ -188,7 +188,7 @@ class TestContractOfScriptedBodies(CameraContract):
 
 
 def test_what_a_nikon_is_given() -> None:
-    assert plan(NIKON_Z7.get, SETTINGS) == {
+    assert plan_settings(NIKON_Z7.get, SETTINGS) == {
         "isoauto": "Off",
         "capturetarget": "Internal RAM",
         "imagequality": "NEF (Raw)",
@@ -196,48 +196,48 @@ def test_what_a_nikon_is_given() -> None:
         "f-number": "f/8",
         "shutterspeed2": "1/60",
     }
-    assert plan(NIKON_D7100.get, replace(SETTINGS, shutter_s=0.5))["shutterspeed2"] == "1/2"
+    assert plan_settings(NIKON_D7100.get, replace(SETTINGS, shutter_s=0.5))["shutterspeed2"] == "1/2"
     # Its other list rounds short times away: 1/6400 s is "0.0001s" there, as 1/8000 s is.
-    assert plan(NIKON_D7100.get, replace(SETTINGS, shutter_s=1 / 6400))["shutterspeed2"] == "1/6400"
+    assert plan_settings(NIKON_D7100.get, replace(SETTINGS, shutter_s=1 / 6400))["shutterspeed2"] == "1/6400"
 
 
 def test_what_a_sony_is_given() -> None:
-    assert plan(SONY_A7M4.get, replace(SETTINGS, shutter_s=0.5)) == {
+    assert plan_settings(SONY_A7M4.get, replace(SETTINGS, shutter_s=0.5)) == {
         "capturetarget": "sdram",
         "imagequality": "RAW",
         "iso": "100",
         "f-number": "f/8",
         "shutterspeed": "5/10",
     }
-    older = plan(SONY_A6400.get, replace(SETTINGS, aperture=5.6, shutter_s=3.2))
+    older = plan_settings(SONY_A6400.get, replace(SETTINGS, aperture=5.6, shutter_s=3.2))
     assert (older["f-number"], older["shutterspeed"], older["iso"]) == ("5.6", "32/10", "100")
-    assert "capturetarget" not in plan(SONY_A6000.get, SETTINGS)
+    assert "capturetarget" not in plan_settings(SONY_A6000.get, SETTINGS)
 
 
 SPOILED: list[tuple[dict[str, BodySetting], BodySetting | str, str]] = [
     (
         NIKON_Z7,
         BodySetting("bracketing", "On", ("On", "Off"), fixed=True),
-        "bracketing is On, so that every frame would",
+        "bracketing is On; every frame would",
     ),
-    (NIKON_Z7, BodySetting("rawcompression", "Lossy", ("Lossy",)), "rawcompression is Lossy, so that raw values"),
+    (NIKON_Z7, BodySetting("rawcompression", "Lossy", ("Lossy",)), "rawcompression is Lossy; raw values"),
     (
         NIKON_Z7,
         BodySetting("imagequality", "JPEG Fine", ("JPEG Basic", "JPEG Fine", "NEF+Fine")),
-        r"imagequality offers JPEG Basic, JPEG Fine, NEF\+Fine, none of RAW, NEF \(Raw\)",
+        r"imagequality offers JPEG Basic, JPEG Fine, NEF\+Fine; one of RAW, NEF \(Raw\)",
     ),
     (
         NIKON_Z7,
         BodySetting("imagequality", "JPEG Fine", ("JPEG Fine", "NEF (Raw)"), fixed=True),
-        r"imagequality offers JPEG Fine, NEF \(Raw\), none of RAW, .* that can be set",
+        r"imagequality offers JPEG Fine, NEF \(Raw\); one of RAW, .* expected",
     ),
-    (NIKON_Z7, "imagequality", "a raw format cannot be asked for: the body shows neither imageformat nor imagequality"),
-    (NIKON_Z7, "f-number", "aperture or f-number 8 cannot be asked for: the body does not show it"),
-    (NIKON_Z7, BodySetting("f-number", "f/1.8", ("f/1.8", "f/2")), "f-number 8 is not offered; offered are f/1.8, f/2"),
+    (NIKON_Z7, "imagequality", "a raw format cannot be set: the body shows neither imageformat nor imagequality"),
+    (NIKON_Z7, "f-number", "aperture or f-number 8 cannot be set: the body does not show it"),
+    (NIKON_Z7, BodySetting("f-number", "f/1.8", ("f/1.8", "f/2")), "f-number 8 is not offered; offered: f/1.8, f/2"),
     (
         NIKON_Z7,
         BodySetting("capturetarget", "Memory card", ("Memory card",)),
-        "capturetarget offers Memory card, none of",
+        "capturetarget offers Memory card; one of",
     ),
     (SONY_A7M4, BodySetting("expprogram", "Unknown value 8000", ("M", "P")), "expprogram is Unknown value 8000"),
     (SONY_A7M4, BodySetting("focusmode", "DMF", ("Manual", "DMF")), "focusmode is DMF"),
@@ -245,7 +245,7 @@ SPOILED: list[tuple[dict[str, BodySetting], BodySetting | str, str]] = [
     (
         SONY_A6400,
         BodySetting("f-number", "4.5", bounds=(3.5, 5.6)),
-        "f-number 8 is not offered; offered are 3.5 to 5.6",
+        "f-number 8 is not offered; offered: 3.5 to 5.6",
     ),
 ]
 
@@ -254,19 +254,19 @@ SPOILED: list[tuple[dict[str, BodySetting], BodySetting | str, str]] = [
 def test_what_would_spoil_a_series_is_refused(
     tree: dict[str, BodySetting], spoiled: BodySetting | str, says: str
 ) -> None:
-    plan(tree.get, SETTINGS)
+    plan_settings(tree.get, SETTINGS)
     changed = dict(tree)
     if isinstance(spoiled, str):
         del changed[spoiled]
     else:
         changed[spoiled.name] = spoiled
     with pytest.raises(DeviceRefused, match=says):
-        plan(changed.get, SETTINGS)
+        plan_settings(changed.get, SETTINGS)
 
 
 def test_everything_that_is_wrong_is_told_at_once() -> None:
     with pytest.raises(DeviceRefused, match=r"iso 100.*f-number 8.*shutterspeed"):
-        plan(lambda name: None, SETTINGS)
+        plan_settings(lambda name: None, SETTINGS)
 
 
 def test_a_lens_without_contacts_is_used_as_one() -> None:
@@ -274,11 +274,11 @@ def test_a_lens_without_contacts_is_used_as_one() -> None:
     # 2.5.28 of the simulated body).
     for value, choices in (("implicit auto", ("implicit auto",)), ("f/0", ()), ("", ())):
         bare = (NIKON_Z7 | {"f-number": BodySetting("f-number", value, choices)}).get
-        assert "f-number" not in plan(bare, replace(SETTINGS, aperture=None))
+        assert "f-number" not in plan_settings(bare, replace(SETTINGS, aperture=None))
         with pytest.raises(DeviceRefused, match=r'aperture 8 cannot be set.*aperture = "none"'):
-            plan(bare, SETTINGS)
+            plan_settings(bare, SETTINGS)
     with pytest.raises(DeviceRefused, match=r"f/5\.6.*f-number"):
-        plan(NIKON_Z7.get, replace(SETTINGS, aperture=None))
+        plan_settings(NIKON_Z7.get, replace(SETTINGS, aperture=None))
 
 
 @pytest.mark.parametrize(
@@ -291,7 +291,7 @@ def test_a_lens_without_contacts_is_used_as_one() -> None:
     ],
 )  # fmt: skip
 def test_numbers_in_labels(label: str, number: float | None) -> None:
-    assert number_of(label) == number
+    assert parse_number(label) == number
 
 
 def test_a_dial_that_turns_step_by_step_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,7 +303,7 @@ def test_a_dial_that_turns_step_by_step_is_waited_for(monkeypatch: pytest.Monkey
 
 def test_a_setting_that_the_body_does_not_take_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = Fake(monkeypatch, "Nikon Z 7", stubborn=frozenset({"imagequality"}))
-    with pytest.raises(DeviceRefused, match=r"NEF \(Raw\).*NEF\+Fine"):
+    with pytest.raises(DeviceRefused, match=r"NEF\+Fine on the camera, NEF \(Raw\) was set"):
         fake.camera.configure(SETTINGS)
 
 
@@ -311,7 +311,7 @@ def test_a_setting_that_the_body_does_not_take_is_refused(monkeypatch: pytest.Mo
 def test_a_picture_in_place_of_a_raw_file_is_refused(monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
     fake = Fake(monkeypatch, "Sony A7 IV", suffix=suffix)
     fake.camera.configure(SETTINGS)
-    with pytest.raises(DeviceRefused, match=r"capt0000\..*no raw file"):
+    with pytest.raises(DeviceRefused, match=r"capt0000\..*a raw file was expected"):
         fake.camera.expose()
     assert fake.body.files == {}, "it does not stay in the camera's memory"
     with pytest.raises(DeviceError):
@@ -387,7 +387,7 @@ try:
 except DeviceError as error:
     said["made"] = str(error)
 for name, label in (("f-number", "f/8"), ("shutterspeed", "1.0000s")):
-    with camera._speaking() as body:
+    with camera._connection() as body:
         camera._set(body, name, label)
         said[name] = body.get_single_config(name).get_value()
 camera.close()
@@ -406,7 +406,7 @@ def test_libgphoto2s_virtual_camera(tmp_path: Path) -> None:
         env=os.environ | {"VCAMERADIR": str(tmp_path), "HOME": str(tmp_path)},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
-    if "found: no camera at all" in done.stderr:
+    if "detected: none" in done.stderr:
         pytest.skip("this build of libgphoto2 has no virtual camera")
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout.splitlines()[-1])
@@ -415,10 +415,10 @@ def test_libgphoto2s_virtual_camera(tmp_path: Path) -> None:
     assert said["supplies"]["battery"] == 0.5
     assert said["supplies"]["card_free_bytes"] > 1 << 20
     assert said["refused"].startswith(
-        "the camera cannot take the series: a raw format cannot be asked for: the body shows neither imageformat nor "
+        "the camera cannot take the series: a raw format cannot be set: the body shows neither imageformat nor "
         "imagequality"
     )
-    assert "iso 100 cannot be asked for" in said["refused"]
+    assert "iso 100 cannot be set" in said["refused"]
     assert "f-number" not in said["refused"], "that it can"
-    assert "no raw file, though it was asked for one" in said["made"]
+    assert "a raw file was expected" in said["made"]
     assert (said["f-number"], said["shutterspeed"]) == ("f/8", "1.0000s")

@@ -169,7 +169,7 @@ def test_a_display_and_a_camera_that_are_not_there(bench: Bench) -> None:
     assert code == 3
     assert "display 'HDMI-1' is not there" in said
     assert str(DESK) in said
-    assert "no camera with vendor 04a9 on USB; found: none at all" in said
+    assert "no camera with vendor 04a9 on USB; present: none" in said
 
 
 def test_two_cameras_of_which_none_is_named(bench: Bench) -> None:
