@@ -576,7 +576,6 @@ class Scale:
 
 
 def _parse_number(setting: float | str) -> float | None:
-    """Return the positive number of a setting, such as ``1/60`` or ``f/8``; None if it has none."""
     if isinstance(setting, str):
         dividend, slash, divisor = setting.strip().lower().removesuffix("s").removeprefix("f/").partition("/")
         try:
@@ -1151,7 +1150,7 @@ class EosBody:
             raise self._truncated_error(pending, received)
 
     def _fetch_piece(self, operation: Operation, pending: PendingObject, offset: int) -> bytes:
-        """Return the next bytes of an object; they may be fewer than requested."""
+        # Fewer bytes than requested are valid; the rest follows.
         limit = min(PIECE_BYTES, pending.size - offset)
         for remaining_tries in reversed(range(_PIECE_TRIES)):
             try:
@@ -1218,7 +1217,6 @@ class EosBody:
             self._session.call(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
 
     def _poll_until(self, condition: Callable[[], bool]) -> bool:
-        """Poll until `condition` is true, for a limited time; return whether it is."""
         end = self._clock.monotonic() + SETTLE_LIMIT_S
         while not condition():
             if self._clock.monotonic() >= end:
@@ -1246,7 +1244,6 @@ class EosBody:
         return level
 
     def _card_free_bytes(self) -> int | None:
-        """Return the free space of all cards, bytes; None without a card, or if it is not reported."""
         storage_ids = self._call_if_supported(Operation.EOS_GET_STORAGE_IDS)
         if storage_ids is None:
             return None
@@ -1259,7 +1256,6 @@ class EosBody:
         return sum(free) if free else None
 
     def _request_property(self, code: int) -> bool:
-        """Request an event with a property's value; return whether the body accepts the request."""
         return self._call_if_supported(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, code) is not None
 
     def _call_if_supported(self, operation: Operation, *parameters: int) -> tuple[tuple[int, ...], bytes] | None:
@@ -1486,7 +1482,6 @@ class CanonEos:
         self._drop_connection(fault)
 
     def _failure_message(self, last_fault: DeviceError, attempts: str) -> str:
-        """Return why a call ends: the first fault, the attempts, the last fault, and one remedy."""
         first, latest = (fault.without_remedy() for fault in (self._first_fault or last_fault, last_fault))
         return f"{first}; {attempts}{'' if latest == first else f'; last fault: {latest}'}; {_REMEDY}"
 
@@ -1530,7 +1525,6 @@ class CanonEos:
         return release.announced
 
     def _receive_frame(self, body: EosBody, release: _Release, into: BinaryIO, start: int) -> PendingObject:
-        """Write the frame of a release to `into` from `start` on; return the frame when it is complete."""
         while True:
             frame = self._wait_for_frame(body, release)
             # Data of the same object before a fault are valid, because pieces are written whole.
@@ -1620,7 +1614,7 @@ def _may_recover(error: DeviceError) -> bool:
 
 
 def _file_name(frame: PendingObject) -> str:
-    """Return the camera's file name without characters that are invalid in file names, with a suffix."""
+    # Without characters that are invalid in file names.
     name = re.sub(r"[^A-Za-z0-9._-]", "_", frame.name).strip(".") or f"{frame.handle:08X}"
     # Some bodies announce a file without name or suffix, but with its format.
     return name if "." in name else name + _SUFFIXES.get(frame.format, "")

@@ -428,7 +428,6 @@ def _translate_lookup_errors(subject: str, remedy: str) -> Generator[None]:
 
 
 def _detected_cameras() -> str:
-    """Return the cameras that libgphoto2 detects, mainly on USB."""
     cameras = load_library().Camera.autodetect()
     names = [f"{cameras.get_name(index)} at {cameras.get_value(index)}" for index in range(cameras.count())]
     return "; ".join(names) or "none"
@@ -479,14 +478,12 @@ def _read_setting(camera: gphoto2.Camera, name: str) -> BodySetting | None:
 
 
 def _format_value(value: object) -> str:
-    """Return a value as text, a number with up to nine digits."""
     if value is None:
         return ""
     return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
 def _card_free_bytes(camera: gphoto2.Camera) -> int | None:
-    """Return the free space of all cards, bytes; None if it is not reported."""
     gp = load_library()
     try:
         stores = camera.get_storageinfo()

@@ -556,7 +556,6 @@ class PjLinkProjector:
         return authentication_digest(seed, self._password).encode("ascii")
 
     def _detect_other_server(self) -> str | None:
-        """Return which other server answers at this address; None if none does."""
         http_reply = self._probe(_HTTP_REQUEST)
         if http_reply[:5].lower() in _HTTP_REPLY_STARTS:
             return "an HTTP server"

@@ -374,7 +374,6 @@ class FullScreen:
             self._glfw.poll_events()
 
     def _restore_window(self) -> None:
-        """Fill the display again after it was disconnected or in another mode."""
         glfw = self._glfw
         for display, monitor in self._displays_now():
             if (display.name, display.width, display.height) == (
@@ -486,7 +485,6 @@ class FullScreen:
             )
 
     def _describe_cover(self, column: int, row: int) -> str:
-        """Describe the window in front of a pixel, if it is known, and the remedy."""
         cover = None
         if self._screen is not None:
             own: int = self._glfw.get_x11_window(self._window)
@@ -525,7 +523,6 @@ def display_warnings(selection: str | int | None = None) -> tuple[str, ...]:
 
 
 def _find_warnings(glfw: Any, display: Display, monitor: Any, screen: XScreen | None) -> tuple[str, ...]:
-    """Return what may change the light of a display; `screen` is None without an X server."""
     warnings: list[str] = []
     ramp_fault = _describe_ramp_fault(glfw, monitor)
     if ramp_fault:

@@ -528,7 +528,6 @@ class IpTransport(CableTransport):
         return False
 
     def _next_packet(self, timeout: float) -> Packet:
-        """Return the next packet on the command channel; answer pings during the wait."""
         remaining = timeout
         while True:
             wait = min(remaining, _PING_EVERY_S)

@@ -115,7 +115,6 @@ def lossless_fault(stream: bytes | memoryview) -> str | None:
 
 
 def _read_header(stream: bytes | memoryview) -> _Header | None:
-    """Return the header before the samples; None if the stream cannot be checked."""
     if bytes(stream[:2]) != bytes((0xFF, _SOI)):
         return None
     header, position = _Header(), 2

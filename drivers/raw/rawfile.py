@@ -298,7 +298,6 @@ class Mosaic:
 
 
 def _median(values: NDArray[np.float64], frequencies: NDArray[np.int64]) -> float:
-    """Return the median of `values`, each repeated `frequencies` times."""
     order = np.argsort(values)
     cumulative = np.cumsum(frequencies[order])
     middle = np.searchsorted(cumulative, ((cumulative[-1] - 1) // 2, cumulative[-1] // 2), side="right")
@@ -362,7 +361,6 @@ def decode_raw(data: bytes | memoryview, path: Path, *, is_verified: bool = Fals
 
 
 def _lossless_fault(data: bytes | memoryview, contents: _Contents) -> str | None:
-    """Return the damage of a lossless JPEG in the frames; None if there is none."""
     extents = {extent for frame in contents.frames if frame.lossless for extent in frame.extents}
     faults = (lossless_fault(data[offset : offset + size]) for offset, size in extents)
     return next((fault for fault in faults if fault is not None), None)
@@ -440,7 +438,6 @@ def check_frames(data: bytes | memoryview, frames: Sequence[StoredFrame]) -> Seq
 
 
 def _tiff_frames(data: bytes | memoryview, directories: Sequence[Directory]) -> Iterator[StoredFrame]:
-    """Yield the Bayer frames of a DNG, a CR2, or a maker's TIFF."""
     # LibRaw treats a version of zeros as missing.
     is_dng = any(any(directory.integers(TiffTag.DNG_VERSION)) for directory in directories)
     is_canon = bytes(data[8:10]) == b"CR" and not is_dng
@@ -552,7 +549,6 @@ def _cr2_frame(data: bytes | memoryview, directory: Directory) -> StoredFrame | 
 
 
 def _maker_frame(data: bytes | memoryview, directory: Directory, extents: tuple[Extent, ...]) -> StoredFrame:
-    """Return the frame of a maker's TIFF."""
     rows, columns = directory.first(TiffTag.IMAGE_LENGTH), directory.first(TiffTag.IMAGE_WIDTH)
     # TIFF 6.0: uncompressed if not stated. Olympus states compressed pixels of 16 bits as uncompressed.
     compression = directory.first(TiffTag.COMPRESSION) or _UNCOMPRESSED
@@ -758,7 +754,6 @@ def _masked_areas(
 
 
 def _intersection(first: Area, second: Area) -> Area:
-    """Return the intersection of two areas; without rows or columns if it is empty."""
     top, left = max(first.top, second.top), max(first.left, second.left)
     bottom = min(first.top + first.height, second.top + second.height)
     right = min(first.left + first.width, second.left + second.width)
@@ -879,7 +874,6 @@ def _plain_mosaic(path: Path, data: bytes | memoryview, contents: _Contents) -> 
 
 
 def _first_number(directories: Sequence[Directory], tag: TiffTag) -> float:
-    """Return the first number of `tag` in any directory; 0 if none has it."""
     values = (directory.numbers(tag) for directory in directories)
     return next((numbers[0] for numbers in values if numbers), 0.0)
 
@@ -976,7 +970,6 @@ def _row_tile_extremes(extreme: np.ufunc, counts: NDArray[np.uint16]) -> tuple[N
 
 
 def _extent_text(indices: NDArray[np.intp], shape: tuple[int, ...]) -> str | None:
-    """Describe rows or tiles by their indices; None if there are none."""
     if not len(indices):
         return None
     if indices.ndim == 1:

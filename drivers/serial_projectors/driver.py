@@ -247,7 +247,6 @@ class LineProjector(Projector):
             return ""
 
     def _query_if_supported(self, query: Question) -> str | None:
-        """Return the value of a query; None if the projector does not support the query."""
         try:
             return self._query(query)
         except _Unknown:
@@ -290,7 +289,6 @@ class LineProjector(Projector):
             pass
 
     def _next_reply(self, wait: float) -> str | None:
-        """Return the next message that is a reply; None if none arrives within `wait` seconds."""
         parse = answer_parser(self._language)
         while (message := self._exchange.poll(parse, wait)) is not None:
             if not self._handle_unasked(message):

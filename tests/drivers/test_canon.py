@@ -119,7 +119,7 @@ class Replay:
         self.closed = True
 
 
-def test_speaks_as_the_recorded_host_did(body: str, recording: list[Recorded]) -> None:
+def test_sends_the_requests_of_the_recorded_host(body: str, recording: list[Recorded]) -> None:
     cable = Replay(recording[:37])
     camera = CanonEos(lambda: cable, SimulatedClock())
     assert camera.identity() == IDENTITIES[body]
@@ -191,7 +191,7 @@ SPOILS: list[tuple[Callable[[SimulatedEos], None], str]] = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("spoil", "reason"), SPOILS)
 @pytest.mark.parametrize("body", [EOS_550D, EOS_6D_MARK_II], ids=["550D", "6D Mark II"])
-def test_what_would_spoil_a_series_is_refused_with_its_remedy(
+def test_refuses_body_settings_that_spoil_a_series(
     spoil: Callable[[SimulatedEos], None], reason: str, body: EosModel
 ) -> None:
     lab = Lab(body)
@@ -201,7 +201,7 @@ def test_what_would_spoil_a_series_is_refused_with_its_remedy(
     assert lab.film.frames == []
 
 
-def test_a_dial_turned_during_the_series_is_set_back_or_refused(lab: Lab) -> None:
+def test_restores_or_refuses_a_dial_turned_during_the_series(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.take()
     lab.eos.set_menu(Property.EOS_SHUTTER_SPEED, 0x38)
@@ -213,7 +213,7 @@ def test_a_dial_turned_during_the_series_is_set_back_or_refused(lab: Lab) -> Non
         lab.take()
 
 
-def test_raw_beside_jpeg_is_not_offered_as_raw_alone() -> None:
+def test_refuses_raw_plus_jpeg() -> None:
     both = ImageFormat((ImageFile(6, 0, 4), ImageFile(1, 0, 3)))
     properties = tuple(
         replace(spec, value=both.encode(), formats=(both,)) if spec.code == Property.EOS_IMAGE_FORMAT else spec
@@ -257,7 +257,7 @@ class Stuck(faults.TroubledResponder):
 @pytest.mark.parametrize(
     ("result", "said"), [(1, "autofocus"), (3, "mirror is up"), (7, "is full"), (8, "read-only"), (25, "result 0x19")]
 )
-def test_a_release_of_the_older_kind_tells_why_there_is_none(result: int, said: str) -> None:
+def test_older_release_reports_its_reason(result: int, said: str) -> None:
     lab = Lab(without=(Operation.EOS_REMOTE_RELEASE_ON,))
     lab.device = stuck = Stuck(lab.eos)
     stuck.result = result
@@ -281,7 +281,7 @@ PIECES = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lists", [False, True], ids=["lists none", "refuses both"])
-def test_a_body_that_gives_no_parts_gives_whole_frames(lists: bool) -> None:
+def test_fetches_whole_frames_without_partial_reads(lists: bool) -> None:
     lab = Lab(film_bytes=2_500_000, without=() if lists else PIECES)
     lab.device = faults.Declining(
         lab.eos, ResponseCode.OPERATION_NOT_SUPPORTED, Occasion(set(PIECES) if lists else set(), times=None)
@@ -295,7 +295,7 @@ def test_a_body_that_gives_no_parts_gives_whole_frames(lists: bool) -> None:
     assert lab.waiting() == 0
 
 
-def test_the_body_is_kept_awake_in_a_long_wait() -> None:
+def test_keeps_the_body_awake_in_a_long_wait() -> None:
     lab = Lab(auto_power_off_s=30)
     lab.eos.set_menu(Property.EOS_AUTO_POWER_OFF, 0)
     lab.camera.configure(replace(SETTINGS, shutter_s=30))
@@ -345,7 +345,7 @@ def goes_on(lab: Lab, frames: int = 3) -> None:
         (ResponseCode.SESSION_NOT_OPEN, 2),
     ],
 )
-def test_an_operation_that_is_declined_for_a_while(moody_lab: Lab, code: Operation, answer: int, times: int) -> None:
+def test_continues_after_a_declined_operation(moody_lab: Lab, code: Operation, answer: int, times: int) -> None:
     moody_lab.device = faults.Declining(moody_lab.eos, answer, Occasion({code}, times=times))
     goes_on(moody_lab)
 
@@ -355,7 +355,7 @@ def test_an_operation_that_is_declined_for_a_while(moody_lab: Lab, code: Operati
 @pytest.mark.parametrize(
     ("forgetful", "obeys", "after"), [(False, False, 0), (False, True, 3), (True, True, 0), (True, False, 3)]
 )
-def test_an_operation_that_is_never_answered(code: Operation, forgetful: bool, obeys: bool, after: int) -> None:
+def test_continues_after_an_unanswered_operation(code: Operation, forgetful: bool, obeys: bool, after: int) -> None:
     lab = Lab(forgetful=forgetful)
     lab.device = faults.Hanging(lab.eos, Occasion({code}, after=after), obeys=obeys)
     goes_on(lab)
@@ -364,7 +364,7 @@ def test_an_operation_that_is_never_answered(code: Operation, forgetful: bool, o
 @pytest.mark.slow
 @pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
 @pytest.mark.parametrize("after", [0, 3])
-def test_a_body_unplugged_at_an_operation_is_found_at_its_new_address(
+def test_reconnects_to_a_body_at_its_new_address(
     moody_lab: Lab, code: Operation, after: int
 ) -> None:
     bus = SimulatedBus()
@@ -378,7 +378,7 @@ def test_a_body_unplugged_at_an_operation_is_found_at_its_new_address(
 @pytest.mark.slow
 @pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
 @pytest.mark.parametrize("after", [0, 3])
-def test_a_response_lost_on_the_way(moody_lab: Lab, code: Operation, after: int) -> None:
+def test_continues_after_a_lost_response(moody_lab: Lab, code: Operation, after: int) -> None:
     occasion = Occasion({code}, after=after)
     moody_lab.cable = lambda transport: faults.LosingResponses(transport, occasion)
     goes_on(moody_lab)
@@ -386,7 +386,7 @@ def test_a_response_lost_on_the_way(moody_lab: Lab, code: Operation, after: int)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("after", [*range(0, 14_000, 1231), 4095, 4096, 4097, 8192])
-def test_a_cable_pulled_at_any_byte(after: int) -> None:
+def test_continues_after_unplugging_at_any_byte(after: int) -> None:
     lab = Lab(film_bytes=3000)
     lab.pipes = lambda pipes: faults.CutOff(pipes, after) if lab.openings == 1 else pipes
     goes_on(lab)
@@ -404,7 +404,7 @@ WRONG = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("operation", "change"), WRONG)
-def test_wrong_data_in_a_frame_or_a_piece_of_it(operation: Operation, change: str) -> None:
+def test_continues_after_wrong_frame_data(operation: Operation, change: str) -> None:
     without = {Operation.GET_PARTIAL_OBJECT: PIECES[:1], Operation.GET_OBJECT: PIECES}.get(operation, ())
     lab = Lab(without=without)
     lab.device = faults.Falsifying(lab.eos, CHANGES[change], Occasion({operation}))
@@ -430,7 +430,7 @@ def is_frame(record: Record) -> bool:
 
 
 @pytest.mark.slow
-def test_an_announcement_that_is_lost_costs_at_most_one_attempt(moody_lab: Lab, request: pytest.FixtureRequest) -> None:
+def test_lost_announcement_costs_at_most_one_attempt(moody_lab: Lab, request: pytest.FixtureRequest) -> None:
     seen: list[Record] = []
 
     def lose_second(records: tuple[Record, ...]) -> tuple[Record, ...]:
@@ -445,7 +445,7 @@ def test_an_announcement_that_is_lost_costs_at_most_one_attempt(moody_lab: Lab, 
 
 
 @pytest.mark.slow
-def test_announcements_that_are_late_or_doubled(lab: Lab) -> None:
+def test_accepts_late_and_repeated_announcements(lab: Lab) -> None:
     former: list[Record] = []
 
     def repeat(records: tuple[Record, ...]) -> tuple[Record, ...]:
@@ -460,14 +460,14 @@ def test_announcements_that_are_late_or_doubled(lab: Lab) -> None:
 
 
 @pytest.mark.slow
-def test_an_object_that_is_announced_for_ever_and_never_there(lab: Lab) -> None:
+def test_refuses_an_object_that_is_announced_but_missing(lab: Lab) -> None:
     bogus = TransferRequest(0x77, 0xB103, 600, "IMG_9999.CR2")
     lab.device = Announcing(lab.eos, lambda records: (*records, bogus))
     goes_on(lab)
     assert len(lab.film.frames) == 3
 
 
-def test_an_announcement_that_comes_after_the_next_release_is_not_taken_for_its_frame(lab: Lab) -> None:
+def test_late_announcement_is_not_the_next_frame(lab: Lab) -> None:
     held: list[Record] = []
 
     def hold_first(records: tuple[Record, ...]) -> tuple[Record, ...]:
@@ -488,7 +488,7 @@ def test_an_announcement_that_comes_after_the_next_release_is_not_taken_for_its_
     assert lab.waiting() == 0
 
 
-def test_a_transfer_goes_on_where_it_broke_off() -> None:
+def test_resumes_an_interrupted_transfer() -> None:
     lab = Lab(film_bytes=2_500_000)
     listening = listen(lab)
     lab.device = faults.Hanging(lab.device, Occasion({Operation.EOS_GET_PARTIAL_OBJECT}, after=1))
@@ -511,7 +511,7 @@ def test_a_transfer_goes_on_where_it_broke_off() -> None:
         ("../../IMG 1.CR3", 0xB108, r"_\.\._IMG_1\.CR3"),
     ],
 )
-def test_a_frame_is_named_as_the_body_does_and_after_its_format(lab: Lab, name: str, format: int, comes: str) -> None:
+def test_frame_name_follows_body_and_format(lab: Lab, name: str, format: int, comes: str) -> None:
     lab.device = Announcing(
         lab.eos,
         lambda records: tuple(
@@ -523,7 +523,7 @@ def test_a_frame_is_named_as_the_body_does_and_after_its_format(lab: Lab, name: 
     assert re.fullmatch(comes, lab.take(attempts=1).name)
 
 
-def test_what_stood_behind_the_place_in_the_file_is_gone(lab: Lab) -> None:
+def test_truncates_the_file_after_the_frame(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     into = io.BytesIO(b"former" * 1000)
     capture(lab.camera, into)
@@ -531,7 +531,7 @@ def test_what_stood_behind_the_place_in_the_file_is_gone(lab: Lab) -> None:
 
 
 @pytest.mark.slow
-def test_records_that_nobody_knows_and_a_queue_that_never_ends(lab: Lab) -> None:
+def test_ignores_unknown_records_and_an_endless_queue(lab: Lab) -> None:
     strange = OtherRecord(0xC1FE, b"whatever")
     shutter = Notice(EosEvent.SHUTDOWN_TIMER_UPDATED, 30)
     lab.device = Announcing(lab.eos, lambda records: (strange, *records, *(shutter,) * 20))
@@ -549,7 +549,7 @@ HINTS: dict[str, Callable[[Responder], Responder]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trouble", HINTS)
-def test_hints_on_the_event_pipe_are_hints(lab: Lab, trouble: str) -> None:
+def test_event_pipe_faults_are_harmless(lab: Lab, trouble: str) -> None:
     lab.device = HINTS[trouble](lab.eos)
     goes_on(lab)
     assert lab.openings == 1
@@ -569,7 +569,7 @@ SIZES: dict[str, Callable[[int], int]] = {
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_a_size_that_is_not_true_is_told(lab: Lab, size: str) -> None:
+def test_reports_a_wrong_size(lab: Lab, size: str) -> None:
     lab.device = Announcing(lab.eos, announced(SIZES[size]))
     lab.camera.configure(SETTINGS)
     for _ in range(2):
@@ -581,7 +581,7 @@ def test_a_size_that_is_not_true_is_told(lab: Lab, size: str) -> None:
     assert lab.waiting() == 0
 
 
-def test_a_jpeg_beside_the_raw_is_freed(lab: Lab) -> None:
+def test_frees_a_jpeg_next_to_the_raw(lab: Lab) -> None:
     def add_jpeg(records: tuple[Record, ...]) -> tuple[Record, ...]:
         jpeg = TransferRequest(0x78, 0x3801, 10, "IMG_0001.JPG")
         return tuple(item for record in records for item in ((record, jpeg) if is_frame(record) else (record,)))
@@ -593,7 +593,7 @@ def test_a_jpeg_beside_the_raw_is_freed(lab: Lab) -> None:
     assert freed.count(0x78) == 2
 
 
-def test_what_a_killed_run_left_is_thrown_away(lab: Lab) -> None:
+def test_discards_frames_of_a_killed_run(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.take()
     # The host dies with the release pressed and the frame under way.
@@ -604,7 +604,7 @@ def test_what_a_killed_run_left_is_thrown_away(lab: Lab) -> None:
     assert len(lab.film.frames) == 5
 
 
-def test_a_full_memory_is_emptied(lab: Lab) -> None:
+def test_empties_a_full_memory(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     for _ in range(EOS_550D.burst):
         lab.press()
@@ -615,7 +615,7 @@ def test_a_full_memory_is_emptied(lab: Lab) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["busy", "silent", "gone", "never announced"])
-def test_no_call_is_silent_for_long(kind: str) -> None:
+def test_calls_end_within_their_time_limits(kind: str) -> None:
     lab = Lab()
     lab.camera.configure(SETTINGS)
     always = Occasion({Operation.EOS_GET_EVENT}, times=None)
@@ -645,7 +645,7 @@ def gone_for_good(transport: Transport) -> Transport:
     raise LinkClosed("no camera on USB")
 
 
-def test_a_cable_that_fails_between_exposure_and_download_costs_no_frame(lab: Lab) -> None:
+def test_keeps_the_frame_if_the_cable_fails_before_download(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     for number in range(3):
         lab.camera.expose()
@@ -655,7 +655,7 @@ def test_a_cable_that_fails_between_exposure_and_download_costs_no_frame(lab: La
     assert len(lab.film.frames) == 3
 
 
-def test_a_cable_that_stays_out_for_a_while_costs_no_frame_either(lab: Lab) -> None:
+def test_keeps_the_frame_if_the_cable_is_out_for_a_while(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.camera.expose()
     lab.pull()
@@ -667,7 +667,7 @@ def test_a_cable_that_stays_out_for_a_while_costs_no_frame_either(lab: Lab) -> N
     assert [lab.download()] == lab.film.frames
 
 
-def test_a_body_that_forgets_its_frames_says_so_once(lab: Lab) -> None:
+def test_reports_lost_frames_once(lab: Lab) -> None:
     lab = Lab(forgetful=True)
     lab.camera.configure(SETTINGS)
     lab.camera.expose()
@@ -679,7 +679,7 @@ def test_a_body_that_forgets_its_frames_says_so_once(lab: Lab) -> None:
     lab.take(attempts=1)
 
 
-def test_a_finger_on_the_camera_between_exposure_and_download_changes_no_frame(lab: Lab) -> None:
+def test_manual_release_does_not_change_the_frame(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.camera.expose()
     lab.press()
@@ -688,7 +688,7 @@ def test_a_finger_on_the_camera_between_exposure_and_download_changes_no_frame(l
     assert lab.waiting() == 0
 
 
-def test_configuring_drops_a_frame_that_was_not_downloaded(lab: Lab) -> None:
+def test_configure_drops_a_pending_frame(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.camera.expose()
     lab.camera.configure(SETTINGS)
@@ -713,7 +713,7 @@ OPTIONAL = (
 @pytest.mark.slow
 @pytest.mark.parametrize("answer", [ResponseCode.OPERATION_NOT_SUPPORTED, ResponseCode.EOS_UNKNOWN_COMMAND])
 @pytest.mark.parametrize("code", OPTIONAL, ids=[code.name for code in OPTIONAL])
-def test_an_optional_operation_that_a_body_lists_and_has_not_got(code: Operation, answer: int) -> None:
+def test_continues_without_a_missing_optional_operation(code: Operation, answer: int) -> None:
     lab = Lab()
 
     class Rooming(faults.TroubledResponder):
@@ -747,7 +747,7 @@ def test_an_optional_operation_that_a_body_lists_and_has_not_got(code: Operation
 # What is left of battery and card.
 
 
-def test_what_a_body_has_left(lab: Lab) -> None:
+def test_reads_battery_and_card_capacity(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     supplies = lab.camera.supplies()
     assert isinstance(lab.camera, ReportsSupplies)
@@ -759,13 +759,13 @@ def test_what_a_body_has_left(lab: Lab) -> None:
     assert lab.camera.supplies().card_free_bytes is None
 
 
-def test_a_body_that_reports_its_battery_by_the_standard_alone() -> None:
+def test_reads_the_standard_battery_property() -> None:
     properties = tuple(spec for spec in EOS_550D.properties if spec.code != Property.EOS_BATTERY_POWER)
     lab = Lab(replace(EOS_550D, properties=properties), battery=0.75)
     assert lab.camera.supplies().battery == 0.75
 
 
-def test_a_camera_that_never_was_is_told_at_once() -> None:
+def test_absent_camera_is_reported_at_once() -> None:
     clock = SimulatedClock()
 
     def absent() -> Transport:
@@ -776,7 +776,7 @@ def test_a_camera_that_never_was_is_told_at_once() -> None:
     assert clock.monotonic() == 0
 
 
-def test_another_body_in_its_place_is_refused(lab: Lab) -> None:
+def test_refuses_another_body(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.device = SimulatedEos(EOS_550D, lab.film, lab.clock, serial="0000000002", auto_power_off_s=0)
     lab.pull()
@@ -784,7 +784,7 @@ def test_another_body_in_its_place_is_refused(lab: Lab) -> None:
         lab.take()
 
 
-def test_another_makers_camera_is_refused(lab: Lab) -> None:
+def test_refuses_another_maker(lab: Lab) -> None:
     body = replace(EOS_550D, info=replace(EOS_550D.info, manufacturer="Nikon Corporation", model="D90"))
     with pytest.raises(DeviceRefused, match="Nikon Corporation D90"):
         Lab(body).camera.identity()
@@ -797,7 +797,7 @@ def without_lists(records: tuple[Record, ...]) -> tuple[Record, ...]:
     return tuple(record for record in records if not isinstance(record, AvailableValues | AvailableFormats))
 
 
-def test_a_body_that_lists_nothing_works_with_the_values_that_it_sends(lab: Lab) -> None:
+def test_accepts_present_values_without_lists(lab: Lab) -> None:
     lab.device = Announcing(lab.eos, without_lists)
     lab.eos.set_menu(Property.EOS_ISO_SPEED, 0x48)
     lab.camera.configure(SETTINGS)
@@ -808,7 +808,7 @@ def test_a_body_that_lists_nothing_works_with_the_values_that_it_sends(lab: Lab)
         lab.camera.configure(replace(SETTINGS, iso=200))
 
 
-def test_a_body_that_tells_its_state_late_is_asked_again(lab: Lab) -> None:
+def test_waits_for_a_late_state(lab: Lab) -> None:
     # "The new EOS occasionally returned an empty event set": camera_prepare_canon_eos_capture of libgphoto2 2.5.34.
     held: list[Record] = []
 
@@ -824,7 +824,7 @@ def test_a_body_that_tells_its_state_late_is_asked_again(lab: Lab) -> None:
     assert lab.openings == 1
 
 
-def test_times_of_an_electronic_shutter_are_offered_and_set() -> None:
+def test_sets_electronic_shutter_times() -> None:
     lab = Lab(replace(EOS_550D, shutter_codes=(0x98, 0xA0, 0xA3, 0xA5, 0xA8, 0xAB, 0xAD, 0xB0)))
     assert [round(1 / time) for time in lab.camera.shutter_speeds()] == [
         32000, 25600, 20000, 16000, 12800, 10000, 8000, 4000,
@@ -858,7 +858,7 @@ class Slow(faults.TroubledResponder):
         return super().answer(request, data)
 
 
-def test_a_body_that_is_busy_for_a_while_is_waited_for_on_the_same_connection(lab: Lab) -> None:
+def test_waits_for_a_busy_body_on_the_same_connection(lab: Lab) -> None:
     lab.device = Slow(lab, 24)
     lab.camera.configure(SETTINGS)
     assert 24 <= lab.clock.monotonic() < 30
@@ -874,7 +874,7 @@ def test_a_body_that_is_busy_for_a_while_is_waited_for_on_the_same_connection(la
 @pytest.mark.parametrize(
     "model", ["EOS M50", "EOS M", "EOS Kiss M", "EOS M50m2", "PowerShot SX540 HS", "PowerShot G5 X"]
 )
-def test_a_body_with_another_remote_mode_is_refused_untouched(model: str) -> None:
+def test_refuses_bodies_with_another_remote_mode(model: str) -> None:
     lab = Lab(replace(EOS_550D, info=replace(EOS_550D.info, model=f"Canon {model}")))
     listening = listen(lab)
     with pytest.raises(DeviceRefused, match=rf'{model}; .*remote mode.*connection = "gphoto2"'):
@@ -886,7 +886,7 @@ def test_a_body_with_another_remote_mode_is_refused_untouched(model: str) -> Non
 # camlibs/ptp2/config.c, 2.5.34).
 
 
-def test_a_lens_without_contacts_takes_frames_and_no_aperture() -> None:
+def test_exposes_with_a_lens_without_contacts() -> None:
     lab = Lab(replace(EOS_550D, aperture_codes=()))
     with pytest.raises(DeviceRefused, match=r'aperture 8 cannot be set.*set aperture = "none"'):
         lab.camera.configure(SETTINGS)
@@ -899,7 +899,7 @@ def test_a_lens_without_contacts_takes_frames_and_no_aperture() -> None:
 # What a body tells, as values.
 
 
-def test_mirror_lockup_among_recorded_custom_functions(body: str, recording: list[Recorded]) -> None:
+def test_reads_mirror_lockup_in_recorded_custom_functions(body: str, recording: list[Recorded]) -> None:
     state = EosState()
     records = decode_events(bytes.fromhex(recording[5]["data"] or ""))
     state.update(records)
@@ -918,7 +918,7 @@ def test_mirror_lockup_among_recorded_custom_functions(body: str, recording: lis
 
 
 @pytest.mark.slow
-def test_what_a_body_claims_costs_little_memory() -> None:
+def test_claims_of_a_body_use_little_memory() -> None:
     state = EosState()
     tracemalloc.start()
     for batch in range(8):
@@ -936,14 +936,14 @@ def test_what_a_body_claims_costs_little_memory() -> None:
 
 
 @pytest.mark.parametrize("length", [1 << 32, (1 << 32) - 1, 5 << 20, 1 << 40])
-def test_an_answer_of_gigabytes_is_refused_before_it_is_read(length: int) -> None:
+def test_refuses_an_answer_of_gigabytes(length: int) -> None:
     # 32 bits of a container say at most 4 GiB, or that the end is not known; PTP/IP has 64.
     reception = Reception(PtpRequest(Operation.EOS_GET_EVENT, 7), None, "the camera")
     with pytest.raises(ProtocolError, match="4194304"):
         reception.start(7, length)
 
 
-def test_an_answer_without_end_is_refused_at_its_bound() -> None:
+def test_refuses_an_endless_answer() -> None:
     reception = Reception(PtpRequest(Operation.EOS_GET_EVENT, 7), None, "the camera")
     reception.start(7, None)
     for _ in range(64):
@@ -1012,7 +1012,7 @@ RECORDS: st.SearchStrategy[Record] = st.one_of(
 )
 
 
-def test_a_shot_of_the_400d() -> None:
+def test_decodes_a_frame_of_the_400d() -> None:
     # 2 572 677 bytes, 21 April 2009 on the camera's clock.
     entry = ObjectEntry(
         handle=0x31946352,
@@ -1030,13 +1030,13 @@ def test_a_shot_of_the_400d() -> None:
     assert canon.encode_events([ObjectEvent(EosEvent.OBJECT_ADDED, entry)]) == payload
 
 
-def test_an_object_that_waits_in_the_camera() -> None:
+def test_decodes_a_transfer_request() -> None:
     request = TransferRequest(0x91910021, ObjectFormat.CR2, 26006080, "IMG_0042.CR2")
     assert canon.decode_events(examples.TRANSFER_REQUEST) == (request,)
     assert canon.encode_events([request]) == examples.TRANSFER_REQUEST
 
 
-def test_a_request_of_a_body_with_long_names() -> None:
+def test_decodes_a_transfer_request_with_long_names() -> None:
     # libgphoto2's ptp-pack.c quotes this body of a 0xc1b8 record; the name is empty.
     body = bytes.fromhex("40c03214 08b10000 00000000 d41ca602 00000000 00c03214 06000000 00")
     octets = bytes.fromhex("25000000 b8c10000") + body + bytes.fromhex("08000000 00000000")
@@ -1046,7 +1046,7 @@ def test_a_request_of_a_body_with_long_names() -> None:
     assert canon.encode_events([record]) == octets
 
 
-def test_a_state_dump() -> None:
+def test_decodes_a_state_dump() -> None:
     raw, jpeg = ImageFile(6, 0, 4), ImageFile(1, 0, 3)
     records = (
         PropertyChanged(Property.EOS_ISO_SPEED, b"\x68\0\0\0"),
@@ -1060,7 +1060,7 @@ def test_a_state_dump() -> None:
     assert canon.encode_events(records) == examples.STATE
 
 
-def test_an_object_of_a_body_with_sizes_of_64_bits() -> None:
+def test_decodes_an_object_with_64_bit_sizes() -> None:
     # Size at 0x1c of the record, parent at 0x24, the other handle at 0x28, name at 0x2c.
     head = "40000000 a7c10000 21009191 01000200 08b10000 00000000 20000000 0000004001000000 00009191 20009191"
     name = "494d475f303034322e43523300000000 00000000"
@@ -1074,13 +1074,13 @@ def test_an_object_of_a_body_with_sizes_of_64_bits() -> None:
 
 
 @pytest.mark.parametrize("end", ["", "0000", "00000000 00000000", "00000000 00000000 00000000", "08000000 00000000"])
-def test_some_bodies_leave_the_closing_record_out(end: str) -> None:
+def test_accepts_a_missing_closing_record(end: str) -> None:
     record = bytes.fromhex("10000000 89c10000 03d10000 68000000")
     assert canon.decode_events(record + bytes.fromhex(end)) == (PropertyChanged(0xD103, b"\x68\0\0\0"),)
     assert canon.decode_events(2 * record + bytes.fromhex(end)) == 2 * (PropertyChanged(0xD103, b"\x68\0\0\0"),)
 
 
-def test_more_records_than_any_body_queues_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_too_many_records(monkeypatch: pytest.MonkeyPatch) -> None:
     assert canon.MAX_RECORDS == 65536
     monkeypatch.setattr(canon, "MAX_RECORDS", 500)
     notice = bytes.fromhex("0c000000 8bc10000 01000000")
@@ -1113,7 +1113,7 @@ def test_more_records_than_any_body_queues_are_refused(monkeypatch: pytest.Monke
         ),
     ],
 )
-def test_records_that_contradict_themselves_are_named(octets: str, says: str) -> None:
+def test_refuses_inconsistent_records(octets: str, says: str) -> None:
     with pytest.raises(ProtocolError, match=says):
         canon.decode_events(bytes.fromhex(octets))
 
@@ -1126,25 +1126,25 @@ def test_records_that_contradict_themselves_are_named(octets: str, says: str) ->
         "20d10000 03000000 00000000 02000000",
     ],
 )
-def test_lists_of_unknown_form_stay_as_they_came(body: str) -> None:
+def test_keeps_lists_of_unknown_form(body: str) -> None:
     octets = bytes.fromhex(body)
     records = (OtherRecord(EosEvent.AVAILABLE_LIST_CHANGED, octets),)
     assert canon.decode_events(canon.encode_events(records)) == records
 
 
-def test_more_than_the_bound_is_refused_unread() -> None:
+def test_refuses_data_above_the_limit() -> None:
     with pytest.raises(ProtocolError, match="at most 4194304"):
         canon.decode_events(bytes(canon.MAX_EVENTS + 1))
 
 
 @pytest.mark.slow
 @given(st.lists(RECORDS, max_size=6).map(tuple))
-def test_any_records_come_back_with_and_without_the_closing_one(records: tuple[Record, ...]) -> None:
+def test_records_survive_encoding_and_decoding(records: tuple[Record, ...]) -> None:
     octets = canon.encode_events(records)
     assert canon.decode_events(octets) == canon.decode_events(octets.removesuffix(canon.encode_events())) == records
 
 
-def test_settings_are_canons_bytes() -> None:
+def test_settings_match_canons_bytes() -> None:
     setting = PropertySetting(Property.EOS_CAPTURE_DESTINATION, canon.number_value(CaptureDestination.HOST))
     assert setting.encode() == examples.SETTING
     assert PropertySetting.decode(examples.SETTING) == setting
@@ -1160,7 +1160,7 @@ APERTURES_60D = (0x25, 0x28, 0x2B, 0x2D, 0x30, 0x33, 0x35, 0x38, 0x3B, 0x3D, 0x4
 
 
 @SCALES
-def test_every_label_finds_its_code_back(scale: Scale) -> None:
+def test_labels_give_back_their_codes(scale: Scale) -> None:
     for step in scale.steps:
         assert scale.code(step.label, [step.code]) == scale.code(step.value, [step.code]) == step.code
 
@@ -1182,13 +1182,13 @@ def test_labels_are_rounded_stops(scale: Scale) -> None:
         assert stops < 0.25, (step, stops)
 
 
-def test_the_list_of_the_body_decides_between_half_and_third_stops() -> None:
+def test_list_of_the_body_selects_half_or_third_stops() -> None:
     assert SHUTTER.code("1/10") == SHUTTER.code(0.1, [0x50, 0x53, 0x55]) == 0x53
     assert SHUTTER.code("1/10", [0x50, 0x54, 0x58]) == 0x54
     assert APERTURE.code(3.5, APERTURES_60D) == 0x25
 
 
-def test_what_is_between_is_not_guessed() -> None:
+def test_refuses_values_between_steps() -> None:
     with pytest.raises(InputError, match=r"^aperture 7\.5 is not offered; nearest: 6\.3, 7\.1, 8, 9$"):
         APERTURE.code(7.5, APERTURES_60D)
     with pytest.raises(InputError, match=r"2\.8.*3\.5, 4, 4\.5, 5"):
@@ -1198,12 +1198,12 @@ def test_what_is_between_is_not_guessed() -> None:
 
 
 @pytest.mark.parametrize("wanted", ["", "fast", "1/0", "-1", 0, -1.0, math.nan, math.inf, "nan", "inf", "1/2/3"])
-def test_what_is_no_value(wanted: float | str) -> None:
+def test_refuses_invalid_values(wanted: float | str) -> None:
     with pytest.raises(InputError):
         SHUTTER.code(wanted)
 
 
-def test_bulb_and_auto_are_no_values() -> None:
+def test_bulb_and_auto_have_no_value() -> None:
     assert SHUTTER.code("bulb", [0x0C, 0x10]) == 0x0C
     assert ISO.code("Auto") == 0
     assert SHUTTER.label(0x0C) == "bulb"

@@ -101,7 +101,7 @@ class TestContract(CameraContract):
 
 
 @pytest.mark.slow
-def test_a_lost_connection_is_renewed_by_the_next_call(bodies: Bodies) -> None:
+def test_next_call_renews_a_lost_connection(bodies: Bodies) -> None:
     with bodies.served() as (port, _):
         camera = Gphoto2Camera(port, MODEL)
         camera.configure(SETTINGS)
@@ -116,7 +116,7 @@ def test_a_lost_connection_is_renewed_by_the_next_call(bodies: Bodies) -> None:
 
 
 @pytest.mark.slow
-def test_no_camera_is_said_with_what_helps() -> None:
+def test_missing_network_camera_is_a_link_error() -> None:
     with pytest.raises(LinkError, match="ptpip:127"):
         Gphoto2Camera("ptpip:127.0.0.1:1:1", MODEL).identity()
 
@@ -129,7 +129,7 @@ def test_no_camera_is_said_with_what_helps() -> None:
         ("nonsense", None, r"has no port 'nonsense' \(such as usb:001,004.*detected: "),
     ],
 )
-def test_what_libgphoto2_does_not_know_is_a_mistake_of_the_settings(
+def test_refuses_unknown_model_and_port(
     port: str | None, model: str | None, words: str
 ) -> None:
     with pytest.raises(ConfigurationError, match=words):
@@ -137,13 +137,13 @@ def test_what_libgphoto2_does_not_know_is_a_mistake_of_the_settings(
 
 
 @pytest.mark.slow
-def test_no_camera_at_all_says_what_was_found() -> None:
+def test_missing_camera_is_a_link_error() -> None:
     with pytest.raises(LinkError):
         Gphoto2Camera("usb:777,777").identity()
 
 
 @pytest.mark.slow
-def test_a_missing_library_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gphoto2", None)
     with pytest.raises(ConfigurationError, match="pip install gphoto2"):
         Gphoto2Camera()
@@ -187,7 +187,7 @@ class TestContractOfScriptedBodies(CameraContract):
         return Bench(fake.camera, fake.film, identity, fake.clock.now, keeps_names=False)
 
 
-def test_what_a_nikon_is_given() -> None:
+def test_plans_nikon_settings() -> None:
     assert plan_settings(NIKON_Z7.get, SETTINGS) == {
         "isoauto": "Off",
         "capturetarget": "Internal RAM",
@@ -201,7 +201,7 @@ def test_what_a_nikon_is_given() -> None:
     assert plan_settings(NIKON_D7100.get, replace(SETTINGS, shutter_s=1 / 6400))["shutterspeed2"] == "1/6400"
 
 
-def test_what_a_sony_is_given() -> None:
+def test_plans_sony_settings() -> None:
     assert plan_settings(SONY_A7M4.get, replace(SETTINGS, shutter_s=0.5)) == {
         "capturetarget": "sdram",
         "imagequality": "RAW",
@@ -251,7 +251,7 @@ SPOILED: list[tuple[dict[str, BodySetting], BodySetting | str, str]] = [
 
 
 @pytest.mark.parametrize(("tree", "spoiled", "says"), SPOILED)
-def test_what_would_spoil_a_series_is_refused(
+def test_refuses_settings_that_spoil_a_series(
     tree: dict[str, BodySetting], spoiled: BodySetting | str, says: str
 ) -> None:
     plan_settings(tree.get, SETTINGS)
@@ -264,12 +264,12 @@ def test_what_would_spoil_a_series_is_refused(
         plan_settings(changed.get, SETTINGS)
 
 
-def test_everything_that_is_wrong_is_told_at_once() -> None:
+def test_reports_all_faults_at_once() -> None:
     with pytest.raises(DeviceRefused, match=r"iso 100.*f-number 8.*shutterspeed"):
         plan_settings(lambda name: None, SETTINGS)
 
 
-def test_a_lens_without_contacts_is_used_as_one() -> None:
+def test_accepts_a_lens_without_contacts() -> None:
     # As libgphoto2 shows a Canon's aperture of code 0: "implicit auto", and that as the only choice (printed by gphoto2
     # 2.5.28 of the simulated body).
     for value, choices in (("implicit auto", ("implicit auto",)), ("f/0", ()), ("", ())):
@@ -290,25 +290,25 @@ def test_a_lens_without_contacts_is_used_as_one() -> None:
         ("Unknown value 8000", None),
     ],
 )  # fmt: skip
-def test_numbers_in_labels(label: str, number: float | None) -> None:
+def test_parses_numbers_in_labels(label: str, number: float | None) -> None:
     assert parse_number(label) == number
 
 
-def test_a_dial_that_turns_step_by_step_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waits_for_a_dial_that_turns_step_by_step(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = Fake(monkeypatch, "Sony A6400", settles_after=8)
     fake.camera.configure(SETTINGS)
     assert fake.body.exposure() == ExposureSettings(100, 8.0, 1 / 60)
     assert 0.5 < fake.clock.monotonic() < 10
 
 
-def test_a_setting_that_the_body_does_not_take_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_a_setting_that_the_body_ignores(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = Fake(monkeypatch, "Nikon Z 7", stubborn=frozenset({"imagequality"}))
     with pytest.raises(DeviceRefused, match=r"NEF\+Fine on the camera, NEF \(Raw\) was set"):
         fake.camera.configure(SETTINGS)
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "JPG", "hif"])
-def test_a_picture_in_place_of_a_raw_file_is_refused(monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+def test_refuses_an_image_instead_of_a_raw_file(monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
     fake = Fake(monkeypatch, "Sony A7 IV", suffix=suffix)
     fake.camera.configure(SETTINGS)
     with pytest.raises(DeviceRefused, match=r"capt0000\..*a raw file was expected"):
@@ -319,7 +319,7 @@ def test_a_picture_in_place_of_a_raw_file_is_refused(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("code", [-7, -10, -34, -110, -1])
-def test_a_fault_of_any_kind_is_a_device_error_and_the_next_frame_is_taken(fake: Fake, code: int) -> None:
+def test_takes_the_next_frame_after_any_fault(fake: Fake, code: int) -> None:
     fake.camera.configure(SETTINGS)
     for _ in range(3):
         fake.body.fails.append(code)
@@ -331,7 +331,7 @@ def test_a_fault_of_any_kind_is_a_device_error_and_the_next_frame_is_taken(fake:
     assert fake.body.openings == 4
 
 
-def test_a_busy_body_is_asked_for_its_file_again(fake: Fake) -> None:
+def test_repeats_a_file_request_to_a_busy_body(fake: Fake) -> None:
     fake.camera.configure(SETTINGS)
     fake.camera.expose()
     fake.body.fails.extend([-110] * 4)
@@ -344,7 +344,7 @@ def test_a_busy_body_is_asked_for_its_file_again(fake: Fake) -> None:
         fake.camera.download(io.BytesIO())
 
 
-def test_a_fault_of_the_download_says_that_the_frame_is_lost(fake: Fake) -> None:
+def test_failed_download_reports_the_lost_frame(fake: Fake) -> None:
     fake.camera.configure(SETTINGS)
     fake.camera.expose()
     fake.body.fails.append(-34)
@@ -354,7 +354,7 @@ def test_a_fault_of_the_download_says_that_the_frame_is_lost(fake: Fake) -> None
         fake.camera.download(io.BytesIO())
 
 
-def test_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_battery_and_card_capacity(monkeypatch: pytest.MonkeyPatch) -> None:
     nikon = Fake(monkeypatch, "Nikon D7100")
     assert isinstance(nikon.camera, ReportsSupplies)
     assert nikon.body.tree["capturetarget"].value == "Memory card"
@@ -396,7 +396,7 @@ print(json.dumps(said))
 
 
 @pytest.mark.slow
-def test_libgphoto2s_virtual_camera(tmp_path: Path) -> None:
+def test_reads_the_virtual_camera_of_libgphoto2(tmp_path: Path) -> None:
     pytest.importorskip("gphoto2", reason="the extra `gphoto2` is not installed")
     (tmp_path / "IMG_0001.JPG").write_bytes(b"\xff\xd8\xff\xd9")
     # python-gphoto2 takes its virtual USB for the real one where this is set.

@@ -42,5 +42,5 @@ from drivers.raw import rawfile
     ],
     ids=str,
 )
-def test_numbers_are_the_published_ones(ours: tuple[object, ...], published: tuple[object, ...]) -> None:
+def test_constants_match_published_numbers(ours: tuple[object, ...], published: tuple[object, ...]) -> None:
     assert ours == published

@@ -91,13 +91,13 @@ def joined(packets: Iterable[Packet]) -> list[Packet]:
 
 
 @pytest.mark.parametrize(("octets", "packet"), list(zip(examples.IP_PACKETS, CONVERSATION, strict=True)))
-def test_packets_are_the_standards_bytes(octets: bytes, packet: Packet) -> None:
+def test_packets_match_the_standards_bytes(octets: bytes, packet: Packet) -> None:
     assert PacketCutter().feed(octets) == [packet]
     assert ptpip.encode(packet) == octets
 
 
 @given(st.lists(PACKETS, max_size=6), st.lists(st.integers(0, 10_000), max_size=12))
-def test_any_split_gives_the_same_packets(packets: list[Packet], cuts: list[int]) -> None:
+def test_packets_do_not_depend_on_splitting(packets: list[Packet], cuts: list[int]) -> None:
     stream = b"".join(map(ptpip.encode, packets))
     cutter = PacketCutter()
     assert joined(packet for piece in split(stream, cuts) for packet in cutter.feed(piece)) == joined(packets)
@@ -122,7 +122,7 @@ def test_any_split_gives_the_same_packets(packets: list[Packet], cuts: list[int]
         ("09000000 0d000000 00", "followed by 1 bytes"),
     ],
 )
-def test_what_is_no_packet_is_named(octets: str, says: str) -> None:
+def test_refuses_invalid_packets(octets: str, says: str) -> None:
     cutter = PacketCutter()
     with pytest.raises(ProtocolError, match=says):
         cutter.feed(bytes.fromhex(octets))
@@ -198,7 +198,7 @@ def connect_in_turn(far_end: Callable[[], FarEnd], clock: SimulatedClock) -> IpT
     return IpTransport(open_command, lambda: current[-1].open_event(), guid=GUID, name="Cr", clock=clock)
 
 
-def test_greets_in_the_standards_bytes() -> None:
+def test_greeting_matches_the_standards_bytes() -> None:
     # CIPA DC-005-2005, 2.3.1 and 2.3.3.
     far, transport = connected()
     hello = GUID + "Cr\0".encode("utf-16-le") + bytes.fromhex("00000100")
@@ -207,7 +207,7 @@ def test_greets_in_the_standards_bytes() -> None:
     assert transport.label == "cam (camera)"
 
 
-def test_asks_and_sends_data_in_the_standards_bytes() -> None:
+def test_request_and_data_match_the_standards_bytes() -> None:
     far, transport = connected()
     far.heard(far.command)
     far.command.write(DONE, PATIENCE_S)
@@ -222,7 +222,7 @@ def test_asks_and_sends_data_in_the_standards_bytes() -> None:
 
 
 @pytest.mark.parametrize(("total", "wrong"), [(5, "announced 5"), (7, "announced 7")])
-def test_data_must_be_as_long_as_announced(total: int, wrong: str) -> None:
+def test_refuses_data_of_another_length(total: int, wrong: str) -> None:
     far, transport = connected()
     start = packet(9, bytes.fromhex("05000000") + total.to_bytes(8, "little"))
     end = packet(12, bytes.fromhex("05000000") + b"abcdef")
@@ -231,7 +231,7 @@ def test_data_must_be_as_long_as_announced(total: int, wrong: str) -> None:
         transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S)
 
 
-def test_waits_for_the_event_connection_to_be_accepted() -> None:
+def test_waits_for_the_event_connection() -> None:
     far = FarEnd()
     far.refusals = 3
     clock = SimulatedClock()
@@ -239,7 +239,7 @@ def test_waits_for_the_event_connection_to_be_accepted() -> None:
     assert 0.2 < clock.monotonic() < 0.5
 
 
-def test_does_not_wait_for_it_for_ever() -> None:
+def test_wait_for_the_event_connection_is_limited() -> None:
     far = FarEnd()
     far.refusals = 1000
     clock = SimulatedClock()
@@ -253,21 +253,21 @@ def test_does_not_wait_for_it_for_ever() -> None:
 @pytest.mark.parametrize(
     ("reason", "remedy"), [(1, "pair it again"), (2, "another program"), (3, "off and on"), (9, "reason 9")]
 )
-def test_a_refusal_says_what_helps(reason: int, remedy: str) -> None:
+def test_refusal_names_the_remedy(reason: int, remedy: str) -> None:
     refusal = packet(5, reason.to_bytes(4, "little"))
     for words in ((refusal,), (ACK, refusal)):
         with pytest.raises(DeviceRefused, match=remedy):
             connect_in_turn(lambda words=words: FarEnd(*words), SimulatedClock())
 
 
-def test_what_is_no_camera_is_named() -> None:
+def test_reports_other_servers() -> None:
     with pytest.raises(ProtocolError, match="PTP/IP stream has"):
         FarEnd(b"SSH-2.0-OpenSSH_9.6\r\n").connect()
     with pytest.raises(ProtocolError):
         FarEnd(packet(14)).connect()
 
 
-def test_pings_are_answered_between_transactions() -> None:
+def test_answers_pings_between_transactions() -> None:
     far, transport = connected()
     far.heard(far.event)
     far.event.write(packet(13), PATIENCE_S)
@@ -275,7 +275,7 @@ def test_pings_are_answered_between_transactions() -> None:
     assert far.heard(far.event) == packet(14)
 
 
-def test_a_long_wait_for_a_response_answers_pings(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_pings_during_a_long_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drivers.ptp.ip._PING_EVERY_S", 0.01)
     far, transport = connected()
     far.heard(far.event)
@@ -294,7 +294,7 @@ def test_a_long_wait_for_a_response_answers_pings(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-def test_a_flood_of_events_keeps_the_newest() -> None:
+def test_keeps_the_newest_events() -> None:
     far, transport = connected()
     far.event.write(
         b"".join(packet(8, bytes.fromhex("01c1 ffffffff") + n.to_bytes(4, "little")) for n in range(9000)), PATIENCE_S
@@ -304,14 +304,14 @@ def test_a_flood_of_events_keeps_the_newest() -> None:
     assert events[-1].parameters == (8999,)
 
 
-def test_an_event_connection_that_is_lost_is_told() -> None:
+def test_reports_a_lost_event_connection() -> None:
     far, transport = connected()
     far.event.close()
     with pytest.raises(LinkClosed):
         transport.events()
 
 
-def test_a_stranger_in_the_middle_of_a_transaction_is_refused() -> None:
+def test_refuses_an_unexpected_packet_in_a_transaction() -> None:
     far, transport = connected()
     far.command.write(packet(4), PATIENCE_S)
     with pytest.raises(ProtocolError):
@@ -319,7 +319,7 @@ def test_a_stranger_in_the_middle_of_a_transaction_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_second_initiator_hears_that_the_device_is_busy() -> None:
+def test_second_initiator_gets_busy() -> None:
     with serve_ptpip(Echo(), 0) as server:
         first = IpTransport.connect(*server.address, guid=GUID, name="CroP", clock=SystemClock())
         with pytest.raises(DeviceRefused):
@@ -337,7 +337,7 @@ def answer(size: int) -> bytes:
 
 
 @given(cut=st.integers(0, len(answer(100)) - 1), hangs_up=st.booleans())
-def test_a_stream_that_ends_at_any_byte_is_closed_or_late(cut: int, hangs_up: bool) -> None:
+def test_truncated_stream_is_closed_or_late(cut: int, hangs_up: bool) -> None:
     far, transport = connected()
     far.command.write(answer(100)[:cut], PATIENCE_S)
     if hangs_up:
@@ -349,7 +349,7 @@ def test_a_stream_that_ends_at_any_byte_is_closed_or_late(cut: int, hangs_up: bo
 
 
 @given(at=st.integers(0, len(answer(100)) - 1), value=st.integers(0, 255))
-def test_a_garbled_byte_never_ends_in_anything_but_our_errors(at: int, value: int) -> None:
+def test_changed_byte_gives_only_our_errors(at: int, value: int) -> None:
     far, transport = connected()
     stream = bytearray(answer(100))
     stream[at] = value
@@ -363,7 +363,7 @@ def test_a_garbled_byte_never_ends_in_anything_but_our_errors(at: int, value: in
 
 
 @pytest.mark.parametrize("taken_up_before", [True, False])
-def test_waits_for_a_device_that_still_holds_an_old_connection(taken_up_before: bool) -> None:
+def test_waits_for_a_device_with_an_old_connection(taken_up_before: bool) -> None:
     busy = [FarEnd(packet(5, (2).to_bytes(4, "little"))) for _ in range(3)]
     ends = [FarEnd(), *busy, *([FarEnd()] if taken_up_before else [])]
     clock = SimulatedClock()

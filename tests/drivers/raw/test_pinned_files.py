@@ -83,7 +83,7 @@ def seen(mosaic: Mosaic) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_files_of_every_maker_are_read_as_before(pinned: Pinned) -> None:
+def test_files_of_every_maker_match_the_pins(pinned: Pinned) -> None:
     files = {name: data for name, (data, _) in maker_files().items()} | REAL
     files["cr2 in slices"] = cr2_bytes(FULL, "Canon EOS 6D", 400, (2, 30, 20))
     files["dng, active and masked"] = dng_bytes(
@@ -104,7 +104,7 @@ def test_files_of_every_maker_are_read_as_before(pinned: Pinned) -> None:
 
 
 @pytest.mark.slow
-def test_damaged_files_are_told_as_before(pinned: Pinned) -> None:
+def test_damaged_files_match_the_pins(pinned: Pinned) -> None:
     files = {name: data for name, (data, _) in maker_files().items()} | {"cr3": BOXES}
     files["dng, active area"] = dng_bytes(TONES, {50829: longs(2, 4, 48, 80), 50830: longs(0, 0, 48, 4)})
     found: dict[str, Any] = {}
@@ -114,7 +114,7 @@ def test_damaged_files_are_told_as_before(pinned: Pinned) -> None:
     pinned("raw files with damage", found)
 
 
-def test_directories_of_all_types_are_read_as_before(pinned: Pinned) -> None:
+def test_directories_of_all_types_match_the_pins(pinned: Pinned) -> None:
     def one(order: str, tag: int, kind: int, count: int, value: bytes) -> bytes:
         place = value.ljust(4, b"\0") if len(value) <= 4 else struct.pack(order + "I", 26)
         head = (b"II" if order == "<" else b"MM") + struct.pack(order + "HIHHHI", 42, 8, 1, tag, kind, count)

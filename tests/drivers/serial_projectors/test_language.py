@@ -23,7 +23,7 @@ from tests.drivers.serial_projectors.made_up import MADE_UP, TEXT
 EPSON, BENQ, OPTOMA = (load_language(name) for name in ("epson", "benq", "optoma"))
 
 
-def test_languages_are_found_in_any_case_and_unknown_ones_name_the_known() -> None:
+def test_loads_languages_in_any_case_and_lists_known_ones() -> None:
     assert {"benq", "epson", "optoma"} <= set(built_in_languages())
     assert load_language("Epson") == EPSON
     with pytest.raises(
@@ -34,14 +34,14 @@ def test_languages_are_found_in_any_case_and_unknown_ones_name_the_known() -> No
         load_language("epsn")
 
 
-def test_speeds_and_ports_are_those_of_the_manuals() -> None:
+def test_speeds_and_ports_match_the_manuals() -> None:
     assert (EPSON.line.baud, BENQ.line.baud, OPTOMA.line.baud) == (9600, 115200, 9600)
     assert EPSON.network is not None
     assert BENQ.network is not None
     assert (EPSON.network.port, BENQ.network.port, OPTOMA.network) == (3629, 8000, None)
 
 
-def test_codes_are_those_of_the_manual() -> None:
+def test_codes_match_the_manual() -> None:
     # Epson, ESC/VP21 guide, PWR.
     expected = {"00": "standby", "01": "on", "02": "warm-up", "03": "cooling", "04": "standby", "09": "standby"}
     assert {code: power.value for code, power in EPSON.power.states.items()} == expected
@@ -59,7 +59,7 @@ def test_codes_are_those_of_the_manual() -> None:
     assert EPSON.faults.parts == parts | {"0B": "other"}
 
 
-def test_a_file_of_ones_own_is_read(tmp_path: Path) -> None:
+def test_loads_a_user_file(tmp_path: Path) -> None:
     path = tmp_path / "lantern.TOML"
     path.write_text(TEXT)
     assert load_language(str(path)) == MADE_UP
@@ -116,7 +116,7 @@ def test_a_file_of_ones_own_is_read(tmp_path: Path) -> None:
         ('busy = ["BUSY"]\nunknown = ["WHAT"]', "", "refusals: expected at least one refusing reply"),
     ],
 )
-def test_a_mistake_names_file_key_and_expectation(before: str, after: str, said: str) -> None:
+def test_mistakes_report_file_key_and_expectation(before: str, after: str, said: str) -> None:
     assert before in TEXT
     with pytest.raises(ConfigurationError) as told:
         parse_language(TEXT.replace(before, after), "lantern.toml")
@@ -126,7 +126,7 @@ def test_a_mistake_names_file_key_and_expectation(before: str, after: str, said:
     assert "mistakes" not in str(told.value), "one mistake is reported once"
 
 
-def test_a_missing_table_is_described_and_missing_quotation_marks_are_suggested() -> None:
+def test_reports_missing_tables_and_missing_quotation_marks() -> None:
     begin, _, end = TEXT.partition("[mute]")
     without_mute = begin + end[end.index("[faults]") :]
     with pytest.raises(ConfigurationError, match=r"the table \[mute\] is missing; add it, with on, off, done"):
@@ -135,18 +135,18 @@ def test_a_missing_table_is_described_and_missing_quotation_marks_are_suggested(
         parse_language(TEXT.replace("baud = 19200", "baud = x"), "lantern.toml")
 
 
-def test_one_refusal_needs_no_list() -> None:
+def test_accepts_one_refusal_without_a_list() -> None:
     assert parse_language(TEXT.replace('["BUSY"]', '"BUSY"'), "lantern.toml") == MADE_UP
 
 
 @pytest.mark.parametrize("state", ['accepted = "2"', 'accepted = "20"\nrefusals = { 4g = "a bad request" }'])
-def test_a_state_that_is_no_byte_is_refused(state: str) -> None:
+def test_refuses_a_state_that_is_not_a_byte(state: str) -> None:
     handshake = f'[network.handshake]\nsend = "hi"\nanswer_begins = "h"\nanswer_length = 2\nstate_at = 1\n{state}\n'
     with pytest.raises(ConfigurationError, match="two hexadecimal digits"):
         parse_language(TEXT.replace("[refusals]", f"{handshake}[refusals]"), "lantern.toml")
 
 
-def test_a_state_behind_the_end_of_the_answer_is_refused() -> None:
+def test_refuses_a_state_after_the_end_of_the_answer() -> None:
     handshake = (
         '[network.handshake]\nsend = "hi"\nanswer_begins = "h"\nanswer_length = 2\nstate_at = 2\naccepted = "00"\n'
     )
@@ -154,7 +154,7 @@ def test_a_state_behind_the_end_of_the_answer_is_refused() -> None:
         parse_language(TEXT.replace("[refusals]", f"{handshake}[refusals]"), "lantern.toml")
 
 
-def test_an_answer_survives_both_ends() -> None:
+def test_answers_survive_encoding_and_parsing() -> None:
     for language in (EPSON, BENQ, OPTOMA, MADE_UP):
         data = encode_answer(language.line, "Answer 1")
         taken = answer_parser(language)(data + b"more")
@@ -164,7 +164,7 @@ def test_an_answer_survives_both_ends() -> None:
 
 
 @given(data=st.binary(max_size=80))
-def test_whatever_comes_is_taken_waited_for_or_refused(data: bytes) -> None:
+def test_any_bytes_are_parsed_or_refused(data: bytes) -> None:
     assert EPSON.network is not None
     assert EPSON.network.handshake is not None
     parsers = [answer_parser(language, "pow=?") for language in (EPSON, BENQ, OPTOMA, MADE_UP)]
