@@ -42,7 +42,7 @@ class ExposureSettings:
     iso
         ISO speed.
     aperture
-        f-number; None if the body cannot set it (manual lens, telescope).
+        f-number; None if the body cannot set it (lens without contacts).
     shutter_s
         Shutter time, seconds.
     """

@@ -1334,7 +1334,7 @@ class _Release:
 
 
 class CanonEos:
-    """A `drivers.camera.Camera` over PTP on any cable.
+    """A `drivers.camera.Camera` over PTP on any cable; `open_transport` opens the cable for each connection.
 
     - A failed connection is renewed, for a limited number of times and a limited time in one call. Then the call raises
       its first cause; the caller decides about longer waits.
@@ -1342,13 +1342,6 @@ class CanonEos:
       missing frame is an error. Objects in memory before a release are discarded, so frames are never mixed up.
     - The frame stays in memory until its download is complete, or until the next exposure. A failed cable or an
       unwritable file costs a download, not a frame.
-
-    Parameters
-    ----------
-    open_transport
-        Opens the cable; called again for each new connection.
-    clock
-        Measures time limits.
     """
 
     def __init__(self, open_transport: Callable[[], Transport], clock: Clock = SYSTEM_CLOCK) -> None:

@@ -240,8 +240,6 @@ class Gphoto2Camera:
         libgphoto2's name of the port, ``usb:001,005`` or ``ptpip:192.168.1.1``; None selects the first detected camera.
     model
         libgphoto2's name of the model, ``PTP/IP Camera`` on a network; None detects it, which works on USB.
-    clock
-        Measures time limits.
     """
 
     def __init__(self, port: str | None = None, model: str | None = None, clock: Clock = SYSTEM_CLOCK) -> None:

@@ -337,25 +337,14 @@ class PjLinkProjector:
     """A `drivers.projector.Projector` over PJLink class 1, with the additions of class 2.
 
     All queries and commands may raise `DeviceRefused` (unknown, not offered, not now, wrong password), `DeviceFault`
-    (the projector reports a failure), `LinkError` and `ProtocolError`. After a fault of cable or protocol the
-    connection is closed, so that a late reply is never taken for the next one.
+    (the projector reports a failure), `LinkError` and `ProtocolError`.
 
-    Many projectors implement only part of their class. A query answered with `ERR1` or `ERR2` returns None or an empty
-    value and is not repeated. After `ERR3` it may be repeated.
-
-    Parameters
-    ----------
-    connect
-        Opens a connection when it is first needed. Many projectors serve only one, and close it after about 30 s
-        without a command. A command that meets a closed connection is sent once more, which does no harm.
-    password
-        PJLink password; None if the projector has none.
-    timeout
-        Time for a reply, seconds.
-    label
-        Name of the projector in messages.
-    clock
-        Measures `timeout`.
+    - `connect` opens a connection when it is first needed. Many projectors serve only one, and close it after about 30
+      s without a command. A command that meets a closed connection is sent once more, which does no harm.
+    - After a fault the connection is closed, so that a late reply is never taken for the next one.
+    - Many projectors implement only part of their class. A query answered with `ERR1` or `ERR2` returns None or an
+      empty value and is not repeated. After `ERR3` it may be repeated.
+    - `password` is None if the projector has none.
     """
 
     def __init__(
@@ -600,28 +589,10 @@ def search(
     open_socket: Callable[[int], UdpSocket] = UdpSocket,
     clock: Clock = SYSTEM_CLOCK,
 ) -> tuple[FoundProjector, ...]:
-    """Broadcast a search over UDP and return the class 2 projectors that reply.
+    """Broadcast a search over UDP for `seconds`; return the class 2 projectors in the order of their replies.
 
     Nothing in these replies is authenticated. Projectors also send notices of start-up, faults, power and input to the
     controller in their menu; these are ignored here.
-
-    Parameters
-    ----------
-    seconds
-        Time for which replies are collected.
-    address
-        Broadcast address.
-    listen_port
-        UDP port for the replies.
-    open_socket
-        Opens the UDP socket.
-    clock
-        Measures `seconds`.
-
-    Returns
-    -------
-    tuple of FoundProjector
-        In the order of their replies.
     """
     projectors: dict[FoundProjector, None] = {}
     with open_socket(listen_port) as datagrams:

@@ -225,16 +225,9 @@ _COVER_REMEDY: Final = "check for a window or notification in front, desktop sca
 
 
 class FullScreen:
-    """A `drivers.presenter.Presenter` on a display; black when it opens.
+    """A `drivers.presenter.Presenter` on a display, selected as in `choose_display`; black when it opens.
 
     All calls must be in the thread that opened it. It reads no keys: `close` or the end of the process closes it.
-
-    Parameters
-    ----------
-    display
-        Selection as in `choose_display`.
-    clock
-        Measures time limits.
     """
 
     def __init__(self, display: str | int | None = None, clock: Clock = SYSTEM_CLOCK) -> None:

@@ -186,14 +186,9 @@ class Cover:
 
 
 class XScreen:
-    """The screen of an X server, and the windows on it.
+    """The screen of an X server (None: of DISPLAY), and the windows on it.
 
-    Parameters
-    ----------
-    display
-        Name of the server, such as ``:1``; None uses DISPLAY.
-    keep_awake
-        True suspends screen saver and power saving while the connection is open.
+    With `keep_awake` screen saver and power saving are suspended while the connection is open.
     """
 
     def __init__(self, display: str | None = None, *, keep_awake: bool = True) -> None:

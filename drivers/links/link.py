@@ -83,7 +83,7 @@ class PeerLink:
                 raise LinkClosed("the simulated device closed the connection; open a new one")
             if not timeout:
                 return b""
-            raise LinkTimeout(f"the simulated device has not replied within {timeout:g} s")
+            raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s")
         data = bytes(self._incoming[:limit])
         del self._incoming[:limit]
         return data
@@ -109,12 +109,8 @@ MessageParser = Callable[[bytes], tuple[_T, int] | None]
 class Exchange:
     """Requests and replies over connections that `connect` opens.
 
-    Parameters
-    ----------
-    greet
-        Exchanges the opening messages of a new connection; returns an unlogged prefix for the first request.
-    silence_remedy, endless_remedy
-        Remedies in the messages for a missing reply and for a reply without an end.
+    - `greet` exchanges the opening messages of a new connection; returns an unlogged prefix for the first request.
+    - `silence_remedy`, `endless_remedy`: remedies in the messages for a missing reply and for a reply without an end.
     """
 
     def __init__(
@@ -252,7 +248,7 @@ class Exchange:
 
     def _timeout_error(self, wait: float) -> LinkTimeout:
         received = f" (received only {quoted(self._received)})" if self._received else ""
-        return LinkTimeout(f"{self._label} has not replied within {wait:g} s{received}; {self._silence_remedy}")
+        return LinkTimeout(f"{self._label} has not answered within {wait:g} s{received}; {self._silence_remedy}")
 
 
 def quoted(data: bytes) -> str:

@@ -43,7 +43,7 @@ class TcpLink:
             ) from error
         except ConnectionRefusedError as error:
             raise LinkClosed(
-                f"{address} refuses connections; check the port, and that network control is enabled on the device"
+                f"nothing listens at {address}; check the port, and that network control is enabled on the device"
             ) from error
         except (OSError, OverflowError) as error:
             raise LinkClosed(f"cannot connect to {address}: {error}; check the address and the network") from error

@@ -115,18 +115,9 @@ _MAX_POLLING_S: Final = 0.05
 class UsbDevice:
     """A still image device on the bus.
 
-    Attributes
-    ----------
-    vendor, product
-        USB identifiers.
-    serial
-        Serial number; None if the device has none or does not permit reading it.
-    name
-        Product name; may be empty.
-    port
-        Bus and ports on the way, such as ``1-2.4``; unlike `address`, it does not change when the device restarts.
-    address
-        Address on the bus.
+    - `serial`: None if the device has no serial number, or does not permit reading it.
+    - `port`: bus and ports on the way, such as ``1-2.4``; unlike `address`, it does not change when the device
+      restarts.
     """
 
     vendor: int
@@ -153,17 +144,7 @@ def open_usb(
     port: str | None = None,
     backend: IBackend | None = None,
 ) -> OpenUsbDevice:
-    """Open the one still image device with the given properties, and claim its interface.
-
-    Raises
-    ------
-    DeviceRefused
-        The device cannot be opened by this user, or another program uses it.
-    InputError
-        Several devices have these properties.
-    LinkClosed
-        No device has these properties.
-    """
+    """Open the one still image device with the given properties, and claim its interface."""
     matching: list[tuple[usb.core.Device, UsbDevice]] = []
     other_devices: list[UsbDevice] = []
     read_error: DeviceRefused | None = None

@@ -419,18 +419,10 @@ _CANCEL_S: Final = 2.0  # Timeout for the end of a cancelled transaction, second
 class IpTransport(CableTransport):
     """A `drivers.ptp.protocol.Transport` over two links.
 
-    Parameters
-    ----------
-    open_command, open_event
-        Open the two connections, again after `reset`. If the second raises `LinkClosed`, it is repeated for 2 s.
-    guid
-        16 bytes that identify this computer to a paired camera.
-    name
-        Name of this computer on the camera's display.
-    clock
-        Measures time limits.
-    label
-        Name of the camera in messages.
+    - `open_command`, `open_event` open them, again after `reset`. If the second raises `LinkClosed`, it is repeated for
+      2 s.
+    - `guid`: 16 bytes that identify this computer to a paired camera.
+    - `name`: name of this computer on the camera's display.
     """
 
     def __init__(

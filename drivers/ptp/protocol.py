@@ -581,19 +581,7 @@ class Transport(Protocol):
         receive: Callable[[bytes], object] | None = None,
         timeout: float,
     ) -> Transaction:
-        """Execute one transaction.
-
-        Parameters
-        ----------
-        request
-            Operation, transaction number and parameters.
-        send
-            Data phase to the device; None if the operation has none.
-        receive
-            Called with each piece of the data phase from the device; None collects up to `MAX_COLLECTED` bytes.
-        timeout
-            Longest wait for each reply of the device, seconds.
-        """
+        """Execute one transaction; arguments as in `PtpSession.call`, collecting at most `MAX_COLLECTED` bytes."""
 
     @abstractmethod
     def events(self) -> tuple[PtpEvent, ...]:

@@ -47,20 +47,8 @@ class LineProjector(Projector):
     """A `drivers.projector.Projector` with a line protocol; the connection is opened at the first use.
 
     All queries and commands may raise `DeviceRefused`, `DeviceFault`, `LinkError` and `ProtocolError`. A command may be
-    repeated without harm. No command is sent if the projector is already in the requested state or changes to it.
-
-    Parameters
-    ----------
-    language
-        Commands and replies of the projector.
-    connect
-        Opens a connection.
-    network
-        True for a connection over TCP, which starts with the handshake of the language.
-    label
-        Name of the projector in messages.
-    clock
-        Measures time limits.
+    repeated without harm. No command is sent if the projector is already in the requested state or changes to it. With
+    `network` the connection starts with the handshake of the language.
     """
 
     def __init__(

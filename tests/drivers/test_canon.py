@@ -364,9 +364,7 @@ def test_continues_after_an_unanswered_operation(code: Operation, forgetful: boo
 @pytest.mark.slow
 @pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
 @pytest.mark.parametrize("after", [0, 3])
-def test_reconnects_to_a_body_at_its_new_address(
-    moody_lab: Lab, code: Operation, after: int
-) -> None:
+def test_reconnects_to_a_body_at_its_new_address(moody_lab: Lab, code: Operation, after: int) -> None:
     bus = SimulatedBus()
     troubled = faults.Interrupting(moody_lab.eos, lambda: bus.replug(device), Occasion({code}, after=after))
     device = PtpUsbDevice(troubled)

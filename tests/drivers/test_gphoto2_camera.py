@@ -129,9 +129,7 @@ def test_missing_network_camera_is_a_link_error() -> None:
         ("nonsense", None, r"has no port 'nonsense' \(such as usb:001,004.*detected: "),
     ],
 )
-def test_refuses_unknown_model_and_port(
-    port: str | None, model: str | None, words: str
-) -> None:
+def test_refuses_unknown_model_and_port(port: str | None, model: str | None, words: str) -> None:
     with pytest.raises(ConfigurationError, match=words):
         Gphoto2Camera(port, model).identity()
 

@@ -27,7 +27,7 @@ def test_loads_languages_in_any_case_and_lists_known_ones() -> None:
     assert {"benq", "epson", "optoma"} <= set(built_in_languages())
     assert load_language("Epson") == EPSON
     with pytest.raises(
-        ConfigurationError, match=f"'klingon' does not exist; expected {', '.join(built_in_languages())}, or "
+        ConfigurationError, match=f"'klingon' does not.* expected {', '.join(built_in_languages())}, or "
     ):
         load_language("klingon")
     with pytest.raises(ConfigurationError, match="did you mean 'epson'"):
@@ -83,28 +83,16 @@ def test_loads_a_user_file(tmp_path: Path) -> None:
         ("stopped = { HOT", "stopped = { Off", "power: OFF: expected each value in only one"),
         ("{ NO = true, YES = false }", "{ NO = true, no = false }", "mute.states: expected values that differ in more"),
         ("states = { NO = true, YES = false }", "", "mute: ask is given: expected states with a value"),
-        (
-            "states = { NO = true, YES = false }",
-            "states = { NO = true }",
-            "mute: ask is given: expected states with a value",
-        ),
+        ("states = { NO = true, YES = false }", "states = { NO = true }", "mute: ask is given: expected states"),
         ('ask = "SHOW?"', "", "mute: answer is given without ask"),
         ('healthy = "NONE"', 'healthy = "NO FAULT"', "faults: 'NO FAULT': expected one word"),
         ('healthy = "NONE"', 'healthy = "f"', "faults: healthy = 'f': expected a value that is not in parts"),
         ('healthy = "NONE"', 'healthy = "NONE"\ndigits = 1', "faults: 'NONE': expected 1 hexadecimal digits"),
         ('{ F = "fan", L = "lamp", T = "temperature" }', "{}", "faults.parts: at least 1 value was expected"),
-        (
-            'command = "@{}\\r\\n"',
-            'command = "@{}"',
-            "line: command = '@{}': expected the characters that end a command",
-        ),
+        ('command = "@{}\\r\\n"', 'command = "@{}"', "line: command = '@{}': expected the characters"),
         ('ends = "\\r"', 'ends = "#"', "expected one of the characters of ends = '#'"),
         ('answer = "@{}\\r\\n"', 'answer = "@{}#\\r\\n"', "expected one of the characters of ends = '\\r'"),
-        (
-            'ends = "\\r"',
-            'ends = "S\\r"',
-            "mute.answer has 'SHOW {}': expected a text without the characters of line.ends",
-        ),
+        ('ends = "\\r"', 'ends = "S\\r"', "mute.answer has 'SHOW {}': expected a text without the characters"),
         ("[name]", '[[unasked]]\ntext = "{}"\n[name]', "power.answer = 'POWER {}' is also one of the unasked messages"),
         ("[name]", '[unasked]\ntext = "BYE"\n[name]', "unasked: a list of tables was expected: write [[unasked]]"),
         ("baud = 19200", "baud = 20", "line.baud = 20: "),
