@@ -1,4 +1,4 @@
-"""The EOS driver against recorded conversations, and against scripted bodies that speak the recorded layouts."""
+"""EOS driver against recorded conversations, and against simulated bodies with faults."""
 
 from __future__ import annotations
 
@@ -77,14 +77,14 @@ IDENTITIES = {
 
 
 class Replay:
-    """A cable on which a recorded body answers as it did; what it was not asked then, it does not know now."""
+    """A cable with a recorded body; requests that were not recorded are errors."""
 
     label = "the recorded body"
 
     def __init__(self, transactions: list[Recorded]) -> None:
-        self.left = list(transactions)
+        self.remaining = list(transactions)
         self.transactions: list[int] = []
-        self.asked: list[tuple[int, tuple[int, ...], bytes | None]] = []
+        self.requests: list[tuple[int, tuple[int, ...], bytes | None]] = []
         self.closed = False
 
     def transact(
@@ -98,14 +98,18 @@ class Replay:
         assert receive is None
         assert timeout > 0
         self.transactions.append(request.transaction)
-        self.asked.append((request.code, request.parameters, send))
+        self.requests.append((request.code, request.parameters, send))
         sent = None if send is None else send.hex()
-        for number, known in enumerate(self.left):
-            data = known["data"] if known["dir"] == "out" else None
-            if int(known["code"], 16) == request.code and tuple(known["params"]) == request.parameters and data == sent:
-                self.left = self.left[number + 1 :]
-                answer = bytes.fromhex(known["data"] or "") if known["dir"] == "in" else b""
-                response = PtpResponse(int(known["rc"], 16), request.transaction, tuple(known["rparams"]))
+        for number, recorded in enumerate(self.remaining):
+            data = recorded["data"] if recorded["dir"] == "out" else None
+            if (
+                int(recorded["code"], 16) == request.code
+                and tuple(recorded["params"]) == request.parameters
+                and data == sent
+            ):
+                self.remaining = self.remaining[number + 1 :]
+                answer = bytes.fromhex(recorded["data"] or "") if recorded["dir"] == "in" else b""
+                response = PtpResponse(int(recorded["rc"], 16), request.transaction, tuple(recorded["rparams"]))
                 return Transaction(response, answer)
         pytest.fail(f"the recorded host did not ask {request} with {sent} here")
 
@@ -127,8 +131,8 @@ def test_sends_the_requests_of_the_recorded_host(body: str, recording: list[Reco
     camera.close()
     assert cable.closed
     assert cable.transactions == list(range(len(cable.transactions)))
-    assert cable.left == [], "the last of the recorded transactions is the last of ours"
-    assert [code for code, _, _ in cable.asked if code != Operation.EOS_GET_EVENT] == [
+    assert cable.remaining == [], "the last of the recorded transactions is the last of ours"
+    assert [code for code, _, _ in cable.requests if code != Operation.EOS_GET_EVENT] == [
         0x1002, 0x1001, 0x9114, 0x9115, 0x9127, 0x9110, 0x911A, 0x9110, 0x9114, 0x9115, 0x1003,
     ]  # fmt: skip
 
@@ -140,7 +144,7 @@ def lab() -> Lab:
 
 @pytest.fixture(params=[False, True], ids=["keeps frames", "forgets frames"])
 def moody_lab(request: pytest.FixtureRequest) -> Lab:
-    """Give a body that keeps what waits in its memory when a session ends, and one that does not."""
+    """Labs with a body that keeps its memory at the end of a session, and with one that does not."""
     return Lab(forgetful=request.param)
 
 
@@ -170,7 +174,7 @@ class TestOverNetwork(CameraContract):
             camera.close()
 
 
-# What the body's own settings spoil.
+# Body settings that spoil a series.
 
 
 SPOILS: list[tuple[Callable[[SimulatedEos], None], str]] = [
@@ -223,28 +227,28 @@ def test_refuses_raw_plus_jpeg() -> None:
         Lab(replace(EOS_550D, properties=properties)).camera.configure(SETTINGS)
 
 
-class Listening(faults.TroubledResponder):
-    """Notes what the body is asked."""
+class RequestRecorder(faults.TroubledResponder):
+    """Records the requests to the body."""
 
     def __init__(self, good: Responder) -> None:
         super().__init__(good)
-        self.asked: list[PtpRequest] = []
+        self.requests: list[PtpRequest] = []
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-        self.asked.append(request)
+        self.requests.append(request)
         return super().answer(request, data)
 
     def parameters(self, code: int) -> list[tuple[int, ...]]:
-        return [request.parameters for request in self.asked if request.code == code]
+        return [request.parameters for request in self.requests if request.code == code]
 
 
-def listen(lab: Lab) -> Listening:
-    lab.device = listening = Listening(lab.device)
-    return listening
+def record_requests(lab: Lab) -> RequestRecorder:
+    lab.device = recorder = RequestRecorder(lab.device)
+    return recorder
 
 
-class Stuck(faults.TroubledResponder):
-    """Answers a release of the older kind with a result."""
+class ReleaseResult(faults.TroubledResponder):
+    """Answers the older release operation with a result."""
 
     result = 0
 
@@ -255,14 +259,14 @@ class Stuck(faults.TroubledResponder):
 
 
 @pytest.mark.parametrize(
-    ("result", "said"), [(1, "autofocus"), (3, "mirror is up"), (7, "is full"), (8, "read-only"), (25, "result 0x19")]
+    ("result", "reason"), [(1, "autofocus"), (3, "mirror is up"), (7, "is full"), (8, "read-only"), (25, "result 0x19")]
 )
-def test_older_release_reports_its_reason(result: int, said: str) -> None:
+def test_older_release_reports_its_reason(result: int, reason: str) -> None:
     lab = Lab(without=(Operation.EOS_REMOTE_RELEASE_ON,))
-    lab.device = stuck = Stuck(lab.eos)
-    stuck.result = result
+    lab.device = device = ReleaseResult(lab.eos)
+    device.result = result
     lab.camera.configure(SETTINGS)
-    with pytest.raises(DeviceRefused, match=said):
+    with pytest.raises(DeviceRefused, match=reason):
         lab.take(attempts=1)
 
 
@@ -286,12 +290,12 @@ def test_fetches_whole_frames_without_partial_reads(lists: bool) -> None:
     lab.device = faults.Declining(
         lab.eos, ResponseCode.OPERATION_NOT_SUPPORTED, Occasion(set(PIECES) if lists else set(), times=None)
     )
-    listening = listen(lab)
+    recorder = record_requests(lab)
     lab.camera.configure(SETTINGS)
     for _ in range(3):
         lab.take(attempts=1)
     assert lab.openings == 1
-    assert [len(listening.parameters(code)) for code in PIECES] == [lists, lists], "it is not asked again"
+    assert [len(recorder.parameters(code)) for code in PIECES] == [lists, lists], "it is not asked again"
     assert lab.waiting() == 0
 
 
@@ -326,8 +330,8 @@ EVERY_OPERATION = (
 NAMES = [code.name for code in EVERY_OPERATION]
 
 
-def goes_on(lab: Lab, frames: int = 3) -> None:
-    """See that a series is taken whole, and that nothing is left in the body's memory."""
+def take_series(lab: Lab, frames: int = 3) -> None:
+    """Take a series of frames; no object may remain in the body's memory."""
     lab.camera.configure(SETTINGS)
     for _ in range(frames):
         lab.take()
@@ -347,7 +351,7 @@ def goes_on(lab: Lab, frames: int = 3) -> None:
 )
 def test_continues_after_a_declined_operation(moody_lab: Lab, code: Operation, answer: int, times: int) -> None:
     moody_lab.device = faults.Declining(moody_lab.eos, answer, Occasion({code}, times=times))
-    goes_on(moody_lab)
+    take_series(moody_lab)
 
 
 @pytest.mark.slow
@@ -358,7 +362,7 @@ def test_continues_after_a_declined_operation(moody_lab: Lab, code: Operation, a
 def test_continues_after_an_unanswered_operation(code: Operation, forgetful: bool, obeys: bool, after: int) -> None:
     lab = Lab(forgetful=forgetful)
     lab.device = faults.Hanging(lab.eos, Occasion({code}, after=after), obeys=obeys)
-    goes_on(lab)
+    take_series(lab)
 
 
 @pytest.mark.slow
@@ -370,7 +374,7 @@ def test_reconnects_to_a_body_at_its_new_address(moody_lab: Lab, code: Operation
     device = PtpUsbDevice(troubled)
     bus.plug(device)
     moody_lab.camera = CanonEos(lambda: UsbTransport(open_usb(backend=bus), moody_lab.clock), moody_lab.clock)
-    goes_on(moody_lab)
+    take_series(moody_lab)
 
 
 @pytest.mark.slow
@@ -379,7 +383,7 @@ def test_reconnects_to_a_body_at_its_new_address(moody_lab: Lab, code: Operation
 def test_continues_after_a_lost_response(moody_lab: Lab, code: Operation, after: int) -> None:
     occasion = Occasion({code}, after=after)
     moody_lab.cable = lambda transport: faults.LosingResponses(transport, occasion)
-    goes_on(moody_lab)
+    take_series(moody_lab)
 
 
 @pytest.mark.slow
@@ -387,11 +391,11 @@ def test_continues_after_a_lost_response(moody_lab: Lab, code: Operation, after:
 def test_continues_after_unplugging_at_any_byte(after: int) -> None:
     lab = Lab(film_bytes=3000)
     lab.pipes = lambda pipes: faults.CutOff(pipes, after) if lab.openings == 1 else pipes
-    goes_on(lab)
+    take_series(lab)
     assert lab.openings > 1
 
 
-# Of a frame without a length beside it only a decoder can tell garbage.
+# Garbage in a frame without a stated length is detected only by a decoder.
 WRONG = [
     (operation, change)
     for operation in (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT, Operation.GET_OBJECT)
@@ -406,11 +410,11 @@ def test_continues_after_wrong_frame_data(operation: Operation, change: str) -> 
     without = {Operation.GET_PARTIAL_OBJECT: PIECES[:1], Operation.GET_OBJECT: PIECES}.get(operation, ())
     lab = Lab(without=without)
     lab.device = faults.Falsifying(lab.eos, CHANGES[change], Occasion({operation}))
-    goes_on(lab)
+    take_series(lab)
 
 
 class Announcing(faults.TroubledResponder):
-    """Changes the records in GetEvent's answers."""
+    """Changes the records in replies to GetEvent."""
 
     def __init__(self, good: Responder, change: Callable[[tuple[Record, ...]], tuple[Record, ...]]) -> None:
         super().__init__(good)
@@ -437,7 +441,7 @@ def test_lost_announcement_costs_at_most_one_attempt(moody_lab: Lab, request: py
         return tuple(record for record in records if not (record in fresh and len(seen) == 2))
 
     moody_lab.device = Announcing(moody_lab.eos, lose_second)
-    goes_on(moody_lab)
+    take_series(moody_lab)
     assert len(moody_lab.film.frames) == (4 if "forgets" in request.node.name else 3)
     assert moody_lab.openings == 2
 
@@ -452,7 +456,7 @@ def test_accepts_late_and_repeated_announcements(lab: Lab) -> None:
         return again + records + tuple(record for record in records if is_frame(record))
 
     lab.device = Announcing(lab.eos, repeat)
-    goes_on(lab, 6)
+    take_series(lab, 6)
     assert len(lab.film.frames) == 6
     assert lab.openings == 1
 
@@ -461,7 +465,7 @@ def test_accepts_late_and_repeated_announcements(lab: Lab) -> None:
 def test_refuses_an_object_that_is_announced_but_missing(lab: Lab) -> None:
     bogus = TransferRequest(0x77, 0xB103, 600, "IMG_9999.CR2")
     lab.device = Announcing(lab.eos, lambda records: (*records, bogus))
-    goes_on(lab)
+    take_series(lab)
     assert len(lab.film.frames) == 3
 
 
@@ -469,14 +473,14 @@ def test_late_announcement_is_not_the_next_frame(lab: Lab) -> None:
     held: list[Record] = []
 
     def hold_first(records: tuple[Record, ...]) -> tuple[Record, ...]:
-        if listening.parameters(Operation.EOS_REMOTE_RELEASE_ON):
+        if recorder.parameters(Operation.EOS_REMOTE_RELEASE_ON):
             late, held[:] = tuple(held), []
             return records + late
         held.extend(filter(is_frame, records))
         return tuple(record for record in records if not is_frame(record))
 
     lab.device = Announcing(lab.eos, hold_first)
-    listening = listen(lab)
+    recorder = record_requests(lab)
     lab.camera.configure(replace(SETTINGS, shutter_s=1.0))
     lab.press()
     lab.camera.idle()
@@ -488,11 +492,11 @@ def test_late_announcement_is_not_the_next_frame(lab: Lab) -> None:
 
 def test_resumes_an_interrupted_transfer() -> None:
     lab = Lab(film_bytes=2_500_000)
-    listening = listen(lab)
+    recorder = record_requests(lab)
     lab.device = faults.Hanging(lab.device, Occasion({Operation.EOS_GET_PARTIAL_OBJECT}, after=1))
     lab.camera.configure(SETTINGS)
     lab.take(attempts=1)
-    asked = listening.parameters(Operation.EOS_GET_PARTIAL_OBJECT)
+    asked = recorder.parameters(Operation.EOS_GET_PARTIAL_OBJECT)
     assert [offset for _, offset, _ in asked] == [0, 1 << 20, 2 << 20]
     assert lab.openings == 2
 
@@ -533,7 +537,7 @@ def test_ignores_unknown_records_and_an_endless_queue(lab: Lab) -> None:
     strange = OtherRecord(0xC1FE, b"whatever")
     shutter = Notice(EosEvent.SHUTDOWN_TIMER_UPDATED, 30)
     lab.device = Announcing(lab.eos, lambda records: (strange, *records, *(shutter,) * 20))
-    goes_on(lab)
+    take_series(lab)
     assert len(lab.film.frames) == 3
 
 
@@ -549,7 +553,7 @@ HINTS: dict[str, Callable[[Responder], Responder]] = {
 @pytest.mark.parametrize("trouble", HINTS)
 def test_event_pipe_faults_are_harmless(lab: Lab, trouble: str) -> None:
     lab.device = HINTS[trouble](lab.eos)
-    goes_on(lab)
+    take_series(lab)
     assert lab.openings == 1
 
 
@@ -585,9 +589,9 @@ def test_frees_a_jpeg_next_to_the_raw(lab: Lab) -> None:
         return tuple(item for record in records for item in ((record, jpeg) if is_frame(record) else (record,)))
 
     lab.device = Announcing(lab.eos, add_jpeg)
-    listening = listen(lab)
-    goes_on(lab, 2)
-    freed = [parameters[0] for parameters in listening.parameters(Operation.EOS_TRANSFER_COMPLETE)]
+    recorder = record_requests(lab)
+    take_series(lab, 2)
+    freed = [parameters[0] for parameters in recorder.parameters(Operation.EOS_TRANSFER_COMPLETE)]
     assert freed.count(0x78) == 2
 
 
@@ -598,7 +602,7 @@ def test_discards_frames_of_a_killed_run(lab: Lab) -> None:
     lab.device.answer(PtpRequest(Operation.EOS_REMOTE_RELEASE_ON, 1000, (3, 1)), None)
     assert len(lab.film.frames) == 2
     lab.camera = CanonEos(lab.open, lab.clock)
-    goes_on(lab)
+    take_series(lab)
     assert len(lab.film.frames) == 5
 
 
@@ -612,8 +616,8 @@ def test_empties_a_full_memory(lab: Lab) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["busy", "silent", "gone", "never announced"])
-def test_calls_end_within_their_time_limits(kind: str) -> None:
+@pytest.mark.parametrize("fault", ["busy", "silent", "gone", "never announced"])
+def test_calls_end_within_their_time_limits(fault: str) -> None:
     lab = Lab()
     lab.camera.configure(SETTINGS)
     always = Occasion({Operation.EOS_GET_EVENT}, times=None)
@@ -622,21 +626,21 @@ def test_calls_end_within_their_time_limits(kind: str) -> None:
         "silent": lambda: faults.Hanging(lab.eos, always),
         "gone": lambda: lab.eos,
         "never announced": lambda: Announcing(lab.eos, lambda records: tuple(r for r in records if not is_frame(r))),
-    }[kind]()
-    if kind == "gone":
+    }[fault]()
+    if fault == "gone":
         lab.cable = gone_for_good
     lab.pull()
-    begun = lab.clock.monotonic()
+    start = lab.clock.monotonic()
     cause = {
         "busy": "answers DEVICE_BUSY",
         "silent": "sent nothing for 20 s; no connection for",
         "gone": "no camera on USB; no connection for",
         "never announced": "announced no frame in time, and its memory holds none",
-    }[kind]
+    }[fault]
     with pytest.raises(DeviceError, match=rf"^(Canon Digital Camera .* at USB port 1-1 )?{cause}"):
         lab.camera.expose()
     # A bare answer may take 20 s, what declines it 10 s, and the connection is renewed for 30 s after that at most.
-    assert lab.clock.monotonic() - begun <= {"busy": 45, "silent": 75, "gone": 30, "never announced": 45}[kind]
+    assert lab.clock.monotonic() - start <= {"busy": 45, "silent": 75, "gone": 30, "never announced": 45}[fault]
 
 
 def gone_for_good(transport: Transport) -> Transport:
@@ -715,7 +719,7 @@ def test_continues_without_a_missing_optional_operation(code: Operation, answer:
     lab = Lab()
 
     class Rooming(faults.TroubledResponder):
-        """Has room for frames, and does not know how to be told of it."""
+        """Has space for frames, and does not support its announcement."""
 
         def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
             answered = super().answer(request, data)
@@ -728,7 +732,7 @@ def test_continues_without_a_missing_optional_operation(code: Operation, answer:
         if code == Operation.EOS_PC_HDD_CAPACITY
         else faults.Declining(lab.eos, answer, Occasion({code}, times=None))
     )
-    listening = listen(lab)
+    recorder = record_requests(lab)
     lab.camera.configure(SETTINGS)
     for _ in range(3):
         lab.take(attempts=1)
@@ -738,7 +742,7 @@ def test_continues_without_a_missing_optional_operation(code: Operation, answer:
     assert lab.openings == 1
     assert lab.waiting() == 0
     if code not in (Operation.EOS_KEEP_DEVICE_ON, Operation.EOS_REMOTE_RELEASE_OFF):
-        assert len(listening.parameters(code)) <= 1, "it is not asked again"
+        assert len(recorder.parameters(code)) <= 1, "it is not asked again"
     lab.camera.close()
 
 
@@ -818,7 +822,7 @@ def test_waits_for_a_late_state(lab: Lab) -> None:
         return now
 
     lab.device = Announcing(lab.eos, late)
-    goes_on(lab)
+    take_series(lab)
     assert lab.openings == 1
 
 
@@ -835,7 +839,7 @@ def test_sets_electronic_shutter_times() -> None:
 class Slow(faults.TroubledResponder):
     """Is busy for `seconds` after each OpenSession, and as long before each first release on a connection.
 
-    An EOS 2000D answers so what is sent soon after connecting, and its second release (gphoto2, issue 382).
+    An EOS 2000D is busy after connecting and at its second release (gphoto2, issue 382).
     """
 
     def __init__(self, lab: Lab, seconds: float) -> None:
@@ -874,10 +878,10 @@ def test_waits_for_a_busy_body_on_the_same_connection(lab: Lab) -> None:
 )
 def test_refuses_bodies_with_another_remote_mode(model: str) -> None:
     lab = Lab(replace(EOS_550D, info=replace(EOS_550D.info, model=f"Canon {model}")))
-    listening = listen(lab)
+    recorder = record_requests(lab)
     with pytest.raises(DeviceRefused, match=rf'{model}; .*remote mode.*connection = "gphoto2"'):
         lab.camera.identity()
-    assert not listening.parameters(Operation.EOS_SET_REMOTE_MODE)
+    assert not recorder.parameters(Operation.EOS_SET_REMOTE_MODE)
 
 
 # Code 0 and no list, as of a telescope or an adapter: "implicit auto" in libgphoto2's table (canon_aperture in
@@ -1088,7 +1092,7 @@ def test_refuses_too_many_records(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("octets", "says"),
+    ("octets", "reason"),
     [
         ("10000000 89c10000 03d10000 68000000 08", "the size of a record at byte 16 requires 4 bytes; 1 follow"),
         ("07000000 89c10000", "the size of a record at byte 0 is 7; expected at least 8"),
@@ -1111,8 +1115,8 @@ def test_refuses_too_many_records(monkeypatch: pytest.MonkeyPatch) -> None:
         ),
     ],
 )
-def test_refuses_inconsistent_records(octets: str, says: str) -> None:
-    with pytest.raises(ProtocolError, match=says):
+def test_refuses_inconsistent_records(octets: str, reason: str) -> None:
+    with pytest.raises(ProtocolError, match=reason):
         canon.decode_events(bytes.fromhex(octets))
 
 
@@ -1195,10 +1199,10 @@ def test_refuses_values_between_steps() -> None:
         SHUTTER.code("1/60", [])
 
 
-@pytest.mark.parametrize("wanted", ["", "fast", "1/0", "-1", 0, -1.0, math.nan, math.inf, "nan", "inf", "1/2/3"])
-def test_refuses_invalid_values(wanted: float | str) -> None:
+@pytest.mark.parametrize("setting", ["", "fast", "1/0", "-1", 0, -1.0, math.nan, math.inf, "nan", "inf", "1/2/3"])
+def test_refuses_invalid_values(setting: float | str) -> None:
     with pytest.raises(InputError):
-        SHUTTER.code(wanted)
+        SHUTTER.code(setting)
 
 
 def test_bulb_and_auto_have_no_value() -> None:

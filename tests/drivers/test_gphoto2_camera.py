@@ -1,4 +1,4 @@
-"""The way through libgphoto2, against the simulated EOS on the loopback: another initiator than ours, in real time."""
+"""Camera through libgphoto2, against the simulated EOS over loopback in real time, and against scripted bodies."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ MODEL = "PTP/IP Camera"
 
 
 class FarFilm(SeededFilm):
-    """The film in the other process: exposed here again as that one says it was."""
+    """The film of the other process: repeats its exposures here."""
 
     def __init__(self, reports: int) -> None:
         super().__init__(FILM_BYTES)
@@ -63,7 +63,7 @@ class Bodies:
 
     @contextmanager
     def served(self, port: int = 0) -> Generator[tuple[str, FarFilm]]:
-        """Serve a simulated EOS; give libgphoto2's name of its port, and its film."""
+        """Serve a simulated EOS; yield libgphoto2's name of its port, and its film."""
         self._order(str(port))
         try:
             yield self._reports.readline().decode().strip(), FarFilm(self._reports.fileno())
@@ -123,14 +123,14 @@ def test_missing_network_camera_is_a_link_error() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("port", "model", "words"),
+    ("port", "model", "reason"),
     [
         (None, "Nonsense 5", r"has no model 'Nonsense 5' \(gphoto2 --list-cameras .*detected: "),
         ("nonsense", None, r"has no port 'nonsense' \(such as usb:001,004.*detected: "),
     ],
 )
-def test_refuses_unknown_model_and_port(port: str | None, model: str | None, words: str) -> None:
-    with pytest.raises(ConfigurationError, match=words):
+def test_refuses_unknown_model_and_port(port: str | None, model: str | None, reason: str) -> None:
+    with pytest.raises(ConfigurationError, match=reason):
         Gphoto2Camera(port, model).identity()
 
 
@@ -148,16 +148,16 @@ def test_missing_library_error_names_the_package(monkeypatch: pytest.MonkeyPatch
 
 
 class NoisyFilm(SeededFilm):
-    """A film in bodies that make another raw file than Canon's."""
+    """A film of bodies with raw files of other makers."""
 
     suffix = ".nef"
 
     def accept(self, settings: ExposureSettings) -> None:
-        """Take every exposure that the body is set to."""
+        """Accept every exposure."""
 
 
 class Fake:
-    """A camera of ours with a fake libgphoto2 below it."""
+    """Our camera with a fake libgphoto2."""
 
     def __init__(self, patch: pytest.MonkeyPatch, name: str, **given: object) -> None:
         self.clock = SimulatedClock()
@@ -248,9 +248,9 @@ SPOILED: list[tuple[dict[str, BodySetting], BodySetting | str, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("tree", "spoiled", "says"), SPOILED)
+@pytest.mark.parametrize(("tree", "spoiled", "reason"), SPOILED)
 def test_refuses_settings_that_spoil_a_series(
-    tree: dict[str, BodySetting], spoiled: BodySetting | str, says: str
+    tree: dict[str, BodySetting], spoiled: BodySetting | str, reason: str
 ) -> None:
     plan_settings(tree.get, SETTINGS)
     changed = dict(tree)
@@ -258,7 +258,7 @@ def test_refuses_settings_that_spoil_a_series(
         del changed[spoiled]
     else:
         changed[spoiled.name] = spoiled
-    with pytest.raises(DeviceRefused, match=says):
+    with pytest.raises(DeviceRefused, match=reason):
         plan_settings(changed.get, SETTINGS)
 
 

@@ -1,7 +1,6 @@
-"""PJLink: lines and datagrams of the standard, conversations, the projector contract, troubled cables, and the search.
+"""PJLink: the standard's lines and datagrams, conversations, the projector contract, cable faults, and the search.
 
-Examples and conversations are those of JBMIA, PJLink Specifications 1.04 and 2.00 (sections 3 to 5), not of the codec
-under test.
+Examples and conversations are from JBMIA, PJLink Specifications 1.04 and 2.00 (sections 3 to 5).
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ DIGEST = b"5d8409bc1c3fa39749434aa3a5c38682"
 
 
 def driver(*scripts: Script, password: str | None = None) -> PjLinkProjector:
-    """Return the driver on one script after another; a connection too many is an error."""
+    """Return a driver on scripted connections; an additional connection is an error."""
     waiting = list(scripts)
     return PjLinkProjector(lambda: waiting.pop(0), password)
 
@@ -83,10 +82,10 @@ def test_wrong_password_is_refused() -> None:
 
 
 class Refusing(BaseHTTPRequestHandler):
-    """A web page that is none."""
+    """A web server without pages."""
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 @pytest.mark.slow
@@ -136,7 +135,7 @@ def test_reads_faults_lamps_and_identity() -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "error", "words"),
+    ("code", "error", "reason"),
     [
         (b"ERR1", DeviceRefused, "does not support this command"),
         (b"ERR2", DeviceRefused, "does not offer this value"),
@@ -144,10 +143,10 @@ def test_reads_faults_lamps_and_identity() -> None:
         (b"ERR4", DeviceFault, "internal failure"),
     ],
 )
-def test_error_codes_have_messages(code: bytes, error: type[Exception], words: str) -> None:
+def test_error_codes_have_messages(code: bytes, error: type[Exception], reason: str) -> None:
     script = Script(b"PJLINK 0\r", b"%1AVMT 31\r", b"%1AVMT=" + code + b"\r", b"%1POWR ?\r", b"%1POWR=3\r")
     projector = driver(script)
-    with pytest.raises(error, match=rf"{code.decode()} to AVMT 31: .*{words}"):
+    with pytest.raises(error, match=rf"{code.decode()} to AVMT 31: .*{reason}"):
         projector.set_muted(True)
     # A refusal is no fault of the cable: the same connection goes on.
     assert projector.power() is Power.WARMING
@@ -323,14 +322,14 @@ def test_endless_answer_is_a_timeout() -> None:
             return b"P"
 
         def write(self, data: bytes, timeout: float) -> None:
-            """Hear what it is, without a word on that."""
+            """Ignore the data."""
 
     with pytest.raises(LinkTimeout):
         PjLinkProjector(lambda: Endless(b""), timeout=5.0, clock=clock).power()
 
 
 def noisy(link: Link) -> Link:
-    """Have a projector answer in small letters, with LF and filling, and announce its start in between."""
+    """Let a projector answer in lower case, with LF and padding, and with start-up notices."""
 
     def garble(data: bytes) -> bytes:
         data = data.replace(b"%1POWR=", b"%1powr=").replace(b"=OK", b"=Ok").replace(b"=ERR", b"=err")
@@ -367,8 +366,8 @@ class TestOverLoopback(ProjectorContract):
             projector.close()
 
 
-class TestAnswersThatTakeTheirTime(ProjectorContract):
-    """Four of the five seconds that an answer may take, by a clock of the cable's own."""
+class TestSlowReplies(ProjectorContract):
+    """Replies take four of the permitted five seconds, by the cable's own clock."""
 
     @pytest.fixture
     def bench(self) -> Bench:
@@ -396,12 +395,12 @@ def test_recovers_from_a_garbled_answer() -> None:
 
 def test_recovers_from_a_lost_answer() -> None:
     device = SimulatedProjector(SimulatedClock())
-    made: list[Link] = []
+    links: list[Link] = []
 
     def connect() -> Link:
         good = PeerLink(PjLinkPeer(device))
-        made.append(Deaf(good, after=1) if not made else good)
-        return made[-1]
+        links.append(Deaf(good, after=1) if not links else good)
+        return links[-1]
 
     projector = PjLinkProjector(connect)
     with pytest.raises(LinkTimeout):
@@ -587,13 +586,13 @@ def test_lines_do_not_depend_on_splitting(data: st.DataObject) -> None:
     lines = [line.encode() for line in data.draw(st.lists(st.one_of(PRINTABLE.filter(bool), reply), max_size=6))]
     stream = b"".join(line + data.draw(end) for line in lines)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
-    found, rest = list[bytes](), b""
+    lines_read, rest = list[bytes](), b""
     for start, stop in zip([0, *cuts], [*cuts, len(stream)], strict=True):
         rest += stream[start:stop]
-        while (taken := wire.split_line(rest)) is not None:
-            found.append(taken[0])
-            rest = rest[taken[1] :]
-    assert found == lines
+        while (parsed := wire.split_line(rest)) is not None:
+            lines_read.append(parsed[0])
+            rest = rest[parsed[1] :]
+    assert lines_read == lines
 
 
 def test_refuses_lines_above_the_longest() -> None:
@@ -623,8 +622,8 @@ def test_parses_the_standards_datagrams(datagram: bytes, command: str, value: st
     reply = PjLinkReply(command, value, 2)
     assert wire.encode_reply(reply) == datagram
     for received in (datagram, datagram.lower() + b"\n", datagram[:-1], b"\r" + datagram + b"\0\0\0\0"):
-        (found,) = wire.parse_datagram(received)
-        assert (found.command, found.value.upper(), found.level) == (command, value.upper(), 2)
+        (parsed,) = wire.parse_datagram(received)
+        assert (parsed.command, parsed.value.upper(), parsed.level) == (command, value.upper(), 2)
 
 
 @pytest.mark.parametrize(
@@ -638,8 +637,8 @@ def test_ignores_other_datagrams(datagram: bytes) -> None:
 
 
 def test_replies_in_a_datagram_keep_their_order() -> None:
-    found = wire.parse_datagram(b"%2POWR=3\r%2what\r%2INPT=31\r")
-    assert found == (PjLinkReply("POWR", "3", 2), PjLinkReply("INPT", "31", 2))
+    replies = wire.parse_datagram(b"%2POWR=3\r%2what\r%2INPT=31\r")
+    assert replies == (PjLinkReply("POWR", "3", 2), PjLinkReply("INPT", "31", 2))
 
 
 @given(st.binary(max_size=300))
@@ -647,8 +646,8 @@ def test_any_datagram_is_parsed_without_error(datagram: bytes) -> None:
     assert len(wire.parse_datagram(datagram)) <= len(datagram)
 
 
-class PaperNetwork(UdpSocket):
-    """Datagrams that arrive at given times, whoever asks; keeps what was sent and when."""
+class ScriptedNetwork(UdpSocket):
+    """Datagrams that arrive at given times; records sent datagrams with their times."""
 
     def __init__(self, clock: SimulatedClock, *arrivals: tuple[float, bytes, str]) -> None:
         self._clock = clock
@@ -672,22 +671,22 @@ class PaperNetwork(UdpSocket):
         self.closed = True
 
 
-def look(network: PaperNetwork, clock: SimulatedClock) -> tuple[FoundProjector, ...]:
+def run_search(network: ScriptedNetwork, clock: SimulatedClock) -> tuple[FoundProjector, ...]:
     ports: list[int] = []
 
-    def opened(port: int) -> PaperNetwork:
+    def opened(port: int) -> ScriptedNetwork:
         ports.append(port)
         return network
 
-    found = search(open_socket=opened, clock=clock)
+    projectors = search(open_socket=opened, clock=clock)
     assert ports == [4352]
     assert network.closed
-    return found
+    return projectors
 
 
 def test_search_collects_for_thirty_seconds_without_duplicates() -> None:
     clock = SimulatedClock()
-    network = PaperNetwork(
+    network = ScriptedNetwork(
         clock,
         (0.0, b"%2SRCH\r", "192.168.1.2"),  # our own question, come back
         (0.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"),
@@ -699,7 +698,7 @@ def test_search_collects_for_thirty_seconds_without_duplicates() -> None:
         (10.0, b"%2ACKN=0g:11:22:aa:bb:cc\r", "192.168.1.24"),
         (31.0, b"%2ACKN=00:11:22:aa:bb:03\r", "192.168.1.23"),
     )
-    assert look(network, clock) == (
+    assert run_search(network, clock) == (
         FoundProjector("192.168.1.20", "00:11:22:aa:bb:01"),
         FoundProjector("192.168.1.21", "00:11:22:aa:bb:02"),
     )
@@ -711,21 +710,21 @@ def test_search_collects_for_thirty_seconds_without_duplicates() -> None:
 def test_search_time_starts_at_the_call() -> None:
     clock = SimulatedClock()
     clock.sleep(1000)
-    network = PaperNetwork(clock, (1000.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"))
-    assert [found.host for found in look(network, clock)] == ["192.168.1.20"]
+    network = ScriptedNetwork(clock, (1000.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"))
+    assert [projector.host for projector in run_search(network, clock)] == ["192.168.1.20"]
     assert clock.monotonic() == pytest.approx(1030.0)
 
 
 def test_endless_junk_does_not_extend_the_search() -> None:
     clock = SimulatedClock()
-    network = PaperNetwork(clock, *[(0.01 * i, b"\xff" * 40, "192.168.1.9") for i in range(4000)])
-    assert look(network, clock) == ()
+    network = ScriptedNetwork(clock, *[(0.01 * i, b"\xff" * 40, "192.168.1.9") for i in range(4000)])
+    assert run_search(network, clock) == ()
     assert clock.monotonic() == pytest.approx(30.0, abs=0.1)
 
 
 def test_search_refuses_a_port_in_use() -> None:
-    with UdpSocket(host="127.0.0.1") as taken, pytest.raises(LinkClosed, match="close the other program"):
-        search(listen_port=taken.address[1])
+    with UdpSocket(host="127.0.0.1") as socket, pytest.raises(LinkClosed, match="close the other program"):
+        search(listen_port=socket.address[1])
 
 
 def test_refuses_calls_on_a_closed_socket() -> None:

@@ -1,4 +1,4 @@
-"""Directories of TIFF whose values no writer means end in one error."""
+"""Impossible values in TIFF directories raise one error."""
 
 from __future__ import annotations
 

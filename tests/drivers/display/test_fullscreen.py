@@ -1,4 +1,4 @@
-"""The full-screen presenter on X servers without a monitor; the screenshots are not its own."""
+"""Full-screen presenter on X servers without a monitor, checked with independent screenshots."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def screen(virtual: VirtualScreen) -> Iterator[FullScreen]:
 
 
 def plain(picture: Picture) -> Colour:
-    """Return the one colour of a picture."""
+    """Return the only colour of an image."""
     code = int(picture[0, 0])
     assert np.all(picture == code)
     return Colour(code >> 16, code >> 8 & 255, code & 255)
@@ -142,9 +142,9 @@ def test_detects_a_changed_corner(screen: FullScreen, virtual: VirtualScreen) ->
     colour = Colour(10, 20, 30)
     screen.show(colour)
     with messaging(virtual, "speck", "+639+359"):
-        said = covered(screen, colour)
-    assert "in 1 of 230400 pixels" in said
-    assert "within 1×1 px at +639+359; covered by “speck” (Xmessage), " in said
+        message = covered(screen, colour)
+    assert "in 1 of 230400 pixels" in message
+    assert "within 1×1 px at +639+359; covered by “speck” (Xmessage), " in message
 
 
 def test_detects_another_colour_without_a_covering_window(screen: FullScreen) -> None:
@@ -164,7 +164,7 @@ def running(command: list[str]) -> Generator[subprocess.Popen[bytes]]:
 
 @contextlib.contextmanager
 def messaging(server: VirtualScreen, title: str, place: str = "+100+80") -> Generator[None]:
-    """Let another program put a window in front, and return when it is seen; it goes at the end of the block."""
+    """Show a window of another program in front; yield when it is visible."""
     program = shutil.which("xmessage")
     if program is None:
         pytest.skip("xmessage is not installed (Debian: x11-utils)")
@@ -182,7 +182,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 def covered(presenter: FullScreen, colour: Colour) -> str:
-    """Return what `verify` says, empty where all is well."""
+    """Return the error text of `verify`; empty without an error."""
     try:
         presenter.verify(colour)
     except DeviceError as error:
@@ -235,7 +235,7 @@ def test_detects_a_disconnected_display(outputs: str) -> None:
 
 
 def shows(presenter: FullScreen, colour: Colour) -> bool:
-    """Return whether a presenter can show a colour now."""
+    """Return whether a presenter can show a colour."""
     try:
         presenter.show(colour)
     except DeviceError:
@@ -339,9 +339,9 @@ def test_process_survives_the_end_of_the_server(tmp_path: Path) -> None:
         assert process.stdout is not None
         assert process.stdout.readline() == "lit\n"
         server.end()
-        said, _ = process.communicate("\n", timeout=PATIENCE_S)
+        output, _ = process.communicate("\n", timeout=PATIENCE_S)
     assert process.returncode == 0
-    assert said.count("the X server of display 1: screen 320×200 at +0+0, 0 Hz has ended (logout or crash)") == 2
+    assert output.count("the X server of display 1: screen 320×200 at +0+0, 0 Hz has ended (logout or crash)") == 2
 
 
 def test_shows_all_codes_in_every_pixel_without_a_cursor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -365,10 +365,10 @@ def test_lists_displays_from_left_to_right(outputs: str) -> None:
     assert projector.refresh_hz == 80
 
 
-@pytest.mark.parametrize("wanted", ["right", 2])
-def test_fills_only_the_selected_display(outputs: str, wanted: str | int) -> None:
+@pytest.mark.parametrize("selection", ["right", 2])
+def test_fills_only_the_selected_display(outputs: str, selection: str | int) -> None:
     before = screenshot(outputs, 640, 360)
-    with contextlib.closing(FullScreen(wanted)) as presenter:
+    with contextlib.closing(FullScreen(selection)) as presenter:
         presenter.show(Colour(12, 200, 77))
         after = screenshot(outputs, 1120, 360)
         assert plain(after[:270, 640:]) == Colour(12, 200, 77)
@@ -444,7 +444,7 @@ def test_reports_a_colour_profile(outputs: str) -> None:
 
 
 def test_reports_wayland(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Xwayland says what it is by an extension of its own (xwayland-extension, version 23.1)."""
+    """Xwayland has its own extension (xwayland-extension, version 23.1)."""
     asked: list[str] = []
 
     def has(_: XScreen, name: str) -> bool:
@@ -485,9 +485,9 @@ def test_refuses_to_read_outside_the_screen(virtual: VirtualScreen) -> None:
 @pytest.mark.parametrize("display", [":4711", ""])
 def test_refuses_without_a_desktop(monkeypatch: pytest.MonkeyPatch, display: str) -> None:
     monkeypatch.setenv("DISPLAY", display)
-    with pytest.raises(DeviceError, match=r"desktop.*\(DISPLAY") as told:
+    with pytest.raises(DeviceError, match=r"desktop.*\(DISPLAY") as caught:
         FullScreen()
-    assert "b'" not in str(told.value)
+    assert "b'" not in str(caught.value)
     with pytest.raises(DeviceError):
         list_displays()
 
@@ -498,7 +498,7 @@ ABOVE = Display(2, "DP-1", 0, -1080, 1920, 1080, 60)
 
 
 @pytest.mark.parametrize(
-    ("displays", "wanted", "expected"),
+    ("displays", "selection", "expected"),
     [
         ((DESK,), None, DESK),
         ((DESK, BEAMER), "left", DESK),
@@ -511,13 +511,13 @@ ABOVE = Display(2, "DP-1", 0, -1080, 1920, 1080, 60)
     ],
 )
 def test_selects_a_display_by_each_property(
-    displays: tuple[Display, ...], wanted: str | int | None, expected: Display
+    displays: tuple[Display, ...], selection: str | int | None, expected: Display
 ) -> None:
-    assert choose_display(displays, wanted) == expected
+    assert choose_display(displays, selection) == expected
 
 
 @pytest.mark.parametrize(
-    ("displays", "wanted", "reason"),
+    ("displays", "selection", "reason"),
     [
         ((DESK, BEAMER), None, "display \\(not set\\): 2 match"),
         ((DESK, BEAMER), "HDMI-2", "display 'HDMI-2' is not connected"),
@@ -530,9 +530,9 @@ def test_selects_a_display_by_each_property(
     ],
 )
 def test_refuses_an_ambiguous_or_missing_display(
-    displays: tuple[Display, ...], wanted: str | int | None, reason: str
+    displays: tuple[Display, ...], selection: str | int | None, reason: str
 ) -> None:
     with pytest.raises(ConfigurationError, match=reason) as caught:
-        choose_display(displays, wanted)
+        choose_display(displays, selection)
     for display in displays:
         assert str(display) in str(caught.value)

@@ -1,4 +1,4 @@
-"""Cables: the contract over memory and loopback TCP, and what each kind adds."""
+"""Network cables: the link contract over memory and loopback TCP, and the features of each cable."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class TestTcpServed(LinkContract):
 
 
 class _tcp_ends:  # noqa: N801 – reads as the function it stands for
-    """Both ends of one TCP connection; the server's thread is gone afterwards."""
+    """Both ends of one TCP connection; the server's thread ends with the block."""
 
     def __enter__(self) -> Ends:
         self._taken: list[TcpLink] = []
@@ -51,7 +51,7 @@ class _tcp_ends:  # noqa: N801 – reads as the function it stands for
 
 
 class _Echo:
-    """A peer that says who it is, repeats what it hears, and hangs up at ``bye``."""
+    """A peer that greets, repeats its input, and disconnects after ``bye``."""
 
     def __init__(self) -> None:
         self.connections = 0
@@ -113,7 +113,7 @@ def test_refuses_a_port_in_use() -> None:
 
 
 def test_server_accepts_several_connections_and_leaves_no_thread() -> None:
-    before = threading.active_count()
+    thread_count = threading.active_count()
 
     def echo(link: TcpLink) -> None:
         while True:
@@ -129,12 +129,12 @@ def test_server_accepts_several_connections_and_leaves_no_thread() -> None:
             with pytest.raises(LinkClosed):
                 link.read(1, PATIENCE_S)
             link.close()
-        again = TcpLink.connect(*server.address, PATIENCE_S)
-        again.write(b"x", PATIENCE_S)
-        assert read_exactly(again, 1) == b"x"
-        again.close()
+        new_link = TcpLink.connect(*server.address, PATIENCE_S)
+        new_link.write(b"x", PATIENCE_S)
+        assert read_exactly(new_link, 1) == b"x"
+        new_link.close()
     server.close()
-    assert threading.active_count() == before
+    assert threading.active_count() == thread_count
 
 
 def test_quotes_mark_truncation() -> None:

@@ -1,4 +1,4 @@
-"""The serial cable: the link contract on a pseudo-terminal, and every way in which a port cannot be opened."""
+"""Serial cable: the link contract on a pseudo-terminal, and all errors of opening."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_missing_port_error_lists_present_ports(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(
-    ("said", "kind", "remedy"),
+    ("cause", "error_type", "remedy"),
     [
         (serial.SerialException(errno.EACCES, "Permission denied"), DeviceRefused, "dialout"),
         (serial.SerialException(errno.EIO, "Could not configure port"), LinkClosed, "check that it is a serial port"),
@@ -115,16 +115,16 @@ def test_missing_port_error_lists_present_ports(monkeypatch: pytest.MonkeyPatch)
     ],
 )
 def test_open_errors_name_the_remedy(
-    monkeypatch: pytest.MonkeyPatch, said: Exception, kind: type[Exception], remedy: str
+    monkeypatch: pytest.MonkeyPatch, cause: Exception, error_type: type[Exception], remedy: str
 ) -> None:
     def refuse(*_: object, **__: object) -> serial.Serial:
-        raise said
+        raise cause
 
     monkeypatch.setattr(serial, "Serial", refuse)
-    with pytest.raises(kind, match=remedy) as caught:
+    with pytest.raises(error_type, match=remedy) as caught:
         SerialLink.open("/dev/ttyUSB0", 9600)
     assert "/dev/ttyUSB0" in str(caught.value)
-    assert caught.value.__cause__ is said
+    assert caught.value.__cause__ is cause
 
 
 def test_refuses_a_second_open_of_a_port(far: FarEnd) -> None:

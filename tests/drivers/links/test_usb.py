@@ -1,4 +1,4 @@
-"""USB through pyusb: the PTP contract on the simulated bus, and what finding and opening say when they cannot."""
+"""USB through pyusb: the PTP contract on the simulated bus, and errors of searching and opening."""
 
 from __future__ import annotations
 
@@ -142,15 +142,15 @@ def test_reopens_a_restarted_camera_by_serial_number() -> None:
     device = camera("7")
     bus = bus_with(camera("6"), device)
     transport = UsbTransport(open_usb(serial="7", backend=bus), SimulatedClock())
-    before = list_devices(backend=bus)
+    old_devices = list_devices(backend=bus)
     bus.replug(device)
     with pytest.raises(LinkClosed):
         transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S)
     transport.close()
-    again = UsbTransport(open_usb(serial="7", backend=bus), SimulatedClock())
-    assert again.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
-    assert {found.address for found in before} != {found.address for found in list_devices(backend=bus)}
-    assert {found.port for found in before} == {found.port for found in list_devices(backend=bus)}
+    reopened = UsbTransport(open_usb(serial="7", backend=bus), SimulatedClock())
+    assert reopened.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
+    assert {device.address for device in old_devices} != {device.address for device in list_devices(backend=bus)}
+    assert {device.port for device in old_devices} == {device.port for device in list_devices(backend=bus)}
 
 
 def test_port_reset_keeps_the_pipes() -> None:

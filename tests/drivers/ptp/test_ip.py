@@ -79,7 +79,7 @@ PACKETS = st.one_of(
 
 
 def joined(packets: Iterable[Packet]) -> list[Packet]:
-    """Return the packets with neighbouring data of one transaction put together."""
+    """Return the packets with consecutive data of one transaction joined."""
     result: list[Packet] = []
     for packet in packets:
         before = result[-1] if result else None
@@ -104,7 +104,7 @@ def test_packets_do_not_depend_on_splitting(packets: list[Packet], cuts: list[in
 
 
 @pytest.mark.parametrize(
-    ("octets", "says"),
+    ("octets", "reason"),
     [
         ("08000000 00000000", "type 0"),
         ("08000000 0f000000", "type 15"),
@@ -122,11 +122,11 @@ def test_packets_do_not_depend_on_splitting(packets: list[Packet], cuts: list[in
         ("09000000 0d000000 00", "followed by 1 bytes"),
     ],
 )
-def test_refuses_invalid_packets(octets: str, says: str) -> None:
+def test_refuses_invalid_packets(octets: str, reason: str) -> None:
     cutter = PacketCutter()
-    with pytest.raises(ProtocolError, match=says):
+    with pytest.raises(ProtocolError, match=reason):
         cutter.feed(bytes.fromhex(octets))
-    with pytest.raises(ProtocolError, match=says):
+    with pytest.raises(ProtocolError, match=reason):
         cutter.feed(ptpip.encode(Ping()))
 
 
@@ -143,8 +143,8 @@ class TestLoopback(TransportContract):
             transport.close()
 
 
-def packet(kind: int, body: bytes = b"") -> bytes:
-    return (8 + len(body)).to_bytes(4, "little") + kind.to_bytes(4, "little") + body
+def packet(packet_type: int, body: bytes = b"") -> bytes:
+    return (8 + len(body)).to_bytes(4, "little") + packet_type.to_bytes(4, "little") + body
 
 
 ACK = packet(2, (7).to_bytes(4, "little") + bytes(16) + "cam\0".encode("utf-16-le") + bytes.fromhex("00000100"))
@@ -153,7 +153,7 @@ DONE = packet(7, bytes.fromhex("0120 05000000"))
 
 
 class FarEnd:
-    """Both connections of a device whose words are put into its mouth beforehand."""
+    """Both connections of a device with prepared replies."""
 
     def __init__(self, command: bytes = ACK, event: bytes = EVENT_ACK) -> None:
         near_command, self.command = joined_links()
@@ -182,13 +182,13 @@ class FarEnd:
 
 
 def connected() -> tuple[FarEnd, IpTransport]:
-    """Return a device and the transport to it."""
+    """Return a device and its transport."""
     far = FarEnd()
     return far, far.connect()
 
 
 def connect_in_turn(far_end: Callable[[], FarEnd], clock: SimulatedClock) -> IpTransport:
-    """Connect to a device that is another at each try."""
+    """Connect to a new device at each attempt."""
     current: list[FarEnd] = []
 
     def open_command() -> Link:
@@ -211,8 +211,8 @@ def test_request_and_data_match_the_standards_bytes() -> None:
     far, transport = connected()
     far.heard(far.command)
     far.command.write(DONE, PATIENCE_S)
-    done = transport.transact(PtpRequest(0x9110, 5, (1, 2)), send=bytes(70000), timeout=PATIENCE_S)
-    assert done.response == PtpResponse(0x2001, 5)
+    transaction = transport.transact(PtpRequest(0x9110, 5, (1, 2)), send=bytes(70000), timeout=PATIENCE_S)
+    assert transaction.response == PtpResponse(0x2001, 5)
     assert far.heard(far.command) == (
         packet(6, bytes.fromhex("02000000 1091 05000000 01000000 02000000"))
         + packet(9, bytes.fromhex("05000000 7011010000000000"))
@@ -221,13 +221,13 @@ def test_request_and_data_match_the_standards_bytes() -> None:
     )
 
 
-@pytest.mark.parametrize(("total", "wrong"), [(5, "announced 5"), (7, "announced 7")])
-def test_refuses_data_of_another_length(total: int, wrong: str) -> None:
+@pytest.mark.parametrize(("total", "reason"), [(5, "announced 5"), (7, "announced 7")])
+def test_refuses_data_of_another_length(total: int, reason: str) -> None:
     far, transport = connected()
     start = packet(9, bytes.fromhex("05000000") + total.to_bytes(8, "little"))
     end = packet(12, bytes.fromhex("05000000") + b"abcdef")
     far.command.write(start + end + DONE, PATIENCE_S)
-    with pytest.raises(ProtocolError, match=wrong):
+    with pytest.raises(ProtocolError, match=reason):
         transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S)
 
 
@@ -355,11 +355,11 @@ def test_changed_byte_gives_only_our_errors(at: int, value: int) -> None:
     stream[at] = value
     far.command.write(bytes(stream), PATIENCE_S)
     try:
-        done = transport.transact(PtpRequest(0x9116, 5), timeout=0.0)
+        transaction = transport.transact(PtpRequest(0x9116, 5), timeout=0.0)
     except (ProtocolError, LinkTimeout):
         return
-    assert done.response.transaction == 5
-    assert len(done.data) == 100 or not done.response.ok
+    assert transaction.response.transaction == 5
+    assert len(transaction.data) == 100 or not transaction.response.ok
 
 
 @pytest.mark.parametrize("taken_up_before", [True, False])

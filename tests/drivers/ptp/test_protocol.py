@@ -1,4 +1,4 @@
-"""PTP on any cable: datasets against bytes written from the standard, and a session against a scripted cable."""
+"""PTP on any cable: datasets against the standard's bytes, and a session on a scripted cable."""
 
 from __future__ import annotations
 
@@ -157,13 +157,13 @@ def test_datasets_survive_encoding_and_decoding(dataset: DeviceInfo | StorageInf
 
 
 class Scripted:
-    """A cable that answers from a script of response codes and errors, OK when it is over."""
+    """A cable that replies with scripted response codes and errors, then with OK."""
 
     label = "the scripted camera"
 
     def __init__(self, *script: int | Exception) -> None:
         self.script = list(script)
-        self.asked: list[PtpRequest] = []
+        self.requests: list[PtpRequest] = []
         self.resets = 0
 
     def transact(
@@ -174,7 +174,7 @@ class Scripted:
         receive: Callable[[bytes], object] | None = None,
         timeout: float,
     ) -> Transaction:
-        self.asked.append(request)
+        self.requests.append(request)
         step = self.script.pop(0) if self.script else ResponseCode.OK
         if isinstance(step, Exception):
             raise step
@@ -201,17 +201,17 @@ def test_opens_with_number_0_and_counts_from_1(answer: int) -> None:
     session, cable, _ = opened(answer)
     assert session.call(Operation.GET_DEVICE_INFO) == ((7,), b"data")
     session.close()
-    assert cable.asked == [PtpRequest(0x1002, 0, (1,)), PtpRequest(0x1001, 1), PtpRequest(0x1003, 2)]
+    assert cable.requests == [PtpRequest(0x1002, 0, (1,)), PtpRequest(0x1001, 1), PtpRequest(0x1003, 2)]
 
 
 def test_tries_the_next_session_number() -> None:
     _, cable, _ = opened(ResponseCode.INVALID_TRANSACTION_ID, ResponseCode.INVALID_TRANSACTION_ID)
-    assert [request.parameters for request in cable.asked] == [(1,), (2,), (3,)]
+    assert [request.parameters for request in cable.requests] == [(1,), (2,), (3,)]
 
 
 def test_resets_a_silent_body() -> None:
     _, cable, _ = opened(LinkTimeout("silent"), ProtocolError("garbage"))
-    assert (len(cable.asked), cable.resets) == (OPEN_TRIES, OPEN_TRIES - 1)
+    assert (len(cable.requests), cable.resets) == (OPEN_TRIES, OPEN_TRIES - 1)
 
 
 @pytest.mark.parametrize("fault", [LinkTimeout("silent"), ProtocolError("garbage")])
@@ -224,7 +224,7 @@ def test_does_not_retry_a_disconnected_body() -> None:
     cable = Scripted(LinkClosed("gone"))
     with pytest.raises(LinkClosed):
         PtpSession(cable, SimulatedClock()).open()
-    assert len(cable.asked) == 1
+    assert len(cable.requests) == 1
 
 
 def test_refused_open_is_an_error() -> None:
@@ -236,7 +236,7 @@ def test_refused_open_is_an_error() -> None:
 def test_retries_temporarily_declined_operations(code: int) -> None:
     session, cable, clock = opened(ResponseCode.OK, code, code, code)
     session.call(Operation.EOS_KEEP_DEVICE_ON)
-    assert [request.transaction for request in cable.asked[1:]] == [1, 2, 3, 4]
+    assert [request.transaction for request in cable.requests[1:]] == [1, 2, 3, 4]
     assert clock.monotonic() == pytest.approx(0.05 + 0.1 + 0.2)
 
 
@@ -252,7 +252,7 @@ def test_other_responses_are_reported_by_name() -> None:
     session, cable, _ = opened(ResponseCode.OK, 0x200F)
     with pytest.raises(DeviceRefused, match=r"scripted.*ACCESS_DENIED \(0x200f\)"):
         session.call(Operation.EOS_KEEP_DEVICE_ON)
-    assert len(cable.asked) == 2
+    assert len(cable.requests) == 2
 
 
 Read = Callable[[bytes], object]
@@ -263,7 +263,7 @@ EVERY = pytest.mark.parametrize(
 
 
 def outcome(read: Read, data: bytes) -> object:
-    """Return what is read, or ProtocolError; let anything else through."""
+    """Return the value or ProtocolError; other errors are raised."""
     try:
         return read(data)
     except ProtocolError:

@@ -39,7 +39,7 @@ MESSAGES = st.one_of(
 
 
 def joined(messages: Iterable[Message]) -> list[Message]:
-    """Return the messages with the pieces of each data phase put together."""
+    """Return the messages with the pieces of each data phase joined."""
     result: list[Message] = []
     for message in messages:
         before = result[-1] if result else None
@@ -98,7 +98,7 @@ def test_short_packet_ends_a_phase_of_unknown_length(length: int, alone: bool) -
 
 
 @pytest.mark.parametrize(
-    ("octets", "says"),
+    ("octets", "reason"),
     [
         ("0b000000 0100 0210 00000000", "command container of 11 bytes"),
         ("0d000000 0300 0120 00000000 00", "response container of 13 bytes"),
@@ -109,11 +109,11 @@ def test_short_packet_ends_a_phase_of_unknown_length(length: int, alone: bool) -
         ("0c000000 0500 0210 00000000", "container of type 5"),
     ],
 )
-def test_refuses_invalid_containers(octets: str, says: str) -> None:
+def test_refuses_invalid_containers(octets: str, reason: str) -> None:
     reader = ContainerReader()
-    with pytest.raises(ProtocolError, match=says):
+    with pytest.raises(ProtocolError, match=reason):
         reader.feed(bytes.fromhex(octets))
-    with pytest.raises(ProtocolError, match=says):
+    with pytest.raises(ProtocolError, match=reason):
         reader.feed(container.encode(PtpResponse(0x2001, 5)))
 
 
@@ -165,7 +165,7 @@ class TestOverMemory(TransportContract):
 
 
 class Script:
-    """Pipes that note what is written and read out what was put down; b"" is an empty packet, an error is raised."""
+    """Pipes that record writes and return scripted reads; b"" is an empty packet, an error is raised."""
 
     label = "the camera"
     packet_size = 512
@@ -282,7 +282,7 @@ def test_refuses_endless_empty_packets() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reads", "wrong"),
+    ("reads", "reason"),
     [
         ((data(100, bytes(88))[:4] + bytes.fromhex("0200 1691 06000000") + bytes(88), OK), "transaction 6"),
         ((data(13, b"a"), data(13, b"a"), OK), "second data phase"),
@@ -290,8 +290,8 @@ def test_refuses_endless_empty_packets() -> None:
         ((b"garbage that is no container at all",), "container"),
     ],
 )
-def test_refuses_protocol_violations(reads: tuple[bytes, ...], wrong: str) -> None:
-    with pytest.raises(ProtocolError, match=wrong):
+def test_refuses_protocol_violations(reads: tuple[bytes, ...], reason: str) -> None:
+    with pytest.raises(ProtocolError, match=reason):
         get(Script(*reads))
 
 

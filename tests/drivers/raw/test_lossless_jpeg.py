@@ -1,4 +1,4 @@
-"""Damage inside a lossless JPEG is seen, which LibRaw decodes over; whole streams of two encoders are none."""
+"""Detection of damage inside a lossless JPEG, which LibRaw ignores; complete streams of two encoders are accepted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FLAT: Counts = np.full((64, 96), 2048, np.uint16)
 
 
 def by_imagecodecs(counts: Counts) -> bytes:
-    """Return counts as another encoder writes them: one component, Huffman codes of the picture's own."""
+    """Return the stream of another encoder: one component, Huffman codes of the image."""
     return bytes(imagecodecs.ljpeg_encode(counts, bitspersample=14))
 
 
@@ -98,7 +98,7 @@ def test_refuses_unusual_headers(old: bytes, new: bytes, reason: str) -> None:
 
 @pytest.mark.parametrize("predictor", range(1, 8))
 def test_predictors_match_the_standard(predictor: int) -> None:
-    """T.81, table H.1, in numpy: where the predictor is another one, samples leave their precision."""
+    """T.81, table H.1, in numpy; with a wrong predictor samples exceed their precision."""
     counts = NOISE.astype(np.int64)
     left, up, corner = (np.roll(counts, shift, axes) for shift, axes in (((1), 1), ((1), 0), ((1, 1), (0, 1))))
     predicted = {

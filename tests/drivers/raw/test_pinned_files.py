@@ -1,4 +1,4 @@
-"""What every kind of raw file, whole or damaged, is read as, and what is written of one, byte by byte."""
+"""Pinned results for every kind of raw file, complete or damaged."""
 
 from __future__ import annotations
 
@@ -32,51 +32,59 @@ PLACES = box(b"stsz", struct.pack(">III", 0, 4000, 1)), box(b"co64", struct.pack
 BOXES = cr3("Canon EOS R", track(areas(), b"CRAW", (80, 48), *PLACES), pixels=np.random.default_rng(1).bytes(4000))
 
 
-def said(ask: Callable[[], Any]) -> Any:
-    """Return an answer, or that there is none."""
+def result_or_refusal(read: Callable[[], Any]) -> Any:
+    """Return the result, or a record of the refusal."""
     try:
-        return ask()
+        return read()
     except (FormatError, TiffDamaged):
         return {"refused": 1}
 
 
 def stored(frame: StoredFrame) -> dict[str, Any]:
     """Return the fields of a stored frame without its directory."""
-    return {one.name: getattr(frame, one.name) for one in fields(frame) if one.name != "directory"}
+    return {
+        record_field.name: getattr(frame, record_field.name)
+        for record_field in fields(frame)
+        if record_field.name != "directory"
+    }
 
 
 def contents(data: bytes) -> Any:
-    """Return the numbers of a file's frames and directories."""
+    """Return the frames and directory values of a file."""
 
-    def ask() -> Any:
-        found = rawfile._read_contents(Path("case"), data)
-        fault = rawfile._lossless_fault(data, found)
+    def read() -> Any:
+        structure = rawfile._read_contents(Path("case"), data)
+        fault = rawfile._lossless_fault(data, structure)
         if fault is not None:
             raise rawfile._unreadable_error(Path("case"), fault)
-        values = [value for one in found.directories for _, value in sorted(one.values.items())]
-        return {"frames": [*map(stored, found.frames)], "values": values}
+        values = [value for directory in structure.directories for _, value in sorted(directory.values.items())]
+        return {"frames": [*map(stored, structure.frames)], "values": values}
 
-    return said(ask)
+    return result_or_refusal(read)
 
 
-def seen(mosaic: Mosaic) -> dict[str, Any]:
-    """Return all that is asked of a frame."""
+def measured(mosaic: Mosaic) -> dict[str, Any]:
+    """Return all results computed from a frame."""
     black = frame_black(mosaic)
     planes = [plane_of(mosaic, channel) for channel in CHANNELS]
 
-    def lean(found: Any) -> Any:
-        """Return an array, of a large one every so many a value."""
-        shape: tuple[int, ...] = getattr(found, "shape", ())
-        return found[::13, ::11] if np.prod(shape) > 100_000 else found
+    def thinned(value: Any) -> Any:
+        """Return an array; of a large one only some elements."""
+        shape: tuple[int, ...] = getattr(value, "shape", ())
+        return value[::13, ::11] if np.prod(shape) > 100_000 else value
 
     return {
-        **{one.name: lean(getattr(mosaic, one.name)) for one in fields(mosaic) if one.name != "sensor"},
-        "beside": lean(mosaic.sensor) if mosaic.masked else mosaic.sensor.shape,
+        **{
+            record_field.name: thinned(getattr(mosaic, record_field.name))
+            for record_field in fields(mosaic)
+            if record_field.name != "sensor"
+        },
+        "beside": thinned(mosaic.sensor) if mosaic.masked else mosaic.sensor.shape,
         "masked black": mosaic.masked_black(),
         "saturation": mosaic.saturation(),
         "exposure": mosaic.origin.exposure,
         "strongest": [rawfile.strongest_channel(mosaic, black, every) for every in (1, 8, 16)],
-        "planes": np.stack([lean(plane.values) for plane in planes]),
+        "planes": np.stack([thinned(plane.values) for plane in planes]),
         "offsets": [plane.offset_px for plane in planes],
         "filled": filled_fault(mosaic.counts, mosaic.black, mosaic.white_level) is not None,
     }
@@ -99,7 +107,10 @@ def test_files_of_every_maker_match_the_pins(pinned: Pinned) -> None:
     files["dng in tiles of nothing"] = dng_bytes(np.zeros((40, 300), np.uint16))
     pinned(
         "raw files",
-        {name: said(lambda data=data: seen(decode_raw(data, Path("case")))) for name, data in files.items()},
+        {
+            name: result_or_refusal(lambda data=data: measured(decode_raw(data, Path("case"))))
+            for name, data in files.items()
+        },
     )
 
 
@@ -128,6 +139,6 @@ def test_directories_of_all_types_match_the_pins(pinned: Pinned) -> None:
     found: dict[str, Any] = {}
     for order, tag, kind, count in product("<>", tags, range(14), (1, 2)):
         data = one(order, tag, kind, count, value)
-        read = said(lambda data=data: [list(one.values.values()) for one in read_directories(data)])
+        read = result_or_refusal(lambda data=data: [list(one.values.values()) for one in read_directories(data)])
         found.setdefault(f"{order}{tag.name}", []).append(read)
     pinned("directories of all types", found)

@@ -1,4 +1,4 @@
-"""Raw files: real ones against dcraw's own output, made ones with odd margins, damaged ones."""
+"""Raw files: real files against dcraw's output, generated files with odd margins, damaged files."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def noise(shape: tuple[int, int], top: int = 4096) -> NDArray[np.uint16]:
 
 
 def outcome(path: Path) -> Mosaic | FormatError:
-    """Return what reading gives; anything but these two fails the test."""
+    """Return the mosaic or the FormatError; other errors fail the test."""
     try:
         return read_raw(path)
     except FormatError as error:
@@ -142,12 +142,12 @@ def test_visible_area_of_a_dng_is_its_active_area(tmp_path: Path, maker: str, to
     np.testing.assert_array_equal(mosaic.sensor, counts)
 
 
-def nobody(path: Path, data: bytes, contents: object) -> None:
-    """Stand in for the reader of plain files, and leave all to LibRaw."""
+def no_plain_mosaic(path: Path, data: bytes, contents: object) -> None:
+    """Replace the reader of plain files, so that LibRaw reads all files."""
 
 
-def asks_libraw(path: Path) -> bool:
-    """Return whether a file is decoded by LibRaw, or refused."""
+def uses_libraw(path: Path) -> bool:
+    """Return whether LibRaw decodes a file, or the file is refused."""
     asked: list[object] = []
 
     def imread(source: object) -> rawpy.RawPy:
@@ -193,10 +193,10 @@ def test_plain_dng_equals_libraw(
         more[50712] = shorts(*range(0, 8192, 2))
     write_dng(tmp_path / "a.dng", noise(size), more)
     # A table of tones is LibRaw's to apply, a visible area that is not stated its to know.
-    assert asks_libraw(tmp_path / "a.dng") == (table or corner is None)
+    assert uses_libraw(tmp_path / "a.dng") == (table or corner is None)
     read = read_raw(tmp_path / "a.dng")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rawfile, "_plain_mosaic", nobody)
+        patch.setattr(rawfile, "_plain_mosaic", no_plain_mosaic)
         unpacked = read_raw(tmp_path / "a.dng")
     np.testing.assert_array_equal(read.sensor, unpacked.sensor)
     np.testing.assert_array_equal(read.black, unpacked.black)
@@ -317,7 +317,7 @@ def test_threads_decode_in_parallel(tmp_path: Path, capfd: pytest.CaptureFixture
 
 
 def canon_file(serial: int, lens: bytes) -> bytes:
-    """Return a CR2's directories by hand: the first one, Exif with the maker's note alone, Canon's note in it."""
+    """Return the directories of a CR2: the first one, Exif with only the maker note, Canon's note."""
 
     def directory(*entries: tuple[int, int, int, int]) -> bytes:
         rows = b"".join(struct.pack("<HHII", *entry) for entry in entries)
@@ -382,6 +382,8 @@ def one_strip(size: tuple[int, int], compression: int, bits: int, offset: int, b
     )
 
 
+# Pixel tags of real cameras, from the tag lists of drewnoakes/metadata-extractor-images. Invented: first positions
+# of the strips of the D200 and the tiles of the A7 IV, and the Samsung.
 STATED: dict[str, tuple[str, Directory]] = {
     "DSLR-A500": ("SONY", one_strip((4288, 2858), 32767, 12, 917504, 12255104)),
     "ILCE-7M3": ("SONY", one_strip((6048, 4024), 32767, 12, 458752, 24337152)),
@@ -412,8 +414,6 @@ STATED: dict[str, tuple[str, Directory]] = {
     "K-1 Mark II": ("PENTAX", one_strip((7392, 4950), 65535, 14, 169568, 39118125)),
     "DC-X": ("SAMSUNG", one_strip((5632, 3714), 32770, 12, 400000, 22000000)),
 }
-"""What files of real cameras state of their pixels: the lists of tags of the collection
-drewnoakes/metadata-extractor-images. Made up: where D200's strips and A7 IV's tiles begin, and the Samsung."""
 
 
 @pytest.mark.slow
@@ -463,7 +463,7 @@ def test_refuses_a_stub_that_points_beyond_its_end() -> None:
 
 
 def test_refuses_zeros_of_a_size_known_to_libraw() -> None:
-    """LibRaw takes any file of 786 432 bytes for a frame of an industrial camera."""
+    """LibRaw accepts any file of 786 432 bytes as a frame of an industrial camera."""
     with pytest.raises(FormatError):
         decode_raw(bytes(786_432), WHERE)
 
@@ -484,25 +484,25 @@ def test_recognises_checked_layouts(name: str) -> None:
 
 def test_refuses_makers_of_unknown_layout() -> None:
     data = in_maker_tiff("Eastman Kodak", "DC50", bytes(8000), {})
-    with pytest.raises(FormatError) as told:
+    with pytest.raises(FormatError) as caught:
         decode_raw(data, WHERE)
-    assert "copy" not in str(told.value)
+    assert "copy" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("compression", "name"), [(8, "Deflate"), (32946, "Deflate"), (9, "VC-5"), (52546, "JPEG XL"), (5, "number 5")]
 )
 def test_reports_unsupported_compression(compression: int, name: str) -> None:
-    with pytest.raises(FormatError, match=f"{name}.*supported") as told:
+    with pytest.raises(FormatError, match=f"{name}.*supported") as caught:
         decode_raw(dng_bytes(frame(), {259: shorts(compression)}), WHERE)
-    assert "copy" not in str(told.value)
+    assert "copy" not in str(caught.value)
 
 
 # Pixels
 
 
 def in_strips(more: Tags, strips: int, pixels: bytes) -> bytes:
-    """Return a DNG whose pixels are in strips behind one another."""
+    """Return a DNG with contiguous strips."""
     tags: Tags = {**more, 278: longs(SIDE // strips), 279: longs(*(len(pixels) // strips,) * strips)}
     start = len(dng_bytes(frame(), {**tags, 273: longs(*(0,) * strips)}, pixels, place=None)) - len(pixels)
     places = longs(*(start + number * (len(pixels) // strips) for number in range(strips)))
@@ -519,7 +519,7 @@ def test_reads_contiguous_strips_and_refuses_others() -> None:
 
 
 def test_refuses_lossless_jpeg_in_strips() -> None:
-    """LibRaw takes the first strip for all, and leaves the other rows at zero."""
+    """LibRaw treats the first strip as all data, and leaves the other rows at zero."""
     strip = lossless_jpeg(frame()[: SIDE // 2])
     data = in_strips({259: shorts(7), 258: shorts(14)}, 2, strip * 2)
     with pytest.raises(FormatError):
@@ -533,7 +533,7 @@ def test_refuses_a_jpeg_of_another_size() -> None:
 
 
 def test_refuses_invalid_pentax_codes(capfd: pytest.CaptureFixture[str]) -> None:
-    """Pentax's codes are Huffman's; noise in their place decodes to samples beyond their precision."""
+    """Pentax uses Huffman codes; noise decodes to samples above their precision."""
     noise = np.random.default_rng(5).bytes(48 * 80 * 8)
     data = in_maker_tiff("PENTAX", "PENTAX K-1", noise, {258: shorts(14), 259: shorts(65535)})
     with pytest.raises(FormatError, match="LibRaw reports 'Data error"):
@@ -614,7 +614,7 @@ with zipfile.ZipFile(shipped("raw/found.zip")) as _kept:
 
 @pytest.mark.parametrize("name", FOUND)
 def test_refuses_files_of_earlier_searches(name: str) -> None:
-    """By reading, or by what import, judge and build ask of a frame that was read."""
+    """Refused by reading, or by the later check for padded parts."""
     try:
         mosaic = decode_raw(FOUND[name], Path(name))
     except FormatError:

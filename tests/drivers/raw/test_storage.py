@@ -1,4 +1,4 @@
-"""What a CR3 says of itself; the files are built after published descriptions, as none of a real body is at hand."""
+"""Content of CR3 files, built from published descriptions, because no real file is available."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from tests.drivers.raw.maker_files import PIXELS, SIDES, areas, box, cr3, large_
 
 
 def test_reads_camera_and_black_areas() -> None:
-    said = read_cr3(cr3())
-    assert (said.maker, said.model) == ("Canon", "Canon EOS M50")
-    assert said.black == (Area(0, 0, 4056, 256), Area(0, 264, 28, 6024))
-    assert said.frames == (StoredFrame(4056, 6288, ((900, PIXELS),)),) * 2
+    content = read_cr3(cr3())
+    assert (content.maker, content.model) == ("Canon", "Canon EOS M50")
+    assert content.black == (Area(0, 0, 4056, 256), Area(0, 264, 28, 6024))
+    assert content.frames == (StoredFrame(4056, 6288, ((900, PIXELS),)),) * 2
 
 
 @pytest.mark.parametrize(
@@ -67,19 +67,19 @@ def test_refuses_a_file_truncated_anywhere() -> None:
 
 
 @given(st.binary(max_size=300), st.integers(0, 900))
-def test_any_bytes_are_read_or_refused(noise: bytes, place: int) -> None:
+def test_any_bytes_are_read_or_refused(noise: bytes, position: int) -> None:
     data = bytearray(cr3())
-    data[place : place + len(noise)] = noise
+    data[position : position + len(noise)] = noise
     for candidate in (bytes(data), b"\0\0\0\x18ftypcrx " + noise):
         try:
-            said = read_cr3(candidate)
+            content = read_cr3(candidate)
         except RawDamaged:
             continue
-        assert len(said.black) <= 2
+        assert len(content.black) <= 2
 
 
 def masked(model: str, left: int, stated: Cr3 | None, rows: int = 4056) -> tuple[Area, ...]:
-    """Return what is taken for black of a sensor whose picture begins at column `left`."""
+    """Return the masked areas of a sensor whose visible area starts at column `left`."""
     visible = Area(36, left, rows - 36, 6288 - left)
     return rawfile._masked_areas(None, model, visible, (rows, 6288), stated)
 
@@ -109,7 +109,7 @@ SMALL = box(b"stsz", struct.pack(">III", 0, 400, 1)), box(b"co64", struct.pack("
 
 
 def test_refuses_files_that_libraw_cannot_decode(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for name, data, says in (
+    for name, data, reason in (
         ("whole.CR3", cr3("R", track(areas(), b"CRAW", (64, 48), *SMALL)), "LibRaw reports"),
         ("stub.CR3", cr3(), "its pixels extend to byte 5000900"),
         ("cut.CR3", cr3()[:-10], "its box 'mdat' extends to byte"),
@@ -118,6 +118,6 @@ def test_refuses_files_that_libraw_cannot_decode(tmp_path: Path, capfd: pytest.C
     ):
         path = tmp_path / name
         path.write_bytes(data)
-        with pytest.raises(FormatError, match=says):
+        with pytest.raises(FormatError, match=reason):
             read_raw(path)
     assert capfd.readouterr() == ("", "")

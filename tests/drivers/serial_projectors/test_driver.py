@@ -1,7 +1,6 @@
-"""Projectors that speak a line protocol: the contract in every language, the manuals' bytes, and trouble.
+"""Projectors with a line protocol: the contract in every language, the manuals' bytes, and cable faults.
 
-The conversations are written after the manuals that each language file names; a line marked "not confirmed" follows
-other drivers, as the file says.
+The conversations follow the manuals named in the language files. Lines marked "not confirmed" follow other drivers.
 """
 
 from __future__ import annotations
@@ -48,23 +47,23 @@ OPTOMA_STATE = bytes.fromhex("7E 30 30 31 32 34 20 31 0D")
 
 
 class SerialPeerLink(PeerLink):
-    """A cable to a peer in the same thread, which hears before each read what the peer has to say by now."""
+    """A cable to a peer in the same thread, which is polled before each read."""
 
     def read(self, limit: int, timeout: float) -> bytes:
-        """Return up to `limit` bytes of what the peer has said."""
+        """Return up to `limit` bytes of the peer's replies."""
         if self._open:
             self._incoming += self._peer.receive(b"")
         return super().read(limit, timeout)
 
 
 def identity_in(language: Language) -> ProjectorIdentity:
-    """Return what of the simulated projector's names a language can say."""
+    """Return the names of the simulated projector that a language can report."""
     model = "" if language.model is None else language.model.shown.replace("{}", IDENTITY.model)
     return ProjectorIdentity(language.maker, model, "" if language.name is None else IDENTITY.name)
 
 
 def faults_in(language: Language, faults: frozenset[Fault]) -> frozenset[Fault]:
-    """Return which faults a language can say: errors, if any."""
+    """Return the faults that a language can report: errors, if any."""
     announces = any(message.fault is not None for message in language.unasked)
     if language.faults is None and not announces:
         return frozenset()
@@ -74,7 +73,7 @@ def faults_in(language: Language, faults: frozenset[Fault]) -> frozenset[Fault]:
 def bench_of(
     language: Language, device: SimulatedProjector, projector: Projector, catch_up: Callable[[], None]
 ) -> Bench:
-    """Return the bench of a simulated projector; `catch_up` lets its cable bring what it says unasked."""
+    """Return the bench of a simulated projector; `catch_up` delivers unasked messages."""
 
     def wait(seconds: float) -> None:
         assert isinstance(device.clock, SimulatedClock)
@@ -99,17 +98,17 @@ def bench_of(
 
 
 class TestOverMemory(ProjectorContract):
-    @pytest.fixture(params=[(name, whole) for name in NAMES for whole in (True, False)], ids=str)
+    @pytest.fixture(params=[(name, is_whole) for name in NAMES for is_whole in (True, False)], ids=str)
     def bench(self, request: pytest.FixtureRequest) -> Bench:
-        name, whole = request.param
+        name, is_whole = request.param
         language, device = LANGUAGES[name], SimulatedProjector(SimulatedClock())
         peer = LinePeer(device, language)
-        cable = (lambda: SerialPeerLink(peer)) if whole else (lambda: Dribbling(SerialPeerLink(peer)))
+        cable = (lambda: SerialPeerLink(peer)) if is_whole else (lambda: Dribbling(SerialPeerLink(peer)))
         return bench_of(language, device, LineProjector(language, cable, clock=device.clock), lambda: None)
 
 
 class TestOverTheNetwork(ProjectorContract):
-    """With a handshake, and without echo and prompt."""
+    """With handshake, without echo and prompt."""
 
     @pytest.fixture(params=[name for name in NAMES if LANGUAGES[name].network is not None])
     def bench(self, request: pytest.FixtureRequest) -> Bench:
@@ -289,16 +288,16 @@ def test_epson_network_handshake() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "kind", "reason"),
+    ("answer", "error_type", "reason"),
     [
         (WELCOME[:14] + b"\x41\x00", DeviceRefused, "0x41: a password is required"),
         (WELCOME[:14] + b"\x7f\x00", DeviceRefused, "0x7F: check the network settings"),
         (b"PJLINK 0\r", ProtocolError, "check the port"),
     ],
 )
-def test_epson_network_refusals_have_reasons(answer: bytes, kind: type[DeviceError], reason: str) -> None:
+def test_epson_network_refusals_have_reasons(answer: bytes, error_type: type[DeviceError], reason: str) -> None:
     projector, _ = scripted("epson", (HELLO, answer), network=True)
-    with pytest.raises(kind, match=reason):
+    with pytest.raises(error_type, match=reason):
         projector.power()
 
 
@@ -318,7 +317,7 @@ ON, OFF = Power.ON, Power.STANDBY
 
 
 @pytest.mark.parametrize(
-    ("said", "power"),
+    ("reply", "power"),
     [
         (b"\r\n>*pow=?#\r\n*POW=ON#\r\n>", ON),
         (b">*pow=?#\r\r\n*POW=OFF#\r\n\r\n>", OFF),
@@ -327,8 +326,8 @@ ON, OFF = Power.ON, Power.STANDBY
         (b"\0\0>*pow=?#\r\nPOW=ON\r\n", ON),
     ],
 )
-def test_benq_power_with_and_without_echo_and_prompt(said: bytes, power: Power) -> None:
-    projector, _ = scripted("benq", (b"\r*pow=?#\r", said))
+def test_benq_power_with_and_without_echo_and_prompt(reply: bytes, power: Power) -> None:
+    projector, _ = scripted("benq", (b"\r*pow=?#\r", reply))
     assert projector.power() is power
 
 
@@ -498,7 +497,7 @@ def test_extra_reply_does_not_answer_the_next_query() -> None:
 
 
 def answers_on(name: str) -> bytes:
-    """Return what the simulated projector answers to the question after its power state, when it is on."""
+    """Return the reply of the simulated projector to the power query when it is on."""
     language = LANGUAGES[name]
     peer = LinePeer(SimulatedProjector(SimulatedClock(), Power.ON), language)
     return peer.receive(encode_command(language.line, language.power.ask))

@@ -1,4 +1,4 @@
-"""Language files: what they say is taken as it stands, and what they cannot say is refused with file and key."""
+"""Language files: valid files are loaded, mistakes are refused with file and key."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_loads_a_user_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "said"),
+    ("before", "after", "reason"),
     [
         ("busy =", "bussy =", "unknown key 'refusals.bussy'; did you mean 'busy'?"),
         ("[mute]", "[mutes]", "unknown key 'mutes'; did you mean 'mute'?"),
@@ -104,14 +104,14 @@ def test_loads_a_user_file(tmp_path: Path) -> None:
         ('busy = ["BUSY"]\nunknown = ["WHAT"]', "", "refusals: expected at least one refusing reply"),
     ],
 )
-def test_mistakes_report_file_key_and_expectation(before: str, after: str, said: str) -> None:
+def test_mistakes_report_file_key_and_expectation(before: str, after: str, reason: str) -> None:
     assert before in TEXT
-    with pytest.raises(ConfigurationError) as told:
+    with pytest.raises(ConfigurationError) as caught:
         parse_language(TEXT.replace(before, after), "lantern.toml")
-    assert str(told.value).startswith("lantern.toml")
-    assert said in str(told.value)
-    assert "languages for examples" in str(told.value)
-    assert "mistakes" not in str(told.value), "one mistake is reported once"
+    assert str(caught.value).startswith("lantern.toml")
+    assert reason in str(caught.value)
+    assert "languages for examples" in str(caught.value)
+    assert "mistakes" not in str(caught.value), "one mistake is reported once"
 
 
 def test_reports_missing_tables_and_missing_quotation_marks() -> None:
@@ -145,9 +145,9 @@ def test_refuses_a_state_after_the_end_of_the_answer() -> None:
 def test_answers_survive_encoding_and_parsing() -> None:
     for language in (EPSON, BENQ, OPTOMA, MADE_UP):
         data = encode_answer(language.line, "Answer 1")
-        taken = answer_parser(language)(data + b"more")
-        assert taken is not None
-        assert taken[0] == "Answer 1"
+        parsed = answer_parser(language)(data + b"more")
+        assert parsed is not None
+        assert parsed[0] == "Answer 1"
     assert encode_answer(EPSON.line, "") == b":"
 
 
@@ -156,9 +156,9 @@ def test_any_bytes_are_parsed_or_refused(data: bytes) -> None:
     assert EPSON.network is not None
     assert EPSON.network.handshake is not None
     parsers = [answer_parser(language, "pow=?") for language in (EPSON, BENQ, OPTOMA, MADE_UP)]
-    for take in (*parsers, handshake_parser(EPSON.network.handshake)):
+    for parse in (*parsers, handshake_parser(EPSON.network.handshake)):
         try:
-            taken = take(data)
+            parsed = parse(data)
         except ProtocolError:
             continue
-        assert taken is None or 1 <= taken[1] <= len(data)
+        assert parsed is None or 1 <= parsed[1] <= len(data)
