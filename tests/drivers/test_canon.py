@@ -100,16 +100,12 @@ class Replay:
         self.transactions.append(request.transaction)
         self.requests.append((request.code, request.parameters, send))
         sent = None if send is None else send.hex()
-        for number, recorded in enumerate(self.remaining):
-            data = recorded["data"] if recorded["dir"] == "out" else None
-            if (
-                int(recorded["code"], 16) == request.code
-                and tuple(recorded["params"]) == request.parameters
-                and data == sent
-            ):
+        for number, entry in enumerate(self.remaining):
+            data = entry["data"] if entry["dir"] == "out" else None
+            if int(entry["code"], 16) == request.code and tuple(entry["params"]) == request.parameters and data == sent:
                 self.remaining = self.remaining[number + 1 :]
-                answer = bytes.fromhex(recorded["data"] or "") if recorded["dir"] == "in" else b""
-                response = PtpResponse(int(recorded["rc"], 16), request.transaction, tuple(recorded["rparams"]))
+                answer = bytes.fromhex(entry["data"] or "") if entry["dir"] == "in" else b""
+                response = PtpResponse(int(entry["rc"], 16), request.transaction, tuple(entry["rparams"]))
                 return Transaction(response, answer)
         pytest.fail(f"the recorded host did not ask {request} with {sent} here")
 

@@ -32,7 +32,7 @@ PLACES = box(b"stsz", struct.pack(">III", 0, 4000, 1)), box(b"co64", struct.pack
 BOXES = cr3("Canon EOS R", track(areas(), b"CRAW", (80, 48), *PLACES), pixels=np.random.default_rng(1).bytes(4000))
 
 
-def result_or_refusal(read: Callable[[], Any]) -> Any:
+def result(read: Callable[[], Any]) -> Any:
     """Return the result, or a record of the refusal."""
     try:
         return read()
@@ -42,11 +42,7 @@ def result_or_refusal(read: Callable[[], Any]) -> Any:
 
 def stored(frame: StoredFrame) -> dict[str, Any]:
     """Return the fields of a stored frame without its directory."""
-    return {
-        record_field.name: getattr(frame, record_field.name)
-        for record_field in fields(frame)
-        if record_field.name != "directory"
-    }
+    return {item.name: getattr(frame, item.name) for item in fields(frame) if item.name != "directory"}
 
 
 def contents(data: bytes) -> Any:
@@ -60,7 +56,7 @@ def contents(data: bytes) -> Any:
         values = [value for directory in structure.directories for _, value in sorted(directory.values.items())]
         return {"frames": [*map(stored, structure.frames)], "values": values}
 
-    return result_or_refusal(read)
+    return result(read)
 
 
 def measured(mosaic: Mosaic) -> dict[str, Any]:
@@ -74,11 +70,7 @@ def measured(mosaic: Mosaic) -> dict[str, Any]:
         return value[::13, ::11] if np.prod(shape) > 100_000 else value
 
     return {
-        **{
-            record_field.name: thinned(getattr(mosaic, record_field.name))
-            for record_field in fields(mosaic)
-            if record_field.name != "sensor"
-        },
+        **{item.name: thinned(getattr(mosaic, item.name)) for item in fields(mosaic) if item.name != "sensor"},
         "beside": thinned(mosaic.sensor) if mosaic.masked else mosaic.sensor.shape,
         "masked black": mosaic.masked_black(),
         "saturation": mosaic.saturation(),
@@ -107,10 +99,7 @@ def test_files_of_every_maker_match_the_pins(pinned: Pinned) -> None:
     files["dng in tiles of nothing"] = dng_bytes(np.zeros((40, 300), np.uint16))
     pinned(
         "raw files",
-        {
-            name: result_or_refusal(lambda data=data: measured(decode_raw(data, Path("case"))))
-            for name, data in files.items()
-        },
+        {name: result(lambda data=data: measured(decode_raw(data, Path("case")))) for name, data in files.items()},
     )
 
 
@@ -139,6 +128,6 @@ def test_directories_of_all_types_match_the_pins(pinned: Pinned) -> None:
     found: dict[str, Any] = {}
     for order, tag, kind, count in product("<>", tags, range(14), (1, 2)):
         data = one(order, tag, kind, count, value)
-        read = result_or_refusal(lambda data=data: [list(one.values.values()) for one in read_directories(data)])
+        read = result(lambda data=data: [list(one.values.values()) for one in read_directories(data)])
         found.setdefault(f"{order}{tag.name}", []).append(read)
     pinned("directories of all types", found)
