@@ -1,1 +1,1 @@
-"""Every foreign wire, bus, display and file that the lab uses; imports none of the packages above it."""
+"""Device protocols, buses, displays and raw files; imports only `foundation`."""

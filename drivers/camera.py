@@ -1,8 +1,7 @@
-"""The interface of a tethered camera, and the values that it takes and returns.
+"""Interface of a tethered camera, and the values that it takes and returns.
 
-Kept small so that a second maker fits beside the first: a camera is configured once, then asked for one raw frame
-after another, each written whole into a file that the caller opened. Exposure and download are two calls, so that the
-light can be changed while the frame travels.
+A camera is configured once. Then `Camera.expose` and `Camera.download` take one raw frame after another. They are two
+calls, so that the projector can show the next illuminant while the frame is transferred.
 """
 
 from __future__ import annotations
@@ -14,7 +13,13 @@ from typing import BinaryIO, Protocol, runtime_checkable
 
 @dataclass(frozen=True)
 class CameraIdentity:
-    """Maker, model, serial number and firmware of the connected body."""
+    """Identity of the connected camera body.
+
+    Attributes
+    ----------
+    maker, model, serial, firmware
+        Texts as the body reports them; empty if it does not report them.
+    """
 
     maker: str
     model: str
@@ -23,36 +28,46 @@ class CameraIdentity:
 
     @property
     def name(self) -> str:
-        """Maker and model, the maker once where the model begins with it."""
-        first, begins = (words.casefold().split()[:1] for words in (self.maker, self.model))
-        return self.model if first == begins else f"{self.maker} {self.model}".strip()
+        """Maker and model; the model alone if it begins with the maker."""
+        maker_word, model_word = (words.casefold().split()[:1] for words in (self.maker, self.model))
+        return self.model if maker_word == model_word else f"{self.maker} {self.model}".strip()
 
 
 @dataclass(frozen=True)
 class ExposureSettings:
-    """How a frame is exposed: ISO speed, f-number, None where the body has no say in it, shutter time in seconds."""
+    """Settings of one exposure.
+
+    Attributes
+    ----------
+    iso
+        ISO speed.
+    aperture
+        f-number; None if the body cannot set it (lens without contacts).
+    shutter_s
+        Shutter time, seconds.
+    """
 
     iso: int
     aperture: float | None
     shutter_s: float
 
     def __str__(self) -> str:
-        opening = "aperture not set by the body" if self.aperture is None else f"f/{self.aperture:g}"
-        return f"ISO {self.iso}, {opening}, {self.shutter_s:g} s"
+        aperture = "aperture not set by the body" if self.aperture is None else f"f/{self.aperture:g}"
+        return f"ISO {self.iso}, {aperture}, {self.shutter_s:g} s"
 
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """One raw frame that has reached the host completely.
+    """One raw frame that has arrived completely.
 
     Attributes
     ----------
     name
-        The camera's own name for the file, e.g. ``IMG_0042.CR2``; its suffix names the format.
+        File name given by the camera, e.g. ``IMG_0042.CR2``; the suffix is the format.
     size
-        Bytes written.
+        Size of the raw file, bytes.
     released_at
-        When the shutter was released, UTC.
+        Time at which the shutter was released, UTC.
     """
 
     name: str
@@ -61,72 +76,96 @@ class CapturedFrame:
 
 
 class Camera(Protocol):
-    """A tethered camera that has been opened."""
+    """A tethered camera with an open connection."""
 
     def identity(self) -> CameraIdentity:
         """Return maker, model, serial number and firmware."""
 
     def configure(self, settings: ExposureSettings) -> None:
-        """Set and verify the exposure, raw format and manual mode.
+        """Set the exposure, raw format and manual mode, and read them back.
+
+        Parameters
+        ----------
+        settings
+            ISO speed, f-number and shutter time; each must be a value that the body offers.
 
         Raises
         ------
         DeviceRefused
-            The body does not offer a value; the message lists what it offers.
+            The body does not offer a value; the message lists the values that it offers.
         """
 
     def shutter_speeds(self) -> tuple[float, ...]:
-        """Return the shutter times that the body offers now, as engraved, seconds, rising; empty if it lists none.
+        """Return the shutter times that the body offers now.
+
+        Returns
+        -------
+        tuple of float
+            Nominal times in seconds, rising; empty if the body lists none.
 
         Raises
         ------
         DeviceError
-            It cannot be reached.
+            The camera cannot be reached.
         """
 
     def expose(self) -> datetime:
-        """Release the shutter without autofocus; return when it was released, UTC, once the light may change.
+        """Release the shutter without autofocus; return as soon as the illuminant may change.
 
-        A frame that was exposed before and has not been downloaded is dropped.
+        An earlier frame that was not downloaded is dropped.
+
+        Returns
+        -------
+        datetime
+            Time of the release, UTC.
 
         Raises
         ------
         DeviceRefused
-            The body was never configured, or declines to take a frame.
+            The body was not configured, or refuses to release.
         DeviceError
-            No frame was taken, or none can be found; it may be exposed again.
+            No frame was taken; the caller may expose again.
         """
 
     def download(self, into: BinaryIO) -> CapturedFrame:
-        """Write the raw file of the frame exposed last, whole and unchanged, to `into`.
+        """Write the raw file of the last exposure to a stream, complete and unchanged.
 
-        A download that failed may be tried again with a new stream, and gives the same frame.
+        After an error, call again with a new stream; the same frame is written.
+
+        Parameters
+        ----------
+        into
+            Writable binary stream; after an error its content is invalid.
+
+        Returns
+        -------
+        CapturedFrame
+            Name, size and release time of the frame.
 
         Raises
         ------
         DeviceError
-            The frame did not arrive, and what `into` holds is worthless; or the body holds no frame, or no longer, and
-            the message says so: then it must be exposed again.
+            The transfer failed. If the body no longer holds the frame, the message asks for a new exposure.
         """
 
     def close(self) -> None:
-        """Give the camera back to its user; a second call does nothing."""
+        """Release the camera; a second call does nothing."""
 
 
 @dataclass(frozen=True)
 class Supplies:
-    """What a camera has left for a long series; None is what it does not tell.
+    """Remaining battery and card capacity; None if the camera does not report a value.
 
     Attributes
     ----------
     battery
-        Charge, 0 … 1, in the few steps that the body reports.
+        Charge, 0 to 1, in the few steps that the body reports.
     mains
-        Whether it runs on mains power.
+        True on mains power.
     card_free_bytes
-        Room on the card where frames go, bytes; on all cards together where there are several.
+        Free space for frames, bytes; the sum over all cards.
     saves_to_host
-        Whether frames go to the host and leave nothing on the card, once the camera is configured.
+        True if a configured camera sends frames to the host only.
     """
 
     battery: float | None = None
@@ -137,39 +176,39 @@ class Supplies:
 
 @runtime_checkable
 class ReportsSupplies(Protocol):
-    """A camera that can tell how long it will last."""
+    """A camera that reports battery and card capacity."""
 
     def supplies(self) -> Supplies:
-        """Return what is left of battery and card.
+        """Return battery and card capacity.
 
         Raises
         ------
         DeviceError
-            It cannot be reached.
+            The camera cannot be reached.
         """
 
 
 @runtime_checkable
 class NeedsKeepAlive(Protocol):
-    """A camera that must be polled for events in long pauses: to stay awake, and to empty its queue."""
+    """A camera that must be polled during pauses, to stay awake and to empty its event queue."""
 
     def idle(self) -> None:
-        """Keep the camera awake and empty its queue of events; call it every few seconds of a pause."""
+        """Poll the camera once; call this every few seconds of a pause."""
 
 
 def capture(camera: Camera, into: BinaryIO) -> CapturedFrame:
-    """Take a frame: expose it, and write its raw file to `into`.
+    """Expose one frame and write its raw file to `into`.
 
     Raises
     ------
     DeviceError
-        From either; what `into` holds is worthless, and the frame may be taken again.
+        Exposure or download failed; the content of `into` is invalid, and the frame may be taken again.
     """
     camera.expose()
     return camera.download(into)
 
 
 def keep_awake(camera: Camera) -> None:
-    """Keep a camera awake that would fall asleep; call it every few seconds of a pause."""
+    """Poll a camera that needs it; call this every few seconds of a pause."""
     if isinstance(camera, NeedsKeepAlive):
         camera.idle()

@@ -1,35 +1,14 @@
-"""A Canon EOS body as the suite's `Camera`: one raw frame after another, for hours, without a human.
+"""A Canon EOS body as a `drivers.camera.Camera` over PTP, for hours of unattended exposures.
 
-First what these bodies say beyond the standard, as values: events, lists, codes of shutter, aperture and ISO. GetEvent
-answers a chain of records: size (32 bits, these included), type (32), body; a record of size 8 and type 0 ends it,
-which some bodies leave out. The first answer after SetEventMode holds the camera's whole state, later ones what has
-changed since. Properties travel as bytes: 32 bits for every number, text with a closing NUL, structures for a few.
-``decode`` and ``encode`` undo each other on well-formed bytes; a record whose type or form is not known stays as it
-came, in `OtherRecord`, and one that contradicts itself raises `ProtocolError`.
+`EosState` holds what the body reports, `EosBody` one connection, `CanonEos` the camera across connections. GetEvent
+returns a chain of records: size with header (32 bits), type (32 bits), body. A record of size 8 and type 0 ends the
+chain; some bodies leave it out. The first reply after SetEventMode holds the whole state, later replies the changes.
+Property values are bytes: 32 bits for a number, text with a closing NUL, structures for a few. ``decode`` and
+``encode`` are inverse on well-formed bytes. Records of unknown type or form are kept in `OtherRecord`; inconsistent
+records raise `ProtocolError`.
 
-Then a body's state and its connection (`EosBody`):
-
-- Every step is one that the recorded conversations have, or one that libgphoto2 takes. Nothing is sent or taken for
-  settable that the body does not list. Where it lists an operation and does not know it all the same, the camera does
-  without if it can.
-- What a body claims costs little: counts and sizes are checked before they are believed, and what it reports is
-  held up to limits that no real body comes near.
-- A body keeps a frame in its memory until TransferComplete, and refuses the next when that memory is full. So every
-  object that it announces is fetched or thrown away, and freed in either case.
-
-And the camera (`CanonEos`):
-
-- A connection that fails is renewed, a limited number of times and for a limited time in one call. Then the call fails,
-  with its first cause: longer patience is the caller's, who can say what is awaited.
-- A release is never repeated once it may have happened: after a fault the frame is looked for in the camera's memory,
-  and what is not found there is an error. What waits there before a release belongs to nobody any more. So no frame is
-  ever taken for another one's.
-- The exposed frame stays in the memory until it has been downloaded whole, or the next is exposed: a cable that fails
-  and a file that cannot be written cost a download, not a frame.
-
-Source: no public standard; layouts and conversations as recorded from an EOS 60D and an EOS 400D with a host;
-libgphoto2 2.5.34 for how these are read, and for the order of a release; the number of mirror lockup among the custom
-functions as ExifTool names it (CanonCustom::Functions2).
+Source: no public standard. Layouts and conversations were recorded from an EOS 60D and an EOS 400D; libgphoto2 2.5.34
+for their meaning and for the order of a release; ExifTool (CanonCustom::Functions2) for the number of mirror lockup.
 """
 
 from __future__ import annotations
@@ -60,9 +39,9 @@ from drivers.ptp.codes import (
 )
 from drivers.ptp.protocol import (
     MAX_DATASET,
-    PASSING,
-    PASSING_LIMIT_S,
     START_TIMEOUT_S,
+    TRANSIENT,
+    TRANSIENT_LIMIT_S,
     Cursor,
     DeviceInfo,
     OperationDeclined,
@@ -77,12 +56,12 @@ from drivers.ptp.protocol import (
 from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
-_RAW: Final = 6  # Kind of a raw file, see `ImageFile`
-_LOSSLESS: Final = 4  # Compression of a raw file, see `ImageFile`
+_RAW: Final = 6  # `ImageFile.kind` of a raw file
+_LOSSLESS: Final = 4  # `ImageFile.compression` of a lossless raw file
 
 _JPEG_SIZES: Final = {0: "L", 1: "M", 2: "S", 5: "M1", 6: "M2", 14: "S1", 15: "S2", 16: "S3"}
 
-_IMAGE_FILE_LENGTH: Final = 16  # Bytes of one file's format: this length, kind, size and compression, 32 bits each
+_IMAGE_FILE_LENGTH: Final = 16  # Bytes of one format: this length, kind, size and compression, 32 bits each
 
 _MAX_IMAGE_FILES: Final = 2  # Files of one release: a raw file and a JPEG
 
@@ -90,35 +69,35 @@ _SETTING_HEADER: Final = 8  # Bytes before a new value: length and property
 
 
 def number_value(number: int) -> bytes:
-    """Return a number as a property's value; negative ones as their two's complement in 32 bits."""
+    """Return the property value of a number; negative numbers as two's complement of 32 bits."""
     return encode_integer(number & 0xFFFFFFFF if -(1 << 31) <= number < 0 else number, 4)
 
 
 def text_value(text: str) -> bytes:
-    """Return text as a property's value, closed by NUL."""
+    """Return the property value of a text, closed by NUL."""
     octets = text.encode("latin-1", "replace")
     if b"\0" in octets:
-        raise ValueError(f"{text[:40]!r} holds a NUL")
+        raise ValueError(f"{text[:40]!r} contains a NUL, which ends a text")
     return octets + b"\0"
 
 
 def number_of(value: bytes) -> int:
-    """Return the number in a property's value: its first 32 bits."""
+    """Return the number in the first 32 bits of a property value."""
     return Cursor(value, "a property's value").u32("the number")
 
 
 def text_of(value: bytes) -> str:
-    """Return the text in a property's value, up to its first NUL."""
+    """Return the text of a property value, up to its first NUL."""
     return value.partition(b"\0")[0].decode("latin-1")
 
 
 @dataclass(frozen=True)
 class ImageFile:
-    """One of the files that a release makes.
+    """One of the files written by a release.
 
     - `kind`: 1 JPEG, 6 raw.
-    - `size`: 0 large, 1 medium (of raw: mRAW), 2 small (sRAW), 5 and 6 M1 and M2, 14, 15 and 16 S1, S2 and S3.
-    - `compression`: of JPEG 2 normal and 3 fine; of raw 4 lossless and 3 lossy.
+    - `size`: 0 large, 1 medium (raw: mRAW), 2 small (raw: sRAW), 5 and 6 M1 and M2, 14 to 16 S1 to S3.
+    - `compression`: JPEG: 2 normal, 3 fine; raw: 4 lossless, 3 lossy.
     """
 
     kind: int
@@ -127,7 +106,7 @@ class ImageFile:
 
     @property
     def is_raw(self) -> bool:
-        """Whether the file is raw, of any size."""
+        """True for a raw file of any size."""
         return self.kind == _RAW
 
     def __str__(self) -> str:
@@ -141,7 +120,7 @@ class ImageFile:
 
 @dataclass(frozen=True)
 class ImageFormat:
-    """The one or two files of a release; the value of properties 0xd120 to 0xd123."""
+    """The one or two files of a release; value of properties 0xd120 to 0xd123."""
 
     files: tuple[ImageFile, ...]
 
@@ -161,13 +140,13 @@ class ImageFormat:
 
     @classmethod
     def decode(cls, value: bytes) -> ImageFormat:
-        """Return the image format in a property's value."""
+        """Return the image format of a property value."""
         return cls.read(Cursor(value, "an image format"))
 
     def encode(self) -> bytes:
-        """Return the property's value."""
+        """Return the property value."""
         if not 1 <= len(self.files) <= _MAX_IMAGE_FILES:
-            raise ValueError(f"{len(self.files)} files; a release makes 1 or {_MAX_IMAGE_FILES}")
+            raise ValueError(f"{len(self.files)} files; expected 1 or {_MAX_IMAGE_FILES}")
         return encode_integer(len(self.files), 4) + b"".join(
             encode_integer(number, 4)
             for file in self.files
@@ -178,7 +157,7 @@ class ImageFormat:
         return " + ".join(str(file) for file in self.files)
 
 
-RAW_ONLY = ImageFormat((ImageFile(_RAW, 0, _LOSSLESS),))  # One full raw file a release: what a measurement wants
+RAW_ONLY = ImageFormat((ImageFile(_RAW, 0, _LOSSLESS),))  # One full-size raw file, as required for measurements
 
 # Properties whose value is an `ImageFormat`.
 IMAGE_FORMAT_PROPERTIES = frozenset(
@@ -193,7 +172,7 @@ IMAGE_FORMAT_PROPERTIES = frozenset(
 
 @dataclass(frozen=True)
 class PropertySetting:
-    """What SetDevicePropValueEx (0x9110) sends: a property's new value, see `number_value` and `text_value`."""
+    """Data of SetDevicePropValueEx (0x9110): the new value of a property, see `number_value`, `text_value`."""
 
     code: int
     value: bytes
@@ -203,9 +182,9 @@ class PropertySetting:
         """Return the setting in the data of a request."""
         cursor = Cursor(data, "SetDevicePropValueEx", MAX_DATASET)
         length = cursor.u32("length")
-        if length < cursor.at + 4 or length > len(data):
+        if length < cursor.position + 4 or length > len(data):
             raise cursor.fault("length", f"8 to {len(data)}", length)
-        return cls(cursor.u32("property"), cursor.take(length - cursor.at, "value"))
+        return cls(cursor.u32("property"), cursor.take(length - cursor.position, "value"))
 
     def encode(self) -> bytes:
         """Return the data of the request."""
@@ -219,12 +198,12 @@ _TIME_LENGTH: Final = 4  # Bytes of a time, seconds since 1970
 
 @dataclass(frozen=True)
 class ObjectEntry:
-    """An object as EOS bodies list it, in GetObjectInfoEx and in events.
+    """An object as listed in GetObjectInfoEx and in events.
 
-    - `group`: A second handle; one and the same for files that belong together, else often the handle again.
+    - `group`: second handle; equal for files that belong together, else often the same as `handle`.
     - `name`: at most `name_width` characters.
-    - `time`: seconds since 1970 on the camera's clock; None where the body leaves it out.
-    - `name_width`: bytes of the name's field, padded with NUL; 16 on all bodies recorded.
+    - `time`: seconds since 1970 on the camera's clock; None if the body leaves it out.
+    - `name_width`: bytes of the name field, padded with NUL; 16 on all recorded bodies.
     """
 
     handle: int
@@ -241,27 +220,27 @@ class ObjectEntry:
 
     @classmethod
     def read(cls, cursor: Cursor, size_length: int = 4) -> ObjectEntry:
-        """Return the object in the rest of a record; `size_length` is 8 on bodies with sizes of 64 bits."""
-        handle, storage, kind = cursor.u32("handle"), cursor.u32("storage"), cursor.u32("format")
+        """Return the object in the rest of a record; `size_length` is 8 on bodies with 64-bit sizes."""
+        handle, storage, object_format = cursor.u32("handle"), cursor.u32("storage"), cursor.u32("format")
         reserved, flags = cursor.u32("reserved"), cursor.u32("flags")
         size = cursor.integer(size_length, "size")
         parent, group = cursor.u32("parent"), cursor.u32("group")
-        width = cursor.left
+        width = cursor.remaining
         time = None
         if width >= _NAME_WIDTH + _TIME_LENGTH:
             width -= _TIME_LENGTH
         name = text_of(cursor.take(width, "name"))
-        if cursor.left:
+        if cursor.remaining:
             time = cursor.u32("time")
-        return cls(handle, storage, kind, size, name, parent, group, flags, time, width, reserved)
+        return cls(handle, storage, object_format, size, name, parent, group, flags, time, width, reserved)
 
     def encode(self, size_length: int = 4) -> bytes:
         """Return the body of a record."""
         name = self.name.encode("latin-1", "replace")
         if len(name) > self.name_width or b"\0" in name:
-            raise ValueError(f"{self.name!r} is no name of at most {self.name_width} characters")
+            raise ValueError(f"name {self.name!r}: expected at most {self.name_width} characters and no NUL")
         if self.name_width < _NAME_WIDTH if self.time is not None else self.name_width >= _NAME_WIDTH + _TIME_LENGTH:
-            raise ValueError(f"a name's field of {self.name_width} bytes and a time behind it look alike")
+            raise ValueError(f"a name field of {self.name_width} bytes cannot be told apart from a following time")
         time = b"" if self.time is None else encode_integer(self.time, _TIME_LENGTH)
         return b"".join(
             (
@@ -276,49 +255,49 @@ class ObjectEntry:
 
 
 def encode_object_entries(entries: Iterable[ObjectEntry]) -> bytes:
-    """Return the answer to GetObjectInfoEx."""
+    """Return the reply to GetObjectInfoEx."""
     bodies = [entry.encode() for entry in entries]
     return encode_integer(len(bodies), 4) + b"".join(encode_integer(4 + len(body), 4) + body for body in bodies)
 
 
 @dataclass(frozen=True)
 class DeviceInfoEx:
-    """What GetDeviceInfoEx (0x9108) answers: record types, properties, and numbers whose meaning is not known."""
+    """Reply to GetDeviceInfoEx (0x9108): record types, properties, and numbers of unknown meaning."""
 
     events: tuple[int, ...] = ()
     properties: tuple[int, ...] = ()
-    others: tuple[int, ...] = ()
+    unknown: tuple[int, ...] = ()
 
     @classmethod
     def decode(cls, data: bytes) -> DeviceInfoEx:
-        """Return the device in an answer."""
+        """Return the values of a reply."""
         cursor = Cursor(data, "DeviceInfoEx", MAX_DATASET)
         length = cursor.u32("length")
         if length > len(data):
-            raise cursor.fault("length", f"at most {len(data)}, the bytes there are", length)
-        return cls(cursor.array(4, "events"), cursor.array(4, "properties"), cursor.array(4, "others"))
+            raise cursor.fault("length", f"at most {len(data)}, the size of the reply", length)
+        return cls(cursor.array(4, "events"), cursor.array(4, "properties"), cursor.array(4, "unknown numbers"))
 
     def encode(self) -> bytes:
-        """Return the answer."""
-        arrays = b"".join(encode_array(array, 4) for array in (self.events, self.properties, self.others))
+        """Return the bytes of the reply."""
+        arrays = b"".join(encode_array(array, 4) for array in (self.events, self.properties, self.unknown))
         return encode_integer(4 + len(arrays), 4) + arrays
 
 
-# Bytes of the longest answer to GetEvent that is read; a body left alone for a day queues some 250 kB.
+# Longest accepted reply to GetEvent, bytes; a body that is not polled for a day queues about 250 kB.
 MAX_EVENTS: Final = 4 << 20
 
-# Records of one answer; a body left alone queues some 8000 in half a day (as users of libgphoto2 report).
+# Most records of one reply; about 8000 are queued in 12 h without polling (reports of libgphoto2 users).
 MAX_RECORDS: Final = 1 << 16
 
-_HEADER_LENGTH: Final = 8  # Bytes of a record's size and type
+_HEADER_LENGTH: Final = 8  # Bytes of size and type of a record
 
 _END: Final = struct.pack("<II", _HEADER_LENGTH, EosEvent.END)
-_LIST: Final = 3  # The kind of an available list that has items; 1 and 7 say that there is none
+_LIST: Final = 3  # Kind of an available list with items; 1 and 7 mean an empty list
 
 
 @dataclass(frozen=True)
 class PropertyChanged:
-    """A property has this value now (0xc189)."""
+    """New value of a property (0xc189)."""
 
     code: int
     value: bytes
@@ -326,7 +305,7 @@ class PropertyChanged:
 
 @dataclass(frozen=True)
 class AvailableValues:
-    """A property can be set to one of these now (0xc18a); to none where the list is empty."""
+    """Values that a property accepts now (0xc18a); none if the list is empty."""
 
     code: int
     values: tuple[int, ...] = ()
@@ -335,7 +314,7 @@ class AvailableValues:
 
 @dataclass(frozen=True)
 class AvailableFormats:
-    """An image format property can be set to one of these now (0xc18a)."""
+    """Formats that an image format property accepts now (0xc18a)."""
 
     code: int
     formats: tuple[ImageFormat, ...] = ()
@@ -344,7 +323,7 @@ class AvailableFormats:
 
 @dataclass(frozen=True)
 class ObjectEvent:
-    """An object has been written to the card (0xc181, 0xc1a7) or has changed there (0xc187, 0xc1a8)."""
+    """An object was written to the card (0xc181, 0xc1a7) or changed there (0xc187, 0xc1a8)."""
 
     type: int
     entry: ObjectEntry
@@ -352,10 +331,10 @@ class ObjectEvent:
 
 @dataclass(frozen=True)
 class TransferRequest:
-    """An object waits in the camera's memory to be fetched, and blocks it until TransferComplete (0xc186, 0xc1a9).
+    """An object in the camera's memory; it occupies the memory until TransferComplete (0xc186, 0xc1a9).
 
-    `extra` are the numbers between size and name, empty where all are 0; on bodies that send 0xc1b8 instead, the
-    parent and one whose meaning is not known.
+    `extra` holds the numbers between size and name, empty if all are 0. On bodies that send 0xc1b8 they are the parent
+    and an unknown number.
     """
 
     handle: int
@@ -365,12 +344,12 @@ class TransferRequest:
     type: int = EosEvent.REQUEST_OBJECT_TRANSFER
     reserved: int = field(default=0, repr=False)
     extra: tuple[int, ...] = field(default=(), repr=False)
-    padding: int = field(default=0, repr=False)  # NULs behind the name's own
+    padding: int = field(default=0, repr=False)  # Number of NULs after the closing NUL of the name
 
 
 @dataclass(frozen=True)
 class Notice:
-    """A record that is one number: a handle, a storage, a status, seconds; `rest` is what a body adds to it."""
+    """A record of one number: a handle, a storage, a status, or seconds; `rest` holds additional bytes."""
 
     type: int
     number: int
@@ -379,7 +358,7 @@ class Notice:
 
 @dataclass(frozen=True)
 class OtherRecord:
-    """A record as it came, for its type or form is not known."""
+    """A record of unknown type or form, unchanged."""
 
     type: int
     body: bytes = b""
@@ -387,14 +366,14 @@ class OtherRecord:
 
 Record = PropertyChanged | AvailableValues | AvailableFormats | ObjectEvent | TransferRequest | Notice | OtherRecord
 
-# Bytes of the size in each kind of object event.
+# Bytes of the size field in each type of object event.
 _OBJECT_EVENTS: dict[int, int] = {
     EosEvent.OBJECT_ADDED: 4,
     EosEvent.OBJECT_INFO_CHANGED: 4,
     EosEvent.OBJECT_ADDED_64: 8,
     EosEvent.OBJECT_INFO_CHANGED_64: 8,
 }
-# Bytes of the size, and numbers between it and the name, in each kind of transfer request.
+# Bytes of the size field, and count of numbers between it and the name, in each type of transfer request.
 _TRANSFER_REQUESTS: dict[int, tuple[int, int]] = {
     EosEvent.REQUEST_OBJECT_TRANSFER: (4, 1),
     EosEvent.REQUEST_OBJECT_TRANSFER_64: (8, 0),
@@ -422,73 +401,71 @@ _NOTICES: frozenset[int] = frozenset(
 
 
 def decode_events(data: bytes) -> tuple[Record, ...]:
-    """Return the records that GetEvent (0x9116) answers, without the closing one; no bytes are no records.
-
-    A chain that ends with its last record, or with NULs, is whole: no cable hands on a part of an answer as all of it.
-    """
+    """Return the records in a reply to GetEvent (0x9116) without the closing record; no bytes are no records."""
     cursor = Cursor(data, "GetEvent", MAX_EVENTS)
     records: list[Record] = []
     while True:
-        place = cursor.at
-        if not any(data[place : place + _HEADER_LENGTH]) and not any(data[place:]):
+        start = cursor.position
+        # A chain may end without its closing record or with NULs; no transport passes on part of a reply as all of it.
+        if not any(data[start : start + _HEADER_LENGTH]) and not any(data[start:]):
             return tuple(records)
         if len(records) == MAX_RECORDS:
-            raise ProtocolError(f"GetEvent gives more than {MAX_RECORDS} records; switch the camera off and on")
-        size, kind = cursor.u32("the size of a record"), cursor.u32("the type of a record")
-        if kind == EosEvent.END and size == _HEADER_LENGTH:
+            raise ProtocolError(f"GetEvent returns more than {MAX_RECORDS} records; switch the camera off and on")
+        size, record_type = cursor.u32("the size of a record"), cursor.u32("the type of a record")
+        if record_type == EosEvent.END and size == _HEADER_LENGTH:
             return tuple(records)
         if size < _HEADER_LENGTH:
-            raise cursor.fault("the size of a record", f"at least {_HEADER_LENGTH}", size, at=place)
-        body = cursor.take(size - _HEADER_LENGTH, f"a record of type {describe(EosEvent, kind)}")
+            raise cursor.fault("the size of a record", f"at least {_HEADER_LENGTH}", size, position=start)
+        body = cursor.take(size - _HEADER_LENGTH, f"a record of type {describe(EosEvent, record_type)}")
         try:
-            records.append(_decode_record(kind, body))
+            records.append(_decode_record(record_type, body))
         except ProtocolError as error:
-            raise ProtocolError(f"GetEvent, record {len(records)} at byte {place}: {error}") from error
+            raise ProtocolError(f"GetEvent, record {len(records)} at byte {start}: {error}") from error
 
 
 def encode_events(records: Iterable[Record] = ()) -> bytes:
-    """Return the answer to GetEvent, closed; without records the answer for nothing new."""
+    """Return the reply to GetEvent with its closing record; without records if nothing is new."""
     chain = bytearray()
     for record in records:
-        kind, body = _encode_record(record)
-        chain += encode_integer(_HEADER_LENGTH + len(body), 4) + encode_integer(kind, 4) + body
+        record_type, body = _encode_record(record)
+        chain += encode_integer(_HEADER_LENGTH + len(body), 4) + encode_integer(record_type, 4) + body
     return bytes(chain) + _END
 
 
-def _decode_record(kind: int, body: bytes) -> Record:
-    cursor = Cursor(body, describe(EosEvent, kind))
-    if kind == EosEvent.PROPERTY_CHANGED:
+def _decode_record(record_type: int, body: bytes) -> Record:
+    cursor = Cursor(body, describe(EosEvent, record_type))
+    if record_type == EosEvent.PROPERTY_CHANGED:
         return PropertyChanged(cursor.u32("property"), cursor.rest())
-    if kind == EosEvent.AVAILABLE_LIST_CHANGED:
+    if record_type == EosEvent.AVAILABLE_LIST_CHANGED:
         return _decode_list(cursor, body)
-    if kind in _OBJECT_EVENTS:
-        return ObjectEvent(kind, ObjectEntry.read(cursor, _OBJECT_EVENTS[kind]))
-    if kind in _TRANSFER_REQUESTS:
-        return _decode_transfer_request(cursor, kind)
-    if kind in _NOTICES and len(body) >= 4:
-        return Notice(kind, cursor.u32("number"), cursor.rest())
-    return OtherRecord(kind, body)
+    if record_type in _OBJECT_EVENTS:
+        return ObjectEvent(record_type, ObjectEntry.read(cursor, _OBJECT_EVENTS[record_type]))
+    if record_type in _TRANSFER_REQUESTS:
+        return _decode_transfer_request(cursor, record_type)
+    if record_type in _NOTICES and len(body) >= 4:
+        return Notice(record_type, cursor.u32("number"), cursor.rest())
+    return OtherRecord(record_type, body)
 
 
 def _decode_list(cursor: Cursor, body: bytes) -> Record:
-    code, kind, count = cursor.u32("property"), cursor.u32("kind of list"), cursor.u32("count")
-    cursor.what = f"{cursor.what} for {describe(Property, code)}"
-    if kind != _LIST:
-        known = not count and not cursor.left
-        return AvailableValues(code, (), kind) if known else OtherRecord(EosEvent.AVAILABLE_LIST_CHANGED, body)
+    code, list_kind, count = cursor.u32("property"), cursor.u32("kind of list"), cursor.u32("count")
+    cursor.name = f"{cursor.name} for {describe(Property, code)}"
+    if list_kind != _LIST:
+        is_empty = not count and not cursor.remaining
+        return AvailableValues(code, (), list_kind) if is_empty else OtherRecord(EosEvent.AVAILABLE_LIST_CHANGED, body)
     if code in IMAGE_FORMAT_PROPERTIES:
-        # A format takes at least four bytes, so that the bytes left bound the loop whatever the count says.
+        # A format has at least four bytes, so the remaining bytes limit the loop for any count.
         record = AvailableFormats(code, tuple(ImageFormat.read(cursor) for _ in range(count)))
     else:
         record = AvailableValues(code, cursor.integers(count, 4, "values"))
-    return OtherRecord(EosEvent.AVAILABLE_LIST_CHANGED, body) if cursor.left else record
+    return OtherRecord(EosEvent.AVAILABLE_LIST_CHANGED, body) if cursor.remaining else record
 
 
 def _decode_transfer_request(cursor: Cursor, kind: int) -> TransferRequest:
-    size_length, extras = _TRANSFER_REQUESTS[kind]
+    size_length, extra_count = _TRANSFER_REQUESTS[kind]
     handle, object_format, reserved = cursor.u32("handle"), cursor.u32("format"), cursor.u32("reserved")
     size = cursor.integer(size_length, "size")
-    extra = cursor.integers(extras, 4, "the numbers before the name")
+    extra = cursor.integers(extra_count, 4, "the numbers before the name")
     octets = cursor.rest()
     name = text_of(octets)
     if len(octets) == len(name):
@@ -501,27 +478,27 @@ def _encode_record(record: Record) -> tuple[int, bytes]:
     match record:
         case PropertyChanged(code, value):
             return EosEvent.PROPERTY_CHANGED, encode_integer(code, 4) + bytes(value)
-        case AvailableValues(code, values, kind):
-            head = encode_integer(code, 4) + encode_integer(kind, 4)
-            return EosEvent.AVAILABLE_LIST_CHANGED, head + encode_array(values, 4)
-        case AvailableFormats(code, formats, kind):
-            numbers = b"".join(encode_integer(number, 4) for number in (code, kind, len(formats)))
+        case AvailableValues(code, values, record_type):
+            header = encode_integer(code, 4) + encode_integer(record_type, 4)
+            return EosEvent.AVAILABLE_LIST_CHANGED, header + encode_array(values, 4)
+        case AvailableFormats(code, formats, record_type):
+            numbers = b"".join(encode_integer(number, 4) for number in (code, record_type, len(formats)))
             return EosEvent.AVAILABLE_LIST_CHANGED, numbers + b"".join(item.encode() for item in formats)
-        case ObjectEvent(kind, entry):
-            return kind, entry.encode(_OBJECT_EVENTS[kind])
+        case ObjectEvent(record_type, entry):
+            return record_type, entry.encode(_OBJECT_EVENTS[record_type])
         case TransferRequest():
             return record.type, _encode_transfer_request(record)
-        case Notice(kind, number, rest):
-            return kind, encode_integer(number, 4) + rest
-        case OtherRecord(kind, body):
-            return kind, body
+        case Notice(record_type, number, rest):
+            return record_type, encode_integer(number, 4) + rest
+        case OtherRecord(record_type, body):
+            return record_type, body
 
 
 def _encode_transfer_request(record: TransferRequest) -> bytes:
-    size_length, extras = _TRANSFER_REQUESTS[record.type]
-    extra = record.extra or (0,) * extras
-    if len(extra) != extras:
-        raise ValueError(f"{len(extra)} extra numbers; a record of type 0x{record.type:04x} has {extras}")
+    size_length, extra_count = _TRANSFER_REQUESTS[record.type]
+    extra = record.extra or (0,) * extra_count
+    if len(extra) != extra_count:
+        raise ValueError(f"{len(extra)} extra numbers; expected {extra_count} in a record of type 0x{record.type:04x}")
     return b"".join(
         (
             *(encode_integer(number, 4) for number in (record.handle, record.format, record.reserved)),
@@ -532,13 +509,13 @@ def _encode_transfer_request(record: TransferRequest) -> bytes:
     )
 
 
-# How far, of one, a wanted value may lie from a nominal one; neighbouring nominal values are 5 % apart or more.
+# Accepted relative deviation from a nominal value; neighbouring nominal values differ by 5 % or more.
 TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
 class DialPosition:
-    """One position of a dial: the camera's code, its label, and the nominal value (s, f-number or ISO)."""
+    """One position of a dial: code, label, and nominal value (s, f-number or ISO)."""
 
     code: int
     label: str
@@ -554,63 +531,63 @@ class Scale:
     specials: dict[int, str]
 
     def label(self, code: int) -> str:
-        """Return what the camera shows for `code`; the code itself where it is in no table."""
+        """Return the label of a code on the camera; "code 0x…" if it is unknown."""
         if code in self.specials:
             return self.specials[code]
         step = self._step(code)
         return f"code 0x{code:02x}" if step is None else step.label
 
     def value(self, code: int) -> float:
-        """Return the nominal value of a code that a camera reports."""
+        """Return the nominal value of a reported code."""
         step = self._step(code)
         if step is None:
             raise ProtocolError(
-                f"the camera reports {self.name} {self.label(code)} (0x{code:02x}), which is no fixed value; "
+                f"the camera reports {self.name} {self.label(code)} (0x{code:02x}), a fixed value is required; "
                 "turn its mode dial to M and set a value"
             )
         return step.value
 
-    def code(self, wanted: float | str, available: Iterable[int] | None = None) -> int:
-        """Return the code of a nominal value or label, one of `available` where a camera's list is given.
+    def code(self, setting: float | str, available: Iterable[int] | None = None) -> int:
+        """Return the code of a nominal value or label; one of `available` if it is not None.
 
-        `wanted`: seconds, f-number or ISO speed; or text as on the dial: ``1/60``, ``0.5``, ``30``, ``auto``, ``bulb``.
+        `setting` is a number (seconds, f-number or ISO speed), or a text as on the dial: ``1/60``, ``30``, ``auto``,
+        ``bulb``.
         """
-        offered = None if available is None else tuple(available)
+        codes = None if available is None else tuple(available)
         for code, label in self.specials.items():
-            if isinstance(wanted, str) and wanted.strip().lower() == label and (offered is None or code in offered):
+            if isinstance(setting, str) and setting.strip().lower() == label and (codes is None or code in codes):
                 return code
-        number = _number(wanted)
-        steps = [step for step in self.steps if offered is None or step.code in offered]
-        fitting = [step for step in steps if number is not None and _near(number, step.value)]
-        if not fitting:
-            raise self._absent(wanted, number, steps)
+        number = _parse_number(setting)
+        steps = [step for step in self.steps if codes is None or step.code in codes]
+        matches = [step for step in steps if number is not None and _is_close(number, step.value)]
+        if not matches:
+            raise self._not_offered_error(setting, number, steps)
         # Third stops before half stops (code ≡ 4 mod 8), then the nearer nominal value, then the lower code.
-        best = min(fitting, key=lambda step: (step.code % 8 == 4, abs(step.value / (number or 1) - 1), step.code))
+        best = min(matches, key=lambda step: (step.code % 8 == 4, abs(step.value / (number or 1) - 1), step.code))
         return best.code
 
     def _step(self, code: int) -> DialPosition | None:
         return next((step for step in self.steps if step.code == code), None)
 
-    def _absent(self, wanted: float | str, number: float | None, steps: list[DialPosition]) -> InputError:
-        near = steps if number is None else sorted(steps, key=lambda step: abs(math.log2(step.value / number)))[:4]
-        offers = ", ".join(dict.fromkeys(step.label for step in sorted(near, key=lambda step: step.code)))
-        return InputError(f"{self.name} {wanted} is not offered; near it: {offers or 'nothing, the list is empty'}")
+    def _not_offered_error(self, setting: float | str, number: float | None, steps: list[DialPosition]) -> InputError:
+        nearest = steps if number is None else sorted(steps, key=lambda step: abs(math.log2(step.value / number)))[:4]
+        labels = ", ".join(dict.fromkeys(step.label for step in sorted(nearest, key=lambda step: step.code)))
+        return InputError(f"{self.name} {setting} is not offered; nearest: {labels or 'none, the list is empty'}")
 
 
-def _number(wanted: float | str) -> float | None:
-    """Return the positive number that `wanted` is or spells, or None."""
-    if isinstance(wanted, str):
-        over, slash, under = wanted.strip().lower().removesuffix("s").removeprefix("f/").partition("/")
+def _parse_number(setting: float | str) -> float | None:
+    if isinstance(setting, str):
+        dividend, slash, divisor = setting.strip().lower().removesuffix("s").removeprefix("f/").partition("/")
         try:
-            number = float(over) / float(under) if slash else float(over)
+            number = float(dividend) / float(divisor) if slash else float(dividend)
         except (ValueError, ZeroDivisionError):
             return None
     else:
-        number = float(wanted)
+        number = float(setting)
     return number if 0 < number < math.inf else None
 
 
-def _near(number: float, nominal: float) -> bool:
+def _is_close(number: float, nominal: float) -> bool:
     return abs(number / nominal - 1) <= TOLERANCE
 
 
@@ -618,14 +595,14 @@ def _scale(name: str, table: str, specials: dict[int, str]) -> Scale:
     steps: list[DialPosition] = []
     for entry in table.split():
         code, label = entry.split("=")
-        value = _number(label)
+        value = _parse_number(label)
         assert value is not None
         steps.append(DialPosition(int(code, 16), label, value))
     return Scale(name, tuple(sorted(steps, key=lambda step: step.code)), specials)
 
 
-# Shutter time in seconds (property 0xd102); beyond 1/8000 s of electronic shutters, as Canon's EDSDK names them up to
-# 1/32000 s. The last three follow the law of eighths of a stop, and 1/64000 s is the shortest that an EOS R3 offers.
+# Shutter time in seconds (property 0xd102). Names of electronic shutter times up to 1/32000 s from Canon's EDSDK; the
+# last three are continued in eighths of a stop, to 1/64000 s of the EOS R3.
 SHUTTER = _scale(
     "shutter time",
     """
@@ -640,7 +617,7 @@ SHUTTER = _scale(
     {0x00: "auto", 0x0C: "bulb", 0x04: "bulb"},
 )
 
-# Aperture as f-number (property 0xd101); 0 also where the lens has no contacts.
+# Aperture as f-number (property 0xd101); also 0 for a lens without contacts.
 APERTURE = _scale(
     "aperture",
     """
@@ -663,29 +640,29 @@ ISO = _scale(
     {0x00: "auto", 0x01: "auto"},
 )
 
-MIRROR_LOCKUP_FUNCTION = 0x060F  # Number of mirror lockup among the custom functions, on bodies that have it there
+MIRROR_LOCKUP_FUNCTION = 0x060F  # Custom function of mirror lockup, on bodies that have it
 
-MAX_PROPERTIES = 1024  # Properties that are remembered; a real body reports 80 to 300
-# Bytes of a property's value that are remembered; the longest known, of focus points, has some 5000.
+MAX_PROPERTIES = 1024  # Most stored properties; real bodies report 80 to 300
+# Longest stored property value, bytes; the longest known value, of focus points, has about 5000.
 MAX_VALUE = 1 << 14
-# Values of a property's list that are remembered; the longest known, of image formats, has 31 and of Kelvin 76.
+# Longest stored list of values; known lists have up to 31 (image formats) and 76 (colour temperatures).
 MAX_LIST = 1024
-_MAX_WAITING = 64  # Objects that are remembered; more than a body's memory holds
+_MAX_PENDING = 64  # Most stored objects; more than a body's memory can hold
 _NOT_RAW = (ObjectFormat.EXIF_JPEG, ObjectFormat.JFIF, ObjectFormat.MOV, ObjectFormat.MOV2)
 _NOT_RAW_SUFFIXES = (".jpg", ".jpeg", ".hif", ".mov", ".mp4")
 _SILENT_OR_PLAIN = (DriveMode.SINGLE, DriveMode.SINGLE_SILENT)
-_BATTERY_LOW = 0  # Of EOS_BATTERY_POWER: 0 is low, as libgphoto2 reads it
-# Of EOS_BATTERY_POWER, as libgphoto2 reads it; other numbers are not known.
+_BATTERY_LOW = 0  # EOS_BATTERY_POWER of a low battery (libgphoto2)
+# Charge for each EOS_BATTERY_POWER (libgphoto2); other numbers are unknown.
 _BATTERY_LEVELS = {_BATTERY_LOW: 0.0, 5: 0.25, 1: 0.5, 4: 0.75, 2: 1.0}
-# Of EOS_BATTERY_POWER: mains power, as Canon's EDSDK has it of the same state; not seen on the wire.
+# EOS_BATTERY_POWER on mains power, from Canon's EDSDK; never recorded from a device.
 _BATTERY_MAINS = 0xFFFFFFFF
 
-_Kept = TypeVar("_Kept")
+_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True)
-class WaitingObject:
-    """An object that the body wants fetched; `size` in bytes as announced, and not to be trusted."""
+class PendingObject:
+    """An object in the camera's memory; `size` in bytes as announced, not verified."""
 
     handle: int
     format: int
@@ -694,19 +671,19 @@ class WaitingObject:
 
     @property
     def is_raw(self) -> bool:
-        """Whether it is the frame itself rather than the picture or film beside it."""
+        """True for the raw frame, false for an image or film recorded with it."""
         return self.format not in _NOT_RAW and not self.name.lower().endswith(_NOT_RAW_SUFFIXES)
 
 
 @dataclass
 class EosState:
-    """The properties of a body, what they can be set to, and the objects that wait in its memory.
+    """Properties of a body, their permitted values, and the objects in its memory.
 
-    - `values`: the value of each property reported so far.
-    - `lists`, `formats`: what a property can be set to now.
-    - `functions`: the custom functions: number to first value.
-    - `busy`: whether the body reported that it is exposing or writing.
-    - `waiting`: by handle, in the order of their announcement.
+    - `values`: last reported value of each property.
+    - `lists`, `formats`: permitted values of each property.
+    - `functions`: custom functions, number to first value.
+    - `busy`: the body reported that it exposes or writes.
+    - `pending`: objects by handle, in the order of their announcement.
     """
 
     values: dict[int, bytes] = field(default_factory=dict[int, bytes])
@@ -714,228 +691,225 @@ class EosState:
     formats: dict[int, tuple[ImageFormat, ...]] = field(default_factory=dict[int, tuple[ImageFormat, ...]])
     functions: dict[int, int] = field(default_factory=dict[int, int])
     busy: bool = False
-    waiting: dict[int, WaitingObject] = field(default_factory=dict[int, WaitingObject])
+    pending: dict[int, PendingObject] = field(default_factory=dict[int, PendingObject])
 
-    def take(self, records: Iterable[Record]) -> None:
-        """Update the state from the records of one answer."""
+    def update(self, records: Iterable[Record]) -> None:
+        """Update the state from the records of one reply."""
         for record in records:
             match record:
                 case PropertyChanged(Property.EOS_CUSTOM_FUNCTIONS, value):
-                    for number, first in custom_functions(value[:MAX_VALUE]).items():
-                        _remember(self.functions, number, first)
+                    for number, first_value in custom_functions(value[:MAX_VALUE]).items():
+                        _store(self.functions, number, first_value)
                 case PropertyChanged(code, value):
                     if len(value) <= MAX_VALUE:
-                        _remember(self.values, code, value)
+                        _store(self.values, code, value)
                 case AvailableValues(code, values):
                     if len(values) <= MAX_LIST:
-                        _remember(self.lists, code, values)
+                        _store(self.lists, code, values)
                 case AvailableFormats(code, formats):
                     if len(formats) <= MAX_LIST:
-                        _remember(self.formats, code, formats)
+                        _store(self.formats, code, formats)
                 case TransferRequest():
-                    self._announce(WaitingObject(record.handle, record.format, record.size, record.name))
+                    self._add_pending(PendingObject(record.handle, record.format, record.size, record.name))
                 case ObjectEvent(EosEvent.OBJECT_ADDED | EosEvent.OBJECT_ADDED_64, entry):
                     if entry.format != ObjectFormat.ASSOCIATION:
-                        self._announce(WaitingObject(entry.handle, entry.format, entry.size, entry.name))
+                        self._add_pending(PendingObject(entry.handle, entry.format, entry.size, entry.name))
                 case Notice(EosEvent.OBJECT_REMOVED, handle):
-                    self.waiting.pop(handle, None)
+                    self.pending.pop(handle, None)
                 case Notice(EosEvent.CAMERA_STATUS_CHANGED, status):
                     self.busy = status == CameraStatus.BUSY
 
     def number(self, code: int) -> int | None:
-        """Return the value of a property that is a number, None where it was not reported."""
+        """Return the value of a numeric property; None if it was not reported."""
         value = self.values.get(code)
         return number_of(value) if value is not None and len(value) >= 4 else None
 
     def text(self, code: int) -> str:
-        """Return the value of a property that is text, empty where it was not reported."""
+        """Return the value of a text property; empty if it was not reported."""
         return text_of(self.values.get(code, b""))
 
-    def holds(self, code: int, value: bytes) -> bool:
+    def has_value(self, code: int, value: bytes) -> bool:
         """Return whether a property has this value now."""
-        # Some bodies send more bytes than they take.
+        # Some bodies report more bytes than they accept.
         return code in self.values and self.values[code][: len(value)] == value
 
-    def _announce(self, waiting: WaitingObject) -> None:
-        # An object announced twice keeps its place; of too many the oldest are forgotten.
-        self.waiting[waiting.handle] = waiting
-        while len(self.waiting) > _MAX_WAITING:
-            del self.waiting[next(iter(self.waiting))]
+    def _add_pending(self, pending: PendingObject) -> None:
+        # An object announced twice keeps its position; if there are too many, the oldest are dropped.
+        self.pending[pending.handle] = pending
+        while len(self.pending) > _MAX_PENDING:
+            del self.pending[next(iter(self.pending))]
 
 
 def battery_level(state: EosState) -> float | None:
-    """Return the charge that a body reports, 0 … 1 in quarters; None where it does not, or runs on mains power."""
+    """Return the charge, 0 to 1 in quarters; None if it is not reported, or on mains power."""
     power = state.number(Property.EOS_BATTERY_POWER)
     return None if power is None else _BATTERY_LEVELS.get(power)
 
 
-def _remember(kept: dict[int, _Kept], code: int, value: _Kept) -> None:
-    if code in kept or len(kept) < MAX_PROPERTIES:
-        kept[code] = value
+def _store(store: dict[int, _Value], code: int, value: _Value) -> None:
+    if code in store or len(store) < MAX_PROPERTIES:
+        store[code] = value
 
 
 def custom_functions(value: bytes) -> dict[int, int]:
     """Return the custom functions in a value of property 0xd1a0: number to first value.
 
-    A value holds one group: its length, 1, the group's number, the length of the rest, the count of functions, then
-    for each its number, the count of its values, and those; 32 bits each. What does not fit that is left out.
+    A value holds one group, in fields of 32 bits: its length, 1, the group number, the length of the rest, and the
+    count of functions. Then follow for each function its number, the count of its values, and the values. A malformed
+    rest is ignored.
     """
     cursor = Cursor(value, "custom functions")
     functions: dict[int, int] = {}
     try:
-        cursor.integers(4, 4, "the head")
+        cursor.integers(4, 4, "the header")
         for _ in range(cursor.u32("the count of functions")):
             number = cursor.u32("the number of a function")
-            first, *_ = cursor.array(4, "the values of a function") or (0,)
-            functions[number] = first
+            first_value, *_ = cursor.array(4, "the values of a function") or (0,)
+            functions[number] = first_value
     except ProtocolError:
         pass
     return functions
 
 
-def problems(state: EosState) -> list[str]:
-    """Return everything about a body's own settings that would spoil a series, each with its remedy."""
-    found: list[str] = []
+def find_setting_faults(state: EosState) -> list[str]:
+    """Return all settings of a body that would spoil a series, each with its remedy."""
+    faults: list[str] = []
     mode, focus, drive = (
         state.number(code) for code in (Property.EOS_AE_MODE, Property.EOS_FOCUS_MODE, Property.EOS_DRIVE_MODE)
     )
     if mode is not None and mode != AeMode.MANUAL:
-        found.append(f"the mode dial stands at {_named(AeMode, mode)}: turn it to M")
+        faults.append(f"the mode dial is set to {_code_name(AeMode, mode)}: turn it to M")
     if focus is not None and focus != FocusMode.MANUAL:
-        found.append("autofocus is on: set the lens to MF and focus by hand")
+        faults.append("autofocus is on: set the lens to MF and focus by hand")
     if drive is not None and drive not in _SILENT_OR_PLAIN:
-        found.append(f"the drive mode is {_named(DriveMode, drive)}: set single shooting")
+        faults.append(f"the drive mode is {_code_name(DriveMode, drive)}: set single shooting")
     if state.number(Property.EOS_MIRROR_UP_SETTING) or state.functions.get(MIRROR_LOCKUP_FUNCTION) == 1:
-        found.append("mirror lockup is on: switch it off")
+        faults.append("mirror lockup is on: switch it off")
     if state.number(Property.EOS_AEB) or state.number(Property.EOS_BRACKET_MODE):
-        found.append("exposure bracketing is on: switch it off")
+        faults.append("exposure bracketing is on: switch it off")
     if state.number(Property.EOS_HDR_SETTING):
-        found.append("HDR mode is on: switch it off")
-    off_after = state.number(Property.EOS_AUTO_POWER_OFF)
-    if off_after:
-        found.append(f"auto power off is set to {off_after} s: set it to off")
+        faults.append("HDR mode is on: switch it off")
+    power_off_s = state.number(Property.EOS_AUTO_POWER_OFF)
+    if power_off_s:
+        faults.append(f"auto power off is set to {power_off_s} s: set it to off")
     if state.number(Property.EOS_BATTERY_POWER) == _BATTERY_LOW:
-        found.append("the battery is low: charge it, or use mains power")
-    return found
+        faults.append("the battery is low: charge it, or use mains power")
+    return faults
 
 
-def plan(state: EosState, settings: ExposureSettings) -> dict[int, bytes]:
-    """Return which property gets which value for a series of raw frames, in the order of setting."""
-    refused = problems(state)
-    wanted: dict[int, bytes] = {}
+def plan_settings(state: EosState, settings: ExposureSettings) -> dict[int, bytes]:
+    """Return the property values for a series of raw frames, in the order of setting."""
+    faults = find_setting_faults(state)
+    values: dict[int, bytes] = {}
     try:
-        wanted[Property.EOS_IMAGE_FORMAT] = _raw_format(state).encode()
+        values[Property.EOS_IMAGE_FORMAT] = _raw_format(state).encode()
     except InputError as error:
-        refused.append(str(error))
+        faults.append(str(error))
     for code, scale, value in (
         (Property.EOS_ISO_SPEED, ISO, settings.iso),
         (Property.EOS_APERTURE, APERTURE, settings.aperture),
         (Property.EOS_SHUTTER_SPEED, SHUTTER, settings.shutter_s),
     ):
-        offered = _offered(state, code, scale)
+        offered_codes = _offered_codes(state, code, scale)
         if value is None:
-            if offered:
-                refused.append(f"the lens has apertures, {scale.label(offered[0])} among them: name one as f-number")
-        elif scale is APERTURE and not offered:
-            refused.append(
-                f'aperture {value:g} cannot be set, for the lens tells of none: set aperture = "none" for it'
-            )
+            if offered_codes:
+                faults.append(f"the lens offers apertures, e.g. {scale.label(offered_codes[0])}: set one as f-number")
+        elif scale is APERTURE and not offered_codes:
+            faults.append(f'aperture {value:g} cannot be set, because the lens reports none: set aperture = "none"')
         else:
             try:
-                wanted[code] = number_value(scale.code(value, offered))
+                values[code] = number_value(scale.code(value, offered_codes))
             except InputError as error:
-                refused.append(str(error))
-    if refused:
-        raise DeviceRefused(f"the camera cannot take the series: {'; '.join(refused)}")
+                faults.append(str(error))
+    if faults:
+        raise DeviceRefused(f"the camera cannot take the series: {'; '.join(faults)}")
     if WhiteBalance.DAYLIGHT in state.lists.get(Property.EOS_WHITE_BALANCE, ()):
-        # Raw values do not depend on it; a fixed one keeps what converters show the same through the series.
-        wanted[Property.EOS_WHITE_BALANCE] = number_value(WhiteBalance.DAYLIGHT)
-    return wanted
+        # Raw values do not depend on it; a fixed value gives previews of the series the same colours.
+        values[Property.EOS_WHITE_BALANCE] = number_value(WhiteBalance.DAYLIGHT)
+    return values
 
 
 def shutter_speeds(state: EosState) -> tuple[float, ...]:
-    """Return the nominal shutter times that a body lists, seconds, rising; bulb and codes in no table are left out."""
+    """Return the nominal shutter times that a body lists, seconds, rising; without bulb and unknown codes."""
     values = {step.code: step.value for step in SHUTTER.steps}
     return tuple(sorted({values[code] for code in state.lists.get(Property.EOS_SHUTTER_SPEED, ()) if code in values}))
 
 
 def host_destination(state: EosState) -> bytes:
-    """Return the value of property 0xd11c that sends frames to the host; a body that lists none is given it to try."""
+    """Return the value of property 0xd11c for frames sent to the host; also if the body lists no values."""
     offered = state.lists.get(Property.EOS_CAPTURE_DESTINATION, ())
-    known = (*offered, state.number(Property.EOS_CAPTURE_DESTINATION))
-    if offered and CaptureDestination.HOST not in known:
-        listed = ", ".join(str(value) for value in offered)
+    values = (*offered, state.number(Property.EOS_CAPTURE_DESTINATION))
+    if offered and CaptureDestination.HOST not in values:
+        offered_text = ", ".join(str(number) for number in offered)
         raise DeviceRefused(
-            f"the camera offers the capture destinations {listed}, but not {CaptureDestination.HOST.value}, the host; "
-            "such a body cannot be tethered here"
+            f"the camera offers capture destinations {offered_text}, required: {CaptureDestination.HOST.value} (host); "
+            "use another camera"
         )
     return number_value(CaptureDestination.HOST)
 
 
 def _raw_format(state: EosState) -> ImageFormat:
     offered = state.formats.get(Property.EOS_IMAGE_FORMAT, ())
-    if RAW_ONLY not in offered and not state.holds(Property.EOS_IMAGE_FORMAT, RAW_ONLY.encode()):
+    if RAW_ONLY not in offered and not state.has_value(Property.EOS_IMAGE_FORMAT, RAW_ONLY.encode()):
         raws = ", ".join(str(item) for item in offered if any(file.is_raw for file in item.files))
-        raise InputError(f"image format {RAW_ONLY} alone is not offered; with raw are: {raws or 'none'}")
+        raise InputError(f"image format {RAW_ONLY} alone is not offered; formats with raw: {raws or 'none'}")
     return RAW_ONLY
 
 
-def _offered(state: EosState, code: int, scale: Scale) -> tuple[int, ...]:
-    """Return the codes that a body can be set to, or stands at where it lists nothing: then nothing can be set."""
+def _offered_codes(state: EosState, code: int, scale: Scale) -> tuple[int, ...]:
+    """Return the codes that a body accepts; without a list only its present code, because none can be set."""
     current = state.number(code)
-    standing = () if current is None or current in scale.specials else (current,)
-    return state.lists.get(code) or standing
+    current_codes = () if current is None or current in scale.specials else (current,)
+    return state.lists.get(code) or current_codes
 
 
-def _named(kind: type[AeMode] | type[DriveMode], value: int) -> str:
+def _code_name(code_type: type[AeMode] | type[DriveMode], value: int) -> str:
     try:
-        return kind(value).name.lower().replace("_", " ")
+        return code_type(value).name.lower().replace("_", " ")
     except ValueError:
         return f"0x{value:02x}"
 
 
-PIECE_BYTES = 1 << 20  # Asked for at once; pieces of 5 MiB have crashed newer bodies
-MAX_FRAME_BYTES = 256 << 20  # No raw file of an EOS body comes near it
-# GetEvent answers that one drain takes, at most: a few empty the queue, and some firmware repeats itself.
+PIECE_BYTES = 1 << 20  # Bytes of one request; 5 MiB have crashed newer bodies
+MAX_FRAME_BYTES = 256 << 20  # Largest accepted frame; raw files of EOS bodies stay far below
+# Most GetEvent requests of one drain. A few empty the queue, but some firmware repeats records without end.
 MAX_POLLS = 64
-KEEP_ALIVE_S = 10.0  # After this long a body is asked to stay awake, as libgphoto2 asks it
-SETTLE_LIMIT_S = 5.0  # How long a body may take to report a value that it was given, or room for a frame
-# How long a body may be busy after it was connected, or when it is to release, before it is refused: an EOS 2000D is
-# for seconds at either (gphoto2, issue 382).
+KEEP_ALIVE_S = 10.0  # Interval of KeepDeviceOn requests, as in libgphoto2
+SETTLE_LIMIT_S = 5.0  # Time for a body to report a new value, or space for a frame
+# Longest accepted busy time at connection and at a release, seconds; an EOS 2000D is busy for seconds at both
+# (gphoto2, issue 382).
 BUSY_LIMIT_S = 30.0
-# Presses in a row, spread over `PASSING_LIMIT_S`: what keeps a body busy ends by itself or by what is fetched
-# between.
+# Attempts of one release, spread over `TRANSIENT_LIMIT_S`: a busy state ends by itself, or when the events are read
+# between attempts.
 RELEASE_TRIES = 5
-# Wait for the answer to a release; some bodies expose before they answer. libgphoto2 waits as long.
+# Timeout of a release, as in libgphoto2; some bodies expose before they reply.
 CAPTURE_TIMEOUT_S = 100.0
 
-_REMOTE_ON, _REMOTE_OFF = 1, 0  # Parameter of SetRemoteMode, as the recorded conversations and libgphoto2 send it
-# Bodies to which libgphoto2 sends 0x15 or 0x11 as remote mode (`is_canon_eos_m` in its ptp-private.h), with live view
-# on before each frame: EOS M, but for the M6 Mark II, which is as the reflex bodies, and compact cameras. "Canon EOS
-# Kiss M" is the M50's name in Japan.
+_REMOTE_ON, _REMOTE_OFF = 1, 0  # Parameter of SetRemoteMode, as recorded and in libgphoto2
+# Bodies to which libgphoto2 sends 0x15 or 0x11 as remote mode, and live view before each frame (`is_canon_eos_m` in
+# its ptp-private.h): compact cameras and EOS M, except the M6 Mark II. "Canon EOS Kiss M" is the M50 in Japan.
 _OTHER_REMOTE_MODE = re.compile(r"Canon (?!EOS)|Canon EOS (Kiss )?M(?!6 Mark II\b)")
 _WITHOUT_AF = 1  # Second parameter of RemoteReleaseOn: a release without autofocus
-# Room announced to the body: so many clusters of so many bytes, 320 GiB, more than a session takes.
+# Disk space announced to the body, clusters and bytes per cluster: 320 GiB, more than a session needs.
 _HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
-# Pauses between questions to the body, seconds; short at first, for most answers come at once (as libgphoto2 waits).
+# Pauses between polls, seconds, as in libgphoto2; the first are short, because most replies come at once.
 _PAUSES_S = (0.05, 0.1, 0.15, 0.2)
-# Requests of one piece in all, with the longest pause between: a second for a fault that passes, then the frame is
-# retaken.
+# Requests of one piece, with the longest pause between them: 1 s for a transient fault, then the frame is repeated.
 _PIECE_TRIES = 5
-_FREE_TRIES = 3  # Few, as the next `make_ready` tries again
-# Operations that give a part of an object, the preferred one first.
-_IN_PIECES = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
-# Responses to an operation that a body has not got, whatever it lists.
-_NOT_GOT = (ResponseCode.OPERATION_NOT_SUPPORTED, ResponseCode.EOS_UNKNOWN_COMMAND)
-# Responses to a request for a piece that asking again does not change.
-_LASTING = (
-    *_NOT_GOT,
+_FREE_TRIES = 3  # Requests to free an object; the next `make_ready` repeats them
+# Operations that return a part of an object, the preferred one first.
+_PARTIAL_READS = (Operation.EOS_GET_PARTIAL_OBJECT, Operation.GET_PARTIAL_OBJECT)
+# Responses to an operation that a body lists but does not support.
+_UNSUPPORTED = (ResponseCode.OPERATION_NOT_SUPPORTED, ResponseCode.EOS_UNKNOWN_COMMAND)
+# Responses to a request for a piece for which a repetition is useless.
+_PERMANENT = (
+    *_UNSUPPORTED,
     ResponseCode.INVALID_OBJECT_HANDLE,
     ResponseCode.SESSION_NOT_OPEN,
     ResponseCode.DEVICE_BUSY,
 )
-# Responses to a question after something that a body has not got: a card, a property.
-_NOTHING_THERE = (
+# Responses to a request for a card or property that does not exist.
+_NOT_PRESENT = (
     ResponseCode.PARAMETER_NOT_SUPPORTED,
     ResponseCode.INVALID_STORAGE_ID,
     ResponseCode.DEVICE_PROP_NOT_SUPPORTED,
@@ -943,11 +917,11 @@ _NOTHING_THERE = (
     ResponseCode.STORE_NOT_AVAILABLE,
     ResponseCode.INVALID_PARAMETER,
 )
-_SLOT_FILLED = 0xFFFF  # Bits of a storage number that are 0 where there is no card in the slot (ISO 15740, 5.2.1)
-_MAX_CARDS = 8  # Cards that are asked for their room; bodies have one or two
-# What RemoteRelease answers as parameter; 0 is success.
+_SLOT_FILLED = 0xFFFF  # Bits of a storage number; 0 for an empty slot (ISO 15740, 5.2.1)
+_MAX_CARDS = 8  # Most cards to query; bodies have one or two
+# Parameter of the response to RemoteRelease; 0 is success.
 _RELEASE_RESULTS = {
-    1: "it finds no focus: set the lens to MF",
+    1: "the autofocus failed: set the lens to MF",
     3: "its mirror is up: switch mirror lockup off",
     7: "its card is full: empty it",
     8: "its card is read-only: unlock it",
@@ -955,117 +929,124 @@ _RELEASE_RESULTS = {
 
 
 class EosBody:
-    """An EOS body behind an open cable."""
+    """One connection to an EOS body.
+
+    - Every step was recorded from a host, or is sent by libgphoto2. Nothing is sent that the body does not list. If it
+      lists an operation but rejects it as unknown, the connection continues without that operation if possible.
+    - Counts and sizes are checked before memory is used; the limits are far above those of real bodies.
+    - A body keeps a frame in memory until TransferComplete, and refuses to release while the memory is full. Therefore
+      every announced object is fetched or discarded, and then freed.
+    """
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
         self._clock = clock
         self._session = PtpSession(transport, clock)
         self._info = DeviceInfo()
-        self._destination: bytes | None = None
+        self._user_destination: bytes | None = None
         self._unsupported: set[int] = set()
-        self._spoken_at = clock.monotonic()
+        self._last_keep_alive = clock.monotonic()
         self.state = EosState()
 
     @property
     def label(self) -> str:
-        """What messages call the body."""
+        """Name of the body in messages."""
         return self._session.label
 
     def identity(self) -> CameraIdentity:
-        """Return maker, model, serial number and firmware; the serial number is the engraved one where it is sent."""
+        """Return maker, model, serial number and firmware; the engraved serial number if it is reported."""
         serial = self.state.text(Property.EOS_SERIAL_NUMBER) or self._info.serial_number
         return CameraIdentity(self._info.manufacturer, self._info.model, serial, self._info.device_version)
 
     def connect(self) -> None:
-        """Open the session, take the body under remote control and learn its state."""
-        self._while_busy(self._session.open)
-        self._while_busy(self._take_control)
+        """Open the session, start remote control and read the state of the body."""
+        self._retry_while_busy(self._session.open)
+        self._retry_while_busy(self._start_remote_control)
 
-    def _take_control(self) -> None:
+    def _start_remote_control(self) -> None:
         _, data = self._session.call(Operation.GET_DEVICE_INFO)
         self._info = DeviceInfo.decode(data)
-        remote = (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_GET_EVENT)
-        if "canon" not in self._info.manufacturer.lower() or not all(map(self._offers, remote)):
+        required = (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_GET_EVENT)
+        if "canon" not in self._info.manufacturer.lower() or not all(map(self._offers, required)):
             raise DeviceRefused(
-                f"{self.label} is a {self._info.manufacturer} {self._info.model}, which does not speak as a Canon EOS "
-                "does; connect an EOS body, or take the frames otherwise and use `acquire import`"
+                f"{self.label} is a {self._info.manufacturer} {self._info.model}, a Canon EOS body was "
+                "expected; connect an EOS body, or take the frames otherwise and use `acquire import`"
             )
         if _OTHER_REMOTE_MODE.match(self._info.model):
             raise DeviceRefused(
-                f"{self.label} is a {self._info.model}; EOS M and compact bodies want another remote mode than 1, and "
-                'other steps to a frame, which are not known well enough here; set connection = "gphoto2" in '
-                "[lab.camera], or take the frames otherwise and use `acquire import`"
+                f"{self.label} is a {self._info.model}; EOS M and compact bodies require another remote mode, which "
+                'this driver lacks; set connection = "gphoto2" in [lab.camera], or take the frames otherwise and use '
+                "`acquire import`"
             )
         self._session.call(Operation.EOS_SET_REMOTE_MODE, _REMOTE_ON)
         self._session.call(Operation.EOS_SET_EVENT_MODE, _REMOTE_ON)
         self.drain()
-        # libgphoto2 asks again, too: newer bodies have nothing to tell when they are asked at once.
-        if not self._settled(lambda: bool(self.state.values)):
-            raise ProtocolError(f"{self.label} sends no state when asked for events; switch it off and on")
-        if self._requested(Property.EOS_SERIAL_NUMBER):
-            self._settled(lambda: Property.EOS_SERIAL_NUMBER in self.state.values)
-        self._receive_frames()
+        # As in libgphoto2: the first poll of newer bodies returns nothing.
+        if not self._poll_until(lambda: bool(self.state.values)):
+            raise ProtocolError(f"{self.label} sent no state within {SETTLE_LIMIT_S:g} s; switch it off and on")
+        if self._request_property(Property.EOS_SERIAL_NUMBER):
+            self._poll_until(lambda: Property.EOS_SERIAL_NUMBER in self.state.values)
+        self._send_frames_to_host()
 
     def supplies(self) -> Supplies:
-        """Return what is left of battery and card, as far as the body tells."""
+        """Return battery and card capacity, as far as the body reports them."""
         self.drain()
         level = self._battery_level()
-        # On mains power a battery is reported, too: anything else is not known.
+        # A battery is also reported on mains power, so other values mean unknown, not false.
         mains = True if self.state.number(Property.EOS_BATTERY_POWER) == _BATTERY_MAINS else None
-        saves_to_host = self.state.holds(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.HOST))
+        saves_to_host = self.state.has_value(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.HOST))
         return Supplies(level, mains, self._card_free_bytes(), saves_to_host)
 
     def disconnect(self) -> None:
-        """Give the body back as it was found; a fault of the cable goes to the caller."""
-        self.free_waiting()
-        if self._destination is not None:
+        """Restore the initial state of the body and close the session; link faults are raised."""
+        self.free_pending()
+        if self._user_destination is not None:
             with contextlib.suppress(OperationDeclined):
-                self._send(Property.EOS_CAPTURE_DESTINATION, self._destination)
+                self._send_property(Property.EOS_CAPTURE_DESTINATION, self._user_destination)
         for operation in (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_SET_EVENT_MODE):
             with contextlib.suppress(OperationDeclined):
                 self._session.call(operation, _REMOTE_OFF, timeout=START_TIMEOUT_S, retry_s=1.0)
         self._session.close()
 
     def poll(self) -> bool:
-        """Ask once what is new; return whether anything was."""
+        """Read new events once; return whether there were any."""
         with contextlib.suppress(ProtocolError):
-            self._session.events()  # hints that asking would be worth while, which it is anyway
+            self._session.events()  # only hints at new records, which are requested in any case
         _, data = self._session.call(Operation.EOS_GET_EVENT)
         records = decode_events(data)
-        self.state.take(records)
+        self.state.update(records)
         self._keep_awake()
         return bool(records)
 
     def drain(self) -> None:
-        """Ask until there is nothing new."""
+        """Poll until there are no new events."""
         for _ in range(MAX_POLLS):
             if not self.poll():
                 return
 
     def set(self, code: int, value: bytes) -> None:
-        """Set a property, and see that the body reports it."""
-        if self.state.holds(code, value):
+        """Set a property, and wait until the body reports the new value."""
+        if self.state.has_value(code, value):
             return
-        self._send(code, value)
-        self._verify(code, value)
+        self._send_property(code, value)
+        self._verify_property(code, value)
 
     def make_ready(self) -> None:
         """Empty the event queue and the memory, and wait until the body can take a frame."""
         self.drain()
-        self.free_waiting()
-        # A body whose "idle" was lost would seem busy for ever; its answer shows whether it takes the release.
-        self._settled(lambda: not self.state.busy)
-        self.free_waiting()
-        if not self._settled(lambda: self.state.number(Property.EOS_AVAILABLE_SHOTS) != 0):
-            raise DeviceRefused(f"{self.label} has no room for a frame; switch it off and on to empty its memory")
+        self.free_pending()
+        # The result is ignored, because the record "idle" may be lost; the release then fails if the body is busy.
+        self._poll_until(lambda: not self.state.busy)
+        self.free_pending()
+        if not self._poll_until(lambda: self.state.number(Property.EOS_AVAILABLE_SHOTS) != 0):
+            raise DeviceRefused(f"{self.label} has no memory for a frame; switch it off and on to empty its memory")
 
     def release(self) -> None:
-        """Press the release down and let it go, without autofocus."""
+        """Press and release the shutter button, without autofocus."""
         if self._offers(Operation.EOS_REMOTE_RELEASE_ON):
             try:
-                self._while_busy(self._press)
+                self._retry_while_busy(self._press_button)
             except OperationDeclined as error:
-                if not self._lacks(Operation.EOS_REMOTE_RELEASE_ON, error):
+                if not self._mark_unsupported(Operation.EOS_REMOTE_RELEASE_ON, error):
                     raise
             else:
                 return
@@ -1075,8 +1056,8 @@ class EosBody:
             reason = _RELEASE_RESULTS.get(result, f"result 0x{result:x}")
             raise DeviceRefused(f"{self.label} does not release: {reason}")
 
-    def _press(self) -> None:
-        for left in reversed(range(RELEASE_TRIES)):
+    def _press_button(self) -> None:
+        for remaining_tries in reversed(range(RELEASE_TRIES)):
             try:
                 self._session.call(
                     Operation.EOS_REMOTE_RELEASE_ON,
@@ -1087,139 +1068,140 @@ class EosBody:
                 )
                 break
             except OperationDeclined as error:
-                # What keeps a body busy here is a release still held down, or events that nobody fetched.
-                self._let_go()
+                # A body is busy here if its button is still pressed, or if events wait to be read.
+                self._release_button()
                 self.drain()
                 if error.code != ResponseCode.DEVICE_BUSY:
                     raise
-                if not left:
+                if not remaining_tries:
                     raise OperationDeclined(
-                        f"{error}; look for mirror lockup, a timer or a menu on its display", error.code
+                        f"{error}; check mirror lockup, timer, and an open menu on its display", error.code
                     ) from error
-                self._clock.sleep(PASSING_LIMIT_S / RELEASE_TRIES)
-        self._let_go()
+                self._clock.sleep(TRANSIENT_LIMIT_S / RELEASE_TRIES)
+        self._release_button()
 
-    def await_object(self, not_before: float, until: float, wanted: Callable[[WaitingObject], bool]) -> WaitingObject:
-        """Return the newest object that waits and is wanted."""
+    def wait_for_object(self, not_before: float, until: float, fits: Callable[[PendingObject], bool]) -> PendingObject:
+        """Return the newest pending object for which `fits` is true; objects before `not_before` are discarded."""
         pauses = iter(_PAUSES_S)
         while True:
             if self.poll():
                 pauses = iter(_PAUSES_S)
             if self._clock.monotonic() < not_before:
-                self.free_waiting()
-            # Of two the later one belongs to this release: the other's announcement was late.
-            for candidate in reversed(list(self.state.waiting.values())):
-                if wanted(candidate):
+                self.free_pending()
+            # If there are two, the later one belongs to this release; the other was announced late.
+            for candidate in reversed(list(self.state.pending.values())):
+                if fits(candidate):
                     return candidate
             if self._clock.monotonic() >= until:
-                raise LinkTimeout(f"{self.label} has announced no frame in time")
+                raise LinkTimeout(f"{self.label} announced no frame in time")
             self._clock.sleep(next(pauses, _PAUSES_S[-1]))
 
-    def fetch(self, waiting: WaitingObject, into: BinaryIO, offset: int = 0) -> None:
-        """Append an object's bytes from `offset` on to `into`, piece by piece."""
-        if not 0 < waiting.size <= MAX_FRAME_BYTES:
+    def fetch(self, pending: PendingObject, into: BinaryIO, offset: int = 0) -> None:
+        """Append the bytes of an object from `offset` on to `into`, piece by piece."""
+        if not 0 < pending.size <= MAX_FRAME_BYTES:
             raise DeviceError(
-                f"{self.label} announces {waiting.name!r} of {waiting.size} bytes; 1 to {MAX_FRAME_BYTES} were expected"
+                f"{self.label} announces {pending.name!r} of {pending.size} bytes; 1 to {MAX_FRAME_BYTES} expected"
             )
-        while offset < waiting.size:
-            operation = next((known for known in _IN_PIECES if self._offers(known)), None)
+        while offset < pending.size:
+            operation = next((candidate for candidate in _PARTIAL_READS if self._offers(candidate)), None)
             if operation is None:
-                self._fetch_whole(waiting, into, offset)
+                self._fetch_whole(pending, into, offset)
                 return
             try:
-                offset += into.write(self._piece(operation, waiting, offset))
+                offset += into.write(self._fetch_piece(operation, pending, offset))
             except OperationDeclined as error:
-                if not self._lacks(operation, error):
+                if not self._mark_unsupported(operation, error):
                     raise
             self._keep_awake()
 
-    def free(self, waiting: WaitingObject) -> None:
-        """Let the body forget an object; where it will not, the next `make_ready` tries again."""
-        for left in reversed(range(_FREE_TRIES)):
+    def free(self, pending: PendingObject) -> None:
+        """Remove an object from the body's memory; if this fails, the next `make_ready` repeats it."""
+        for remaining_tries in reversed(range(_FREE_TRIES)):
             try:
-                self._session.call(Operation.EOS_TRANSFER_COMPLETE, waiting.handle)
+                self._session.call(Operation.EOS_TRANSFER_COMPLETE, pending.handle)
             except OperationDeclined as error:
-                # What has gone is as well, and where nothing can be freed the body frees it by itself.
-                gone = error.code == ResponseCode.INVALID_OBJECT_HANDLE
-                if not gone and not self._lacks(Operation.EOS_TRANSFER_COMPLETE, error):
-                    if left:
+                # A missing object is already free; a body without this operation frees objects automatically.
+                is_freed = error.code == ResponseCode.INVALID_OBJECT_HANDLE
+                if not is_freed and not self._mark_unsupported(Operation.EOS_TRANSFER_COMPLETE, error):
+                    if remaining_tries:
                         self._clock.sleep(_PAUSES_S[-1])
                     continue
-            self.state.waiting.pop(waiting.handle, None)
+            self.state.pending.pop(pending.handle, None)
             return
 
-    def free_waiting(self) -> None:
-        """Let the body forget every object that waits."""
-        for waiting in list(self.state.waiting.values()):
-            self.free(waiting)
+    def free_pending(self) -> None:
+        """Remove all pending objects from the body's memory."""
+        for pending in list(self.state.pending.values()):
+            self.free(pending)
 
-    def _fetch_whole(self, waiting: WaitingObject, into: BinaryIO, offset: int) -> None:
-        """Append an object's bytes from `offset` on, from a body that gives no parts: those before come again."""
-        came = 0
+    def _fetch_whole(self, pending: PendingObject, into: BinaryIO, offset: int) -> None:
+        """Append an object from `offset` on; for bodies without partial reads, which send it from its start."""
+        received = 0
 
-        def take(piece: bytes) -> None:
-            nonlocal came
-            if came + len(piece) > waiting.size:
-                raise ProtocolError(f"{self.label} announced {waiting.size} bytes for {waiting.name!r} and gives more")
-            into.write(piece[max(offset - came, 0) :])
-            came += len(piece)
+        def append(piece: bytes) -> None:
+            nonlocal received
+            if received + len(piece) > pending.size:
+                raise ProtocolError(f"{self.label} announced {pending.size} bytes for {pending.name!r} and sends more")
+            into.write(piece[max(offset - received, 0) :])
+            received += len(piece)
 
-        self._session.call(Operation.GET_OBJECT, waiting.handle, receive=take)
-        if came < waiting.size:
-            raise self._cut(waiting, came)
+        self._session.call(Operation.GET_OBJECT, pending.handle, receive=append)
+        if received < pending.size:
+            raise self._truncated_error(pending, received)
 
-    def _piece(self, operation: Operation, waiting: WaitingObject, offset: int) -> bytes:
-        """Return the next bytes of an object; fewer than were asked for are good, for the rest follows."""
-        wanted = min(PIECE_BYTES, waiting.size - offset)
-        for left in reversed(range(_PIECE_TRIES)):
+    def _fetch_piece(self, operation: Operation, pending: PendingObject, offset: int) -> bytes:
+        # Fewer bytes than requested are valid; the rest follows.
+        limit = min(PIECE_BYTES, pending.size - offset)
+        for remaining_tries in reversed(range(_PIECE_TRIES)):
             try:
-                sent, data = self._session.call(operation, waiting.handle, offset, wanted)
+                parameters, data = self._session.call(operation, pending.handle, offset, limit)
             except OperationDeclined as error:
-                if not left or error.code in _LASTING:
+                if not remaining_tries or error.code in _PERMANENT:
                     raise
             else:
-                if len(data) > wanted:
-                    raise ProtocolError(f"{self.label} gives {len(data)} bytes at {offset}; {wanted} were asked for")
-                # The standard's operation answers how many bytes were sent; what Canon's own answers is not known.
-                counted = sent[0] if sent and operation == Operation.GET_PARTIAL_OBJECT else len(data)
-                if data and counted == len(data):
+                if len(data) > limit:
+                    raise ProtocolError(f"{self.label} sent {len(data)} bytes at {offset}; at most {limit} expected")
+                # The standard's operation reports the number of sent bytes; the parameters of Canon's are unknown.
+                count = parameters[0] if parameters and operation == Operation.GET_PARTIAL_OBJECT else len(data)
+                if data and count == len(data):
                     return data
             self._clock.sleep(_PAUSES_S[-1])
-        raise self._cut(waiting, offset)
+        raise self._truncated_error(pending, offset)
 
-    def _cut(self, waiting: WaitingObject, came: int) -> DeviceError:
+    def _truncated_error(self, pending: PendingObject, received: int) -> DeviceError:
         return DeviceError(
-            f"{self.label} announced {waiting.size} bytes for {waiting.name!r}, but gives only {came}; "
-            "the frame is worthless and may be retaken"
+            f"{self.label} announced {pending.size} bytes for {pending.name!r}, sent only {received}; "
+            "the frame is invalid and may be repeated"
         )
 
-    def _receive_frames(self) -> None:
+    def _send_frames_to_host(self) -> None:
         host = host_destination(self.state)
-        # A body that a killed run left behind stands at the host already; its user wants the card again.
-        self._destination = number_value(CaptureDestination.CARD)
-        if not self.state.holds(Property.EOS_CAPTURE_DESTINATION, host):
-            self._destination = self.state.values.get(Property.EOS_CAPTURE_DESTINATION, self._destination)
-            self._send(Property.EOS_CAPTURE_DESTINATION, host)
-        self._optional(Operation.EOS_PC_HDD_CAPACITY, _HOST_CLUSTERS, _HOST_CLUSTER_BYTES, 1)
+        # After a killed run the body is still set to the host; restore the card for its user.
+        self._user_destination = number_value(CaptureDestination.CARD)
+        if not self.state.has_value(Property.EOS_CAPTURE_DESTINATION, host):
+            self._user_destination = self.state.values.get(Property.EOS_CAPTURE_DESTINATION, self._user_destination)
+            self._send_property(Property.EOS_CAPTURE_DESTINATION, host)
+        self._call_if_supported(Operation.EOS_PC_HDD_CAPACITY, _HOST_CLUSTERS, _HOST_CLUSTER_BYTES, 1)
         self.drain()
-        self._verify(Property.EOS_CAPTURE_DESTINATION, host)
+        self._verify_property(Property.EOS_CAPTURE_DESTINATION, host)
 
-    def _send(self, code: int, value: bytes) -> None:
+    def _send_property(self, code: int, value: bytes) -> None:
         self._session.call(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, send=PropertySetting(code, value).encode())
 
-    def _verify(self, code: int, value: bytes) -> None:
-        if self._settled(lambda: self.state.holds(code, value)):
+    def _verify_property(self, code: int, value: bytes) -> None:
+        if self._poll_until(lambda: self.state.has_value(code, value)):
             return
-        if self._requested(code) and self._settled(lambda: self.state.holds(code, value)):
+        if self._request_property(code) and self._poll_until(lambda: self.state.has_value(code, value)):
             return
-        came = self.state.values.get(code)
+        reported = self.state.values.get(code)
         raise DeviceRefused(
-            f"{self.label} was given {value.hex()} for property {describe(Property, code)} and reports "
-            f"{came.hex() if came is not None else 'nothing'}; set it by hand, or switch the camera off and on"
+            f"{self.label} reports {reported.hex() if reported is not None else 'nothing'} for property "
+            f"{describe(Property, code)}, {value.hex()} was set; set it by hand, or switch the camera off and on"
         )
 
-    def _while_busy(self, action: Callable[[], None]) -> None:
-        """Do something until the body is not busy, for a limited time: a new session would only begin its work anew."""
+    def _retry_while_busy(self, action: Callable[[], None]) -> None:
+        """Repeat `action` while the body is busy, for a limited time."""
+        # No new session here: the body would start its work again.
         end = self._clock.monotonic() + BUSY_LIMIT_S
         while True:
             try:
@@ -1228,14 +1210,13 @@ class EosBody:
                 if error.code != ResponseCode.DEVICE_BUSY:
                     raise
                 if self._clock.monotonic() >= end:
-                    raise DeviceRefused(f"{error}; it has been so for {BUSY_LIMIT_S:g} s") from error
+                    raise DeviceRefused(f"{error}; it has been busy for {BUSY_LIMIT_S:g} s") from error
 
-    def _let_go(self) -> None:
+    def _release_button(self) -> None:
         with contextlib.suppress(OperationDeclined):
             self._session.call(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
 
-    def _settled(self, condition: Callable[[], bool]) -> bool:
-        """Poll until `condition` holds, for a limited time; return whether it does."""
+    def _poll_until(self, condition: Callable[[], bool]) -> bool:
         end = self._clock.monotonic() + SETTLE_LIMIT_S
         while not condition():
             if self._clock.monotonic() >= end:
@@ -1247,8 +1228,8 @@ class EosBody:
 
     def _keep_awake(self) -> None:
         now = self._clock.monotonic()
-        if now - self._spoken_at >= KEEP_ALIVE_S:
-            self._spoken_at = now
+        if now - self._last_keep_alive >= KEEP_ALIVE_S:
+            self._last_keep_alive = now
             if self._offers(Operation.EOS_KEEP_DEVICE_ON):
                 with contextlib.suppress(OperationDeclined):
                     self._session.call(Operation.EOS_KEEP_DEVICE_ON, retry_s=0.0)
@@ -1256,43 +1237,41 @@ class EosBody:
     def _battery_level(self) -> float | None:
         level = battery_level(self.state)
         if level is None and Property.BATTERY_LEVEL in self._info.properties:
-            answer = self._optional(Operation.GET_DEVICE_PROP_VALUE, Property.BATTERY_LEVEL)
-            # 0 may stand for power from elsewhere (ISO 15740, 13.4.1); an empty battery would not answer.
+            answer = self._call_if_supported(Operation.GET_DEVICE_PROP_VALUE, Property.BATTERY_LEVEL)
+            # 0 may mean another power source (ISO 15740, 13.4.1); with an empty battery there is no reply.
             if answer is not None and answer[1][:1] not in (b"", b"\0"):
                 level = min(answer[1][0], 100) / 100
         return level
 
     def _card_free_bytes(self) -> int | None:
-        """Return the room on all cards together; None where there is no card, or none is told of."""
-        listed = self._optional(Operation.EOS_GET_STORAGE_IDS)
-        if listed is None:
+        storage_ids = self._call_if_supported(Operation.EOS_GET_STORAGE_IDS)
+        if storage_ids is None:
             return None
         free: list[int] = []
-        for storage in decode_u32_array(listed[1], "the list of cards")[:_MAX_CARDS]:
+        for storage in decode_u32_array(storage_ids[1], "the list of cards")[:_MAX_CARDS]:
             if storage & _SLOT_FILLED:
-                answer = self._optional(Operation.EOS_GET_STORAGE_INFO, storage)
+                answer = self._call_if_supported(Operation.EOS_GET_STORAGE_INFO, storage)
                 if answer is not None:
                     free.append(StorageInfo.decode(answer[1]).free)
         return sum(free) if free else None
 
-    def _requested(self, code: int) -> bool:
-        """Ask for a property whose value an event will bring; return whether the body takes the question."""
-        return self._optional(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, code) is not None
+    def _request_property(self, code: int) -> bool:
+        return self._call_if_supported(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, code) is not None
 
-    def _optional(self, operation: Operation, *parameters: int) -> tuple[tuple[int, ...], bytes] | None:
-        """Return what an operation answers; None where the body has not got it, or declines these parameters."""
+    def _call_if_supported(self, operation: Operation, *parameters: int) -> tuple[tuple[int, ...], bytes] | None:
+        """Return the reply to an operation; None if the body does not support it or these parameters."""
         if not self._offers(operation):
             return None
         try:
             return self._session.call(operation, *parameters)
         except OperationDeclined as error:
-            if not self._lacks(operation, error) and error.code not in _NOTHING_THERE:
+            if not self._mark_unsupported(operation, error) and error.code not in _NOT_PRESENT:
                 raise
             return None
 
-    def _lacks(self, operation: Operation, error: OperationDeclined) -> bool:
-        """Return whether a body has not got an operation that it lists, by its answer; it is not asked again then."""
-        if error.code not in _NOT_GOT:
+    def _mark_unsupported(self, operation: Operation, error: OperationDeclined) -> bool:
+        """Return whether `error` means an unsupported operation; it is then never called again."""
+        if error.code not in _UNSUPPORTED:
             return False
         self._unsupported.add(operation)
         return True
@@ -1301,24 +1280,24 @@ class EosBody:
         return operation in self._info.operations and operation not in self._unsupported
 
 
-# How often a call renews the connection: a fault that comes back more often lasts. Chosen, as the next two.
+# Renewals of the connection in one call; a fault that occurs more often is permanent. Chosen without measurement.
 RECOVERIES = 3
-# Time after the first fault of a call in which the connection may be renewed; a body that was switched off and on, or
-# put back on its cable, is there within 10 s.
+# Time after the first fault of a call in which the connection may be renewed, seconds. A body that was switched off
+# and on, or plugged in again, is ready within 10 s. Chosen without measurement.
 RECOVERY_S = 30.0
-# Time after its exposure within which a frame may be announced, beside as much time again as it was exposed: so long
-# a dark frame takes that some bodies subtract.
+# Time for the announcement of a frame after the exposure, seconds. The shutter time is added once more, for the dark
+# frame that some bodies subtract. Chosen without measurement.
 FRAME_S = 30.0
-# Time for a frame to be announced on a new connection, on which the body sends its whole state at once.
+# Time for the announcement on a new connection, where the body sends its whole state at once, seconds.
 REDISCOVERY_S = 10.0
 
-_CERTAIN_SHARE = 0.9  # Share of the nominal shutter time that passes at least: 1/6 s is really 0.149 s
-# Pauses between attempts to find the camera again, doubled from one to the other: soon for a cable put back, seldom
-# enough that a body which starts is left alone.
+_SHORTEST_RELATIVE_TIME = 0.9  # Shortest real shutter time / nominal time; 1/6 s is really 0.149 s
+# First and longest of the doubling pauses between attempts to reconnect, seconds: short for a cable that was plugged in
+# again, long enough not to disturb a body that starts up.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 5.0
-# Responses that a new session may cure.
-_STUCK = (
-    *PASSING,
+# Responses after which a new session may help.
+_SESSION_FAULTS = (
+    *TRANSIENT,
     ResponseCode.UNDEFINED,
     ResponseCode.GENERAL_ERROR,
     ResponseCode.SESSION_NOT_OPEN,
@@ -1328,19 +1307,20 @@ _STUCK = (
 )
 _SUFFIXES: dict[int, str] = {ObjectFormat.CRW: ".CRW", ObjectFormat.CR2: ".CR2", ObjectFormat.CR3: ".CR3"}
 _REMEDY = (
-    "check its cable and battery, switch it off and on, and end other programs that use it (a desktop's photo importer "
-    "begins by itself)"
+    "check its cable and battery, switch it off and on, and close other programs that use it (the photo importer of a "
+    "desktop starts automatically)"
 )
 
 _Result = TypeVar("_Result")
 
 
 @dataclass
-class _Shot:
-    """A release that has happened, or may have.
+class _Release:
+    """A release that has happened, or may have happened.
 
-    `announced` is its frame once the body has named it, `fetched` what a download has begun with; objects that are
-    `absent` cannot be its frame.
+    - `not_before`, `until`: clock times between which the frame may be announced.
+    - `announced`: the announced frame. `fetched`: the frame of an unfinished download.
+    - `absent`: handles that cannot be its frame.
     """
 
     body: EosBody
@@ -1348,241 +1328,245 @@ class _Shot:
     not_before: float
     until: float
     shutter_s: float
-    announced: WaitingObject | None = None
-    fetched: WaitingObject | None = None
+    announced: PendingObject | None = None
+    fetched: PendingObject | None = None
     absent: set[int] = field(default_factory=set[int])
 
 
 class CanonEos:
-    """A `drivers.camera.Camera` over PTP, whatever the cable."""
+    """A `drivers.camera.Camera` over PTP on any cable; `open_transport` opens the cable for each connection.
+
+    - A failed connection is renewed, for a limited number of times and a limited time in one call. Then the call raises
+      its first cause; the caller decides about longer waits.
+    - A release is never repeated if it may have happened. After a fault the frame is searched in the camera's memory; a
+      missing frame is an error. Objects in memory before a release are discarded, so frames are never mixed up.
+    - The frame stays in memory until its download is complete, or until the next exposure. A failed cable or an
+      unwritable file costs a download, not a frame.
+    """
 
     def __init__(self, open_transport: Callable[[], Transport], clock: Clock = SYSTEM_CLOCK) -> None:
         self._open_transport = open_transport
         self._clock = clock
-        self._fault: DeviceError | None = None
-        self._renewable_until = math.inf
+        self._first_fault: DeviceError | None = None
+        self._renewal_deadline = math.inf
         self._transport: Transport | None = None
         self._body: EosBody | None = None
         self._identity: CameraIdentity | None = None
         self._settings: ExposureSettings | None = None
-        self._shot: _Shot | None = None
+        self._last_release: _Release | None = None
         self._closed = False
 
     def identity(self) -> CameraIdentity:
         """Return maker, model, serial number and firmware."""
-        self._begin()
-        return self._carry_out(EosBody.identity)
+        self._start_call()
+        return self._run(EosBody.identity)
 
     def supplies(self) -> Supplies:
-        """Return what is left of battery and card; see `drivers.camera.ReportsSupplies`."""
-        self._begin()
-        return self._carry_out(EosBody.supplies)
+        """Return battery and card capacity; see `drivers.camera.ReportsSupplies`."""
+        self._start_call()
+        return self._run(EosBody.supplies)
 
     def configure(self, settings: ExposureSettings) -> None:
-        """Set and verify the exposure, raw format and destination; a frame that was not downloaded is dropped."""
+        """Set and verify exposure, raw format and destination; a frame without download is dropped."""
 
-        def configured(body: EosBody) -> None:
+        def set_up(body: EosBody) -> None:
             body.make_ready()
             _apply(body, settings)
 
-        self._begin()
-        self._settings = self._shot = None
-        self._carry_out(configured)
+        self._start_call()
+        self._settings = self._last_release = None
+        self._run(set_up)
         self._settings = settings
 
     def shutter_speeds(self) -> tuple[float, ...]:
-        """Return the shutter times that the body offers now, as engraved, seconds, rising; empty if it lists none."""
+        """Return the shutter times that the body offers; see `drivers.camera.Camera.shutter_speeds`."""
 
-        def listed(body: EosBody) -> tuple[float, ...]:
+        def list_speeds(body: EosBody) -> tuple[float, ...]:
             body.drain()
             return shutter_speeds(body.state)
 
-        self._begin()
-        return self._carry_out(listed)
+        self._start_call()
+        return self._run(list_speeds)
 
     def expose(self) -> datetime:
-        """Release the shutter without autofocus; return when it was released, UTC, once the body announces the frame.
+        """Release the shutter without autofocus, and return its time (UTC) when the body announces the frame.
 
-        A frame that was exposed before and has not been downloaded is dropped.
+        An earlier frame without download is dropped.
         """
         settings = self._settings
         if settings is None:
-            raise DeviceRefused("the camera has no exposure settings; configure it before the first exposure")
-        self._begin()
-        self._shot = None
-        shot = self._release(settings)
+            raise DeviceRefused("the camera has no exposure settings; call configure before the first exposure")
+        self._start_call()
+        self._last_release = None
+        release = self._release(settings)
         try:
-            self._carry_out(lambda body: self._await_frame(body, shot))
+            self._run(lambda body: self._wait_for_frame(body, release))
         except Exception:
-            self._empty()
+            self._empty_memory()
             raise
-        self._shot = shot
-        return shot.released_at
+        self._last_release = release
+        return release.released_at
 
     def download(self, into: BinaryIO) -> CapturedFrame:
-        """Write the raw file of the frame exposed last, whole and unchanged, to `into`.
+        """Write the raw file of the last exposure to `into`, complete and unchanged.
 
-        A download that failed, for whatever reason, may be tried again with a new stream as long as the body holds the
-        frame in its memory: until the next exposure, or until it is switched off.
+        A failed download may be repeated with a new stream until the next exposure, or until the body is switched off.
         """
-        shot = self._shot
-        if shot is None:
-            raise DeviceError("no exposed frame waits in the camera to be downloaded; expose it again")
-        self._begin()
+        release = self._last_release
+        if release is None:
+            raise DeviceError("the camera holds no exposed frame; expose again")
+        self._start_call()
         start = into.tell()
-        frame = self._carry_out(lambda body: self._receive(body, shot, into, start))
-        self._shot = None
-        self._empty()
-        return CapturedFrame(_file_name(frame), frame.size, shot.released_at)
+        frame = self._run(lambda body: self._receive_frame(body, release, into, start))
+        self._last_release = None
+        self._empty_memory()
+        return CapturedFrame(_file_name(frame), frame.size, release.released_at)
 
     def idle(self) -> None:
-        """Fetch what has happened while nothing was asked, and keep the body awake; call it now and then in a pause."""
-        self._begin()
-        self._carry_out(EosBody.drain)
+        """Read new events and keep the body awake; call this every few seconds of a pause."""
+        self._start_call()
+        self._run(EosBody.drain)
 
     def close(self) -> None:
-        """Give the camera back to its user; a second call does nothing."""
+        """Release the camera; a second call does nothing."""
         self._closed = True
-        self._shot = None
+        self._last_release = None
         body = self._body
         if body is not None:
             try:
                 body.disconnect()
             except DeviceError as error:
-                self._drop(error)
+                self._drop_connection(error)
             else:
-                self._drop(None)
+                self._drop_connection(None)
 
-    def _begin(self) -> None:
-        """Begin a call: it has had no fault yet."""
-        self._fault, self._renewable_until = None, math.inf
+    def _start_call(self) -> None:
+        self._first_fault, self._renewal_deadline = None, math.inf
 
-    def _carry_out(self, action: Callable[[EosBody], _Result]) -> _Result:
-        """Return what `action` does with a connected body, over a new connection if this one fails."""
+    def _run(self, action: Callable[[EosBody], _Result]) -> _Result:
+        """Return the result of `action` on a connected body; over a new connection if the present one fails."""
         renewals = 0
         was_busy = False
         while True:
-            body = self._connected()
+            body = self._ensure_connected()
             try:
                 return action(body)
             except DeviceError as error:
-                if not _curable(error):
+                if not _may_recover(error):
                     raise
-                self._lose(error)
-                # A body that is busy in every session is kept so by its own settings, not by a fault.
-                busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
-                late = self._clock.monotonic() >= self._renewable_until
-                if renewals == RECOVERIES or late or (busy and was_busy):
-                    kind = DeviceRefused if busy else DeviceError
+                self._record_fault(error)
+                # A body that is busy in every session is busy because of its settings, not because of a fault.
+                is_busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
+                is_late = self._clock.monotonic() >= self._renewal_deadline
+                if renewals == RECOVERIES or is_late or (is_busy and was_busy):
+                    error_type = DeviceRefused if is_busy else DeviceError
                     times = "once" if renewals == 1 else f"{renewals} times"
-                    raise kind(self._given_up(error, f"the connection was renewed {times} without success")) from error
-                was_busy = busy
+                    attempts = f"the connection was renewed {times} without success"
+                    raise error_type(self._failure_message(error, attempts)) from error
+                was_busy = is_busy
                 renewals += 1
 
-    def _lose(self, fault: DeviceError) -> None:
-        """Drop a connection that failed at its work, and keep the first such fault of a call.
+    def _record_fault(self, fault: DeviceError) -> None:
+        """Drop a failed connection, and keep the first fault of a call as its cause."""
+        # Faults before a new connection is ready follow from the end of the old one and are not recorded.
+        if self._first_fault is None:
+            self._first_fault = fault
+            self._renewal_deadline = self._clock.monotonic() + RECOVERY_S
+        self._drop_connection(fault)
 
-        What ails a new connection before it is made follows from the old one's end, and is no first cause.
-        """
-        if self._fault is None:
-            self._fault = fault
-            self._renewable_until = self._clock.monotonic() + RECOVERY_S
-        self._drop(fault)
+    def _failure_message(self, last_fault: DeviceError, attempts: str) -> str:
+        first, latest = (fault.without_remedy() for fault in (self._first_fault or last_fault, last_fault))
+        return f"{first}; {attempts}{'' if latest == first else f'; last fault: {latest}'}; {_REMEDY}"
 
-    def _given_up(self, last: DeviceError, tried: str) -> str:
-        """Return why a call ends, its first cause first, for whatever came of that says less; with one remedy."""
-        first, held = (fault.without_remedy() for fault in (self._fault or last, last))
-        return f"{first}; {tried}{'' if held == first else f'; at last: {held}'}; {_REMEDY}"
+    def _release(self, settings: ExposureSettings) -> _Release:
+        """Release the shutter; return the release, which has or may have happened."""
 
-    def _release(self, settings: ExposureSettings) -> _Shot:
-        """Return the release that has happened, or may have; one that the body declines has not."""
-
-        def released(body: EosBody) -> _Shot:
+        def press(body: EosBody) -> _Release:
             body.make_ready()
-            _apply(body, settings)  # sends nothing unless a dial was turned
+            _apply(body, settings)  # sends nothing, unless somebody turned a dial
             now = self._clock.monotonic()
-            exposed = now + _CERTAIN_SHARE * settings.shutter_s
+            not_before = now + _SHORTEST_RELATIVE_TIME * settings.shutter_s
             until = now + 2 * settings.shutter_s + FRAME_S
-            shot = _Shot(body, self._clock.now(), exposed, until, settings.shutter_s, absent=set(body.state.waiting))
+            old_handles = set(body.state.pending)
+            pressed = _Release(body, self._clock.now(), not_before, until, settings.shutter_s, absent=old_handles)
             try:
                 body.release()
             except (LinkError, ProtocolError) as error:
-                self._lose(error)
-            return shot
+                self._record_fault(error)
+            return pressed
 
-        return self._carry_out(released)
+        return self._run(press)
 
-    def _await_frame(self, body: EosBody, shot: _Shot) -> WaitingObject:
-        """Return the frame of a release when the body has announced it; the same one whenever it is asked again."""
-        renewed = body is not shot.body
-        until = self._clock.monotonic() + shot.shutter_s + REDISCOVERY_S if renewed else shot.until
-        known = shot.announced
+    def _wait_for_frame(self, body: EosBody, release: _Release) -> PendingObject:
+        """Return the frame of a release once the body has announced it; the same frame in every call."""
+        is_new_connection = body is not release.body
+        until = self._clock.monotonic() + release.shutter_s + REDISCOVERY_S if is_new_connection else release.until
+        announced = release.announced
 
-        def wanted(waiting: WaitingObject) -> bool:
-            if known is not None and (waiting.name, waiting.size) != (known.name, known.size):
-                return False  # taken since, by a finger on the camera
-            return waiting.is_raw and waiting.handle not in shot.absent
+        def is_frame(pending: PendingObject) -> bool:
+            if announced is not None and (pending.name, pending.size) != (announced.name, announced.size):
+                return False  # released later, by hand on the camera
+            return pending.is_raw and pending.handle not in release.absent
 
         try:
-            shot.announced = body.await_object(shot.not_before, until, wanted)
+            release.announced = body.wait_for_object(release.not_before, until, is_frame)
         except LinkTimeout as error:
-            if not renewed:
-                raise  # its announcement may be lost: a new connection hears it again
-            self._shot = None
-            raise DeviceError(f"{error}, and holds none in its memory; take it again") from error
-        return shot.announced
+            if not is_new_connection:
+                raise  # the announcement may be lost; a new connection repeats it
+            self._last_release = None
+            raise DeviceError(f"{error}, and its memory holds none; expose again") from error
+        return release.announced
 
-    def _receive(self, body: EosBody, shot: _Shot, into: BinaryIO, start: int) -> WaitingObject:
-        """Return the frame of a release when it is complete in `into`, from `start` on."""
+    def _receive_frame(self, body: EosBody, release: _Release, into: BinaryIO, start: int) -> PendingObject:
         while True:
-            frame = self._await_frame(body, shot)
-            # What has come of the same object before a fault is good: pieces are written whole.
-            offset = into.tell() - start if frame == shot.fetched else 0
+            frame = self._wait_for_frame(body, release)
+            # Data of the same object before a fault are valid, because pieces are written whole.
+            offset = into.tell() - start if frame == release.fetched else 0
             into.seek(start + offset)
             into.truncate()
-            shot.fetched = frame
+            release.fetched = frame
             try:
                 body.fetch(frame, into, offset)
             except OperationDeclined as error:
                 if error.code != ResponseCode.INVALID_OBJECT_HANDLE:
                     raise
-                shot.absent.add(frame.handle)
-                shot.announced = None
+                release.absent.add(frame.handle)
+                release.announced = None
                 body.free(frame)
                 continue
             return frame
 
-    def _empty(self) -> None:
-        """Let the body forget what waits; where that fails the next call sees to it over a new connection."""
+    def _empty_memory(self) -> None:
+        """Free all pending objects; if this fails, the next call does it over a new connection."""
         if self._body is not None:
             try:
-                self._body.free_waiting()
+                self._body.free_pending()
                 self._body.drain()
-                self._body.free_waiting()
+                self._body.free_pending()
             except DeviceError as error:
-                self._drop(error)
+                self._drop_connection(error)
 
-    def _connected(self) -> EosBody:
+    def _ensure_connected(self) -> EosBody:
         if self._closed:
             raise DeviceError("the camera has been closed; open the rig again")
         if self._body is not None:
             return self._body
-        first = self._identity is None
-        begun = self._clock.monotonic()
-        end = min(self._renewable_until, begun + RECOVERY_S)
+        is_first = self._identity is None
+        start = self._clock.monotonic()
+        end = min(self._renewal_deadline, start + RECOVERY_S)
         pause = _FIRST_PAUSE_S
         while True:
             try:
                 return self._connect()
             except DeviceError as error:
-                # While it comes back a body may be absent, or in the hands of the desktop.
-                curable = not first if self._transport is None else _curable(error)
-                self._drop(error)
-                if not curable:
+                # A body that restarts may be absent, or in use by the desktop.
+                may_recover = not is_first if self._transport is None else _may_recover(error)
+                self._drop_connection(error)
+                if not may_recover:
                     raise
                 if self._clock.monotonic() + pause > end:
-                    waited = f"no connection for {self._clock.monotonic() - begun:.0f} s"
-                    raise DeviceError(self._given_up(error, waited)) from error
+                    attempts = f"no connection for {self._clock.monotonic() - start:.0f} s"
+                    raise DeviceError(self._failure_message(error, attempts)) from error
             self._clock.sleep(pause)
             pause = min(2 * pause, _LONGEST_PAUSE_S)
 
@@ -1590,19 +1574,19 @@ class CanonEos:
         self._transport = self._open_transport()
         body = EosBody(self._transport, self._clock)
         body.connect()
-        found, known = body.identity(), self._identity
-        if known is not None and (found.model, found.serial) != (known.model, known.serial):
+        identity, expected = body.identity(), self._identity
+        if expected is not None and (identity.model, identity.serial) != (expected.model, expected.serial):
             raise DeviceRefused(
-                f"in place of the {known.model} with serial number {known.serial} there is now a {found.model} with "
-                f"{found.serial}; connect the first one again"
+                f"the connected camera is a {identity.model} with serial number {identity.serial}, expected the "
+                f"{expected.model} with {expected.serial}; connect that camera again"
             )
         if self._settings is not None:
             _apply(body, self._settings)
-        self._identity = found
+        self._identity = identity
         self._body = body
         return body
 
-    def _drop(self, fault: DeviceError | None) -> None:
+    def _drop_connection(self, fault: DeviceError | None) -> None:
         transport, self._transport, self._body = self._transport, None, None
         if transport is not None:
             if fault is not None and not isinstance(fault, LinkClosed):
@@ -1612,18 +1596,18 @@ class CanonEos:
 
 
 def _apply(body: EosBody, settings: ExposureSettings) -> None:
-    for code, value in plan(body.state, settings).items():
+    for code, value in plan_settings(body.state, settings).items():
         body.set(code, value)
 
 
-def _curable(error: DeviceError) -> bool:
+def _may_recover(error: DeviceError) -> bool:
     return isinstance(error, LinkError | ProtocolError) or (
-        isinstance(error, OperationDeclined) and error.code in _STUCK
+        isinstance(error, OperationDeclined) and error.code in _SESSION_FAULTS
     )
 
 
-def _file_name(frame: WaitingObject) -> str:
-    """Return the camera's name for a file, with nothing in it that a file name cannot hold, and a suffix."""
+def _file_name(frame: PendingObject) -> str:
+    # Without characters that are invalid in file names.
     name = re.sub(r"[^A-Za-z0-9._-]", "_", frame.name).strip(".") or f"{frame.handle:08X}"
-    # Some bodies announce a file without its name, or without the suffix, but with its format.
+    # Some bodies announce a file without name or suffix, but with its format.
     return name if "." in name else name + _SUFFIXES.get(frame.format, "")

@@ -1,22 +1,10 @@
-"""PJLink, the projector industry's control protocol over TCP: its bytes, a projector with it, and the search for them.
+"""PJLink over TCP: messages, a projector driver, and the network search.
 
-What we send follows the standard to the letter; what we accept is wider: any case, LF after or instead of CR, empty
-lines, NUL between lines (some projectors fill their packets up with it). A datagram, which arrives unasked and from
-anybody, is no error: one that holds nothing of ours is an empty answer.
+We send exactly what the standard defines, and accept more: any case, LF instead of or after CR, empty lines, and NUL
+between lines (some projectors pad their packets with it). Datagrams may come from any sender; a datagram without a
+valid reply gives an empty result, not an error.
 
-Of the projector:
-
-- One connection at a time, opened when first needed: many projectors serve one controller only. They hang up on an idle
-  one after about 30 s; a command that meets a connection so lost is sent once more, and may be without harm.
-- After a fault of cable or protocol the connection is dropped, so that a late answer never meets a later question.
-- Projectors in the field do not know all of their class. What a question cannot be asked for (`ERR1`, `ERR2`) is None,
-  or empty, and not asked again; `ERR3` means that it may be asked later. Only commands are refused.
-
-A controller broadcasts a search over UDP; each class 2 projector answers (ACKN) within 10 s with its MAC address. A
-projector also sends notices to the one controller whose address was entered in its menu: of its start (LKUP), and of
-each change of fault, power and input. Nothing there is proved by a password.
-
-Source: JBMIA, PJLink Specifications 1.04 (class 1), 2.00 (class 2: same lines, digit 2; 3.2 search, 3.3 status
+Source: JBMIA, PJLink Specifications 1.04 (class 1) and 2.00 (class 2: same lines with digit 2; 3.2 search, 3.3 status
 notification).
 """
 
@@ -38,10 +26,10 @@ from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceFault, DeviceRefused, LinkError, LinkTimeout, ProtocolError
 
 PORT = 4352  # TCP and UDP port of PJLink (PJLink Specifications 1.04 and 2.00)
-MAX_LINE = 136  # Bytes of a command or reply, its CR included
-DIGEST_LENGTH = 32  # Characters before the first command: the digest by MD5 (PJLink Specifications 1.04, 5.1)
+MAX_LINE = 136  # Longest command or reply with its CR, bytes
+DIGEST_LENGTH = 32  # Characters of the MD5 digest before the first command (PJLink Specifications 1.04, 5.1)
 MAX_PASSWORD = 32  # Characters of a password (PJLink Specifications 1.04, authentication)
-IDLE_LIMIT_S = 30.0  # Projectors hang up after about this long without a command
+IDLE_LIMIT_S = 30.0  # Projectors disconnect after about this time without a command
 
 QUERY = "?"
 OK = "OK"
@@ -50,7 +38,7 @@ MUTE_OFF = "30"
 
 
 class ErrorCode(Enum):
-    """What a projector answers instead of a value (1.04, 2.3)."""
+    """Error replies (1.04, 2.3)."""
 
     UNDEFINED = "ERR1"
     OUT_OF_PARAMETER = "ERR2"
@@ -59,14 +47,14 @@ class ErrorCode(Enum):
 
 
 class Refused(Enum):
-    """The line that answers a wrong password, in place of a greeting or reply."""
+    """Reply to a wrong password, in place of a greeting or a reply."""
 
     WRONG_PASSWORD = "PJLINK ERRA"
 
 
 @dataclass(frozen=True)
 class PjLinkRequest:
-    """A command: four capital letters and a parameter, `QUERY` to ask; `digest` on a connection's first one."""
+    """A command: four capital letters, and a parameter or `QUERY`; only the first on a connection has a digest."""
 
     command: str
     parameter: str = QUERY
@@ -76,7 +64,7 @@ class PjLinkRequest:
 
 @dataclass(frozen=True)
 class PjLinkReply:
-    """An answer: the command it belongs to, and its value, or `OK`, or an error's code."""
+    """A reply: the command, and its value, `OK` or an error code."""
 
     command: str
     value: str
@@ -84,38 +72,38 @@ class PjLinkReply:
 
     @property
     def error(self) -> ErrorCode | None:
-        """The error that the value stands for, or None for a true value."""
+        """Error code; None if the value is no error."""
         try:
             return ErrorCode(self.value.upper())
         except ValueError:
             return None
 
 
-def take_line(data: bytes, limit: int = MAX_LINE) -> tuple[bytes, int] | None:
-    """Take one line, without its end, off the front of `data`, past empty ones and filling."""
+def split_line(data: bytes, limit: int = MAX_LINE) -> tuple[bytes, int] | None:
+    """Return the first line without its end, and its length in bytes; skip empty lines and NUL."""
     start = len(data) - len(data.lstrip(b"\r\n\0"))
-    found = re.compile(rb"[\r\n]").search(data, start)
-    line = data[start : None if found is None else found.start()].replace(b"\0", b"")
+    line_end = re.compile(rb"[\r\n]").search(data, start)
+    line = data[start : None if line_end is None else line_end.start()].replace(b"\0", b"")
     if len(line) >= limit:
         raise ProtocolError(
-            f"a PJLink line of more than {limit} bytes begins {quoted(line)}; "
-            "check that this is a projector's control port"
+            f"a PJLink line starts with {quoted(line)} and has {len(line)} bytes, fewer than {limit} expected; "
+            "check that this is the control port of a projector"
         )
-    return None if found is None else (line, found.end())
+    return None if line_end is None else (line, line_end.end())
 
 
 def authentication_digest(seed: str, password: str) -> str:
-    """Return the digest that proves the password: MD5 of seed and password, 32 lowercase hex digits (1.04, 5.1)."""
+    """Return MD5 of seed and password as 32 lowercase hex digits (1.04, 5.1)."""
     return hashlib.md5((seed + password).encode(), usedforsecurity=False).hexdigest()
 
 
 def encode_greeting(seed: str | None) -> bytes:
-    """Return the projector's first line; no seed where no password is wanted."""
+    """Return the projector's first line; `seed` is None if it requires no password."""
     return b"PJLINK 0\r" if seed is None else f"PJLINK 1 {seed}\r".encode("ascii")
 
 
 def parse_greeting(line: bytes) -> str | Refused | None:
-    """Return the seed in the projector's first line, None where no password is wanted."""
+    """Return the seed in the projector's first line; None if it requires no password."""
     text = line.decode("ascii", "replace").strip()
     words = text.split()
     match [words[0].upper(), *words[1:]] if words else []:
@@ -127,34 +115,34 @@ def parse_greeting(line: bytes) -> str | Refused | None:
             return Refused.WRONG_PASSWORD
         case [word, *_] if word.startswith("HTTP/"):
             raise ProtocolError(
-                f"an HTTP server answers {quoted(line)}, no projector; give the projector's port, {PORT} unless its "
-                "menu says another"
+                f"an HTTP server answers {quoted(line)}, a PJLink projector was expected; set the projector's port, "
+                f"{PORT} unless its menu shows another"
             )
         case _:
             raise ProtocolError(
-                f"the projector greets with {quoted(line)}, PJLINK 0 or PJLINK 1 and a seed of 8 characters was "
-                f"expected; check that PJLink is enabled on it and that the port is {PORT}"
+                f"the projector greets with {quoted(line)}; expected PJLINK 0, or PJLINK 1 and a seed of 8 characters. "
+                f"Check that PJLink is enabled on it and that the port is {PORT}"
             )
 
 
 def encode_request(request: PjLinkRequest) -> bytes:
-    """Return a command line."""
+    """Return the bytes of a command."""
     if not re.fullmatch(r"[A-Z0-9]{4}", request.command):
-        raise ValueError(f"{request.command!r} is no PJLink command")
+        raise ValueError(f"PJLink command {request.command!r}: expected four capital letters or digits")
     line = f"%{request.level}{request.command} {request.parameter}\r".encode()
     if len(line) > MAX_LINE or b"\r" in line[:-1] or b"\n" in line:
-        raise ValueError(f"{request.parameter!r} is no PJLink parameter")
+        raise ValueError(f"PJLink parameter {request.parameter!r}: expected one line of at most {MAX_LINE} bytes")
     return request.digest.encode("ascii") + line
 
 
 def parse_request(line: bytes) -> PjLinkRequest:
-    """Return the command in a line, without its end."""
-    found = re.fullmatch(rb"([0-9A-Fa-f]{32})?%([0-9])([0-9A-Za-z]{4}) (.{1,128})", line, re.DOTALL)
-    if found is None:
+    """Return the command in a line without its end."""
+    match = re.fullmatch(rb"([0-9A-Fa-f]{32})?%([0-9])([0-9A-Za-z]{4}) (.{1,128})", line, re.DOTALL)
+    if match is None:
         raise ProtocolError(
-            f"{quoted(line)} is no PJLink command; expected %1 or %2, four letters, a space, a parameter"
+            f"{quoted(line)} is not a PJLink command; expected %1 or %2, four letters, a space, a parameter"
         )
-    digest, level, command, parameter = found.groups(b"")
+    digest, level, command, parameter = match.groups(b"")
     return PjLinkRequest(
         command.decode("ascii").upper(),
         parameter.decode("utf-8", "replace"),
@@ -164,20 +152,20 @@ def parse_request(line: bytes) -> PjLinkRequest:
 
 
 def encode_reply(reply: PjLinkReply | Refused) -> bytes:
-    """Return an answer's line."""
+    """Return the bytes of a reply."""
     if isinstance(reply, Refused):
         return f"{reply.value}\r".encode("ascii")
     return f"%{reply.level}{reply.command}={reply.value}\r".encode()
 
 
 def parse_reply(line: bytes) -> PjLinkReply | Refused:
-    """Return the answer in a line, without its end; a value's case is kept, for names have one."""
+    """Return the reply in a line without its end; the case of its value is kept."""
     if line.strip().upper() == b"PJLINK ERRA":
         return Refused.WRONG_PASSWORD
-    found = re.fullmatch(rb"%([0-9])([0-9A-Za-z]{4})=(.{0,128})", line, re.DOTALL)
-    if found is None:
+    match = re.fullmatch(rb"%([0-9])([0-9A-Za-z]{4})=(.{0,128})", line, re.DOTALL)
+    if match is None:
         raise ProtocolError(f"the projector answers {quoted(line)}; expected %1 or %2, four letters, = and a value")
-    level, command, value = found.groups()
+    level, command, value = match.groups()
     return PjLinkReply(command.decode("ascii").upper(), value.decode("utf-8", "replace").strip(), int(level))
 
 
@@ -188,51 +176,51 @@ _SEVERITY_DIGITS = {severity: digit for digit, severity in _SEVERITIES.items()}
 
 
 def format_power(power: Power) -> str:
-    """Return POWR's digit for a power state."""
+    """Return the POWR digit of a power state."""
     return _POWER_DIGITS[power]
 
 
 def parse_power(value: str) -> Power:
-    """Return the power state that POWR answers."""
+    """Return the power state in a POWR reply."""
     if value not in _POWERS:
         raise _unexpected("POWR", value, "0 standby, 1 on, 2 cooling or 3 warm-up")
     return _POWERS[value]
 
 
 def format_mute(muted: bool) -> str:
-    """Return AVMT's code for picture and sound muted, or neither."""
+    """Return the AVMT code that mutes image and sound, or neither."""
     return MUTE_ON if muted else MUTE_OFF
 
 
 def parse_mute(value: str) -> bool:
-    """Return whether AVMT's code means that the picture is muted; 21 mutes the sound alone."""
+    """Return whether an AVMT code mutes the image; 21 mutes only the sound."""
     if not re.fullmatch("[123][01]", value):
         raise _unexpected("AVMT", value, "11, 21, 31 or 30")
     return value in ("11", "31")
 
 
 def format_faults(faults: Iterable[Fault]) -> str:
-    """Return ERST's six digits."""
+    """Return the six digits of ERST."""
     digits = {fault.part: _SEVERITY_DIGITS[fault.severity] for fault in faults}
-    return "".join(digits.get(part, "0") for part in FAULT_PARTS)
+    return "".join(digits.get(component, "0") for component in FAULT_PARTS)
 
 
 def parse_faults(value: str) -> tuple[Fault, ...]:
-    """Return the faults in ERST's six digits."""
+    """Return the faults in the six digits of ERST."""
     if not re.fullmatch("[012]{6}", value):
         raise _unexpected("ERST", value, "six digits of 0, 1 or 2")
     return tuple(
-        Fault(part, _SEVERITIES[digit]) for part, digit in zip(FAULT_PARTS, value, strict=True) if digit != "0"
+        Fault(name, _SEVERITIES[digit]) for name, digit in zip(FAULT_PARTS, value, strict=True) if digit != "0"
     )
 
 
 def format_lamps(lamps: Sequence[Lamp]) -> str:
-    """Return LAMP's pairs of hours and 0 or 1."""
+    """Return the LAMP value: pairs of hours, and 1 if lit or 0."""
     return " ".join(f"{lamp.hours} {int(lamp.lit)}" for lamp in lamps)
 
 
 def parse_lamps(value: str) -> tuple[Lamp, ...]:
-    """Return the lamps in LAMP's pairs."""
+    """Return the lamps in a LAMP reply."""
     if not re.fullmatch(r"[0-9]+ +[01]( +[0-9]+ +[01])*", value, re.ASCII):
         raise _unexpected("LAMP", value, "pairs of hours and 0 or 1")
     words = value.split()
@@ -240,12 +228,12 @@ def parse_lamps(value: str) -> tuple[Lamp, ...]:
 
 
 def is_class_1_input(code: str) -> bool:
-    """Return whether a code may be used in class 1."""
+    """Return whether class 1 permits an input code."""
     return re.fullmatch("[1-5][1-9]", code) is not None
 
 
 def parse_input(value: str) -> str:
-    """Return an input's code, its letter a capital."""
+    """Return an input code in capitals."""
     if not re.fullmatch("[1-6][1-9A-Z]", value.upper()):
         raise _unexpected("INPT", value, "a digit 1 to 6 and one of 1 to 9 or A to Z")
     return value.upper()
@@ -253,50 +241,50 @@ def parse_input(value: str) -> str:
 
 @dataclass(frozen=True)
 class Resolution:
-    """A picture's width and height in pixels."""
+    """Width and height of an image, pixels."""
 
     width: int
     height: int
 
 
 class NoResolution(Enum):
-    """Why an input has no resolution (IRES)."""
+    """Reason why an input has no resolution (IRES)."""
 
     NO_SIGNAL = "-"
     UNKNOWN_SIGNAL = "*"
 
 
 def format_resolution(resolution: Resolution | NoResolution) -> str:
-    """Return the value of IRES."""
+    """Return the IRES value."""
     if isinstance(resolution, NoResolution):
         return resolution.value
     return f"{resolution.width}x{resolution.height}"
 
 
 def parse_input_resolution(value: str) -> Resolution | NoResolution:
-    """Return the resolution that IRES answers, such as ``1920x1080``, or why there is none."""
+    """Return the resolution in an IRES reply, such as ``1920x1080``, or why it is missing."""
     if value in ("-", "*"):
         return NoResolution(value)
-    found = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", value, re.ASCII)
-    if found is None:
+    match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", value, re.ASCII)
+    if match is None:
         raise _unexpected("IRES", value, "width, x and height in pixels, - or *")
-    return Resolution(int(found[1]), int(found[2]))
+    return Resolution(int(match[1]), int(match[2]))
 
 
 def format_freeze(frozen: bool) -> str:
-    """Return FREZ's digit for a picture frozen or moving."""
+    """Return the FREZ digit."""
     return "1" if frozen else "0"
 
 
 def parse_freeze(value: str) -> bool:
-    """Return whether FREZ reports a frozen picture."""
+    """Return whether a FREZ reply reports a frozen image."""
     if value not in ("0", "1"):
         raise _unexpected("FREZ", value, "0 moving or 1 frozen")
     return value == "1"
 
 
 def parse_class(value: str) -> int:
-    """Return the class that CLSS answers."""
+    """Return the class in a CLSS reply."""
     if not re.fullmatch("[1-9]", value, re.ASCII):
         raise _unexpected("CLSS", value, "1 or 2")
     return int(value)
@@ -307,49 +295,56 @@ def _unexpected(command: str, value: str, expected: str) -> ProtocolError:
 
 
 SEARCH = b"%2SRCH\r"
-COLLECT_S = 30.0  # So long a controller collects answers, which projectors delay by up to 10 s
+# Time for which search replies are collected; projectors delay them by up to 10 s (2.00, 3.2).
+COLLECT_S = 30.0
 
 
-def replies_in(datagram: bytes) -> tuple[PjLinkReply, ...]:
-    """Return the answers and notices in a datagram, in their order; what is neither is passed over."""
-    found: list[PjLinkReply] = []
+def parse_datagram(datagram: bytes) -> tuple[PjLinkReply, ...]:
+    """Return the class 2 replies and notices of a datagram in order; ignore all other lines."""
+    replies: list[PjLinkReply] = []
     for line in re.split(rb"[\r\n\0]+", datagram):
         with contextlib.suppress(ProtocolError):
             reply = parse_reply(line.strip())
             if isinstance(reply, PjLinkReply) and reply.level == 2:
-                found.append(reply)
-    return tuple(found)
+                replies.append(reply)
+    return tuple(replies)
 
 
-def is_notice_of_start(line: bytes) -> bool:
-    """Return whether a line is LKUP, which some projectors send into a controller's TCP connection as well."""
-    return any(reply.command == "LKUP" for reply in replies_in(line))
+def is_startup_notice(line: bytes) -> bool:
+    """Return whether a line is the start-up notice LKUP; some projectors also send it over TCP."""
+    return any(reply.command == "LKUP" for reply in parse_datagram(line))
 
 
-DEFAULT_TIMEOUT_S = 5.0  # The standard asks for an answer within 2 s; real projectors take longer while they warm up
-_SILENT = "check that it is on the network, and that PJLink is enabled on it in standby too"
-_CHECK_PORT = "check that a projector answers at this port"
+# The standard requires a reply within 2 s; real projectors take longer during warm-up.
+DEFAULT_TIMEOUT_S = 5.0
+_SILENCE_REMEDY = "check that it is on the network, and that PJLink is enabled on it, also in standby"
+_PORT_REMEDY = "check that a projector answers at this port"
 
-# How long another server may take to answer its own kind of question; on a local network it takes milliseconds.
-_OTHER_SERVER_S = 2.0
-_HTTP_QUESTION = b"GET / HTTP/1.0\r\n\r\n"
-_HTTP_ANSWERS = (b"http/", b"rtsp/", b"<!doc", b"<html")
+# Timeout for the reply of another kind of server; on a local network it takes milliseconds.
+_OTHER_SERVER_TIMEOUT_S = 2.0
+_HTTP_REQUEST = b"GET / HTTP/1.0\r\n\r\n"
+_HTTP_REPLY_STARTS = (b"http/", b"rtsp/", b"<!doc", b"<html")
 # InitCommandRequest: length, type, an identifier of zeros, name, version (CIPA DC-005, 2.3.1).
-_PTPIP_QUESTION = struct.pack("<II16s10sI", 38, 1, b"", "CroP".encode("utf-16-le"), 0x10000)
-# Types of packets, behind their length: InitCommandAck and InitFail (same place).
-_PTPIP_ANSWERS = tuple(struct.pack("<I", kind) for kind in (2, 5))
+_PTPIP_REQUEST = struct.pack("<II16s10sI", 38, 1, b"", "CroP".encode("utf-16-le"), 0x10000)
+# Packet types after the length field: InitCommandAck and InitFail (same clause).
+_PTPIP_REPLY_TYPES = tuple(struct.pack("<I", packet_type) for packet_type in (2, 5))
 
 
-_Answer = TypeVar("_Answer")
+_Value = TypeVar("_Value")
 
 
 class PjLinkProjector:
-    """A `drivers.projector.Projector` over PJLink class 1, and what class 2 adds.
+    """A `drivers.projector.Projector` over PJLink class 1, with the additions of class 2.
 
-    Every question and command may raise `DeviceRefused` (not known, not offered, not now, wrong password),
-    `DeviceFault` (the projector reports a failure of its own), `LinkError` and `ProtocolError`.
+    All queries and commands may raise `DeviceRefused` (unknown, not offered, not now, wrong password), `DeviceFault`
+    (the projector reports a failure), `LinkError` and `ProtocolError`.
 
-    `password`: the PJLink password, None where the projector has none.
+    - `connect` opens a connection when it is first needed. Many projectors serve only one, and close it after about 30
+      s without a command. A command that meets a closed connection is sent once more, which does no harm.
+    - After a fault the connection is closed, so that a late reply is never taken for the next one.
+    - Many projectors implement only part of their class. A query answered with `ERR1` or `ERR2` returns None or an
+      empty value and is not repeated. After `ERR3` it may be repeated.
+    - `password` is None if the projector has none.
     """
 
     def __init__(
@@ -364,163 +359,161 @@ class PjLinkProjector:
         self._password = password
         self._label = label
         self._connect, self._has_greeted = connect, False
-        self._exchange = Exchange(connect, timeout, label, clock, self._greet, _SILENT, _CHECK_PORT)
-        self._unknown: set[PjLinkRequest] = set()
+        self._exchange = Exchange(connect, timeout, label, clock, self._greet, _SILENCE_REMEDY, _PORT_REMEDY)
+        self._unsupported: set[PjLinkRequest] = set()
 
     def identity(self) -> ProjectorIdentity:
-        """Return maker, model and name; empty what the projector does not say."""
-        return ProjectorIdentity(self._name("INF1"), self._name("INF2"), self._name("NAME"))
+        """Return maker, model and name; empty texts if the projector does not report them."""
+        return ProjectorIdentity(self._query_name("INF1"), self._query_name("INF2"), self._query_name("NAME"))
 
     def power(self) -> Power:
-        """Return the power state now."""
-        return parse_power(self._ask("POWR"))
+        """Return the current power state."""
+        return parse_power(self._query("POWR"))
 
     def switch_on(self) -> None:
-        """Begin to switch on; refused while it cools down."""
+        """Start to switch on; refused during cooling."""
         self._set("POWR", "1")
 
     def switch_off(self) -> None:
-        """Begin to switch off; refused while it warms up."""
+        """Start to switch off; refused during warm-up."""
         self._set("POWR", "0")
 
     def muted(self) -> bool | None:
-        """Return whether the picture is blanked by mute, None where it cannot tell; refused unless it is on."""
-        value = self._ask_if_known("AVMT")
+        """Return whether mute blanks the image; None if it is not reported; refused unless the projector is on."""
+        value = self._query_if_supported("AVMT")
         return None if value is None else parse_mute(value)
 
     def set_muted(self, muted: bool) -> None:
-        """Blank picture and sound, or show them; refused unless the projector is on."""
+        """Blank image and sound, or show them; refused unless the projector is on."""
         self._set("AVMT", format_mute(muted))
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return every fault reported now; empty when healthy, and where the projector cannot tell, or not now."""
+        """Return all present faults; empty if there are none, or none are reported (now)."""
         request = PjLinkRequest("ERST")
-        if request in self._unknown:
-            self.power()  # to be silent because the cable is out must not look like health
+        if request in self._unsupported:
+            self.power()  # raises if the cable is unplugged, which must not look like a healthy projector
             return ()
-        reply = self._reply_to(request)
-        if self._cannot_tell(request, reply) or reply.error is ErrorCode.UNAVAILABLE:
+        reply = self._exchange_request(request)
+        if self._is_unsupported(request, reply) or reply.error is ErrorCode.UNAVAILABLE:
             return ()
         return parse_faults(self._value(reply))
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return every lamp; empty for a lampless projector, which does not know the question."""
-        value = self._ask_if_known("LAMP")
+        """Return all lamps; empty for a lampless projector, which does not support the query."""
+        value = self._query_if_supported("LAMP")
         return () if value is None else parse_lamps(value)
 
     def pjlink_class(self) -> int:
-        """Return the class of PJLink that the projector speaks, 1 or 2; asked once."""
+        """Return the PJLink class of the projector; queried once."""
         if self._class is None:
-            value = self._ask_if_known("CLSS")
+            value = self._query_if_supported("CLSS")
             self._class = 1 if value is None else parse_class(value)
         return self._class
 
     def input(self) -> str:
-        """Return the code of the input that is selected; refused unless the projector is on."""
-        return parse_input(self._ask("INPT", level=min(self.pjlink_class(), 2)))
+        """Return the code of the selected input; refused unless the projector is on."""
+        return parse_input(self._query("INPT", level=min(self.pjlink_class(), 2)))
 
     def input_resolution(self) -> Resolution | NoResolution | None:
-        """Return the resolution of the signal, or why it has none; None where it cannot tell; class 2."""
-        value = self._ask_class_2("IRES")
+        """Return the resolution of the signal, or why it is missing; None if not reported; class 2."""
+        value = self._query_class_2("IRES")
         return None if value is None else parse_input_resolution(value)
 
     def frozen(self) -> bool | None:
-        """Return whether the picture is frozen: it then no longer follows the signal; as `input_resolution`."""
-        value = self._ask_class_2("FREZ")
+        """Return whether the image is frozen and ignores the signal; None if not reported; class 2."""
+        value = self._query_class_2("FREZ")
         return None if value is None else parse_freeze(value)
 
     def picture_fault(self) -> str | None:
-        """Return whether the picture is frozen or no signal arrives, as far as the projector can tell; else None."""
-        if self._answer_now(self.pjlink_class, 1) < 2:
+        """Return the fault if the image is frozen or no signal arrives; None if no fault is reported."""
+        if self._value_now(self.pjlink_class, 1) < 2:
             return None
-        if self._answer_now(self.frozen, None):
-            return "the projector's picture is frozen; release freeze on its remote control"
-        if self._answer_now(self.input_resolution, None) is NoResolution.NO_SIGNAL:
+        if self._value_now(self.frozen, None):
+            return "the projector's image is frozen; release freeze on its remote control"
+        if self._value_now(self.input_resolution, None) is NoResolution.NO_SIGNAL:
             return "no signal arrives at the projector's input; check the cable, the input and the display's settings"
         return None
 
     def close(self) -> None:
-        """Release the control port; the power state stays."""
+        """Release the control port and keep the power state."""
         self._exchange.close()
 
-    def _name(self, command: str) -> str:
-        reply = self._reply_to(PjLinkRequest(command))
+    def _query_name(self, command: str) -> str:
+        reply = self._exchange_request(PjLinkRequest(command))
         return reply.value if reply.error is None else ""
 
-    def _ask(self, command: str, level: int = 1) -> str:
-        return self._value(self._reply_to(PjLinkRequest(command, level=level)))
+    def _query(self, command: str, level: int = 1) -> str:
+        return self._value(self._exchange_request(PjLinkRequest(command, level=level)))
 
-    def _ask_class_2(self, command: str) -> str | None:
+    def _query_class_2(self, command: str) -> str | None:
         if self.pjlink_class() < 2:
             raise DeviceRefused(
-                f"{self._label} speaks PJLink class 1, {command} needs class 2; look in its menu or on its type plate"
+                f"{self._label} has PJLink class 1, {command} requires class 2; look in its menu or on its type plate"
             )
-        return self._ask_if_known(command, level=2)
+        return self._query_if_supported(command, level=2)
 
-    def _ask_if_known(self, command: str, level: int = 1) -> str | None:
-        """Return what the projector answers, None where it does not know the question, or has no such part."""
+    def _query_if_supported(self, command: str, level: int = 1) -> str | None:
         request = PjLinkRequest(command, level=level)
-        if request in self._unknown:
+        if request in self._unsupported:
             return None
-        reply = self._reply_to(request)
-        return None if self._cannot_tell(request, reply) else self._value(reply)
+        reply = self._exchange_request(request)
+        return None if self._is_unsupported(request, reply) else self._value(reply)
 
-    def _cannot_tell(self, request: PjLinkRequest, reply: PjLinkReply) -> bool:
-        """Return whether a question is unknown to the projector, and remember it: that does not change."""
-        # A question has no parameter that could be out of range; whoever says so does not know it either.
-        unknown = reply.error in (ErrorCode.UNDEFINED, ErrorCode.OUT_OF_PARAMETER)
-        if unknown:
-            self._unknown.add(request)
-        return unknown
+    def _is_unsupported(self, request: PjLinkRequest, reply: PjLinkReply) -> bool:
+        # A query has no parameter that could be out of range, so ERR2 also means that it is unsupported.
+        is_unsupported = reply.error in (ErrorCode.UNDEFINED, ErrorCode.OUT_OF_PARAMETER)
+        if is_unsupported:
+            self._unsupported.add(request)
+        return is_unsupported
 
-    def _answer_now(self, question: Callable[[], _Answer], unknown: _Answer) -> _Answer:
-        """Return what is answered now, `unknown` where the projector declines to answer now."""
+    def _value_now(self, query: Callable[[], _Value], default: _Value) -> _Value:
+        """Return the reply to a query, or `default` if the projector refuses it now."""
         try:
-            return question()
+            return query()
         except DeviceRefused:
             if not self._exchange.connected:
-                raise  # it refused the connection, not the question
-            return unknown
+                raise  # the projector refused the connection, not the query
+            return default
 
     def _set(self, command: str, parameter: str) -> None:
-        value = self._value(self._reply_to(PjLinkRequest(command, parameter)), parameter)
+        value = self._value(self._exchange_request(PjLinkRequest(command, parameter)), parameter)
         if value.upper() != OK:
             self.close()
             raise ProtocolError(f"{self._label} answers {value!r} to {command} {parameter}; expected OK")
 
     def _value(self, reply: PjLinkReply, parameter: str = QUERY) -> str:
-        asked = f"{self._label} answers {reply.value} to {reply.command} {parameter}"
+        exchange = f"{self._label} answers {reply.value} to {reply.command} {parameter}"
         match reply.error:
             case None:
                 return reply.value
             case ErrorCode.UNDEFINED:
-                raise DeviceRefused(f"{asked}: it does not know this command; do it with its remote control")
+                raise DeviceRefused(f"{exchange}: it does not support this command; use its remote control")
             case ErrorCode.OUT_OF_PARAMETER:
-                raise DeviceRefused(f"{asked}: it does not offer this value; choose it with its remote control")
+                raise DeviceRefused(f"{exchange}: it does not offer this value; set it with its remote control")
             case ErrorCode.UNAVAILABLE:
                 raise DeviceRefused(
-                    f"{asked}: it is warming up, cooling down or in standby; wait until its power is on and try again"
+                    f"{exchange}: it is warming up, cooling down or in standby; wait until it is on and try again"
                 )
             case ErrorCode.FAILURE:
-                raise DeviceFault(f"{asked}: it reports a failure of its own; look at its lamps and display")
+                raise DeviceFault(f"{exchange}: it reports an internal failure; check its indicator lamps and display")
 
-    def _reply_to(self, request: PjLinkRequest) -> PjLinkReply:
-        reply = self._exchange.ask(encode_request(request), take_line, is_notice_of_start)
+    def _exchange_request(self, request: PjLinkRequest) -> PjLinkReply:
+        reply = self._exchange.query(encode_request(request), split_line, is_startup_notice)
         try:
             answer = parse_reply(reply)
             if isinstance(answer, Refused):
-                raise self._wrong_password()
+                raise self._wrong_password_error()
             if answer.command != request.command:
                 raise ProtocolError(
-                    f"{self._label} answers {answer.command} to {request.command}; check that no other controller "
-                    "shares the connection"
+                    f"{self._label} answers {answer.command} to {request.command}; check that no other controller uses "
+                    "this connection"
                 )
         except DeviceRefused:
-            asked_before = self._exchange.questions > 1
+            is_later_request = self._exchange.request_count > 1
             self._exchange.close()
-            if asked_before:
-                # Some servers want the digest before every command: a new connection begins with one.
-                return self._reply_to(request)
+            if is_later_request:
+                # Some servers require the digest before every command; a new connection starts with one.
+                return self._exchange_request(request)
             raise
         except ProtocolError:
             self._exchange.close()
@@ -528,64 +521,62 @@ class PjLinkProjector:
         return answer
 
     def _greet(self, exchange: Exchange) -> bytes:
-        """Return the digest that the first command must begin with."""
+        """Return the digest that precedes the first command."""
         try:
-            line = exchange.listen(take_line, is_notice_of_start)
+            line = exchange.listen(split_line, is_startup_notice)
         except LinkTimeout as error:
             exchange.close()
-            server = None if self._has_greeted else self._other_server()
+            # Only if no projector has answered before: a projector that starts up is silent, too.
+            server = None if self._has_greeted else self._detect_other_server()
             if server is None:
                 raise
             raise DeviceRefused(
-                f"{self._label}: {server} answers at its address and port, no projector; give the address of the "
-                f"projector, and as port {PORT} unless its menu says another"
+                f"{self._label}: {server} answers at its address and port; set the address of the projector, and "
+                f"port {PORT} unless its menu shows another"
             ) from error
         seed = parse_greeting(line)
         self._has_greeted = True
         if isinstance(seed, Refused):
-            raise self._wrong_password()
+            raise self._wrong_password_error()
         if seed is None:
             return b""
         if self._password is None:
-            raise DeviceRefused(f"{self._label} asks for a password; give the one set for PJLink in its menu")
+            raise DeviceRefused(f"{self._label} requires a password; set the PJLink password of its menu")
         return authentication_digest(seed, self._password).encode("ascii")
 
-    def _other_server(self) -> str | None:
-        """Return what answers where nobody greets, by what it says to questions of its own kind; None if nothing does.
-
-        It is asked only where no projector was met before, for one that is starting is silent as well.
-        """
-        said = self._answer_to(_HTTP_QUESTION)
-        if said[:5].lower() in _HTTP_ANSWERS:
+    def _detect_other_server(self) -> str | None:
+        http_reply = self._probe(_HTTP_REQUEST)
+        if http_reply[:5].lower() in _HTTP_REPLY_STARTS:
             return "an HTTP server"
-        return "a camera (PTP/IP)" if self._answer_to(_PTPIP_QUESTION)[4:8] in _PTPIP_ANSWERS else None
+        return "a camera (PTP/IP)" if self._probe(_PTPIP_REQUEST)[4:8] in _PTPIP_REPLY_TYPES else None
 
-    def _answer_to(self, question: bytes) -> bytes:
+    def _probe(self, request: bytes) -> bytes:
         try:
             link = self._connect()
         except LinkError:
             return b""
         try:
-            link.write(question, _OTHER_SERVER_S)
-            return link.read(MAX_LINE, _OTHER_SERVER_S)
+            link.write(request, _OTHER_SERVER_TIMEOUT_S)
+            return link.read(MAX_LINE, _OTHER_SERVER_TIMEOUT_S)
         except LinkError:
             return b""
         finally:
             link.close()
 
-    def _wrong_password(self) -> DeviceRefused:
-        return DeviceRefused(f"{self._label} refuses the password; give the one set for PJLink in its menu")
+    def _wrong_password_error(self) -> DeviceRefused:
+        return DeviceRefused(f"{self._label} refuses the password; set the PJLink password of its menu")
 
 
-ASKED = 3  # A datagram may be lost, so the search is sent so often, a second apart; a projector may answer each
-ASK_EVERY_S = 1.0  # Far enough apart that one disturbance of the network does not swallow two
+# The search is repeated because datagrams may be lost; a projector may reply to each.
+SEARCH_COUNT = 3
+SEARCH_INTERVAL_S = 1.0  # Long enough that one network disturbance does not affect two searches
 
 _MAC = re.compile("[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}")
 
 
 @dataclass(frozen=True)
 class FoundProjector:
-    """A projector that answered: where its control port is reached, and its MAC address."""
+    """A projector that replied to the search: address of its control port, and its MAC address."""
 
     host: str
     mac: str
@@ -598,24 +589,25 @@ def search(
     open_socket: Callable[[int], UdpSocket] = UdpSocket,
     clock: Clock = SYSTEM_CLOCK,
 ) -> tuple[FoundProjector, ...]:
-    """Ask all projectors of the network to answer, and return those that do, in the order of their answers.
+    """Broadcast a search over UDP for `seconds`; return the class 2 projectors in the order of their replies.
 
-    `address`: of the broadcast. `clock`: measures `seconds`.
+    Nothing in these replies is authenticated. Projectors also send notices of start-up, faults, power and input to the
+    controller in their menu; these are ignored here.
     """
-    found: dict[FoundProjector, None] = {}
+    projectors: dict[FoundProjector, None] = {}
     with open_socket(listen_port) as datagrams:
         start = clock.monotonic()
-        asked = 0
-        while (passed := clock.monotonic() - start) < seconds:
-            if asked < ASKED and passed >= asked * ASK_EVERY_S:
+        sent_count = 0
+        while (elapsed := clock.monotonic() - start) < seconds:
+            if sent_count < SEARCH_COUNT and elapsed >= sent_count * SEARCH_INTERVAL_S:
                 datagrams.send(SEARCH, (address, PORT))
-                asked += 1
-            ends = min(seconds, asked * ASK_EVERY_S) if asked < ASKED else seconds
+                sent_count += 1
+            wait_end = min(seconds, sent_count * SEARCH_INTERVAL_S) if sent_count < SEARCH_COUNT else seconds
             try:
-                datagram, (host, _) = datagrams.receive(max(ends - passed, 0.0))
+                datagram, (host, _) = datagrams.receive(max(wait_end - elapsed, 0.0))
             except LinkTimeout:
                 continue
-            for reply in replies_in(datagram):
+            for reply in parse_datagram(datagram):
                 if reply.command == "ACKN" and _MAC.fullmatch(reply.value):
-                    found[FoundProjector(host, reply.value.lower())] = None
-    return tuple(found)
+                    projectors[FoundProjector(host, reply.value.lower())] = None
+    return tuple(projectors)

@@ -1,4 +1,4 @@
-"""The interface of whatever fills the projector's picture with one plain colour."""
+"""Interface of a presenter, which fills the projector's image with one uniform colour."""
 
 from __future__ import annotations
 
@@ -6,7 +6,13 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 
 class Colour(NamedTuple):
-    """The codes of a plain frame as the projector receives them, each 0 … 255; readers of files check that."""
+    """Codes of a uniform image as the projector receives them.
+
+    Attributes
+    ----------
+    red, green, blue
+        0 to 255. The type does not check the range; readers of files do.
+    """
 
     red: int
     green: int
@@ -18,15 +24,15 @@ WHITE = Colour(255, 255, 255)
 
 
 class Presenter(Protocol):
-    """A full-screen plain colour."""
+    """A full-screen display of one uniform colour."""
 
     def show(self, colour: Colour) -> None:
-        """Fill the picture with exactly `colour`; returns when it is known to be on the screen.
+        """Display `colour` on the whole screen; return once it is on the screen.
 
         Raises
         ------
         DeviceError
-            The colour is not, or not exactly, on the screen.
+            The screen does not show exactly these codes.
         """
 
     def close(self) -> None:
@@ -35,21 +41,21 @@ class Presenter(Protocol):
 
 @runtime_checkable
 class ReadsBack(Protocol):
-    """A presenter that can read what the screen shows, at any time after `Presenter.show`."""
+    """A presenter that can read back the screen at any time after `Presenter.show`."""
 
     def verify(self, colour: Colour) -> None:
-        """Return if the screen shows exactly `colour` everywhere now.
+        """Check that the whole screen shows exactly `colour` now.
 
         Raises
         ------
         DeviceError
-            It does not, or cannot be read; with what covers it where that is known.
+            The screen shows other codes or cannot be read. The message names the covering window if it is known.
         """
 
 
 @runtime_checkable
 class ReportsWarnings(Protocol):
-    """A presenter that can report what changes, or may change, the light behind the codes that it shows."""
+    """A presenter that reports what may change the displayed illuminant without changing the codes."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return a sentence with its remedy for each such cause, a gamma ramp for one; empty when there is none."""
+        """Return one sentence with its remedy for each such cause (e.g. a gamma ramp); empty if there is none."""

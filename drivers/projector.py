@@ -1,7 +1,7 @@
-"""The interface of a projector's control port: its lamp, its faults, its name.
+"""Interface of a projector's control port: power, mute, lamp and faults.
 
-What the projector *shows* is set elsewhere; see `drivers.presenter`. A question that a projector does not know is
-answered as one that it cannot tell, never as an error: few know all that their standard has.
+`drivers.presenter` sets the displayed image. Many projectors implement only part of their protocol. A query that a
+projector does not support returns None or an empty value, and raises no error.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final, Protocol, runtime_checkable
 
 
 class Power(Enum):
-    """The four states of a lamp projector (PJLink 1.04, POWR)."""
+    """Power states of a lamp projector (PJLink 1.04, POWR)."""
 
     STANDBY = "standby"
     ON = "on"
@@ -22,19 +22,27 @@ class Power(Enum):
 
 
 class Severity(Enum):
-    """How bad a reported fault is (PJLink 1.04, ERST)."""
+    """Severity of a reported fault (PJLink 1.04, ERST)."""
 
     WARNING = "warning"
     ERROR = "error"
 
 
-# The parts of which a projector can report faults, in the order of PJLink 1.04, ERST.
+# Components with a fault state, in the order of PJLink 1.04, ERST.
 FAULT_PARTS: Final = ("fan", "lamp", "temperature", "cover", "filter", "other")
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault that a projector reports: `part` is one of `FAULT_PARTS`."""
+    """One reported fault.
+
+    Attributes
+    ----------
+    part
+        One of `FAULT_PARTS`.
+    severity
+        Warning or error.
+    """
 
     part: str
     severity: Severity
@@ -42,7 +50,15 @@ class Fault:
 
 @dataclass(frozen=True)
 class Lamp:
-    """One lamp: its accumulated hours and whether it is lit."""
+    """One lamp.
+
+    Attributes
+    ----------
+    hours
+        Accumulated hours of operation.
+    lit
+        True if the lamp is on.
+    """
 
     hours: int
     lit: bool
@@ -50,7 +66,7 @@ class Lamp:
 
 @dataclass(frozen=True)
 class ProjectorIdentity:
-    """Which projector answers, as it names itself; empty where it reports none."""
+    """Identity as the projector reports it; empty texts if it reports none."""
 
     maker: str
     model: str
@@ -58,7 +74,7 @@ class ProjectorIdentity:
 
 
 class Projector(Protocol):
-    """A projector whose control port has been opened."""
+    """A projector with an open control port."""
 
     @abstractmethod
     def identity(self) -> ProjectorIdentity:
@@ -66,40 +82,40 @@ class Projector(Protocol):
 
     @abstractmethod
     def power(self) -> Power:
-        """Return the power state now."""
+        """Return the current power state."""
 
     @abstractmethod
     def switch_on(self) -> None:
-        """Begin to switch on; returns at once, `power` shows when it is done."""
+        """Start to switch on; returns at once. `power` shows the progress."""
 
     @abstractmethod
     def switch_off(self) -> None:
-        """Begin to switch off; returns at once, `power` shows when it is done."""
+        """Start to switch off; returns at once. `power` shows the progress."""
 
     @abstractmethod
     def muted(self) -> bool | None:
-        """Return whether the picture is blanked by mute; None where the projector is on and cannot tell."""
+        """Return whether mute blanks the image; None if the projector is on and does not report it."""
 
     @abstractmethod
     def set_muted(self, muted: bool) -> None:
-        """Blank the picture, or show it."""
+        """Blank the image (True) or show it (False)."""
 
     @abstractmethod
     def faults(self) -> tuple[Fault, ...]:
-        """Return every fault reported now; empty when healthy, and where the projector cannot tell."""
+        """Return all present faults; empty if there are none or the projector does not report faults."""
 
     @abstractmethod
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return every lamp; empty for a lampless projector, and for one that does not count hours."""
+        """Return all lamps; empty for a lampless projector, or if it does not count hours."""
 
     @abstractmethod
     def close(self) -> None:
-        """Release the control port; a second call does nothing. The power state stays."""
+        """Release the control port and keep the power state; a second call does nothing."""
 
 
 @runtime_checkable
 class ReportsPictureFault(Protocol):
-    """A projector that can report, beyond `Projector`, that its picture is not the one that is sent to it."""
+    """A projector that reports if it does not display the signal it receives."""
 
     def picture_fault(self) -> str | None:
-        """Return why the picture does not follow the signal (frozen, no signal); None if it does, or is not known."""
+        """Return why the displayed image differs from the signal (frozen, no signal); None if no fault is reported."""

@@ -1,12 +1,12 @@
-"""TIFF files: their tags, their directories read, and the head of a new file laid out; never the pixels themselves.
+"""TIFF files: reads their directories, and writes the header of a new file; pixels are not touched.
 
-Every byte sequence whatever ends in a result or in `TiffDamaged`. Only the tags in `_DECODED` are decoded; maker notes
-and previews are not touched. Makers' own magic numbers (Olympus, Panasonic) pass, since what follows is TIFF all the
-same. A head has one picture in one uncompressed strip, little-endian; the pixels follow as they lie in memory.
+Any bytes give a result or raise `TiffDamaged`. Only the tags in `_DECODED` are decoded; maker notes and previews are
+ignored. Magic numbers of makers (Olympus, Panasonic) are accepted, because the rest is TIFF. A new header describes one
+image in one uncompressed strip, little-endian; the pixels follow as in memory.
 
 Sources: TIFF 6.0, sections 2, 8 and 15 and supplement 1 (SubIFDs); TIFF/EP (ISO 12234-2) for the colour filter array;
-Exif 2.32, section 4.6; DNG 1.7.1, chapters 2 and 4. Tags of Canon, Panasonic and Fujifilm, of which there is no public
-standard: P. Harvey, ExifTool, lib/Image/ExifTool/{Exif,PanasonicRaw,FujiFilm}.pm.
+Exif 2.32, section 4.6; DNG 1.7.1, chapters 2 and 4. Tags of Canon, Panasonic and Fujifilm have no public standard:
+P. Harvey, ExifTool, lib/Image/ExifTool/{Exif,PanasonicRaw,FujiFilm}.pm.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Final
 
 
 class TiffTag(IntEnum):
-    """Tag codes of TIFF, TIFF/EP, Exif and DNG, and makers' own."""
+    """Tag codes of TIFF, TIFF/EP, Exif, DNG, and of makers."""
 
     # TIFF 6.0
     NEW_SUBFILE_TYPE = 254
@@ -85,7 +85,7 @@ class TiffTag(IntEnum):
     ACTIVE_AREA = 50829
     MASKED_AREAS = 50830
 
-    # Canon CR2: widths of the vertical slices in which the raw pixels are stored
+    # Canon CR2: widths of the vertical slices of the stored raw pixels
     CR2_SLICES = 50752
 
 
@@ -97,22 +97,22 @@ D65: Final = 21  # LightSource of daylight of 6504 K (Exif 2.32, section 4.6.5),
 
 
 class TiffDamaged(ValueError):
-    """The bytes are no TIFF, or a directory points beyond their end."""
+    """The bytes are not a TIFF, or a directory points beyond their end."""
 
 
-_MAX_DIRECTORIES: Final = 64  # Directories that are read: a camera's file has under ten, and a damaged chain must end
+_MAX_DIRECTORIES: Final = 64  # Most directories; camera files have fewer than ten, and a damaged chain must end
 
-_MAX_ENTRIES: Final = 512  # Entries of a directory, as LibRaw allows; a camera's has under a hundred
+_MAX_ENTRIES: Final = 512  # Most entries of a directory, as in LibRaw; camera files have fewer than 100
 
-# Values of a directory's tags: a linearisation table, the longest that is read, has at most 65 536.
+# Most values in a directory; the longest, a linearisation table, has at most 65 536.
 _MAX_VALUES: Final = 1 << 18
 
-# Numbers of floating point that are believed: larger ones are not exact, and no place, size or level is one.
+# Largest accepted floating-point number; integers above it are not exact, and no offset, size or level reaches it.
 _LARGEST: Final = 2.0**53
 
 _TEXT: Final = 2  # Type ASCII (TIFF 6.0, section 2)
 
-# Letters of `struct` by type (TIFF 6.0, section 2; 13, IFD: TIFF technical note 1); rationals are two numbers.
+# `struct` formats by type (TIFF 6.0, section 2; 13, IFD: TIFF technical note 1); a rational is two numbers.
 _FORMATS: Final = {
     1: "B",
     2: "s",
@@ -130,13 +130,13 @@ _FORMATS: Final = {
 }
 
 _INTEGERS: Final = frozenset({1, 3, 4, 7})
-_PLACES: Final = frozenset({4, 13})
+_OFFSETS: Final = frozenset({4, 13})
 _NUMBERS: Final = frozenset(_FORMATS) - {_TEXT}
 
 _T = TiffTag
-# Tags that are read, and the types that each may have; a damaged value of any other is no fault of the pixels. A name
-# of another type is left out, as writers differ there and no pixel depends on it; a number of another type is damage.
-# Integers may be UNDEFINED, as colour filters are in Exif.
+# Decoded tags, and the permitted types of each; other tags do not affect the pixels. A text of another type is ignored,
+# because writers differ and no pixel depends on it; a number of another type is damage. Integers may be UNDEFINED, as
+# for colour filters in Exif.
 _DECODED: Final[dict[int, frozenset[int]]] = {
     tag: types
     for types, tags in (
@@ -152,7 +152,7 @@ _DECODED: Final[dict[int, frozenset[int]]] = {
             ),
         ),
         (
-            _PLACES,
+            _OFFSETS,
             (
                 _T.STRIP_OFFSETS, _T.TILE_OFFSETS, _T.SUB_IFDS, _T.EXIF_IFD_POINTER,
             ),
@@ -175,7 +175,7 @@ _DECODED: Final[dict[int, frozenset[int]]] = {
     for tag in tags
 }  # fmt: skip
 
-# Tags whose zero divided by zero means that the camera does not know.
+# Tags in which 0/0 means an unknown value.
 _EXPOSURES: Final = frozenset({TiffTag.EXPOSURE_TIME, TiffTag.F_NUMBER, TiffTag.PHOTOGRAPHIC_SENSITIVITY})
 
 _POINTERS: Final = (TiffTag.SUB_IFDS, TiffTag.EXIF_IFD_POINTER)  # Tags that point to further directories
@@ -185,95 +185,95 @@ ReadValue = str | tuple[float, ...]
 
 @dataclass(frozen=True)
 class Directory:
-    """One image file directory: the decoded tags that it holds; rationals have become floats."""
+    """One image file directory: its decoded tags, with rationals as floats."""
 
     values: dict[int, ReadValue]
 
     def numbers(self, tag: TiffTag) -> tuple[float, ...]:
-        """Return the numbers of `tag`; empty where the directory has none."""
+        """Return the numbers of `tag`; empty if the tag is missing."""
         value = self.values.get(tag, ())
         return () if isinstance(value, str) else value
 
     def integers(self, tag: TiffTag) -> tuple[int, ...]:
-        """Return the numbers of `tag` cut to integers; empty where the directory has none."""
+        """Return the numbers of `tag`, truncated to integers; empty if the tag is missing."""
         return tuple(int(number) for number in self.numbers(tag))
 
     def text(self, tag: TiffTag) -> str:
-        """Return the text of `tag`; empty where the directory has none."""
+        """Return the text of `tag`; empty if the tag is missing."""
         value = self.values.get(tag, "")
         return value if isinstance(value, str) else ""
 
     def first(self, tag: TiffTag) -> int:
-        """Return the first number of `tag` cut to an integer; 0 where the directory has none."""
+        """Return the first number of `tag`, truncated to an integer; 0 if the tag is missing."""
         return next(iter(self.integers(tag)), 0)
 
 
 def is_tiff(data: bytes | memoryview) -> bool:
-    """Return whether `data` begins as TIFF does, or as a maker's near copy of it."""
+    """Return whether `data` starts with the magic number of TIFF, or of a maker's variant."""
     return data[:4] in (b"II*\0", b"MM\0*", b"IIRO", b"IIRS", b"MMOR", b"IIU\0")
 
 
 def read_directories(data: bytes | memoryview) -> list[Directory]:
-    """Return the directories of the main chain and, after each, those it points to by SubIFDs and as Exif."""
+    """Return the directories of the main chain, each followed by its SubIFDs and Exif directory."""
     if not is_tiff(data) or len(data) < 8:
-        raise TiffDamaged("it does not begin as a TIFF file does")
+        raise TiffDamaged("its first bytes are not those of a TIFF file")
     order = "<" if data[:2] == b"II" else ">"
     directories: list[Directory] = []
-    seen: set[int] = set()
-    waiting = [_unpack(order, "I", data, 4)[0]]
-    while waiting:
-        offset = waiting.pop()
-        if offset == 0 or offset in seen or len(seen) >= _MAX_DIRECTORIES:
+    read_offsets: set[int] = set()
+    pending_offsets = [_unpack(order, "I", data, 4)[0]]
+    while pending_offsets:
+        offset = pending_offsets.pop()
+        if offset == 0 or offset in read_offsets or len(read_offsets) >= _MAX_DIRECTORIES:
             continue
-        seen.add(offset)
-        directory, following = _read_directory(order, data, offset)
+        read_offsets.add(offset)
+        directory, next_offset = _read_directory(order, data, offset)
         directories.append(directory)
-        waiting.append(following)
-        waiting.extend(reversed([place for tag in _POINTERS for place in directory.integers(tag)]))
+        pending_offsets.append(next_offset)
+        pending_offsets.extend(reversed([position for tag in _POINTERS for position in directory.integers(tag)]))
     return directories
 
 
 def _read_directory(order: str, data: bytes | memoryview, offset: int) -> tuple[Directory, int]:
     (count,) = _unpack(order, "H", data, offset)
     if count > _MAX_ENTRIES:
-        raise TiffDamaged(f"a directory claims {count} entries")
+        raise TiffDamaged(f"a directory has {count} entries, at most {_MAX_ENTRIES} expected")
     values: dict[int, ReadValue] = {}
-    claimed = 0
+    value_count = 0
     for number in range(count):
-        entry = offset + 2 + 12 * number
-        tag, kind, length = _unpack(order, "HHI", data, entry)
+        entry_offset = offset + 2 + 12 * number
+        tag, value_type, length = _unpack(order, "HHI", data, entry_offset)
         allowed = _DECODED.get(tag)
         if allowed is None:
             continue
-        claimed += length
-        if claimed > _MAX_VALUES:
-            raise TiffDamaged(f"a directory claims {claimed} values")
-        if kind in allowed:
-            values[tag] = _read_value(order, data, entry + 8, kind, length, exact=tag not in _EXPOSURES)
+        value_count += length
+        if value_count > _MAX_VALUES:
+            raise TiffDamaged(f"a directory has {value_count} values, at most {_MAX_VALUES} expected")
+        if value_type in allowed:
+            values[tag] = _read_value(order, data, entry_offset + 8, value_type, length, exact=tag not in _EXPOSURES)
         elif _TEXT not in allowed:
-            raise TiffDamaged(f"its tag {tag} is of type {kind}, one of {sorted(allowed)} expected")
+            raise TiffDamaged(f"its tag {tag} is of type {value_type}, one of {sorted(allowed)} expected")
     end = offset + 2 + 12 * count
-    # Some writers leave out the link that ends the chain when the directory is the last thing in the file.
-    following = _unpack(order, "I", data, end)[0] if end + 4 <= len(data) else 0
-    return Directory(values), following
+    # Some writers leave out the final link of the chain if the directory ends the file.
+    next_offset = _unpack(order, "I", data, end)[0] if end + 4 <= len(data) else 0
+    return Directory(values), next_offset
 
 
-def _read_value(order: str, data: bytes | memoryview, place: int, kind: int, length: int, *, exact: bool) -> ReadValue:
-    one = _FORMATS[kind]
-    size = struct.calcsize(order + one) * length
+def _read_value(order: str, data: bytes | memoryview, offset: int, code: int, length: int, *, exact: bool) -> ReadValue:
+    layout = _FORMATS[code]
+    size = struct.calcsize(order + layout) * length
     if size > 4:
-        (place,) = _unpack(order, "I", data, place)
-    if kind == _TEXT:
-        if place + length > len(data):
-            raise TiffDamaged(f"a text reaches to byte {place + length}, and it has only {len(data)}")
-        return bytes(data[place : place + length]).split(b"\0")[0].decode("utf-8", "replace").strip()
-    numbers = _unpack(order, one * length if len(one) == 2 else f"{length}{one}", data, place)
-    if len(one) == 2:
+        (offset,) = _unpack(order, "I", data, offset)
+    if code == _TEXT:
+        if offset + length > len(data):
+            raise TiffDamaged(f"a text extends to byte {offset + length}, the file has {len(data)} bytes")
+        return bytes(data[offset : offset + length]).split(b"\0")[0].decode("utf-8", "replace").strip()
+    numbers = _unpack(order, layout * length if len(layout) == 2 else f"{length}{layout}", data, offset)
+    if len(layout) == 2:
         if exact and not all(numbers[1::2]):
-            raise TiffDamaged("a tag holds a number that is divided by zero")
+            raise TiffDamaged("a tag has a rational with denominator 0")
         return tuple(top / bottom if bottom else 0.0 for top, bottom in zip(numbers[::2], numbers[1::2], strict=True))
-    if one in "fd" and not all(abs(number) <= _LARGEST for number in numbers):
-        raise TiffDamaged(f"a tag holds numbers beyond {_LARGEST:g}, or none")
+    if layout in "fd" and not all(abs(number) <= _LARGEST for number in numbers):
+        raise TiffDamaged(f"a tag has a number that is not finite or above {_LARGEST:g}")
     return tuple(numbers)
 
 
@@ -283,11 +283,11 @@ def _unpack(order: str, layout: str, data: bytes | memoryview, offset: int) -> t
             raise struct.error
         return struct.unpack_from(order + layout, data, offset)
     except struct.error as error:
-        raise TiffDamaged(f"it points to byte {offset}, and has only {len(data)}") from error
+        raise TiffDamaged(f"it points to byte {offset}, the file has {len(data)} bytes") from error
 
 
 class ValueType(IntEnum):
-    """The types of a tag's values that are written (TIFF 6.0, section 2)."""
+    """Types of written values (TIFF 6.0, section 2)."""
 
     BYTE = 1
     ASCII = 2
@@ -298,11 +298,11 @@ class ValueType(IntEnum):
     SRATIONAL = 10
 
 
-Value = tuple[ValueType, Sequence[int]]  # A tag's type and its numbers; a rational is two of them, numerator first
+Value = tuple[ValueType, Sequence[int]]  # Type and numbers; a rational is numerator and denominator
 
 Tags = dict[TiffTag, Value]  # Values by tag
 
-LARGEST_FILE: Final = (1 << 32) - 1  # Bytes that the 32-bit offsets of TIFF reach
+LARGEST_FILE: Final = (1 << 32) - 1  # Bytes, limited by the 32-bit offsets of TIFF
 
 _LETTERS: Final = {
     ValueType.BYTE: "B",
@@ -314,22 +314,22 @@ _LETTERS: Final = {
     ValueType.SRATIONAL: "ii",
 }
 _HEADER: Final = struct.pack("<2sHI", b"II", 42, 8)
-_ALIGNMENT: Final = 16  # Bytes on whose multiple the pixels begin, so that samples of any type are aligned
+_ALIGNMENT: Final = 16  # The pixels start at a multiple of these bytes, so that samples of any type are aligned
 
 
 def text(value: str) -> Value:
-    """Return the value of an ASCII tag; what ASCII cannot write becomes a question mark."""
+    """Return the value of an ASCII tag; other characters become question marks."""
     return ValueType.ASCII, value.encode("ascii", "replace") + b"\0"
 
 
 def rationals(*values: float | Fraction) -> Value:
-    """Return numbers ≥ 0 as the nearest fractions of denominators up to 100 000."""
-    near = (Fraction(value).limit_denominator(100_000) for value in values)
-    return ValueType.RATIONAL, [part for value in near for part in value.as_integer_ratio()]
+    """Return numbers ≥ 0 as the nearest fractions with denominators up to 100 000."""
+    fractions = (Fraction(value).limit_denominator(100_000) for value in values)
+    return ValueType.RATIONAL, [number for value in fractions for number in value.as_integer_ratio()]
 
 
 def head(main: Tags, strip: int, exif: Tags | None = None) -> bytes:
-    """Return the bytes before the pixels."""
+    """Return all bytes before the `strip` bytes of pixels."""
     tags: Tags = {
         **main,
         TiffTag.STRIP_OFFSETS: (ValueType.LONG, [0]),
@@ -344,21 +344,21 @@ def head(main: Tags, strip: int, exif: Tags | None = None) -> bytes:
         end += len(_directory(exif, 0))
     strip_at = end + -end % _ALIGNMENT
     if strip_at + strip > LARGEST_FILE:
-        raise ValueError(f"{strip} bytes of pixels are more than the 4 GiB of a TIFF file")
+        raise ValueError(f"{strip} bytes of pixels; a TIFF file holds at most 4 GiB")
     tags[TiffTag.STRIP_OFFSETS] = (ValueType.LONG, [strip_at])
     directories = _directory(tags, len(_HEADER)) + (b"" if exif is None else _directory(exif, exif_at))
     return _HEADER + directories + bytes(strip_at - end)
 
 
 def _directory(tags: Tags, at: int) -> bytes:
-    """Return a directory that stands at byte `at` of the file, its longer values behind it; of even length."""
+    """Return a directory at byte `at` of the file with its longer values after it; its length is even."""
     entries = struct.pack("<H", len(tags))
     values = b""
     values_at = at + 2 + 12 * len(tags) + 4
-    for code, (kind, numbers) in sorted(tags.items()):
-        letters = _LETTERS[kind]
+    for code, (value_type, numbers) in sorted(tags.items()):
+        letters = _LETTERS[value_type]
         value = struct.pack(f"<{len(numbers)}{letters[0]}", *numbers)
-        entries += struct.pack("<HHI", code, kind, len(numbers) // len(letters))
+        entries += struct.pack("<HHI", code, value_type, len(numbers) // len(letters))
         if len(value) <= 4:
             entries += value.ljust(4, b"\0")
         else:

@@ -202,7 +202,7 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
             f"{path} is not the file that was taken: its SHA-256 is {found[:16]}…, the journal says "
             f"{record.sha256[:16]}…; restore the file from a copy, {_TAKEN_AGAIN}"
         )
-    mosaic = decode_raw(data, path, known_whole=True)
+    mosaic = decode_raw(data, path, is_verified=True)
     fault = filled_fault(mosaic.counts, mosaic.black, mosaic.white_level)
     if fault is not None:
         raise FormatError(

@@ -1,1 +1,1 @@
-"""What shows a plain colour: full-screen windows and projectors that paint a colour by themselves."""
+"""Displays of uniform colours in full-screen windows."""

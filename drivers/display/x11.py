@@ -1,9 +1,9 @@
-"""What an X server has on its screen, and which window lies in front; a hold on its screen saver; its end.
+"""Screen content of an X server and covering windows; suspends the screen saver, and detects the end of the server.
 
-It has a connection of its own, so that what it reads is what the server shows, whoever drew it; through libxcb, which
-returns errors to its caller. Xlib, which the window needs, ends the process when its server goes; `outlive` prevents
-that. A window may vanish at any moment, and a reply that does not come is a window that is not there. A window manager
-frames each, so that its name stands on a descendant.
+The connection is separate, so that the screen is read as the server shows it. It uses libxcb, which returns errors;
+Xlib, required for the window, ends the process if the server ends, which `outlive` prevents. Windows may disappear at
+any time, so a missing reply is treated as a missing window. Window managers put frames around windows; therefore names
+are searched in descendants.
 
 Sources: X Window System Protocol, GetImage, QueryExtension, QueryTree, GetWindowAttributes, GetGeometry and
 GetProperty; MIT-SCREEN-SAVER extension 1.1, Suspend; DPMS extension 1.2; Xlib, XSetIOErrorHandler(3) and
@@ -24,99 +24,99 @@ import numpy.typing as npt
 
 from foundation.errors import RUN_AGAIN, DeviceError
 
-INPUT_ONLY = 2  # Window class of what shows nothing (X protocol, CreateWindow)
-VIEWABLE = 2  # Map state of a window that is mapped, with all above it (X protocol, GetWindowAttributes)
-MAX_TEXT = 256  # Bytes of a name that are read: enough to tell one window from another
-MAX_DEPTH = 4  # Levels below a top window at which its name is looked for; window managers frame a window in one or two
-# Windows looked at for one name, so that a program with thousands of them costs no more than the rest.
+INPUT_ONLY = 2  # Window class without visible content (X protocol, CreateWindow)
+VIEWABLE = 2  # Map state of a mapped window with mapped ancestors (X protocol, GetWindowAttributes)
+MAX_TEXT = 256  # Longest name, bytes; enough to distinguish windows
+MAX_DEPTH = 4  # Levels below a top window that are searched for its name; window managers add one or two
+# Most windows searched for one name, as a limit for programs with thousands of windows.
 MAX_WINDOWS = 200
 
-_ANY_TYPE = 0  # AnyPropertyType of GetProperty: a name is wanted in whatever encoding it has
-_FOUR = 4  # GetProperty counts in words of four bytes (X protocol, GetProperty)
+_ANY_TYPE = 0  # AnyPropertyType of GetProperty: names in any encoding
+_WORD_BYTES = 4  # GetProperty counts in words of four bytes (X protocol, GetProperty)
 
 
-_Z_PIXMAP = 2  # Format of GetImage: whole pixels one after the other (X protocol, GetImage; XYPixmap is 1)
+_Z_PIXMAP = 2  # Format of GetImage: complete pixels in sequence (X protocol, GetImage; XYPixmap is 1)
 _ALL_PLANES = 0xFFFFFFFF  # Plane mask of GetImage: every bit of a pixel
-_DPMS_ON = 0  # Power level of a display that is lit (DPMS extension 1.2, DPMSInfo; 1 standby, 2 suspend, 3 off)
+_DPMS_ON = 0  # Power level of an active display (DPMS extension 1.2, DPMSInfo; 1 standby, 2 suspend, 3 off)
 
 
 _lost: set[int] = set()
 
 
 @ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
-def _go_on(display: int | None) -> int:
-    # The usual one writes to stderr and exits.
+def _ignore_loss(display: int | None) -> int:
+    # The default handler writes to stderr and exits.
     return 0
 
 
 @ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
-def _note_loss(display: int | None, data: int | None) -> None:
+def _record_loss(display: int | None, data: int | None) -> None:
     _lost.add(display or 0)
 
 
 def outlive(display: int) -> None:
-    """Let the process go on when the server of an Xlib connection is gone; old libraries end it all the same."""
+    """Keep the process alive if the server of an Xlib connection ends; not possible with old libraries."""
     with contextlib.suppress(OSError, AttributeError):
         xlib = ctypes.CDLL("libX11.so.6")
-        leave = xlib.XSetIOErrorExitHandler
-        leave.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
-        leave.restype = None
-        leave(display, ctypes.cast(_note_loss, ctypes.c_void_p), None)
-        xlib.XSetIOErrorHandler(_go_on)
-        # A new connection may stand where a lost one stood.
+        set_exit_handler = xlib.XSetIOErrorExitHandler
+        set_exit_handler.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
+        set_exit_handler.restype = None
+        set_exit_handler(display, ctypes.cast(_record_loss, ctypes.c_void_p), None)
+        xlib.XSetIOErrorHandler(_ignore_loss)
+        # A new connection may have the address of a lost one.
         _lost.discard(display)
 
 
 def is_lost(display: int) -> bool:
-    """Return whether the server of an Xlib connection that was to be outlived is gone."""
+    """Return whether the server of an Xlib connection has ended, after `outlive`."""
     return display in _lost
 
 
 def is_dark(display: int) -> bool:
-    """Return whether power saving keeps the displays of an Xlib connection dark now; False where it cannot tell."""
+    """Return whether power saving keeps the displays of an Xlib connection dark; False if it is unknown."""
     with contextlib.suppress(OSError, AttributeError):
         extension = ctypes.CDLL("libXext.so.6")
-        first, second = ctypes.c_int(), ctypes.c_int()
+        event_base, error_base = ctypes.c_int(), ctypes.c_int()
         extension.DPMSQueryExtension.argtypes = [ctypes.c_void_p] * 3
-        if not extension.DPMSQueryExtension(display, ctypes.byref(first), ctypes.byref(second)):
+        if not extension.DPMSQueryExtension(display, ctypes.byref(event_base), ctypes.byref(error_base)):
             return False
         level, enabled = ctypes.c_uint16(), ctypes.c_uint8()
         extension.DPMSInfo.argtypes = [ctypes.c_void_p] * 3
-        answered = extension.DPMSInfo(display, ctypes.byref(level), ctypes.byref(enabled))
-        return bool(answered and enabled.value and level.value != _DPMS_ON)
+        has_reply = extension.DPMSInfo(display, ctypes.byref(level), ctypes.byref(enabled))
+        return bool(has_reply and enabled.value and level.value != _DPMS_ON)
     return False
 
 
 class _Cookie(ctypes.Structure):
-    """What libxcb gives for a request under way."""
+    """Handle of a pending libxcb request."""
 
     _fields_ = (("sequence", ctypes.c_uint),)
 
 
 class _Screens(ctypes.Structure):
-    """xcb_screen_iterator_t: the root window's number stands first in what `data` points to."""
+    """xcb_screen_iterator_t; `data` points to the number of the root window."""
 
     _fields_ = (("data", ctypes.POINTER(ctypes.c_uint32)), ("rem", ctypes.c_int), ("index", ctypes.c_int))
 
 
-_POINTER, _WORD, _HALF, _BYTE, _PLACE = (
+_POINTER, _WORD, _HALF, _BYTE, _COORDINATE = (
     ctypes.c_void_p,
     ctypes.c_uint32,
     ctypes.c_uint16,
     ctypes.c_uint8,
     ctypes.c_int16,
 )
-# The requests that are sent, by their names in libxcb, and the types of what they are given.
+# Requests by their names in libxcb, with argument types.
 _REQUESTS: dict[str, list[type]] = {
     "get_geometry": [_WORD],
-    "get_image": [_BYTE, _WORD, _PLACE, _PLACE, _HALF, _HALF, _WORD],
+    "get_image": [_BYTE, _WORD, _COORDINATE, _COORDINATE, _HALF, _HALF, _WORD],
     "get_property": [_BYTE, _WORD, _WORD, _WORD, _WORD, _WORD],
     "get_window_attributes": [_WORD],
     "intern_atom": [_BYTE, _HALF, ctypes.c_char_p],
     "query_extension": [_HALF, ctypes.c_char_p],
     "query_tree": [_WORD],
 }
-# What else of libxcb is called: what it returns and takes.
+# Other functions of libxcb: return type and argument types.
 _CALLS: dict[str, tuple[type | None, list[type]]] = {
     "connect": (_POINTER, [ctypes.c_char_p, ctypes.POINTER(ctypes.c_int)]),
     "connection_has_error": (ctypes.c_int, [_POINTER]),
@@ -134,23 +134,23 @@ _CALLS: dict[str, tuple[type | None, list[type]]] = {
 }
 
 
-def _library() -> ctypes.CDLL:
+def _load_xcb() -> ctypes.CDLL:
     try:
         xcb = ctypes.CDLL("libxcb.so.1")
     except OSError as error:
-        raise DeviceError("libxcb.so.1 is not installed, so the screen cannot be read; install libxcb1") from error
+        raise DeviceError("libxcb.so.1 is not installed and is required to read the screen; install libxcb1") from error
     signatures = dict(_CALLS)
     for name, arguments in _REQUESTS.items():
         signatures[name] = (_Cookie, [_POINTER, *arguments])
         signatures[f"{name}_reply"] = (_POINTER, [_POINTER, _Cookie, _POINTER])
-    for name, (answer, arguments) in signatures.items():
+    for name, (result_type, arguments) in signatures.items():
         function = getattr(xcb, f"xcb_{name}")
-        function.restype, function.argtypes = answer, arguments
+        function.restype, function.argtypes = result_type, arguments
     return xcb
 
 
 class _Reply:
-    """A reply of libxcb, false where none came; freed at the end of its ``with``."""
+    """A reply of libxcb, false if none arrived; freed at the end of its ``with`` block."""
 
     def __init__(self, address: int | None, libc: ctypes.CDLL) -> None:
         self.address = address or 0
@@ -167,13 +167,13 @@ class _Reply:
         return bool(self.address)
 
     def read(self, offset: int, size: int) -> bytes:
-        """Return `size` bytes of it at `offset`."""
+        """Return `size` bytes at `offset`."""
         return ctypes.string_at(self.address + offset, size)
 
 
 @dataclass(frozen=True)
 class Cover:
-    """A window over a place: its name, and where it is, px of the whole screen, y down."""
+    """A covering window: name and area, px of the whole screen, y down."""
 
     name: str
     x: int
@@ -186,13 +186,13 @@ class Cover:
 
 
 class XScreen:
-    """The screen of an X server, and the windows on it.
+    """The screen of an X server (None: of DISPLAY), and the windows on it.
 
-    `display`: the server's name, such as ``:1``; None: what DISPLAY names.
+    With `keep_awake` screen saver and power saving are suspended while the connection is open.
     """
 
     def __init__(self, display: str | None = None, *, keep_awake: bool = True) -> None:
-        self._xcb = _library()
+        self._xcb = _load_xcb()
         self._libc = ctypes.CDLL(None)
         self._libc.free.argtypes = [ctypes.c_void_p]
         number = ctypes.c_int()
@@ -201,107 +201,107 @@ class XScreen:
         )
         if self._xcb.xcb_connection_has_error(self._connection):
             self.close()
-            named = "DISPLAY" if display is None else display
-            raise DeviceError(f"the X server cannot be reached; check {named} and that this user may open it")
+            setting = "DISPLAY" if display is None else display
+            raise DeviceError(f"the X server cannot be reached; check {setting}, and that this user may open it")
         screens = self._xcb.xcb_setup_roots_iterator(self._xcb.xcb_get_setup(self._connection))
         for _ in range(number.value):
             self._xcb.xcb_screen_next(ctypes.byref(screens))
         self._root: int = screens.data[0]
-        self._seen: npt.NDArray[np.uint32] = np.empty((0, 0), np.uint32)
+        self._pixels: npt.NDArray[np.uint32] = np.empty((0, 0), np.uint32)
+        # True if screen saver and power saving are suspended.
         self.stays_awake = keep_awake and self._suspend_saver()
-        """Whether screen saver and power saving are held off while this is open."""
 
     def size(self) -> tuple[int, int]:
-        """Return width and height of the whole screen now, px; a change of mode changes them."""
+        """Return width and height of the whole screen, px; they change with the display mode."""
         self._require_open()
-        with self._ask("get_geometry", self._root) as reply:
+        with self._request("get_geometry", self._root) as reply:
             if not reply:
-                raise DeviceError(f"the X server is gone: somebody logged out, or it crashed; log in, {RUN_AGAIN}")
+                raise DeviceError(f"the X server has ended (logout or crash); log in again, {RUN_AGAIN}")
             width, height = struct.unpack("=HH", reply.read(16, 4))
         return width, height
 
     def read(self, x: int, y: int, width: int, height: int) -> npt.NDArray[np.uint32]:
-        """Return what the server shows there, (height, width) uint32, 0xRRGGBB; the next call writes over it."""
+        """Return the screen content, (height, width) uint32, 0xRRGGBB; the next call overwrites it."""
         self._require_open()
-        with self._ask("get_image", _Z_PIXMAP, self._root, x, y, width, height, _ALL_PLANES) as reply:
+        with self._request("get_image", _Z_PIXMAP, self._root, x, y, width, height, _ALL_PLANES) as reply:
             if not reply:
                 raise DeviceError(
-                    f"the X server shows no {width}×{height} pixels at +{x}+{y} any more; "
+                    f"the X screen has no area of {width}×{height} px at +{x}+{y}; "
                     "check the display's cable and the desktop's display settings"
                 )
             size: int = self._xcb.xcb_get_image_data_length(reply.address)
             depth = reply.read(1, 1)[0]
             if depth not in (24, 32) or size != 4 * width * height:
-                raise DeviceError(f"the X screen has a depth of {depth} bits; set 24, so that codes arrive as they are")
+                raise DeviceError(f"the X screen has a depth of {depth} bits, 24 expected; set 24 for unchanged codes")
             raw = (ctypes.c_uint8 * size).from_address(self._xcb.xcb_get_image_data(reply.address))
-            if self._seen.shape != (height, width):
-                self._seen = np.empty((height, width), np.uint32)
+            if self._pixels.shape != (height, width):
+                self._pixels = np.empty((height, width), np.uint32)
             pixels = np.frombuffer(memoryview(raw), dtype="<u4").reshape(height, width)
-            return np.bitwise_and(pixels, np.uint32(0xFFFFFF), out=self._seen)
+            return np.bitwise_and(pixels, np.uint32(0xFFFFFF), out=self._pixels)
 
     def has_extension(self, name: str) -> bool:
-        """Return whether the server has the extension `name`."""
-        with self._ask("query_extension", len(name), name.encode("ascii")) as reply:
+        """Return whether the server has an extension."""
+        with self._request("query_extension", len(name), name.encode("ascii")) as reply:
             return bool(reply) and reply.read(8, 1) != b"\0"
 
     def has_root_property(self, name: str) -> bool:
-        """Return whether the root window has a property `name` that is not empty."""
+        """Return whether the root window has a property that is not empty."""
         return self._property(self._root, name) != b""
 
     def cover(self, x: int, y: int, own: int) -> Cover | None:
-        """Return the topmost window that shows something at a place, None where that is `own`, or none does."""
+        """Return the topmost visible window at a position; None if it is `own`, or if there is none."""
         if self._connection is None:
             return None
-        ours = self._top_of(own)
-        for window in reversed(self._tree(self._root)[1]):
-            if window == ours:
+        own_top = self._top_window(own)
+        for window in reversed(self._query_tree(self._root)[1]):
+            if window == own_top:
                 return None
-            place = self._place(window)
-            if place is None:
+            area = self._visible_area(window)
+            if area is None:
                 continue
-            left, top, width, height = place
+            left, top, width, height = area
             if left <= x < left + width and top <= y < top + height:
-                return Cover(self._name(window), *place)
+                return Cover(self._window_name(window), *area)
         return None
 
-    def _top_of(self, window: int) -> int:
+    def _top_window(self, window: int) -> int:
         for _ in range(2 * MAX_DEPTH):
-            parent, _children = self._tree(window)
+            parent, _children = self._query_tree(window)
             if parent in (0, self._root):
                 return window
             window = parent
         return window
 
-    def _name(self, top: int) -> str:
+    def _window_name(self, top: int) -> str:
         title, program = "", ""
-        for window in self._family(top):
-            title = title or self._text(window, "_NET_WM_NAME") or self._text(window, "WM_NAME")
-            program = program or self._text(window, "WM_CLASS").rstrip("\0").rpartition("\0")[2]
+        for window in self._descendants(top):
+            title = title or self._text_property(window, "_NET_WM_NAME") or self._text_property(window, "WM_NAME")
+            program = program or self._text_property(window, "WM_CLASS").rstrip("\0").rpartition("\0")[2]
             if title and program:
                 break
         if title:
             return f"“{title}” ({program})" if program and program.lower() != title.lower() else f"“{title}”"
         return f"a window of {program}" if program else f"a window without a name (0x{top:x})"
 
-    def _family(self, top: int) -> Iterator[int]:
+    def _descendants(self, top: int) -> Iterator[int]:
         level = [top]
-        seen = 0
+        count = 0
         for _ in range(MAX_DEPTH):
             for window in level:
                 yield window
-                seen += 1
-                if seen >= MAX_WINDOWS:
+                count += 1
+                if count >= MAX_WINDOWS:
                     return
-            level = [child for window in level for child in self._tree(window)[1]]
+            level = [child for window in level for child in self._query_tree(window)[1]]
 
     def close(self) -> None:
-        """Hang up, and let the screen saver run again; a second call does nothing."""
+        """Disconnect, and enable the screen saver again; a second call does nothing."""
         connection, self._connection = self._connection, None
         if connection is not None:
             self._xcb.xcb_disconnect(connection)
 
     def _suspend_saver(self) -> bool:
-        # A request of an extension that the server lacks would end the connection.
+        # A request of a missing extension would end the connection.
         if not self.has_extension("MIT-SCREEN-SAVER"):
             return False
         with contextlib.suppress(OSError, AttributeError):
@@ -318,47 +318,47 @@ class XScreen:
         if self._connection is None:
             raise DeviceError("the screen was closed; open it again")
 
-    def _tree(self, window: int) -> tuple[int, list[int]]:
-        """Return a window's parent, 0 where it has none, and its children from the lowest to the topmost."""
-        with self._ask("query_tree", window) as reply:
+    def _query_tree(self, window: int) -> tuple[int, list[int]]:
+        """Return a window's parent (0 if none) and its children from the lowest to the topmost."""
+        with self._request("query_tree", window) as reply:
             if not reply:
                 return 0, []
             count: int = self._xcb.xcb_query_tree_children_length(reply.address)
-            children = ctypes.string_at(self._xcb.xcb_query_tree_children(reply.address), _FOUR * count)
+            children = ctypes.string_at(self._xcb.xcb_query_tree_children(reply.address), _WORD_BYTES * count)
             (parent,) = struct.unpack("=I", reply.read(12, 4))
             return parent, list(struct.unpack(f"={count}I", children))
 
-    def _place(self, window: int) -> tuple[int, int, int, int] | None:
-        with self._ask("get_window_attributes", window) as reply:
+    def _visible_area(self, window: int) -> tuple[int, int, int, int] | None:
+        with self._request("get_window_attributes", window) as reply:
             if not reply:
                 return None
-            (kind,) = struct.unpack("=H", reply.read(12, 2))
-            if kind == INPUT_ONLY or reply.read(26, 1)[0] != VIEWABLE:
+            (window_class,) = struct.unpack("=H", reply.read(12, 2))
+            if window_class == INPUT_ONLY or reply.read(26, 1)[0] != VIEWABLE:
                 return None
-        with self._ask("get_geometry", window) as reply:
+        with self._request("get_geometry", window) as reply:
             if not reply:
                 return None
             x, y, width, height, border = struct.unpack("=hhHHH", reply.read(12, 10))
             return x, y, width + 2 * border, height + 2 * border
 
-    def _text(self, window: int, name: str) -> str:
+    def _text_property(self, window: int, name: str) -> str:
         text = self._property(window, name).decode("utf-8", "replace")
-        return "".join(sign for sign in text if sign.isprintable() or sign == "\0").strip()
+        return "".join(character for character in text if character.isprintable() or character == "\0").strip()
 
     def _property(self, window: int, name: str) -> bytes:
-        """Return the first `MAX_TEXT` bytes of a window's property, none where it has not got it."""
-        with self._ask("intern_atom", 1, len(name), name.encode("ascii")) as reply:
+        """Return the first `MAX_TEXT` bytes of a window's property; empty if it is missing."""
+        with self._request("intern_atom", 1, len(name), name.encode("ascii")) as reply:
             (atom,) = struct.unpack("=I", reply.read(8, 4)) if reply else (0,)
         if not atom:
             return b""
-        with self._ask("get_property", 0, window, atom, _ANY_TYPE, 0, MAX_TEXT // _FOUR) as reply:
+        with self._request("get_property", 0, window, atom, _ANY_TYPE, 0, MAX_TEXT // _WORD_BYTES) as reply:
             if not reply:
                 return b""
             size: int = self._xcb.xcb_get_property_value_length(reply.address)
             return ctypes.string_at(self._xcb.xcb_get_property_value(reply.address), size)
 
-    def _ask(self, request: str, *arguments: object) -> _Reply:
-        """Return what the server answers to a request; false where it does not, or the screen was closed."""
+    def _request(self, request: str, *arguments: object) -> _Reply:
+        """Return the reply to a request; a false reply if there is none, or the screen was closed."""
         if self._connection is None:
             return _Reply(None, self._libc)
         cookie = getattr(self._xcb, f"xcb_{request}")(self._connection, *arguments)

@@ -1,1 +1,1 @@
-"""The cables: the only files that import socket, pyserial or pyusb."""
+"""Cables to devices; only these modules import socket, pyserial and pyusb."""

@@ -1,7 +1,7 @@
-"""What a cable is: three verbs and a time limit; and one question at a time over it.
+"""A cable as three verbs with a time limit, and one request at a time over it.
 
-An implementation translates the system's errors into `LinkTimeout` and `LinkClosed` at this border and nowhere else.
-What was sent before hanging up can still be read after it.
+Contract of every implementation: errors of the system become `LinkTimeout` and `LinkClosed` here and nowhere else.
+Bytes that the far side sent before it disconnected can still be read.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
 
 class Link(Protocol):
-    """One open, ordered, two-way stream of bytes to a device."""
+    """An open, ordered, two-way stream of bytes to a device."""
 
     def write(self, data: bytes, timeout: float) -> None:
         """Send all of `data` within `timeout` seconds."""
 
     def read(self, limit: int, timeout: float) -> bytes:
-        """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first.
+        """Return the next 1 to `limit` bytes; wait at most `timeout` seconds for the first byte.
 
-        A timeout of 0 asks whether something is there: it brings b"" where nothing is, and is no fault.
+        With a timeout of 0 it returns b"" if no byte is waiting, and does not raise `LinkTimeout`.
         """
 
     def close(self) -> None:
-        """Hang up; a second call does nothing."""
+        """Disconnect; a second call does nothing."""
 
 
 class ClosedAtEnd:
-    """What is closed at the end of its `with` block."""
+    """Base class: `close` is called at the end of the `with` block."""
 
     def __enter__(self) -> Self:
         return self
@@ -40,26 +40,26 @@ class ClosedAtEnd:
         self.close()
 
     def close(self) -> None:
-        """Release it; a second call does nothing."""
+        """Release the resource; a second call does nothing."""
         raise NotImplementedError
 
 
 class Peer(Protocol):
-    """The far side of a connection as a pure machine: bytes in, bytes out."""
+    """The far side of a connection as a pure state machine: bytes in, bytes out."""
 
     def connect(self) -> bytes:
-        """Begin a new connection, forgetting any other, and return what the far side sends first."""
+        """Start a new connection, drop any earlier one, and return the first bytes of the far side."""
 
     def receive(self, data: bytes) -> bytes:
-        """Take the next bytes from the near side and return the answer so far; may hang up."""
+        """Process the next bytes of the near side and return the reply so far; may disconnect."""
 
     @property
     def closed(self) -> bool:
-        """Whether the far side has hung up."""
+        """True if the far side has disconnected."""
 
 
 class PeerLink:
-    """A `Link` whose far side is a `Peer` in the same thread."""
+    """A `Link` to a `Peer` in the same thread."""
 
     def __init__(self, peer: Peer) -> None:
         self._peer = peer
@@ -67,47 +67,50 @@ class PeerLink:
         self._open = True
 
     def write(self, data: bytes, timeout: float) -> None:
-        """Hand `data` to the peer; like a real cable, one that was hung up shows it only to the next reader."""
+        """Pass `data` to the peer."""
         if not self._open:
             raise LinkClosed("this end of the simulated cable was closed; open a new connection")
+        # As on a real cable, a disconnection is seen only by the next read.
         if not self._peer.closed:
             self._incoming += self._peer.receive(data)
 
     def read(self, limit: int, timeout: float) -> bytes:
-        """Return up to `limit` bytes of what the peer has answered; b"" if there is nothing and `timeout` is 0."""
+        """Return up to `limit` bytes of the reply; see `Link.read`."""
         if not self._open:
             raise LinkClosed("this end of the simulated cable was closed; open a new connection")
         if not self._incoming:
             if self._peer.closed:
-                raise LinkClosed("the simulated device hung up; open a new connection")
+                raise LinkClosed("the simulated device closed the connection; open a new one")
             if not timeout:
                 return b""
             raise LinkTimeout(f"the simulated device has not answered within {timeout:g} s")
-        taken = bytes(self._incoming[:limit])
+        data = bytes(self._incoming[:limit])
         del self._incoming[:limit]
-        return taken
+        return data
 
     def close(self) -> None:
-        """Hang up."""
+        """Disconnect; a second call does nothing."""
         self._open = False
 
 
 _log = logging.getLogger(__name__)
 
-POLL_S = 0.1  # How long to look for something that may have come and answers no question
+# Default wait for a message that the device may have sent unasked, seconds.
+POLL_S = 0.1
 
-MAX_MESSAGE = 512  # Bytes; no message of any language comes near it
+# Longest message, bytes; all supported protocols stay far below it.
+MAX_MESSAGE = 512
 
 _T = TypeVar("_T")
-# Returns the message at the front of the bytes and how many of them it took, or None while it is not whole.
+# Returns the first message and its length in bytes, or None while the message is incomplete.
 MessageParser = Callable[[bytes], tuple[_T, int] | None]
 
 
 class Exchange:
-    """Questions and answers over connections that `connect` opens.
+    """Requests and replies over connections that `connect` opens.
 
-    `greet`: says and hears over a new connection what comes before the first question; returns what that question must
-    begin with, which is not logged. `silent`, `endless`: what helps where no answer comes, and where one has no end.
+    - `greet` exchanges the opening messages of a new connection; returns an unlogged prefix for the first request.
+    - `silence_remedy`, `endless_remedy`: remedies in the messages for a missing reply and for a reply without an end.
     """
 
     def __init__(
@@ -117,44 +120,44 @@ class Exchange:
         label: str,
         clock: Clock,
         greet: Callable[[Exchange], bytes],
-        silent: str,
-        endless: str,
+        silence_remedy: str,
+        endless_remedy: str,
     ) -> None:
         self._connect = connect
         self._timeout = timeout
         self._label = label
         self._clock = clock
         self._greet = greet
-        self._silent_remedy, self._endless_remedy = silent, endless
-        self._proof = b""
-        self.questions = 0
-        """Asked on the connection there is, since it was greeted."""
+        self._silence_remedy, self._endless_remedy = silence_remedy, endless_remedy
+        self._prefix = b""
+        # Requests on the present connection since its greeting.
+        self.request_count = 0
         self._link: Link | None = None
-        self._rest = b""
+        self._received = b""
 
-    def ask(self, question: bytes, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None = None) -> _T:
-        """Send `question` and return the first message that `unsolicited` does not claim."""
-        return self._again_if_lost(lambda: self._ask_once(question, take, unsolicited))
+    def query(self, request: bytes, parse: MessageParser[_T], skip: Callable[[_T], bool] | None = None) -> _T:
+        """Send `request` and return the first message that `skip` does not reject."""
+        return self._repeat_if_lost(lambda: self._request_once(request, parse, skip))
 
-    def open_with(self, opening: bytes, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None = None) -> _T:
-        """Send `opening` over the connection just opened and return its answer, as `ask`; only for `greet`."""
-        return self._ask_once(opening, take, unsolicited)
+    def open_with(self, opening: bytes, parse: MessageParser[_T], skip: Callable[[_T], bool] | None = None) -> _T:
+        """Send `opening` over the new connection and return its reply; for `greet` only."""
+        return self._request_once(opening, parse, skip)
 
-    def listen(self, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None = None) -> _T:
-        """Return what the other side says first over the connection just opened; only for `greet`."""
+    def listen(self, parse: MessageParser[_T], skip: Callable[[_T], bool] | None = None) -> _T:
+        """Return the first message of the device on the new connection; for `greet` only."""
         assert self._link is not None
-        return self._answer(self._link, take, unsolicited)
+        return self._answer(self._link, parse, skip)
 
     def send(self, command: bytes) -> None:
-        """Send `command`, whose answer will take its time and be met by `poll`."""
-        self._again_if_lost(lambda: self._send_once(command))
+        """Send a command with a slow reply; read the reply with `poll`."""
+        self._repeat_if_lost(lambda: self._send_once(command))
 
-    def poll(self, take: MessageParser[_T], wait: float = POLL_S) -> _T | None:
-        """Return the next message if it comes within `wait` seconds; None without one, or without a connection."""
+    def poll(self, parse: MessageParser[_T], wait: float = POLL_S) -> _T | None:
+        """Return the next message within `wait` seconds; None if none arrives or nothing is connected."""
         if self._link is None:
             return None
         try:
-            return self._next(self._link, take, wait)
+            return self._next_message(self._link, parse, wait)
         except LinkTimeout:
             return None
         except BaseException:
@@ -163,38 +166,38 @@ class Exchange:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a connection."""
+        """True if a connection is open."""
         return self._link is not None
 
     def close(self) -> None:
-        """Drop the connection, if there is one."""
+        """Close the connection, if there is one."""
         link, self._link = self._link, None
-        self._rest = b""
+        self._received = b""
         if link is not None:
             link.close()
 
-    def _again_if_lost(self, action: Callable[[], _T]) -> _T:
-        """Do something over the connection there is, once more over a new one where that turns out to be lost."""
-        used = self._link is not None
+    def _repeat_if_lost(self, action: Callable[[], _T]) -> _T:
+        """Run `action`; repeat it once over a new connection if an old connection turns out to be lost."""
+        was_connected = self._link is not None
         try:
             return action()
         except LinkClosed:
-            if not used:
+            if not was_connected:
                 raise
             return action()
 
-    def _ask_once(self, question: bytes, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None) -> _T:
-        link = self._send_once(question)
+    def _request_once(self, request: bytes, parse: MessageParser[_T], skip: Callable[[_T], bool] | None) -> _T:
+        link = self._send_once(request)
         try:
-            return self._answer(link, take, unsolicited)
+            return self._answer(link, parse, skip)
         except BaseException:
             self.close()
             raise
 
-    def _answer(self, link: Link, take: MessageParser[_T], unsolicited: Callable[[_T], bool] | None) -> _T:
+    def _answer(self, link: Link, parse: MessageParser[_T], skip: Callable[[_T], bool] | None) -> _T:
         while True:
-            message = self._next(link, take, self._timeout)
-            if unsolicited is None or not unsolicited(message):
+            message = self._next_message(link, parse, self._timeout)
+            if skip is None or not skip(message):
                 return message
 
     def _send_once(self, command: bytes) -> Link:
@@ -202,51 +205,52 @@ class Exchange:
             link = self._link
             if link is None:
                 link = self._link = self._connect()
-                self._proof = self._greet(self)
-                self.questions = 0
-            self._discard(link)
-            proof, self._proof = self._proof, b""
-            link.write(proof + command, self._timeout)
-            self.questions += 1
+                self._prefix = self._greet(self)
+                self.request_count = 0
+            self._discard_input(link)
+            prefix, self._prefix = self._prefix, b""
+            link.write(prefix + command, self._timeout)
+            self.request_count += 1
             _log.debug("sent %r", command)
         except BaseException:
             self.close()
             raise
         return link
 
-    def _next(self, link: Link, take: MessageParser[_T], wait: float) -> _T:
+    def _next_message(self, link: Link, parse: MessageParser[_T], wait: float) -> _T:
         deadline = self._clock.monotonic() + wait
         remaining = wait
-        while (taken := take(self._rest)) is None:
-            if len(self._rest) > MAX_MESSAGE:
-                raise ProtocolError(f"{self._label} sends without end; {self._endless_remedy}")
+        while (parsed := parse(self._received)) is None:
+            if len(self._received) > MAX_MESSAGE:
+                sent = f"sent {len(self._received)} bytes without the end of a message, at most {MAX_MESSAGE} expected"
+                raise ProtocolError(f"{self._label} {sent}; {self._endless_remedy}")
             if remaining < 0:
-                raise self._silent(wait)
+                raise self._timeout_error(wait)
             try:
-                came = link.read(MAX_MESSAGE, remaining)
+                data = link.read(MAX_MESSAGE, remaining)
             except LinkTimeout as error:
-                raise self._silent(wait) from error
-            if not came:
-                raise self._silent(wait)
-            self._rest += came
+                raise self._timeout_error(wait) from error
+            if not data:
+                raise self._timeout_error(wait)
+            self._received += data
             remaining = deadline - self._clock.monotonic()
-        message, length = taken
-        _log.debug("received %r", self._rest[:length])
-        self._rest = self._rest[length:]
+        message, length = parsed
+        _log.debug("received %r", self._received[:length])
+        self._received = self._received[length:]
         return message
 
-    def _discard(self, link: Link) -> None:
-        self._rest = b""
-        # Whoever never stops talking is met by the limit of the next message.
+    def _discard_input(self, link: Link) -> None:
+        self._received = b""
+        # The limit ends the loop for a device that never stops sending; the next message then exceeds MAX_MESSAGE.
         for _ in range(MAX_MESSAGE):
             if not link.read(MAX_MESSAGE, 0.0):
                 return
 
-    def _silent(self, wait: float) -> LinkTimeout:
-        begun = f" beyond {quoted(self._rest)}" if self._rest else ""
-        return LinkTimeout(f"{self._label} has not answered within {wait:g} s{begun}; {self._silent_remedy}")
+    def _timeout_error(self, wait: float) -> LinkTimeout:
+        received = f" (received only {quoted(self._received)})" if self._received else ""
+        return LinkTimeout(f"{self._label} has not answered within {wait:g} s{received}; {self._silence_remedy}")
 
 
 def quoted(data: bytes) -> str:
-    """Return bytes as a message shows them."""
+    """Return the first 40 bytes as text for a message."""
     return repr(data[:40])[1:] + ("…" if len(data) > 40 else "")

@@ -1,1 +1,1 @@
-"""PTP, the picture transfer protocol of cameras: its wires, its transports and the cameras that speak it."""
+"""PTP, the picture transfer protocol of cameras: datasets, sessions and transports."""

@@ -1,12 +1,11 @@
-"""The numbers of PTP and their names: the standard's, and Canon's for its EOS bodies.
+"""Numbers of PTP with their names: of the standard, and of Canon for EOS bodies.
 
-Messages carry plain integers, for a device may use codes that no one has named; `drivers.ptp.protocol.describe` turns
-one into words. Of responses and event records all that are known have a name here, for users read them; of the rest
-those in use.
-Canon's meanings hold for EOS bodies alone: other makers use the same numbers for other things.
+Messages carry plain integers, because a device may use unnamed codes; `drivers.ptp.protocol.describe` returns their
+names. All known responses and event records have a name here, because users read them; other codes only if used.
+Canon's meanings are valid only for EOS bodies: other makers use the same numbers differently.
 
-Sources: ISO 15740:2013, tables of clauses 10 to 13; Canon's extensions have no public standard, their numbers were
-found on the wire and are those that libgphoto2 names.
+Sources: ISO 15740:2013, tables of clauses 10 to 13. Canon's extensions have no public standard; their numbers were
+recorded from devices and have the names of libgphoto2.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from enum import IntEnum
 
 
 class Operation(IntEnum):
-    """What an initiator can ask for; from 0x9000 Canon's."""
+    """Operations of an initiator; from 0x9000 of Canon."""
 
     GET_DEVICE_INFO = 0x1001
     OPEN_SESSION = 0x1002
@@ -64,7 +63,7 @@ class Operation(IntEnum):
 
 
 class ResponseCode(IntEnum):
-    """How an operation ended; from 0xa000 Canon's."""
+    """Results of operations; from 0xa000 of Canon."""
 
     UNDEFINED = 0x2000
     OK = 0x2001
@@ -110,7 +109,7 @@ class ResponseCode(IntEnum):
 
 
 class EventCode(IntEnum):
-    """What a device reports on its event channel; from 0xc000 Canon's."""
+    """Events on the event channel; from 0xc000 of Canon."""
 
     UNDEFINED = 0x4000
     OBJECT_ADDED = 0x4002
@@ -124,7 +123,7 @@ class EventCode(IntEnum):
 
 
 class EosEvent(IntEnum):
-    """The kinds of records in what GetEvent answers."""
+    """Types of the records in a reply to GetEvent."""
 
     END = 0
     OBJECT_ADDED = 0xC181
@@ -159,7 +158,7 @@ class EosEvent(IntEnum):
 
 
 class ObjectFormat(IntEnum):
-    """What an object is; from 0xb100 Canon's."""
+    """Formats of objects; from 0xb100 of Canon."""
 
     UNDEFINED = 0x3000
     ASSOCIATION = 0x3001
@@ -177,7 +176,7 @@ class ObjectFormat(IntEnum):
 
 
 class Property(IntEnum):
-    """Settings and states of a device; from 0xd100 Canon's."""
+    """Settings and states of a device; from 0xd100 of Canon."""
 
     BATTERY_LEVEL = 0x5001
 
@@ -236,7 +235,7 @@ class Property(IntEnum):
 
 
 class DataType(IntEnum):
-    """The type of a property's value; an array's is 0x4000 more."""
+    """Types of property values; 0x4000 is added for arrays."""
 
     INT8 = 0x0001
     UINT8 = 0x0002
@@ -252,21 +251,21 @@ class DataType(IntEnum):
 
 
 class StorageType(IntEnum):
-    """What a store is made of."""
+    """Media of a store."""
 
     UNDEFINED = 0
     REMOVABLE_RAM = 4
 
 
 class FilesystemType(IntEnum):
-    """How a store is ordered."""
+    """File systems of a store."""
 
     UNDEFINED = 0
     DCF = 3
 
 
 class AeMode(IntEnum):
-    """Where the mode dial of an EOS stands (property 0xd105); read-only on bodies with a dial."""
+    """Position of the mode dial of an EOS body (property 0xd105); read-only on bodies with a dial."""
 
     PROGRAM = 0
     SHUTTER_PRIORITY = 1
@@ -278,7 +277,7 @@ class AeMode(IntEnum):
 
 
 class FocusMode(IntEnum):
-    """How an EOS focuses (property 0xd108)."""
+    """Focus mode of an EOS body (property 0xd108)."""
 
     ONE_SHOT = 0
     AI_SERVO = 1
@@ -287,7 +286,7 @@ class FocusMode(IntEnum):
 
 
 class DriveMode(IntEnum):
-    """What a pressed release does (property 0xd106)."""
+    """Action of the release button (property 0xd106)."""
 
     SINGLE = 0x00
     CONTINUOUS = 0x01
@@ -301,7 +300,7 @@ class DriveMode(IntEnum):
 
 
 class WhiteBalance(IntEnum):
-    """The white balance of an EOS (property 0xd109); raw files carry it as a note only."""
+    """White balance of an EOS body (property 0xd109); in raw files only metadata."""
 
     AUTO = 0x00
     DAYLIGHT = 0x01
@@ -316,7 +315,7 @@ class WhiteBalance(IntEnum):
 
 
 class CaptureDestination(IntEnum):
-    """Where an EOS puts a frame (property 0xd11c); a body offers some of these, its list decides."""
+    """Destination of frames (property 0xd11c); the body lists the values that it offers."""
 
     CARD = 2
     HOST = 4
@@ -324,14 +323,14 @@ class CaptureDestination(IntEnum):
 
 
 class CameraStatus(IntEnum):
-    """Whether an EOS takes commands (record 0xc18b)."""
+    """Whether an EOS body accepts commands (record 0xc18b)."""
 
     IDLE = 0
     BUSY = 1
 
 
 class ReleaseButton(IntEnum):
-    """How far the release of an EOS is pressed or let go (RemoteReleaseOn and Off, first parameter)."""
+    """Position of the release button (RemoteReleaseOn and RemoteReleaseOff, first parameter)."""
 
     HALF = 1
     FULL = 2

@@ -1,17 +1,17 @@
-"""PTP on any cable: datasets as bytes and as values, and a session of numbered transactions.
+"""PTP on any cable: datasets, and a session of numbered transactions.
 
-A transaction is a request, at most one data phase, and a response; events come beside. Everything is little-endian. A
-string is a count of UTF-16 units with the closing NUL, then the units; an empty string is the count 0 alone. An array
-is a count of 32 bits, then the items.
+A transaction is a request, at most one data phase, and a response; events arrive separately. All numbers are
+little-endian. A string is the count of its UTF-16 units with the closing NUL, then the units; an empty string is only
+the count 0. An array is a count of 32 bits, then the items.
 
-Rules that hold inside:
+Contract:
 
-- ``decode`` and ``encode`` undo each other on well-formed bytes, so that both ends of the cable share one type.
-- Whatever bytes a device sends, the only error is `ProtocolError`; a count is compared with the bytes that are left
-  before anything is made from it. Bytes behind a dataset's last field are no fault, for later editions append.
-  ``encode`` raises ValueError for what the wire cannot hold; that is our own mistake, never a device's.
-- A fault of cable or protocol goes straight to the caller: whether an operation may be repeated is not known here.
-  After one, the session is spent; a new one begins with `Transport.reset` or a new transport.
+- ``decode`` and ``encode`` are inverse on well-formed bytes, so both ends of a cable share one type.
+- Invalid bytes of a device raise only `ProtocolError`. Counts are checked before memory is allocated. Extra bytes after
+  the last field are accepted, because later editions append fields. ``encode`` raises ValueError for values that the
+  protocol cannot carry.
+- Faults of cable or protocol go to the caller, who decides about a repetition. After a fault the session is over; a new
+  one starts with `Transport.reset` or a new transport.
 
 Source: ISO 15740:2013, clauses 5 (types and datasets), 9.3 (sessions and transactions) and 13 (properties).
 """
@@ -33,7 +33,7 @@ from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError,
 
 
 def describe(kind: type[IntEnum], code: int) -> str:
-    """Return a code for people: ``DEVICE_BUSY (0x2019)``, or ``0x2fff`` where no name is known."""
+    """Return name and number of a code, such as ``DEVICE_BUSY (0x2019)``; only the number without a name."""
     try:
         return f"{kind(code).name} (0x{code:04x})"
     except ValueError:
@@ -41,39 +41,37 @@ def describe(kind: type[IntEnum], code: int) -> str:
 
 
 class Cursor:
-    """Reads `data`, little-endian, from its start; `what` names it in messages."""
+    """Reads little-endian `data` from its start; `name` is used in messages."""
 
-    def __init__(self, data: bytes, what: str, limit: int | None = None) -> None:
+    def __init__(self, data: bytes, name: str, limit: int | None = None) -> None:
         if limit is not None and len(data) > limit:
-            raise ProtocolError(f"{what} of {len(data)} bytes; at most {limit} were expected")
+            raise ProtocolError(f"{name} has {len(data)} bytes; at most {limit} expected")
         self._data = bytes(data)
-        self.what = what
-        self.at = 0
-        self._before = 0
+        self.name = name
+        self.position = 0
+        self._field_position = 0
 
     @property
-    def left(self) -> int:
-        """Bytes not yet read."""
-        return len(self._data) - self.at
+    def remaining(self) -> int:
+        """Number of bytes not yet read."""
+        return len(self._data) - self.position
 
-    def fault(self, field: str, expected: str, came: object, at: int | None = None) -> ProtocolError:
-        """Return the error that states what is wrong with the field that was read last, or with the one at `at`."""
-        place = self._before if at is None else at
-        return ProtocolError(f"{self.what}: {field} at byte {place} is {came}; expected {expected}")
+    def fault(self, field: str, expected: str, value: object, position: int | None = None) -> ProtocolError:
+        """Return the error for a wrong field: the last one read, or the one at `position`."""
+        start = self._field_position if position is None else position
+        return ProtocolError(f"{self.name}: {field} at byte {start} is {value}; expected {expected}")
 
     def take(self, count: int, field: str) -> bytes:
         """Return the next `count` bytes."""
-        begin, end = self.at, self.at + count
+        start, end = self.position, self.position + count
         if end > len(self._data):
-            raise ProtocolError(
-                f"{self.what}: {field} at byte {begin} needs {count} bytes, but only {self.left} follow"
-            )
-        self._before, self.at = begin, end
-        return self._data[begin:end]
+            raise ProtocolError(f"{self.name}: {field} at byte {start} requires {count} bytes; {self.remaining} follow")
+        self._field_position, self.position = start, end
+        return self._data[start:end]
 
     def rest(self) -> bytes:
-        """Return all bytes that are left."""
-        return self.take(self.left, "the rest")
+        """Return all remaining bytes."""
+        return self.take(self.remaining, "the rest")
 
     def integer(self, size: int, field: str, signed: bool = False) -> int:
         """Return the next integer of `size` bytes."""
@@ -97,10 +95,10 @@ class Cursor:
 
     def integers(self, count: int, size: int, field: str, signed: bool = False) -> tuple[int, ...]:
         """Return `count` integers of `size` bytes."""
-        if count * size > self.left:
+        if count * size > self.remaining:
             raise ProtocolError(
-                f"{self.what}: {field} at byte {self.at} announces {count} items of {size} bytes, "
-                f"but only {self.left} bytes follow"
+                f"{self.name}: {field} at byte {self.position} announces {count} items of {size} bytes; "
+                f"only {self.remaining} bytes follow"
             )
         octets = self.take(count * size, field)
         return tuple(
@@ -108,18 +106,18 @@ class Cursor:
         )
 
     def array(self, size: int, field: str, signed: bool = False) -> tuple[int, ...]:
-        """Return an array: a count of 4 bytes, then as many integers of `size` bytes (ISO 15740, 5.3.3)."""
+        """Return an array: a count of 4 bytes, then `count` integers of `size` bytes (ISO 15740, 5.3.3)."""
         return self.integers(self.u32(f"the count of {field}"), size, field, signed)
 
 
-# Bytes of the largest dataset that is read; real ones stay below 10 kB, long lists of handles included.
+# Largest accepted dataset, bytes; real ones stay below 10 kB, including long lists of handles.
 MAX_DATASET = 1 << 20
-_MAX_STRING_UNITS = 254  # UTF-16 units of the longest string, its closing NUL not counted
+_MAX_STRING_UNITS = 254  # Longest string without its closing NUL, UTF-16 units
 
 Value = int | str | tuple[int, ...]  # A property's value: an integer, a string, or an array of integers
 
-_ARRAY = 0x4000  # Bit that makes an array of a type of integers (ISO 15740, table of data type codes)
-# Bytes and sign of each integer type.
+_ARRAY = 0x4000  # Bit of array types (ISO 15740, table of data type codes)
+# Size in bytes, and whether signed, of each integer type.
 _INTEGERS: dict[int, tuple[int, bool]] = {
     DataType.INT8: (1, True),
     DataType.UINT8: (1, False),
@@ -135,29 +133,29 @@ _INTEGERS: dict[int, tuple[int, bool]] = {
 
 
 def _read_string(cursor: Cursor, field: str) -> str:
-    """Return the next string, up to its first NUL; what is no UTF-16 becomes U+FFFD."""
+    # Cut at the first NUL; invalid UTF-16 becomes U+FFFD.
     count = cursor.u8(f"the length of {field}")
     octets = cursor.take(2 * count, field)
     return octets[: 2 * _MAX_STRING_UNITS].decode("utf-16-le", "replace").partition("\0")[0]
 
 
 def encode_string(text: str) -> bytes:
-    """Return `text` as a string of PTP."""
+    """Return `text` as a PTP string."""
     if not text:
         return b"\0"
     octets = text.encode("utf-16-le")
     units = len(octets) // 2
     if units > _MAX_STRING_UNITS or "\0" in text:
-        raise ValueError(f"{text[:40]!r} of {units} UTF-16 units is no PTP string; at most {_MAX_STRING_UNITS}, no NUL")
+        raise ValueError(f"{text[:40]!r} has {units} UTF-16 units; at most {_MAX_STRING_UNITS} and no NUL expected")
     return bytes([units + 1]) + octets + b"\0\0"
 
 
 def encode_integer(value: int, size: int, signed: bool = False) -> bytes:
-    """Return `value` in `size` bytes; ValueError where it does not fit."""
+    """Return `value` in `size` bytes; ValueError if it does not fit."""
     try:
         return value.to_bytes(size, "little", signed=signed)
     except OverflowError as error:
-        raise ValueError(f"{value} does not fit in {size} bytes") from error
+        raise ValueError(f"{value} does not fit into {size} bytes") from error
 
 
 def encode_array(values: Iterable[int], size: int, signed: bool = False) -> bytes:
@@ -166,9 +164,9 @@ def encode_array(values: Iterable[int], size: int, signed: bool = False) -> byte
     return encode_integer(len(items), 4) + b"".join(encode_integer(item, size, signed) for item in items)
 
 
-def decode_u32_array(data: bytes, what: str = "the list") -> tuple[int, ...]:
-    """Return the items of an array of 32-bit integers: storage ids, object handles."""
-    return Cursor(data, what, MAX_DATASET).array(4, "items")
+def decode_u32_array(data: bytes, name: str = "the list") -> tuple[int, ...]:
+    """Return the items of an array of 32-bit integers, such as storage ids or object handles."""
+    return Cursor(data, name, MAX_DATASET).array(4, "items")
 
 
 def encode_u32_array(values: Iterable[int]) -> bytes:
@@ -177,7 +175,7 @@ def encode_u32_array(values: Iterable[int]) -> bytes:
 
 
 def read_value(cursor: Cursor, data_type: int, field: str) -> Value:
-    """Return the next value of a property of type `data_type`, one of `DataType` or an array of it."""
+    """Return the next property value of type `data_type`: one of `DataType`, or an array of it."""
     if data_type == DataType.STRING:
         return _read_string(cursor, field)
     if data_type & _ARRAY and data_type - _ARRAY in _INTEGERS:
@@ -190,12 +188,12 @@ def read_value(cursor: Cursor, data_type: int, field: str) -> Value:
 
 
 def decode_value(data_type: int, data: bytes) -> Value:
-    """Return a property's value, as GetDevicePropValue answers it."""
+    """Return a property value, as in the reply to GetDevicePropValue."""
     return read_value(Cursor(data, "the property's value", MAX_DATASET), data_type, "value")
 
 
 def encode_value(data_type: int, value: Value) -> bytes:
-    """Return a property's value as bytes; ValueError where it is not of the type."""
+    """Return the bytes of a property value; ValueError if it is not of the type."""
     if data_type == DataType.STRING and isinstance(value, str):
         return encode_string(value)
     if data_type & _ARRAY and data_type - _ARRAY in _INTEGERS and isinstance(value, tuple):
@@ -209,14 +207,13 @@ def encode_value(data_type: int, value: Value) -> bytes:
 
 @dataclass(frozen=True)
 class FieldKind:
-    """How a dataset's field stands on the wire: `read` takes it at a cursor and is given its name, for messages."""
+    """Format of a dataset field: `read` takes a cursor, and the field's name for messages."""
 
     read: Callable[[Cursor, str], Any]
     encode: Callable[[Any], bytes]
 
 
-def _of_type(data_type: int) -> FieldKind:
-    """Return how a field of one of ISO 15740's types stands on the wire."""
+def _field_kind(data_type: int) -> FieldKind:
     if data_type in _INTEGERS:
         size, signed = _INTEGERS[data_type]
         return FieldKind(
@@ -227,42 +224,42 @@ def _of_type(data_type: int) -> FieldKind:
     )
 
 
-U16 = Annotated[int, _of_type(DataType.UINT16)]
-U32 = Annotated[int, _of_type(DataType.UINT32)]
-U64 = Annotated[int, _of_type(DataType.UINT64)]
-U16s = Annotated[tuple[int, ...], _of_type(_ARRAY + DataType.UINT16)]
-Text = Annotated[str, _of_type(DataType.STRING)]
-Rest = Annotated[bytes, FieldKind(lambda cursor, _: cursor.rest(), bytes)]  # What a dataset's fields are on the wire
+U16 = Annotated[int, _field_kind(DataType.UINT16)]
+U32 = Annotated[int, _field_kind(DataType.UINT32)]
+U64 = Annotated[int, _field_kind(DataType.UINT64)]
+U16s = Annotated[tuple[int, ...], _field_kind(_ARRAY + DataType.UINT16)]
+Text = Annotated[str, _field_kind(DataType.STRING)]
+Rest = Annotated[bytes, FieldKind(lambda cursor, _: cursor.rest(), bytes)]  # All remaining bytes
 
 
 class PtpDataset:
-    """A frozen dataclass whose fields, each a type above, follow each other on the wire."""
+    """Base of frozen dataclasses whose fields, each of a type above, follow each other in a dataset."""
 
     @classmethod
     @cache
     def _layout(cls) -> tuple[tuple[str, str, FieldKind], ...]:
         hints = get_type_hints(cls, include_extras=True).items()
         fields = [(name, hint.__metadata__[0]) for name, hint in hints if get_origin(hint) is Annotated]
-        return tuple((name, name.replace("_", " "), kind) for name, kind in fields)
+        return tuple((name, name.replace("_", " "), field_kind) for name, field_kind in fields)
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
-        """Return the value in a dataset."""
+        """Return the value of a dataset."""
         return cls.read(Cursor(data, cls.__name__, MAX_DATASET))
 
     @classmethod
     def read(cls, cursor: Cursor) -> Self:
         """Return the value at a cursor."""
-        return cls(**{name: kind.read(cursor, words) for name, words, kind in cls._layout()})
+        return cls(**{name: field_kind.read(cursor, label) for name, label, field_kind in cls._layout()})
 
     def encode(self) -> bytes:
-        """Return the dataset."""
-        return b"".join([kind.encode(getattr(self, name)) for name, _, kind in self._layout()])
+        """Return the bytes of the dataset."""
+        return b"".join([field_kind.encode(getattr(self, name)) for name, _, field_kind in self._layout()])
 
 
 @dataclass(frozen=True)
 class DeviceInfo(PtpDataset):
-    """What a device is and can do (GetDeviceInfo, 5.5.1); version 100 is 1.00."""
+    """Identity and capabilities of a device (GetDeviceInfo, 5.5.1); version 100 is 1.00."""
 
     standard_version: U16 = 100
     vendor_extension_id: U32 = 0
@@ -282,7 +279,7 @@ class DeviceInfo(PtpDataset):
 
 @dataclass(frozen=True)
 class ObjectInfo(PtpDataset):
-    """An object in a store (GetObjectInfo, 5.5.3): bytes, pixels, dates as ``YYYYMMDDThhmmss``."""
+    """An object in a store (GetObjectInfo, 5.5.3): sizes in bytes and pixels, dates as ``YYYYMMDDThhmmss``."""
 
     storage: U32 = 0
     format: U16 = 0
@@ -307,9 +304,9 @@ class ObjectInfo(PtpDataset):
 
 @dataclass(frozen=True)
 class StorageInfo(PtpDataset):
-    """A store (GetStorageInfo, 5.5.2): capacities in bytes; 0xffffffff free images where the device does not know.
+    """A store (GetStorageInfo, 5.5.2): capacities in bytes; 0xffffffff free images if the device does not report them.
 
-    `padding` is what a device sends behind the dataset: two NULs on the EOS 60D.
+    `padding` holds the bytes after the dataset: two NULs on the EOS 60D.
     """
 
     storage_type: U16 = 0
@@ -323,16 +320,16 @@ class StorageInfo(PtpDataset):
     padding: Rest = field(default=b"", repr=False)
 
 
-_NO_FORM, _ENUMERATION = 0, 2  # How a property's values are listed (13.3.3): not at all, or one by one
+_NO_FORM, _ENUMERATION = 0, 2  # Form flag (13.3.3): no list of values, or all values
 
 
 @dataclass(frozen=True)
 class DevicePropDesc:
-    """A property of a device (GetDevicePropDesc, 13.3.3): its type, whether it can be set, its values.
+    """A property of a device (GetDevicePropDesc, 13.3.3).
 
-    - `choices`: what it can be set to; empty where they are not listed.
-    - `widened`: the device sends the choices' one byte as two, as the EOS 60D does for the battery's level
-      (0x5001: 100, 75, 50, 25, 0); the standard does not allow it.
+    - `choices`: permitted values; empty if they are not listed.
+    - `widened`: the device sends each choice of one byte as two bytes. The EOS 60D does so for the battery level
+      (0x5001: 100, 75, 50, 25, 0), against the standard.
     """
 
     code: int
@@ -344,12 +341,12 @@ class DevicePropDesc:
     widened: bool = False
 
     def encode(self) -> bytes:
-        """Return the dataset."""
+        """Return the bytes of the dataset."""
         form = bytes([_NO_FORM])
         if self.choices:
-            gap = b"\0" if self.widened else b""
-            listed = b"".join(encode_value(self.data_type, value) + gap for value in self.choices)
-            form = bytes([_ENUMERATION]) + encode_integer(len(self.choices), 2) + listed
+            padding = b"\0" if self.widened else b""
+            choices = b"".join(encode_value(self.data_type, value) + padding for value in self.choices)
+            form = bytes([_ENUMERATION]) + encode_integer(len(self.choices), 2) + choices
         return b"".join(
             (
                 encode_integer(self.code, 2),
@@ -364,23 +361,23 @@ class DevicePropDesc:
 
 _log = logging.getLogger(__name__)
 
-# Wait for the answer to OpenSession: a body that a killed host left behind never answers before a reset.
+# Timeout for OpenSession, seconds. After a killed host, a body does not reply before it is reset.
 START_TIMEOUT_S = 1.5
-TIMEOUT_S = 20.0  # Wait for every other answer, unless the caller sets another; libgphoto2 waits as long
-PASSING_LIMIT_S = 10.0  # How long an operation is asked again when a device declines it for the moment
-OPEN_TRIES = 3  # Tries at OpenSession with a reset between them, as many as libgphoto2 makes
+TIMEOUT_S = 20.0  # Default timeout of all other replies, as in libgphoto2
+TRANSIENT_LIMIT_S = 10.0  # Time for which a temporarily declined operation is repeated
+OPEN_TRIES = 3  # Attempts at OpenSession, with a reset between them, as in libgphoto2
 
-# Responses that mean: not now.
-PASSING = (ResponseCode.DEVICE_BUSY, ResponseCode.EOS_OBJECT_NOT_READY, ResponseCode.EOS_MEMORY_STATUS_NOT_READY)
+# Responses of a temporary nature.
+TRANSIENT = (ResponseCode.DEVICE_BUSY, ResponseCode.EOS_OBJECT_NOT_READY, ResponseCode.EOS_MEMORY_STATUS_NOT_READY)
 
-_FIRST_PAUSE_S = 0.05  # Before the first repetition: short to an operator, long beside the milliseconds of an operation
-_LONGEST_PAUSE_S = 1.0  # Pauses double up to here, so that a device that is free again waits for a second at most
-# Session numbers tried where a device declines the transaction number, as libgphoto2 does; a few, then no more.
+_FIRST_PAUSE_S = 0.05  # Pause before the first repetition; an operation takes milliseconds
+_LONGEST_PAUSE_S = 1.0  # Upper limit of the doubling pauses, so that a ready device waits at most 1 s
+# Last session number to try if a device declines the transaction number, as in libgphoto2.
 _LAST_SESSION = 8
 
 
 class OperationDeclined(DeviceRefused):
-    """A device answered an operation with another response than OK: `code`."""
+    """The response to an operation was not OK; `code` is the response code."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -388,9 +385,9 @@ class OperationDeclined(DeviceRefused):
 
 
 _REMEDIES: dict[int, str] = {
-    ResponseCode.STORE_FULL: "; its card is full: empty it, or put another in",
+    ResponseCode.STORE_FULL: "; its card is full: empty or replace it",
     ResponseCode.STORE_READ_ONLY: "; its card is read-only: unlock it",
-    ResponseCode.EOS_LOW_BATTERY: "; its battery is empty: change it, or connect a mains adapter",
+    ResponseCode.EOS_LOW_BATTERY: "; its battery is empty: replace it, or connect a mains adapter",
 }
 
 
@@ -404,22 +401,22 @@ class PtpSession:
 
     @property
     def label(self) -> str:
-        """What messages call the device."""
+        """Name of the device in messages."""
         return self._transport.label
 
     def open(self) -> None:
-        """Open the session; one that a former host left open is taken over."""
-        faults = 0
+        """Open the session, or take over one that an earlier host left open."""
+        fault_count = 0
         session = 1
-        pauses = self._pauses(PASSING_LIMIT_S)
+        pauses = self._pauses(TRANSIENT_LIMIT_S)
         while True:
             try:
                 code = self._transport.transact(
                     PtpRequest(Operation.OPEN_SESSION, 0, (session,)), timeout=START_TIMEOUT_S
                 ).response.code
             except (LinkTimeout, ProtocolError):
-                faults += 1
-                if faults == OPEN_TRIES:
+                fault_count += 1
+                if fault_count == OPEN_TRIES:
                     raise
                 self._transport.reset()
                 continue
@@ -428,11 +425,11 @@ class PtpSession:
                 return
             if code == ResponseCode.INVALID_TRANSACTION_ID and session < _LAST_SESSION:
                 session += 1
-            elif code not in PASSING or not next(pauses, False):
-                raise self._declined(PtpRequest(Operation.OPEN_SESSION, 0, (session,)), code)
+            elif code not in TRANSIENT or not next(pauses, False):
+                raise self._declined_error(PtpRequest(Operation.OPEN_SESSION, 0, (session,)), code)
 
     def close(self) -> None:
-        """Close the session as far as the device still answers; the cable stays open."""
+        """Close the session if the device still replies; the cable stays open."""
         with contextlib.suppress(DeviceError):
             self.call(Operation.CLOSE_SESSION, timeout=START_TIMEOUT_S, retry_s=0.0)
 
@@ -443,66 +440,75 @@ class PtpSession:
         send: bytes | None = None,
         receive: Callable[[bytes], object] | None = None,
         timeout: float = TIMEOUT_S,
-        retry_s: float = PASSING_LIMIT_S,
+        retry_s: float = TRANSIENT_LIMIT_S,
     ) -> tuple[tuple[int, ...], bytes]:
-        """Carry out an operation.
+        """Execute an operation and return the response's parameters and the collected data.
 
-        `send`: the data phase to the device; None where the operation has none. `receive`: takes the data phase from
-        the device piece by piece; None collects it. `timeout`: longest wait for each answer, seconds. `retry_s`: how
-        long it is asked again when the device declines for the moment, seconds.
+        Parameters
+        ----------
+        operation, parameters
+            Code and up to five parameters.
+        send
+            Data phase to the device; None if the operation has none.
+        receive
+            Called with each piece of the data phase from the device; None collects the data.
+        timeout
+            Longest wait for each reply, seconds.
+        retry_s
+            Time for which a temporarily declined operation is repeated, seconds.
         """
         pauses = self._pauses(retry_s)
         while True:
             self._transaction = next_transaction(self._transaction)
             request = PtpRequest(operation, self._transaction, parameters)
-            done = self._transport.transact(request, send=send, receive=receive, timeout=timeout)
-            answered = describe(ResponseCode, done.response.code)
-            _log.debug("%s%s: %s", describe(Operation, operation), parameters, answered)
-            if done.response.ok:
-                return done.response.parameters, done.data
-            # A device that declines sends no data, so that `receive` has seen nothing of a try that is repeated.
-            if done.response.code not in PASSING or not next(pauses, False):
-                raise self._declined(request, done.response.code)
+            transaction = self._transport.transact(request, send=send, receive=receive, timeout=timeout)
+            response_name = describe(ResponseCode, transaction.response.code)
+            _log.debug("%s%s: %s", describe(Operation, operation), parameters, response_name)
+            if transaction.response.ok:
+                return transaction.response.parameters, transaction.data
+            # A device that declines sends no data, so a repetition never repeats a call of `receive`.
+            if transaction.response.code not in TRANSIENT or not next(pauses, False):
+                raise self._declined_error(request, transaction.response.code)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return the events that came on the event channel since the last call; never waits."""
+        """Return the events received since the last call; never waits."""
         return self._transport.events()
 
     def _pauses(self, limit: float) -> Iterator[bool]:
-        """Let growing pauses pass, one at each step; end when `limit` seconds are over."""
+        """Sleep for doubling pauses, one at each step; stop after `limit` seconds."""
         end = self._clock.monotonic() + limit
         pause = _FIRST_PAUSE_S
-        while (left := end - self._clock.monotonic()) > 0:
-            self._clock.sleep(min(pause, left))
+        while (remaining := end - self._clock.monotonic()) > 0:
+            self._clock.sleep(min(pause, remaining))
             pause = min(2 * pause, _LONGEST_PAUSE_S)
             yield True
 
-    def _declined(self, request: PtpRequest, code: int) -> OperationDeclined:
-        remedy = "; wait until it is idle, then try again" if code in PASSING else _REMEDIES.get(code, "")
+    def _declined_error(self, request: PtpRequest, code: int) -> OperationDeclined:
+        remedy = "; wait until it is idle, and try again" if code in TRANSIENT else _REMEDIES.get(code, "")
         return OperationDeclined(f"{self.label} answers {describe(ResponseCode, code)} to {request}{remedy}", code)
 
 
-MAX_PARAMETERS = 5  # Parameters of 32 bits that a request, response or event may carry
-LAST_TRANSACTION = 0xFFFFFFFE  # The highest transaction number; 1 follows it, for 0 and 0xffffffff are taken
+MAX_PARAMETERS = 5  # Parameters of 32 bits in a request, response or event
+LAST_TRANSACTION = 0xFFFFFFFE  # Highest transaction number; 1 follows, because 0 and 0xffffffff are reserved
 
 
 def _read_parameters(cursor: Cursor, field: str) -> tuple[int, ...]:
-    count, odd = divmod(cursor.left, 4)
-    if odd or count > MAX_PARAMETERS:
+    count, excess = divmod(cursor.remaining, 4)
+    if excess or count > MAX_PARAMETERS:
         expected = f"0 to {MAX_PARAMETERS} of 4 bytes"
-        raise cursor.fault(f"the list of {field}", expected, f"{cursor.left} bytes", at=cursor.at)
+        raise cursor.fault(f"the list of {field}", expected, f"{cursor.remaining} bytes", position=cursor.position)
     return cursor.integers(count, 4, field)
 
 
 def _encode_parameters(parameters: tuple[int, ...]) -> bytes:
     if len(parameters) > MAX_PARAMETERS:
-        raise ValueError(f"{len(parameters)} parameters; at most {MAX_PARAMETERS} are possible")
+        raise ValueError(f"{len(parameters)} parameters; at most {MAX_PARAMETERS} expected")
     return b"".join(encode_integer(parameter, 4) for parameter in parameters)
 
 
 @dataclass(frozen=True)
 class _Coded(PtpDataset):
-    """What request, response and event have: a number of `codes`, and parameters; in text ``NAME(0x1, 0x2)``."""
+    """Base of request, response and event: a number of `codes` and parameters; text ``NAME(0x1, 0x2)``."""
 
     codes: ClassVar[type[IntEnum]]
     code: U16
@@ -510,49 +516,49 @@ class _Coded(PtpDataset):
     parameters: Annotated[tuple[int, ...], FieldKind(_read_parameters, _encode_parameters)] = ()
 
     def __str__(self) -> str:
-        listed = ", ".join(f"0x{parameter:x}" for parameter in self.parameters)
-        return describe(self.codes, self.code) + (f"({listed})" if listed else "")
+        parameters = ", ".join(f"0x{parameter:x}" for parameter in self.parameters)
+        return describe(self.codes, self.code) + (f"({parameters})" if parameters else "")
 
 
 @dataclass(frozen=True)
 class PtpRequest(_Coded):
-    """An operation that the initiator asks for."""
+    """An operation requested by the initiator."""
 
     codes = Operation
 
 
 @dataclass(frozen=True)
 class PtpResponse(_Coded):
-    """How an operation ended; `transaction` is the request's."""
+    """Result of an operation; `transaction` is the number of the request."""
 
     codes = ResponseCode
 
     @property
     def ok(self) -> bool:
-        """Whether the operation was carried out."""
+        """True if the operation was executed."""
         return self.code == ResponseCode.OK
 
 
 @dataclass(frozen=True)
 class PtpEvent(_Coded):
-    """Something that happened in the device; `transaction` is 0xffffffff where it belongs to none."""
+    """An event in the device; `transaction` is 0xffffffff if it belongs to no transaction."""
 
     codes = EventCode
     transaction: U32 = 0xFFFFFFFF
 
 
 def next_transaction(transaction: int) -> int:
-    """Return the number that follows `transaction`; OpenSession carries 0 and 0xffffffff means none."""
+    """Return the number after `transaction`; OpenSession has 0, and 0xffffffff means none."""
     return 1 if transaction >= LAST_TRANSACTION else transaction + 1
 
 
-# Bytes of a data phase that a transport collects for a caller who takes none of it piece by piece.
+# Largest data phase that a transport collects if the caller does not pass `receive`, bytes.
 MAX_COLLECTED = 4 * 1024 * 1024
 
 
 @dataclass(frozen=True)
 class Transaction:
-    """How a transaction ended: the device's response, and the data phase if it was collected."""
+    """Result of a transaction: the response, and the collected data phase."""
 
     response: PtpResponse
     data: bytes = b""
@@ -564,7 +570,7 @@ class Transport(Protocol):
     @property
     @abstractmethod
     def label(self) -> str:
-        """What messages call the device: address and name as far as known."""
+        """Name of the device in messages: address, and name if known."""
 
     @abstractmethod
     def transact(
@@ -575,20 +581,15 @@ class Transport(Protocol):
         receive: Callable[[bytes], object] | None = None,
         timeout: float,
     ) -> Transaction:
-        """Carry out one transaction.
-
-        `send`: the data phase to the device; None where the operation has none. `receive`: takes the data phase from
-        the device piece by piece; None collects up to `MAX_COLLECTED` bytes. `timeout`: longest wait for each answer of
-        the device, seconds.
-        """
+        """Execute one transaction; arguments as in `PtpSession.call`, collecting at most `MAX_COLLECTED` bytes."""
 
     @abstractmethod
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return the events that have come since the last call; never waits."""
+        """Return the events received since the last call; never waits."""
 
     @abstractmethod
     def reset(self) -> None:
-        """Bring cable and device back to where a session can be opened; costs a session that is open."""
+        """Restore cable and device so that a session can be opened; ends an open session."""
 
     @abstractmethod
     def close(self) -> None:
@@ -597,106 +598,106 @@ class Transport(Protocol):
 
 @dataclass(frozen=True)
 class Answer:
-    """A response, and the data phase before it; None where there is none (an empty one is b"")."""
+    """A response and its data phase; `data` is None without a data phase, and b"" for an empty one."""
 
     response: PtpResponse
     data: bytes | None = None
 
 
 class NoAnswer(Exception):
-    """Raised instead of answering: the device says nothing, and the initiator waits in vain."""
+    """Raised by a responder that does not reply; the initiator times out."""
 
 
 class Responder(Protocol):
-    """The other end of a cable: a device that answers one request at a time, without containers or packets."""
+    """The device end of a cable: answers one request at a time, without containers or packets."""
 
     def takes_data(self, request: PtpRequest) -> bool:
         """Return whether the initiator sends a data phase with this operation."""
 
     def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
-        """Carry out a request; `data` is the initiator's data phase."""
+        """Execute a request; `data` is the initiator's data phase."""
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return the events that have come up since the last call."""
+        """Return the events that occurred since the last call."""
 
     def cancelled(self, transaction: int) -> None:
-        """Note that the initiator gave up a transaction."""
+        """Record that the initiator cancelled a transaction."""
 
     def unplugged(self) -> None:
-        """Note that the cable was pulled or reset: the session is over."""
+        """Record that the cable was unplugged or reset: the session is over."""
 
 
 class Reception:
-    """Takes what the device sends between a request and the end of its response; `label` names the device."""
+    """Receives the data and response of one request; `label` names the device."""
 
     def __init__(self, request: PtpRequest, receive: Callable[[bytes], object] | None, label: str) -> None:
         self.request = request
         self._receive = receive
         self.label = label
         self._started = False
-        self._announced: int | None = None
-        self._taken = 0
+        self._announced_length: int | None = None
+        self._received_count = 0
         self._collected = bytearray()
 
     @property
-    def left(self) -> int | None:
-        """Bytes of the data phase still to come; None where no length was announced."""
-        return None if self._announced is None else self._announced - self._taken
+    def remaining(self) -> int | None:
+        """Bytes of the data phase still to come; None if no length was announced."""
+        return None if self._announced_length is None else self._announced_length - self._received_count
 
     def start(self, transaction: int, length: int | None) -> None:
-        """Note that a data phase of `length` bytes begins; None where the device does not know."""
+        """Start a data phase of `length` bytes; None if the device did not announce the length."""
         self._check_transaction("data", transaction)
         if self._started:
-            raise ProtocolError(f"{self.label} sends a second data phase with {self.request}; reset it")
+            raise ProtocolError(f"{self.label} sent a second data phase with {self.request}; reset it")
         if self._receive is None and length is not None and length > MAX_COLLECTED:
-            raise self._too_long(length)
+            raise self._too_long_error(length)
         self._started = True
-        self._announced = length
+        self._announced_length = length
 
     def take(self, piece: bytes) -> None:
-        """Take the next bytes of the data phase."""
+        """Process the next bytes of the data phase."""
         if not self._started:
-            raise ProtocolError(f"{self.label} sends data with {self.request} but never announced them; reset it")
-        self._taken += len(piece)
-        if self._announced is not None and self._taken > self._announced:
+            raise ProtocolError(f"{self.label} sent data with {self.request} without a start of data; reset it")
+        self._received_count += len(piece)
+        if self._announced_length is not None and self._received_count > self._announced_length:
             raise ProtocolError(
-                f"{self.label} announced {self._announced} bytes with {self.request} "
-                f"and sends at least {self._taken}; reset it"
+                f"{self.label} announced {self._announced_length} bytes with {self.request} "
+                f"and sent at least {self._received_count}; reset it"
             )
         if self._receive is not None:
             if piece:
                 self._receive(piece)
-        elif self._taken > MAX_COLLECTED:
-            raise self._too_long(self._taken)
+        elif self._received_count > MAX_COLLECTED:
+            raise self._too_long_error(self._received_count)
         else:
             self._collected += piece
 
     def end(self, response: PtpResponse) -> Transaction:
-        """Return the transaction that `response` ends."""
+        """Return the transaction that `response` completes."""
         self._check_transaction("a response", response.transaction)
-        # A device that gives up in the middle reports that by its response: then the response is what counts.
-        if response.ok and self._announced is not None and self._taken != self._announced:
+        # If the device aborts the data phase, its response reports the error and is returned.
+        if response.ok and self._announced_length is not None and self._received_count != self._announced_length:
             raise ProtocolError(
-                f"{self.label} announced {self._announced} bytes with {self.request}, sent {self._taken}, "
-                f"and reports success; ask again"
+                f"{self.label} announced {self._announced_length} bytes with {self.request}, "
+                f"sent {self._received_count}, and reports success; repeat the operation"
             )
         return Transaction(response, bytes(self._collected))
 
-    def _check_transaction(self, what: str, transaction: int) -> None:
+    def _check_transaction(self, message_kind: str, transaction: int) -> None:
         if transaction != self.request.transaction:
             raise ProtocolError(
-                f"{self.label} sends {what} of transaction {transaction} during {self.request}, "
-                f"which is transaction {self.request.transaction}; reset it"
+                f"{self.label} sent {message_kind} of transaction {transaction} during {self.request}, "
+                f"transaction {self.request.transaction}; reset it"
             )
 
-    def _too_long(self, length: int) -> ProtocolError:
+    def _too_long_error(self, length: int) -> ProtocolError:
         return ProtocolError(
-            f"{self.label} sends {length} bytes or more with {self.request}; at most {MAX_COLLECTED} were expected"
+            f"{self.label} sends {length} bytes or more with {self.request}; at most {MAX_COLLECTED} expected"
         )
 
 
 class CableTransport(Transport, ABC):
-    """A `Transport` over a real cable: one transaction after the other, and none where one was left unfinished."""
+    """Base of transports over real cables; it refuses a transaction after an unfinished one."""
 
     def __init__(self) -> None:
         self.closed = False
@@ -704,11 +705,11 @@ class CableTransport(Transport, ABC):
 
     @abstractmethod
     def exchange(self, reception: Reception, send: bytes | None, timeout: float) -> Transaction:
-        """Send the request and the data phase to the device, and return what the device answers."""
+        """Send the request with its data phase, and return the reply of the device."""
 
     @abstractmethod
-    def call_off(self, transaction: int) -> bool:
-        """Call off a transaction whose data the caller cannot take; return whether the next can follow."""
+    def cancel(self, transaction: int) -> bool:
+        """Cancel a transaction whose data the caller cannot accept; return whether the next can follow."""
 
     def transact(
         self,
@@ -718,10 +719,10 @@ class CableTransport(Transport, ABC):
         receive: Callable[[bytes], object] | None = None,
         timeout: float,
     ) -> Transaction:
-        """Carry out one transaction; see `Transport`."""
+        """Execute one transaction; see `Transport`."""
         self.check_open()
         if not self.between_transactions:
-            raise ProtocolError(f"{self.label}: the transaction before {request} did not end; reset the connection")
+            raise ProtocolError(f"{self.label}: the transaction before {request} is unfinished; reset the connection")
         self.between_transactions = False
         try:
             transaction = self.exchange(Reception(request, receive, self.label), send, timeout)
@@ -731,12 +732,12 @@ class CableTransport(Transport, ABC):
         except (LinkError, ProtocolError):
             raise
         except BaseException:
-            self.between_transactions = self.call_off(request.transaction)
+            self.between_transactions = self.cancel(request.transaction)
             raise
         self.between_transactions = True
         return transaction
 
     def check_open(self) -> None:
-        """Require that the cable is open."""
+        """Raise `LinkClosed` if the cable is closed."""
         if self.closed:
-            raise LinkClosed(f"{self.label} is gone, or the connection to it was closed; open it again")
+            raise LinkClosed(f"{self.label} is disconnected, or its connection was closed; open it again")

@@ -1,13 +1,8 @@
-"""PTP over USB: commands, data and responses as containers on the bulk pipes, events on the interrupt pipe.
+"""PTP over USB: commands, data and responses in containers on the bulk pipes, events on the interrupt pipe.
 
-A container is its length (32 bits, header included), its type (16), a code (16), the transaction (32), then up to five
-parameters of 32 bits, or a payload. A device may cut its containers as it likes: header alone, data and response in one
-transfer, a zero-length packet or none.
-
-`ContainerReader` takes a stream in any pieces and hands the payload of a data phase on as it comes. The one thing a
-stream alone does not show is where a data phase of unknown length ends: only there a piece must be what one read of the
-pipe returned, for a short packet ends it. Lengths are checked before they are believed; after its only error,
-`ProtocolError`, the stream has lost its place: every further `feed` raises too, until a new reader is taken.
+A container is its length with header (32 bits), its type (16), a code (16), the transaction (32), then up to five
+parameters of 32 bits, or a payload. Devices split containers in any way: header alone, data and response in one
+transfer, with or without a zero-length packet.
 
 Sources: USB Still Image Capture Device Definition 1.0, clauses 5 (control requests) and 7 (containers); ISO 15740:2013,
 annex D.
@@ -38,15 +33,15 @@ from foundation.clock import Clock
 from foundation.errors import LinkError, LinkTimeout, ProtocolError
 
 _HEADER: Final = struct.Struct("<IHHI")  # Length, type, code and transaction (clause 7)
-HEADER_LENGTH: Final = _HEADER.size  # Bytes of these
-_LENGTH_AND_TYPE = 6  # Bytes before the code: what follows them is a message as ISO 15740 has it
-# A container's length where the payload goes on until a short packet: more than 4 GiB, or not known.
+HEADER_LENGTH: Final = _HEADER.size  # Bytes
+_LENGTH_AND_TYPE = 6  # Bytes before the code, where the message of ISO 15740 starts
+# Length field of a container that ends with a short packet: more than 4 GiB, or unknown.
 UNKNOWN_LENGTH = 0xFFFFFFFF
 HIGH_SPEED_PACKET = 512  # wMaxPacketSize of a bulk pipe at high speed; 64 at full speed, 1024 at super speed
 
 
 class ContainerType(IntEnum):
-    """What a container holds."""
+    """Types of containers."""
 
     COMMAND = 1
     DATA = 2
@@ -56,7 +51,7 @@ class ContainerType(IntEnum):
 
 @dataclass(frozen=True)
 class DataStart:
-    """A data phase begins; `length` counts the payload's bytes, None where only a short packet ends it."""
+    """Start of a data phase; `length` of the payload in bytes, None if a short packet ends it."""
 
     code: int
     transaction: int
@@ -65,7 +60,7 @@ class DataStart:
 
 @dataclass(frozen=True)
 class DataPiece:
-    """The next bytes of the payload, perhaps none; the piece with `last` closes the data phase."""
+    """The next bytes of the payload, may be empty; the piece with `last` ends the data phase."""
 
     data: bytes
     last: bool = False
@@ -76,30 +71,32 @@ _MESSAGES: dict[int, type[PtpRequest | PtpResponse | PtpEvent]] = {
     ContainerType.RESPONSE: PtpResponse,
     ContainerType.EVENT: PtpEvent,
 }
-_KINDS = {message: kind for kind, message in _MESSAGES.items()}
+_CONTAINER_TYPES = {message: container_type for container_type, message in _MESSAGES.items()}
 Message = PtpRequest | PtpResponse | PtpEvent | DataStart | DataPiece
 
 
 class ContainerReader:
-    """Cuts the bytes from a pipe into messages, however the transfers split them.
+    """Splits the bytes of one pipe into messages, for pieces of any size.
 
-    One for each pipe. `packet_size` is the pipe's wMaxPacketSize; it matters only to data phases of unknown length.
+    `packet_size` is the pipe's wMaxPacketSize. It is used only in data phases of unknown length, which a short packet
+    ends: there each piece must be the result of one read. After a `ProtocolError` the position in the stream is lost,
+    and every further `feed` raises too.
     """
 
     def __init__(self, packet_size: int = HIGH_SPEED_PACKET) -> None:
         self._packet_size = packet_size
-        self._rest = bytearray()
-        self._payload_left: int | None = 0
+        self._buffer = bytearray()
+        self._payload_remaining: int | None = 0
         self._in_data = False
 
     def feed(self, piece: bytes) -> list[Message]:
-        """Take the next bytes, an empty piece for a zero-length packet, and return what they complete."""
-        if self._in_data and self._payload_left is None:
+        """Process the next bytes (b"" for a zero-length packet) and return the messages that they complete."""
+        if self._in_data and self._payload_remaining is None:
             return self._feed_until_short(piece)
         messages: list[Message] = []
-        self._rest += piece
+        self._buffer += piece
         try:
-            while self._next(messages, piece):
+            while self._take_message(messages, piece):
                 pass
         except ProtocolError:
             if not messages:
@@ -111,89 +108,87 @@ class ContainerReader:
         self._in_data = not last
         return [DataPiece(bytes(piece), last)] if piece or last else []
 
-    def _next(self, messages: list[Message], piece: bytes) -> bool:
-        """Move one message, or a piece of one, from what is left to `messages`; return whether more may follow."""
+    def _take_message(self, messages: list[Message], piece: bytes) -> bool:
+        """Move one message, or a part of one, from the buffer to `messages`; return whether to continue."""
         if self._in_data:
-            return self._next_payload(messages)
-        if len(self._rest) < HEADER_LENGTH:
+            return self._take_payload(messages)
+        if len(self._buffer) < HEADER_LENGTH:
             return False
-        length, kind, code, transaction = _HEADER.unpack_from(self._rest)
-        if kind == ContainerType.DATA:
+        length, container_type, code, transaction = _HEADER.unpack_from(self._buffer)
+        if container_type == ContainerType.DATA:
             if length < HEADER_LENGTH:
-                raise _unusable(f"a data container of {length} bytes; its header alone has {HEADER_LENGTH}")
+                raise _stream_error(f"a data container of {length} bytes, {HEADER_LENGTH} or more expected")
             self._start_data(messages, code, transaction, length, piece)
-            return bool(self._in_data or self._rest)
-        _check_length(kind, length)
-        if len(self._rest) < length:
+            return bool(self._in_data or self._buffer)
+        _check_length(container_type, length)
+        if len(self._buffer) < length:
             return False
-        messages.append(_MESSAGES[kind].decode(bytes(self._rest[_LENGTH_AND_TYPE:length])))
-        del self._rest[:length]
-        return bool(self._rest)
+        messages.append(_MESSAGES[container_type].decode(bytes(self._buffer[_LENGTH_AND_TYPE:length])))
+        del self._buffer[:length]
+        return bool(self._buffer)
 
     def _start_data(self, messages: list[Message], code: int, transaction: int, length: int, piece: bytes) -> None:
-        del self._rest[:HEADER_LENGTH]
+        del self._buffer[:HEADER_LENGTH]
         self._in_data = True
         if length != UNKNOWN_LENGTH:
-            self._payload_left = length - HEADER_LENGTH
-            messages.append(DataStart(code, transaction, self._payload_left))
+            self._payload_remaining = length - HEADER_LENGTH
+            messages.append(DataStart(code, transaction, self._payload_remaining))
             return
-        self._payload_left = None
+        self._payload_remaining = None
         messages.append(DataStart(code, transaction, None))
-        payload = bytes(self._rest)
-        self._rest.clear()
-        # A header that travels alone is a short packet too, but it opens the phase and does not end it.
+        payload = bytes(self._buffer)
+        self._buffer.clear()
+        # A header alone is also a short packet, but it starts the phase and does not end it.
         last = bool(payload) and len(piece) % self._packet_size != 0
         if payload:
             messages.append(DataPiece(payload, last))
         self._in_data = not last
 
-    def _next_payload(self, messages: list[Message]) -> bool:
-        left = self._payload_left
-        if left is None:
+    def _take_payload(self, messages: list[Message]) -> bool:
+        remaining = self._payload_remaining
+        if remaining is None:
             return False
-        payload = bytes(self._rest[:left])
-        del self._rest[: len(payload)]
-        self._payload_left = left - len(payload)
-        self._in_data = self._payload_left > 0
+        payload = bytes(self._buffer[:remaining])
+        del self._buffer[: len(payload)]
+        self._payload_remaining = remaining - len(payload)
+        self._in_data = self._payload_remaining > 0
         if payload or not self._in_data:
             messages.append(DataPiece(payload, last=not self._in_data))
-        return bool(self._rest)
+        return bool(self._buffer)
 
 
 def encode(message: PtpRequest | PtpResponse | PtpEvent) -> bytes:
     """Return the container of a message."""
     body = message.encode()
-    return encode_integer(_LENGTH_AND_TYPE + len(body), 4) + encode_integer(_KINDS[type(message)], 2) + body
+    return encode_integer(_LENGTH_AND_TYPE + len(body), 4) + encode_integer(_CONTAINER_TYPES[type(message)], 2) + body
 
 
 def encode_data_header(code: int, transaction: int, length: int | None) -> bytes:
-    """Return what stands before a payload of `length` bytes; None, or too many for 32 bits, until a short packet."""
+    """Return the header of a payload of `length` bytes; None, or more than 32 bits: until a short packet."""
     total = UNKNOWN_LENGTH if length is None else min(HEADER_LENGTH + length, UNKNOWN_LENGTH)
-    kind = ContainerType.DATA
-    return encode_integer(total, 4) + encode_integer(kind, 2) + encode_integer(code, 2) + encode_integer(transaction, 4)
+    start = encode_integer(total, 4) + encode_integer(ContainerType.DATA, 2)
+    return start + encode_integer(code, 2) + encode_integer(transaction, 4)
 
 
 def ends_with_empty_packet(total: int, packet_size: int) -> bool:
-    """Return whether a transfer of `total` bytes, header included, must be closed by a zero-length packet.
-
-    A receiver detects the end of a transfer by a packet that is not full; where all are full, an empty one is due.
-    """
+    """Return whether a transfer of `total` bytes with header must end with a zero-length packet."""
+    # The receiver detects the end by a packet that is not full; if all are full, an empty packet must follow.
     return total % packet_size == 0
 
 
-def _check_length(kind: int, length: int) -> None:
-    if kind not in _MESSAGES:
-        raise _unusable(f"a container of type {kind}; 1 command, 2 data, 3 response or 4 event was expected")
-    count, odd = divmod(length - HEADER_LENGTH, 4)
-    if odd or not 0 <= count <= MAX_PARAMETERS:
-        raise _unusable(
-            f"a {ContainerType(kind).name.lower()} container of {length} bytes; "
-            f"12 and 4 for each of 0 to {MAX_PARAMETERS} parameters were expected"
+def _check_length(container_type: int, length: int) -> None:
+    if container_type not in _MESSAGES:
+        raise _stream_error(f"a container of type {container_type}, expected 1 command, 2 data, 3 response or 4 event")
+    count, excess = divmod(length - HEADER_LENGTH, 4)
+    if excess or not 0 <= count <= MAX_PARAMETERS:
+        raise _stream_error(
+            f"a {ContainerType(container_type).name.lower()} container of {length} bytes, "
+            f"expected 12 and 4 for each of 0 to {MAX_PARAMETERS} parameters"
         )
 
 
-def _unusable(what: str) -> ProtocolError:
-    return ProtocolError(f"the USB pipe gives {what}; reset the device")
+def _stream_error(fault: str) -> ProtocolError:
+    return ProtocolError(f"the USB pipe has {fault}; reset the device")
 
 
 class ControlRequest(IntEnum):
@@ -206,7 +201,7 @@ class ControlRequest(IntEnum):
 
 
 _CANCELLATION = 0x4001  # Cancellation code in the data of a CANCEL request (clause 5)
-# Bytes that GET_DEVICE_STATUS is asked for: a header of 4, and parameters that name stalled pipes.
+# Bytes requested by GET_DEVICE_STATUS: a header of 4, and the addresses of stalled pipes.
 MAX_DEVICE_STATUS = 0x14
 
 
@@ -216,7 +211,7 @@ def encode_cancel(transaction: int) -> bytes:
 
 
 def decode_cancel(data: bytes) -> int:
-    """Return the transaction that a CANCEL request ends."""
+    """Return the number of the transaction that a CANCEL request ends."""
     cursor = Cursor(data, "a cancel request", 6)
     code = cursor.u16("code")
     if code != _CANCELLATION:
@@ -226,66 +221,66 @@ def decode_cancel(data: bytes) -> int:
 
 @dataclass(frozen=True)
 class DeviceStatus:
-    """What GET_DEVICE_STATUS answers: a response code, and the addresses of stalled endpoints."""
+    """Reply to GET_DEVICE_STATUS: a response code, and the addresses of stalled endpoints."""
 
     code: int
     parameters: tuple[int, ...] = ()
 
     @classmethod
     def decode(cls, data: bytes) -> DeviceStatus:
-        """Return the status in an answer."""
+        """Return the status in a reply."""
         cursor = Cursor(data, "the device status", 0xFFFF)
         length = cursor.u16("length")
-        count, odd = divmod(length - 4, 4)
-        if odd or count < 0 or count > MAX_PARAMETERS:
+        count, excess = divmod(length - 4, 4)
+        if excess or count < 0 or count > MAX_PARAMETERS:
             raise cursor.fault("length", f"4 and 4 for each of 0 to {MAX_PARAMETERS} parameters", length)
         return cls(cursor.u16("code"), cursor.integers(count, 4, "parameters"))
 
     def encode(self) -> bytes:
-        """Return the answer."""
+        """Return the bytes of the reply."""
         parameters = b"".join(encode_integer(parameter, 4) for parameter in self.parameters)
         return encode_integer(4 + len(parameters), 2) + encode_integer(self.code, 2) + parameters
 
 
-PIECE = 512 * 1024  # Bytes of the largest transfer; bigger ones are more than some hosts and cameras bear
-MAX_EVENTS = 4096  # Events returned at once from a device that never stops raising them
+PIECE = 512 * 1024  # Largest transfer, bytes; some hosts and cameras fail with larger ones
+MAX_EVENTS = 4096  # Most events of one call, for a device that never stops sending them
 
-_CONTROL_S = 1.0  # For a control request, which a device answers in milliseconds if at all
-_READY_TRIES = 40  # Two seconds in all for a device to be ready after a cancellation or reset
-_READY_EVERY_S = 0.05  # Between two questions for the status: little beside what a reset takes
-_DRAIN_S = 0.05  # A device that has been silent for so long has sent all that it had
-# Pieces thrown away, 128 MiB at most: more than a raw frame, and an end to a device that never stops.
+_CONTROL_S = 1.0  # Timeout of a control request; a reply takes milliseconds
+_READY_TRIES = 40  # Status requests after a cancellation or reset, 2 s in total
+_READY_EVERY_S = 0.05  # Pause between two status requests; short compared with a reset
+_DRAIN_S = 0.05  # Silence after which all old data have arrived
+# Most pieces to discard, 128 MiB: more than a raw frame, and a limit for a device that never stops.
 _DRAIN_READS = 256
-_EMPTY_READS = 16  # Empty packets in a row that are skipped: one may follow a full packet, so many mean a fault
+_EMPTY_READS = 16  # Empty packets in a row that are skipped; one may follow a full packet, more are a fault
 
 
 class UsbTransport(CableTransport):
-    """A `drivers.ptp.protocol.Transport` over the pipes of a still image interface, which it closes in the end."""
+    """A `drivers.ptp.protocol.Transport` over the pipes of a still image interface; `close` also closes the pipes."""
 
     def __init__(self, pipes: UsbPipes, clock: Clock) -> None:
         super().__init__()
         self._pipes = pipes
         self._clock = clock
-        self._stalls = 0
+        self._stall_count = 0
         self._reader = ContainerReader(pipes.packet_size)
         self._events_reader = ContainerReader(pipes.packet_size)
 
     @property
     def label(self) -> str:
-        """The device's name, numbers and port."""
+        """Name, numbers and port of the device."""
         return self._pipes.label
 
     def exchange(self, reception: Reception, send: bytes | None, timeout: float) -> Transaction:
-        """Send the request and the data phase to the device, and return what the device answers."""
-        self._stalls = 0
+        """Send the request with its data phase, and return the reply of the device."""
+        self._stall_count = 0
         self._reader = ContainerReader(self._pipes.packet_size)
-        self._send(reception.request, send, timeout)
-        return self._receive(reception, timeout)
+        self._send_request(reception.request, send, timeout)
+        return self._receive_reply(reception, timeout)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return the events that have come since the last call.
+        """Return the events received since the last call.
 
-        Takes one polling interval of the interrupt pipe, some milliseconds, for the bus looks no more often.
+        A call takes at least one polling interval of the interrupt pipe, some milliseconds.
         """
         self.check_open()
         events: list[PtpEvent] = []
@@ -306,14 +301,14 @@ class UsbTransport(CableTransport):
         return tuple(events)
 
     def reset(self) -> None:
-        """Have the device forget everything; the session that was open is over."""
+        """Reset the device; ends an open session."""
         self.check_open()
         try:
             self._pipes.control_out(ControlRequest.RESET_DEVICE, b"", _CONTROL_S)
             self._await_ready()
         except (LinkTimeout, PipeStalled, ProtocolError):
             self._pipes.reset_port()
-        self._clean()
+        self._clear_pipes()
         self._events_reader = ContainerReader(self._pipes.packet_size)
         self.between_transactions = True
 
@@ -322,13 +317,13 @@ class UsbTransport(CableTransport):
         self.closed = True
         self._pipes.close()
 
-    def _send(self, request: PtpRequest, send: bytes | None, timeout: float) -> None:
+    def _send_request(self, request: PtpRequest, send: bytes | None, timeout: float) -> None:
         self._write(encode(request), timeout)
         if send is None:
             return
         container = encode_data_header(request.code, request.transaction, len(send)) + send
-        for at in range(0, len(container), PIECE):
-            self._write(container[at : at + PIECE], timeout)
+        for start in range(0, len(container), PIECE):
+            self._write(container[start : start + PIECE], timeout)
         if ends_with_empty_packet(len(container), self._pipes.packet_size):
             self._write(b"", timeout)
 
@@ -336,63 +331,63 @@ class UsbTransport(CableTransport):
         try:
             self._pipes.bulk_write(data, timeout)
         except PipeStalled as stall:
-            self._recover(Pipe.BULK_OUT, stall)
+            self._clear_stall(Pipe.BULK_OUT, stall)
             self._write(data, timeout)
 
     def _read(self, limit: int, timeout: float) -> bytes:
         try:
             return self._pipes.bulk_read(limit, timeout)
         except PipeStalled as stall:
-            self._recover(Pipe.BULK_IN, stall)
+            self._clear_stall(Pipe.BULK_IN, stall)
             return self._read(limit, timeout)
 
-    def _recover(self, pipe: Pipe, stall: PipeStalled) -> None:
+    def _clear_stall(self, pipe: Pipe, stall: PipeStalled) -> None:
         self._pipes.clear_halt(pipe)
-        self._stalls += 1
-        if self._stalls > 1:
-            raise ProtocolError(f"{self.label} stalls again and again on its pipe {pipe.value}; reset it") from stall
+        self._stall_count += 1
+        if self._stall_count > 1:
+            raise ProtocolError(f"{self.label} stalls repeatedly on its pipe {pipe.value}; reset it") from stall
 
-    def _receive(self, reception: Reception, timeout: float) -> Transaction:
-        empty = 0
-        open_ended = False
+    def _receive_reply(self, reception: Reception, timeout: float) -> Transaction:
+        empty_count = 0
+        is_open_ended = False
         while True:
-            limit = self._limit(reception.left, open_ended)
+            limit = self._read_limit(reception.remaining, is_open_ended)
             piece = self._read(limit, timeout)
-            empty = 0 if piece else empty + 1
-            if empty > _EMPTY_READS:
-                raise ProtocolError(f"{self.label} sends one empty packet after the other; reset it")
+            empty_count = 0 if piece else empty_count + 1
+            if empty_count > _EMPTY_READS:
+                raise ProtocolError(f"{self.label} sent {empty_count} empty packets in a row; reset it")
             messages = self._reader.feed(piece)
-            if open_ended and piece and len(piece) < limit and len(piece) % self._pipes.packet_size == 0:
-                # The zero-length packet that ends the data phase ended this read too and left no other trace.
+            if is_open_ended and piece and len(piece) < limit and len(piece) % self._pipes.packet_size == 0:
+                # The zero-length packet at the end of the data phase has also ended this read.
                 messages += self._reader.feed(b"")
             for message in messages:
                 match message:
                     case DataStart(_, transaction, length):
                         reception.start(transaction, length)
-                        open_ended = length is None
+                        is_open_ended = length is None
                     case DataPiece(data, last):
                         reception.take(data)
-                        open_ended = open_ended and not last
+                        is_open_ended = is_open_ended and not last
                     case PtpResponse() as response:
                         return reception.end(response)
                     case _:
-                        raise ProtocolError(f"{self.label} sends {message} where a response was due; reset it")
+                        raise ProtocolError(f"{self.label} sent {message}, a response was expected; reset it")
 
-    def _limit(self, left: int | None, open_ended: bool) -> int:
-        packet = self._pipes.packet_size
-        if open_ended:
+    def _read_limit(self, remaining: int | None, is_open_ended: bool) -> int:
+        packet_size = self._pipes.packet_size
+        if is_open_ended:
             return PIECE
-        if not left:
-            return packet
-        # Whole packets of the data only, so that the response never comes in the same read.
-        return max(packet, min(PIECE, left // packet * packet))
+        if not remaining:
+            return packet_size
+        # Only whole packets of the data, so that the response never arrives in the same read.
+        return max(packet_size, min(PIECE, remaining // packet_size * packet_size))
 
-    def call_off(self, transaction: int) -> bool:
-        """Call off a transaction whose data the caller cannot take; return whether the next can follow."""
+    def cancel(self, transaction: int) -> bool:
+        """Cancel a transaction whose data the caller cannot accept; return whether the next can follow."""
         with contextlib.suppress(LinkError, ProtocolError):
             self._pipes.control_out(ControlRequest.CANCEL, encode_cancel(transaction), _CONTROL_S)
             self._await_ready()
-            self._clean()
+            self._clear_pipes()
             return True
         return False
 
@@ -402,12 +397,12 @@ class UsbTransport(CableTransport):
             if DeviceStatus.decode(status).code != ResponseCode.DEVICE_BUSY:
                 return
             self._clock.sleep(_READY_EVERY_S)
-        raise LinkTimeout(f"{self.label} stays busy; switch it off and on")
+        raise LinkTimeout(f"{self.label} stays busy after a reset; switch it off and on")
 
-    def _clean(self) -> None:
-        """Clear the bulk pipes of stalls, and of what the device had still to say."""
+    def _clear_pipes(self) -> None:
+        """Clear stalls of the bulk pipes, and discard data that the device still sends."""
         for pipe in (Pipe.BULK_OUT, Pipe.BULK_IN):
-            # Where no stall is, some devices decline to clear it.
+            # Some devices refuse to clear a pipe that is not stalled.
             with contextlib.suppress(PipeStalled):
                 self._pipes.clear_halt(pipe)
         for _ in range(_DRAIN_READS):

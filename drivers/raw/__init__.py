@@ -1,1 +1,1 @@
-"""Raw files of cameras: unprocessed photosites, black level, active area."""
+"""Raw files of cameras: unprocessed counts, black level, active area."""

@@ -1,13 +1,13 @@
-"""Where raw files keep the photosites of a frame: what every kind of file says of it, and CR3, which is no TIFF.
+"""Location of the photosites in raw files: the record `StoredFrame`, and the reader of CR3 files.
 
-What says it is a `Stored`; `drivers.raw.rawfile` reads those of TIFF files, a DNG's among them. Every byte sequence
-whatever ends in frames or `RawDamaged`. A CR3 (EOS R, EOS M50, EOS 250D and later) is an ISO base media file: boxes in
-boxes, each a size of 32 bits (1: of 64 bits, behind the type; 0: up to the end), a type of four letters, and content;
-big-endian. One that reaches beyond the file's end betrays a cut; what is inside a box and makes no sense is left out.
+`drivers.raw.rawfile` reads TIFF files, including DNG. Any bytes give frames or raise `RawDamaged`. A CR3 (EOS R, EOS
+M50, EOS 250D and later) is an ISO base media file of nested boxes, big-endian: a size of 32 bits (1: 64 bits after the
+type; 0: to the end), a type of four letters, and content. A box beyond the end of the file means a truncated file;
+invalid content inside a box is ignored.
 
-Sources: ISO/IEC 14496-12, 4.2 (boxes), 8.7.3 (sizes of samples) and 8.7.5 (places of chunks). For the rest, of which
-there is no public standard: P. Harvey, ExifTool (CanonRaw.pm); L. Clévy, "Describing the Canon Raw v3 (CR3) file
-format" (structure); and LibRaw 0.22 for what CDI1 holds (src/metadata/cr3_parser.cpp) and CMP1 (src/decoders/crx.cpp).
+Sources: ISO/IEC 14496-12, 4.2 (boxes), 8.7.3 (sample sizes) and 8.7.5 (chunk offsets). The rest has no public standard:
+P. Harvey, ExifTool (CanonRaw.pm); L. Clévy, "Describing the Canon Raw v3 (CR3) file format" (structure); LibRaw 0.22
+for the content of CDI1 (src/metadata/cr3_parser.cpp) and CMP1 (src/decoders/crx.cpp).
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from dataclasses import dataclass
 
 from drivers.tiff import Directory, TiffDamaged, TiffTag, read_directories
 
-Extent = tuple[int, int]  # First byte, and how many
+Extent = tuple[int, int]  # First byte, and number of bytes
 
-# Bits for each photosite below which no codec of a maker's puts a frame, since noise takes several. Chosen.
+# Lower limit of the compressed size, bits per photosite: noise alone takes several bits. Chosen.
 LEAST_BITS = 0.25
 
 
 class RawDamaged(ValueError):
-    """The bytes are not all there, or contradict each other."""
+    """The bytes are incomplete or inconsistent."""
 
 
 class RawUnsupported(ValueError):
-    """It may be whole, but pixels of this kind cannot be read, or not be checked."""
+    """The file may be complete, but this kind of pixels cannot be read or checked."""
 
 
 class NotBayer(ValueError):
-    """Its pixels are not those of a sensor with one colour filter each."""
+    """The pixels are not from a sensor with one colour filter per photosite."""
 
 
 @dataclass(frozen=True)
 class Area:
-    """A rectangle of photosites: first row and column, counted from 0, and how many of each."""
+    """A rectangle of photosites: first row and column from 0, number of rows and columns."""
 
     top: int
     left: int
@@ -47,16 +47,16 @@ class Area:
 
 
 @dataclass(frozen=True)
-class Stored:
-    """The photosites of one frame as a file says that they are stored.
+class StoredFrame:
+    """Storage of the photosites of one frame, as described by the file.
 
-    - `rows`, `columns`: of the whole sensor.
-    - `extents`: their bytes, in order.
-    - `least_bits`: bits that a photosite takes at least.
-    - `bits`: how many the largest count may have.
-    - `lossless`: whether each extent is a lossless JPEG, which can be decoded to its end.
-    - `spare_rows`: how many rows more LibRaw may make of it.
-    - `directory`: what describes it in a TIFF file.
+    - `rows`, `columns`: size of the whole sensor.
+    - `extents`: positions of the bytes, in order.
+    - `least_bits`: smallest number of bits per photosite.
+    - `bits`: number of bits of the largest count.
+    - `lossless`: each extent is a lossless JPEG, which can be decoded to its end.
+    - `spare_rows`: rows that LibRaw may add.
+    - `directory`: its directory in a TIFF file.
     """
 
     rows: int
@@ -68,19 +68,19 @@ class Stored:
     spare_rows: int = 0
     directory: Directory | None = None
 
-    def holds(self, rows: int, columns: int) -> bool:
-        """Return whether that is the size of the sensor as LibRaw would make it."""
+    def has_size(self, rows: int, columns: int) -> bool:
+        """Return whether LibRaw may return a sensor of this size for the frame."""
         return columns == self.columns and rows in (self.rows, self.rows + self.spare_rows)
 
 
 def ciff_entries(data: bytes | memoryview) -> dict[int, Extent]:
-    """Return where the values of Canon's CRW lie, by tag, those of inner heaps included; none of any other file.
+    """Return the extents of the values in a Canon CRW by tag, with inner heaps; empty for other files.
 
     Source: Canon, CIFF 1.0 revision 4: a heap ends with the offset of its table; types 0x28 and 0x30 are heaps.
     """
     if bytes(data[6:14]) != b"HEAPCCDR":
         return {}
-    found: dict[int, Extent] = {}
+    extents: dict[int, Extent] = {}
     heaps = [(struct.unpack_from("<I", data, 2)[0], len(data))]
     for _ in range(64):
         if not heaps:
@@ -90,167 +90,168 @@ def ciff_entries(data: bytes | memoryview) -> dict[int, Extent]:
             table = start + struct.unpack_from("<I", data, end - 4)[0]
             (count,) = struct.unpack_from("<H", data, table)
             for number in range(min(count, 127)):
-                kind, size, offset = struct.unpack_from("<HII", data, table + 2 + 10 * number)
-                if kind & 0xC000 == 0:
-                    found.setdefault(kind, (start + offset, size))
-                if kind & 0xF800 in (0x2800, 0x3000) and size >= 6 and start + offset + size <= len(data):
+                tag, size, offset = struct.unpack_from("<HII", data, table + 2 + 10 * number)
+                if tag & 0xC000 == 0:
+                    extents.setdefault(tag, (start + offset, size))
+                if tag & 0xF800 in (0x2800, 0x3000) and size >= 6 and start + offset + size <= len(data):
                     heaps.append((start + offset, start + offset + size))
         except struct.error:
             continue
-    return found
+    return extents
 
 
-MAX_BOXES = 4096  # Boxes that are walked; a real file has about a hundred
+MAX_BOXES = 4096  # Most boxes to read; a real file has about a hundred
 
-_CANON = bytes.fromhex("85c0b687820f11e08111f4ce462b6a48")  # The uuid of the box with Canon's metadata
+_CANON = bytes.fromhex("85c0b687820f11e08111f4ce462b6a48")  # uuid of the box with Canon's metadata
 _SAMPLE_ENTRY_HEAD = 82  # Bytes of a CRAW sample entry before the boxes in it (cr3_parser.cpp)
-_MOST_SAMPLES = 4096  # Samples of a track that are looked at; a roll of bursts has a few hundred
-_UUID_LENGTH = 16  # Bytes of a uuid, which stands before the content of such a box (ISO/IEC 14496-12, 4.2)
-_TABLE_HEAD = 8  # Bytes of `stsd` before its entries: version and flags, and how many (ISO/IEC 14496-12, 8.5.2)
+_MOST_SAMPLES = 4096  # Most samples of a track; a roll of bursts has a few hundred
+_UUID_LENGTH = 16  # Bytes of the uuid before the content of a uuid box (ISO/IEC 14496-12, 4.2)
+_TABLE_HEAD = 8  # Bytes of `stsd` before its entries: version, flags and count (ISO/IEC 14496-12, 8.5.2)
 _FULL_BOX_HEAD = 4  # Bytes of version and flags in a full box (ISO/IEC 14496-12, 4.2)
-_WHOLE_AREAS = 48  # Bytes of `IAD1` in the track of the whole picture: six areas of four numbers; a preview's has fewer
-_LEFT_BLACK, _UPPER_BLACK = 3, 4  # Which of those areas are optically black (cr3_parser.cpp)
+_WHOLE_AREAS = 48  # Bytes of `IAD1` in the track of the full image: six areas of four numbers; previews have fewer
+_LEFT_BLACK, _UPPER_BLACK = 3, 4  # Indices of the optically black areas (cr3_parser.cpp)
 
 
 @dataclass(frozen=True)
 class Cr3:
-    """What a CR3 says of itself.
+    """Content of a CR3.
 
-    - `maker`, `model`: as ``Canon`` and ``Canon EOS R``; empty where the file does not say.
-    - `black`: optically black areas that it states for its largest picture, on the whole sensor: left, upper; those
-      that it leaves empty are left out.
-    - `frames`: the pictures of its tracks of raw pixels.
-    - `exif`: directories of its Exif box, with serial number and lens; none where it has no such box.
+    - `maker`, `model`: such as ``Canon`` and ``Canon EOS R``; empty if missing.
+    - `black`: optically black areas of the largest image in sensor coordinates, left and upper; without empty areas.
+    - `frames`: images of the raw tracks.
+    - `exif`: directories of the Exif box with serial number and lens; empty without this box.
     """
 
     maker: str = ""
     model: str = ""
     black: tuple[Area, ...] = ()
     exif: tuple[Directory, ...] = ()
-    frames: tuple[Stored, ...] = ()
+    frames: tuple[StoredFrame, ...] = ()
 
 
 @dataclass(frozen=True)
 class _Box:
-    kind: bytes
+    box_type: bytes
     start: int
     end: int
 
 
 def read_cr3(data: bytes | memoryview) -> Cr3:
-    """Return what a CR3 says of itself."""
+    """Return the content of a CR3."""
     maker = model = ""
     black: tuple[Area, ...] = ()
     exif: tuple[Directory, ...] = ()
-    frames: list[Stored] = []
-    left = [MAX_BOXES]
-    found: set[bytes] = set()
-    for box in _boxes(data, 0, len(data), left, whole=True):
-        found.add(box.kind)
-        if box.kind != b"moov":
+    frames: list[StoredFrame] = []
+    budget = [MAX_BOXES]
+    box_types: set[bytes] = set()
+    for box in _boxes(data, 0, len(data), budget, is_file=True):
+        box_types.add(box.box_type)
+        if box.box_type != b"moov":
             continue
-        for part in _boxes(data, box.start, box.end, left):
-            if part.kind == b"uuid" and bytes(data[part.start : part.start + _UUID_LENGTH]) == _CANON:
-                for entry in _boxes(data, part.start + _UUID_LENGTH, part.end, left):
-                    if entry.kind == b"CMT1":
-                        known = _directories(data[entry.start : entry.end])
-                        named = ((one.text(TiffTag.MAKE), one.text(TiffTag.MODEL)) for one in known)
-                        maker, model = next((names for names in named if names[1]), ("", ""))
-                    elif entry.kind == b"CMT2":
+        for inner in _boxes(data, box.start, box.end, budget):
+            if inner.box_type == b"uuid" and bytes(data[inner.start : inner.start + _UUID_LENGTH]) == _CANON:
+                for entry in _boxes(data, inner.start + _UUID_LENGTH, inner.end, budget):
+                    if entry.box_type == b"CMT1":
+                        directories = _directories(data[entry.start : entry.end])
+                        names = ((tags.text(TiffTag.MAKE), tags.text(TiffTag.MODEL)) for tags in directories)
+                        maker, model = next((pair for pair in names if pair[1]), ("", ""))
+                    elif entry.box_type == b"CMT2":
                         exif = _directories(data[entry.start : entry.end])
-            elif part.kind == b"trak":
-                table = _inside(data, part, left, b"mdia", b"minf", b"stbl")
-                entry = table and _inside(data, table, left, b"stsd", b"CRAW")
+            elif inner.box_type == b"trak":
+                table = _find_box(data, inner, budget, b"mdia", b"minf", b"stbl")
+                entry = table and _find_box(data, table, budget, b"stsd", b"CRAW")
                 if table is None or entry is None:
                     continue
-                black = _black_areas(data, entry, left) or black
-                frames += _frames(data, table, entry, left)
-    for kind, what in ((b"moov", "description of its pictures"), (b"mdat", "pictures")):
-        if kind not in found:
-            raise RawDamaged(f"it holds no {what} ({kind.decode('ascii')})")
+                black = _black_areas(data, entry, budget) or black
+                frames += _track_frames(data, table, entry, budget)
+    for box_type, content_name in ((b"moov", "description of its images"), (b"mdat", "images")):
+        if box_type not in box_types:
+            raise RawDamaged(f"it contains no {content_name} ({box_type.decode('ascii')})")
     return Cr3(maker, model, black, exif, tuple(frames))
 
 
-def _boxes(data: bytes | memoryview, start: int, end: int, left: list[int], *, whole: bool = False) -> Iterator[_Box]:
-    """Yield the boxes between two places; a damaged one ends the row, or, of a `whole` file, is an error."""
+def _boxes(
+    data: bytes | memoryview, start: int, end: int, budget: list[int], *, is_file: bool = False
+) -> Iterator[_Box]:
+    """Yield the boxes between two positions; a damaged box ends them, or raises an error if `is_file`."""
+    # `budget` holds the number of boxes that may still be read.
     while end - start >= 8:
-        left[0] -= 1
-        if left[0] < 0:
-            raise RawDamaged(f"it has more than {MAX_BOXES} boxes")
-        size, kind = struct.unpack_from(">I4s", data, start)
-        head = 8
+        budget[0] -= 1
+        if budget[0] < 0:
+            raise RawDamaged(f"it has more than {MAX_BOXES} boxes, about 100 expected")
+        size, box_type = struct.unpack_from(">I4s", data, start)
+        header_size = 8
         if size == 1 and end - start >= 16:
             (size,) = struct.unpack_from(">Q", data, start + 8)
-            head = 16
+            header_size = 16
         elif size == 0:
             size = end - start
-        if size < head or start + size > end:
-            if whole:
-                name = kind.decode("ascii", "replace")
-                raise RawDamaged(f"its part {name!r} reaches to byte {start + size}, and it has only {end}")
+        if size < header_size or start + size > end:
+            if is_file:
+                name = box_type.decode("ascii", "replace")
+                raise RawDamaged(f"its box {name!r} extends to byte {start + size}, the file has {end} bytes")
             return
-        yield _Box(kind, start + head, start + size)
+        yield _Box(box_type, start + header_size, start + size)
         start += size
-    if whole and start != end:
-        raise RawDamaged(f"{end - start} bytes follow its last part, too few for another")
+    if is_file and start != end:
+        raise RawDamaged(f"{end - start} bytes follow its last box, 0 or at least 8 expected")
 
 
 def _directories(content: bytes | memoryview) -> tuple[Directory, ...]:
-    """Return the directories of the TIFF in a box; none where it is damaged."""
     try:
         return tuple(read_directories(bytes(content)))
     except TiffDamaged:
         return ()
 
 
-# Bytes of a box before the boxes in it.
-_HEADS = {b"stsd": _TABLE_HEAD, b"CRAW": _SAMPLE_ENTRY_HEAD, b"CDI1": _FULL_BOX_HEAD}
+# Bytes of a box before its inner boxes.
+_HEADER_SIZES = {b"stsd": _TABLE_HEAD, b"CRAW": _SAMPLE_ENTRY_HEAD, b"CDI1": _FULL_BOX_HEAD}
 
 
-def _inside(data: bytes | memoryview, box: _Box, left: list[int], *kinds: bytes) -> _Box | None:
-    """Return the first box of each of `kinds`, one within the other; None where one is missing."""
-    for kind in kinds:
-        found = next((inner for inner in _boxes(data, box.start, box.end, left) if inner.kind == kind), None)
-        if found is None:
+def _find_box(data: bytes | memoryview, box: _Box, budget: list[int], *box_types: bytes) -> _Box | None:
+    """Follow the first box of each type, one inside the other; return the last, None if one is missing."""
+    for box_type in box_types:
+        child = next((inner for inner in _boxes(data, box.start, box.end, budget) if inner.box_type == box_type), None)
+        if child is None:
             return None
-        box = _Box(kind, min(found.start + _HEADS.get(kind, 0), found.end), found.end)
+        box = _Box(box_type, min(child.start + _HEADER_SIZES.get(box_type, 0), child.end), child.end)
     return box
 
 
-def _frames(data: bytes | memoryview, table: _Box, entry: _Box, left: list[int]) -> list[Stored]:
-    """Return the pictures of a track of raw pixels, each a sample in a chunk of its own; none of another track."""
-    described = _inside(data, entry, left, b"CMP1")
-    sizes, places = _inside(data, table, left, b"stsz"), _inside(data, table, left, b"co64")
-    if described is None or described.end - described.start < 16:
+def _track_frames(data: bytes | memoryview, table: _Box, entry: _Box, budget: list[int]) -> list[StoredFrame]:
+    """Return the images of a raw track, each a sample in its own chunk; empty for other tracks."""
+    compression = _find_box(data, entry, budget, b"CMP1")
+    sizes_box, offsets_box = _find_box(data, table, budget, b"stsz"), _find_box(data, table, budget, b"co64")
+    if compression is None or compression.end - compression.start < 16:
         return []
-    columns, rows = struct.unpack_from(">II", data, described.start + 8)
-    if sizes is None or places is None:
-        raise RawDamaged("a track of its pixels does not say where they are")
-    stsz, co64 = (bytes(data[box.start : box.end]) for box in (sizes, places))
+    columns, rows = struct.unpack_from(">II", data, compression.start + 8)
+    if sizes_box is None or offsets_box is None:
+        raise RawDamaged("a track of its pixels has no sizes (stsz) or offsets (co64)")
+    stsz, co64 = (bytes(data[box.start : box.end]) for box in (sizes_box, offsets_box))
     try:
-        each, count = struct.unpack_from(">II", stsz, 4)
+        common_length, count = struct.unpack_from(">II", stsz, 4)
         (chunks,) = struct.unpack_from(">I", co64, 4)
         if not 0 < count == chunks <= _MOST_SAMPLES:
-            raise RawDamaged(f"a track of its pixels has {count} samples in {chunks} chunks")
-        lengths = (each,) * count if each else struct.unpack_from(f">{count}I", stsz, 12)
+            raise RawDamaged(f"a track of its pixels has {count} samples in {chunks} chunks, equal numbers expected")
+        lengths = (common_length,) * count if common_length else struct.unpack_from(f">{count}I", stsz, 12)
         offsets = struct.unpack_from(f">{count}Q", co64, 8)
     except struct.error as error:
         raise RawDamaged("a track of its pixels ends within its tables") from error
-    return [Stored(rows, columns, (extent,)) for extent in zip(offsets, lengths, strict=True)]
+    return [StoredFrame(rows, columns, (extent,)) for extent in zip(offsets, lengths, strict=True)]
 
 
-def _black_areas(data: bytes | memoryview, entry: _Box, left: list[int]) -> tuple[Area, ...]:
-    """Return the optically black areas that a track states; none for one that is not of the whole picture."""
-    place = _inside(data, entry, left, b"CDI1", b"IAD1")
-    if place is None:
+def _black_areas(data: bytes | memoryview, entry: _Box, budget: list[int]) -> tuple[Area, ...]:
+    """Return the optically black areas of a track; empty if it is not the full image."""
+    box = _find_box(data, entry, budget, b"CDI1", b"IAD1")
+    if box is None:
         return ()
-    if place.end - place.start < _WHOLE_AREAS:
+    if box.end - box.start < _WHOLE_AREAS:
         return ()
-    numbers = struct.unpack_from(f">{_WHOLE_AREAS // 2}H", data, place.start)
+    numbers = struct.unpack_from(f">{_WHOLE_AREAS // 2}H", data, box.start)
     areas: list[Area] = []
     for index in (_LEFT_BLACK, _UPPER_BLACK):
         first_column, first_row, last_column, last_row = numbers[4 * index : 4 * index + 4]
-        # The last row and column belong to it, as of all areas that Canon states.
+        # Last row and column are inclusive, as in all areas in Canon's files.
         if last_column > first_column and last_row > first_row:
             areas.append(Area(first_row, first_column, last_row - first_row + 1, last_column - first_column + 1))
     return tuple(areas)

@@ -1,1 +1,1 @@
-"""Projectors that speak a line protocol of their maker, on a serial cable or over TCP."""
+"""Projectors with a line protocol of their maker, on a serial cable or over TCP."""

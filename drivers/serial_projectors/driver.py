@@ -1,10 +1,4 @@
-"""The driver of all projectors that speak a line protocol: what is asked and sent is in their `Language`.
-
-- A projector that cools down is not switched on, and one that warms up is not switched off; one that is in the wanted
-  state, or on the way to it, is sent nothing.
-- Every command may be repeated without harm (`drivers.links.link`).
-- A question that the projector refuses though it is on is one that it does not know.
-"""
+"""Driver of all projectors with a line protocol; a `Language` holds the commands and replies of each maker."""
 
 from __future__ import annotations
 
@@ -21,40 +15,40 @@ from drivers.serial_projectors.language import (
     answer_parser,
     encode_command,
     handshake_parser,
-    refusal_in,
-    value_in,
+    match_value,
+    refusal_kind,
 )
 from foundation.clock import SYSTEM_CLOCK, Clock
 from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
 
-_CHECK_CABLE = (
-    "check the cable (straight or null-modem, as its manual says), the speed, and that it may be controlled in standby"
+_CABLE_REMEDY = (
+    "check the cable (straight or null-modem, see its manual), the speed, and that control in standby is enabled"
 )
-_WAIT = "wait until its power is on and try again"
-_BY_HAND = "do it with its remote control, or try again when its power is on"
+_WAIT_REMEDY = "wait until it is on and try again"
+_MANUAL_REMEDY = "use its remote control, or try again when it is on"
 
 
 class _Unknown(DeviceRefused):
-    """The projector does not have this command or question."""
+    """The projector does not support this command or query."""
 
 
 class _Busy(DeviceRefused):
-    """The projector cannot carry it out now."""
+    """The projector cannot execute the command now."""
 
 
 class _Unclear(DeviceRefused):
-    """The projector does not have it, or cannot carry it out now."""
+    """The projector does not support the command, or cannot execute it now."""
 
 
-_REFUSED = {"unknown": (_Unknown, _BY_HAND), "busy": (_Busy, _WAIT), "unclear": (_Unclear, _WAIT)}
+_REFUSALS = {"unknown": (_Unknown, _MANUAL_REMEDY), "busy": (_Busy, _WAIT_REMEDY), "unclear": (_Unclear, _WAIT_REMEDY)}
 
 
 class LineProjector(Projector):
-    """A `drivers.projector.Projector` that speaks a line protocol; nothing is opened before its first use.
+    """A `drivers.projector.Projector` with a line protocol; the connection is opened at the first use.
 
-    Every question and command may raise `DeviceRefused`, `DeviceFault`, `LinkError` and `ProtocolError`.
-
-    `network`: whether the connection is one over TCP, and begins as the language says.
+    All queries and commands may raise `DeviceRefused`, `DeviceFault`, `LinkError` and `ProtocolError`. A command may be
+    repeated without harm. No command is sent if the projector is already in the requested state or changes to it. With
+    `network` the connection starts with the handshake of the language.
     """
 
     def __init__(
@@ -70,47 +64,47 @@ class LineProjector(Projector):
         self._handshake = language.network.handshake if network and language.network is not None else None
         self._clock = clock
         timeout = language.line.timeout_s
-        self._exchange = Exchange(connect, timeout, label, clock, self._greet, _CHECK_CABLE, CHECK_SPEED)
-        # A command to switch whose answer is to come, and until when.
-        self._under_way: Power | None = None
-        self._give_up_at = 0.0
-        # What was seen, announced or set last.
-        self._settled: Power | None = None
-        self._announced: Power | None = None
-        self._failed: tuple[str, ...] = ()
-        self._muted: bool | None = None
+        self._exchange = Exchange(connect, timeout, label, clock, self._greet, _CABLE_REMEDY, CHECK_SPEED)
+        # State that a switch command started; its reply is pending until `_switch_deadline`.
+        self._switching_to: Power | None = None
+        self._switch_deadline = 0.0
+        # Last stable power state, last announced power state, announced faults, last mute command.
+        self._stable_power: Power | None = None
+        self._announced_power: Power | None = None
+        self._announced_faults: tuple[str, ...] = ()
+        self._mute_set: bool | None = None
 
     def identity(self) -> ProjectorIdentity:
-        """Return maker, model and name; empty what the projector does not report."""
+        """Return maker, model and name; empty texts if the projector does not report them."""
         language = self._language
-        return ProjectorIdentity(language.maker, self._text(language.model), self._text(language.name))
+        return ProjectorIdentity(language.maker, self._query_text(language.model), self._query_text(language.name))
 
     def power(self) -> Power:
-        """Return the power state now; what the language does not report, by what was seen, announced or sent last."""
-        self._take_late_answer()
-        if self._under_way is not None:
-            return self._under_way
+        """Return the power state; the last announced or commanded state fills gaps of the language."""
+        self._read_switch_reply()
+        if self._switching_to is not None:
+            return self._switching_to
         words = self._language.power
         try:
-            value = self._value(words).upper()
+            value = self._query(words).upper()
         except _Busy as error:
-            return self._state_between(error)
+            return self._transition_state(error)
         if value in words.stopped:
             raise DeviceFault(f"{self.label} answers {value} to {words.ask}: {words.stopped[value]}")
         if value not in words.states:
             raise self._unexpected(words.ask, value, f"one of {', '.join((*words.states, *words.stopped))}")
         power = words.states[value]
-        if power is Power.ON and self._announced is not Power.COOLING:
-            self._announced = None
-        power = self._announced or power
+        if power is Power.ON and self._announced_power is not Power.COOLING:
+            self._announced_power = None
+        power = self._announced_power or power
         if power in (Power.ON, Power.STANDBY):
-            self._settled = power
+            self._stable_power = power
         if power is Power.STANDBY:
-            self._muted = None
+            self._mute_set = None
         return power
 
     def switch_on(self) -> None:
-        """Begin to switch on; refused while it cools down."""
+        """Start to switch on; refused during cooling."""
         power = self.power()
         if power is Power.COOLING:
             raise DeviceRefused(f"{self.label} is cooling down; wait until it is in standby and try again")
@@ -118,7 +112,7 @@ class LineProjector(Projector):
             self._switch(self._language.power.on, Power.WARMING)
 
     def switch_off(self) -> None:
-        """Begin to switch off; refused while it warms up."""
+        """Start to switch off; refused during warm-up."""
         power = self.power()
         if power is Power.WARMING:
             raise DeviceRefused(f"{self.label} is warming up; wait until it is on and try again")
@@ -126,16 +120,16 @@ class LineProjector(Projector):
             self._switch(self._language.power.off, Power.COOLING)
 
     def muted(self) -> bool | None:
-        """Return whether the picture is hidden; what was set last if the projector cannot tell, None before that."""
-        told = self._mute_told()
-        return self._muted if told is None else told
+        """Return whether mute hides the image; the last command if this is not reported, None before it."""
+        reported = self._query_mute()
+        return self._mute_set if reported is None else reported
 
-    def _mute_told(self) -> bool | None:
-        """Return whether it answers that the picture is hidden; without such a question, what was set last."""
+    def _query_mute(self) -> bool | None:
+        """Return the reported mute state; the last command if the language has no such query."""
         words = self._language.mute
         if not words.ask:
-            return self._muted
-        value = self._value_if_known(Question(ask=words.ask, answer=words.answer))
+            return self._mute_set
+        value = self._query_if_supported(Question(ask=words.ask, answer=words.answer))
         if value is None:
             return None
         if value.upper() not in words.states:
@@ -143,160 +137,161 @@ class LineProjector(Projector):
         return words.states[value.upper()]
 
     def set_muted(self, muted: bool) -> None:
-        """Hide the picture, or show it; refused unless the projector is on."""
+        """Hide the image or show it; refused unless the projector is on."""
         words = self._language.mute
-        if words.only_changes and self._mute_told() is muted:
+        if words.only_changes and self._query_mute() is muted:
             return
-        self._exchanged(words.on if muted else words.off, (words.done,))
-        self._muted = muted
+        self._exchange_command(words.on if muted else words.off, (words.done,))
+        self._mute_set = muted
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return every fault reported now, or announced since the lamp was struck last.
+        """Return all faults reported now, or announced since the lamp was last struck.
 
-        Empty if the projector is healthy, if its language has no faults, and if it does not report them now though it
-        is not in standby.
+        Empty without a fault, if the language has no faults, and if the projector does not report them now outside
+        standby.
         """
         words = self._language.faults
         if words is None:
-            # To be silent because the cable is out must not look like health.
+            # Raises if the cable is unplugged, which must not look like a healthy projector.
             with contextlib.suppress(_Busy):
                 self.power()
-            if self._language.has_news:
-                self._pass_over(POLL_S)
-            return tuple(Fault(part, Severity.ERROR) for part in self._failed)
+            if self._language.reports_unasked:
+                self._discard_messages(POLL_S)
+            return tuple(Fault(component, Severity.ERROR) for component in self._announced_faults)
         try:
-            codes = self._value(words).upper().split()
+            codes = self._query(words).upper().split()
         except _Unknown:
             return ()
         except DeviceRefused:
             if self.power() is Power.STANDBY:
                 raise
             return ()
-        if not codes or not all(map(words.may_be, codes)):
+        if not codes or not all(map(words.is_valid, codes)):
             raise self._unexpected(words.ask, " ".join(codes), f"{words.healthy} or one of {', '.join(words.parts)}")
-        parts = dict.fromkeys(words.parts.get(code, "other") for code in codes if code != words.healthy.upper())
-        return tuple(Fault(part, Severity.ERROR) for part in parts)
+        components = dict.fromkeys(words.parts.get(code, "other") for code in codes if code != words.healthy.upper())
+        return tuple(Fault(component, Severity.ERROR) for component in components)
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return every lamp; empty for a lampless projector, and for one that does not count hours."""
-        question = self._language.lamp_hours
-        value = None if question is None else self._value_if_known(question)
-        if question is None or value is None:
+        """Return all lamps; empty for a lampless projector, or if it does not count hours."""
+        query = self._language.lamp_hours
+        value = None if query is None else self._query_if_supported(query)
+        if query is None or value is None:
             return ()
         hours = value.split()
-        if not hours or not all(word.isascii() and word.isdecimal() for word in hours):
-            raise self._unexpected(question.ask, value, "hours")
-        lit = self.power() in (Power.ON, Power.WARMING)
-        return tuple(Lamp(int(word), lit) for word in hours)
+        if not hours or not all(number.isascii() and number.isdecimal() for number in hours):
+            raise self._unexpected(query.ask, value, "hours")
+        is_lit = self.power() in (Power.ON, Power.WARMING)
+        return tuple(Lamp(int(number), is_lit) for number in hours)
 
     def close(self) -> None:
-        """Release the cable; the power state stays."""
-        self._under_way = None
+        """Release the cable and keep the power state."""
+        self._switching_to = None
         self._exchange.close()
 
-    def _switch(self, command: str, begins: Power) -> None:
+    def _switch(self, command: str, next_power: Power) -> None:
         words = self._language.power
         if words.done_within_s:
             self._exchange.send(encode_command(self._language.line, command))
-            self._under_way = begins
-            self._give_up_at = self._clock.monotonic() + words.done_within_s
+            self._switching_to = next_power
+            self._switch_deadline = self._clock.monotonic() + words.done_within_s
             return
-        self._exchanged(command, (words.done,))
+        self._exchange_command(command, (words.done,))
         if self._language.announces_power:
-            self._announced = begins
+            self._announced_power = next_power
 
-    def _state_between(self, error: DeviceRefused) -> Power:
-        if self._settled is None:
-            unclear = f"{self.label} is warming up or cooling down, and does not report which; wait two minutes"
-            raise _Busy(unclear) from error
-        return Power.WARMING if self._settled is Power.STANDBY else Power.COOLING
+    def _transition_state(self, error: DeviceRefused) -> Power:
+        if self._stable_power is None:
+            busy_message = f"{self.label} is warming up or cooling down, and does not report which; wait two minutes"
+            raise _Busy(busy_message) from error
+        return Power.WARMING if self._stable_power is Power.STANDBY else Power.COOLING
 
-    def _take_late_answer(self) -> None:
-        if self._under_way is None:
+    def _read_switch_reply(self) -> None:
+        if self._switching_to is None:
             return
         words = self._language.power
-        command = words.on if self._under_way is Power.WARMING else words.off
+        command = words.on if self._switching_to is Power.WARMING else words.off
         try:
-            reply = self._next_answer(POLL_S)
+            reply = self._next_reply(POLL_S)
         except BaseException:
-            self._under_way = None
+            self._switching_to = None
             raise
         if reply is None:
-            if self._clock.monotonic() >= self._give_up_at:
+            if self._clock.monotonic() >= self._switch_deadline:
                 self.close()
                 raise LinkTimeout(
-                    f"{self.label} has not carried out {command} within {words.done_within_s:g} s; "
-                    "look at its indicators and its cable"
+                    f"{self.label} has not confirmed {command} within {words.done_within_s:g} s; "
+                    "check its indicators and its cable"
                 )
             return
-        self._under_way = None
-        self._require_accepted(command, reply, "look at its indicators and try again")
+        self._switching_to = None
+        self._require_accepted(command, reply, "check its indicators and try again")
 
-    def _text(self, question: TextQuestion | None) -> str:
-        if question is None:
+    def _query_text(self, query: TextQuestion | None) -> str:
+        if query is None:
             return ""
         try:
-            return question.shown.replace("{}", self._value(question))
+            return query.shown.replace("{}", self._query(query))
         except DeviceRefused:
             return ""
 
-    def _value_if_known(self, question: Question) -> str | None:
-        """Return the value that a question is answered; None if the projector does not know the question."""
+    def _query_if_supported(self, query: Question) -> str | None:
         try:
-            return self._value(question)
+            return self._query(query)
         except _Unknown:
             return None
         except _Unclear:
+            # A projector that is on and refuses a query does not support it.
             if self.power() is Power.ON:
                 return None
             raise
 
-    def _value(self, question: Question) -> str:
-        return self._exchanged(question.ask, question.answer)
+    def _query(self, query: Question) -> str:
+        return self._exchange_command(query.ask, query.answer)
 
-    def _exchanged(self, text: str, answers: tuple[str, ...]) -> str:
-        self._take_late_answer()
-        if self._under_way is not None:
-            raise DeviceRefused(f"{self.label} is busy with its {self._under_way.value}; wait until that is done")
-        if self._language.has_news:
-            # What waits is thrown away when a question is asked; here it may be news.
-            self._pass_over(0.0)
+    def _exchange_command(self, text: str, answers: tuple[str, ...]) -> str:
+        self._read_switch_reply()
+        if self._switching_to is not None:
+            raise DeviceRefused(f"{self.label} is busy ({self._switching_to.value}); wait until it has finished")
+        if self._language.reports_unasked:
+            # `Exchange.query` discards waiting input; read it first, because it may announce power or faults.
+            self._discard_messages(0.0)
         line = self._language.line
-        reply = self._exchange.ask(encode_command(line, text), answer_parser(self._language, text), self._take_unasked)
+        reply = self._exchange.query(
+            encode_command(line, text), answer_parser(self._language, text), self._handle_unasked
+        )
         self._require_accepted(text, reply)
-        value = value_in(answers, reply)
+        value = match_value(answers, reply)
         if value is None:
             self._exchange.close()
             raise self._unexpected(text, reply, f"{' or '.join(map(repr, answers))}; {CHECK_SPEED}")
         return value
 
     def _require_accepted(self, sent: str, reply: str, remedy: str = "") -> None:
-        refusal = refusal_in(self._language.refusals, reply)
+        refusal = refusal_kind(self._language.refusals, reply)
         if refusal is not None:
-            kind, usual = _REFUSED[refusal]
-            raise kind(f"{self.label} answers {reply} to {sent}; {remedy or usual}")
+            error_type, usual_remedy = _REFUSALS[refusal]
+            raise error_type(f"{self.label} answers {reply} to {sent}; {remedy or usual_remedy}")
 
-    def _pass_over(self, wait: float) -> None:
-        while self._next_answer(wait) is not None:
+    def _discard_messages(self, wait: float) -> None:
+        while self._next_reply(wait) is not None:
             pass
 
-    def _next_answer(self, wait: float) -> str | None:
-        """Return the next message that answers something, None if none comes within `wait` seconds."""
-        take = answer_parser(self._language)
-        while (message := self._exchange.poll(take, wait)) is not None:
-            if not self._take_unasked(message):
+    def _next_reply(self, wait: float) -> str | None:
+        parse = answer_parser(self._language)
+        while (message := self._exchange.poll(parse, wait)) is not None:
+            if not self._handle_unasked(message):
                 return message
         return None
 
-    def _take_unasked(self, message: str) -> bool:
-        unasked = self._language.unasked_in(message)
+    def _handle_unasked(self, message: str) -> bool:
+        unasked = self._language.match_unasked(message)
         if unasked is None:
             return False
         if unasked.power is not None:
-            self._announced = None if unasked.power in (Power.STANDBY, Power.ON) else unasked.power
-            self._failed = () if unasked.power is Power.WARMING else self._failed
-        if unasked.fault is not None and unasked.fault not in self._failed:
-            self._failed += (unasked.fault,)
+            self._announced_power = None if unasked.power in (Power.STANDBY, Power.ON) else unasked.power
+            self._announced_faults = () if unasked.power is Power.WARMING else self._announced_faults
+        if unasked.fault is not None and unasked.fault not in self._announced_faults:
+            self._announced_faults += (unasked.fault,)
         return True
 
     def _greet(self, exchange: Exchange) -> bytes:
@@ -308,12 +303,12 @@ class LineProjector(Projector):
                 raise DeviceRefused(f"{self.label} refuses the connection with 0x{state}: {reason}")
         elif line.wake:
             try:
-                exchange.open_with(line.wake.encode("ascii"), answer_parser(self._language), self._take_unasked)
+                exchange.open_with(line.wake.encode("ascii"), answer_parser(self._language), self._handle_unasked)
             except LinkTimeout as error:
                 limit = self._language.power.done_within_s
-                late = f"; or it is still switching on or off for an earlier program: wait {limit:g} s" if limit else ""
-                raise LinkTimeout(f"{error}{late}") from error
+                switching_hint = f"; if an earlier program switched it on or off, wait {limit:g} s" if limit else ""
+                raise LinkTimeout(f"{error}{switching_hint}") from error
         return b""
 
-    def _unexpected(self, question: str, answer: str, expected: str) -> ProtocolError:
-        return ProtocolError(f"{self.label} answers {answer!r} to {question}; expected {expected}")
+    def _unexpected(self, query: str, answer: str, expected: str) -> ProtocolError:
+        return ProtocolError(f"{self.label} answers {answer!r} to {query}; expected {expected}")

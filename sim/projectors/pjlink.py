@@ -60,7 +60,7 @@ class PjLinkPeer:
         if data:
             connection.last_received_s = self._projector.clock.monotonic()
         try:
-            while not connection.closed and (next_line := wire.take_line(connection.received, _LONGEST)) is not None:
+            while not connection.closed and (next_line := wire.split_line(connection.received, _LONGEST)) is not None:
                 line, length = next_line
                 connection.received = connection.received[length:]
                 reply = self._reply(wire.parse_request(line))

@@ -1,4 +1,4 @@
-"""Conversations of a host with an EOS body, for the tests of what reads and leads them."""
+"""Fixtures with recorded and simulated conversations of a host with an EOS body."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CONVERSATIONS = conversations()
 
 @pytest.fixture(scope="session", params=CONVERSATIONS)
 def body(request: pytest.FixtureRequest) -> str:
-    """Give the name of the body that answered in `recording`."""
+    """Name of the body in `recording`."""
     return request.param
 
 

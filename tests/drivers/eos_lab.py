@@ -1,4 +1,4 @@
-"""A simulated EOS with the driver before it, in trouble if wanted: what the tests of the EOS driver play with."""
+"""A simulated EOS with its driver, optionally with faults, for the tests of the EOS driver."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from tests.contracts.camera import SeededFilm
 
 
 class Lab:
-    """A simulated EOS on cables of memory: `device` and `pipes` may be put in trouble before the camera is used."""
+    """A simulated EOS on cables in memory; `device`, `pipes` and `cable` may be replaced by faulty ones."""
 
-    def __init__(self, body: EosModel = EOS_550D, film_bytes: int = 600, **given: Any) -> None:
-        kind: dict[str, Any] = {"auto_power_off_s": 0, **given}
+    def __init__(self, body: EosModel = EOS_550D, film_bytes: int = 600, **options: Any) -> None:
+        all_options: dict[str, Any] = {"auto_power_off_s": 0, **options}
         self.clock = SimulatedClock()
         self.film = SeededFilm(film_bytes)
-        self.eos = SimulatedEos(body, self.film, self.clock, **kind)
+        self.eos = SimulatedEos(body, self.film, self.clock, **all_options)
         self.device: Responder = self.eos
         self.pipes: Callable[[UsbPipes], UsbPipes] = lambda pipes: pipes
         self.cable: Callable[[Transport], Transport] = lambda transport: transport
@@ -39,13 +39,13 @@ class Lab:
         return self.cable(UsbTransport(self.pipes(pipes), self.clock))
 
     def take(self, attempts: int = 3) -> CapturedFrame:
-        """Take a frame as the sequencer does, and see that it is the one that was exposed last."""
-        for left in reversed(range(attempts)):
+        """Take a frame as the sequencer does; it must be the last exposed frame."""
+        for remaining_attempts in reversed(range(attempts)):
             into = io.BytesIO()
             try:
                 captured = capture(self.camera, into)
             except DeviceError as error:
-                if not left or isinstance(error, DeviceRefused | DeviceFault):
+                if not remaining_attempts or isinstance(error, DeviceRefused | DeviceFault):
                     raise
                 continue
             assert into.getvalue() == self.film.frames[-1]
@@ -54,22 +54,22 @@ class Lab:
         raise AssertionError
 
     def press(self) -> None:
-        """Press the release on the camera itself, and let the frame come."""
+        """Release the shutter on the camera itself."""
         self.eos._full_press()
         self.clock.sleep(5)
         assert not self.eos.busy
 
     def waiting(self) -> int:
-        """Return how many objects wait in the body's memory now."""
+        """Return the number of objects in the body's memory."""
         assert not self.eos.busy
         return len(self.eos._memory)
 
     def pull(self) -> None:
-        """Pull the cable out, and put it back."""
-        self.camera._drop(None)
+        """Unplug the cable and plug it in again."""
+        self.camera._drop_connection(None)
 
     def download(self) -> bytes:
-        """Return what the camera writes of the frame exposed last."""
+        """Return the bytes of the last exposed frame."""
         into = io.BytesIO()
         self.camera.download(into)
         return into.getvalue()

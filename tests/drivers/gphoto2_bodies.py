@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from drivers.camera import ExposureSettings
-from drivers.gphoto2_camera import BodySetting, number_of
+from drivers.gphoto2_camera import BodySetting, parse_number
 from foundation.clock import Clock
 from tests.contracts.camera import SeededFilm
 
@@ -125,7 +125,7 @@ BODIES: Mapping[str, dict[str, BodySetting]] = {
 
 
 class GPhotoFault(Exception):
-    """Stands for gphoto2.GPhoto2Error."""
+    """Replaces gphoto2.GPhoto2Error."""
 
     def __init__(self, code: int, string: str = "a fault") -> None:
         super().__init__(string)
@@ -133,7 +133,7 @@ class GPhotoFault(Exception):
 
 
 class Widget:
-    """A setting as gphoto2 hands it out: a copy, which is given back to set it."""
+    """A setting as gphoto2 returns it: a copy, which must be given back to set it."""
 
     def __init__(self, setting: BodySetting, value: object) -> None:
         self.setting, self.value = setting, value
@@ -171,9 +171,9 @@ class Widget:
 
 @dataclass
 class FakeBody:
-    """A body behind libgphoto2: its settings, what it makes of a release, and what goes wrong.
+    """A body behind libgphoto2: its settings, the files of a release, and its faults.
 
-    `settles_after` is how many looks a new value takes to be seen; `stubborn` settings never take one.
+    `settles_after`: readings until a new value is visible; `stubborn` settings never change.
     """
 
     tree: dict[str, BodySetting]
@@ -242,10 +242,10 @@ class FakeBody:
         return [SimpleNamespace(fields=8, freekbytes=3_000_000), SimpleNamespace(fields=0, freekbytes=7)]
 
     def exposure(self) -> ExposureSettings:
-        """Return how a frame is exposed now."""
+        """Return the present exposure settings."""
         speed = self.tree.get("shutterspeed2", self.tree["shutterspeed"]).value
         iso, aperture, shutter = (
-            number_of(text) for text in (self.tree["iso"].value, self.tree["f-number"].value, speed)
+            parse_number(text) for text in (self.tree["iso"].value, self.tree["f-number"].value, speed)
         )
         assert iso is not None
         assert aperture is not None
@@ -258,7 +258,7 @@ class FakeBody:
 
 
 def fake_module(body: FakeBody) -> Any:
-    """Return what stands for the module gphoto2, with one camera on it."""
+    """Return a replacement of the module gphoto2 with one camera."""
     open_body: Callable[[], FakeBody] = lambda: body  # noqa: E731 - it stands for a class
     return SimpleNamespace(
         Camera=open_body,

@@ -1,8 +1,8 @@
-"""A simulated EOS in a process of its own, for an initiator that keeps the interpreter of its process to itself.
+"""A simulated EOS in its own process, for an initiator that blocks the interpreter of its process.
 
-``python -m tests.drivers.gphoto2_server`` takes numbers of ports, for each of which it prints the address of a body,
-then a line for each exposure, until the line ``end``, which it answers by ``ended``. Each body is a fork, since the
-imports take half a second.
+``python -m tests.drivers.gphoto2_server`` reads port numbers. For each it prints the address of a body, then one line
+per exposure, until the line ``end``, answered by ``ended``. Each body is a fork, because the imports take half a
+second.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FILM_BYTES = 1_200_000
 
 
 class ReportedFilm(SeededFilm):
-    """Tells on standard output how it was exposed."""
+    """Prints the settings of each exposure."""
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
         size = super().expose(settings, released_at, into)

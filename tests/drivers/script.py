@@ -1,4 +1,4 @@
-"""A cable that has one conversation by heart, and objects to a byte too many or too few."""
+"""A cable with one scripted conversation; missing and additional bytes are errors."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from foundation.errors import LinkClosed, LinkTimeout
 
 
 class Script:
-    """Lines that the device says and lines that it must hear, in their order; None hangs up.
+    """Alternating lines of the device and of the host in their order; None disconnects.
 
-    What it says is never given to one who does not wait: that is who looks for what came unasked. Unheard answers are
-    an error, too: see `ended`.
+    A read with timeout 0 returns nothing, as it only checks for unsolicited messages. Unread replies are errors, see
+    `ended`.
     """
 
     def __init__(self, *lines: bytes | None) -> None:

@@ -1,7 +1,6 @@
-"""PJLink: lines and datagrams of the standard, conversations, the projector contract, troubled cables, and the search.
+"""PJLink: the standard's lines and datagrams, conversations, the projector contract, cable faults, and the search.
 
-Examples and conversations are those of JBMIA, PJLink Specifications 1.04 and 2.00 (sections 3 to 5), not of the codec
-under test.
+Examples and conversations are from JBMIA, PJLink Specifications 1.04 and 2.00 (sections 3 to 5).
 """
 
 from __future__ import annotations
@@ -41,12 +40,12 @@ DIGEST = b"5d8409bc1c3fa39749434aa3a5c38682"
 
 
 def driver(*scripts: Script, password: str | None = None) -> PjLinkProjector:
-    """Return the driver on one script after another; a connection too many is an error."""
+    """Return a driver on scripted connections; an additional connection is an error."""
     waiting = list(scripts)
     return PjLinkProjector(lambda: waiting.pop(0), password)
 
 
-def test_power_without_password() -> None:
+def test_queries_power_without_password() -> None:
     script = Script(
         b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=0\r", b"%1POWR 1\r", b"%1POWR=OK\r", b"%1POWR ?\r", b"%1POWR=3\r"
     )
@@ -59,7 +58,7 @@ def test_power_without_password() -> None:
     assert script.closed
 
 
-def test_only_the_first_command_proves_the_password() -> None:
+def test_only_the_first_command_has_a_digest() -> None:
     script = Script(
         b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", b"%1AVMT 31\r", b"%1AVMT=OK\r"
     )  # fmt: skip
@@ -69,12 +68,12 @@ def test_only_the_first_command_proves_the_password() -> None:
     assert script.ended()
 
 
-def test_a_password_that_nobody_asks_for_is_not_sent() -> None:
+def test_unrequested_password_is_not_sent() -> None:
     script = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r")
     assert driver(script, password=PASSWORD).power() is Power.ON
 
 
-def test_a_wrong_password_is_refused_in_words() -> None:
+def test_wrong_password_is_refused() -> None:
     script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"PJLINK ERRA\r")
     with pytest.raises(DeviceRefused):
         driver(script, password=PASSWORD).power()
@@ -83,23 +82,23 @@ def test_a_wrong_password_is_refused_in_words() -> None:
 
 
 class Refusing(BaseHTTPRequestHandler):
-    """A web page that is none."""
+    """A web server without pages."""
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 @pytest.mark.slow
-def test_a_web_server_at_a_projectors_port_is_named() -> None:
+def test_reports_a_web_server_at_the_port() -> None:
     with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         projector = PjLinkProjector(lambda: TcpLink.connect("127.0.0.1", server.server_port, 10.0), timeout=0.05)
-        with pytest.raises(DeviceRefused, match=r"^the projector: an HTTP server answers at its .* as port 4352"):
+        with pytest.raises(DeviceRefused, match=r"^the projector: an HTTP server answers at its .* port 4352"):
             projector.power()
         server.shutdown()
 
 
-def test_a_missing_password_is_asked_for_before_anything_is_sent() -> None:
+def test_missing_password_is_reported_before_sending() -> None:
     script = Script(b"PJLINK 1 498e4a67\r")
     with pytest.raises(DeviceRefused):
         driver(script).power()
@@ -107,7 +106,7 @@ def test_a_missing_password_is_asked_for_before_anything_is_sent() -> None:
     assert script.closed
 
 
-def test_a_server_that_wants_the_digest_each_time_gets_a_new_connection() -> None:
+def test_reconnects_if_each_command_needs_a_digest() -> None:
     first = Script(
         b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", b"%1ERST ?\r", b"PJLINK ERRA\r"
     )  # fmt: skip
@@ -119,7 +118,7 @@ def test_a_server_that_wants_the_digest_each_time_gets_a_new_connection() -> Non
     assert second.ended()
 
 
-def test_health_and_name() -> None:
+def test_reads_faults_lamps_and_identity() -> None:
     script = Script(
         b"PJLINK 0\r",
         b"%1ERST ?\r", b"%1ERST=010020\r",
@@ -136,31 +135,31 @@ def test_health_and_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "error", "words"),
+    ("code", "error", "reason"),
     [
-        (b"ERR1", DeviceRefused, "does not know this command"),
+        (b"ERR1", DeviceRefused, "does not support this command"),
         (b"ERR2", DeviceRefused, "does not offer this value"),
         (b"ERR3", DeviceRefused, "warming up, cooling down or in standby"),
-        (b"ERR4", DeviceFault, "failure of its own"),
+        (b"ERR4", DeviceFault, "internal failure"),
     ],
 )
-def test_each_error_has_its_sentence(code: bytes, error: type[Exception], words: str) -> None:
+def test_error_codes_have_messages(code: bytes, error: type[Exception], reason: str) -> None:
     script = Script(b"PJLINK 0\r", b"%1AVMT 31\r", b"%1AVMT=" + code + b"\r", b"%1POWR ?\r", b"%1POWR=3\r")
     projector = driver(script)
-    with pytest.raises(error, match=rf"{code.decode()} to AVMT 31: .*{words}"):
+    with pytest.raises(error, match=rf"{code.decode()} to AVMT 31: .*{reason}"):
         projector.set_muted(True)
     # A refusal is no fault of the cable: the same connection goes on.
     assert projector.power() is Power.WARMING
 
 
-def test_a_new_connection_that_is_dropped_is_not_tried_again() -> None:
+def test_dropped_new_connection_is_not_repeated() -> None:
     for script in (Script(None), Script(b"PJLINK 0\r", b"%1POWR ?\r", None)):
         with pytest.raises(LinkClosed):
             driver(script).power()
         assert script.closed
 
 
-def test_a_late_answer_never_meets_a_later_question() -> None:
+def test_late_answer_does_not_answer_the_next_query() -> None:
     late = Script(b"PJLINK 0\r", b"%1POWR ?\r")
     fresh = Script(b"PJLINK 0\r", b"%1ERST ?\r", b"%1ERST=000000\r")
     projector = driver(late, fresh)
@@ -173,17 +172,17 @@ def test_a_late_answer_never_meets_a_later_question() -> None:
 @pytest.mark.parametrize(
     "answer", [b"%1LAMP=1 1\r", b"what?\r", b"%1POWR=7\r", b"%1POWR=\r", b"x" * 500, b"\xff\r", b"%1POWR=OK\r"]
 )
-def test_an_answer_that_does_not_fit_is_a_protocol_error(answer: bytes) -> None:
+def test_unexpected_answer_is_a_protocol_error(answer: bytes) -> None:
     with pytest.raises(ProtocolError):
         driver(Script(b"PJLINK 0\r", b"%1POWR ?\r", answer)).power()
 
 
-def test_a_set_command_must_be_answered_by_ok() -> None:
+def test_set_command_requires_ok() -> None:
     with pytest.raises(ProtocolError):
         driver(Script(b"PJLINK 0\r", b"%1POWR 1\r", b"%1POWR=1\r")).switch_on()
 
 
-def test_what_class_2_tells() -> None:
+def test_class_2_queries() -> None:
     script = Script(
         b"PJLINK 0\r",
         b"%1CLSS ?\r", b"%1CLSS=2\r",
@@ -201,7 +200,7 @@ def test_what_class_2_tells() -> None:
 
 
 @pytest.mark.parametrize(("level", "code", "meant"), [(b"1", b"31", "31"), (b"2", b"3a", "3A")])
-def test_the_input_is_asked_for_in_the_projectors_class(level: bytes, code: bytes, meant: str) -> None:
+def test_input_query_uses_the_projectors_class(level: bytes, code: bytes, meant: str) -> None:
     script = Script(
         b"PJLINK 0\r",
         b"%1CLSS ?\r", b"%1CLSS=" + level + b"\r",
@@ -216,7 +215,7 @@ def class_2(*conversation: bytes) -> PjLinkProjector:
 
 
 @pytest.mark.parametrize("code", [b"ERR1", b"err1", b"ERR2"])
-def test_a_class_2_projector_that_does_not_know_a_question_cannot_tell(code: bytes) -> None:
+def test_unsupported_class_2_queries_return_no_value(code: bytes) -> None:
     script = Script(
         b"PJLINK 0\r",
         b"%1CLSS ?\r", b"%1CLSS=2\r",
@@ -241,7 +240,7 @@ def test_a_class_2_projector_that_does_not_know_a_question_cannot_tell(code: byt
     assert script.ended()
 
 
-def test_a_projector_that_cannot_tell_whether_it_is_frozen_is_asked_for_its_signal() -> None:
+def test_queries_signal_if_freeze_is_unsupported() -> None:
     projector = class_2(b"%2FREZ ?\r", b"%2FREZ=ERR1\r", b"%2IRES ?\r", b"%2IRES=-\r")
     assert "no signal" in (projector.picture_fault() or "")
     projector = class_2(b"%2FREZ ?\r", b"%2FREZ=0\r", b"%2IRES ?\r", b"%2IRES=ERR1\r", b"%2FREZ ?\r", b"%2FREZ=1\r")
@@ -249,7 +248,7 @@ def test_a_projector_that_cannot_tell_whether_it_is_frozen_is_asked_for_its_sign
     assert "frozen" in (projector.picture_fault() or "")
 
 
-def test_what_a_projector_does_not_tell_now_it_is_asked_again() -> None:
+def test_unavailable_values_are_queried_again() -> None:
     script = Script(
         b"PJLINK 0\r",
         b"%1CLSS ?\r", b"%1CLSS=ERR3\r",
@@ -274,21 +273,21 @@ def test_what_a_projector_does_not_tell_now_it_is_asked_again() -> None:
     assert script.ended()
 
 
-def test_a_failure_that_the_projector_reports_is_no_ignorance() -> None:
+def test_reported_failure_is_a_device_fault() -> None:
     with pytest.raises(DeviceFault):
         class_2(b"%2FREZ ?\r", b"%2FREZ=ERR4\r").picture_fault()
     with pytest.raises(DeviceFault):
         driver(Script(b"PJLINK 0\r", b"%1ERST ?\r", b"%1ERST=ERR4\r")).faults()
 
 
-def test_a_wrong_password_is_no_ignorance() -> None:
+def test_wrong_password_is_not_an_unsupported_query() -> None:
     script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1CLSS ?\r", b"PJLINK ERRA\r")
     with pytest.raises(DeviceRefused):
         driver(script, password=PASSWORD).picture_fault()
 
 
 @pytest.mark.parametrize("answer", [b"%1CLSS=1\r", b"%1CLSS=ERR1\r"])
-def test_class_1_is_never_asked_what_class_2_knows(answer: bytes) -> None:
+def test_class_1_gets_no_class_2_queries(answer: bytes) -> None:
     script = Script(b"PJLINK 0\r", b"%1CLSS ?\r", answer)
     projector = driver(script)
     for ask in (
@@ -301,7 +300,7 @@ def test_class_1_is_never_asked_what_class_2_knows(answer: bytes) -> None:
     assert script.ended()
 
 
-def test_a_notice_of_start_inside_the_connection_answers_nothing() -> None:
+def test_startup_notice_does_not_answer_a_query() -> None:
     # Some class 2 projectors send it there, and fill their packets up with NUL (seen by users of other controllers).
     script = Script(
         b"PJLINK 0\r" + bytes(200),
@@ -314,7 +313,7 @@ def test_a_notice_of_start_inside_the_connection_answers_nothing() -> None:
     assert script.ended()
 
 
-def test_an_answer_that_never_ends_is_a_timeout() -> None:
+def test_endless_answer_is_a_timeout() -> None:
     clock = SimulatedClock()
 
     class Endless(Script):
@@ -323,14 +322,14 @@ def test_an_answer_that_never_ends_is_a_timeout() -> None:
             return b"P"
 
         def write(self, data: bytes, timeout: float) -> None:
-            """Hear what it is, without a word on that."""
+            """Ignore the data."""
 
     with pytest.raises(LinkTimeout):
         PjLinkProjector(lambda: Endless(b""), timeout=5.0, clock=clock).power()
 
 
 def noisy(link: Link) -> Link:
-    """Have a projector answer in small letters, with LF and filling, and announce its start in between."""
+    """Let a projector answer in lower case, with LF and padding, and with start-up notices."""
 
     def garble(data: bytes) -> bytes:
         data = data.replace(b"%1POWR=", b"%1powr=").replace(b"=OK", b"=Ok").replace(b"=ERR", b"=err")
@@ -367,8 +366,8 @@ class TestOverLoopback(ProjectorContract):
             projector.close()
 
 
-class TestAnswersThatTakeTheirTime(ProjectorContract):
-    """Four of the five seconds that an answer may take, by a clock of the cable's own."""
+class TestSlowReplies(ProjectorContract):
+    """Replies take four of the permitted five seconds, by the cable's own clock."""
 
     @pytest.fixture
     def bench(self) -> Bench:
@@ -377,7 +376,7 @@ class TestAnswersThatTakeTheirTime(ProjectorContract):
         return Bench.of(PjLinkProjector(slow, clock=cable_clock), device)
 
 
-def test_an_answer_that_comes_too_late_is_a_timeout() -> None:
+def test_late_answer_is_a_timeout() -> None:
     clock = SimulatedClock()
     peer = PjLinkPeer(SimulatedProjector(SimulatedClock()))
     projector = PjLinkProjector(lambda: Slow(PeerLink(peer), clock, 6.0), clock=clock)
@@ -385,7 +384,7 @@ def test_an_answer_that_comes_too_late_is_a_timeout() -> None:
         projector.power()
 
 
-def test_a_garbled_answer_is_told_and_the_next_connection_is_clean() -> None:
+def test_recovers_from_a_garbled_answer() -> None:
     peer = PjLinkPeer(SimulatedProjector(SimulatedClock(), Power.ON))
     garbles: list[Callable[[bytes], bytes]] = [lambda data: data.replace(b"POWR=", b"PO\xffR="), lambda data: data]
     projector = PjLinkProjector(lambda: Garbling(PeerLink(peer), garbles.pop(0)))
@@ -394,14 +393,14 @@ def test_a_garbled_answer_is_told_and_the_next_connection_is_clean() -> None:
     assert projector.power() is Power.ON
 
 
-def test_a_swallowed_answer_is_told_and_the_next_connection_is_clean() -> None:
+def test_recovers_from_a_lost_answer() -> None:
     device = SimulatedProjector(SimulatedClock())
-    made: list[Link] = []
+    links: list[Link] = []
 
     def connect() -> Link:
         good = PeerLink(PjLinkPeer(device))
-        made.append(Deaf(good, after=1) if not made else good)
-        return made[-1]
+        links.append(Deaf(good, after=1) if not links else good)
+        return links[-1]
 
     projector = PjLinkProjector(connect)
     with pytest.raises(LinkTimeout):
@@ -410,7 +409,7 @@ def test_a_swallowed_answer_is_told_and_the_next_connection_is_clean() -> None:
     assert projector.power() is Power.WARMING
 
 
-def test_what_is_logged_has_neither_password_nor_digest(caplog: pytest.LogCaptureFixture) -> None:
+def test_log_has_no_password_or_digest(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("DEBUG")
     script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")
     assert driver(script, password=PASSWORD).power() is Power.ON
@@ -422,7 +421,7 @@ def test_what_is_logged_has_neither_password_nor_digest(caplog: pytest.LogCaptur
 PRINTABLE = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=100)
 
 
-def test_digest_is_the_standards_example() -> None:
+def test_digest_matches_the_standards_example() -> None:
     # PJLink 1.04, 5.1: seed 498e4a67, password JBMIAProjectorLink.
     assert wire.authentication_digest("498e4a67", "JBMIAProjectorLink") == "5d8409bc1c3fa39749434aa3a5c38682"
 
@@ -436,25 +435,25 @@ def test_digest_is_the_standards_example() -> None:
         (b"PJLINK ERRA", Refused.WRONG_PASSWORD),
     ],
 )
-def test_greetings(line: bytes, greeting: str | Refused | None) -> None:
+def test_parses_greetings(line: bytes, greeting: str | Refused | None) -> None:
     assert wire.parse_greeting(line) == greeting
 
 
 @pytest.mark.parametrize(
     "line", [b"", b"PJLINK", b"PJLINK 1", b"PJLINK 1 short", b"PJLINK 0 x", b"SSH-2.0-x", b"\xff\xfe"]
 )
-def test_what_is_no_greeting_is_quoted(line: bytes) -> None:
+def test_refuses_invalid_greetings(line: bytes) -> None:
     with pytest.raises(ProtocolError, match="PJLink is enabled"):
         wire.parse_greeting(line)
 
 
-def test_an_http_server_that_speaks_first_is_said_to_be_one() -> None:
+def test_reports_an_http_server_that_sends_first() -> None:
     # RFC 9110, 15.5.9: what a server may send that has waited too long for a request.
     with pytest.raises(ProtocolError, match=r"HTTP server.*'HTTP/1\.1 408"):
         wire.parse_greeting(b"HTTP/1.1 408 Request Timeout")
 
 
-def test_commands_are_the_standards_bytes() -> None:
+def test_commands_match_the_standards_bytes() -> None:
     # PJLink 1.04, 4.1 and 5.1.
     assert wire.encode_request(PjLinkRequest("POWR", "1")) == b"%1POWR 1\r"
     assert wire.encode_request(PjLinkRequest("INPT")) == b"%1INPT ?\r"
@@ -483,17 +482,17 @@ def test_commands_are_the_standards_bytes() -> None:
         (b"pjlink erra", Refused.WRONG_PASSWORD),
     ],
 )
-def test_replies(line: bytes, reply: PjLinkReply | Refused) -> None:
+def test_parses_replies(line: bytes, reply: PjLinkReply | Refused) -> None:
     assert wire.parse_reply(line) == reply
 
 
 @pytest.mark.parametrize("line", [b"%1POWR 0", b"POWR=0", b"%1POW=0", b"%xPOWR=0", b"", b"%1NAME=" + b"x" * 129])
-def test_what_is_no_reply_is_quoted(line: bytes) -> None:
+def test_refuses_invalid_replies(line: bytes) -> None:
     with pytest.raises(ProtocolError):
         wire.parse_reply(line)
 
 
-def test_values_of_the_standard() -> None:
+def test_parses_values_of_class_1() -> None:
     assert [wire.parse_power(digit) for digit in "0123"] == [Power.STANDBY, Power.ON, Power.COOLING, Power.WARMING]
     assert [wire.parse_mute(code) for code in ("11", "31", "21", "30")] == [True, True, False, False]
     assert wire.parse_faults("000000") == ()
@@ -508,7 +507,7 @@ def test_values_of_the_standard() -> None:
     assert wire.parse_lamps("120 1 3000 0") == (Lamp(120, True), Lamp(3000, False))
 
 
-def test_values_of_class_2() -> None:
+def test_parses_values_of_class_2() -> None:
     # PJLink 2.00, 4.4, 4.9, 4.14 and 4.18 to 4.26.
     assert [wire.parse_input(code) for code in ("11", "59", "3A", "6z")] == ["11", "59", "3A", "6Z"]
     assert [wire.is_class_1_input(code) for code in ("11", "59", "3A", "61", "10")] == [True, True, False, False, False]
@@ -545,7 +544,7 @@ def test_values_of_class_2() -> None:
         (wire.parse_lamps, "١ 1"),
     ],
 )
-def test_values_outside_the_standard_are_protocol_errors(parse: object, value: str) -> None:
+def test_refuses_values_outside_the_standard(parse: object, value: str) -> None:
     assert callable(parse)
     with pytest.raises(ProtocolError):
         parse(value)
@@ -561,12 +560,12 @@ def test_values_outside_the_standard_are_protocol_errors(parse: object, value: s
         st.sampled_from(("", "5d8409bc1c3fa39749434aa3a5c38682")),
     )
 )
-def test_requests_come_back(request_: PjLinkRequest) -> None:
+def test_requests_survive_encoding_and_parsing(request_: PjLinkRequest) -> None:
     assert wire.parse_request(wire.encode_request(request_)[:-1]) == request_
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes_are_a_value_or_a_protocol_error(line: bytes) -> None:
+def test_any_bytes_give_a_value_or_a_protocol_error(line: bytes) -> None:
     for parse in (wire.parse_greeting, wire.parse_request, wire.parse_reply):
         try:
             parse(line)
@@ -576,7 +575,7 @@ def test_any_bytes_are_a_value_or_a_protocol_error(line: bytes) -> None:
 
 @pytest.mark.slow
 @given(st.data())
-def test_any_split_gives_the_same_lines(data: st.DataObject) -> None:
+def test_lines_do_not_depend_on_splitting(data: st.DataObject) -> None:
     end = st.sampled_from((b"\r", b"\r\n", b"\n", b"\r\r\n", b"\r\0\0\0"))
     value = st.one_of(
         PRINTABLE,
@@ -587,23 +586,23 @@ def test_any_split_gives_the_same_lines(data: st.DataObject) -> None:
     lines = [line.encode() for line in data.draw(st.lists(st.one_of(PRINTABLE.filter(bool), reply), max_size=6))]
     stream = b"".join(line + data.draw(end) for line in lines)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
-    found, rest = list[bytes](), b""
+    lines_read, rest = list[bytes](), b""
     for start, stop in zip([0, *cuts], [*cuts, len(stream)], strict=True):
         rest += stream[start:stop]
-        while (taken := wire.take_line(rest)) is not None:
-            found.append(taken[0])
-            rest = rest[taken[1] :]
-    assert found == lines
+        while (parsed := wire.split_line(rest)) is not None:
+            lines_read.append(parsed[0])
+            rest = rest[parsed[1] :]
+    assert lines_read == lines
 
 
-def test_the_longest_line_passes_and_one_byte_more_does_not() -> None:
+def test_refuses_lines_above_the_longest() -> None:
     longest = b"%1NAME=" + b"x" * 128
     assert len(longest) + 1 == wire.MAX_LINE
-    assert wire.take_line(longest + b"\r") == (longest, 136)
-    assert wire.take_line(longest) is None
+    assert wire.split_line(longest + b"\r") == (longest, 136)
+    assert wire.split_line(longest) is None
     for longer in (longest + b"y\r", longest + b"y"):
         with pytest.raises(ProtocolError):
-            wire.take_line(longer)
+            wire.split_line(longer)
 
 
 MAC = "00:11:22:aa:bb:cc"
@@ -619,12 +618,12 @@ MAC = "00:11:22:aa:bb:cc"
         (b"%2INPT=3A\r", "INPT", "3A"),
     ],
 )
-def test_the_standards_datagrams(datagram: bytes, command: str, value: str) -> None:
+def test_parses_the_standards_datagrams(datagram: bytes, command: str, value: str) -> None:
     reply = PjLinkReply(command, value, 2)
     assert wire.encode_reply(reply) == datagram
     for received in (datagram, datagram.lower() + b"\n", datagram[:-1], b"\r" + datagram + b"\0\0\0\0"):
-        (found,) = wire.replies_in(received)
-        assert (found.command, found.value.upper(), found.level) == (command, value.upper(), 2)
+        (parsed,) = wire.parse_datagram(received)
+        assert (parsed.command, parsed.value.upper(), parsed.level) == (command, value.upper(), 2)
 
 
 @pytest.mark.parametrize(
@@ -633,22 +632,22 @@ def test_the_standards_datagrams(datagram: bytes, command: str, value: str) -> N
         b"", b"%2SRCH\r", b"%1POWR=1\r", b"PJLINK ERRA\r", b"\xff\xfe\x00", b"M-SEARCH * HTTP/1.1\r\n\r\n", b"x" * 2000,
     ],
 )  # fmt: skip
-def test_what_is_none_of_ours_is_passed_over(datagram: bytes) -> None:
-    assert wire.replies_in(datagram) == ()
+def test_ignores_other_datagrams(datagram: bytes) -> None:
+    assert wire.parse_datagram(datagram) == ()
 
 
-def test_several_in_one_datagram_keep_their_order() -> None:
-    found = wire.replies_in(b"%2POWR=3\r%2what\r%2INPT=31\r")
-    assert found == (PjLinkReply("POWR", "3", 2), PjLinkReply("INPT", "31", 2))
+def test_replies_in_a_datagram_keep_their_order() -> None:
+    replies = wire.parse_datagram(b"%2POWR=3\r%2what\r%2INPT=31\r")
+    assert replies == (PjLinkReply("POWR", "3", 2), PjLinkReply("INPT", "31", 2))
 
 
 @given(st.binary(max_size=300))
-def test_any_datagram_is_read_without_complaint(datagram: bytes) -> None:
-    assert len(wire.replies_in(datagram)) <= len(datagram)
+def test_any_datagram_is_parsed_without_error(datagram: bytes) -> None:
+    assert len(wire.parse_datagram(datagram)) <= len(datagram)
 
 
-class PaperNetwork(UdpSocket):
-    """Datagrams that arrive at given times, whoever asks; keeps what was sent and when."""
+class ScriptedNetwork(UdpSocket):
+    """Datagrams that arrive at given times; records sent datagrams with their times."""
 
     def __init__(self, clock: SimulatedClock, *arrivals: tuple[float, bytes, str]) -> None:
         self._clock = clock
@@ -672,22 +671,22 @@ class PaperNetwork(UdpSocket):
         self.closed = True
 
 
-def look(network: PaperNetwork, clock: SimulatedClock) -> tuple[FoundProjector, ...]:
+def run_search(network: ScriptedNetwork, clock: SimulatedClock) -> tuple[FoundProjector, ...]:
     ports: list[int] = []
 
-    def opened(port: int) -> PaperNetwork:
+    def opened(port: int) -> ScriptedNetwork:
         ports.append(port)
         return network
 
-    found = search(open_socket=opened, clock=clock)
+    projectors = search(open_socket=opened, clock=clock)
     assert ports == [4352]
     assert network.closed
-    return found
+    return projectors
 
 
-def test_collects_for_thirty_seconds_and_names_each_once() -> None:
+def test_search_collects_for_thirty_seconds_without_duplicates() -> None:
     clock = SimulatedClock()
-    network = PaperNetwork(
+    network = ScriptedNetwork(
         clock,
         (0.0, b"%2SRCH\r", "192.168.1.2"),  # our own question, come back
         (0.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"),
@@ -699,7 +698,7 @@ def test_collects_for_thirty_seconds_and_names_each_once() -> None:
         (10.0, b"%2ACKN=0g:11:22:aa:bb:cc\r", "192.168.1.24"),
         (31.0, b"%2ACKN=00:11:22:aa:bb:03\r", "192.168.1.23"),
     )
-    assert look(network, clock) == (
+    assert run_search(network, clock) == (
         FoundProjector("192.168.1.20", "00:11:22:aa:bb:01"),
         FoundProjector("192.168.1.21", "00:11:22:aa:bb:02"),
     )
@@ -708,27 +707,27 @@ def test_collects_for_thirty_seconds_and_names_each_once() -> None:
     assert [at for at, _, _ in network.sent] == pytest.approx([0.0, 1.0, 2.0])
 
 
-def test_a_search_counts_from_its_own_begin() -> None:
+def test_search_time_starts_at_the_call() -> None:
     clock = SimulatedClock()
     clock.sleep(1000)
-    network = PaperNetwork(clock, (1000.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"))
-    assert [found.host for found in look(network, clock)] == ["192.168.1.20"]
+    network = ScriptedNetwork(clock, (1000.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"))
+    assert [projector.host for projector in run_search(network, clock)] == ["192.168.1.20"]
     assert clock.monotonic() == pytest.approx(1030.0)
 
 
-def test_junk_without_end_does_not_prolong_the_search() -> None:
+def test_endless_junk_does_not_extend_the_search() -> None:
     clock = SimulatedClock()
-    network = PaperNetwork(clock, *[(0.01 * i, b"\xff" * 40, "192.168.1.9") for i in range(4000)])
-    assert look(network, clock) == ()
+    network = ScriptedNetwork(clock, *[(0.01 * i, b"\xff" * 40, "192.168.1.9") for i in range(4000)])
+    assert run_search(network, clock) == ()
     assert clock.monotonic() == pytest.approx(30.0, abs=0.1)
 
 
-def test_a_taken_port_is_told_with_its_remedy() -> None:
-    with UdpSocket(host="127.0.0.1") as taken, pytest.raises(LinkClosed, match="end the other program"):
-        search(listen_port=taken.address[1])
+def test_search_refuses_a_port_in_use() -> None:
+    with UdpSocket(host="127.0.0.1") as socket, pytest.raises(LinkClosed, match="close the other program"):
+        search(listen_port=socket.address[1])
 
 
-def test_a_socket_that_was_closed_says_so() -> None:
+def test_refuses_calls_on_a_closed_socket() -> None:
     udp = UdpSocket(host="127.0.0.1")
     udp.close()
     udp.close()
@@ -738,6 +737,6 @@ def test_a_socket_that_was_closed_says_so() -> None:
         udp.send(b"x", ("127.0.0.1", 9))
 
 
-def test_a_datagram_too_long_for_the_network_is_told() -> None:
+def test_refuses_a_too_long_datagram() -> None:
     with UdpSocket(host="127.0.0.1") as udp, pytest.raises(LinkClosed):
         udp.send(b"x" * 70000, udp.address)

@@ -1,7 +1,7 @@
-"""Ports, speeds, identifiers and codes are those that makers and standards publish: both ends of our cables share them.
+"""Ports, speeds, identifiers and codes match the published numbers; simulator and driver share them.
 
-Sources, where the module itself names no clause: IANA's list of ports; PJLink 2.10; X.Org,
-X.h and dpms.h; Khronos, gl.xml; TIFF 6.0 and DNG 1.7.1; USB 2.0, chapter 9; ISO 15740 and CIPA DC-005.
+Sources, unless the module names them: IANA's list of ports; PJLink 2.10; X.Org, X.h and dpms.h; Khronos, gl.xml; TIFF
+6.0 and DNG 1.7.1; USB 2.0, chapter 9; ISO 15740 and CIPA DC-005.
 """
 
 from __future__ import annotations
@@ -42,5 +42,5 @@ from drivers.raw import rawfile
     ],
     ids=str,
 )
-def test_numbers_are_the_published_ones(ours: tuple[object, ...], published: tuple[object, ...]) -> None:
+def test_constants_match_published_numbers(ours: tuple[object, ...], published: tuple[object, ...]) -> None:
     assert ours == published

@@ -113,7 +113,7 @@ def free_port() -> int:
             'control = "serial"\nlanguage = "optoma"\nhost = "127.0.0.1"',
             "Optoma projectors are reached over a serial port only",
         ),
-        ('control = "serial"\nlanguage = "epson"\nbaud = 12345678901\ndevice = "{port}"', "choose another speed"),
+        ('control = "serial"\nlanguage = "epson"\nbaud = 12345678901\ndevice = "{port}"', "set another speed"),
     ],
 )
 def test_a_cable_that_cannot_be(bench: Bench, camera: str, text: str, words: str) -> None:
@@ -128,7 +128,7 @@ def test_a_serial_port_that_is_not_there(bench: Bench, camera: str) -> None:
         f'{camera}[lab.projector]\ncontrol = "serial"\nlanguage = "benq"\ndevice = "/dev/ttyCROP9"\n'
     )
     assert code == 3
-    assert said.startswith("projector: there is no serial port /dev/ttyCROP9; found: ")
+    assert said.startswith("projector: serial port /dev/ttyCROP9 does not exist; present: ")
 
 
 def test_another_language_than_the_projectors(bench: Bench, camera: str) -> None:
@@ -138,7 +138,7 @@ def test_another_language_than_the_projectors(bench: Bench, camera: str) -> None
         )
     assert code == 3
     assert "answers 'ERR" in said
-    assert "check that speed and parity are those set in the projector's menu, and that its language is right" in said
+    assert "check speed and parity against the projector's menu, and that the language is the correct one" in said
 
 
 def test_a_port_at_which_nobody_listens(bench: Bench, camera: str) -> None:
@@ -167,9 +167,9 @@ def test_a_display_and_a_camera_that_are_not_there(bench: Bench) -> None:
     code, said = bench.told('[lab.light]\ndisplay = "HDMI-1"\n')
     # The camera is asked all the same; a device's fault decides the code.
     assert code == 3
-    assert "display 'HDMI-1' is not there" in said
+    assert "display 'HDMI-1' is not connected" in said
     assert str(DESK) in said
-    assert "no camera with vendor 04a9 on USB; found: none at all" in said
+    assert "no camera with vendor 04a9 on USB; present: none" in said
 
 
 def test_two_cameras_of_which_none_is_named(bench: Bench) -> None:
@@ -177,8 +177,8 @@ def test_two_cameras_of_which_none_is_named(bench: Bench) -> None:
     bench.plug("2")
     code, said = bench.told("")
     assert code == 2
-    assert "2 cameras on USB fit: " in said
-    assert "name one by serial number or port" in said
+    assert "2 cameras on USB match, 1 expected: " in said
+    assert "set a serial number or port" in said
 
 
 def test_what_answers_at_the_cameras_port_is_none(bench: Bench) -> None:
@@ -186,4 +186,4 @@ def test_what_answers_at_the_cameras_port_is_none(bench: Bench) -> None:
         port = server.address[1]
         code, said = bench.told(f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\nport = {port}\n')
     assert code == 3
-    assert f"what answers in place of the camera at 127.0.0.1:{port} speaks no PTP/IP" in said
+    assert f"the camera at 127.0.0.1:{port} sent no valid PTP/IP reply" in said

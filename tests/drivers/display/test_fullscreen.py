@@ -1,4 +1,4 @@
-"""The full-screen presenter on X servers without a monitor; the screenshots are not its own."""
+"""Full-screen presenter on X servers without a monitor, checked with independent screenshots."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def screen(virtual: VirtualScreen) -> Iterator[FullScreen]:
 
 
 def plain(picture: Picture) -> Colour:
-    """Return the one colour of a picture."""
+    """Return the only colour of an image."""
     code = int(picture[0, 0])
     assert np.all(picture == code)
     return Colour(code >> 16, code >> 8 & 255, code & 255)
@@ -85,7 +85,7 @@ class TestFullScreen(PresenterContract):
         return Bench(screen, lambda: plain(virtual.picture()))
 
 
-def test_a_pop_up_after_the_colour_came_is_noticed_and_named(screen: FullScreen, virtual: VirtualScreen) -> None:
+def test_reports_a_pop_up_by_name(screen: FullScreen, virtual: VirtualScreen) -> None:
     colour = Colour(255, 136, 0)
     screen.show(colour)
     screen.verify(colour)
@@ -96,7 +96,7 @@ def test_a_pop_up_after_the_colour_came_is_noticed_and_named(screen: FullScreen,
         picture = virtual.picture()
         assert np.count_nonzero(picture != 0xFF8800) > 100
     # What it covered stays wrong, with nobody in front, until it is painted again.
-    until(lambda: "in front of it" not in covered(screen, colour))
+    until(lambda: "covered by" not in covered(screen, colour))
     screen.show(colour)
     screen.verify(colour)
 
@@ -111,7 +111,7 @@ def window_manager() -> Generator[None]:
         yield
 
 
-def test_a_pop_up_in_a_window_managers_frame_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_a_framed_pop_up_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     colour = Colour(3, 99, 7)
     with virtual_screen(tmp_path, "640x360") as server:
         monkeypatch.setenv("DISPLAY", server.display)
@@ -125,9 +125,7 @@ def test_a_pop_up_in_a_window_managers_frame_is_named(tmp_path: Path, monkeypatc
             presenter.verify(colour)
 
 
-def test_under_a_window_manager_it_fills_the_display_that_was_chosen(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fills_the_selected_display_under_a_window_manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     colour = Colour(3, 99, 7)
     with two_outputs(tmp_path) as server:
         monkeypatch.setenv("DISPLAY", server)
@@ -140,16 +138,16 @@ def test_under_a_window_manager_it_fills_the_display_that_was_chosen(
                     assert np.count_nonzero(seen == seen[0, 640 if place == "right" else 0]) <= 640 * 360
 
 
-def test_a_picture_that_changed_in_one_corner_is_noticed(screen: FullScreen, virtual: VirtualScreen) -> None:
+def test_detects_a_changed_corner(screen: FullScreen, virtual: VirtualScreen) -> None:
     colour = Colour(10, 20, 30)
     screen.show(colour)
     with messaging(virtual, "speck", "+639+359"):
-        said = covered(screen, colour)
-    assert "in 1 of 230400 pixels" in said
-    assert "within 1×1 px at +639+359; in front of it lies “speck” (Xmessage), " in said
+        message = covered(screen, colour)
+    assert "in 1 of 230400 pixels" in message
+    assert "within 1×1 px at +639+359; covered by “speck” (Xmessage), " in message
 
 
-def test_a_picture_of_another_colour_is_noticed_and_nobody_is_blamed(screen: FullScreen) -> None:
+def test_detects_another_colour_without_a_covering_window(screen: FullScreen) -> None:
     screen.show(Colour(10, 20, 30))
     with pytest.raises(DeviceError, match=r"\(10, 20, 30\).*\(10, 20, 31\) in 230400.*window"):
         screen.verify(Colour(10, 20, 31))
@@ -166,7 +164,7 @@ def running(command: list[str]) -> Generator[subprocess.Popen[bytes]]:
 
 @contextlib.contextmanager
 def messaging(server: VirtualScreen, title: str, place: str = "+100+80") -> Generator[None]:
-    """Let another program put a window in front, and return when it is seen; it goes at the end of the block."""
+    """Show a window of another program in front; yield when it is visible."""
     program = shutil.which("xmessage")
     if program is None:
         pytest.skip("xmessage is not installed (Debian: x11-utils)")
@@ -184,7 +182,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 def covered(presenter: FullScreen, colour: Colour) -> str:
-    """Return what `verify` says, empty where all is well."""
+    """Return the error text of `verify`; empty without an error."""
     try:
         presenter.verify(colour)
     except DeviceError as error:
@@ -196,7 +194,7 @@ def properties() -> str:
     return subprocess.run(["xprop", "-root"], capture_output=True, text=True, check=True).stdout
 
 
-def test_what_opengl_does_not_draw_is_noticed(screen: FullScreen, virtual: VirtualScreen) -> None:
+def test_detects_pixels_that_opengl_did_not_draw(screen: FullScreen, virtual: VirtualScreen) -> None:
     import glfw
 
     prototype: Any = ctypes.CFUNCTYPE
@@ -204,7 +202,7 @@ def test_what_opengl_does_not_draw_is_noticed(screen: FullScreen, virtual: Virtu
     screen.show(Colour(1, 2, 3))
     mask(1, 0, 1, 1)
     with pytest.raises(
-        DeviceError, match=r"OpenGL drew \(9, \d+, 9\) in place of \(9, 9, 9\) in 230400 of 230400 pixels"
+        DeviceError, match=r"OpenGL drew \(9, \d+, 9\) instead of \(9, 9, 9\) in 230400 of 230400 pixels"
     ):
         screen.show(Colour(9, 9, 9))
     mask(1, 1, 1, 1)
@@ -212,7 +210,7 @@ def test_what_opengl_does_not_draw_is_noticed(screen: FullScreen, virtual: Virtu
     assert plain(virtual.picture()) == Colour(9, 9, 9)
 
 
-def test_a_display_that_goes_away_is_noticed(outputs: str) -> None:
+def test_detects_a_disconnected_display(outputs: str) -> None:
     xrandr = shutil.which("xrandr")
     if xrandr is None:
         pytest.skip("xrandr is not installed (Debian: x11-xserver-utils)")
@@ -222,7 +220,7 @@ def test_a_display_that_goes_away_is_noticed(outputs: str) -> None:
         subprocess.run([xrandr, "--output", "DUMMY1", "--off"], check=True)
         for use in (presenter.show, presenter.verify):
             with pytest.raises(
-                DeviceError, match=r"no longer fills display 2: DUMMY1.*; displays now: 1: DUMMY0|no 480"
+                DeviceError, match=r"does not fill display 2: DUMMY1.*; present displays: 1: DUMMY0|no area of 480"
             ):
                 use(Colour(9, 9, 9))
         subprocess.run([xrandr, "--output", "DUMMY1", "--mode", "480x270", "--right-of", "DUMMY0"], check=True)
@@ -237,7 +235,7 @@ def test_a_display_that_goes_away_is_noticed(outputs: str) -> None:
 
 
 def shows(presenter: FullScreen, colour: Colour) -> bool:
-    """Return whether a presenter can show a colour now."""
+    """Return whether a presenter can show a colour."""
     try:
         presenter.show(colour)
     except DeviceError:
@@ -245,7 +243,7 @@ def shows(presenter: FullScreen, colour: Colour) -> bool:
     return True
 
 
-def test_a_window_moved_away_is_noticed_and_put_back(screen: FullScreen, virtual: VirtualScreen) -> None:
+def test_restores_a_moved_window(screen: FullScreen, virtual: VirtualScreen) -> None:
     import glfw
 
     glfw.set_window_monitor(glfw.get_current_context(), cast("Any", None), 10, 10, 300, 200, 0)
@@ -255,7 +253,7 @@ def test_a_window_moved_away_is_noticed_and_put_back(screen: FullScreen, virtual
     assert plain(virtual.picture()) == WHITE
 
 
-def test_a_display_that_power_saving_keeps_dark_is_noticed(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_detects_a_display_in_power_saving(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
     # No server without a monitor has power saving: only that its absence is no darkness is seen on a real one.
     asked: list[bool] = []
     monkeypatch.setattr(fullscreen, "is_dark", lambda display: asked.append(is_dark(display)))  # pyrefly: ignore[implicit-any-lambda]
@@ -267,7 +265,7 @@ def test_a_display_that_power_saving_keeps_dark_is_noticed(screen: FullScreen, m
             use(WHITE)
 
 
-def test_only_its_own_thread_may_show(screen: FullScreen, virtual: VirtualScreen) -> None:
+def test_refuses_calls_from_another_thread(screen: FullScreen, virtual: VirtualScreen) -> None:
     caught: list[str] = []
 
     def stray() -> None:
@@ -284,7 +282,7 @@ def test_only_its_own_thread_may_show(screen: FullScreen, virtual: VirtualScreen
     assert plain(virtual.picture()) == BLACK
 
 
-def test_the_light_goes_out_with_a_process_that_is_killed(virtual: VirtualScreen) -> None:
+def test_window_disappears_with_a_killed_process(virtual: VirtualScreen) -> None:
     program = (
         "from drivers.display.fullscreen import FullScreen; from drivers.presenter import Colour\n"
         "screen = FullScreen(); screen.show(Colour(250, 240, 230)); print('lit', flush=True); input()"
@@ -302,7 +300,7 @@ def test_the_light_goes_out_with_a_process_that_is_killed(virtual: VirtualScreen
     assert plain(virtual.picture()) == BLACK
 
 
-def test_a_display_that_another_process_fills_is_left_alone(virtual: VirtualScreen) -> None:
+def test_refuses_a_display_in_use_by_another_process(virtual: VirtualScreen) -> None:
     program = (
         "from drivers.display.fullscreen import FullScreen; from drivers.presenter import Colour\n"
         "screen = FullScreen(); screen.show(Colour(250, 240, 230)); print('lit', flush=True); input(); screen.close()"
@@ -317,7 +315,7 @@ def test_a_display_that_another_process_fills_is_left_alone(virtual: VirtualScre
         process.communicate(b"\n")
 
 
-def test_a_server_that_ends_does_not_end_us(tmp_path: Path) -> None:
+def test_process_survives_the_end_of_the_server(tmp_path: Path) -> None:
     program = (
         "from foundation.errors import DeviceError; from drivers.display.fullscreen import FullScreen\n"
         "from drivers.presenter import WHITE\n"
@@ -341,14 +339,12 @@ def test_a_server_that_ends_does_not_end_us(tmp_path: Path) -> None:
         assert process.stdout is not None
         assert process.stdout.readline() == "lit\n"
         server.end()
-        said, _ = process.communicate("\n", timeout=PATIENCE_S)
+        output, _ = process.communicate("\n", timeout=PATIENCE_S)
     assert process.returncode == 0
-    assert said.count("the X server of display 1: screen 320×200 at +0+0, 0 Hz is gone: somebody logged out") == 2
+    assert output.count("the X server of display 1: screen 320×200 at +0+0, 0 Hz has ended (logout or crash)") == 2
 
 
-def test_all_lights_and_every_code_arrive_in_every_pixel_without_a_cursor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shows_all_codes_in_every_pixel_without_a_cursor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lights = [light.colour for light in plan_illuminations()]
     assert len(lights) == 707
     codes = [Colour(code, 255 - code, (code * 7) % 256) for code in range(256)]
@@ -369,10 +365,10 @@ def test_lists_displays_from_left_to_right(outputs: str) -> None:
     assert projector.refresh_hz == 80
 
 
-@pytest.mark.parametrize("wanted", ["right", 2])
-def test_the_display_that_was_named_lights_up_and_the_other_does_not(outputs: str, wanted: str | int) -> None:
+@pytest.mark.parametrize("selection", ["right", 2])
+def test_fills_only_the_selected_display(outputs: str, selection: str | int) -> None:
     before = screenshot(outputs, 640, 360)
-    with contextlib.closing(FullScreen(wanted)) as presenter:
+    with contextlib.closing(FullScreen(selection)) as presenter:
         presenter.show(Colour(12, 200, 77))
         after = screenshot(outputs, 1120, 360)
         assert plain(after[:270, 640:]) == Colour(12, 200, 77)
@@ -380,7 +376,7 @@ def test_the_display_that_was_named_lights_up_and_the_other_does_not(outputs: st
         assert np.array_equal(after[:, :640], before)
 
 
-def test_tells_the_displays_apart(outputs: str) -> None:
+def test_identifies_displays(outputs: str) -> None:
     class Onlooker(SimulatedClock):
         picture: Picture | None = None
 
@@ -399,7 +395,7 @@ def test_tells_the_displays_apart(outputs: str) -> None:
     assert set(np.unique(clock.picture[:, :640])) == {0, 0xFFFFFF}
 
 
-def test_a_bent_gamma_ramp_is_reported(outputs: str) -> None:
+def test_reports_a_bent_gamma_ramp(outputs: str) -> None:
     import glfw
 
     with contextlib.closing(FullScreen("right")) as presenter:
@@ -414,7 +410,7 @@ def test_a_bent_gamma_ramp_is_reported(outputs: str) -> None:
         assert "gamma ramp of DUMMY1 is not straight (red 0.33 becomes 0.40): switch off night light" in warning
 
 
-def test_a_gamma_ramp_that_was_never_written_is_none(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ignores_an_uninitialised_gamma_ramp(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
     import glfw
 
     straight = np.linspace(0, 1, 256)
@@ -428,7 +424,7 @@ def test_a_gamma_ramp_that_was_never_written_is_none(screen: FullScreen, monkeyp
         assert len(ramps(screen)) == any(ramp is one for one in bad)
 
 
-def test_a_colour_profile_of_the_display_is_reported(outputs: str) -> None:
+def test_reports_a_colour_profile(outputs: str) -> None:
     if shutil.which("xprop") is None:
         pytest.skip("xprop is not installed: apt-get install x11-utils")
     with contextlib.closing(FullScreen("right")) as presenter:
@@ -447,8 +443,8 @@ def test_a_colour_profile_of_the_display_is_reported(outputs: str) -> None:
         assert "colour profile is set for DUMMY1" in warning
 
 
-def test_a_compositor_under_the_x_server_is_reported(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Xwayland says what it is by an extension of its own (xwayland-extension, version 23.1)."""
+def test_reports_wayland(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Xwayland has its own extension (xwayland-extension, version 23.1)."""
     asked: list[str] = []
 
     def has(_: XScreen, name: str) -> bool:
@@ -466,7 +462,7 @@ def ramps(presenter: FullScreen) -> list[str]:
     return [warning for warning in presenter.warnings() if "gamma" in warning]
 
 
-def test_the_screen_saver_is_held_off_where_that_can_be_asked_for(virtual: VirtualScreen) -> None:
+def test_suspends_the_screen_saver(virtual: VirtualScreen) -> None:
     screen = XScreen()
     assert screen.stays_awake == (ctypes.util.find_library("xcb-screensaver") is not None)
     assert screen.has_extension("MIT-SCREEN-SAVER")
@@ -477,9 +473,9 @@ def test_the_screen_saver_is_held_off_where_that_can_be_asked_for(virtual: Virtu
         screen.read(0, 0, 1, 1)
 
 
-def test_what_is_not_on_the_screen_cannot_be_read(virtual: VirtualScreen) -> None:
+def test_refuses_to_read_outside_the_screen(virtual: VirtualScreen) -> None:
     screen = XScreen()
-    with pytest.raises(DeviceError, match=r"100×100.*\+600\+0 any more"):
+    with pytest.raises(DeviceError, match=r"100×100 px at \+600\+0"):
         screen.read(600, 0, 100, 100)
     assert screen.read(0, 0, 100, 100).shape == (100, 100)
     screen.close()
@@ -487,11 +483,11 @@ def test_what_is_not_on_the_screen_cannot_be_read(virtual: VirtualScreen) -> Non
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only there a missing DISPLAY is a missing desktop")
 @pytest.mark.parametrize("display", [":4711", ""])
-def test_no_desktop_says_so(monkeypatch: pytest.MonkeyPatch, display: str) -> None:
+def test_refuses_without_a_desktop(monkeypatch: pytest.MonkeyPatch, display: str) -> None:
     monkeypatch.setenv("DISPLAY", display)
-    with pytest.raises(DeviceError, match=r"desktop.*\(DISPLAY") as told:
+    with pytest.raises(DeviceError, match=r"desktop.*\(DISPLAY") as caught:
         FullScreen()
-    assert "b'" not in str(told.value)
+    assert "b'" not in str(caught.value)
     with pytest.raises(DeviceError):
         list_displays()
 
@@ -502,7 +498,7 @@ ABOVE = Display(2, "DP-1", 0, -1080, 1920, 1080, 60)
 
 
 @pytest.mark.parametrize(
-    ("displays", "wanted", "expected"),
+    ("displays", "selection", "expected"),
     [
         ((DESK,), None, DESK),
         ((DESK, BEAMER), "left", DESK),
@@ -514,29 +510,29 @@ ABOVE = Display(2, "DP-1", 0, -1080, 1920, 1080, 60)
         ((DESK, BEAMER), "2", BEAMER),
     ],
 )
-def test_a_display_is_chosen_by_any_of_its_marks(
-    displays: tuple[Display, ...], wanted: str | int | None, expected: Display
+def test_selects_a_display_by_each_property(
+    displays: tuple[Display, ...], selection: str | int | None, expected: Display
 ) -> None:
-    assert choose_display(displays, wanted) == expected
+    assert choose_display(displays, selection) == expected
 
 
 @pytest.mark.parametrize(
-    ("displays", "wanted", "reason"),
+    ("displays", "selection", "reason"),
     [
-        ((DESK, BEAMER), None, "no display is named: 2 fit"),
-        ((DESK, BEAMER), "HDMI-2", "display 'HDMI-2' is not there"),
-        ((DESK, BEAMER), "+1920+0", "not there"),
-        ((DESK, BEAMER), 3, "display 3 is not there"),
-        ((DESK, ABOVE), "DP-1", "display 'DP-1': 2 fit; name one by its place"),
-        ((DESK,), "right", "not two displays side by side"),
-        ((DESK, ABOVE), "left", "not two displays side by side"),
-        ((), None, "no display is named is not there|found: none"),
+        ((DESK, BEAMER), None, "display \\(not set\\): 2 match"),
+        ((DESK, BEAMER), "HDMI-2", "display 'HDMI-2' is not connected"),
+        ((DESK, BEAMER), "+1920+0", "not connected"),
+        ((DESK, BEAMER), 3, "display 3 is not connected"),
+        ((DESK, ABOVE), "DP-1", "display 'DP-1': 2 match; set a position"),
+        ((DESK,), "right", "two displays side by side"),
+        ((DESK, ABOVE), "left", "two displays side by side"),
+        ((), None, "not connected; present: none"),
     ],
 )
-def test_a_choice_that_cannot_be_made_lists_what_there_is(
-    displays: tuple[Display, ...], wanted: str | int | None, reason: str
+def test_refuses_an_ambiguous_or_missing_display(
+    displays: tuple[Display, ...], selection: str | int | None, reason: str
 ) -> None:
     with pytest.raises(ConfigurationError, match=reason) as caught:
-        choose_display(displays, wanted)
+        choose_display(displays, selection)
     for display in displays:
         assert str(display) in str(caught.value)

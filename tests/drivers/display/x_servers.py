@@ -1,7 +1,7 @@
-"""X servers without a monitor, and screenshots of them that owe nothing to the code under test.
+"""X servers without a monitor, and screenshots that are independent of the code under test.
 
-`virtual_screen` keeps its picture in a file as XWD (X11's XWDFile.h), which anybody may read; `screenshot` asks a
-server with a connection and a request written out here byte by byte (X Window System Protocol, clauses 8 and 9).
+`virtual_screen` stores its image in an XWD file (X11's XWDFile.h). `screenshot` sends its own request byte by byte (X
+Window System Protocol, clauses 8 and 9).
 """
 
 from __future__ import annotations
@@ -62,19 +62,19 @@ EndSection
 
 @dataclass(frozen=True)
 class VirtualScreen:
-    """A running Xvfb; `display` is what DISPLAY must be."""
+    """A running Xvfb; `display` is the value of DISPLAY."""
 
     display: str
     memory: Path
     process: subprocess.Popen[bytes]
 
     def end(self) -> None:
-        """Let the server crash."""
+        """Terminate the server."""
         self.process.kill()
         self.process.wait()
 
     def picture(self) -> Picture:
-        """Return what the server has in its frame buffer."""
+        """Return the frame buffer of the server."""
         content = self.memory.read_bytes()
         header = struct.unpack_from(">25I", content)
         size, width, height, stride, colours = header[0], header[4], header[5], header[12], header[19]
@@ -86,7 +86,7 @@ class VirtualScreen:
 
 @contextlib.contextmanager
 def virtual_screen(folder: Path, size: str, *, cursor: bool = False) -> Generator[VirtualScreen]:
-    """Run Xvfb with one screen of `size`, such as ``800x600``, black or, with a cursor, grey; skip where missing."""
+    """Run Xvfb with one screen of `size`, such as ``800x600``; black, or grey with a cursor; skip without Xvfb."""
     arguments = ["-screen", "0", f"{size}x24", "-fbdir", str(folder), "-nolisten", "tcp", "-noreset"]
     # Without -retro, a cursor appears only once some program has chosen one.
     arguments += ["-retro"] if cursor else ["-br", "-nocursor"]
@@ -96,7 +96,7 @@ def virtual_screen(folder: Path, size: str, *, cursor: bool = False) -> Generato
 
 @contextlib.contextmanager
 def two_outputs(folder: Path) -> Generator[str]:
-    """Run Xorg with an output of 640×360 and, right of it, one of 480×270; yield its DISPLAY; skip where missing."""
+    """Run Xorg with outputs of 640×360 and, to its right, 480×270; yield its DISPLAY; skip without Xorg."""
     settings = folder / "xorg.conf"
     settings.write_text(_SETTINGS)
     log = folder / "xorg.log"
@@ -118,10 +118,10 @@ def screenshot(display: str, width: int, height: int) -> Picture:
 
 @contextlib.contextmanager
 def notification(display: str, place: tuple[int, int, int, int], code: int) -> Generator[None]:
-    """Show a window that no window manager touches, as notifications are: x, y, width, height; plain 0xRRGGBB.
+    """Show a uniform window at x, y, width, height without the window manager, like a notification; 0xRRGGBB.
 
     X protocol: CreateWindow (1) with background-pixel and override-redirect, MapWindow (8), GetInputFocus (43), whose
-    reply tells that the server has done all before it.
+    reply confirms all earlier requests.
     """
     with socket.socket(socket.AF_UNIX) as server:
         root, own = _greeted(server, display)
@@ -134,7 +134,7 @@ def notification(display: str, place: tuple[int, int, int, int], code: int) -> G
 
 
 def _greeted(server: socket.socket, display: str) -> tuple[int, int]:
-    """Connect, and return the root window and the first number for a window of one's own."""
+    """Connect; return the root window and the first free window number."""
     server.connect(f"/tmp/.X11-unix/X{display.removeprefix(':')}")
     server.sendall(struct.pack("<BxHHHHxx", ord("l"), 11, 0, 0, 0))
     accepted, length = struct.unpack("<B5xH", _exactly(server, 8))

@@ -1,4 +1,4 @@
-"""Cables: the contract over memory and loopback TCP, and what each kind adds."""
+"""Network cables: the link contract over memory and loopback TCP, and the features of each cable."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class TestTcpServed(LinkContract):
 
 
 class _tcp_ends:  # noqa: N801 – reads as the function it stands for
-    """Both ends of one TCP connection; the server's thread is gone afterwards."""
+    """Both ends of one TCP connection; the server's thread ends with the block."""
 
     def __enter__(self) -> Ends:
         self._taken: list[TcpLink] = []
@@ -51,7 +51,7 @@ class _tcp_ends:  # noqa: N801 – reads as the function it stands for
 
 
 class _Echo:
-    """A peer that says who it is, repeats what it hears, and hangs up at ``bye``."""
+    """A peer that greets, repeats its input, and disconnects after ``bye``."""
 
     def __init__(self) -> None:
         self.connections = 0
@@ -67,7 +67,7 @@ class _Echo:
         return data
 
 
-def test_a_peer_answers_without_waiting() -> None:
+def test_peer_answers_without_waiting() -> None:
     link = PeerLink(_Echo())
     link.write(b"you", 0.0)
     assert link.read(100, 3600.0) == b"hello you"
@@ -76,7 +76,7 @@ def test_a_peer_answers_without_waiting() -> None:
         link.read(100, 3600.0)
 
 
-def test_a_peer_that_hangs_up_has_its_last_words_read() -> None:
+def test_last_bytes_of_a_disconnected_peer_are_read() -> None:
     peer = _Echo()
     link = PeerLink(peer)
     link.write(b"bye", 0.0)
@@ -88,7 +88,7 @@ def test_a_peer_that_hangs_up_has_its_last_words_read() -> None:
     assert peer.connections == 2
 
 
-def test_tcp_names_host_port_and_remedy_when_nobody_listens() -> None:
+def test_tcp_refusal_names_host_port_and_remedy() -> None:
     with TcpServer(lambda link: None) as server:
         _, port = server.address
     with pytest.raises(LinkClosed, match=rf"{LOOPBACK}:{port}.*check the port"):
@@ -96,24 +96,24 @@ def test_tcp_names_host_port_and_remedy_when_nobody_listens() -> None:
 
 
 @pytest.mark.parametrize(("host", "port"), [("no such host", 1), (LOOPBACK, 70000), ("", 0)])
-def test_tcp_refuses_addresses_that_are_none(host: str, port: int) -> None:
+def test_tcp_refuses_invalid_addresses(host: str, port: int) -> None:
     with pytest.raises(LinkClosed):
         TcpLink.connect(host, port, PATIENCE_S)
 
 
-def test_a_full_tcp_cable_is_a_timeout() -> None:
+def test_full_tcp_buffer_is_a_timeout() -> None:
     with _tcp_ends() as (near, _), pytest.raises(LinkTimeout):
         # More than any socket buffer; the far end never reads.
         near.write(bytes(1 << 28), 0.05)
 
 
-def test_a_taken_port_is_an_error_that_names_it() -> None:
+def test_refuses_a_port_in_use() -> None:
     with TcpServer(lambda link: None) as server, pytest.raises(LinkClosed, match=str(server.address[1])):
         TcpServer(lambda link: None, server.address[1])
 
 
-def test_a_server_takes_several_connections_and_leaves_no_thread() -> None:
-    before = threading.active_count()
+def test_server_accepts_several_connections_and_leaves_no_thread() -> None:
+    thread_count = threading.active_count()
 
     def echo(link: TcpLink) -> None:
         while True:
@@ -129,14 +129,14 @@ def test_a_server_takes_several_connections_and_leaves_no_thread() -> None:
             with pytest.raises(LinkClosed):
                 link.read(1, PATIENCE_S)
             link.close()
-        again = TcpLink.connect(*server.address, PATIENCE_S)
-        again.write(b"x", PATIENCE_S)
-        assert read_exactly(again, 1) == b"x"
-        again.close()
+        new_link = TcpLink.connect(*server.address, PATIENCE_S)
+        new_link.write(b"x", PATIENCE_S)
+        assert read_exactly(new_link, 1) == b"x"
+        new_link.close()
     server.close()
-    assert threading.active_count() == before
+    assert threading.active_count() == thread_count
 
 
-def test_what_a_message_quotes_says_where_it_is_cut_off() -> None:
+def test_quotes_mark_truncation() -> None:
     assert quoted(b"%" * 40) == repr("%" * 40)
     assert quoted(b"%" * 41) == repr("%" * 40) + "…"

@@ -1,4 +1,4 @@
-"""The serial cable: the link contract on a pseudo-terminal, and every way in which a port cannot be opened."""
+"""Serial cable: the link contract on a pseudo-terminal, and all errors of opening."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class TestSerialLink(LinkContract):
             near.read(1, PATIENCE_S)
 
 
-def test_what_waited_before_is_thrown_away(far: FarEnd) -> None:
+def test_discards_old_input(far: FarEnd) -> None:
     first = SerialLink.open(far.path, 9600)
     far.write(b"ab", PATIENCE_S)
     assert read_exactly(first, 1) == b"a"
@@ -81,7 +81,7 @@ def test_what_waited_before_is_thrown_away(far: FarEnd) -> None:
     second.close()
 
 
-def test_the_speed_reaches_the_port(far: FarEnd) -> None:
+def test_sets_the_speed_of_the_port(far: FarEnd) -> None:
     import termios
 
     link = SerialLink.open(far.path, 38400)
@@ -94,7 +94,7 @@ def test_the_speed_reaches_the_port(far: FarEnd) -> None:
     assert not flags & (termios.CSTOPB | termios.PARENB)
 
 
-def test_a_port_that_is_not_there_lists_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_port_error_lists_present_ports(monkeypatch: pytest.MonkeyPatch) -> None:
     def two_ports() -> list[ListPortInfo]:
         return [ListPortInfo("/dev/ttyUSB1"), ListPortInfo("/dev/ttyACM0")]
 
@@ -107,27 +107,27 @@ def test_a_port_that_is_not_there_lists_those_that_are(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize(
-    ("said", "kind", "remedy"),
+    ("cause", "error_type", "remedy"),
     [
         (serial.SerialException(errno.EACCES, "Permission denied"), DeviceRefused, "dialout"),
         (serial.SerialException(errno.EIO, "Could not configure port"), LinkClosed, "check that it is a serial port"),
-        (ValueError("Not a valid baudrate: 12"), ConfigurationError, "choose another speed"),
+        (ValueError("Not a valid baudrate: 12"), ConfigurationError, "set another speed"),
     ],
 )
-def test_a_port_that_cannot_be_opened_names_the_remedy(
-    monkeypatch: pytest.MonkeyPatch, said: Exception, kind: type[Exception], remedy: str
+def test_open_errors_name_the_remedy(
+    monkeypatch: pytest.MonkeyPatch, cause: Exception, error_type: type[Exception], remedy: str
 ) -> None:
     def refuse(*_: object, **__: object) -> serial.Serial:
-        raise said
+        raise cause
 
     monkeypatch.setattr(serial, "Serial", refuse)
-    with pytest.raises(kind, match=remedy) as caught:
+    with pytest.raises(error_type, match=remedy) as caught:
         SerialLink.open("/dev/ttyUSB0", 9600)
     assert "/dev/ttyUSB0" in str(caught.value)
-    assert caught.value.__cause__ is said
+    assert caught.value.__cause__ is cause
 
 
-def test_one_port_one_program(far: FarEnd) -> None:
+def test_refuses_a_second_open_of_a_port(far: FarEnd) -> None:
     link = SerialLink.open(far.path, 9600)
     with pytest.raises(DeviceRefused):
         SerialLink.open(far.path, 9600)

@@ -1,4 +1,4 @@
-"""USB through pyusb: the PTP contract on the simulated bus, and what finding and opening say when they cannot."""
+"""USB through pyusb: the PTP contract on the simulated bus, and errors of searching and opening."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Keyboard(PtpUsbDevice):
         return bytes(descriptor)
 
 
-def test_lists_cameras_and_nothing_else() -> None:
+def test_lists_only_cameras() -> None:
     bus = bus_with(camera(), Keyboard(Echo()), camera(serial=None, product=0x32CA))
     assert list_devices(backend=bus) == (
         UsbDevice(0x04A9, 0x31EA, "1234", "Canon Digital Camera", "1-1", 2),
@@ -52,7 +52,7 @@ def test_lists_cameras_and_nothing_else() -> None:
     )
 
 
-def test_opens_by_any_mark() -> None:
+def test_opens_by_each_property() -> None:
     bus = bus_with(camera("1"), camera("2"), camera("3", product=0x32CA))
     pipes = open_usb(serial="2", backend=bus)
     assert "serial number 2" in pipes.label
@@ -62,19 +62,19 @@ def test_opens_by_any_mark() -> None:
     assert "serial number 3" in open_usb(vendor=0x04A9, serial="3", backend=bus).label
 
 
-def test_says_what_is_there_when_the_camera_is_not() -> None:
+def test_missing_camera_error_lists_present_cameras() -> None:
     with pytest.raises(LinkClosed):
         open_usb(backend=SimulatedBus())
     with pytest.raises(LinkClosed, match=r"serial number 9 .*serial number 1\b"):
         open_usb(serial="9", backend=bus_with(camera("1")))
 
 
-def test_asks_which_when_several_fit() -> None:
+def test_refuses_several_matching_cameras() -> None:
     with pytest.raises(InputError, match=r"serial number 1\b.*serial number 2\b"):
         open_usb(vendor=0x04A9, backend=bus_with(camera("1"), camera("2")))
 
 
-def test_a_camera_held_by_the_desktop_says_how_to_free_it() -> None:
+def test_camera_in_use_error_names_the_remedy() -> None:
     device = camera()
     bus = bus_with(device)
     bus.hold(device)
@@ -84,7 +84,7 @@ def test_a_camera_held_by_the_desktop_says_how_to_free_it() -> None:
     open_usb(backend=bus)
 
 
-def test_a_camera_without_permission_names_the_rule() -> None:
+def test_permission_error_names_the_udev_rule() -> None:
     device = camera()
     bus = bus_with(device)
     bus.lock(device)
@@ -94,7 +94,7 @@ def test_a_camera_without_permission_names_the_rule() -> None:
     assert list_devices(backend=bus)[0].serial is None
 
 
-def test_the_kernels_driver_steps_aside_and_comes_back() -> None:
+def test_detaches_and_restores_the_kernel_driver() -> None:
     device = camera()
     bus = bus_with(device)
     bus.bind_kernel_driver(device)
@@ -105,7 +105,7 @@ def test_the_kernels_driver_steps_aside_and_comes_back() -> None:
     assert not bus.is_claimed(device)
 
 
-def test_an_unconfigured_device_is_configured() -> None:
+def test_configures_an_unconfigured_device() -> None:
     device = camera()
     bus = bus_with(device)
     device.control(Setup(0x00, 9, 0, 0, 0))
@@ -113,7 +113,7 @@ def test_an_unconfigured_device_is_configured() -> None:
     assert transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
 
 
-def test_errors_of_the_bus_become_ours() -> None:
+def test_translates_bus_errors() -> None:
     device = camera()
     bus = bus_with(device)
     pipes = open_usb(backend=bus)
@@ -138,22 +138,22 @@ def test_errors_of_the_bus_become_ours() -> None:
         pipes.bulk_write(b"x", 0.001)
 
 
-def test_a_restarted_camera_is_found_again_by_its_number() -> None:
+def test_reopens_a_restarted_camera_by_serial_number() -> None:
     device = camera("7")
     bus = bus_with(camera("6"), device)
     transport = UsbTransport(open_usb(serial="7", backend=bus), SimulatedClock())
-    before = list_devices(backend=bus)
+    old_devices = list_devices(backend=bus)
     bus.replug(device)
     with pytest.raises(LinkClosed):
         transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S)
     transport.close()
-    again = UsbTransport(open_usb(serial="7", backend=bus), SimulatedClock())
-    assert again.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
-    assert {found.address for found in before} != {found.address for found in list_devices(backend=bus)}
-    assert {found.port for found in before} == {found.port for found in list_devices(backend=bus)}
+    reopened = UsbTransport(open_usb(serial="7", backend=bus), SimulatedClock())
+    assert reopened.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
+    assert {device.address for device in old_devices} != {device.address for device in list_devices(backend=bus)}
+    assert {device.port for device in old_devices} == {device.port for device in list_devices(backend=bus)}
 
 
-def test_a_port_reset_keeps_the_pipes() -> None:
+def test_port_reset_keeps_the_pipes() -> None:
     device = camera()
     pipes = open_usb(backend=bus_with(device))
     transport = UsbTransport(pipes, SimulatedClock())
@@ -161,7 +161,7 @@ def test_a_port_reset_keeps_the_pipes() -> None:
     assert transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
 
 
-def test_the_rule_that_messages_name_is_shipped() -> None:
+def test_udev_rule_is_shipped() -> None:
     rule = resources.files("drivers") / "data" / UDEV_RULE
     lines = [line for line in rule.read_text().splitlines() if line and not line.startswith("#")]
     assert len(lines) == 1

@@ -1,4 +1,4 @@
-"""Trouble as a wrapper around a good cable."""
+"""Wrappers that add faults to a good cable."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from foundation.errors import LinkClosed, LinkTimeout
 
 
 class Dribbling:
-    """Passes what it reads byte by byte."""
+    """Reads byte by byte."""
 
     def __init__(self, good: Link) -> None:
         self.good = good
@@ -26,7 +26,7 @@ class Dribbling:
 
 
 class Garbling(Dribbling):
-    """Passes what it reads through `garble`."""
+    """Changes its input by `garble`."""
 
     def __init__(self, good: Link, garble: Callable[[bytes], bytes]) -> None:
         super().__init__(good)
@@ -37,17 +37,17 @@ class Garbling(Dribbling):
 
 
 class DroppedAfter(Dribbling):
-    """Hangs up at the write number `writes`, counted from 0, before anything has gone out."""
+    """Disconnects before write number `writes`, counted from 0."""
 
     def __init__(self, good: Link, writes: int) -> None:
         super().__init__(good)
-        self._left = writes
+        self._remaining_writes = writes
 
     def write(self, data: bytes, timeout: float) -> None:
-        if self._left == 0:
+        if self._remaining_writes == 0:
             self.good.close()
             raise LinkClosed("dropped on purpose")
-        self._left -= 1
+        self._remaining_writes -= 1
         self.good.write(data, timeout)
 
     def read(self, limit: int, timeout: float) -> bytes:
@@ -55,22 +55,22 @@ class DroppedAfter(Dribbling):
 
 
 class Deaf(Dribbling):
-    """Swallows the answers from the read number `after` on, counted from 0."""
+    """Loses the replies from read number `after` on, counted from 0."""
 
     def __init__(self, good: Link, after: int) -> None:
         super().__init__(good)
-        self._left = after
+        self._remaining_reads = after
 
     def read(self, limit: int, timeout: float) -> bytes:
         data = self.good.read(limit, timeout)
-        if self._left == 0 and data:
+        if self._remaining_reads == 0 and data:
             raise LinkTimeout(f"swallowed {data!r} on purpose")
-        self._left -= bool(data)
+        self._remaining_reads -= bool(data)
         return data
 
 
 class Slow(Dribbling):
-    """Takes `seconds` of `clock` for each read, or times out where it may not take as long."""
+    """Each read takes `seconds` of `clock`, or times out."""
 
     def __init__(self, good: Link, clock: Clock, seconds: float) -> None:
         super().__init__(good)

@@ -1,8 +1,7 @@
 """Conversations of a host with an EOS body, transaction by transaction.
 
-The requests and response codes are those of a recorded host and its EOS 60D: two sessions with the dial at aperture
-priority, the card taken out between them. The simulated EOS 550D answers the same requests; the recording itself is a
-second conversation where it is found.
+Requests and response codes were recorded from a host with an EOS 60D: two sessions in aperture priority, the card
+removed between them. The simulated EOS 550D answers the same requests. The full recording is used if it is present.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from tests.data_files import available
 
 
 class Recorded(TypedDict):
-    """One transaction of a conversation; numbers and bytes as hex."""
+    """One transaction; numbers and bytes as hex."""
 
     code: str
     tid: int
@@ -94,19 +93,19 @@ d112 d113 d120 d122 d150 d151 d152 d153 d154 d155 d160 d161 d162 d170 d171 d172 
 d1b1 d1b2 d1b3 d1b4 d1b5 d1b6 d1a9 d145 d1ac d1ad d1ae d11e d11f d1af d1d0 d1d1 d1d9 d1ba d1be d1bc d1b8 d1d3 d1d8 d17f
 d1b7 d1b9 d1db d1dc d1df d1bd d1c1 d1c0 d1bf d1c4 d1c2 d1c5 d194 d198 d1c7
 """
+# Properties of the recorded EOS 60D, in its order.
 EOS_60D_PROPERTIES = tuple(int(code, 16) for code in _PROPERTIES.split())
-"""Properties of the recorded EOS 60D, in the order in which it lists and sends them."""
 
 
 def transcript() -> list[Recorded]:
-    """Return both sessions as the EOS 60D had them, without what the body sent."""
+    """Return both sessions of the EOS 60D, without the data from the body."""
     return [*_session(_WITH_CARD), *_session(_WITHOUT_CARD)]
 
 
 def _session(lines: str) -> Iterator[Recorded]:
     for number, line in enumerate(filter(None, lines.splitlines())):
-        asked, phase, response = (part.strip() for part in line.split("|"))
-        code, *parameters = asked.split()
+        request, phase, response = (column.strip() for column in line.split("|"))
+        code, *parameters = request.split()
         sent = phase not in ("in", "-")
         yield Recorded(
             code=code,
@@ -120,7 +119,7 @@ def _session(lines: str) -> Iterator[Recorded]:
 
 
 def simulated() -> list[Recorded]:
-    """Return the same conversation with the simulated EOS 550D: its dial at aperture priority, in continuous drive."""
+    """Return the same conversation with the simulated EOS 550D in aperture priority and continuous drive."""
     eos = SimulatedEos(EOS_550D, SeededFilm(), SimulatedClock(), auto_power_off_s=0)
     eos.turn_dial(AeMode.APERTURE_PRIORITY)
     eos.set_menu(Property.EOS_DRIVE_MODE, DriveMode.CONTINUOUS)
@@ -143,7 +142,7 @@ def _answered(eos: SimulatedEos) -> Iterator[Recorded]:
 
 
 def conversations() -> dict[str, Callable[[], list[Recorded]]]:
-    """Return what gives each conversation that there is, by the name of its body."""
+    """Return a reader of each available conversation, by the name of its body."""
     found = available("ptp/eos60d_transactions.json")
     return dict([("EOS 550D", simulated), *(("EOS 60D", partial(_read, path)) for path in found)])
 
@@ -153,7 +152,7 @@ def _read(path: Path) -> list[Recorded]:
 
 
 def read_description(data: bytes) -> DevicePropDesc:
-    """Return the property of a recorded GetDevicePropDesc; the only list in the recordings has bytes sent as words."""
+    """Return the property of a recorded GetDevicePropDesc; its list has bytes sent as words."""
     cursor = Cursor(data, "a recorded description")
     code, kind, writable = cursor.u16("code"), cursor.u16("type"), cursor.u8("get/set") != 0
     default, current = read_value(cursor, kind, "default"), read_value(cursor, kind, "current")

@@ -1,6 +1,6 @@
-"""Well-formed bytes of every kind and the function that reads them, for tests that damage them.
+"""Well-formed bytes of every kind with the functions that read them, for tests that damage them.
 
-The bytes are written by hand from the standard, or recorded from the cameras named.
+The bytes were written from the standard, or recorded from the named cameras.
 """
 
 from __future__ import annotations
@@ -96,12 +96,12 @@ IP_PACKETS = (
 
 
 def read_usb(data: bytes) -> object:
-    """Feed a stream to a fresh reader until it is done or raises."""
+    """Feed a stream to a new reader until it ends or raises."""
     return container.ContainerReader().feed(data)
 
 
 def read_ip(data: bytes) -> object:
-    """Feed a stream to a fresh cutter until it is done or raises."""
+    """Feed a stream to a new cutter until it ends or raises."""
     return ptpip.PacketCutter().feed(data)
 
 
@@ -137,6 +137,6 @@ PARAMETERS = st.lists(U32, max_size=5).map(tuple)
 
 
 def split(data: bytes, cuts: Iterable[int]) -> list[bytes]:
-    """Return bytes cut into pieces at any places."""
+    """Return bytes split at the given positions."""
     places = sorted({0, len(data), *(cut % (len(data) + 1) for cut in cuts)})
     return [data[start:end] for start, end in pairwise(places)]

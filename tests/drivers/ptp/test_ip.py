@@ -79,7 +79,7 @@ PACKETS = st.one_of(
 
 
 def joined(packets: Iterable[Packet]) -> list[Packet]:
-    """Return the packets with neighbouring data of one transaction put together."""
+    """Return the packets with consecutive data of one transaction joined."""
     result: list[Packet] = []
     for packet in packets:
         before = result[-1] if result else None
@@ -91,24 +91,24 @@ def joined(packets: Iterable[Packet]) -> list[Packet]:
 
 
 @pytest.mark.parametrize(("octets", "packet"), list(zip(examples.IP_PACKETS, CONVERSATION, strict=True)))
-def test_packets_are_the_standards_bytes(octets: bytes, packet: Packet) -> None:
+def test_packets_match_the_standards_bytes(octets: bytes, packet: Packet) -> None:
     assert PacketCutter().feed(octets) == [packet]
     assert ptpip.encode(packet) == octets
 
 
 @given(st.lists(PACKETS, max_size=6), st.lists(st.integers(0, 10_000), max_size=12))
-def test_any_split_gives_the_same_packets(packets: list[Packet], cuts: list[int]) -> None:
+def test_packets_do_not_depend_on_splitting(packets: list[Packet], cuts: list[int]) -> None:
     stream = b"".join(map(ptpip.encode, packets))
     cutter = PacketCutter()
     assert joined(packet for piece in split(stream, cuts) for packet in cutter.feed(piece)) == joined(packets)
 
 
 @pytest.mark.parametrize(
-    ("octets", "says"),
+    ("octets", "reason"),
     [
         ("08000000 00000000", "type 0"),
         ("08000000 0f000000", "type 15"),
-        ("07000000 0d000000", "PING packet of 7 bytes; 8 to 4096"),
+        ("07000000 0d000000", "PING packet of 7 bytes, 8 to 4096"),
         ("01100000 0d000000", "PING packet of 4097 bytes"),
         ("ffffffff 01000000", "INIT_COMMAND_REQUEST packet of 4294967295 bytes"),
         ("0b000000 0a000000", "DATA packet of 11 bytes"),
@@ -122,11 +122,11 @@ def test_any_split_gives_the_same_packets(packets: list[Packet], cuts: list[int]
         ("09000000 0d000000 00", "followed by 1 bytes"),
     ],
 )
-def test_what_is_no_packet_is_named(octets: str, says: str) -> None:
+def test_refuses_invalid_packets(octets: str, reason: str) -> None:
     cutter = PacketCutter()
-    with pytest.raises(ProtocolError, match=says):
+    with pytest.raises(ProtocolError, match=reason):
         cutter.feed(bytes.fromhex(octets))
-    with pytest.raises(ProtocolError, match=says):
+    with pytest.raises(ProtocolError, match=reason):
         cutter.feed(ptpip.encode(Ping()))
 
 
@@ -143,8 +143,8 @@ class TestLoopback(TransportContract):
             transport.close()
 
 
-def packet(kind: int, body: bytes = b"") -> bytes:
-    return (8 + len(body)).to_bytes(4, "little") + kind.to_bytes(4, "little") + body
+def packet(packet_type: int, body: bytes = b"") -> bytes:
+    return (8 + len(body)).to_bytes(4, "little") + packet_type.to_bytes(4, "little") + body
 
 
 ACK = packet(2, (7).to_bytes(4, "little") + bytes(16) + "cam\0".encode("utf-16-le") + bytes.fromhex("00000100"))
@@ -153,7 +153,7 @@ DONE = packet(7, bytes.fromhex("0120 05000000"))
 
 
 class FarEnd:
-    """Both connections of a device whose words are put into its mouth beforehand."""
+    """Both connections of a device with prepared replies."""
 
     def __init__(self, command: bytes = ACK, event: bytes = EVENT_ACK) -> None:
         near_command, self.command = joined_links()
@@ -182,13 +182,13 @@ class FarEnd:
 
 
 def connected() -> tuple[FarEnd, IpTransport]:
-    """Return a device and the transport to it."""
+    """Return a device and its transport."""
     far = FarEnd()
     return far, far.connect()
 
 
 def connect_in_turn(far_end: Callable[[], FarEnd], clock: SimulatedClock) -> IpTransport:
-    """Connect to a device that is another at each try."""
+    """Connect to a new device at each attempt."""
     current: list[FarEnd] = []
 
     def open_command() -> Link:
@@ -198,7 +198,7 @@ def connect_in_turn(far_end: Callable[[], FarEnd], clock: SimulatedClock) -> IpT
     return IpTransport(open_command, lambda: current[-1].open_event(), guid=GUID, name="Cr", clock=clock)
 
 
-def test_greets_in_the_standards_bytes() -> None:
+def test_greeting_matches_the_standards_bytes() -> None:
     # CIPA DC-005-2005, 2.3.1 and 2.3.3.
     far, transport = connected()
     hello = GUID + "Cr\0".encode("utf-16-le") + bytes.fromhex("00000100")
@@ -207,12 +207,12 @@ def test_greets_in_the_standards_bytes() -> None:
     assert transport.label == "cam (camera)"
 
 
-def test_asks_and_sends_data_in_the_standards_bytes() -> None:
+def test_request_and_data_match_the_standards_bytes() -> None:
     far, transport = connected()
     far.heard(far.command)
     far.command.write(DONE, PATIENCE_S)
-    done = transport.transact(PtpRequest(0x9110, 5, (1, 2)), send=bytes(70000), timeout=PATIENCE_S)
-    assert done.response == PtpResponse(0x2001, 5)
+    transaction = transport.transact(PtpRequest(0x9110, 5, (1, 2)), send=bytes(70000), timeout=PATIENCE_S)
+    assert transaction.response == PtpResponse(0x2001, 5)
     assert far.heard(far.command) == (
         packet(6, bytes.fromhex("02000000 1091 05000000 01000000 02000000"))
         + packet(9, bytes.fromhex("05000000 7011010000000000"))
@@ -221,17 +221,17 @@ def test_asks_and_sends_data_in_the_standards_bytes() -> None:
     )
 
 
-@pytest.mark.parametrize(("total", "wrong"), [(5, "announced 5"), (7, "announced 7")])
-def test_data_must_be_as_long_as_announced(total: int, wrong: str) -> None:
+@pytest.mark.parametrize(("total", "reason"), [(5, "announced 5"), (7, "announced 7")])
+def test_refuses_data_of_another_length(total: int, reason: str) -> None:
     far, transport = connected()
     start = packet(9, bytes.fromhex("05000000") + total.to_bytes(8, "little"))
     end = packet(12, bytes.fromhex("05000000") + b"abcdef")
     far.command.write(start + end + DONE, PATIENCE_S)
-    with pytest.raises(ProtocolError, match=wrong):
+    with pytest.raises(ProtocolError, match=reason):
         transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S)
 
 
-def test_waits_for_the_event_connection_to_be_accepted() -> None:
+def test_waits_for_the_event_connection() -> None:
     far = FarEnd()
     far.refusals = 3
     clock = SimulatedClock()
@@ -239,7 +239,7 @@ def test_waits_for_the_event_connection_to_be_accepted() -> None:
     assert 0.2 < clock.monotonic() < 0.5
 
 
-def test_does_not_wait_for_it_for_ever() -> None:
+def test_wait_for_the_event_connection_is_limited() -> None:
     far = FarEnd()
     far.refusals = 1000
     clock = SimulatedClock()
@@ -251,23 +251,23 @@ def test_does_not_wait_for_it_for_ever() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reason", "remedy"), [(1, "pair the two anew"), (2, "another program"), (3, "off and on"), (9, "reason 9")]
+    ("reason", "remedy"), [(1, "pair it again"), (2, "another program"), (3, "off and on"), (9, "reason 9")]
 )
-def test_a_refusal_says_what_helps(reason: int, remedy: str) -> None:
+def test_refusal_names_the_remedy(reason: int, remedy: str) -> None:
     refusal = packet(5, reason.to_bytes(4, "little"))
     for words in ((refusal,), (ACK, refusal)):
         with pytest.raises(DeviceRefused, match=remedy):
             connect_in_turn(lambda words=words: FarEnd(*words), SimulatedClock())
 
 
-def test_what_is_no_camera_is_named() -> None:
-    with pytest.raises(ProtocolError, match="PTP/IP connection gives"):
+def test_reports_other_servers() -> None:
+    with pytest.raises(ProtocolError, match="PTP/IP stream has"):
         FarEnd(b"SSH-2.0-OpenSSH_9.6\r\n").connect()
     with pytest.raises(ProtocolError):
         FarEnd(packet(14)).connect()
 
 
-def test_pings_are_answered_between_transactions() -> None:
+def test_answers_pings_between_transactions() -> None:
     far, transport = connected()
     far.heard(far.event)
     far.event.write(packet(13), PATIENCE_S)
@@ -275,7 +275,7 @@ def test_pings_are_answered_between_transactions() -> None:
     assert far.heard(far.event) == packet(14)
 
 
-def test_a_long_wait_for_a_response_answers_pings(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_pings_during_a_long_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drivers.ptp.ip._PING_EVERY_S", 0.01)
     far, transport = connected()
     far.heard(far.event)
@@ -294,7 +294,7 @@ def test_a_long_wait_for_a_response_answers_pings(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-def test_a_flood_of_events_keeps_the_newest() -> None:
+def test_keeps_the_newest_events() -> None:
     far, transport = connected()
     far.event.write(
         b"".join(packet(8, bytes.fromhex("01c1 ffffffff") + n.to_bytes(4, "little")) for n in range(9000)), PATIENCE_S
@@ -304,14 +304,14 @@ def test_a_flood_of_events_keeps_the_newest() -> None:
     assert events[-1].parameters == (8999,)
 
 
-def test_an_event_connection_that_is_lost_is_told() -> None:
+def test_reports_a_lost_event_connection() -> None:
     far, transport = connected()
     far.event.close()
     with pytest.raises(LinkClosed):
         transport.events()
 
 
-def test_a_stranger_in_the_middle_of_a_transaction_is_refused() -> None:
+def test_refuses_an_unexpected_packet_in_a_transaction() -> None:
     far, transport = connected()
     far.command.write(packet(4), PATIENCE_S)
     with pytest.raises(ProtocolError):
@@ -319,7 +319,7 @@ def test_a_stranger_in_the_middle_of_a_transaction_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_second_initiator_hears_that_the_device_is_busy() -> None:
+def test_second_initiator_gets_busy() -> None:
     with serve_ptpip(Echo(), 0) as server:
         first = IpTransport.connect(*server.address, guid=GUID, name="CroP", clock=SystemClock())
         with pytest.raises(DeviceRefused):
@@ -337,7 +337,7 @@ def answer(size: int) -> bytes:
 
 
 @given(cut=st.integers(0, len(answer(100)) - 1), hangs_up=st.booleans())
-def test_a_stream_that_ends_at_any_byte_is_closed_or_late(cut: int, hangs_up: bool) -> None:
+def test_truncated_stream_is_closed_or_late(cut: int, hangs_up: bool) -> None:
     far, transport = connected()
     far.command.write(answer(100)[:cut], PATIENCE_S)
     if hangs_up:
@@ -349,21 +349,21 @@ def test_a_stream_that_ends_at_any_byte_is_closed_or_late(cut: int, hangs_up: bo
 
 
 @given(at=st.integers(0, len(answer(100)) - 1), value=st.integers(0, 255))
-def test_a_garbled_byte_never_ends_in_anything_but_our_errors(at: int, value: int) -> None:
+def test_changed_byte_gives_only_our_errors(at: int, value: int) -> None:
     far, transport = connected()
     stream = bytearray(answer(100))
     stream[at] = value
     far.command.write(bytes(stream), PATIENCE_S)
     try:
-        done = transport.transact(PtpRequest(0x9116, 5), timeout=0.0)
+        transaction = transport.transact(PtpRequest(0x9116, 5), timeout=0.0)
     except (ProtocolError, LinkTimeout):
         return
-    assert done.response.transaction == 5
-    assert len(done.data) == 100 or not done.response.ok
+    assert transaction.response.transaction == 5
+    assert len(transaction.data) == 100 or not transaction.response.ok
 
 
 @pytest.mark.parametrize("taken_up_before", [True, False])
-def test_waits_for_a_device_that_still_holds_an_old_connection(taken_up_before: bool) -> None:
+def test_waits_for_a_device_with_an_old_connection(taken_up_before: bool) -> None:
     busy = [FarEnd(packet(5, (2).to_bytes(4, "little"))) for _ in range(3)]
     ends = [FarEnd(), *busy, *([FarEnd()] if taken_up_before else [])]
     clock = SimulatedClock()

@@ -1,4 +1,4 @@
-"""PTP on any cable: datasets against bytes written from the standard, and a session against a scripted cable."""
+"""PTP on any cable: datasets against the standard's bytes, and a session on a scripted cable."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drivers.ptp import usb as container
 from drivers.ptp.codes import DataType, ObjectFormat, Operation, Property, ResponseCode
 from drivers.ptp.protocol import (
     OPEN_TRIES,
-    PASSING_LIMIT_S,
+    TRANSIENT_LIMIT_S,
     DeviceInfo,
     DevicePropDesc,
     ObjectInfo,
@@ -46,7 +46,7 @@ TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0")
 CODES = st.lists(U16, max_size=20).map(tuple)
 
 
-def test_device_info_is_the_standards_bytes() -> None:
+def test_device_info_matches_the_standards_bytes() -> None:
     info = DeviceInfo(
         vendor_extension_id=11,
         vendor_extension_version=100,
@@ -64,7 +64,7 @@ def test_device_info_is_the_standards_bytes() -> None:
     assert DeviceInfo.decode(examples.DEVICE_INFO) == info
 
 
-def test_object_info_is_the_standards_bytes() -> None:
+def test_object_info_matches_the_standards_bytes() -> None:
     info = ObjectInfo(
         storage=0x00020001,
         format=ObjectFormat.CR2,
@@ -83,14 +83,14 @@ def test_object_info_is_the_standards_bytes() -> None:
     assert ObjectInfo.decode(examples.OBJECT_INFO) == info
 
 
-def test_storage_info_keeps_what_a_body_appends() -> None:
+def test_storage_info_keeps_appended_bytes() -> None:
     # 2 x 16 GB nominal: 0x076d880000 bytes of capacity.
     info = StorageInfo(4, 3, 0, 0x076D880000, 0x076CBF8000, 0xFFFFFFFF, "SD", "", b"\0\0")
     assert StorageInfo.decode(examples.STORAGE_INFO) == info
     assert info.encode() == examples.STORAGE_INFO
 
 
-def test_properties_are_the_standards_bytes() -> None:
+def test_properties_match_the_standards_bytes() -> None:
     text = DevicePropDesc(0x5003, DataType.STRING, True, "1", "2", ("1", "2"))
     assert text.encode() == examples.STRING_DESC
     # The 60D sends bytes as words and means bytes.
@@ -119,12 +119,12 @@ def test_properties_are_the_standards_bytes() -> None:
         (0x4006, (), "00000000"),
     ],
 )
-def test_values_are_the_standards_bytes(data_type: int, value: Value, octets: str) -> None:
+def test_values_match_the_standards_bytes(data_type: int, value: Value, octets: str) -> None:
     assert protocol.encode_value(data_type, value) == bytes.fromhex(octets)
     assert protocol.decode_value(data_type, bytes.fromhex(octets)) == value
 
 
-def test_more_than_the_bound_is_refused_unread() -> None:
+def test_refuses_data_above_the_limit() -> None:
     with pytest.raises(ProtocolError, match="1048576"):
         protocol.decode_u32_array(bytes(protocol.MAX_DATASET + 1))
 
@@ -140,7 +140,7 @@ DATASETS = st.one_of(
 
 
 @given(st.sampled_from([kind for kind in DataType if kind != DataType.STRING]), st.data())
-def test_any_value_comes_back(kind: DataType, data: st.DataObject) -> None:
+def test_values_survive_encoding_and_decoding(kind: DataType, data: st.DataObject) -> None:
     # By the standard signed types are the odd ones, and a type of twice the number has half again as many bytes.
     bits, signed = 8 << (kind - 1) // 2, kind % 2 == 1
     least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
@@ -152,18 +152,18 @@ def test_any_value_comes_back(kind: DataType, data: st.DataObject) -> None:
 @pytest.mark.slow
 @settings(max_examples=200)
 @given(DATASETS)
-def test_any_dataset_comes_back(dataset: DeviceInfo | StorageInfo | ObjectInfo) -> None:
+def test_datasets_survive_encoding_and_decoding(dataset: DeviceInfo | StorageInfo | ObjectInfo) -> None:
     assert type(dataset).decode(dataset.encode()) == dataset
 
 
 class Scripted:
-    """A cable that answers from a script of response codes and errors, OK when it is over."""
+    """A cable that replies with scripted response codes and errors, then with OK."""
 
     label = "the scripted camera"
 
     def __init__(self, *script: int | Exception) -> None:
         self.script = list(script)
-        self.asked: list[PtpRequest] = []
+        self.requests: list[PtpRequest] = []
         self.resets = 0
 
     def transact(
@@ -174,7 +174,7 @@ class Scripted:
         receive: Callable[[bytes], object] | None = None,
         timeout: float,
     ) -> Transaction:
-        self.asked.append(request)
+        self.requests.append(request)
         step = self.script.pop(0) if self.script else ResponseCode.OK
         if isinstance(step, Exception):
             raise step
@@ -201,58 +201,58 @@ def test_opens_with_number_0_and_counts_from_1(answer: int) -> None:
     session, cable, _ = opened(answer)
     assert session.call(Operation.GET_DEVICE_INFO) == ((7,), b"data")
     session.close()
-    assert cable.asked == [PtpRequest(0x1002, 0, (1,)), PtpRequest(0x1001, 1), PtpRequest(0x1003, 2)]
+    assert cable.requests == [PtpRequest(0x1002, 0, (1,)), PtpRequest(0x1001, 1), PtpRequest(0x1003, 2)]
 
 
-def test_takes_the_next_session_number_where_one_is_not_taken() -> None:
+def test_tries_the_next_session_number() -> None:
     _, cable, _ = opened(ResponseCode.INVALID_TRANSACTION_ID, ResponseCode.INVALID_TRANSACTION_ID)
-    assert [request.parameters for request in cable.asked] == [(1,), (2,), (3,)]
+    assert [request.parameters for request in cable.requests] == [(1,), (2,), (3,)]
 
 
-def test_resets_a_silent_body_and_tries_again() -> None:
+def test_resets_a_silent_body() -> None:
     _, cable, _ = opened(LinkTimeout("silent"), ProtocolError("garbage"))
-    assert (len(cable.asked), cable.resets) == (OPEN_TRIES, OPEN_TRIES - 1)
+    assert (len(cable.requests), cable.resets) == (OPEN_TRIES, OPEN_TRIES - 1)
 
 
 @pytest.mark.parametrize("fault", [LinkTimeout("silent"), ProtocolError("garbage")])
-def test_gives_up_on_a_body_that_stays_silent(fault: Exception) -> None:
+def test_reports_a_body_that_stays_silent(fault: Exception) -> None:
     with pytest.raises(type(fault)):
         opened(*[fault] * OPEN_TRIES)
 
 
-def test_a_body_that_is_gone_is_not_asked_again() -> None:
+def test_does_not_retry_a_disconnected_body() -> None:
     cable = Scripted(LinkClosed("gone"))
     with pytest.raises(LinkClosed):
         PtpSession(cable, SimulatedClock()).open()
-    assert len(cable.asked) == 1
+    assert len(cable.requests) == 1
 
 
-def test_an_opening_that_is_refused_is_refused() -> None:
+def test_refused_open_is_an_error() -> None:
     with pytest.raises(DeviceRefused, match=r"answers ACCESS_DENIED \(0x200f\) to OPEN_SESSION \(0x1002\)\(0x1\)"):
         opened(ResponseCode.ACCESS_DENIED)
 
 
 @pytest.mark.parametrize("code", [0x2019, 0xA102, 0xA106])
-def test_what_is_declined_for_the_moment_is_asked_again_under_a_new_number(code: int) -> None:
+def test_retries_temporarily_declined_operations(code: int) -> None:
     session, cable, clock = opened(ResponseCode.OK, code, code, code)
     session.call(Operation.EOS_KEEP_DEVICE_ON)
-    assert [request.transaction for request in cable.asked[1:]] == [1, 2, 3, 4]
+    assert [request.transaction for request in cable.requests[1:]] == [1, 2, 3, 4]
     assert clock.monotonic() == pytest.approx(0.05 + 0.1 + 0.2)
 
 
-def test_patience_ends_by_the_clock() -> None:
+def test_retries_end_after_the_limit() -> None:
     session, _, clock = opened(ResponseCode.OK, *[0x2019] * 1000)
     with pytest.raises(OperationDeclined) as caught:
         session.call(Operation.EOS_KEEP_DEVICE_ON)
     assert caught.value.code == 0x2019
-    assert clock.monotonic() == pytest.approx(PASSING_LIMIT_S)
+    assert clock.monotonic() == pytest.approx(TRANSIENT_LIMIT_S)
 
 
-def test_every_other_answer_is_told_by_its_name_at_once() -> None:
+def test_other_responses_are_reported_by_name() -> None:
     session, cable, _ = opened(ResponseCode.OK, 0x200F)
     with pytest.raises(DeviceRefused, match=r"scripted.*ACCESS_DENIED \(0x200f\)"):
         session.call(Operation.EOS_KEEP_DEVICE_ON)
-    assert len(cable.asked) == 2
+    assert len(cable.requests) == 2
 
 
 Read = Callable[[bytes], object]
@@ -263,7 +263,7 @@ EVERY = pytest.mark.parametrize(
 
 
 def outcome(read: Read, data: bytes) -> object:
-    """Return what is read, or ProtocolError; let anything else through."""
+    """Return the value or ProtocolError; other errors are raised."""
     try:
         return read(data)
     except ProtocolError:
@@ -276,7 +276,7 @@ PLAIN = [row for row in READERS if not row[0].startswith("GetEvent")]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("read", "octets"), [row[1:] for row in PLAIN], ids=[row[0] for row in PLAIN])
-def test_cut_short_at_any_byte(read: Read, octets: bytes) -> None:
+def test_truncation_at_any_byte(read: Read, octets: bytes) -> None:
     assert outcome(read, octets) is not ProtocolError
     for length in range(1, len(octets)):
         assert outcome(read, octets[:length]) is ProtocolError, length
@@ -284,14 +284,14 @@ def test_cut_short_at_any_byte(read: Read, octets: bytes) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("read", "octets"), [row[1:] for row in STREAMS], ids=[row[0] for row in STREAMS])
-def test_a_stream_cut_short_waits(read: Read, octets: bytes) -> None:
+def test_truncated_stream_waits(read: Read, octets: bytes) -> None:
     for length in range(len(octets)):
         assert outcome(read, octets[:length]) is not ProtocolError
 
 
 @pytest.mark.slow
 @EVERY
-def test_any_byte_flipped(read: Read, octets: bytes) -> None:
+def test_flipped_byte_gives_a_value_or_an_error(read: Read, octets: bytes) -> None:
     for place in range(len(octets)):
         for flip in (0x01, 0x80, 0xFF):
             damaged = bytearray(octets)
@@ -301,7 +301,7 @@ def test_any_byte_flipped(read: Read, octets: bytes) -> None:
 
 @pytest.mark.slow
 @EVERY
-def test_any_number_inflated(read: Read, octets: bytes) -> None:
+def test_inflated_number_gives_a_value_or_an_error(read: Read, octets: bytes) -> None:
     for place in range(len(octets) - 3):
         for number in (0, 0x7FFFFFFF, 0xFFFFFFFF, len(octets) + 1):
             damaged = octets[:place] + number.to_bytes(4, "little") + octets[place + 4 :]
@@ -310,7 +310,7 @@ def test_any_number_inflated(read: Read, octets: bytes) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("read", [read for _, read, _ in ALL], ids=[name for name, *_ in ALL])
-def test_any_bytes(read: Read) -> None:
+def test_any_bytes_give_a_value_or_an_error(read: Read) -> None:
     @settings(max_examples=60)
     @given(st.binary(max_size=200))
     @example(b"")
@@ -323,7 +323,7 @@ def test_any_bytes(read: Read) -> None:
 
 @pytest.mark.slow
 @EVERY
-def test_no_count_makes_memory(read: Read, octets: bytes) -> None:
+def test_counts_do_not_allocate_memory(read: Read, octets: bytes) -> None:
     damaged = [octets[:place] + b"\xff\xff\xff\x0f" + octets[place + 4 :] for place in range(len(octets) - 3)]
     tracemalloc.start()
     try:
@@ -350,7 +350,7 @@ def payload(transaction: Recorded) -> bytes:
     return bytes.fromhex(transaction["data"] or "")
 
 
-def test_every_dataset_is_rebuilt_to_the_byte(recording: list[Recorded]) -> None:
+def test_recorded_datasets_are_rebuilt_exactly(recording: list[Recorded]) -> None:
     rebuilt = 0
     for number, entry in enumerate(recording):
         if entry["data"] is not None:
@@ -360,7 +360,7 @@ def test_every_dataset_is_rebuilt_to_the_byte(recording: list[Recorded]) -> None
     assert (len(recording), rebuilt) == (70, 48)
 
 
-def test_commands_are_the_bytes_that_the_host_sent(recording: list[Recorded]) -> None:
+def test_commands_match_the_recorded_host(recording: list[Recorded]) -> None:
     # The host's first four commands, container by container, written from the recording's numbers by hand.
     written = ["10000000 0100 0210 00000000 01000000", "0c000000 0100 0110 01000000"]
     written += ["10000000 0100 1491 02000000 01000000", "10000000 0100 1491 03000000 01000000"]

@@ -39,7 +39,7 @@ MESSAGES = st.one_of(
 
 
 def joined(messages: Iterable[Message]) -> list[Message]:
-    """Return the messages with the pieces of each data phase put together."""
+    """Return the messages with the pieces of each data phase joined."""
     result: list[Message] = []
     for message in messages:
         before = result[-1] if result else None
@@ -50,7 +50,7 @@ def joined(messages: Iterable[Message]) -> list[Message]:
     return result
 
 
-def test_commands_are_the_standards_bytes() -> None:
+def test_commands_match_the_standards_bytes() -> None:
     # USB Still Image 1.0, 7.1.1: length, type, code, transaction, parameters.
     assert container.encode(PtpRequest(Operation.OPEN_SESSION, 0, (1,))) == bytes.fromhex(
         "10000000 0100 0210 00000000 01000000"
@@ -61,7 +61,7 @@ def test_commands_are_the_standards_bytes() -> None:
     )
 
 
-def test_a_transaction_as_the_60d_sends_it() -> None:
+def test_reads_a_transaction_of_the_60d() -> None:
     assert joined(ContainerReader().feed(examples.USB_STREAM)) == [
         PtpRequest(Operation.GET_DEVICE_PROP_DESC, 22, (0x5001,)),
         DataStart(Operation.GET_DEVICE_PROP_DESC, 22, 20),
@@ -71,7 +71,7 @@ def test_a_transaction_as_the_60d_sends_it() -> None:
     ]
 
 
-def test_empty_packets_are_passed_over() -> None:
+def test_ignores_empty_packets() -> None:
     reader = ContainerReader()
     phase = container.encode_data_header(0x1009, 5, 500) + bytes(500)
     assert container.ends_with_empty_packet(len(phase), 512)
@@ -82,7 +82,7 @@ def test_empty_packets_are_passed_over() -> None:
 
 @pytest.mark.parametrize("alone", [True, False])
 @pytest.mark.parametrize("length", [0, 1, 499, 500, 501, 512, 1024, 1500])
-def test_a_phase_of_unknown_length_ends_with_a_short_packet(length: int, alone: bool) -> None:
+def test_short_packet_ends_a_phase_of_unknown_length(length: int, alone: bool) -> None:
     header, payload = container.encode_data_header(0x1009, 5, None), bytes(range(256)) * 6
     payload = payload[:length]
     transfers = [header, payload] if alone else [header + payload]
@@ -98,7 +98,7 @@ def test_a_phase_of_unknown_length_ends_with_a_short_packet(length: int, alone: 
 
 
 @pytest.mark.parametrize(
-    ("octets", "says"),
+    ("octets", "reason"),
     [
         ("0b000000 0100 0210 00000000", "command container of 11 bytes"),
         ("0d000000 0300 0120 00000000 00", "response container of 13 bytes"),
@@ -109,11 +109,11 @@ def test_a_phase_of_unknown_length_ends_with_a_short_packet(length: int, alone: 
         ("0c000000 0500 0210 00000000", "container of type 5"),
     ],
 )
-def test_what_is_no_container_is_named(octets: str, says: str) -> None:
+def test_refuses_invalid_containers(octets: str, reason: str) -> None:
     reader = ContainerReader()
-    with pytest.raises(ProtocolError, match=says):
+    with pytest.raises(ProtocolError, match=reason):
         reader.feed(bytes.fromhex(octets))
-    with pytest.raises(ProtocolError, match=says):
+    with pytest.raises(ProtocolError, match=reason):
         reader.feed(container.encode(PtpResponse(0x2001, 5)))
 
 
@@ -121,7 +121,7 @@ def test_what_is_no_container_is_named(octets: str, says: str) -> None:
     st.lists(st.one_of(MESSAGES, st.tuples(U16, U32, st.binary(max_size=600))), max_size=6),
     st.lists(st.integers(0, 10_000), max_size=12),
 )
-def test_any_split_gives_the_same_messages(
+def test_messages_do_not_depend_on_splitting(
     items: list[PtpRequest | PtpResponse | PtpEvent | tuple[int, int, bytes]], cuts: list[int]
 ) -> None:
     stream, expected = b"", list[Message]()
@@ -136,7 +136,7 @@ def test_any_split_gives_the_same_messages(
     assert joined(message for piece in split(stream, cuts) for message in reader.feed(piece)) == expected
 
 
-def test_control_requests_are_the_standards_bytes() -> None:
+def test_control_requests_match_the_standards_bytes() -> None:
     # USB Still Image 1.0, 5.2.1 and 5.2.4.
     assert container.encode_cancel(5) == bytes.fromhex("0140 05000000")
     assert container.decode_cancel(bytes.fromhex("0140 05000000")) == 5
@@ -165,7 +165,7 @@ class TestOverMemory(TransportContract):
 
 
 class Script:
-    """Pipes that note what is written and read out what was put down; b"" is an empty packet, an error is raised."""
+    """Pipes that record writes and return scripted reads; b"" is an empty packet, an error is raised."""
 
     label = "the camera"
     packet_size = 512
@@ -229,7 +229,7 @@ def get(script: Script) -> bytes:
     return over(script).transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).data
 
 
-def test_data_are_one_container_closed_by_an_empty_packet_when_full() -> None:
+def test_full_data_container_ends_with_an_empty_packet() -> None:
     script = Script(OK)
     over(script).transact(PtpRequest(0x9110, 5), send=bytes(500), timeout=PATIENCE_S)
     header = bytes.fromhex("00020000 0200 1091 05000000")
@@ -239,7 +239,7 @@ def test_data_are_one_container_closed_by_an_empty_packet_when_full() -> None:
     assert script.written[1:] == [b"\x01" + header[1:] + bytes(501)]
 
 
-def test_the_tail_is_read_in_whole_packets() -> None:
+def test_reads_the_end_in_whole_packets() -> None:
     size = 12 + 1_000_000
     script = Script(
         data(size, bytes(500)),
@@ -254,20 +254,20 @@ def test_the_tail_is_read_in_whole_packets() -> None:
     assert script.limits == [512, 524288, 475_136, 512, 512]
 
 
-def test_one_stall_is_cleared_and_the_read_repeated() -> None:
+def test_repeats_a_read_after_one_stall() -> None:
     script = Script(STALL, OK)
     assert get(script) == b""
     assert script.written[1:] == [Pipe.BULK_IN]
 
 
-def test_a_second_stall_is_an_error() -> None:
+def test_second_stall_is_an_error() -> None:
     script = Script(STALL, STALL, OK)
     with pytest.raises(ProtocolError):
         get(script)
 
 
 @pytest.mark.parametrize("transfer", [0, 1, 2])
-def test_a_stall_on_the_way_out_is_tried_again(transfer: int) -> None:
+def test_repeats_a_write_after_one_stall(transfer: int) -> None:
     bench = Echo()
     pipes = Stalling(open_usb(backend=SimulatedBus(PtpUsbDevice(bench))), Pipe.BULK_OUT, {transfer})
     transport = UsbTransport(pipes, SimulatedClock())
@@ -276,32 +276,32 @@ def test_a_stall_on_the_way_out_is_tried_again(transfer: int) -> None:
         assert done.response.parameters[0] == 500
 
 
-def test_endless_empty_packets_are_an_error() -> None:
+def test_refuses_endless_empty_packets() -> None:
     with pytest.raises(ProtocolError):
         get(Script(*[b""] * 100))
 
 
 @pytest.mark.parametrize(
-    ("reads", "wrong"),
+    ("reads", "reason"),
     [
         ((data(100, bytes(88))[:4] + bytes.fromhex("0200 1691 06000000") + bytes(88), OK), "transaction 6"),
         ((data(13, b"a"), data(13, b"a"), OK), "second data phase"),
-        ((bytes.fromhex("0c000000 0400 0120 05000000"),), "where a response was due"),
+        ((bytes.fromhex("0c000000 0400 0120 05000000"),), "a response was expected"),
         ((b"garbage that is no container at all",), "container"),
     ],
 )
-def test_what_ptp_does_not_allow_is_refused(reads: tuple[bytes, ...], wrong: str) -> None:
-    with pytest.raises(ProtocolError, match=wrong):
+def test_refuses_protocol_violations(reads: tuple[bytes, ...], reason: str) -> None:
+    with pytest.raises(ProtocolError, match=reason):
         get(Script(*reads))
 
 
-def test_a_device_that_succeeds_with_half_the_data_is_not_believed() -> None:
+def test_refuses_success_with_half_the_data() -> None:
     # A short packet cannot end a container whose length is known: what follows is taken for its payload.
     with pytest.raises((ProtocolError, LinkTimeout)):
         get(Script(data(2000, bytes(100)), OK))
 
 
-def test_events_are_joined_from_packets_of_eight() -> None:
+def test_joins_events_from_packets_of_eight_bytes() -> None:
     # As an EOS sends them: 16 bytes in two packets, 12 in two.
     script = Script(
         events=(
@@ -314,7 +314,7 @@ def test_events_are_joined_from_packets_of_eight() -> None:
     assert over(script).events() == (PtpEvent(0xC101, 0xFFFFFFFF, (42,)), PtpEvent(0xC102, 5))
 
 
-def test_garbage_on_the_interrupt_pipe_is_told_once() -> None:
+def test_reports_garbage_on_the_interrupt_pipe_once() -> None:
     script = Script(events=(b"\xff" * 8, b"\xff" * 8))
     transport = over(script)
     with pytest.raises(ProtocolError):
@@ -323,7 +323,7 @@ def test_garbage_on_the_interrupt_pipe_is_told_once() -> None:
     assert transport.events() == (PtpEvent(0xC101, 5),)
 
 
-def test_reset_asks_the_class_and_waits_until_the_device_is_ready() -> None:
+def test_reset_waits_until_the_device_is_ready() -> None:
     # 5.2.3 and 5.2.4: reset, then status until it is no longer busy.
     script = Script(status=bytes.fromhex("0400 0120"))
     transport = over(script)
@@ -331,7 +331,7 @@ def test_reset_asks_the_class_and_waits_until_the_device_is_ready() -> None:
     assert script.written == [(0x66, b""), (0x67, b""), Pipe.BULK_OUT, Pipe.BULK_IN]
 
 
-def test_a_device_that_stays_busy_has_its_port_reset() -> None:
+def test_resets_the_port_of_a_busy_device() -> None:
     script = Script(status=bytes.fromhex("0400 1920"))
     clock = SimulatedClock()
     UsbTransport(script, clock).reset()
@@ -339,7 +339,7 @@ def test_a_device_that_stays_busy_has_its_port_reset() -> None:
     assert b"port reset" in script.written
 
 
-def test_a_caller_who_cannot_take_data_cancels() -> None:
+def test_cancels_if_the_caller_cannot_accept_data() -> None:
     def full(piece: bytes) -> None:
         raise KeyboardInterrupt
 
@@ -363,7 +363,7 @@ def _give_twice(transport: UsbTransport, pieces: list[bytes]) -> None:
 
 
 @given(after=st.integers(0, 3100))
-def test_pulled_out_at_any_byte_is_closed(after: int) -> None:
+def test_unplugged_at_any_byte_is_closed(after: int) -> None:
     pieces: list[bytes] = []
     transport = UsbTransport(CutOff(camera(), after), SimulatedClock())
     with pytest.raises(LinkClosed):
@@ -372,14 +372,14 @@ def test_pulled_out_at_any_byte_is_closed(after: int) -> None:
 
 
 @given(reads=st.integers(0, 3))
-def test_silence_at_any_read_is_a_timeout(reads: int) -> None:
+def test_missing_read_is_a_timeout(reads: int) -> None:
     transport = UsbTransport(Deaf(camera(), reads), SimulatedClock())
     with pytest.raises(LinkTimeout):
         transport.transact(PtpRequest(GIVE, 1, (3000,)), timeout=PATIENCE_S)
 
 
 @given(at=st.integers(0, 11), value=st.integers(0, 255))
-def test_a_garbled_byte_in_a_response_is_never_taken_for_another_message(at: int, value: int) -> None:
+def test_refuses_a_response_with_a_changed_byte(at: int, value: int) -> None:
     def change(read: bytes) -> bytes:
         return read[:at] + bytes([value]) + read[at + 1 :]
 
@@ -395,7 +395,7 @@ def test_a_garbled_byte_in_a_response_is_never_taken_for_another_message(at: int
 
 
 @pytest.mark.slow
-def test_a_flood_of_events_does_not_keep_us() -> None:
+def test_limits_the_events_of_one_call() -> None:
     transport = UsbTransport(camera(), SimulatedClock())
     transport.transact(PtpRequest(RAISE, 1, (5000,)), timeout=PATIENCE_S)
     assert len(transport.events()) == 4096

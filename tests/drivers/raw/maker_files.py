@@ -24,20 +24,20 @@ ROWS, COLUMNS = 48, 80
 
 
 def counts_of(bits: int) -> Counts:
-    """Return counts around a dark level in a frame of (ROWS, COLUMNS), that need so many bits."""
+    """Return counts of `bits` bits around a dark level, (ROWS, COLUMNS)."""
     top = (1 << bits) - 1
     return np.random.default_rng(bits).integers(top // 8, top, (ROWS, COLUMNS)).astype(np.uint16)
 
 
 def packed(counts: Counts, bits: int, *, least_first: bool = False) -> bytes:
-    """Return counts of `bits` bits one behind the other: most significant bit first, or least."""
+    """Return counts of `bits` bits without gaps, most or least significant bit first."""
     places = np.arange(bits) if least_first else np.arange(bits - 1, -1, -1)
     stream = (counts.ravel()[:, None] >> places & 1).astype(np.uint8).ravel()
     return np.packbits(stream, bitorder="little" if least_first else "big").tobytes()
 
 
 def in_words(pixels: bytes) -> bytes:
-    """Return bytes as Olympus stores them: each four the other way round."""
+    """Return bytes as Olympus stores them: each group of four reversed."""
     return np.frombuffer(pixels, ">u4").astype("<u4").tobytes()
 
 
@@ -61,7 +61,7 @@ def in_maker_tiff(maker: str, model: str, pixels: bytes, more: Tags, magic: byte
 
 
 def raf(bits: int = 16, seed: int = 14) -> tuple[bytes, Counts]:
-    """Return a RAF whose pixels of 16 bits stand in a TIFF of their own."""
+    """Return a RAF with pixels of 16 bits in an inner TIFF."""
     counts = np.random.default_rng(seed).integers(2048, 16383, (ROWS, COLUMNS)).astype(np.uint16)
     inner = tiff_bytes(
         {0xF001: longs(COLUMNS), 0xF002: longs(ROWS), 0xF003: longs(bits), 0xF008: longs(2 * counts.size)},
@@ -78,8 +78,8 @@ def raf(bits: int = 16, seed: int = 14) -> tuple[bytes, Counts]:
 
 
 CANON = bytes.fromhex("85c0b687820f11e08111f4ce462b6a48")
+# Invented: first column, first row, last column, last row.
 LEFT, UPPER = (0, 0, 255, 4055), (264, 0, 6287, 27)
-"""Made up: first column, first row, last column, last row."""
 
 
 def box(kind: bytes, *content: bytes) -> bytes:
@@ -108,12 +108,12 @@ def areas(left: tuple[int, ...] = LEFT, upper: tuple[int, ...] = UPPER) -> bytes
 
 
 SIDES = 6288, 4056
+# Stated bytes of pixels, which no file contains; checks of boxes do not read them.
 PIXELS = 5_000_000
-"""Bytes of pixels, which stand in none of these files: no check of boxes looks at them."""
 
 
 def track(iad1: bytes, entry: bytes = b"CRAW", size: tuple[int, int] = SIDES, *places: bytes) -> bytes:
-    """Return a track; IAD1 stands in CDI1, behind CMP1, in a sample entry of 82 bytes and boxes."""
+    """Return a track; its sample entry has 82 bytes and the boxes CMP1 and CDI1 with IAD1."""
     cmp1 = (bytes(8) + struct.pack(">II", *size)).ljust(0x34, b"\0")
     sample = box(
         entry, bytes(82), box(b"CMP1", cmp1), box(b"CDI1", bytes(4), box(b"IAD1", iad1)), box(b"free", b"\0\0")
@@ -141,7 +141,7 @@ def cr3(model: str = "Canon EOS M50", *tracks: bytes, pixels: bytes = bytes(64))
 
 
 def maker_files() -> dict[str, tuple[bytes, Counts]]:
-    """Return a file of each layout that is checked and the counts that it holds, by name."""
+    """Return a file of each checked layout with its counts, by name."""
     full, wide, tones = counts_of(14), counts_of(16), counts_of(12)
     plain, twelve = full.astype("<u2").tobytes(), packed(tones, 12)
     rows_of_blocks = b"".join(packed(row, 14, least_first=True).ljust(144, b"\0") for row in full)

@@ -1,7 +1,7 @@
-"""Makes raw files by hand, with any counts: CR2 as Canon lays it out, DNG and other TIFF with any tags.
+"""Creates raw files with any counts: CR2 in Canon's layout, DNG and other TIFF with any tags.
 
 Sources: TIFF 6.0; ITU-T T.81 annex H (lossless JPEG, predictor 1); DNG 1.4; CR2: the fourth directory holds the raw
-strip, cut in slices by tag 50752.
+strip, in slices by tag 50752.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+# TIFF tags: code to type, number of values, and bytes of the values.
 Tags = dict[int, tuple[int, int, bytes]]
-"""TIFF tags: code to type, number of values, and the values' bytes."""
 
 
 def write_cr2(
@@ -23,7 +23,7 @@ def write_cr2(
     iso: int = 100,
     slices: tuple[int, int, int] | None = None,
 ) -> None:
-    """Write a CR2, as `cr2_bytes` makes it."""
+    """Write the CR2 of `cr2_bytes`."""
     path.write_bytes(cr2_bytes(counts, model, iso, slices))
 
 
@@ -32,7 +32,7 @@ def cr2_bytes(
 ) -> bytes:
     """Return a CR2; `counts` is (H, W) uint16 of the whole sensor, W even, below 2**14.
 
-    `slices` are their number without the last, their width, and that of the last; None: one slice.
+    `slices`: number without the last, width, and width of the last; None for one slice.
     """
     width = counts.shape[1]
     number, each, last = slices or (0, 0, width)
@@ -81,16 +81,16 @@ def text(value: str) -> tuple[int, int, bytes]:
 
 
 def write_dng(path: Path, counts: NDArray[np.uint16], more: Tags | None = None, strip: bytes | None = None) -> None:
-    """Write a DNG, as `dng_bytes` makes it."""
+    """Write the DNG of `dng_bytes`."""
     path.write_bytes(dng_bytes(counts, more, strip))
 
 
 def dng_bytes(
     counts: NDArray[np.uint16], more: Tags | None = None, strip: bytes | None = None, place: int | None = 273
 ) -> bytes:
-    """Return a DNG of `counts` (H, W) uint16, RGGB unless `more` has it otherwise; uncompressed unless `strip` is.
+    """Return a DNG of `counts` (H, W) uint16, RGGB unless `more` changes it; uncompressed without `strip`.
 
-    `place`: the tag that says where the pixels begin; None where `more` says it.
+    `place`: tag of the position of the pixels; None if `more` has it.
     """
     height, width = counts.shape
     tags: Tags = {
@@ -116,7 +116,7 @@ def dng_bytes(
 def tiff_bytes(
     tags: Tags, pixels: bytes, magic: bytes = b"II*\0", place_tag: int | None = 273, through: int | None = None
 ) -> bytes:
-    """Return a TIFF of one directory, its pixels behind it; `through`: a tag of a first one that points to that one."""
+    """Return a TIFF of one directory and pixels; `through`: a tag of an outer directory that points to it."""
     tags = {279: longs(len(pixels)), **tags, **({} if place_tag is None else {place_tag: longs(0)})}
     first = b"" if through is None else _directory({through: longs(8 + 18)}, 8, 0)
     start = 8 + len(first)
@@ -134,7 +134,7 @@ def lossless_jpeg(counts: NDArray[np.uint16]) -> bytes:
     predicted[1:, 0] = signed[:-1, 0]
     predicted[0, 0] = 1 << 13
     difference = (signed - predicted).reshape(height, width)
-    # Rows that all grow alike have the same code: one is worked out, which makes a whole sensor a matter of a second.
+    # Rows with equal differences have the same code and are encoded once, so a whole sensor takes about 1 s.
     alike = bool((difference == difference[0]).all())
     one = (difference[0] if alike else difference).ravel()
     size = np.zeros(one.shape, np.int32)
@@ -160,7 +160,7 @@ def lossless_jpeg(counts: NDArray[np.uint16]) -> bytes:
 
 
 def _bits(values: NDArray[np.int64], lengths: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Return `values` one after the other, each in its own number of bits, most significant first."""
+    """Return the bits of `values`, each with its own length, most significant first."""
     places = np.arange(int(lengths.max()) - 1, -1, -1)
     return (((values[:, None] >> places) & 1).astype(np.uint8))[places < lengths[:, None]]
 

@@ -1,4 +1,4 @@
-"""Damage inside a lossless JPEG is seen, which LibRaw decodes over; whole streams of two encoders are none."""
+"""Detection of damage inside a lossless JPEG, which LibRaw ignores; complete streams of two encoders are accepted."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ FLAT: Counts = np.full((64, 96), 2048, np.uint16)
 
 
 def by_imagecodecs(counts: Counts) -> bytes:
-    """Return counts as another encoder writes them: one component, Huffman codes of the picture's own."""
+    """Return the stream of another encoder: one component, Huffman codes of the image."""
     return bytes(imagecodecs.ljpeg_encode(counts, bitspersample=14))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("encode", [lossless_jpeg, by_imagecodecs])
 @pytest.mark.parametrize("counts", [NOISE, RAMP, FLAT], ids=["noise", "ramp", "flat"])
-def test_whole_streams_are_whole(counts: Counts, encode: Callable[[Counts], bytes]) -> None:
+def test_accepts_complete_streams(counts: Counts, encode: Callable[[Counts], bytes]) -> None:
     stream = encode(counts)
     assert lossless_fault(stream) is None
     # Whole words, or a sector, behind the last sample.
@@ -45,7 +45,7 @@ def test_whole_streams_are_whole(counts: Counts, encode: Callable[[Counts], byte
 
 @pytest.mark.parametrize("encode", [lossless_jpeg, by_imagecodecs])
 @pytest.mark.parametrize("counts", [NOISE, RAMP], ids=["noise", "ramp"])
-def test_zeroed_bytes_are_seen_wherever_they_are(counts: Counts, encode: Callable[[Counts], bytes]) -> None:
+def test_detects_zeroed_bytes_anywhere(counts: Counts, encode: Callable[[Counts], bytes]) -> None:
     stream = encode(counts)
     begin = stream.index(b"\xff\xda") + 14
     missed = [
@@ -57,24 +57,24 @@ def test_zeroed_bytes_are_seen_wherever_they_are(counts: Counts, encode: Callabl
 
 
 @pytest.mark.parametrize("cut", [1, 3, 50, 3000])
-def test_a_stream_that_ends_early_is_seen(cut: int) -> None:
+def test_detects_a_truncated_stream(cut: int) -> None:
     stream = lossless_jpeg(NOISE)
-    assert re.search("ends before|no code", lossless_fault(stream[: -2 - cut]) or "")
+    assert re.search("ends before|not a code", lossless_fault(stream[: -2 - cut]) or "")
 
 
-def test_bytes_that_are_too_many_are_seen() -> None:
+def test_detects_extra_bytes() -> None:
     stream = lossless_jpeg(NOISE)
-    assert "goes on" in (lossless_fault(stream[:-2] + stream[-200:]) or "")
+    assert "continues" in (lossless_fault(stream[:-2] + stream[-200:]) or "")
 
 
 @given(st.integers(0, 400), st.binary(max_size=6))
-def test_whatever_the_header_says_is_no_traceback(at: int, words: bytes) -> None:
+def test_any_header_gives_no_exception(at: int, words: bytes) -> None:
     stream = lossless_jpeg(NOISE[:4])
     lossless_fault(stream[:at] + words + stream[at + len(words) :])
     lossless_fault(stream[:at])
 
 
-def test_other_jpegs_are_not_looked_at() -> None:
+def test_ignores_other_jpegs() -> None:
     assert lossless_fault(b"") is None
     assert lossless_fault(bytes(imagecodecs.jpeg8_encode(np.zeros((8, 8), np.uint8)))) is None
 
@@ -84,21 +84,21 @@ def test_other_jpegs_are_not_looked_at() -> None:
     [
         (b"\xff\xd8\xff", b"\xff\xd8\xff\xdd\0\x04\0\x08\xff", "restart intervals"),
         (b"\2\1\0\2\x10\1\0\0", b"\2\1\0\2\x10\1\0\2", "point transform"),
-        (b"\2\1\0\2\x10\1\0\0", b"\2\1\0\2\x10\x08\0\0", "no encoder writes"),
-        (b"\2\1\0\2\x10\1\0\0", b"\2\1\0\2\x30\1\0\0", "no encoder writes"),
-        (b"\2\1\0\2\x10\1\0\0", b"\1\1\0\1\0\0\0\0", "no encoder writes"),
+        (b"\2\1\0\2\x10\1\0\0", b"\2\1\0\2\x10\x08\0\0", "invalid header"),
+        (b"\2\1\0\2\x10\1\0\0", b"\2\1\0\2\x30\1\0\0", "invalid header"),
+        (b"\2\1\0\2\x10\1\0\0", b"\1\1\0\1\0\0\0\0", "invalid header"),
     ],
     ids=["restart", "transform", "predictor", "a table that is not there", "a component that is not there"],
 )
-def test_what_no_maker_writes_is_refused(old: bytes, new: bytes, reason: str) -> None:
+def test_refuses_unusual_headers(old: bytes, new: bytes, reason: str) -> None:
     stream = lossless_jpeg(NOISE)
     assert old in stream
     assert reason in (lossless_fault(stream.replace(old, new, 1)) or "")
 
 
 @pytest.mark.parametrize("predictor", range(1, 8))
-def test_samples_are_predicted_as_the_standard_says(predictor: int) -> None:
-    """T.81, table H.1, in numpy: where the predictor is another one, samples leave their precision."""
+def test_predictors_match_the_standard(predictor: int) -> None:
+    """T.81, table H.1, in numpy; with a wrong predictor samples exceed their precision."""
     counts = NOISE.astype(np.int64)
     left, up, corner = (np.roll(counts, shift, axes) for shift, axes in (((1), 1), ((1), 0), ((1, 1), (0, 1))))
     predicted = {
@@ -127,7 +127,7 @@ def _stream_of(differences: NDArray[np.int64], predictor: int) -> bytes:
     return one + scan + data + b"\xff\xd9"
 
 
-def test_files_are_refused_with_that_reason(tmp_path: Path) -> None:
+def test_refuses_files_with_a_damaged_stream(tmp_path: Path) -> None:
     strip = lossless_jpeg(np.tile(NOISE, (4, 4)))
     write_dng(
         tmp_path / "a.dng", np.tile(NOISE, (4, 4)), {259: shorts(7), 258: shorts(14), 279: longs(len(strip))}, strip

@@ -1,4 +1,4 @@
-"""What every kind of raw file, whole or damaged, is read as, and what is written of one, byte by byte."""
+"""Pinned results for every kind of raw file, complete or damaged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 from drivers.raw import rawfile
 from drivers.raw.rawfile import CHANNELS, Mosaic, decode_raw, filled_fault, frame_black, plane_of
-from drivers.raw.storage import Stored
+from drivers.raw.storage import StoredFrame
 from drivers.tiff import TiffDamaged, TiffTag, read_directories
 from foundation.errors import FormatError
 from tests.data_files import shipped
@@ -32,58 +32,58 @@ PLACES = box(b"stsz", struct.pack(">III", 0, 4000, 1)), box(b"co64", struct.pack
 BOXES = cr3("Canon EOS R", track(areas(), b"CRAW", (80, 48), *PLACES), pixels=np.random.default_rng(1).bytes(4000))
 
 
-def said(ask: Callable[[], Any]) -> Any:
-    """Return an answer, or that there is none."""
+def result(read: Callable[[], Any]) -> Any:
+    """Return the result, or a record of the refusal."""
     try:
-        return ask()
+        return read()
     except (FormatError, TiffDamaged):
         return {"refused": 1}
 
 
-def stored(frame: Stored) -> dict[str, Any]:
+def stored(frame: StoredFrame) -> dict[str, Any]:
     """Return the fields of a stored frame without its directory."""
-    return {one.name: getattr(frame, one.name) for one in fields(frame) if one.name != "directory"}
+    return {item.name: getattr(frame, item.name) for item in fields(frame) if item.name != "directory"}
 
 
 def contents(data: bytes) -> Any:
-    """Return the numbers of a file's frames and directories."""
+    """Return the frames and directory values of a file."""
 
-    def ask() -> Any:
-        found = rawfile._examined(Path("case"), data)
-        fault = rawfile._lossless_fault(data, found)
+    def read() -> Any:
+        structure = rawfile._read_contents(Path("case"), data)
+        fault = rawfile._lossless_fault(data, structure)
         if fault is not None:
-            raise rawfile._unreadable(Path("case"), fault)
-        values = [value for one in found.directories for _, value in sorted(one.values.items())]
-        return {"frames": [*map(stored, found.frames)], "values": values}
+            raise rawfile._unreadable_error(Path("case"), fault)
+        values = [value for directory in structure.directories for _, value in sorted(directory.values.items())]
+        return {"frames": [*map(stored, structure.frames)], "values": values}
 
-    return said(ask)
+    return result(read)
 
 
-def seen(mosaic: Mosaic) -> dict[str, Any]:
-    """Return all that is asked of a frame."""
+def measured(mosaic: Mosaic) -> dict[str, Any]:
+    """Return all results computed from a frame."""
     black = frame_black(mosaic)
     planes = [plane_of(mosaic, channel) for channel in CHANNELS]
 
-    def lean(found: Any) -> Any:
-        """Return an array, of a large one every so many a value."""
-        shape: tuple[int, ...] = getattr(found, "shape", ())
-        return found[::13, ::11] if np.prod(shape) > 100_000 else found
+    def thinned(value: Any) -> Any:
+        """Return an array; of a large one only some elements."""
+        shape: tuple[int, ...] = getattr(value, "shape", ())
+        return value[::13, ::11] if np.prod(shape) > 100_000 else value
 
     return {
-        **{one.name: lean(getattr(mosaic, one.name)) for one in fields(mosaic) if one.name != "sensor"},
-        "beside": lean(mosaic.sensor) if mosaic.masked else mosaic.sensor.shape,
+        **{item.name: thinned(getattr(mosaic, item.name)) for item in fields(mosaic) if item.name != "sensor"},
+        "beside": thinned(mosaic.sensor) if mosaic.masked else mosaic.sensor.shape,
         "masked black": mosaic.masked_black(),
         "saturation": mosaic.saturation(),
         "exposure": mosaic.origin.exposure,
         "strongest": [rawfile.strongest_channel(mosaic, black, every) for every in (1, 8, 16)],
-        "planes": np.stack([lean(plane.values) for plane in planes]),
+        "planes": np.stack([thinned(plane.values) for plane in planes]),
         "offsets": [plane.offset_px for plane in planes],
         "filled": filled_fault(mosaic.counts, mosaic.black, mosaic.white_level) is not None,
     }
 
 
 @pytest.mark.slow
-def test_files_of_every_maker_are_read_as_before(pinned: Pinned) -> None:
+def test_files_of_every_maker_match_the_pins(pinned: Pinned) -> None:
     files = {name: data for name, (data, _) in maker_files().items()} | REAL
     files["cr2 in slices"] = cr2_bytes(FULL, "Canon EOS 6D", 400, (2, 30, 20))
     files["dng, active and masked"] = dng_bytes(
@@ -99,12 +99,12 @@ def test_files_of_every_maker_are_read_as_before(pinned: Pinned) -> None:
     files["dng in tiles of nothing"] = dng_bytes(np.zeros((40, 300), np.uint16))
     pinned(
         "raw files",
-        {name: said(lambda data=data: seen(decode_raw(data, Path("case")))) for name, data in files.items()},
+        {name: result(lambda data=data: measured(decode_raw(data, Path("case")))) for name, data in files.items()},
     )
 
 
 @pytest.mark.slow
-def test_damaged_files_are_told_as_before(pinned: Pinned) -> None:
+def test_damaged_files_match_the_pins(pinned: Pinned) -> None:
     files = {name: data for name, (data, _) in maker_files().items()} | {"cr3": BOXES}
     files["dng, active area"] = dng_bytes(TONES, {50829: longs(2, 4, 48, 80), 50830: longs(0, 0, 48, 4)})
     found: dict[str, Any] = {}
@@ -114,7 +114,7 @@ def test_damaged_files_are_told_as_before(pinned: Pinned) -> None:
     pinned("raw files with damage", found)
 
 
-def test_directories_of_all_types_are_read_as_before(pinned: Pinned) -> None:
+def test_directories_of_all_types_match_the_pins(pinned: Pinned) -> None:
     def one(order: str, tag: int, kind: int, count: int, value: bytes) -> bytes:
         place = value.ljust(4, b"\0") if len(value) <= 4 else struct.pack(order + "I", 26)
         head = (b"II" if order == "<" else b"MM") + struct.pack(order + "HIHHHI", 42, 8, 1, tag, kind, count)
@@ -128,6 +128,6 @@ def test_directories_of_all_types_are_read_as_before(pinned: Pinned) -> None:
     found: dict[str, Any] = {}
     for order, tag, kind, count in product("<>", tags, range(14), (1, 2)):
         data = one(order, tag, kind, count, value)
-        read = said(lambda data=data: [list(one.values.values()) for one in read_directories(data)])
+        read = result(lambda data=data: [list(one.values.values()) for one in read_directories(data)])
         found.setdefault(f"{order}{tag.name}", []).append(read)
     pinned("directories of all types", found)

@@ -1,4 +1,4 @@
-"""Raw files: real ones against dcraw's own output, made ones with odd margins, damaged ones."""
+"""Raw files: real files against dcraw's output, generated files with odd margins, damaged files."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from drivers.raw import rawfile
 from drivers.raw.rawfile import (
     LAYOUT_START,
     Mosaic,
-    body_and_lens,
     decode_raw,
     filled_fault,
     layout_is_known,
     read_raw,
+    read_serial_and_lens,
     stored_frames,
 )
 from drivers.raw.storage import Area
@@ -56,7 +56,7 @@ def noise(shape: tuple[int, int], top: int = 4096) -> NDArray[np.uint16]:
 
 
 def outcome(path: Path) -> Mosaic | FormatError:
-    """Return what reading gives; anything but these two fails the test."""
+    """Return the mosaic or the FormatError; other errors fail the test."""
     try:
         return read_raw(path)
     except FormatError as error:
@@ -67,7 +67,7 @@ def outcome(path: Path) -> Mosaic | FormatError:
 
 
 @pytest.mark.slow
-def test_counts_are_dcraws() -> None:
+def test_counts_equal_dcraw() -> None:
     # Measured with dcraw 9.28, -D -4 -T.
     for line in shipped("raw/dcraw_D4T.sha256").read_text().splitlines():
         digest, name, shape = line.split()
@@ -77,7 +77,7 @@ def test_counts_are_dcraws() -> None:
 
 
 @pytest.mark.slow
-def test_a_real_550d_file() -> None:
+def test_reads_a_real_550d_file() -> None:
     # Tags as exiftool and tifffile show them; the sensor's left border is black on a real sensor, near the 2048 counts
     # that Canon's bodies of this generation are set to.
     mosaic = read_raw(EOS_550D)
@@ -94,7 +94,7 @@ def test_a_real_550d_file() -> None:
 
 
 @pytest.mark.slow
-def test_a_real_g2_file() -> None:
+def test_reads_a_real_g2_file() -> None:
     mosaic = read_raw(G2)
     assert mosaic.camera == "Canon PowerShot G2"
     assert mosaic.pattern == "RGGB"
@@ -111,7 +111,7 @@ def test_a_real_g2_file() -> None:
 
 
 @pytest.mark.slow
-def test_a_550d_cr2_is_framed_as_dcraw_does(tmp_path: Path) -> None:
+def test_visible_area_of_a_550d_equals_dcraw(tmp_path: Path) -> None:
     # dcraw 9.28 shows raw[51:3516, 142:5344] as RGGB; LibRaw's own frame begins one row lower.
     columns = np.random.default_rng(2).integers(0, 2, 5344)
     columns[:2] = 1
@@ -129,7 +129,7 @@ def test_a_550d_cr2_is_framed_as_dcraw_does(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("maker", ["Canon", "Nikon"])
 @pytest.mark.parametrize(("top", "left"), [(0, 0), (1, 0), (0, 1), (13, 17), (12, 40)])
-def test_a_dng_is_framed_by_its_active_area(tmp_path: Path, maker: str, top: int, left: int) -> None:
+def test_visible_area_of_a_dng_is_its_active_area(tmp_path: Path, maker: str, top: int, left: int) -> None:
     # DNG 1.4: CFAPattern counts from the active area's corner, however odd that is.
     counts = noise((61, 90))
     more = {271: text(maker), 272: text("Test"), 50829: longs(top, left, 60, 88), 33422: (1, 4, b"\2\1\1\0")}
@@ -142,12 +142,12 @@ def test_a_dng_is_framed_by_its_active_area(tmp_path: Path, maker: str, top: int
     np.testing.assert_array_equal(mosaic.sensor, counts)
 
 
-def nobody(path: Path, data: bytes, contents: object) -> None:
-    """Stand in for the reader of plain files, and leave all to LibRaw."""
+def no_plain_mosaic(path: Path, data: bytes, contents: object) -> None:
+    """Replace the reader of plain files, so that LibRaw reads all files."""
 
 
-def asks_libraw(path: Path) -> bool:
-    """Return whether a file is decoded by LibRaw, or refused."""
+def uses_libraw(path: Path) -> bool:
+    """Return whether LibRaw decodes a file, or the file is refused."""
     asked: list[object] = []
 
     def imread(source: object) -> rawpy.RawPy:
@@ -177,7 +177,7 @@ _CODES = [b"\0\1\1\2", b"\1\0\2\1", b"\1\2\0\1", b"\2\1\1\0"]
     table=st.booleans(),
     maker=st.sampled_from(["Canon", "Nikon"]),
 )
-def test_a_plain_dng_is_what_libraw_reads(
+def test_plain_dng_equals_libraw(
     tmp_path: Path,
     size: tuple[int, int],
     code: bytes,
@@ -193,10 +193,10 @@ def test_a_plain_dng_is_what_libraw_reads(
         more[50712] = shorts(*range(0, 8192, 2))
     write_dng(tmp_path / "a.dng", noise(size), more)
     # A table of tones is LibRaw's to apply, a visible area that is not stated its to know.
-    assert asks_libraw(tmp_path / "a.dng") == (table or corner is None)
+    assert uses_libraw(tmp_path / "a.dng") == (table or corner is None)
     read = read_raw(tmp_path / "a.dng")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rawfile, "_plain_mosaic", nobody)
+        patch.setattr(rawfile, "_plain_mosaic", no_plain_mosaic)
         unpacked = read_raw(tmp_path / "a.dng")
     np.testing.assert_array_equal(read.sensor, unpacked.sensor)
     np.testing.assert_array_equal(read.black, unpacked.black)
@@ -208,7 +208,7 @@ def test_a_plain_dng_is_what_libraw_reads(
 
 
 @pytest.mark.slow
-def test_black_keeps_its_fraction_and_its_place(tmp_path: Path) -> None:
+def test_black_keeps_fraction_and_position(tmp_path: Path) -> None:
     # DNG 1.4: BlackLevel counts from the active area's corner; the deltas of columns and rows add to it.
     levels = ratios((20483, 10), (20495, 10), (2050, 1), (2051, 1))
     more = {50713: shorts(2, 2), 50714: levels, 50829: longs(3, 5, 40, 60)}
@@ -219,7 +219,7 @@ def test_black_keeps_its_fraction_and_its_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_masked_black_is_the_mean_of_each_phase(tmp_path: Path) -> None:
+def test_masked_black_is_the_mean_of_each_position(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     counts = np.full((201, 300), 4000, np.uint16)
     truth = np.array([[2047.25, 2048.0], [2049.5, 2046.75]])
@@ -256,7 +256,7 @@ def test_masked_black_is_the_mean_of_each_phase(tmp_path: Path) -> None:
     ],
     ids=["empty", "one byte", "four bytes", "empty TIFF", "text", "PNG", "JPEG", "zeros"],
 )
-def test_what_is_no_raw_file(tmp_path: Path, content: bytes, capfd: pytest.CaptureFixture[str]) -> None:
+def test_refuses_other_files(tmp_path: Path, content: bytes, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "frame.CR2").write_bytes(content)
     with pytest.raises(FormatError, match=r"frame\.CR2.*raw file"):
         read_raw(tmp_path / "frame.CR2")
@@ -264,7 +264,7 @@ def test_what_is_no_raw_file(tmp_path: Path, content: bytes, capfd: pytest.Captu
 
 
 @pytest.mark.slow
-def test_a_sensor_that_is_no_bayer_is_named_so(tmp_path: Path) -> None:
+def test_refuses_other_sensors(tmp_path: Path) -> None:
     counts = noise((60, 90))
     xtrans = bytes([1, 1, 0, 1, 1, 2] * 6)
     write_dng(tmp_path / "x.dng", counts, {33421: shorts(6, 6), 33422: (1, 36, xtrans)})
@@ -281,7 +281,7 @@ def test_a_sensor_that_is_no_bayer_is_named_so(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("real", REAL, ids=lambda real: real.name)
-def test_a_cut_file_is_an_error(tmp_path: Path, real: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_refuses_truncated_files(tmp_path: Path, real: Path, capfd: pytest.CaptureFixture[str]) -> None:
     data = real.read_bytes()
     # The last 58 bytes of blackmagic.dng pad the file; no tag points at them.
     whole = len(data) - (58 if real.name == "blackmagic.dng" else 0)
@@ -294,7 +294,7 @@ def test_a_cut_file_is_an_error(tmp_path: Path, real: Path, capfd: pytest.Captur
 
 
 @pytest.mark.slow
-def test_threads_decode_side_by_side(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_threads_decode_in_parallel(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     counts = noise((64, 96), 64)
     write_cr2(tmp_path / "good.CR2", counts, "Canon EOS 550D")
     data = (tmp_path / "good.CR2").read_bytes()
@@ -317,7 +317,7 @@ def test_threads_decode_side_by_side(tmp_path: Path, capfd: pytest.CaptureFixtur
 
 
 def canon_file(serial: int, lens: bytes) -> bytes:
-    """Return a CR2's directories by hand: the first one, Exif with the maker's note alone, Canon's note in it."""
+    """Return the directories of a CR2: the first one, Exif with only the maker note, Canon's note."""
 
     def directory(*entries: tuple[int, int, int, int]) -> bytes:
         rows = b"".join(struct.pack("<HHII", *entry) for entry in entries)
@@ -332,9 +332,9 @@ def canon_file(serial: int, lens: bytes) -> bytes:
 
 
 @pytest.mark.slow
-def test_serial_number_and_lens_of_a_canon_before_exif_2_3() -> None:
+def test_reads_canon_maker_note() -> None:
     data = canon_file(330101234, b"EF-S18-55mm f/3.5-5.6 IS\0")
-    assert body_and_lens(data, read_directories(data)) == ("330101234", "EF-S18-55mm f/3.5-5.6 IS")
+    assert read_serial_and_lens(data, read_directories(data)) == ("330101234", "EF-S18-55mm f/3.5-5.6 IS")
 
 
 SIDE = 128
@@ -352,7 +352,7 @@ def frame() -> NDArray[np.uint16]:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_whole_file_is_read_and_a_cut_one_is_not(name: str) -> None:
+def test_reads_complete_files_and_refuses_truncated_ones(name: str) -> None:
     data, counts = FILES[name]
     np.testing.assert_array_equal(decode_raw(data, WHERE).sensor, counts)
     for length in (0, 7, 12, 40, 200, len(data) // 2, len(data) - 40, len(data) - 1):
@@ -382,6 +382,8 @@ def one_strip(size: tuple[int, int], compression: int, bits: int, offset: int, b
     )
 
 
+# Pixel tags of real cameras, from the tag lists of drewnoakes/metadata-extractor-images. Invented: first positions
+# of the strips of the D200 and the tiles of the A7 IV, and the Samsung.
 STATED: dict[str, tuple[str, Directory]] = {
     "DSLR-A500": ("SONY", one_strip((4288, 2858), 32767, 12, 917504, 12255104)),
     "ILCE-7M3": ("SONY", one_strip((6048, 4024), 32767, 12, 458752, 24337152)),
@@ -412,13 +414,11 @@ STATED: dict[str, tuple[str, Directory]] = {
     "K-1 Mark II": ("PENTAX", one_strip((7392, 4950), 65535, 14, 169568, 39118125)),
     "DC-X": ("SAMSUNG", one_strip((5632, 3714), 32770, 12, 400000, 22000000)),
 }
-"""What files of real cameras state of their pixels: the lists of tags of the collection
-drewnoakes/metadata-extractor-images. Made up: where D200's strips and A7 IV's tiles begin, and the Samsung."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", STATED)
-def test_what_real_cameras_state_is_believed(model: str) -> None:
+def test_accepts_layouts_of_real_cameras(model: str) -> None:
     maker, pixels = STATED[model]
     # Where tiles begin stands a lossless JPEG's header.
     sof = bytes.fromhex("ffd8ffc3000e0e02000200010111000000")
@@ -435,40 +435,40 @@ def test_what_real_cameras_state_is_believed(model: str) -> None:
 @pytest.mark.parametrize(
     ("more", "reason"),
     [
-        ({256: longs(3664), 257: longs(2754), 278: longs(2754)}, "photosites"),
-        ({257: longs(SIDE + 1)}, "photosites|parts"),
-        ({324: longs(0xFFFFFFFF), 325: longs(9), 322: longs(2 * SIDE), 323: longs(SIDE)}, "has only|9 bytes"),
-        ({324: longs(600, 700), 325: longs(99999, 99999), 322: longs(SIDE), 323: longs(SIDE)}, "has only|upon each"),
-        ({324: longs(600, 900), 325: longs(200)}, "2 places of its pixels and 1 sizes"),
-        ({278: longs(16)}, "1 parts, 8 expected"),
+        ({256: longs(3664), 257: longs(2754), 278: longs(2754)}, "rows of 3664 px"),
+        ({257: longs(SIDE + 1)}, "photosites|tiles"),
+        ({324: longs(0xFFFFFFFF), 325: longs(9), 322: longs(2 * SIDE), 323: longs(SIDE)}, "the file has|9 bytes"),
+        ({324: longs(600, 700), 325: longs(99999, 99999), 322: longs(SIDE), 323: longs(SIDE)}, "the file has|overlap"),
+        ({324: longs(600, 900), 325: longs(200)}, "2 offsets and 1 sizes"),
+        ({278: longs(16)}, "1 strips or tiles, 8 expected"),
         ({258: shorts(0)}, "0 bits"),
-        ({339: shorts(3)}, "no integers"),
-        ({262: shorts(34892)}, "not of a Bayer sensor: its pixels hold all colours"),
+        ({339: shorts(3)}, "not integers"),
+        ({262: shorts(34892)}, "not from a Bayer sensor: its pixels have all colours"),
         ({277: shorts(2)}, "2 samples"),
-        ({50712: shorts(64)}, "table of tones does not rise"),
-        ({50712: shorts(0, 9, 8)}, "table of tones does not rise"),
-        ({322: longs(0), 323: longs(0), 324: longs(600), 325: longs(65536)}, "parts of 0×0"),
+        ({50712: shorts(64)}, "linearisation table does not rise"),
+        ({50712: shorts(0, 9, 8)}, "linearisation table does not rise"),
+        ({322: longs(0), 323: longs(0), 324: longs(600), 325: longs(65536)}, "have 0×0 px"),
     ],
 )
-def test_extents_that_hold_no_frame_are_refused(more: Tags, reason: str) -> None:
+def test_refuses_invalid_extents(more: Tags, reason: str) -> None:
     with pytest.raises(FormatError, match=reason):
         decode_raw(dng_bytes(frame(), more), WHERE)
 
 
-def test_a_stub_that_points_beyond_its_end_is_no_white_frame() -> None:
+def test_refuses_a_stub_that_points_beyond_its_end() -> None:
     stub = in_maker_tiff("NIKON CORPORATION", "NIKON D3", bytes(12_000), {256: longs(3664), 257: longs(2754)})
     for places in (longs(0xFFFFFFFF), longs(400)):
         with pytest.raises(FormatError):
             decode_raw(stub.replace(longs(len(stub) - 12_000)[2], places[2]), WHERE)
 
 
-def test_zeros_of_a_size_that_libraw_knows_are_refused() -> None:
-    """LibRaw takes any file of 786 432 bytes for a frame of an industrial camera."""
+def test_refuses_zeros_of_a_size_known_to_libraw() -> None:
+    """LibRaw accepts any file of 786 432 bytes as a frame of an industrial camera."""
     with pytest.raises(FormatError):
         decode_raw(bytes(786_432), WHERE)
 
 
-def test_a_file_of_a_layout_that_is_not_checked_is_what_libraw_makes_of_it() -> None:
+def test_unchecked_layout_equals_libraw() -> None:
     data, counts = raf()
     assert not layout_is_known(data[:LAYOUT_START])
     np.testing.assert_array_equal(decode_raw(data, WHERE).sensor, counts)
@@ -478,38 +478,38 @@ def test_a_file_of_a_layout_that_is_not_checked_is_what_libraw_makes_of_it() -> 
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_layout_that_is_checked_is_known_by_its_beginning(name: str) -> None:
+def test_recognises_checked_layouts(name: str) -> None:
     assert layout_is_known(FILES[name][0][:LAYOUT_START])
 
 
-def test_makers_of_whose_layout_nothing_is_known_are_named() -> None:
+def test_refuses_makers_of_unknown_layout() -> None:
     data = in_maker_tiff("Eastman Kodak", "DC50", bytes(8000), {})
-    with pytest.raises(FormatError) as told:
+    with pytest.raises(FormatError) as caught:
         decode_raw(data, WHERE)
-    assert "copy" not in str(told.value)
+    assert "copy" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("compression", "name"), [(8, "Deflate"), (32946, "Deflate"), (9, "VC-5"), (52546, "JPEG XL"), (5, "number 5")]
 )
-def test_what_is_not_supported_is_said_so_and_no_copy_helps(compression: int, name: str) -> None:
-    with pytest.raises(FormatError, match=f"{name}.*supported") as told:
+def test_reports_unsupported_compression(compression: int, name: str) -> None:
+    with pytest.raises(FormatError, match=f"{name}.*supported") as caught:
         decode_raw(dng_bytes(frame(), {259: shorts(compression)}), WHERE)
-    assert "copy" not in str(told.value)
+    assert "copy" not in str(caught.value)
 
 
 # Pixels
 
 
 def in_strips(more: Tags, strips: int, pixels: bytes) -> bytes:
-    """Return a DNG whose pixels are in strips behind one another."""
+    """Return a DNG with contiguous strips."""
     tags: Tags = {**more, 278: longs(SIDE // strips), 279: longs(*(len(pixels) // strips,) * strips)}
     start = len(dng_bytes(frame(), {**tags, 273: longs(*(0,) * strips)}, pixels, place=None)) - len(pixels)
     places = longs(*(start + number * (len(pixels) // strips) for number in range(strips)))
     return dng_bytes(frame(), {**tags, 273: places}, pixels, place=None)
 
 
-def test_strips_in_a_row_are_one_frame_and_others_are_refused() -> None:
+def test_reads_contiguous_strips_and_refuses_others() -> None:
     pixels = frame().astype("<u2").tobytes()
     data = in_strips({}, 4, pixels)
     np.testing.assert_array_equal(decode_raw(data, WHERE).sensor, frame())
@@ -518,25 +518,25 @@ def test_strips_in_a_row_are_one_frame_and_others_are_refused() -> None:
         decode_raw(data.replace(first, struct.pack("<I", 8), 1), WHERE)
 
 
-def test_lossless_jpeg_in_strips_is_refused() -> None:
-    """LibRaw takes the first strip for all, and leaves the other rows at zero."""
+def test_refuses_lossless_jpeg_in_strips() -> None:
+    """LibRaw treats the first strip as all data, and leaves the other rows at zero."""
     strip = lossless_jpeg(frame()[: SIDE // 2])
     data = in_strips({259: shorts(7), 258: shorts(14)}, 2, strip * 2)
     with pytest.raises(FormatError):
         decode_raw(data, WHERE)
 
 
-def test_a_jpeg_of_another_size_is_refused() -> None:
+def test_refuses_a_jpeg_of_another_size() -> None:
     strip = lossless_jpeg(frame()[:-2])
-    with pytest.raises(FormatError, match="no JPEG of 128 rows"):
+    with pytest.raises(FormatError, match="not a JPEG of 128 rows"):
         decode_raw(dng_bytes(frame(), {259: shorts(7), 258: shorts(14)}, strip), WHERE)
 
 
-def test_codes_of_a_maker_that_decode_to_nonsense_are_refused(capfd: pytest.CaptureFixture[str]) -> None:
-    """Pentax's codes are Huffman's; noise in their place decodes to samples beyond their precision."""
+def test_refuses_invalid_pentax_codes(capfd: pytest.CaptureFixture[str]) -> None:
+    """Pentax uses Huffman codes; noise decodes to samples above their precision."""
     noise = np.random.default_rng(5).bytes(48 * 80 * 8)
     data = in_maker_tiff("PENTAX", "PENTAX K-1", noise, {258: shorts(14), 259: shorts(65535)})
-    with pytest.raises(FormatError, match="LibRaw says 'Data error"):
+    with pytest.raises(FormatError, match="LibRaw reports 'Data error"):
         decode_raw(data, WHERE)
     assert capfd.readouterr() == ("", "")
 
@@ -544,9 +544,9 @@ def test_codes_of_a_maker_that_decode_to_nonsense_are_refused(capfd: pytest.Capt
 @pytest.mark.parametrize("hole", [np.s_[100:101], np.s_[64:96, :256], np.s_[100:]], ids=["row", "tile", "end"])
 @pytest.mark.parametrize(
     ("black", "filling", "reason"),
-    [(64, 0, "half of its black level"), (0, 0, "do not reach one count"), (64, 65535, "nothing but the count 65535")],
+    [(64, 0, "half of its black level"), (0, 0, "do not reach one count"), (64, 65535, "only the count 65535")],
 )
-def test_a_frame_that_was_filled_is_told(
+def test_detects_padded_parts_of_a_frame(
     tmp_path: Path, hole: tuple[slice, ...], black: int, filling: int, reason: str
 ) -> None:
     counts = np.tile(frame(), (1, 2))
@@ -560,7 +560,7 @@ def test_a_frame_that_was_filled_is_told(
     assert reason in (faults[1] or "")
 
 
-def test_darkness_and_too_much_light_are_no_holes() -> None:
+def test_accepts_dark_and_saturated_frames() -> None:
     dark = np.random.default_rng(2).normal(64, 8, (SIDE, 2 * SIDE)).clip(0).astype(np.uint16)
     dark[:, 7] = 0  # a dead column
     assert filled_fault(dark, np.full((2, 2), 64.0), 4095) is None
@@ -589,16 +589,16 @@ SIGNED: Callable[[float], tuple[int, int, bytes]] = lambda number: (12, 1, struc
         ({50714: SIGNED(-1e9)}, "black level is"),
         ({50714: longs(4095)}, "black level is"),
         ({50716: (10, 1, struct.pack("<ii", -90, 1))}, "black level is -26"),
-        ({50714: (5, 1, struct.pack("<II", 64, 0))}, "divided by zero"),
+        ({50714: (5, 1, struct.pack("<II", 64, 0))}, "denominator 0"),
     ],
 )
-def test_levels_that_no_sensor_has_are_refused(levels: Tags, reason: str, more: Tags, strip: bytes | None) -> None:
+def test_refuses_impossible_levels(levels: Tags, reason: str, more: Tags, strip: bytes | None) -> None:
     stored: Tags = {} if strip is None else {259: shorts(7), 258: shorts(14)}
     with pytest.raises(FormatError, match=reason):
         decode_raw(dng_bytes(frame(), {**stored, **more, **levels}, strip), WHERE)
 
 
-def test_a_white_level_is_within_the_bits() -> None:
+def test_white_level_fits_the_bits() -> None:
     twelve = {258: shorts(12), 279: longs(SIDE * SIDE * 3)}
     pixels = bytes(SIDE * SIDE * 3)
     assert decode_raw(dng_bytes(frame(), {**twelve, 50717: longs(4096)}, pixels), WHERE).white_level == 4096
@@ -613,8 +613,8 @@ with zipfile.ZipFile(shipped("raw/found.zip")) as _kept:
 
 
 @pytest.mark.parametrize("name", FOUND)
-def test_what_was_found_is_refused(name: str) -> None:
-    """By reading, or by what import, judge and build ask of a frame that was read."""
+def test_refuses_files_of_earlier_searches(name: str) -> None:
+    """Refused by reading, or by the later check for padded parts."""
     try:
         mosaic = decode_raw(FOUND[name], Path(name))
     except FormatError:
@@ -623,7 +623,7 @@ def test_what_was_found_is_refused(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_search_for_more_runs() -> None:
+def test_fuzz_search_runs() -> None:
     tally = Counter[str]()
     assert list(run(seeds(None), 5, range(100), tally)) == []
     assert tally.total() == 100

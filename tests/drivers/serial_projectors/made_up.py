@@ -1,4 +1,4 @@
-"""A language as a user would write it, with a warning of every state and nothing that the makers' languages need."""
+"""A language as a user would write it, with replies for every state, and without special features."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""Projectors that speak a line protocol: the contract in every language, the manuals' bytes, and trouble.
+"""Projectors with a line protocol: the contract in every language, the manuals' bytes, and cable faults.
 
-The conversations are written after the manuals that each language file names; a line marked "not confirmed" follows
-other drivers, as the file says.
+The conversations follow the manuals named in the language files. Lines marked "not confirmed" follow other drivers.
 """
 
 from __future__ import annotations
@@ -48,23 +47,23 @@ OPTOMA_STATE = bytes.fromhex("7E 30 30 31 32 34 20 31 0D")
 
 
 class SerialPeerLink(PeerLink):
-    """A cable to a peer in the same thread, which hears before each read what the peer has to say by now."""
+    """A cable to a peer in the same thread, which is polled before each read."""
 
     def read(self, limit: int, timeout: float) -> bytes:
-        """Return up to `limit` bytes of what the peer has said."""
+        """Return up to `limit` bytes of the peer's replies."""
         if self._open:
             self._incoming += self._peer.receive(b"")
         return super().read(limit, timeout)
 
 
 def identity_in(language: Language) -> ProjectorIdentity:
-    """Return what of the simulated projector's names a language can say."""
+    """Return the names of the simulated projector that a language can report."""
     model = "" if language.model is None else language.model.shown.replace("{}", IDENTITY.model)
     return ProjectorIdentity(language.maker, model, "" if language.name is None else IDENTITY.name)
 
 
 def faults_in(language: Language, faults: frozenset[Fault]) -> frozenset[Fault]:
-    """Return which faults a language can say: errors, if any."""
+    """Return the faults that a language can report: errors, if any."""
     announces = any(message.fault is not None for message in language.unasked)
     if language.faults is None and not announces:
         return frozenset()
@@ -74,7 +73,7 @@ def faults_in(language: Language, faults: frozenset[Fault]) -> frozenset[Fault]:
 def bench_of(
     language: Language, device: SimulatedProjector, projector: Projector, catch_up: Callable[[], None]
 ) -> Bench:
-    """Return the bench of a simulated projector; `catch_up` lets its cable bring what it says unasked."""
+    """Return the bench of a simulated projector; `catch_up` delivers unasked messages."""
 
     def wait(seconds: float) -> None:
         assert isinstance(device.clock, SimulatedClock)
@@ -88,7 +87,7 @@ def bench_of(
 
     def repair() -> None:
         device.repair()
-        if language.faults is None and language.has_news:
+        if language.faults is None and language.reports_unasked:
             # That it is well again, it cannot say: only that its lamp is struck again.
             device.switch_on()
         catch_up()
@@ -99,17 +98,17 @@ def bench_of(
 
 
 class TestOverMemory(ProjectorContract):
-    @pytest.fixture(params=[(name, whole) for name in NAMES for whole in (True, False)], ids=str)
+    @pytest.fixture(params=[(name, is_whole) for name in NAMES for is_whole in (True, False)], ids=str)
     def bench(self, request: pytest.FixtureRequest) -> Bench:
-        name, whole = request.param
+        name, is_whole = request.param
         language, device = LANGUAGES[name], SimulatedProjector(SimulatedClock())
         peer = LinePeer(device, language)
-        cable = (lambda: SerialPeerLink(peer)) if whole else (lambda: Dribbling(SerialPeerLink(peer)))
+        cable = (lambda: SerialPeerLink(peer)) if is_whole else (lambda: Dribbling(SerialPeerLink(peer)))
         return bench_of(language, device, LineProjector(language, cable, clock=device.clock), lambda: None)
 
 
 class TestOverTheNetwork(ProjectorContract):
-    """With a handshake, and without echo and prompt."""
+    """With handshake, without echo and prompt."""
 
     @pytest.fixture(params=[name for name in NAMES if LANGUAGES[name].network is not None])
     def bench(self, request: pytest.FixtureRequest) -> Bench:
@@ -142,7 +141,7 @@ class TestOverAPseudoTerminal(ProjectorContract):
         (b"04", Power.STANDBY),
     ],
 )
-def test_epson_power(code: bytes, power: Power) -> None:
+def test_epson_power_codes(code: bytes, power: Power) -> None:
     projector, script = scripted("epson", (b"PWR?\r", b"PWR=" + code + b"\r:"))
     assert projector.power() is power
     assert script.ended()
@@ -154,7 +153,7 @@ def test_epson_abnormal_state_is_a_fault() -> None:
         projector.power()
 
 
-def test_epson_is_asked_nothing_until_it_has_switched_on() -> None:
+def test_epson_gets_no_query_until_it_has_switched_on() -> None:
     clock = SimulatedClock()
     projector, script = scripted(
         "epson", (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()), (b"PWR?\r", b"PWR=01\r:"), clock=clock
@@ -169,7 +168,7 @@ def test_epson_is_asked_nothing_until_it_has_switched_on() -> None:
     assert script.ended()
 
 
-def test_epson_on_the_way_tells_no_fault_and_still_its_power() -> None:
+def test_epson_reports_power_but_no_faults_while_switching() -> None:
     projector, script = scripted("epson", (b"ERR?\r", b"ERR\r:"), (b"PWR?\r", b"PWR=03\r:"))
     assert projector.faults() == ()
     assert script.ended()
@@ -183,7 +182,7 @@ def test_epson_on_the_way_tells_no_fault_and_still_its_power() -> None:
     assert script.ended()
 
 
-def test_epson_that_is_on_and_does_not_know_a_question_cannot_tell() -> None:
+def test_epson_unsupported_queries_return_no_value() -> None:
     on, off = (b"PWR?\r", b"PWR=01\r:"), (b"PWR?\r", b"PWR=04\r:")
     projector, script = scripted(
         "epson", (b"MUTE?\r", b"ERR\r:"), on, (b"LAMP?\r", b"ERR\r:"), on,
@@ -198,7 +197,7 @@ def test_epson_that_is_on_and_does_not_know_a_question_cannot_tell() -> None:
     assert script.ended()
 
 
-def test_epson_busy_for_an_earlier_program_says_how_long_to_wait() -> None:
+def test_epson_busy_from_an_earlier_program_reports_the_wait() -> None:
     clock = SimulatedClock()
     peer = LinePeer(SimulatedProjector(clock), EPSON)
     LineProjector(EPSON, lambda: SerialPeerLink(peer), clock=clock).switch_on()
@@ -209,7 +208,7 @@ def test_epson_busy_for_an_earlier_program_says_how_long_to_wait() -> None:
     assert later.power() is Power.ON
 
 
-def test_epson_that_never_finishes_is_given_up() -> None:
+def test_epson_switching_times_out() -> None:
     clock = SimulatedClock()
     projector, _ = scripted("epson", (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()), clock=clock)
     projector.switch_on()
@@ -220,7 +219,7 @@ def test_epson_that_never_finishes_is_given_up() -> None:
         projector.power()
 
 
-def test_epson_that_cannot_strike_its_lamp_says_so_late() -> None:
+def test_epson_reports_a_late_refusal() -> None:
     projector, script = scripted("epson", (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()), (b"PWR?\r", b"PWR=04\r:"))
     projector.switch_on()
     script.more(b"ERR\r:")
@@ -252,7 +251,7 @@ def test_epson_mute_lamp_and_error_codes() -> None:
     assert script.ended()
 
 
-def test_epson_passes_over_events() -> None:
+def test_epson_ignores_events() -> None:
     # Not confirmed: what newer projectors send unasked.
     event = b"IMEVENT=0001 02 00000002 00000000 T1 F1\r:"
     projector, script = scripted("epson", (b"PWR?\r", (event, b"PWR=02\r:")))
@@ -260,20 +259,20 @@ def test_epson_passes_over_events() -> None:
     assert script.ended()
 
 
-def test_epson_event_is_no_answer_to_the_wake_up() -> None:
+def test_epson_event_does_not_answer_the_wake_up() -> None:
     script = Script((b"\r", b"IMEVENT=0001 02 00000002 00000000 T1 F1\r:"))
     with pytest.raises(LinkTimeout):
         LineProjector(EPSON, lambda: script, clock=SimulatedClock()).power()
 
 
 @pytest.mark.parametrize("codes", [b"ZZ", b"4", b"004", b"00 X1"])
-def test_epson_fault_that_is_no_code_is_refused(codes: bytes) -> None:
+def test_epson_refuses_an_invalid_fault_code(codes: bytes) -> None:
     projector, _ = scripted("epson", (b"ERR?\r", b"ERR=" + codes + b"\r:"))
     with pytest.raises(ProtocolError):
         projector.faults()
 
 
-def test_epson_fault_of_an_unknown_code_is_of_another_part() -> None:
+def test_epson_unknown_fault_code_is_another_component() -> None:
     projector, _ = scripted("epson", (b"ERR?\r", b"ERR=1f 04\r:"))
     assert projector.faults() == (Fault("other", Severity.ERROR), Fault("temperature", Severity.ERROR))
 
@@ -289,20 +288,20 @@ def test_epson_network_handshake() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "kind", "reason"),
+    ("answer", "error_type", "reason"),
     [
         (WELCOME[:14] + b"\x41\x00", DeviceRefused, "0x41: a password is required"),
         (WELCOME[:14] + b"\x7f\x00", DeviceRefused, "0x7F: check the network settings"),
         (b"PJLINK 0\r", ProtocolError, "check the port"),
     ],
 )
-def test_epson_network_refusals_say_why(answer: bytes, kind: type[DeviceError], reason: str) -> None:
+def test_epson_network_refusals_have_reasons(answer: bytes, error_type: type[DeviceError], reason: str) -> None:
     projector, _ = scripted("epson", (HELLO, answer), network=True)
-    with pytest.raises(kind, match=reason):
+    with pytest.raises(error_type, match=reason):
         projector.power()
 
 
-def test_a_network_that_always_hangs_up_is_not_tried_for_ever() -> None:
+def test_stops_if_the_network_always_disconnects() -> None:
     opened: list[Link] = []
 
     def connect() -> Link:
@@ -318,7 +317,7 @@ ON, OFF = Power.ON, Power.STANDBY
 
 
 @pytest.mark.parametrize(
-    ("said", "power"),
+    ("reply", "power"),
     [
         (b"\r\n>*pow=?#\r\n*POW=ON#\r\n>", ON),
         (b">*pow=?#\r\r\n*POW=OFF#\r\n\r\n>", OFF),
@@ -327,8 +326,8 @@ ON, OFF = Power.ON, Power.STANDBY
         (b"\0\0>*pow=?#\r\nPOW=ON\r\n", ON),
     ],
 )
-def test_benq_power_with_and_without_echo_and_prompt(said: bytes, power: Power) -> None:
-    projector, _ = scripted("benq", (b"\r*pow=?#\r", said))
+def test_benq_power_with_and_without_echo_and_prompt(reply: bytes, power: Power) -> None:
+    projector, _ = scripted("benq", (b"\r*pow=?#\r", reply))
     assert projector.power() is power
 
 
@@ -340,13 +339,13 @@ def test_benq_power_with_and_without_echo_and_prompt(said: bytes, power: Power) 
     ],
     ids=["with a prompt", "without"],
 )
-def test_benq_answer_that_looks_like_its_echo(state: bytes, answer: bytes) -> None:
+def test_benq_answer_equal_to_its_echo(state: bytes, answer: bytes) -> None:
     projector, script = scripted("benq", (b"\r*pow=?#\r", state), (b"\r*pow=on#\r", answer))
     projector.switch_on()
     assert script.ended()
 
 
-def test_benq_on_the_way_is_known_by_where_it_was() -> None:
+def test_benq_transition_follows_from_the_last_state() -> None:
     blocked = b">*pow=?#\r\n*Block item#\r\n>"
     projector, script = scripted(
         "benq",
@@ -389,12 +388,12 @@ def test_benq_names_lamps_and_refusals() -> None:
 
 
 @pytest.mark.parametrize("answer", [b"Illegal format", b"Unsupported item"])
-def test_benq_that_does_not_know_its_mute_cannot_tell(answer: bytes) -> None:
+def test_benq_unsupported_mute_query_returns_none(answer: bytes) -> None:
     projector, _ = scripted("benq", (b"\r*blank=?#\r", b">*blank=?#\r\n*" + answer + b"#\r\n>"))
     assert projector.muted() is None
 
 
-def test_benq_whose_mute_is_unknown_is_sent_it_again() -> None:
+def test_benq_unknown_mute_state_is_set_again() -> None:
     # A remote control may have shown the picture meanwhile.
     ask = (b"\r*blank=?#\r", b"*Unsupported item#\r\n")
     hide = (b"\r*blank=on#\r", b"*BLANK=ON#\r\n")
@@ -405,7 +404,7 @@ def test_benq_whose_mute_is_unknown_is_sent_it_again() -> None:
     assert script.ended()
 
 
-def test_without_a_question_about_faults_only_busy_counts_as_health() -> None:
+def test_without_fault_query_only_busy_counts_as_healthy() -> None:
     ask = b"\r*pow=?#\r"
     projector, _ = scripted("benq", (ask, b"*Block item#\r\n"), (ask, b"*Unsupported item#\r\n"))
     assert projector.faults() == ()
@@ -422,7 +421,7 @@ OPTOMA_MUTE = bytes.fromhex("7E 30 30 30 32 20 31 0D")
 
 
 # "Power State ~XX124 1: 7E 30 30 31 32 34 20 31 0D", W351 manual.
-def test_optoma_switches_on_and_is_overheard() -> None:
+def test_optoma_announces_its_power_state() -> None:
     projector, script = scripted(
         "optoma",
         (OPTOMA_STATE, b"OK0\r"),
@@ -462,21 +461,21 @@ def test_optoma_mute_lamp_model_and_refusal() -> None:
 
 
 @pytest.mark.parametrize("pieces", [(b"PINFO1\r",), (b"P", b"INFO1\r"), (b"PIN", b"FO1\r"), (b"INFO1\rP",)], ids=str)
-def test_optoma_answer_without_end_before_news(pieces: tuple[bytes, ...]) -> None:
+def test_optoma_unended_answer_before_an_unasked_message(pieces: tuple[bytes, ...]) -> None:
     projector, script = scripted("optoma", (OPTOMA_STATE, b"OK0\r"), (OPTOMA_ON, pieces), (OPTOMA_STATE, b"OK0\r"))
     projector.switch_on()
     assert projector.power() is Power.WARMING
     assert script.ended()
 
 
-def test_optoma_refusal_without_end_before_news() -> None:
+def test_optoma_unended_refusal_before_an_unasked_message() -> None:
     projector, _ = scripted("optoma", (OPTOMA_MUTE, b"FINFO6\r"), (OPTOMA_STATE, b"OK1\r"))
     with pytest.raises(DeviceRefused):
         projector.set_muted(True)
     assert projector.faults() == (Fault("fan", Severity.ERROR),)
 
 
-def test_optoma_mute_that_nobody_knows_cannot_be_told() -> None:
+def test_optoma_unsupported_mute_query_returns_none() -> None:
     projector, script = scripted("optoma", (b"~00355 1\r", b"F\r"), (OPTOMA_MUTE, b"P\r"), (b"~00355 1\r", b"F\r"))
     assert projector.muted() is None
     projector.set_muted(True)
@@ -485,12 +484,12 @@ def test_optoma_mute_that_nobody_knows_cannot_be_told() -> None:
 
 
 @pytest.mark.parametrize(("number", "part"), [(4, "lamp"), (6, "fan"), (7, "temperature")])
-def test_optoma_failures_are_overheard(number: int, part: str) -> None:
+def test_optoma_announced_faults_are_reported(number: int, part: str) -> None:
     projector, _ = scripted("optoma", (OPTOMA_STATE, b"INFO%d\rOK0\r" % number))  # INFO4 is not confirmed
     assert projector.faults() == (Fault(part, Severity.ERROR),)
 
 
-def test_what_was_said_too_much_answers_no_later_question() -> None:
+def test_extra_reply_does_not_answer_the_next_query() -> None:
     projector, script = scripted("epson", (b"PWR?\r", b"PWR=01\r:PWR=04\r:"), (b"PWR?\r", b"PWR=03\r:"))
     assert projector.power() is Power.ON
     assert projector.power() is Power.COOLING
@@ -498,7 +497,7 @@ def test_what_was_said_too_much_answers_no_later_question() -> None:
 
 
 def answers_on(name: str) -> bytes:
-    """Return what the simulated projector answers to the question after its power state, when it is on."""
+    """Return the reply of the simulated projector to the power query when it is on."""
     language = LANGUAGES[name]
     peer = LinePeer(SimulatedProjector(SimulatedClock(), Power.ON), language)
     return peer.receive(encode_command(language.line, language.power.ask))
@@ -507,7 +506,7 @@ def answers_on(name: str) -> bytes:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
-def test_any_split_gives_the_same_answer(name: str, data: st.DataObject) -> None:
+def test_answer_does_not_depend_on_splitting(name: str, data: st.DataObject) -> None:
     language, answer = LANGUAGES[name], answers_on(name)
     cuts = sorted(data.draw(st.sets(st.integers(1, len(answer) - 1))))
     pieces = tuple(answer[start:end] for start, end in zip([0, *cuts], [*cuts, len(answer)], strict=True))
@@ -517,7 +516,7 @@ def test_any_split_gives_the_same_answer(name: str, data: st.DataObject) -> None
 
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
-def test_half_an_answer_is_no_answer(name: str, data: st.DataObject) -> None:
+def test_half_an_answer_times_out(name: str, data: st.DataObject) -> None:
     language, answer = LANGUAGES[name], answers_on(name)
     end = answer.rindex(language.line.ends[0].encode("ascii"))
     half = answer[: data.draw(st.integers(0, end))]
@@ -534,7 +533,7 @@ def troubled(name: str, trouble: Callable[[Link], Link]) -> Projector:
 
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.binary(max_size=80))
-def test_whatever_is_answered_is_understood_or_refused(name: str, data: bytes) -> None:
+def test_any_bytes_are_understood_or_refused(name: str, data: bytes) -> None:
     class Answering(Dribbling):
         def read(self, limit: int, timeout: float) -> bytes:
             nonlocal data
@@ -551,7 +550,7 @@ def test_whatever_is_answered_is_understood_or_refused(name: str, data: bytes) -
 
 @pytest.mark.parametrize("name", NAMES)
 @given(key=st.binary(min_size=4, max_size=4).filter(any))
-def test_the_wrong_speed_never_looks_like_an_answer(name: str, key: bytes) -> None:
+def test_wrong_speed_is_a_device_error(name: str, key: bytes) -> None:
     # At the wrong speed bytes come with some bits set wrongly and the highest one mostly set.
     def garble(data: bytes) -> bytes:
         return bytes(byte ^ key[place % 4] | 0x80 for place, byte in enumerate(data))
@@ -561,14 +560,14 @@ def test_the_wrong_speed_never_looks_like_an_answer(name: str, key: bytes) -> No
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_answer_names_the_remedies(name: str) -> None:
+def test_timeout_names_the_remedies(name: str) -> None:
     limit = f"{LANGUAGES[name].line.timeout_s:g} s"
     with pytest.raises(LinkTimeout, match=rf"within {re.escape(limit)}.*cable.*speed.*standby"):
         troubled(name, lambda good: Deaf(good, 0)).power()
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_noise_without_end_is_refused(name: str) -> None:
+def test_refuses_endless_noise(name: str) -> None:
     class Chattering(Dribbling):
         def read(self, limit: int, timeout: float) -> bytes:
             return b"O" * MAX_MESSAGE
@@ -578,7 +577,7 @@ def test_noise_without_end_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_dropped_connection_is_opened_again(name: str) -> None:
+def test_reopens_a_dropped_connection(name: str) -> None:
     language = LANGUAGES[name]
     peer = LinePeer(SimulatedProjector(SimulatedClock(), Power.ON), language)
     opened: list[Link] = []
@@ -595,7 +594,7 @@ def test_a_dropped_connection_is_opened_again(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
+def test_late_answer_does_not_answer_the_next_query(name: str) -> None:
     language = LANGUAGES[name]
     peer = LinePeer(SimulatedProjector(SimulatedClock(), Power.ON), language)
     waiting: list[bytes] = []
@@ -619,7 +618,7 @@ def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_cable_that_was_pulled_out_is_reported(name: str) -> None:
+def test_reports_an_unplugged_cable(name: str) -> None:
     language = LANGUAGES[name]
     with PseudoTerminal(LinePeer(SimulatedProjector(SimulatedClock(), Power.ON), language)) as terminal:
         projector = LineProjector(language, lambda: SerialLink.open(terminal.path, language.line.baud))

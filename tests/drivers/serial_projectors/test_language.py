@@ -1,4 +1,4 @@
-"""Language files: what they say is taken as it stands, and what they cannot say is refused with file and key."""
+"""Language files: valid files are loaded, mistakes are refused with file and key."""
 
 from __future__ import annotations
 
@@ -23,23 +23,25 @@ from tests.drivers.serial_projectors.made_up import MADE_UP, TEXT
 EPSON, BENQ, OPTOMA = (load_language(name) for name in ("epson", "benq", "optoma"))
 
 
-def test_languages_are_found_in_any_case_and_unknown_ones_name_the_known() -> None:
+def test_loads_languages_in_any_case_and_lists_known_ones() -> None:
     assert {"benq", "epson", "optoma"} <= set(built_in_languages())
     assert load_language("Epson") == EPSON
-    with pytest.raises(ConfigurationError, match=f"'klingon'; expected {', '.join(built_in_languages())}, or "):
+    with pytest.raises(
+        ConfigurationError, match=f"'klingon' does not.* expected {', '.join(built_in_languages())}, or "
+    ):
         load_language("klingon")
     with pytest.raises(ConfigurationError, match="did you mean 'epson'"):
         load_language("epsn")
 
 
-def test_speeds_and_ports_are_those_of_the_manuals() -> None:
+def test_speeds_and_ports_match_the_manuals() -> None:
     assert (EPSON.line.baud, BENQ.line.baud, OPTOMA.line.baud) == (9600, 115200, 9600)
     assert EPSON.network is not None
     assert BENQ.network is not None
     assert (EPSON.network.port, BENQ.network.port, OPTOMA.network) == (3629, 8000, None)
 
 
-def test_codes_are_those_of_the_manual() -> None:
+def test_codes_match_the_manual() -> None:
     # Epson, ESC/VP21 guide, PWR.
     expected = {"00": "standby", "01": "on", "02": "warm-up", "03": "cooling", "04": "standby", "09": "standby"}
     assert {code: power.value for code, power in EPSON.power.states.items()} == expected
@@ -57,7 +59,7 @@ def test_codes_are_those_of_the_manual() -> None:
     assert EPSON.faults.parts == parts | {"0B": "other"}
 
 
-def test_a_file_of_ones_own_is_read(tmp_path: Path) -> None:
+def test_loads_a_user_file(tmp_path: Path) -> None:
     path = tmp_path / "lantern.TOML"
     path.write_text(TEXT)
     assert load_language(str(path)) == MADE_UP
@@ -66,7 +68,7 @@ def test_a_file_of_ones_own_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "said"),
+    ("before", "after", "reason"),
     [
         ("busy =", "bussy =", "unknown key 'refusals.bussy'; did you mean 'busy'?"),
         ("[mute]", "[mutes]", "unknown key 'mutes'; did you mean 'mute'?"),
@@ -74,45 +76,45 @@ def test_a_file_of_ones_own_is_read(tmp_path: Path) -> None:
         ("baud = 19200", 'baud = "9600"', "line.baud = '9600': a whole number was expected"),
         ("baud = 19200", "baud = 19200\necho = 'yes'", "line.echo = 'yes': true or false was expected"),
         ('busy = ["BUSY"]', "busy = 5", "refusals.busy = 5: a list was expected"),
-        ('answer = "POWER {}"', 'answer = "POWER"', "power.answer = 'POWER': a text with {}"),
-        ('on = "POWER ON"', 'on = "POWER {}"', "power.on = 'POWER {}': a text without {}"),
+        ('answer = "POWER {}"', 'answer = "POWER"', "power.answer = 'POWER': expected a text with {}"),
+        ('on = "POWER ON"', 'on = "POWER {}"', "power.on = 'POWER {}': expected a text without {}"),
         ('off = "POWER OFF"', 'off = "Power On"', "power: on and off are both 'POWER ON'"),
-        ('done = "POWER {}"', 'done = "BUSY"', "power.done = 'BUSY' is one of the refusals"),
-        ("stopped = { HOT", "stopped = { Off", "power: OFF: a value either of states or of stopped"),
-        ("{ NO = true, YES = false }", "{ NO = true, no = false }", "mute.states: values that differ in more"),
-        ("states = { NO = true, YES = false }", "", "mute: states with a value for true and one for false"),
-        ("states = { NO = true, YES = false }", "states = { NO = true }", "mute: states with a value for true and"),
+        ('done = "POWER {}"', 'done = "BUSY"', "power.done = 'BUSY' is also one of the refusals"),
+        ("stopped = { HOT", "stopped = { Off", "power: OFF: expected each value in only one"),
+        ("{ NO = true, YES = false }", "{ NO = true, no = false }", "mute.states: expected values that differ in more"),
+        ("states = { NO = true, YES = false }", "", "mute: ask is given: expected states with a value"),
+        ("states = { NO = true, YES = false }", "states = { NO = true }", "mute: ask is given: expected states"),
         ('ask = "SHOW?"', "", "mute: answer is given without ask"),
-        ('healthy = "NONE"', 'healthy = "NO FAULT"', "faults: 'NO FAULT': one word was expected"),
-        ('healthy = "NONE"', 'healthy = "f"', "faults: healthy = 'f': a value that is none of the parts"),
-        ('healthy = "NONE"', 'healthy = "NONE"\ndigits = 1', "faults: 'NONE': 1 hexadecimal digits were expected"),
+        ('healthy = "NONE"', 'healthy = "NO FAULT"', "faults: 'NO FAULT': expected one word"),
+        ('healthy = "NONE"', 'healthy = "f"', "faults: healthy = 'f': expected a value that is not in parts"),
+        ('healthy = "NONE"', 'healthy = "NONE"\ndigits = 1', "faults: 'NONE': expected 1 hexadecimal digits"),
         ('{ F = "fan", L = "lamp", T = "temperature" }', "{}", "faults.parts: at least 1 value was expected"),
-        ('command = "@{}\\r\\n"', 'command = "@{}"', "line: command = '@{}': characters that end a command"),
-        ('ends = "\\r"', 'ends = "#"', "one of the characters of ends = '#' was expected"),
-        ('answer = "@{}\\r\\n"', 'answer = "@{}#\\r\\n"', "one of the characters of ends = '\\r' was expected"),
-        ('ends = "\\r"', 'ends = "S\\r"', "mute.answer has 'SHOW {}': a text without the characters of line.ends"),
-        ("[name]", '[[unasked]]\ntext = "{}"\n[name]', "power.answer = 'POWER {}' is one of the unasked messages"),
+        ('command = "@{}\\r\\n"', 'command = "@{}"', "line: command = '@{}': expected the characters"),
+        ('ends = "\\r"', 'ends = "#"', "expected one of the characters of ends = '#'"),
+        ('answer = "@{}\\r\\n"', 'answer = "@{}#\\r\\n"', "expected one of the characters of ends = '\\r'"),
+        ('ends = "\\r"', 'ends = "S\\r"', "mute.answer has 'SHOW {}': expected a text without the characters"),
+        ("[name]", '[[unasked]]\ntext = "{}"\n[name]', "power.answer = 'POWER {}' is also one of the unasked messages"),
         ("[name]", '[unasked]\ntext = "BYE"\n[name]', "unasked: a list of tables was expected: write [[unasked]]"),
         ("baud = 19200", "baud = 20", "line.baud = 20: "),
         ('HEATING = "warm-up"', 'HEATING = "warm"', "power.states.HEATING = 'warm': "),
-        ('OFF = "standby"', 'OFF = "cooling"', 'power: a value for "standby" was expected'),
+        ('OFF = "standby"', 'OFF = "cooling"', 'power: expected a value for "standby"'),
         ('command = "@{}', 'command = "@', "line.command = "),
         ('F = "fan"', 'F = "fans"', f"faults.parts.F = 'fans': expected one of {', '.join(FAULT_PARTS)}"),
-        ('on = "POWER ON"', 'on = "MARCHÉ"', "power.on = 'MARCHÉ': ASCII characters were expected"),
-        ('busy = ["BUSY"]\nunknown = ["WHAT"]', "", "refusals: at least one answer that refuses was expected"),
+        ('on = "POWER ON"', 'on = "MARCHÉ"', "power.on = 'MARCHÉ': expected only ASCII characters"),
+        ('busy = ["BUSY"]\nunknown = ["WHAT"]', "", "refusals: expected at least one refusing reply"),
     ],
 )
-def test_a_mistake_names_file_key_and_expectation(before: str, after: str, said: str) -> None:
+def test_mistakes_report_file_key_and_expectation(before: str, after: str, reason: str) -> None:
     assert before in TEXT
-    with pytest.raises(ConfigurationError) as told:
+    with pytest.raises(ConfigurationError) as caught:
         parse_language(TEXT.replace(before, after), "lantern.toml")
-    assert str(told.value).startswith("lantern.toml")
-    assert said in str(told.value)
-    assert "languages for examples" in str(told.value)
-    assert "mistakes" not in str(told.value), "one mistake is reported once"
+    assert str(caught.value).startswith("lantern.toml")
+    assert reason in str(caught.value)
+    assert "languages for examples" in str(caught.value)
+    assert "mistakes" not in str(caught.value), "one mistake is reported once"
 
 
-def test_a_missing_table_is_described_and_missing_quotation_marks_are_suggested() -> None:
+def test_reports_missing_tables_and_missing_quotation_marks() -> None:
     begin, _, end = TEXT.partition("[mute]")
     without_mute = begin + end[end.index("[faults]") :]
     with pytest.raises(ConfigurationError, match=r"the table \[mute\] is missing; add it, with on, off, done"):
@@ -121,42 +123,42 @@ def test_a_missing_table_is_described_and_missing_quotation_marks_are_suggested(
         parse_language(TEXT.replace("baud = 19200", "baud = x"), "lantern.toml")
 
 
-def test_one_refusal_needs_no_list() -> None:
+def test_accepts_one_refusal_without_a_list() -> None:
     assert parse_language(TEXT.replace('["BUSY"]', '"BUSY"'), "lantern.toml") == MADE_UP
 
 
 @pytest.mark.parametrize("state", ['accepted = "2"', 'accepted = "20"\nrefusals = { 4g = "a bad request" }'])
-def test_a_state_that_is_no_byte_is_refused(state: str) -> None:
+def test_refuses_a_state_that_is_not_a_byte(state: str) -> None:
     handshake = f'[network.handshake]\nsend = "hi"\nanswer_begins = "h"\nanswer_length = 2\nstate_at = 1\n{state}\n'
     with pytest.raises(ConfigurationError, match="two hexadecimal digits"):
         parse_language(TEXT.replace("[refusals]", f"{handshake}[refusals]"), "lantern.toml")
 
 
-def test_a_state_behind_the_end_of_the_answer_is_refused() -> None:
+def test_refuses_a_state_after_the_end_of_the_answer() -> None:
     handshake = (
         '[network.handshake]\nsend = "hi"\nanswer_begins = "h"\nanswer_length = 2\nstate_at = 2\naccepted = "00"\n'
     )
-    with pytest.raises(ConfigurationError, match="state_at = 2 was expected below answer_length = 2"):
+    with pytest.raises(ConfigurationError, match="state_at = 2: expected a value below answer_length = 2"):
         parse_language(TEXT.replace("[refusals]", f"{handshake}[refusals]"), "lantern.toml")
 
 
-def test_an_answer_survives_both_ends() -> None:
+def test_answers_survive_encoding_and_parsing() -> None:
     for language in (EPSON, BENQ, OPTOMA, MADE_UP):
         data = encode_answer(language.line, "Answer 1")
-        taken = answer_parser(language)(data + b"more")
-        assert taken is not None
-        assert taken[0] == "Answer 1"
+        parsed = answer_parser(language)(data + b"more")
+        assert parsed is not None
+        assert parsed[0] == "Answer 1"
     assert encode_answer(EPSON.line, "") == b":"
 
 
 @given(data=st.binary(max_size=80))
-def test_whatever_comes_is_taken_waited_for_or_refused(data: bytes) -> None:
+def test_any_bytes_are_parsed_or_refused(data: bytes) -> None:
     assert EPSON.network is not None
     assert EPSON.network.handshake is not None
     parsers = [answer_parser(language, "pow=?") for language in (EPSON, BENQ, OPTOMA, MADE_UP)]
-    for take in (*parsers, handshake_parser(EPSON.network.handshake)):
+    for parse in (*parsers, handshake_parser(EPSON.network.handshake)):
         try:
-            taken = take(data)
+            parsed = parse(data)
         except ProtocolError:
             continue
-        assert taken is None or 1 <= taken[1] <= len(data)
+        assert parsed is None or 1 <= parsed[1] <= len(data)

@@ -170,7 +170,7 @@ def kind_of(code: int, parameters: list[int], data: bytes) -> object:
             return {type(record) for record in records}, changes(records).keys() & {Property.EOS_AVAILABLE_SHOTS}
         case Operation.EOS_GET_DEVICE_INFO_EX:
             info_ex = DeviceInfoEx.decode(data)
-            return info_ex.events, info_ex.others
+            return info_ex.events, info_ex.unknown
         case Operation.EOS_GET_STORAGE_IDS:
             return decode_u32_array(data)
         case Operation.EOS_GET_STORAGE_INFO:

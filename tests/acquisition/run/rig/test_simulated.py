@@ -119,7 +119,7 @@ def test_an_imported_session_cannot_be_taken() -> None:
         ('[lab.projector]\ncontrol = "pjlink"\n', "lab.projector.host is missing"),
         ('[lab.projector]\ncontrol = "serial"\nlanguage = "epson"\n', "lab.projector.device is missing"),
         ('[lab.projector]\ncontrol = "serial"\ndevice = "/dev/ttyS0"\n', "lab.projector.language is missing"),
-        ('[lab.projector]\ncontrol = "serial"\nlanguage = "klingon"\n', "no projector language 'klingon'"),
+        ('[lab.projector]\ncontrol = "serial"\nlanguage = "klingon"\n', "projector language 'klingon' does not exist"),
         ('[lab.projector]\ncontrol = "pjlink"\ndevice = "/dev/ttyS0"\n', "PJLink goes by the network"),
         ('[lab.projector]\ncontrol = "serial"\nlanguage = "epson"\nhost = "h"\ndevice = "/dev/ttyS0"\n', "both given"),
         ('[lab.camera]\nhost = "1.2.3.4"\n', "connection is"),
