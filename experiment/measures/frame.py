@@ -85,7 +85,7 @@ class FramePlaces:
 def _mean_counts(
     counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: float, floor: float
 ) -> tuple[_Array, _Array, _Array]:
-    """Return mean counts of tiles (T, 4) and strips (rows, 4, 4), and shares (2,) of clipped and empty photosites.
+    """Return mean counts of tiles (T, 4) and strips (rows, 4, 4), and shares (2,) of clipped and empty pixels.
 
     The last axis of the means has the four positions of the block, row by row.
     """
@@ -175,16 +175,17 @@ def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
     greens = [2 * r + c for r, c in positions["G"]]
     green_samples = sampled[:, greens]
     brightest = max(
-        float(np.percentile(sampled[:, 2 * r + c], BRIGHTEST_PERCENTILE) - black[r, c]) for of_channel in positions.values()
+        float(np.percentile(sampled[:, 2 * r + c], BRIGHTEST_PERCENTILE) - black[r, c])
+        for of_channel in positions.values()
         for r, c in of_channel
-    )  # fmt: skip
+    )
     tiles, strips = (_channels(mean - black.ravel(), positions) for mean in means)
     return Measured(
         tiles=tiles,
         strips=strips.reshape(-1, 3),
         samples=green_samples,
         digest=hashlib.blake2b(sampled.tobytes(), digest_size=16).digest(),
-        noise=_photon_transfer(green_samples.astype(np.float64) - [black[place] for place in positions["G"]]),
+        noise=_noise(green_samples.astype(np.float64) - [black[place] for place in positions["G"]]),
         black=mean_black,
         black_measured=bool(mosaic.masked),
         range_dn=float(mosaic.white_level - mean_black),
@@ -209,7 +210,7 @@ def _channels(means: _Array, positions: dict[Channel, tuple[tuple[int, int], ...
     )
 
 
-def _photon_transfer(greens: _Array) -> Noise:
+def _noise(greens: _Array) -> Noise:
     """Fit the photon transfer to pairs of greens (M, 2) of the same block, counts above black."""
     level = greens.mean(axis=1)
     difference = greens[:, 0] - greens[:, 1]
@@ -245,7 +246,7 @@ def _sum_rows(
     sums: npt.NDArray[np.int64],
     tallies: npt.NDArray[np.int64],
 ) -> None:
-    """Add up counts (H, W) between column edges in `sums` (rows, tiles, 4); count clipped and empty in `tallies` (2,)."""
+    """Sum counts (H, W) between column edges to `sums` (rows, tiles, 4); count clipped and empty in `tallies` (2,)."""
     clipped, empty = 0, 0
     for row in range(sums.shape[0]):
         for half in range(2):
