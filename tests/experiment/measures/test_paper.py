@@ -57,9 +57,7 @@ def test_noise_does_not_change_the_shape(seed: int, level: float) -> None:
 
 @pytest.mark.slow
 def test_error_of_white_includes_the_flat_field() -> None:
-    """Some patches have no reference near. From the scatter of references alone, errors were 1.5 times as large, at
-    most 12.
-    """
+    """Without the error of the flat field, deviations are 1.5 standard errors RMS and at most 12."""
     random, level = np.random.default_rng(8), np.array([3000.0, 700.0, 5000.0])
     deviations: list[npt.NDArray[np.float64]] = []
     true = level * falloff(CENTRES).mean(axis=0)
@@ -132,7 +130,7 @@ def test_stain_changes_the_spread_and_not_the_white() -> None:
 def light_at(
     points: npt.NDArray[np.float64], corner: float, centre: tuple[float, float], rim: bool
 ) -> npt.NDArray[np.float64]:
-    """Return lens times projector: cos⁴ of the angle, or with a rim that the mount shades. No fit here has this form."""
+    """Return lens times projector: cos⁴ of the angle, or with a rim shaded by the mount. No fit has this form."""
     half = np.hypot(*PAGE) / 2
     from_axis = (((points - np.array(PAGE) * (0.51, 0.49)) / half) ** 2).sum(axis=1)
     from_spot = (((points - np.array(PAGE) / 2) / half - centre) ** 2).sum(axis=1)
