@@ -98,10 +98,8 @@ def _check_host(host: str) -> str:
         raise ValueError("a serial port; an address is expected, such as 192.168.1.30; give the port as device instead")
     if "/" in host:
         raise ValueError("only an address is expected, such as 192.168.1.30, without http:// or a path")
-    if (host_and_port := re.fullmatch(r"([^:\[\]]+):(\d+)", host)) is not None:
-        raise ValueError(
-            f'only an address is expected; write host = "{host_and_port[1]}" and port = {host_and_port[2]}'
-        )
+    if (match := re.fullmatch(r"([^:\[\]]+):(\d+)", host)) is not None:
+        raise ValueError(f'only an address is expected; write host = "{match[1]}" and port = {match[2]}')
     return host
 
 
@@ -290,14 +288,14 @@ class ProjectorCable(Settings):
     host: Host | None = None
     """Address, for PJLink and for languages over TCP."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """TCP port, if different from that of the language."""
+    """TCP port, if different from the default of the language."""
     password: Annotated[str | None, Field(repr=False)] = None
     """PJLink password. ``{ env = "NAME" }`` or ``{ file = "PATH" }`` read it from an environment variable or a file. It
     is not in `session.toml`."""
     device: str | None = None
     """Serial port, such as /dev/ttyUSB0."""
     baud: Annotated[int, Field(ge=300)] | None = None
-    """Baud rate, if different from that of the language."""
+    """Baud rate, if different from the default of the language."""
     refresh_hz: Positive = 60.0
     """Pictures per second."""
     colour_wheel_hz: NotNegative = 60.0
@@ -323,8 +321,8 @@ class LabSettings(Settings):
     """All settings of LAB.toml."""
 
     rig: Literal["lab", "simulated", "imported"]
-    """Devices: lab (real devices) or simulated (simulated laboratory). `imported` marks a session whose frames were
-    taken by other means."""
+    """Devices: lab (real devices) or simulated (simulated laboratory). `imported` marks a session with frames
+    that were taken by other means."""
     chart: Path
     """chart.json of the print, relative to the settings file."""
     illuminations: Path
@@ -414,7 +412,6 @@ def _is_secret(key: str) -> bool:
 
 
 def _insert_secrets(document: dict[str, Any], folder: Path, where: str) -> None:
-    """Replace the sources of secrets in a document by the secrets."""
     errors: list[ConfigurationError] = []
     for key in _SECRETS:
         *tables, name = key.split(".")

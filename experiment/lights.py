@@ -105,10 +105,7 @@ def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illuminat
     """Read `illuminations.csv`; additional columns are ignored. `computed`: allow names and other spectra."""
     rows = read_csv(path, "make one with: acquire illuminations", "illuminations")[1]
     if not rows or any(column not in rows[0] for column in COLUMNS):
-        raise FormatError(
-            f"{path}: illuminants in the columns {','.join(COLUMNS)} are expected; "
-            "make the file with: acquire illuminations"
-        )
+        raise FormatError(f"{path}: illuminants in the columns {','.join(COLUMNS)} expected; run acquire illuminations")
     lights: list[Illumination] = []
     for number, row in enumerate(rows):
         kind, kelvin = row["kind"], row["cct_k"]
@@ -162,16 +159,14 @@ def parse_ccts(text: str) -> tuple[float, ...]:
 def _require_kelvin(ccts: Sequence[float], description: str) -> None:
     for cct_k in ccts:
         if not 1000 <= cct_k <= 100_000:
-            raise InputError(
-                f"{description}: {cct_k:g} K given, 1000 … 100 000 K expected; give temperatures in this range"
-            )
+            raise InputError(f"{description}: {cct_k:g} K given, temperatures from 1000 to 100 000 K expected")
 
 
 def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:
     """Plot the rb-chromaticities of illuminants (paper, section 3.1), each point in its colour.
 
-    Chromaticities r = R / (R + G + B) and b = B / (R + G + B) are those of the decoded codes, that is of linear light
-    with the sRGB transfer function. An illuminant without light is omitted.
+    Chromaticities r = R / (R + G + B) and b = B / (R + G + B) are computed from the decoded codes, that is from linear
+    light with the sRGB transfer function. An illuminant without light is omitted.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

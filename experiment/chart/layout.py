@@ -108,7 +108,7 @@ class _Grid:
 
     @property
     def reference_count(self) -> int:
-        """Slots that are not taken by tags, including those of colours."""
+        """Slots that are not taken by tags, colours included."""
         return self.columns * self.rows - len(self.tag_slots) * TAG_SLOTS**2
 
     def holds(self, bits: int) -> bool:
@@ -192,10 +192,8 @@ def _choose_grid(bits: int, page: str | tuple[float, float] | None) -> tuple[_Gr
             f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm needs {len(grid.tag_slots)} tags, but the family "
             f"{TAG_FAMILY} has {TAG_IDS}; choose a smaller page"
         )
-    smaller_grids = (
-        _Grid.on(page_mm, slot) for slot in range(SLOT_PX - SLOT_STEP_PX, LEAST_SLOT_PX - 1, -SLOT_STEP_PX)
-    )
-    fitting_grid = next((grid for grid in smaller_grids if grid.holds(bits)), None)
+    smaller = (_Grid.on(page_mm, slot) for slot in range(SLOT_PX - SLOT_STEP_PX, LEAST_SLOT_PX - 1, -SLOT_STEP_PX))
+    fitting_grid = next((grid for grid in smaller if grid.holds(bits)), None)
     problem = (
         f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm is too small for the {8**bits} colours of a chart of {bits} bits"
     )
@@ -304,12 +302,12 @@ def _tag(grid: _Grid, number: int, column: int, row: int) -> Tag:
 
 
 def _references(grid: _Grid, is_reference: _Slots, rng: np.random.Generator) -> list[Reference]:
-    """Return the references: an eighth of each grey, evenly spread, and the rest white."""
     codes = np.zeros(is_reference.shape, dtype=np.int64)
     codes[is_reference] = PAPER_WHITE[0]
     is_white = is_reference.copy()
     count = int(is_reference.sum())
-    # If there are few references, each grey gets fewer, so that `LEAST_WHITES` are white.
+    # An eighth of the references for each grey. If there are few references, each grey gets fewer, so that
+    # `LEAST_WHITES` are white.
     grey_count = min(count // (2 * len(GREY_CODES)), (count - LEAST_WHITES) // len(GREY_CODES))
     for code in GREY_CODES:
         is_grey = spread(is_white, grey_count, rng)
@@ -328,23 +326,12 @@ def _references(grid: _Grid, is_reference: _Slots, rng: np.random.Generator) -> 
 
 
 def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
-    """Choose slots that are spread evenly over a grid, but not regularly.
+    """Choose `count` of the allowed slots (rows, columns), spread evenly over the grid, but not regularly.
 
     After the void-and-cluster method (Ulichney, "The void-and-cluster method for dither array generation", 1993).
     Starting with a random choice, each slot in turn moves to the emptiest position. One pass is enough: on A0, no two
     references are then closer than 4 slots, and no slot is farther than 6 from one. The spectrum is the even ring of
     blue noise. Each quarter of the grid keeps its number.
-
-    Parameters
-    ----------
-    allowed
-        (rows, columns) bool, slots that may be chosen.
-    count
-        Number of slots to choose.
-
-    Returns
-    -------
-        (rows, columns) bool, true for the chosen slots.
     """
     rows, columns = allowed.shape
     middle_row, middle_column = (rows + 1) // 2, (columns + 1) // 2

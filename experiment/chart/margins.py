@@ -117,7 +117,7 @@ def star_boxes() -> Boxes:
 
 
 def edge_boxes() -> Boxes:
-    """Return a black area whose lower edge falls by one pixel in twelve (slanted edge, ISO 12233): (24, 4) int64."""
+    """Return a black area with a lower edge that falls by one pixel in twelve (ISO 12233): (24, 4) int64."""
     step = np.arange(EDGE_STEPS)
     # Each box overlaps the next: boxes that only touch can show a hairline.
     return np.stack(
@@ -153,18 +153,14 @@ def number_every_mm(length_px: int) -> int:
 class Margins:
     """The four margins of a sheet around its patches, and the marks in them.
 
-    Parameters
-    ----------
-    field
-        (4,) int64 px, box of the patch area.
-    taken
-        (N, 4) int64 px, boxes outside the patch area that marks may not touch.
+    `field`: (4,) int64 px, box of the patch area. `occupied`: (N, 4) int64 px, boxes outside it that marks must not
+    touch.
     """
 
-    def __init__(self, field: Boxes, page_px: tuple[int, int], taken: Boxes) -> None:
+    def __init__(self, field: Boxes, page_px: tuple[int, int], occupied: Boxes) -> None:
         self._field = field
         self._page = page_px
-        self._taken = [taken.reshape(-1, 4)]
+        self._taken = [occupied.reshape(-1, 4)]
         self._placed: list[Boxes] = []
 
     @property
@@ -211,12 +207,7 @@ class Margins:
         """Put a millimetre ruler along the whole patch area, numbered from its left or top end; return success."""
         length = self.length(side)
         ticks = ruler_ticks(length)
-        boxes = [
-            np.array(
-                [[start, GAP_PX, start + TICK_PX, GAP_PX + tick_length] for _, start, tick_length in ticks],
-                dtype=np.int64,
-            )
-        ]
+        boxes = [np.array([[start, GAP_PX, start + TICK_PX, GAP_PX + end] for _, start, end in ticks], dtype=np.int64)]
         interval_mm = number_every_mm(length)
         for mm, start, _ in ticks:
             if mm % interval_mm:
@@ -264,12 +255,12 @@ class Margins:
         """Return whether boxes (N, 4) px, (u, v), overlap other marks at each of the shifts (M,) px along a margin."""
         # All shifts at once: two boxes that overlap across the margin exclude an open interval of shifts.
         axis, across = (0, 1) if side in {"top", "bottom"} else (1, 0)
-        boxes, others = self._on_sheet(side, boxes), np.concatenate(self._taken)
+        boxes, marks = self._on_sheet(side, boxes), np.concatenate(self._taken)
         lows, highs = boxes[:, None, across] - _AIR_PX, boxes[:, None, across + 2] + _AIR_PX
-        others = others[(lows.min() < others[:, across + 2]) & (others[:, across] < highs.max())]
-        box_index, other_index = np.nonzero((lows < others[:, across + 2]) & (others[:, across] < highs))
-        starts = others[other_index, axis] - boxes[box_index, axis + 2] - _AIR_PX
-        ends = others[other_index, axis + 2] - boxes[box_index, axis] + _AIR_PX
+        marks = marks[(lows.min() < marks[:, across + 2]) & (marks[:, across] < highs.max())]
+        box_index, other_index = np.nonzero((lows < marks[:, across + 2]) & (marks[:, across] < highs))
+        starts = marks[other_index, axis] - boxes[box_index, axis + 2] - _AIR_PX
+        ends = marks[other_index, axis + 2] - boxes[box_index, axis] + _AIR_PX
         started = np.bincount(np.searchsorted(shifts, starts, "right"), minlength=len(shifts) + 1)
         ended = np.bincount(np.searchsorted(shifts, ends, "left"), minlength=len(shifts) + 1)
         return np.cumsum(started - ended)[: len(shifts)] > 0
@@ -283,8 +274,8 @@ class Margins:
         margin = np.array([-_AIR_PX, -_AIR_PX, _AIR_PX, _AIR_PX])
         # Boxes that overlap one of them also overlap their hull, so the hull excludes most pairs quickly.
         enlarged_hull = hull[None] + margin
-        near_boxes = [taken[_overlapping(taken, enlarged_hull)] for taken in self._taken]
-        if any(_any_overlap(boxes + margin, taken) for taken in near_boxes):
+        near_boxes = [mark_boxes[_overlapping(mark_boxes, enlarged_hull)] for mark_boxes in self._taken]
+        if any(_any_overlap(boxes + margin, mark_boxes) for mark_boxes in near_boxes):
             return False
         self._taken.append(boxes)
         self._placed.append(boxes)
@@ -301,31 +292,23 @@ def target_boxes() -> Boxes:
     return np.concatenate(targets)
 
 
-def _any_overlap(boxes: Boxes, others: Boxes) -> bool:
-    return bool(_overlapping(boxes, others).any())
+def _any_overlap(boxes: Boxes, marks: Boxes) -> bool:
+    return bool(_overlapping(boxes, marks).any())
 
 
-def _overlapping(boxes: Boxes, others: Boxes) -> npt.NDArray[np.bool_]:
-    """Return which boxes (N, 4) overlap any of the others (M, 4)."""
+def _overlapping(boxes: Boxes, marks: Boxes) -> npt.NDArray[np.bool_]:
     x0, y0, x1, y1 = (edge[:, None] for edge in boxes.T)
-    left, top, right, bottom = others.T
+    left, top, right, bottom = marks.T
     return np.asarray(((x0 < right) & (left < x1) & (y0 < bottom) & (top < y1)).any(axis=1))
 
 
-def margin_marks(field: Boxes, page_px: tuple[int, int], taken: Boxes, lines: Iterable[str]) -> Boxes:
-    """Return all marks of a sheet, black on bare paper, (N, 4) int64 px.
+def margin_marks(field: Boxes, page_px: tuple[int, int], occupied: Boxes, lines: Iterable[str]) -> Boxes:
+    """Return all marks of a sheet, black on bare paper, (N, 4) int64 px; arguments as in `Margins`.
 
     Crop marks at the corners, rulers below and on the left, lines of text above, and sharpness targets above and on the
     right, as many as there is room for.
-
-    Parameters
-    ----------
-    field
-        (4,) int64 px, box of the patch area.
-    taken
-        (N, 4) int64 px, boxes outside the patch area that marks may not touch.
     """
-    margins = Margins(field, page_px, taken)
+    margins = Margins(field, page_px, occupied)
     margins.crop_marks()
     margins.ruler("bottom")
     margins.ruler("left")

@@ -127,7 +127,6 @@ def _number(value: float) -> str:
 
 
 def _string(text: str) -> str:
-    """Return a literal string with question marks for non-ASCII characters (ISO 32000-1, 7.3.4.2)."""
     ascii_text = text.encode("ascii", "replace").decode()
     return "(" + ascii_text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)") + ")"
 
@@ -163,7 +162,7 @@ def _metadata(title: str, subject: str, name: str) -> str:
 
 
 def srgb_output_profile() -> bytes:
-    """Return an ICC profile of an output device whose RGB codes are sRGB.
+    """Return an ICC profile of an output device with sRGB as RGB codes.
 
     The class is ``prtr``, which output intents need (ISO 32000-1, 14.11.5), with the tags of a table-based output
     profile. All rendering intents are equal: relative to the white of the medium. Tables of two points are exact in
@@ -188,7 +187,7 @@ def srgb_output_profile() -> bytes:
 
 
 def srgb_display_profile() -> bytes:
-    """Return an ICC profile of a display whose RGB codes are sRGB: three primaries and a curve, class ``mntr``."""
+    """Return an ICC profile of a display with sRGB as RGB codes: three primaries and a curve, class ``mntr``."""
     curve = np.rint(_FULL * decode_srgb(np.linspace(0, 1, _DISPLAY_CURVE))).astype(">u2").tobytes()
     curve = b"curv" + bytes(4) + struct.pack(">I", _DISPLAY_CURVE) + curve
     tags = {
@@ -209,7 +208,7 @@ _LINEAR = _curves(np.array([0.0, 1.0]))  # The identity as a curve
 
 
 def _gamut() -> bytes:
-    """Return the gamut tag: 0 for colours in the gamut, more for those outside."""
+    # 0 for colours in the gamut, more for those outside.
     side = np.linspace(0, _FULL / _ONE_XYZ, _GAMUT_GRID)
     xyz = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     rgb = xyz @ np.linalg.inv(_PRIMARIES).T

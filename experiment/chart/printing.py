@@ -54,12 +54,8 @@ def drawing(chart: Chart) -> Drawing:
     """Return the whole sheet: marks in the margins (`experiment.chart.margins`), then tags, patches and references."""
     field = field_drawing(chart)
     marks = _marks_px(chart).astype(np.float64) * PX_MM
-    return Drawing(
-        chart.page_mm,
-        np.concatenate([marks, field.rectangles_mm]),
-        np.concatenate([np.zeros((len(marks), 3), dtype=np.uint8), field.rgb]),
-        field.tiles,
-    )
+    rgb = np.concatenate([np.zeros((len(marks), 3), dtype=np.uint8), field.rgb])
+    return Drawing(chart.page_mm, np.concatenate([marks, field.rectangles_mm]), rgb, field.tiles)
 
 
 def field_drawing(chart: Chart, within_mm: tuple[float, float, float, float] | None = None) -> Drawing:
@@ -82,12 +78,8 @@ def field_drawing(chart: Chart, within_mm: tuple[float, float, float, float] | N
     tile_indices = np.flatnonzero(is_inside[len(chart.tags) :])
     tiles, colours = boxes[len(chart.tags) :][tile_indices], np.concatenate([chart.rgb, codes])[tile_indices]
     order = np.lexsort(tiles[:, :2].round(3).T)
-    return Drawing(
-        chart.page_mm,
-        np.concatenate([*rectangles, tiles[order]]),
-        np.concatenate([*rgb, colours[order]]),
-        len(order),
-    )
+    all_rectangles = np.concatenate([*rectangles, tiles[order]])
+    return Drawing(chart.page_mm, all_rectangles, np.concatenate([*rgb, colours[order]]), len(order))
 
 
 def _part_boxes(chart: Chart) -> npt.NDArray[np.float64]:
@@ -153,12 +145,10 @@ def label_lines(chart: Chart) -> tuple[str, str]:
     """Return the two lines printed in the margin: identity of the sheet, and how to print it."""
     width, height = chart.page_mm
     bits = "1 bit" if chart.bits == 1 else f"{chart.bits} bits"
-    properties = [f"CroP chart, {bits}, {width:g} x {height:g} mm", f"chart.json {chart.sha256[:16]}"]
-    properties += [] if chart.seed is None else [f"seed {chart.seed}"]
-    properties += [] if chart.software is None else [chart.software.encode("ascii", "replace").decode()]
-    return ", ".join(
-        properties
-    ), "Print at 100 %, colour management off, on matte paper; the rulers are in millimetres."
+    facts = [f"CroP chart, {bits}, {width:g} x {height:g} mm", f"chart.json {chart.sha256[:16]}"]
+    facts += [] if chart.seed is None else [f"seed {chart.seed}"]
+    facts += [] if chart.software is None else [chart.software.encode("ascii", "replace").decode()]
+    return ", ".join(facts), "Print at 100 %, colour management off, on matte paper; the rulers are in millimetres."
 
 
 def label(chart: Chart) -> str:
@@ -176,19 +166,16 @@ def _bands(
     width, height = size
     boxes = np.rint(sheet.rectangles_mm * pixels_per_mm).astype(np.int64)
     boxes = np.clip(boxes, 0, [width, height, width, height])
-    x_edges, y_edges = (np.unique(np.append(boxes[:, axis::2], [0, end])) for axis, end in enumerate(size))
-    (left, right), (top, bottom) = (
-        np.searchsorted(x_edges, boxes[:, 0::2]).T,
-        np.searchsorted(y_edges, boxes[:, 1::2]).T,
-    )
+    xs, ys = (np.unique(np.append(boxes[:, axis::2], [0, end])) for axis, end in enumerate(size))
+    (left, right), (top, bottom) = np.searchsorted(xs, boxes[:, 0::2]).T, np.searchsorted(ys, boxes[:, 1::2]).T
     # Between two adjacent edges all rows are equal, so a rectangle is painted once for many rows.
-    for first in range(0, len(y_edges) - 1, _BANDS):
-        band_edges = y_edges[first : first + _BANDS + 1].tolist()
-        band_rows = np.full((len(band_edges) - 1, len(x_edges) - 1, 3), PAPER_WHITE, dtype=np.uint8)
+    for first in range(0, len(ys) - 1, _BANDS):
+        band_edges = ys[first : first + _BANDS + 1].tolist()
+        band_rows = np.full((len(band_edges) - 1, len(xs) - 1, 3), PAPER_WHITE, dtype=np.uint8)
         for k in np.flatnonzero((top < first + len(band_rows)) & (bottom > first)).tolist():
             band_rows[max(top[k] - first, 0) : bottom[k] - first, left[k] : right[k]] = sheet.rgb[k]
         for (start, end), row in zip(pairwise(band_edges), band_rows, strict=True):
-            yield start, end, np.repeat(row, np.diff(x_edges), axis=0)
+            yield start, end, np.repeat(row, np.diff(xs), axis=0)
 
 
 def _packed_strips(bands: Iterator[tuple[int, int, npt.NDArray[np.uint8]]], height: int) -> Iterator[bytes]:
@@ -261,8 +248,8 @@ def save_pdf(chart: Chart, path: Path) -> None:
     save_drawing(drawing(chart), path, label(chart), f"chart.json has SHA-256 {chart.sha256}")
 
 
-def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, more: bytes = b"") -> None:
-    """Write any drawing as a PDF/X-4 with one page of its size. `more`: operators added to the page."""
+def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, operators: bytes = b"") -> None:
+    """Write any drawing as a PDF/X-4 with one page of its size. `operators`: operators added to the page."""
     width, height = (side * POINTS_PER_MM for side in sheet.page_mm)
     corners = sheet.rectangles_mm * POINTS_PER_MM
     # Renderers paint every pixel that a rectangle touches, so each is slightly smaller, and rounding leaves the next
@@ -274,12 +261,12 @@ def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, more: byt
     boxes = np.stack([left, height - bottom, right - left, bottom - top], axis=1)
     changes = np.flatnonzero((np.diff(sheet.rgb.astype(np.int64), axis=0) != 0).any(axis=1)) + 1
     # Successive rectangles of one colour share a path, which keeps the order and saves bytes.
-    parts: list[bytes] = []
+    paths: list[bytes] = []
     for first, last in zip([0, *changes.tolist()], [*changes.tolist(), len(corners)], strict=True):
         red, green, blue = (int(code) for code in sheet.rgb[first])
         rows = ((box[0], box[1], box[2], box[3]) for box in boxes[first:last].tolist())
-        parts.append(filled(rows, (red, green, blue)))
-    save_page(path, (width, height), b"".join([*parts, more]), title, subject)
+        paths.append(filled(rows, (red, green, blue)))
+    save_page(path, (width, height), b"".join([*paths, operators]), title, subject)
 
 
 def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:

@@ -16,14 +16,7 @@ import numpy.typing as npt
 from experiment.chart.margins import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, margin_marks, text_boxes, whole_px
 from experiment.chart.model import Chart
 from experiment.chart.pdf_x import row_of_pixels
-from experiment.chart.printing import (
-    POINTS_PER_MM,
-    Drawing,
-    field_drawing,
-    field_px,
-    label_lines,
-    save_drawing,
-)
+from experiment.chart.printing import POINTS_PER_MM, Drawing, field_drawing, field_px, label_lines, save_drawing
 from foundation.files import write_whole
 
 PAGE_MM = (297.0, 210.0)  # A4, landscape (ISO 216), which every printer has
@@ -65,7 +58,7 @@ def proof_drawing(chart: Chart) -> Drawing:
         for low, high, room, size in zip((left, top), (right, bottom), WINDOW_MM, cell, strict=True)
     ]
     window = np.array([left, top, left + sides[0], top + sides[1]]) * PX_MM
-    part = field_drawing(chart, (window[0], window[1], window[2], window[3]))
+    cutout = field_drawing(chart, (window[0], window[1], window[2], window[3]))
     shift = (np.array(CORNER_PX) - (left, top)) * PX_MM
     box = np.array([*CORNER_PX, CORNER_PX[0] + sides[0], CORNER_PX[1] + sides[1]], dtype=np.int64)
     page_px = (int(PAGE_MM[0] / PX_MM), int(PAGE_MM[1] / PX_MM))
@@ -79,9 +72,9 @@ def proof_drawing(chart: Chart) -> Drawing:
     shades = np.repeat(np.array(WEDGE_CODES, dtype=np.uint8)[:, None], 3, axis=1)
     return Drawing(
         PAGE_MM,
-        np.concatenate([black, wedge, part.rectangles_mm + np.tile(shift, 2)]),
-        np.concatenate([np.zeros((len(black), 3), dtype=np.uint8), shades, part.rgb]),
-        part.tiles,
+        np.concatenate([black, wedge, cutout.rectangles_mm + np.tile(shift, 2)]),
+        np.concatenate([np.zeros((len(black), 3), dtype=np.uint8), shades, cutout.rgb]),
+        cutout.tiles,
     )
 
 

@@ -118,13 +118,11 @@ class DetectedField:
         distances = np.abs(across)
         for axis in (0, 1):
             for end in (0.0, 1.0):
-                is_on_side = np.abs(share[:, axis] - end) < 1e-6
-                along: _Points = share[is_on_side, 1 - axis]
+                on_side = np.abs(share[:, axis] - end) < 1e-6
+                along: _Points = share[on_side, 1 - axis]
                 if len(along) > 2 * _RUN_ORDER:
-                    curve, _ = robust_curve(along, across[is_on_side], _RUN_ORDER)
-                    distances[is_on_side] = np.abs(
-                        across[is_on_side] - np.polynomial.legendre.legval(2 * along - 1, curve)
-                    )
+                    curve, _ = robust_curve(along, across[on_side], _RUN_ORDER)
+                    distances[on_side] = np.abs(across[on_side] - np.polynomial.legendre.legval(2 * along - 1, curve))
         return distances
 
 
@@ -168,7 +166,7 @@ def find_field(
     Raises
     ------
     InputError, RegistrationError
-        If the corners cannot be those of the chart, or the patch area is not detected.
+        If the corners do not fit the chart, or the patch area is not detected.
     """
     white = max(paper_level(plane) for plane in planes)
     if white < MIN_SIGNAL:
@@ -207,9 +205,8 @@ def _find_given_field(picture: PreparedImage, chart: Chart, corners_px: _Points,
     outline = trace_outline(picture, corners_px)
     if outline is None:
         raise RegistrationError(
-            f"{image_name}: no edge between patches and bare paper on all four sides near the given corners "
-            f"{given_corners}; give the corners of the patch area (not of the sheet) to about 40 pixels, and uncover "
-            "its margin"
+            f"{image_name}: not all four sides near the given corners {given_corners} have an edge between patches and "
+            "paper; give the corners of the patch area (not of the sheet) to 40 pixels, and uncover its margin"
         )
     placed_charts = [_PlacedChart.of(outline, chart, turn) for turn in range(8)]
     misfits = [_colour_misfit(picture, placed, chart) for placed in placed_charts]
@@ -260,14 +257,12 @@ class _PlacedChart:
         sides: list[tuple[_Points, _Points, _Points]] = []
         for side in range(4):
             corner_numbers = {int(order[side]), int(order[(side + 1) % 4])}
-            outline_side = next(k for k in range(4) if {k, (k + 1) % 4} == corner_numbers)
+            k = next(k for k in range(4) if {k, (k + 1) % 4} == corner_numbers)
             along = side % 2
-            points = project(to_mm, outline.sides_px[outline_side])
+            points = project(to_mm, outline.sides_px[k])
             points[:, 1 - along] = corners_mm[side, 1 - along]
             ascending = np.argsort(points[:, along])
-            sides.append(
-                (points[ascending], outline.sides_px[outline_side][ascending], outline.normals[outline_side][ascending])
-            )
+            sides.append((points[ascending], outline.sides_px[k][ascending], outline.normals[k][ascending]))
         mm, px, normals = zip(*sides, strict=True)
         return cls(corners_mm, corners_px, homography, mm, px, normals)
 
@@ -288,7 +283,7 @@ class _PlacedChart:
         return mapped
 
     def field(self, explained: float) -> DetectedField:
-        mm, px, normals = (np.concatenate(parts) for parts in (self.sides_mm, self.sides_px, self.normals))
+        mm, px, normals = (np.concatenate(sides) for sides in (self.sides_mm, self.sides_px, self.normals))
         return DetectedField(self.corners_px, self.homography, mm, px, normals, explained)
 
 
@@ -374,14 +369,9 @@ def corners_text(corners_px: npt.ArrayLike) -> str:
 
 
 def require_corners(corners_px: _Points, shape: tuple[int, int] | None = None) -> None:
-    """Raise `InputError` if corners cannot be those of a patch area.
+    """Raise `InputError` if corners cannot belong to a patch area in an image of `shape` (height, width).
 
-    Parameters
-    ----------
-    corners_px
-        (4, 2) float64, half-size px, clockwise from the printed top-left.
-    shape
-        Height and width of the image, half-size px, if known.
+    `corners_px`: (4, 2) float64, half-size px, clockwise from the printed top-left.
     """
     given_corners = corners_text(corners_px)
     clockwise = "give four positions X,Y, clockwise from the printed top-left corner of the patch area"
@@ -423,11 +413,9 @@ class PreparedImage:
         factor = max(1, round(width / _SMALL_WIDTH_PX))
         size = (width // factor, height // factor)
         brightest = [paper_level(plane) for plane in planes]
-        bright_channels = [
-            k for k, level in enumerate(brightest) if level >= max(MIN_SIGNAL, _LEAST_LIGHT * max(brightest))
-        ]
+        usable = [k for k, level in enumerate(brightest) if level >= max(MIN_SIGNAL, _LEAST_LIGHT * max(brightest))]
         levels: list[_Float] = []
-        for k in bright_channels:
+        for k in usable:
             cropped = planes[k].values[: size[1] * factor, : size[0] * factor]
             small = cv2.blur(cv2.resize(cropped, size, interpolation=cv2.INTER_AREA), (3, 3))
             # Near every point there is paper, or a patch as bright as paper in this channel.
@@ -435,11 +423,9 @@ class PreparedImage:
             level = cv2.blur(cv2.dilate(small, np.ones((reach, reach), dtype=np.uint8)), (reach, reach))
             level = np.maximum(level, np.float32(0.2 * brightest[k])).astype(np.float32)
             levels.append(level)
-        smooth = tuple(
-            replace(planes[k], values=cv2.blur(planes[k].values, (3, 3)).astype(np.float32)) for k in bright_channels
-        )
-        bright = tuple(brightest[k] >= _MUCH_LIGHT * max(brightest) for k in bright_channels)
-        return cls(smooth, tuple(bright_channels), tuple(levels), bright, (height, width), factor)
+        smooth = tuple(replace(planes[k], values=cv2.blur(planes[k].values, (3, 3)).astype(np.float32)) for k in usable)
+        bright = tuple(brightest[k] >= _MUCH_LIGHT * max(brightest) for k in usable)
+        return cls(smooth, tuple(usable), tuple(levels), bright, (height, width), factor)
 
     def to_small(self, points_px: _Points) -> _Points:
         """Return points (..., 2) float64 half-size px in pixels of the small image."""
@@ -449,20 +435,15 @@ class PreparedImage:
         """Return the level relative to paper (...) float32 at points (..., 2) float64 half-size px."""
         x, y = (np.ascontiguousarray(points_px[..., axis], dtype=np.float32) for axis in (0, 1))
         small_points = self.to_small(points_px).astype(np.float32)
+        sx, sy = small_points[..., 0], small_points[..., 1]
         paleness = np.full(x.shape, np.inf, dtype=np.float32)
         for plane, paper_levels, bright in zip(self.planes, self.levels, self.bright, strict=True):
             if not bright:
                 continue
             dx, dy = (np.float32(offset) for offset in plane.offset_px)
             level = cv2.remap(plane.values, x - dx, y - dy, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            paper_level = cv2.remap(
-                paper_levels,
-                small_points[..., 0],
-                small_points[..., 1],
-                cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_REPLICATE,
-            )
-            paleness = np.minimum(paleness, level / paper_level)
+            paper = cv2.remap(paper_levels, sx, sy, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            paleness = np.minimum(paleness, level / paper)
         return paleness
 
 
@@ -504,9 +485,8 @@ def trace_outline(picture: PreparedImage, corners_px: _Points) -> Outline | None
                 return None
             normal = _outward_normal(start, end)
             middle = _bent_points(along, curves[side], start, end)
-            offsets, strength = _steepest_rises(
-                picture.paleness_at(middle[:, None] + across[None, :, None] * normal), across, sigma_px
-            )
+            profiles = picture.paleness_at(middle[:, None] + across[None, :, None] * normal)
+            offsets, strength = _steepest_rises(profiles, across, sigma_px)
             has_edge = strength > _MIN_EDGE
             if has_edge.mean() < 0.4:
                 return None
@@ -569,10 +549,7 @@ def _fitted_step(profile: _Points, sigma: float) -> tuple[_Points, _Points]:
         # Patches are not uniform, so their side of the step has a slope of its own.
         design = np.stack([np.ones_like(step), step, slope, np.minimum(_REFINE_ACROSS_PX[None], 0) + 0 * step], axis=-1)
         gram = np.einsum("kni,knj->kij", design, design) + 1e-9 * np.eye(4)
-        solved = np.asarray(
-            np.linalg.solve(gram, np.einsum("kni,kn->ki", design, profile)[..., None]), dtype=np.float64
-        )
-        solution = solved[..., 0]
+        solution = np.linalg.solve(gram, np.einsum("kni,kn->ki", design, profile)[..., None])[..., 0].astype(np.float64)
         heights = solution[:, 1]
         offsets = offsets - np.clip(solution[:, 2] / np.where(np.abs(heights) > 0.01, heights, 0.01), -0.5, 0.5)
     return offsets, heights
@@ -616,16 +593,8 @@ def _steepest_rises(paleness: _Float, across: _Points, sigma_px: float) -> tuple
 def robust_curve(along: _Points, offsets: _Points, order: int) -> tuple[_Points, npt.NDArray[np.bool_]]:
     """Fit a Legendre series to the majority of the points on a side.
 
-    Parameters
-    ----------
-    along
-        (N,) float64, position along the side, 0 … 1.
-    offsets
-        (N,) float64, position across the side, half-size px.
-
-    Returns
-    -------
-        Coefficients (order + 1,) float64 on −1 … 1, and (N,) bool, the points that fit.
+    `along`: (N,) float64, position along the side, 0 … 1. `offsets`: (N,) float64, position across it, half-size px.
+    Returns the coefficients (order + 1,) float64 on −1 … 1, and (N,) bool, the points that fit.
     """
     basis = np.polynomial.legendre.legvander(2 * along - 1, order)
     scale = max(sigma_of(offsets - np.median(offsets)), 0.5)
@@ -641,21 +610,15 @@ def robust_curve(along: _Points, offsets: _Points, order: int) -> tuple[_Points,
 
 
 def _intersections(sides: Sequence[_Points]) -> _Points:
-    """Return the intersections of four curves (N, 2), each starting about where the previous one ends."""
     corners = np.zeros((4, 2))
     for k in range(4):
         previous, following = sides[k - 1], sides[k]
-        end_normal, start_normal = (
-            _outward_normal(previous[-2], previous[-1]),
-            _outward_normal(following[0], following[1]),
-        )
-        normals = np.stack([end_normal, start_normal])
-        corners[k] = np.linalg.solve(normals, np.array([end_normal @ previous[-1], start_normal @ following[0]]))
+        normals = np.stack([_outward_normal(*previous[-2:]), _outward_normal(*following[:2])])
+        corners[k] = np.linalg.solve(normals, np.array([normals[0] @ previous[-1], normals[1] @ following[0]]))
     return corners
 
 
 def _fit_curve(start: _Points, end: _Points, points: _Points, order: int) -> _Points:
-    """Return the Legendre coefficients of the offset of points from a chord."""
     normal = _outward_normal(start, end)
     share = (points - start) @ (end - start) / float((end - start) @ (end - start))
     basis = np.polynomial.legendre.legvander(2 * share - 1, order)

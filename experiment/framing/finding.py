@@ -158,7 +158,6 @@ def find_chart(
 
 
 def _page_pose(homography: npt.NDArray[np.float64], chart: Chart, plane: Plane) -> tuple[float, bool, float]:
-    """Return the page's fill, whether it lies inside the image, and its rotation in degrees, as in `ChartPose`."""
     height, width = plane.values.shape
     page_w, page_h = chart.page_mm
     corners = project(homography, [(0, 0), (page_w, 0), (page_w, page_h), (0, page_h)])
@@ -183,13 +182,8 @@ def _find_field(
 
 
 def _missing_tags_error(
-    plane: Plane,
-    detected_tags: tuple[DetectedTag, ...],
-    chart_tags: tuple[DetectedTag, ...],
-    expected_tags: str,
-    image_name: str,
+    plane: Plane, detected: tuple[DetectedTag, ...], tags: tuple[DetectedTag, ...], expected: str, image_name: str
 ) -> RegistrationError:
-    """Return the error that names the likeliest reason for too few detected tags."""
     white = paper_level(plane)
     if white < MIN_SIGNAL:
         return RegistrationError(
@@ -197,26 +191,26 @@ def _missing_tags_error(
             f"{MIN_SIGNAL:.0f} expected; switch the projector on, open its shutter, or expose longer"
         )
     mirrored = np.ascontiguousarray(plane.values[:, ::-1])
-    if len(detect_tags(Plane(plane.channel, mirrored, (0.0, 0.0)))) > max(1, len(detected_tags)):
+    if len(detect_tags(Plane(plane.channel, mirrored, (0.0, 0.0)))) > max(1, len(detected)):
         return RegistrationError(
-            f"{image_name} is mirrored: {expected_tags} are detected only in the mirrored image; "
+            f"{image_name} is mirrored: {expected} are detected only in the mirrored image; "
             "take the frame without a mirror, or print the chart unmirrored"
         )
     enlarged = cv2.resize(plane.values, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     magnified = detect_tags(Plane(plane.channel, np.asarray(enlarged, dtype=np.float32), (0.0, 0.0)))
-    if len(magnified) > max(1, len(detected_tags)):
+    if len(magnified) > max(1, len(detected)):
         module = min(tag.side_px for tag in magnified) / 2 / TAG_MODULES
         return RegistrationError(
             f"{image_name}: the tags are too small: a module is {module:.1f} px, at least {MIN_MODULE_PX:g} px "
             "expected; move the camera closer or use a longer lens"
         )
-    if detected_tags and not chart_tags:
+    if detected and not tags:
         return RegistrationError(
-            f"{image_name}: tags {_first_ids([tag.id for tag in detected_tags])} detected, {expected_tags} expected; "
+            f"{image_name}: tags {_first_ids([tag.id for tag in detected])} detected, {expected} expected; "
             "this is another chart: give the chart.json of the print in front of the camera"
         )
     return RegistrationError(
-        f"{image_name}: {len(chart_tags) or 'none'} of the {expected_tags} detected; "
+        f"{image_name}: {len(tags) or 'none'} of the {expected} detected; "
         "point the camera at the chart, focus it, and light all of it"
     )
 
@@ -269,7 +263,7 @@ _Image = npt.NDArray[np.uint8]
 def annotated_png(mosaic: Mosaic, chart: Chart, pose: ChartPose | None) -> bytes:
     """Draw the pose of the chart onto a frame of half size and return it as PNG bytes.
 
-    Drawn are the page and the tags, or the outline of the patch area. If `pose` is None, all detected tags and the
+    Drawn are the page and the tags, or the outline of the patch area. Without `pose`, all detected tags and the
     expected ids are drawn, or for a chart without tags how to give its corners.
     """
     black = frame_black(mosaic)

@@ -100,10 +100,8 @@ def gauges_of(mosaic: Mosaic, channel: Channel, black: npt.NDArray[np.float64], 
     values = np.zeros(blocks.shape[2:], dtype=np.float32)
     for left, top, right, bottom in gauge_boxes(pose):
         region = np.s_[top:bottom, left:right]
-        values[region] = (
-            sum(blocks[position][region].astype(np.float32) for position in positions) / np.float32(len(positions))
-            - level
-        )
+        total = sum(blocks[position][region].astype(np.float32) for position in positions)
+        values[region] = total / np.float32(len(positions)) - level
     return Plane(channel, values, channel_offset_px(positions))
 
 
@@ -151,15 +149,17 @@ def _tag_shift(reference: Plane, plane: Plane, tag: DetectedTag) -> _Points | No
         return None
     # Smooth both crops slightly, so that the gradient follows the image and not its noise.
     crop_region = np.s_[y0 - margin : y1 + margin, x0 - margin : x1 + margin]
-    earlier = cv2.GaussianBlur(reference.values[crop_region], (0, 0), 0.7).astype(np.float64)
-    later = cv2.GaussianBlur(plane.values[crop_region], (0, 0), 0.7)
+    reference_crop = cv2.GaussianBlur(reference.values[crop_region], (0, 0), 0.7).astype(np.float64)
+    plane_crop = cv2.GaussianBlur(plane.values[crop_region], (0, 0), 0.7)
     inner = np.s_[margin:-margin, margin:-margin]
-    gy, gx = (np.asarray(gradient)[inner].ravel() for gradient in np.gradient(earlier))
-    template = earlier[inner].ravel()
+    gy, gx = (np.asarray(gradient)[inner].ravel() for gradient in np.gradient(reference_crop))
+    template = reference_crop[inner].ravel()
     # A small additional Gaussian blur adds half its variance times the Laplacian (heat equation).
-    laplacian = np.asarray(cv2.Laplacian(earlier, cv2.CV_64F))[inner].ravel()
+    laplacian = np.asarray(cv2.Laplacian(reference_crop, cv2.CV_64F))[inner].ravel()
     moved = template
-    rows, columns = np.mgrid[margin : earlier.shape[0] - margin, margin : earlier.shape[1] - margin].astype(np.float32)
+    rows, columns = np.mgrid[
+        margin : reference_crop.shape[0] - margin, margin : reference_crop.shape[1] - margin
+    ].astype(np.float32)
     design = np.column_stack([template - template.mean(), np.ones_like(template), gx, gy, laplacian])
     # Normal equations, because a linear-algebra library would start threads that compete with decoding.
     gram = np.asarray(np.einsum("ni,nj->ij", design, design), dtype=np.float64)
@@ -169,7 +169,7 @@ def _tag_shift(reference: Plane, plane: Plane, tag: DetectedTag) -> _Points | No
     inverse = np.asarray(np.linalg.inv(gram), dtype=np.float64)
     shift, blur_growth = np.zeros(2), 0.0
     for _ in range(_STEPS):
-        remapped = cv2.remap(later, columns + np.float32(shift[0]), rows + np.float32(shift[1]), cv2.INTER_CUBIC)
+        remapped = cv2.remap(plane_crop, columns + np.float32(shift[0]), rows + np.float32(shift[1]), cv2.INTER_CUBIC)
         moved = np.asarray(remapped, dtype=np.float64).ravel()
         # moved = gain · (template + g · step + laplacian · growth / 2) + offset, linear in the products.
         solution = inverse @ np.asarray(np.einsum("ni,n->i", design, moved), dtype=np.float64)
@@ -187,13 +187,11 @@ def _tag_shift(reference: Plane, plane: Plane, tag: DetectedTag) -> _Points | No
 
 
 def _strips(field: DetectedField) -> tuple[_Points, _Points]:
-    """Return centres (K, 2) px and normals (K, 2) of the strips along the outline."""
     indices = np.unique(np.linspace(0, len(field.outline_px) - 1, _STRIPS).round().astype(int))
     return field.outline_px[indices], field.normals[indices]
 
 
 def _strip_samples(middles: _Points, normals: _Points) -> _Points:
-    """Return the sample positions (K, along, across, 2) px of the strips."""
     along = np.stack([-normals[:, 1], normals[:, 0]], axis=-1)
     u = np.arange(-_STRIP_ALONG, _STRIP_ALONG + 1)[None, :, None, None]
     v = np.arange(-_STRIP_ACROSS, _STRIP_ACROSS + 1)[None, None, :, None]
@@ -213,21 +211,19 @@ def _field_shift(reference: Plane, plane: Plane, field: DetectedField) -> Shift:
     earlier = _sampled(reference, samples)
     slope = np.asarray(np.gradient(earlier, axis=2))
     # As for a tag, but only across the edge: blur along an edge has no effect.
-    second_difference = np.zeros_like(earlier)
-    second_difference[:, :, 1:-1] = np.diff(earlier, 2, axis=2)
+    bend = np.zeros_like(earlier)
+    bend[:, :, 1:-1] = np.diff(earlier, 2, axis=2)
     # The ends of a strip have no neighbours on both sides, so their differences are not used.
     inner = np.s_[:, :, 1:-1]
-    template, slope, second_difference = (
-        array[inner].reshape(len(middles), -1) for array in (earlier, slope, second_difference)
-    )
-    design = np.stack([template, np.ones_like(template), slope, second_difference], axis=-1)
+    template, slope, bend = (array[inner].reshape(len(middles), -1) for array in (earlier, slope, bend))
+    design = np.stack([template, np.ones_like(template), slope, bend], axis=-1)
     gram = np.einsum("kni,knj->kij", design, design) + 1e-9 * np.eye(4)
     offsets: _Points = np.zeros(len(middles))
     solution: _Points = np.zeros((len(middles), 4))
     moved = template
     for _ in range(_STEPS):
-        later = _sampled(plane, samples + offsets[:, None, None, None] * normals[:, None, None])
-        moved = later[inner].reshape(len(middles), -1)
+        shifted = _sampled(plane, samples + offsets[:, None, None, None] * normals[:, None, None])
+        moved = shifted[inner].reshape(len(middles), -1)
         # moved = gain · (template + slope · step) + offset, linear in (gain, offset, gain · step).
         solved = np.asarray(np.linalg.solve(gram, np.einsum("kni,kn->ki", design, moved)[..., None]), dtype=np.float64)
         solution = solved[..., 0]
@@ -262,10 +258,8 @@ def _similarity(
     centre = field.corners_px.mean(axis=0)
     x, y = ((middles - centre) / np.abs(field.corners_px - centre).max()).T
     # A rotation moves (x, y) by (−y, x), a change of scale by (x, y).
-    rotation_and_scale = np.stack(
-        [normals[:, 1] * x - normals[:, 0] * y, normals[:, 0] * x + normals[:, 1] * y], axis=-1
-    )
-    design = np.column_stack([normals, rotation_and_scale])
+    normal_x, normal_y = normals.T
+    design = np.column_stack([normals, normal_y * x - normal_x * y, normal_x * x + normal_y * y])
     motion = np.zeros(4)
     robustness = np.ones(len(offsets))
     for _ in range(4):
@@ -303,18 +297,8 @@ def preview_jpeg(
 ) -> bytes:
     """Return a frame as JPEG bytes, at most 640 px wide or high, with marked regions and a text.
 
-    Parameters
-    ----------
-    black
-        (2, 2) float64, black level of the frame, counts.
-    white
-        (3,) float64, camera RGB above black that is shown as white: paper under full white.
-    outlines_px
-        Outlines (K, 2) float64 half-size px, of tags or of the patch area.
-    boxes
-        Left, top, right, bottom of deviating regions, half-size px.
-    cause
-        Text at the bottom; may be empty.
+    `black`: (2, 2) float64, black level, counts. `white`: (3,) float64, camera RGB above black that is shown as white.
+    `outlines_px`: outlines (K, 2) float64 half-size px. `boxes`: left, top, right, bottom of regions, half-size px.
     """
     blocks = mosaic.block_planes()
     height, width = blocks.shape[2:]
@@ -340,9 +324,8 @@ def preview_jpeg(
 def _with_text(image: npt.NDArray[np.uint8], cause: str) -> npt.NDArray[np.uint8]:
     # OpenCV's font has only ASCII letters.
     ascii_cause = cause.replace("°", " deg").replace("×", "x").replace("–", "-").replace("−", "-").replace("…", "...")
-    lines = textwrap.wrap(ascii_cause.encode("ascii", "replace").decode(), max(20, int(image.shape[1] / _LETTER_PX)))[
-        :5
-    ]
+    width = max(20, int(image.shape[1] / _LETTER_PX))
+    lines = textwrap.wrap(ascii_cause.encode("ascii", "replace").decode(), width)[:5]
     height, line_height = len(image), 17
     top = height - line_height * len(lines) - line_height // 2
     image[top:] //= 3

@@ -32,10 +32,10 @@ _INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0
 def blur_px(pose: ChartPose) -> float:
     """Return the blur of the image: median over edges of the σ of the blurring Gaussian, half-size px.
 
-    The edges are those of the tags, or of the patch area if the chart has no tags. NaN if no edge is measured. The
-    value includes lens, focus and movement, and the size and spacing of the photosites: 0.29 px for green (two
-    photosites half a pixel apart), 0.14 px for red and blue. It is accurate to 0.01 px up to a quarter of a tag module.
-    Above that it is up to a tenth too high, because the tag corners are less accurate.
+    The edges belong to the tags, or to the patch area if the chart has no tags. NaN if no edge is measured. The value
+    includes lens, focus and movement, and the size and spacing of the photosites: 0.29 px for green (two photosites
+    half a pixel apart), 0.14 px for red and blue. It is accurate to 0.01 px up to a quarter of a tag module. Above that
+    it is up to a tenth too high, because the tag corners are less accurate.
     """
     if pose.field is not None:
         blurs = _outline_blurs(pose.plane, pose.field)[1]
@@ -107,7 +107,7 @@ def _outline_blurs(plane: Plane, field: DetectedField) -> tuple[_Points, npt.NDA
 
 
 def _sigma(counts: _Points, distances: _Points, step_positions: Sequence[float]) -> float:
-    """Return the σ of the blurred steps of unknown height that fit the counts best."""
+    # Blurred steps of unknown height are fitted for each σ.
     sigma = _BLURS[:, None]
     steps = [ndtr((distances - position) / sigma) for position in step_positions]
     # The derivative of the edge absorbs an error of its position.

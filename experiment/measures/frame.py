@@ -83,19 +83,19 @@ class FramePlaces:
 
 
 def _mean_counts(
-    counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: float, floor: float
+    counts: npt.NDArray[np.uint16], division: FramePlaces, clipping: float, floor: float
 ) -> tuple[_Array, _Array, _Array]:
     """Return mean counts of tiles (T, 4) and strips (rows, 4, 4), and shares (2,) of clipped and empty pixels.
 
     The last axis of the means has the four positions of the block, row by row.
     """
-    sums = np.zeros((places.rows, TILE_COLUMNS, 4), dtype=np.int64)
+    sums = np.zeros((division.rows, TILE_COLUMNS, 4), dtype=np.int64)
     top = min(int(np.ceil(clipping)), 65535)
     tallies = np.zeros(2, dtype=np.int64)
-    _sum_rows(counts, places.x_edges, top, max(int(floor), 0), sums, tallies)
-    tiles = np.add.reduceat(sums, places.y_edges[:-1], axis=0).reshape(-1, 4) / places.tile_blocks
+    _sum_rows(counts, division.x_edges, top, max(int(floor), 0), sums, tallies)
+    tiles = np.add.reduceat(sums, division.y_edges[:-1], axis=0).reshape(-1, 4) / division.tile_blocks
     ends = np.arange(0, TILE_COLUMNS, TILE_COLUMNS // SEGMENTS)
-    widths = np.add.reduceat(np.diff(places.x_edges), ends)
+    widths = np.add.reduceat(np.diff(division.x_edges), ends)
     strips = np.add.reduceat(sums, ends, axis=1) / widths[:, None]
     return tiles, strips, tallies / counts.size
 
@@ -164,20 +164,18 @@ class Measured:
 def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
     """Measure a frame. `black`: (2, 2) float64 counts, if already known."""
     blocks = mosaic.block_planes()
-    places = FramePlaces(int(blocks.shape[2]), int(blocks.shape[3]))
+    division = FramePlaces(int(blocks.shape[2]), int(blocks.shape[3]))
     black = frame_black(mosaic) if black is None else black
     mean_black = float(black.mean())
     empty_limit = _EMPTY_SHARE * mean_black if mean_black >= _LEAST_BLACK else 0.0
-    *means, shares = _mean_counts(mosaic.counts, places, CLIPPING_SHARE * mosaic.white_level, empty_limit)
-    rows, columns = places.sampled
+    *means, shares = _mean_counts(mosaic.counts, division, CLIPPING_SHARE * mosaic.white_level, empty_limit)
+    rows, columns = division.sampled
     sampled = np.stack([blocks[r, c][rows, columns] for r in range(2) for c in range(2)], axis=-1)
     positions = phases(mosaic)
     greens = [2 * r + c for r, c in positions["G"]]
     green_samples = sampled[:, greens]
     brightest = max(
-        float(np.percentile(sampled[:, 2 * r + c], BRIGHTEST_PERCENTILE) - black[r, c])
-        for of_channel in positions.values()
-        for r, c in of_channel
+        float(np.percentile(sampled[:, 2 * r + c], BRIGHTEST_PERCENTILE) - black[r, c]) for r, c in np.ndindex(2, 2)
     )
     tiles, strips = (_channels(mean - black.ravel(), positions) for mean in means)
     return Measured(
@@ -185,7 +183,7 @@ def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
         strips=strips.reshape(-1, 3),
         samples=green_samples,
         digest=hashlib.blake2b(sampled.tobytes(), digest_size=16).digest(),
-        noise=_noise(green_samples.astype(np.float64) - [black[place] for place in positions["G"]]),
+        noise=_noise(green_samples.astype(np.float64) - [black[position] for position in positions["G"]]),
         black=mean_black,
         black_measured=bool(mosaic.masked),
         range_dn=float(mosaic.white_level - mean_black),
@@ -194,24 +192,21 @@ def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
         empty=float(shares[1]),
         camera=mosaic.camera,
         serial=mosaic.serial,
-        places=places,
+        places=division,
     )
 
 
-def strip_blocks(places: FramePlaces) -> float:
+def strip_blocks(division: FramePlaces) -> float:
     """Return the mean number of blocks in a strip."""
-    return places.columns / SEGMENTS
+    return division.columns / SEGMENTS
 
 
 def _channels(means: _Array, positions: dict[Channel, tuple[tuple[int, int], ...]]) -> _Array:
-    """Return means (..., 3) of R, G, B from those (..., 4) of the four positions of the block."""
-    return np.stack(
-        [np.mean([means[..., 2 * r + c] for r, c in positions[channel]], axis=0) for channel in CHANNELS], axis=-1
-    )
+    channels = [np.mean([means[..., 2 * r + c] for r, c in positions[channel]], axis=0) for channel in CHANNELS]
+    return np.stack(channels, axis=-1)
 
 
 def _noise(greens: _Array) -> Noise:
-    """Fit the photon transfer to pairs of greens (M, 2) of the same block, counts above black."""
     level = greens.mean(axis=1)
     difference = greens[:, 0] - greens[:, 1]
     edges = np.quantile(level, np.linspace(0, 1, _NOISE_BINS + 1))

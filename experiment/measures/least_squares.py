@@ -165,7 +165,7 @@ def light_terms(page_mm: tuple[float, float], around: bool = False) -> tuple[_Ar
     """Return polynomials over the page that describe the fall-off of light, simplest shapes first.
 
     The fall-off of a lens is a sum of even powers of the distance from its axis: cos⁴ of the angle, and less where the
-    mount shades the rim. That of a projector is smooth about another point.
+    mount shades the rim. The fall-off of a projector is smooth about another point.
 
     Parameters
     ----------

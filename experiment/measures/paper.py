@@ -135,16 +135,8 @@ class Paper:
 class PaperReader:
     """Measures flat field and ground truth of frames with the same references. Threads may share a reader.
 
-    Parameters
-    ----------
-    places_mm
-        (N, 2) float64, white references on the print.
-    centres_mm
-        (C, 2) float64, the patches, over which the mean of the flat field is 1.
-    base
-        Flat field that those of the frames are multiples of; uniform by default.
-    order
-        Highest order of the flat field.
+    `places_mm`: (N, 2) white references on the print. `centres_mm`: (C, 2) patches, over which the mean of the flat
+    field is 1. `base`: common factor of the flat fields of the frames. `order`: highest order of the flat field.
     """
 
     def __init__(
@@ -182,8 +174,7 @@ class PaperReader:
         if is_usable.sum() < MIN_REFERENCES:
             raise QualityError(
                 f"{frame_name}: {int(is_usable.sum())} white references are usable, at least {MIN_REFERENCES} "
-                "expected; uncover the chart, bring all of it into the image, and expose so that bare paper is below "
-                "saturation"
+                "expected; uncover the chart, bring all of it into the image, and expose so that paper is not saturated"
             )
         basis, values, base = self._at_places[is_usable], levels[is_usable], self._base_at_places[is_usable]
         shape, means = self._base_at_centres.copy(), self._means
@@ -198,10 +189,8 @@ class PaperReader:
                 means = product(self._at_centres, shape) / len(shape)
                 factors = [(shared[2],), (shared[2],), (shared[2],)]
         # On a base, the remaining light has a simple shape: slope and bend are enough for detecting outliers.
-        outlier_terms = self._counts[-1] if not any(self.base.coefficients) else _PLAIN
-        fits = [
-            _best_fit(basis, base[:, channel], values[:, channel], self._counts, outlier_terms) for channel in range(3)
-        ]
+        limit = self._counts[-1] if not any(self.base.coefficients) else _PLAIN
+        fits = [_best_fit(basis, base[:, channel], values[:, channel], self._counts, limit) for channel in range(3)]
         solutions = np.zeros((3, basis.shape[1]))
         for channel, fit in enumerate(fits):
             solutions[channel, : len(fit.solution)] = fit.solution
@@ -233,14 +222,12 @@ class PaperReader:
     def _shared_shape(self, basis: _Array, values: _Array) -> tuple[_Array, _Array, _Array] | None:
         """Return the common shape of all channels at references (N,) and patches (C,), and its coefficients."""
         # An unweighted sum, so that each channel counts by its light, as photon noise requires.
-        summed, uniform = values.sum(axis=1), np.ones(len(values))
-        first_shape = self._shape(basis, _best_fit(basis, uniform, summed, self._counts, self._counts[-1]).solution)
-        if first_shape is None:
+        total, ones = values.sum(axis=1), np.ones(len(values))
+        first = self._shape(basis, _best_fit(basis, ones, total, self._counts, self._counts[-1]).solution)
+        if first is None:
             return None
         # Repeat with the references weighted by the light of the first fit.
-        return self._shape(
-            basis, _best_fit(basis, uniform, summed, self._counts, self._counts[-1], first_shape[0]).solution
-        )
+        return self._shape(basis, _best_fit(basis, ones, total, self._counts, self._counts[-1], first[0]).solution)
 
     def _shape(self, basis: _Array, solution: _Array) -> tuple[_Array, _Array, _Array] | None:
         """Return the normalised shape at references and patches, and its coefficients; None if it is uniform."""
@@ -304,22 +291,11 @@ def _best_fit(
     outlier_terms: int,
     light: _Array | None = None,
 ) -> _Fit:
-    """Return the fit with the best cross-validated number of terms.
+    """Return the fit with the best cross-validated number of terms in `counts`.
 
-    Parameters
-    ----------
-    basis
-        (N, T) float64, the terms.
-    base
-        (N,) float64, shape of the base.
-    values
-        (N,) float64, counts above black.
-    counts
-        Allowed numbers of terms.
-    outlier_terms
-        Largest number of terms of the fit that detects outliers.
-    light
-        (N,) float64, relative light that determines the noise of the references; by default the base.
+    `basis`: (N, T), the terms. `base`: (N,), shape of the base. `values`: (N,), counts above black. `light`: (N,),
+    relative light that determines the noise; by default the base. At most `outlier_terms` terms are used to detect
+    outliers.
     """
     light = base if light is None else light
     level = max(float(np.median(values / light)), 0.0)
@@ -328,12 +304,9 @@ def _best_fit(
     design, scaled_values = basis * (base * inverse_noise)[:, None], values * inverse_noise
     allowed_counts = tuple(count for count in counts if REFERENCES_A_TERM * count <= len(values)) or counts[:1]
     # A large fit keeps dim corners from being outliers. One larger than the references allow would follow a stain.
-    outlier_counts = [
-        count for count in allowed_counts if count <= outlier_terms and JUDGING_A_TERM * count <= len(values)
-    ]
-    weights = robust_least_squares(design[:, : max(outlier_counts, default=allowed_counts[0])], scaled_values, _ROUNDS)[
-        1
-    ]
+    outlier_limit = min(outlier_terms, len(values) // JUDGING_A_TERM)
+    outlier_count = max((count for count in allowed_counts if count <= outlier_limit), default=allowed_counts[0])
+    weights = robust_least_squares(design[:, :outlier_count], scaled_values, _ROUNDS)[1]
     held_out = held_out_squares(design[:, : allowed_counts[-1]], scaled_values, weights, allowed_counts)
     used_count = int((weights > 0).sum())
     prices = used_count * np.log(np.maximum(held_out, 1e-12)) + TERM_PRICE * np.array(allowed_counts)
@@ -342,20 +315,12 @@ def _best_fit(
     likelihoods /= likelihoods.sum()
     # Start with these weights, so that the additional terms do not accept a hand in a corner again.
     root = np.sqrt(weights)
-    solution, later_weights, _ = robust_least_squares(
-        design[:, :best_count] * root[:, None], scaled_values * root, _ROUNDS
-    )
-    return _Fit(
-        solution,
-        weights * later_weights,
-        design,
-        scaled_values,
-        tuple(zip(allowed_counts, likelihoods.tolist(), strict=True)),
-    )
+    solution, factor, _ = robust_least_squares(design[:, :best_count] * root[:, None], scaled_values * root, _ROUNDS)
+    likely = tuple(zip(allowed_counts, likelihoods.tolist(), strict=True))
+    return _Fit(solution, weights * factor, design, scaled_values, likely)
 
 
 def _field_residual(residuals: _Array, places_mm: _Array, page_mm: tuple[float, float], channel: int) -> FieldResidual:
-    """Describe residuals (N, 3), relative to white, by the size and position in one channel."""
     channel_residuals = residuals[:, channel]
     sigma = max(sigma_of(channel_residuals), 1e-9)
     worst = int(np.argmax(np.abs(channel_residuals)))
@@ -367,10 +332,7 @@ def _field_residual(residuals: _Array, places_mm: _Array, page_mm: tuple[float, 
     x, y = places_mm[worst].tolist()
     from_centre = np.linalg.norm(places_mm - np.asarray(page_mm) / 2, axis=1)
     by_distance = np.argsort(from_centre)
-    rings = [
-        channel_residuals[ring_indices]
-        for ring_indices in np.array_split(by_distance, min(_RINGS, len(channel_residuals)))
-    ]
+    rings = [channel_residuals[ring] for ring in np.array_split(by_distance, min(_RINGS, len(channel_residuals)))]
     explained_squares = sum(len(ring) * (ring.mean() - channel_residuals.mean()) ** 2 for ring in rings)
     total_squares = float(((channel_residuals - channel_residuals.mean()) ** 2).sum())
     return FieldResidual(

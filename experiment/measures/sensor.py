@@ -64,9 +64,8 @@ def deviations(levels: _Array, exposure_s: _Array) -> tuple[_Array, _Array]:
     nodes = np.geomspace(LOWEST, HIGHEST, _NODES)
     deviation = np.full((3, _NODES), np.nan)
     for channel in range(3):
-        fits = [
-            _deviation(levels[..., channel], np.log(times), nodes) for times in (exposure_s, _exact_times(exposure_s))
-        ]
+        both_times = (exposure_s, _exact_times(exposure_s))
+        fits = [_deviation(levels[..., channel], np.log(times), nodes) for times in both_times]
         # Cameras write 0.3 s for a third of a stop, and some really expose for 0.3 s: the times that fit the frames
         # better are used.
         deviation[channel] = min(fits, key=lambda fit: fit[1])[0]
@@ -74,39 +73,35 @@ def deviations(levels: _Array, exposure_s: _Array) -> tuple[_Array, _Array]:
 
 
 def _exact_times(exposure_s: _Array) -> _Array:
-    """Round times to powers of two in thirds of a stop, which cameras mean by their nominal times."""
+    # Cameras round the powers of two in thirds of a stop to nominal times.
     return np.asarray(2.0 ** (np.round(_STOPS * np.log2(exposure_s)) / _STOPS), dtype=np.float64)
 
 
 def _deviation(levels: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array, float]:
     """Return the relative deviation (B,) at nodes, and the RMS distance of the frames' factors from their times.
 
-    Parameters
-    ----------
-    levels
-        (K, P) float64, one channel, relative to saturation.
-    log_times
-        (K,) float64, logarithms of exposure times in s.
-    nodes
-        (B,) float64, levels relative to saturation. The deviation is NaN at nodes with too few patches.
+    `levels`: (K, P), one channel, relative to saturation. The deviation is NaN at nodes with too few patches.
     """
     frames = len(levels)
     rows: list[_Array] = []
     log_ratios: list[_Array] = []
     patch_counts = np.zeros(len(nodes))
     for index in range(frames - 1):
-        earlier, later = levels[index], levels[index + 1]
+        previous, following = levels[index], levels[index + 1]
         with np.errstate(invalid="ignore"):
-            is_usable = (earlier >= LOWEST) & (earlier <= HIGHEST) & (later >= LOWEST) & (later <= HIGHEST)
+            is_usable = (previous >= LOWEST) & (previous <= HIGHEST) & (following >= LOWEST) & (following <= HIGHEST)
         if not is_usable.any():
             continue
         row = np.zeros((int(is_usable.sum()), frames - 1 + len(nodes)))
         row[:, index] = 1
-        low, high = _interpolation_weights(earlier[is_usable], nodes), _interpolation_weights(later[is_usable], nodes)
+        low, high = (
+            _interpolation_weights(previous[is_usable], nodes),
+            _interpolation_weights(following[is_usable], nodes),
+        )
         row[:, frames - 1 :] = high - low
         patch_counts += low.sum(axis=0) + high.sum(axis=0)
         rows.append(row)
-        log_ratios.append(np.log(later[is_usable] / earlier[is_usable]))
+        log_ratios.append(np.log(following[is_usable] / previous[is_usable]))
     is_measured = patch_counts >= _LEAST_PATCHES
     if not rows or is_measured.sum() < 2:
         return np.full(len(nodes), np.nan), np.inf
@@ -133,6 +128,5 @@ def _deviation(levels: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array
 
 
 def _interpolation_weights(level: _Array, nodes: _Array) -> _Array:
-    """Return the weights (N, B) of the nodes in a linear interpolation over the logarithm of the level."""
     position = (np.log(level) - np.log(nodes[0])) / (np.log(nodes[1]) - np.log(nodes[0]))
     return np.asarray(np.maximum(1 - np.abs(position[:, None] - np.arange(len(nodes))), 0), dtype=np.float64)

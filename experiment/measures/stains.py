@@ -120,8 +120,8 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     Parameters
     ----------
     level
-        (8**bits, 3) float64, mean counts above black of each colour, by colour index, divided by the flat field. Best
-        is the mean of all white frames.
+        (8**bits, 3) float64, mean counts above black by colour index, divided by the flat field; best of all white
+        frames.
     centres_mm
         (8**bits, 2) float64, position of each colour on the sheet.
     bits
@@ -150,9 +150,8 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
         stained = significant
         clean = usable & ~stained
     with np.errstate(invalid="ignore"):
-        is_deviating = (np.abs(np.expm1(log_ratios)) > np.maximum(RIM_SIGMA * _patch_sigma(log_ratios), STAINED)).any(
-            axis=1
-        )
+        limit = np.maximum(RIM_SIGMA * _patch_sigma(log_ratios), STAINED)
+        is_deviating = (np.abs(np.expm1(log_ratios)) > limit).any(axis=1)
     # Next to a stain a patch is judged alone, because only half of its neighbourhood is stained. That half must
     # deviate; a patch that deviates without it has an error of prediction.
     stained_neighbours = stained[neighbours].sum(axis=1)
@@ -162,7 +161,6 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
 
 
 def _patch_sigma(log_ratios: _Array) -> _Array:
-    """Return the standard deviation (3,) of single patches."""
     is_finite = np.isfinite(log_ratios)
     return np.array([sigma_of(log_ratios[is_finite[:, c], c]) if is_finite[:, c].any() else 0 for c in range(3)])
 
@@ -179,9 +177,7 @@ def _log_ratios(clean_level: _Array, level: _Array, usable: _Mask, bits: int) ->
     side = 1 << bits
     with np.errstate(invalid="ignore", divide="ignore"):
         logs = np.log(np.where(clean_level > LEAST_COUNTS, clean_level, np.nan)).reshape(side, side, side, 3)
-        own_logs = np.log(np.where((level > LEAST_COUNTS) & usable[:, None], level, np.nan)).reshape(
-            side, side, side, 3
-        )
+        own_logs = np.log(np.where((level > LEAST_COUNTS) & usable[:, None], level, np.nan)).reshape(logs.shape)
     sums, count = np.zeros_like(own_logs), np.zeros_like(own_logs)
     for axis in range(3):
         previous, following = (np.roll(logs, step, axis=axis) for step in (1, -1))
@@ -205,13 +201,10 @@ def _median_over_neighbour_codes(cube: _Array, axis: int) -> _Array:
     padded = np.pad(cube, (*padding, (0, 0)), constant_values=np.nan)
     n = cube.shape[0]
     shifted: list[_Array] = []
-    for first_step in range(5):
-        for second_step in range(5):
+    for i in range(5):
+        for j in range(5):
             window = [slice(None)] * 3
-            window[across[0]], window[across[1]] = (
-                slice(first_step, first_step + n),
-                slice(second_step, second_step + n),
-            )
+            window[across[0]], window[across[1]] = slice(i, i + n), slice(j, j + n)
             shifted.append(padded[tuple(window)])
     stack = np.stack(shifted)
     # NaN is sorted last, so the median is at half the number of finite values.
@@ -225,7 +218,7 @@ def _median_over_neighbour_codes(cube: _Array, axis: int) -> _Array:
 def _median_at_equal_codes(curvature: _Array, axis: int) -> _Array:
     """Return the median (n, n, n, 3) over similar codes with equal values on an axis and another one; 0 elsewhere.
 
-    Codes whose third value is below, equal or above are separate. NaN if too few codes are known.
+    Codes with a third value that is below, equal or above are separate. NaN if too few codes are known.
     """
     values = np.indices(curvature.shape[:3])
     medians = np.zeros_like(curvature)
@@ -286,9 +279,8 @@ def spots_of(stains: Stains) -> list[_Index]:
 def spot_colour(stains: Stains, spot: _Index) -> _Array:
     """Return the median deviation (3,) float64 of the patches of a spot, relative; 0 if unknown."""
     alone = stains.alone[spot]
-    return np.array(
-        [float(np.median(channel[np.isfinite(channel)])) if np.isfinite(channel).any() else 0.0 for channel in alone.T]
-    )
+    finite = [channel[np.isfinite(channel)] for channel in alone.T]
+    return np.array([float(np.median(values)) if len(values) else 0.0 for values in finite])
 
 
 def light_of_spot(stains: Stains, spot: _Index, channel: int) -> tuple[float, float]:

@@ -96,9 +96,9 @@ class Session:
         for step in self.steps:
             if step.illumination is None:
                 continue
-            listed = self.illuminations[step.illumination : step.illumination + 1]
-            if not listed or listed[0].colour != step.colour:
-                difference = "has no such illuminant" if not listed else f"has {_codes(listed[0].colour)}"
+            csv_rows = self.illuminations[step.illumination : step.illumination + 1]
+            if not csv_rows or csv_rows[0].colour != step.colour:
+                difference = "has no such illuminant" if not csv_rows else f"has {_codes(csv_rows[0].colour)}"
                 raise FormatError(
                     f"{self.folder / 'illuminations.csv'} was changed after the session was planned: the file "
                     f"{difference}, illuminant {step.illumination} was planned as {_codes(step.colour)}; restore it "
@@ -206,7 +206,7 @@ class Session:
         self.steps = self.journal.steps()
 
     def verify(self, observe: Callable[[int, int], None] = lambda done, total: None) -> tuple[str, ...]:
-        """Void accepted frames whose files are missing or changed, so that they are repeated; return the reasons."""
+        """Void accepted frames with missing or changed files, so that they are repeated; return the reasons."""
         damaged = damaged_files(self.folder, self.journal.accepted_files(), observe)
         for attempt, reason in damaged.items():
             self.journal.void([attempt], datetime.now(UTC), reason)
@@ -250,7 +250,7 @@ class Session:
         return plan.lights
 
     def done_steps(self) -> set[int]:
-        """Return the numbers of the steps with an accepted frame whose file has its full size."""
+        """Return the numbers of the steps with an accepted frame and a file of full size."""
         accepted = self.journal.accepted_files()
         return {frame.step for frame in accepted} - {frame.step for frame in lost_files(self.folder, accepted)}
 
@@ -259,7 +259,7 @@ class Session:
         return self.journal.frames()
 
     def lost_files(self) -> list[AcceptedFile]:
-        """Return the current frame of each step whose file is missing or shorter."""
+        """Return the current frame of each step with a missing or shorter file."""
         require_frames_folder(self.folder)
         return lost_files(self.folder, self.journal.accepted_files())
 

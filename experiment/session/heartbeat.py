@@ -75,12 +75,10 @@ def file_system_of(path: Path) -> str:
     except OSError:
         return ""
     resolved = path.resolve()
-    containing = [
-        (len(mount_point), kind)
-        for _, mount_point, kind, *_ in mounts
-        if resolved.is_relative_to(mount_point.replace("\\040", " "))
+    above = [
+        (len(mount), kind) for _, mount, kind, *_ in mounts if resolved.is_relative_to(mount.replace("\\040", " "))
     ]
-    return max(containing, default=(0, ""))[1]
+    return max(above, default=(0, ""))[1]
 
 
 # `FS_IOC_GETVERSION` of linux/fs.h, `_IOR('v', 1, long)`; other systems refuse it.
@@ -141,14 +139,17 @@ class Heartbeat:
 
     def belongs_to(self, here: SessionPlace | None) -> bool | None:
         """Return whether the sign was given for the session at `here` and not for its original; None if unknown."""
-        place = self.place
-        if place is None or here is None or not (place.inode and here.inode):
+        session_place = self.place
+        if session_place is None or here is None or not (session_place.inode and here.inode):
             return None
-        if (self.process.host, self.process.boot) == (socket.gethostname(), _boot()) and place.device != here.device:
+        if (self.process.host, self.process.boot) == (
+            socket.gethostname(),
+            _boot(),
+        ) and session_place.device != here.device:
             return False
-        if place.generation and here.generation and place.generation != here.generation:
+        if session_place.generation and here.generation and session_place.generation != here.generation:
             return False
-        return (place.inode, place.journal) == (here.inode, here.journal)
+        return (session_place.inode, session_place.journal) == (here.inode, here.journal)
 
     def is_dead(self, now: datetime, alive: bool | None) -> bool:
         """Return whether the run was killed: it has no end, and its process is gone or its sign overdue.
@@ -190,7 +191,7 @@ class Heartbeat:
 
 
 def _generation(folder: Path) -> int:
-    """Return the generation of a folder (ioctl_iflags(2), on ext4, XFS and Btrfs); 0 elsewhere."""
+    # ioctl_iflags(2), on ext4, XFS and Btrfs; 0 elsewhere.
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:

@@ -299,10 +299,10 @@ class Journal:
             detail = f"{counted(len(accepted), 'frame')}: {reason}"
             change.put_numbered("events", {"at": time_text(at), "what": VOIDED, "detail": detail})
 
-    def note(self, at: datetime, what: str, detail: str = "") -> None:
+    def note(self, at: datetime, event: str, detail: str = "") -> None:
         """Record an event."""
         with self._writing() as change:
-            change.put_numbered("events", {"at": time_text(at), "what": what, "detail": detail})
+            change.put_numbered("events", {"at": time_text(at), "what": event, "detail": detail})
 
     def beat(self, state: RunState, sentence: str, until: datetime) -> None:
         """Record a sign of life, which replaces the previous one."""
@@ -320,18 +320,18 @@ class Journal:
         return dict(self._rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
 
     def heartbeat(self) -> Heartbeat | None:
-        """Return the newest sign of life; None if there is none."""
+        """Return the newest sign of life, if there is any."""
         rows = self._rows("SELECT at, pid, started, host, boot, state, sentence, until FROM heartbeat")
         if not rows:
             return None
         at, *process, state, sentence, until = rows[0]
         place_rows = self._rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
-        place = SessionPlace.from_text(place_rows[0][0]) if place_rows else None
+        session_place = SessionPlace.from_text(place_rows[0][0]) if place_rows else None
         at_time, until_time = datetime.fromisoformat(at), datetime.fromisoformat(until)
-        return Heartbeat(at_time, Process(*process), state, sentence, until_time, place)
+        return Heartbeat(at_time, Process(*process), state, sentence, until_time, session_place)
 
     def run_state(self) -> RunState | None:
-        """Return the state in the newest sign of life; None if there is none."""
+        """Return the state in the newest sign of life, if there is any."""
         rows = self._rows("SELECT state FROM heartbeat")
         return rows[0][0] if rows else None
 
@@ -505,7 +505,7 @@ def open_journal(folder: Path) -> Journal:
 
 
 def lost_files(folder: Path, accepted: Sequence[AcceptedFile]) -> list[AcceptedFile]:
-    """Return the current frame of each step whose file is missing or shorter."""
+    """Return the current frame of each step with a missing or shorter file."""
     newest = {frame.step: frame for frame in accepted}
     # As text: creating 800 path objects takes twice as long as the check.
     return [frame for frame in newest.values() if not _has_size(f"{folder}/{frame.file}", frame.size)]
@@ -525,7 +525,7 @@ def no_journal_text(folder: Path) -> str:
 
 
 def thread_beat(path: Path, state: RunState, sentence: str, until: datetime) -> None:
-    """Write a sign of life from another thread than that of the open journal; failures are ignored."""
+    """Write a sign of life from another thread than the one with the open journal; failures are ignored."""
     with suppress(sqlite3.Error), closing(connect(path, "rw")) as connection:
         connection.execute("BEGIN IMMEDIATE")
         _put_beat(connection, path, state, sentence, until)
@@ -533,9 +533,9 @@ def thread_beat(path: Path, state: RunState, sentence: str, until: datetime) -> 
 
 
 def _put_beat(connection: sqlite3.Connection, path: Path, state: RunState, sentence: str, until: datetime) -> None:
-    own, at, place = Process.own(), datetime.now(UTC), SessionPlace.of(path)
-    if place is not None:
-        connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
+    own, at, session_place = Process.own(), datetime.now(UTC), SessionPlace.of(path)
+    if session_place is not None:
+        connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, session_place.to_text()))
     connection.execute(
         "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
         (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
@@ -557,10 +557,8 @@ class _Change:
             f"{verb} INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values())
         )
         # SQLite stores NaN as NULL.
-        ledger_row = {
-            name: None if isinstance(value, float) and value != value else value for name, value in row.items()
-        }
-        self.rows.setdefault(table, []).append(ledger_row)
+        stored = {name: None if isinstance(value, float) and value != value else value for name, value in row.items()}
+        self.rows.setdefault(table, []).append(stored)
         assert cursor.lastrowid is not None
         return cursor.lastrowid
 
@@ -589,7 +587,7 @@ _accepted_file: Final = lru_cache(_ROWS_KEPT)(AcceptedFile)
 
 
 def _condition_of(column: str, numbers: Sequence[int] | None) -> tuple[str, tuple[str, ...]]:
-    """Return the SQL condition that a column is one of some numbers, and its value; no condition if None."""
+    # SQL condition that a column is one of the numbers, and its value.
     if numbers is None:
         return "TRUE", ()
     return f"{column} IN (SELECT value FROM json_each(?))", (json.dumps(list(numbers)),)
@@ -748,9 +746,7 @@ _ROW_KEYS: Final = {
 }
 
 # Columns of an attempt that are unknown at its start, with their values.
-_STARTED_ROW: Final = dict.fromkeys(("ended_at", "taken_at", "exposure_s", "size", "sha256", "verdict")) | {
-    "reason": ""
-}
+_START: Final = dict.fromkeys(("ended_at", "taken_at", "exposure_s", "size", "sha256", "verdict")) | {"reason": ""}
 
 Row = dict[str, Any]
 Rows = dict[str, dict[tuple[Any, ...], Row]]  # Rows by table and key, columns by name
@@ -822,7 +818,7 @@ def _checked_row(table: str, row: Row) -> Row:
 
 def _put_row(rows: Rows, table: str, row: Row) -> None:
     key = tuple(row[name] for name in _ROW_KEYS[table])
-    rows.setdefault(table, {}).setdefault(key, dict(_STARTED_ROW) if table == "attempts" else {}).update(row)
+    rows.setdefault(table, {}).setdefault(key, dict(_START) if table == "attempts" else {}).update(row)
 
 
 def _ledger_line(rows: Mapping[str, Sequence[Row]]) -> bytes:
@@ -834,17 +830,11 @@ def _ledger_line(rows: Mapping[str, Sequence[Row]]) -> bytes:
 
 
 def _ledger_lines(rows: Rows) -> bytes:
-    """Return facts as lines: the plan and the records, each attempt with its details, and the events."""
     single_tables = [{table: list(rows[table].values())} for table in ("plan", "records") if table in rows]
     attempts: dict[int, dict[str, list[Row]]] = {}
-    for table, column in (
-        ("attempts", "id"),
-        ("checks", "attempt"),
-        ("measurements", "attempt"),
-        ("timings", "attempt"),
-    ):
+    for table, key in (("attempts", "id"), ("checks", "attempt"), ("measurements", "attempt"), ("timings", "attempt")):
         for row in rows.get(table, {}).values():
-            attempts.setdefault(row[column], {}).setdefault(table, []).append(row)
+            attempts.setdefault(row[key], {}).setdefault(table, []).append(row)
     events = [{"events": list(rows["events"].values())}] if "events" in rows else []
     return b"".join(_ledger_line(transaction) for transaction in [*single_tables, *attempts.values(), *events])
 
@@ -917,9 +907,8 @@ class _Ledger:
             return False
         if _merge_transactions(transactions) == rows:
             return True
-        _require_no_missing_frames(
-            self._path, _missing_frames(_frames_in(_merge_transactions(transactions[:-1])), _frames_in(rows))
-        )
+        settled = _frames_in(_merge_transactions(transactions[:-1]))
+        _require_no_missing_frames(self._path, _missing_frames(settled, _frames_in(rows)))
         return False
 
     def _open_file(self) -> tuple[int, int]:
@@ -934,7 +923,7 @@ Frames = set[tuple[int, str, str | None]]  # Frames by attempt and hash, with th
 
 
 def settled_frames(path: Path) -> Frames:
-    """Return the frames that a journal opened later must have: all except those of the last transaction.
+    """Return the frames that a journal opened later must have: all except the last transaction.
 
     Empty if the ledger is missing or damaged, which is no fault of an intact journal.
     """
@@ -945,7 +934,6 @@ def settled_frames(path: Path) -> Frames:
 
 
 def _missing_frames(settled: Frames, journal_frames: Frames) -> Frames:
-    """Return the settled frames that the journal does not have, or has with another verdict."""
     # A void frame in the journal is not an older state, because no verdict follows that one.
     voided = {(attempt, sha256) for attempt, sha256, verdict in journal_frames if verdict == VOIDED}
     return {frame for frame in settled - journal_frames if frame[:2] not in voided}

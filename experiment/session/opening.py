@@ -274,8 +274,8 @@ def _copy_to_memory(path: Path) -> sqlite3.Connection:
 
 
 def _is_write_ahead(path: Path) -> bool:
-    """Return whether the header has write-ahead mode (sqlite.org/fileformat.html, 1.3.3: offset 18 is 2)."""
-    # The file is opened only without `-shm`: closing a file releases all locks of the process on it.
+    # Offset 18 of the header is 2 (sqlite.org/fileformat.html, 1.3.3). The file is opened only without `-shm`: closing
+    # it releases all locks of the process on it.
     if side_file(path, "-shm").exists():
         return True
     with path.open("rb") as stream:
@@ -394,7 +394,6 @@ def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | Inp
 
 
 def _disk_fault(path: Path) -> OSError | None:
-    """Return the error of writing next to the journal; None if it works."""
     try:
         # A file without a name, so that nothing remains.
         with tempfile.TemporaryFile(dir=path.parent, buffering=0) as stream:
@@ -527,7 +526,6 @@ _JOINT_CONDITIONS: Final = {
 
 
 def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
-    """Refuse a journal with views, triggers, virtual tables or computed columns."""
     for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
         is_plain = kind == "table" and not str(sql or "").lstrip().upper().startswith("CREATE VIRTUAL")
         # SQLite creates an index for each primary key, without a text.

@@ -1,6 +1,6 @@
 """Values of a session: its plan, and attempts, frames, events and verdicts in its journal.
 
-A `FrameJudge` decides what is measured, and by which limits. The journal keeps every judgement completely, so that each
+A `FrameJudge` decides about measurements and limits. The journal keeps every judgement completely, so that each
 refusal can be read again with its numbers, and a resumed run has the measurements of earlier frames.
 """
 
@@ -121,8 +121,8 @@ class OutlastsPauses(Protocol):
 class Attempt:
     """One attempt at a step, as in the journal.
 
-    Times are those of the clock of the laboratory, None before they are reached. The verdict is None for an attempt
-    that is not finished or was interrupted.
+    Times are of the clock of the laboratory, None before they are reached. The verdict is None for an attempt that is
+    not finished or was interrupted.
     """
 
     id: int
@@ -310,17 +310,8 @@ def plan_steps(
 ) -> tuple[SessionStep, ...]:
     """Return the plan of a session: a white and a dark frame first, every `reference_every` illuminants, and last.
 
-    Parameters
-    ----------
-    illuminations
-        Illuminants to take.
-    reference_every
-        Number of illuminants between two pairs of white and dark frames.
-    seed
-        Seed of the shuffled order (numpy's PCG64), so that neither time nor repeated frames correlate with colour. None
-        keeps the order.
-    response
-        Colours of the response frames, after the first pair.
+    `seed`: seed of the shuffled order (numpy's PCG64), so that neither time nor repeated frames correlate with colour;
+    None keeps the order. `response`: colours of the response frames, after the first pair.
     """
     steps: list[SessionStep] = []
 
@@ -347,14 +338,9 @@ def link_steps(first_number: int) -> tuple[SessionStep, ...]:
     reference with the same lamp.
     """
     colours = (Colour(TOP, TOP, TOP), *PRIMARIES)
-    kinds_and_colours: list[tuple[FrameKind, Colour]] = [
-        *(("response", colour) for colour in colours),
-        ("white", WHITE),
-    ]
-    kinds_and_colours.append(("dark", BLACK))
-    return tuple(
-        SessionStep(number, kind, None, colour) for number, (kind, colour) in enumerate(kinds_and_colours, first_number)
-    )
+    frames: list[tuple[FrameKind, Colour]] = [*(("response", colour) for colour in colours), ("white", WHITE)]
+    frames.append(("dark", BLACK))
+    return tuple(SessionStep(number, kind, None, colour) for number, (kind, colour) in enumerate(frames, first_number))
 
 
 def _shuffled(illuminations: Sequence[Illumination], seed: int) -> list[Illumination]:

@@ -34,7 +34,7 @@ _RANGE = re.compile(r"\s*(\d{1,9})\s*(?:[-–]\s*(\d{1,9})\s*)?")
 
 
 def damaged_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callable[[int, int], None]) -> dict[int, str]:
-    """Return the attempts whose files are missing or changed, with the reason."""
+    """Return the attempts with missing or changed files, and the reasons."""
     try:
         require_frames_folder(folder)
     except OSError as error:
@@ -150,7 +150,7 @@ def lights_text(lights: Collection[int]) -> str:
 def newest_report(session: Path, attempts: Mapping[str, int]) -> RefusedFrames:
     """Return the refused frames of the newest report on a session, in it or next to it.
 
-    The newest report is the one whose newest frame was taken last. The times of the files decide only between reports
+    The newest report has the newest frame. The times of the files decide only between reports
     on the same frames, because a clock may have been wrong.
 
     `taken`: attempt of each frame of the session, by hash.

@@ -67,7 +67,7 @@ def test_parses_temperatures() -> None:
         ("10000:2000:200", "200 K .*10000 to 2000 K"),
         ("2000:10000:0", "steps of 0 K"),
         ("2000:10000:1e-6", "in at most 10000 temperatures"),
-        ("1:1e12:1", "1 K given, 1000"),
+        ("1:1e12:1", "1 K given, temperatures from 1000"),
         ("warm", "FIRST:LAST:STEP or"),
         ("999", "999 K given"),
         ("100001", "100001 K given"),
