@@ -55,7 +55,7 @@ def _check_target(target: str) -> str:
         return target
     url = urlsplit(target)
     if not url.hostname or url.port == 0:
-        raise ValueError("the URL has no host; a URL is expected, such as https://ntfy.sh/my-lab")
+        raise ValueError("the URL has no host; expected a URL such as https://ntfy.sh/my-lab")
     if not target.removesuffix(f"/{MASK}").isascii() or any(character.isspace() for character in target):
         raise ValueError("the URL has spaces or non-ASCII letters; write them as %20 and similar")
     return target
@@ -377,25 +377,25 @@ def load_lab(path: Path) -> LabSettings:
     return settings.model_copy(update=changes)
 
 
-def parse_lab(text: str, where: str, folder: Path | None = None) -> LabSettings:
+def parse_lab(text: str, source_name: str, folder: Path | None = None) -> LabSettings:
     """Parse the settings in a TOML text without resolving paths; `ConfigurationError` if a value is not usable.
 
     Parameters
     ----------
     text
         TOML text.
-    where
+    source_name
         Name of the text in errors.
     folder
         Folder to which files with secrets are relative; if None, secrets are not read, as in `session.toml`.
     """
-    document = parse_toml(text, where)
+    document = parse_toml(text, source_name)
     if folder is not None:
-        _insert_secrets(document, folder, where)
-    return validate_settings(LabSettings, document, where).read_from(where)
+        _insert_secrets(document, folder, source_name)
+    return validate_settings(LabSettings, document, source_name).read_from(source_name)
 
 
-def validate_settings(model: type[_AnySettings], document: dict[str, Any], where: str) -> _AnySettings:
+def validate_settings(model: type[_AnySettings], document: dict[str, Any], source_name: str) -> _AnySettings:
     """Validate the settings in a document; `ConfigurationError` lists every unusable key without secrets."""
     try:
         return model.model_validate(document)
@@ -403,7 +403,7 @@ def validate_settings(model: type[_AnySettings], document: dict[str, Any], where
         mistakes = find_mistakes(model, document, error, _is_secret, NOT_TO_CHOOSE)
         # The cause would contain the values.
         has_secret = any(_is_secret(".".join(map(str, mistake["loc"]))) for mistake in error.errors())
-        raise ConfigurationError(f"{where}:{list_mistakes(mistakes)}") from (None if has_secret else error)
+        raise ConfigurationError(f"{source_name}:{list_mistakes(mistakes)}") from (None if has_secret else error)
 
 
 def _is_secret(key: str) -> bool:
@@ -411,7 +411,7 @@ def _is_secret(key: str) -> bool:
     return any(f"{secret_key}.".startswith(f"{key}.") or key.startswith(f"{secret_key}.") for secret_key in _SECRETS)
 
 
-def _insert_secrets(document: dict[str, Any], folder: Path, where: str) -> None:
+def _insert_secrets(document: dict[str, Any], folder: Path, source_name: str) -> None:
     errors: list[ConfigurationError] = []
     for key in _SECRETS:
         *tables, name = key.split(".")
@@ -431,7 +431,7 @@ def _insert_secrets(document: dict[str, Any], folder: Path, where: str) -> None:
             except ConfigurationError as error:
                 errors.append(error)
     if errors:
-        raise ConfigurationError(f"{where}:{list_mistakes([str(mistake) for mistake in errors])}") from errors[0]
+        raise ConfigurationError(f"{source_name}:{list_mistakes([str(mistake) for mistake in errors])}") from errors[0]
 
 
 def _read_secret(key: str, source: dict[str, Any], folder: Path) -> str:

@@ -46,7 +46,7 @@ PAPER_BLOCKS = {1: (2, 1), 2: (2, 2), 3: (4, 2), 4: (4, 4), 5: (8, 4)}
 
 PAPER_REFERENCE_MM = 100.0  # Largest distance between white references in the margin of the grid of the paper
 
-# Side of these references, 5 mm: about that of a patch, and even, so that the centre is a whole pixel.
+# Side of these references, 5 mm: about the side of a patch, and even, so that the centre is a whole pixel.
 PAPER_REFERENCE_PX = 118
 
 PAPER_REFERENCES = 4  # Smallest number of intervals of these references along the upper and the right margin

@@ -111,7 +111,7 @@ def instructions(chart: Chart, tiff: bool = True) -> str:
     pixels = " × ".join(f"{round(side / MM_PER_INCH * DESIGN_DPI)}" for side in chart.page_mm)
     raster = f" or chart.tif ({pixels} pixels, {DESIGN_DPI} dpi, untagged); both show the same" if tiff else ""
     scale = (
-        f"Marks 0 and {across} below the field are {across} mm apart, 0 and {down} on its left {down} mm."
+        f"Marks 0 and {across} below the patches are {across} mm apart, 0 and {down} on its left {down} mm."
         if min(across, down) > 0
         else "The distances of the marks on the rulers are their numbers, in mm."
     )
@@ -125,7 +125,7 @@ First print proof.pdf on A4 with the same printer, paper and settings; its text 
 
 For the print shop
 ------------------
-Page            {width:g} × {height:g} mm on one sheet, not tiled. Margins hold marks: print them too.
+Page            {width:g} × {height:g} mm on one sheet, not tiled. The margins contain marks: print them too.
 Scale           100 %, "actual size"; never "fit to page". On a roll, cut along the corner marks.
 File            chart.pdf is PDF/X-4: vector, trim box = sheet, no fonts, no transparency, no bleed. Its page is
                 untagged RGB (DeviceRGB).

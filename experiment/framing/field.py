@@ -42,7 +42,7 @@ LEAST_SIDE_PX = 192
 # nothing.
 MIN_EXPLAINED = 0.5
 
-# The residual of the best orientation must be this many times smaller than that of the given one.
+# The residual of the given orientation must be less than this many times the residual of the best one.
 MIN_ADVANTAGE = 1.3
 
 MIRRORED = 4  # First mirrored orientation among the eight orientations of a rectangle
@@ -74,13 +74,13 @@ _INTERPOLATION_PX = 0.4  # σ that linear interpolation adds to an edge, half-si
 
 _REFINED_PX = 1.5  # Largest correction of an edge, half-size px: beyond it, the profile ends before the blur does
 
-_CLEAR_EDGE = 0.15  # Smallest step, relative to paper, whose position is accurate to 0.1 px
+_CLEAR_EDGE = 0.15  # Smallest step, relative to paper, that has a position accurate to 0.1 px
 
 # Order of the curve through the deviations of a side. It follows corners that curl by 6 px to 0.1 px, and not marks in
 # the margin along a twelfth of a side.
-_RUN_ORDER = 8
+_SIDE_CURVE_ORDER = 8
 
-# Number of random patches whose colours are compared: a hundred for each parameter of the fit.
+# Number of random patches for the comparison of colours: a hundred for each parameter of the fit.
 _TRIED_CELLS = 1500
 
 _Float = npt.NDArray[np.float32]
@@ -120,8 +120,8 @@ class DetectedField:
             for end in (0.0, 1.0):
                 on_side = np.abs(share[:, axis] - end) < 1e-6
                 along: _Points = share[on_side, 1 - axis]
-                if len(along) > 2 * _RUN_ORDER:
-                    curve, _ = robust_curve(along, across[on_side], _RUN_ORDER)
+                if len(along) > 2 * _SIDE_CURVE_ORDER:
+                    curve, _ = robust_curve(along, across[on_side], _SIDE_CURVE_ORDER)
                     distances[on_side] = np.abs(across[on_side] - np.polynomial.legendre.legval(2 * along - 1, curve))
         return distances
 

@@ -127,7 +127,7 @@ def find_chart(
     ids = sorted(printed_tags)
     expected_tags = f"{len(ids)} tags 36h11 with ids {ids[0]}–{ids[-1]}"
     tags = tuple(tag for tag in detected_tags if tag.id in printed_tags)
-    missing_ids = tuple(number for number in ids if number not in {tag.id for tag in tags})
+    missing_ids = tuple(tag_id for tag_id in ids if tag_id not in {tag.id for tag in tags})
     if len(tags) < max(MIN_TAGS, len(ids) // 4):
         raise _missing_tags_error(plane, detected_tags, tags, expected_tags, image_name)
     chart_points = np.concatenate([printed_tags[tag.id].corners_mm for tag in tags])
@@ -216,7 +216,7 @@ def _missing_tags_error(
 
 
 def _first_ids(ids: Sequence[int]) -> str:
-    text = ", ".join(str(number) for number in ids[:8])
+    text = ", ".join(str(tag_id) for tag_id in ids[:8])
     return text + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")
 
 

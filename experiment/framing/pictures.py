@@ -64,8 +64,8 @@ class Shift:
     dy: float  # likewise, positive downwards
     largest_px: float  # largest movement of a tag or of a corner of the patch area; shows rotation
     gauges: int  # number of measured tags or strips; 0 means that the movement is unknown
-    # Variance of the later blur minus that of the earlier one, px², median. Above 1 px² it is too low, because it comes
-    # from a linear approximation.
+    # Variance of the blur in the later frame minus the variance in the earlier one, px², median. Above 1 px² it is too
+    # low, because it comes from a linear approximation.
     blur_growth_px2: float = 0.0
 
     @property

@@ -19,7 +19,7 @@ _Points = npt.NDArray[np.float64]
 # the 25 samples of a patch of 10 px comes from its neighbours.
 MAX_BLUR_PX = 1.0
 
-# Tried σ in half-size px, 7 % apart: from less than that of one photosite to far beyond use.
+# Tried σ in half-size px, 7 % apart: from less than one photosite alone causes to far beyond use.
 _BLURS = np.geomspace(0.15, 4, 48)
 
 # Points of the outline at which blur is measured: enough for a median that is not moved by marks in the margin.

@@ -161,17 +161,17 @@ def _page_basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Arr
     return basis
 
 
-def light_terms(page_mm: tuple[float, float], around: bool = False) -> tuple[_Array, tuple[int, ...]]:
+def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tuple[_Array, tuple[int, ...]]:
     """Return polynomials over the page that describe the fall-off of light, simplest shapes first.
 
-    The fall-off of a lens is a sum of even powers of the distance from its axis: cos⁴ of the angle, and less where the
+    The fall-off of a lens is a sum of even powers of the distance from its axis: cos⁴ of the angle, and less if the
     mount shades the rim. The fall-off of a projector is smooth about another point.
 
     Parameters
     ----------
     page_mm
         Width and height of the page.
-    around
+    outside_only
         Whether references surround the patches and are not between them; then up to third order only.
 
     Returns
@@ -191,12 +191,12 @@ def light_terms(page_mm: tuple[float, float], around: bool = False) -> tuple[_Ar
     def radial(half_power: int) -> list[_Array]:
         return [x * r2 ** (half_power - 1), y * r2 ** (half_power - 1), r2**half_power]
 
-    # After slope and bend come the powers r⁴ and r⁶ of the distance from a centre, before the other terms of third and
-    # fourth order; r⁸ comes before those of fifth and sixth. x r² and y r² move the centre to first order. They replace
-    # two of the terms of third order, r⁴ one of fourth, and so on.
+    # After slope and bend come the powers r⁴ and r⁶ of the distance from a centre, then the other terms of third and
+    # fourth order; r⁸ comes before the terms of fifth and sixth order. x r² and y r² move the centre to first order.
+    # They replace two of the terms of third order, r⁴ one of fourth, and so on.
     groups = (
         [power(0), power(1), power(2), power(3)]
-        if around
+        if outside_only
         else [
             power(0), power(1), power(2), radial(2), radial(3), power(3)[:2], power(4)[:4], radial(4),
             [*power(5)[:4], *power(6)[:6]],

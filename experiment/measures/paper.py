@@ -58,8 +58,8 @@ _PLAIN = 6  # Number of terms of slope and bend
 # counts.
 TERM_PRICE = 1.0
 
-# Signal whose photon noise equals the read noise, counts: 6 counts at 1.8 electrons a count. It is added to the light
-# of a reference to get its variance, so that dim corners get the right weight.
+# Signal with a photon noise equal to the read noise, counts: 6 counts at 1.8 electrons a count. It is added to the
+# light of a reference to get its variance, so that dim corners get the right weight.
 READ_COUNTS = 65.0
 
 # Iterations of the robust fit; few references are covered or dirty, so the weights settle at once.
@@ -68,7 +68,7 @@ _ROUNDS = 4
 # Rings with equal numbers of references around the centre of the page, for detecting a remaining fall-off.
 _RINGS = 10
 
-_NEAR = 4  # References whose mean is the worst deviation, one and its neighbours: a tenth of a page side on A0
+_NEAR = 4  # Number of references in the worst deviation, one and its neighbours: a tenth of a page side on A0
 
 _USUAL = 5.0  # Outlier limit of references in standard deviations: by chance one in two million
 
@@ -84,7 +84,7 @@ class FlatField:
     """Spatial distribution of the light over the print, mean 1 over the patches."""
 
     page_mm: tuple[float, float]
-    # For each channel, the polynomials (terms,) float64 whose product is the flat field.
+    # For each channel, polynomials (terms,) float64; their product is the flat field.
     coefficients: tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ...]]
 
     @classmethod

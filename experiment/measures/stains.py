@@ -60,11 +60,11 @@ _LEAST_TIED = 3  # Fewest known codes with two equal values for a median bend
 _LEAST_NEIGHBOURS = 5  # Fewest known patches of a neighbourhood for its mean
 
 # With this many stained neighbours, a patch belongs to the stain even if its neighbourhood does not deviate.
-_MANY_BESIDE = 2
+_MANY_STAINED = 2
 
 _BRIGHT_PERCENTILE = 99.0  # Percentile of the patch levels that counts as white paper
 
-_BESIDE = 2.3  # Largest distance between patches of one spot, in patch sides: one patch may lie between them
+_SPOT_DISTANCE = 2.3  # Largest distance between patches of one spot, in patch sides: one patch may lie between them
 
 # Largest distance from a spot, in patch sides, at which added light is measured in unlisted patches: two rings, of
 # which the first is half in the neighbourhoods of the spot (judgement).
@@ -155,7 +155,7 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     # Next to a stain a patch is judged alone, because only half of its neighbourhood is stained. That half must
     # deviate; a patch that deviates without it has an error of prediction.
     stained_neighbours = stained[neighbours].sum(axis=1)
-    is_affected = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (stained_neighbours >= _MANY_BESIDE)
+    is_affected = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (stained_neighbours >= _MANY_STAINED)
     rim = is_deviating & is_affected & (stained_neighbours > 0)
     return Stains(deviation, error, np.expm1(log_ratios), stained | rim, level, centres_mm)
 
@@ -265,7 +265,7 @@ def joined_cells(stains: Stains, cells: _Index) -> list[_Index]:
     """Group adjacent patches (N,) int64, the largest group first."""
     if not len(cells):
         return []
-    pairs = cKDTree(stains.places_mm[cells]).query_pairs(_BESIDE * cell_mm(stains), output_type="ndarray")
+    pairs = cKDTree(stains.places_mm[cells]).query_pairs(_SPOT_DISTANCE * cell_mm(stains), output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
     count, label = connected_components(graph, directed=False)
     return sorted((cells[label == number] for number in range(int(count))), key=len, reverse=True)

@@ -646,7 +646,7 @@ class _JournalGuard:
 
     def remember(self) -> None:
         """Remember the state of the journal after a write of the run itself."""
-        self._states = {file: look for file in self._files if (look := self._file_state(file)) is not None}
+        self._states = {file: state for file in self._files if (state := self._file_state(file)) is not None}
 
     def require_same(self) -> None:
         """Raise `LostJournalError` if the journal changed since the last write of the run."""
@@ -691,9 +691,9 @@ class _JournalGuard:
             raise storage_error(path, error, "look at") from error
         return _FileState((stat.st_dev, stat.st_ino), stat.st_size, stat.st_mtime_ns)
 
-    def _raise_lost(self, file: Path, how: str) -> None:
+    def _raise_lost(self, file: Path, change: str) -> None:
         raise LostJournalError(
-            f"{file} {how} during the run; ledger.jsonl still has all frames and verdicts",
+            f"{file} {change} during the run; ledger.jsonl still has all frames and verdicts",
             remedy=f"restore the journal with acquire rebuild {self._path.parent}, then run the same command again",
         )
 
@@ -729,7 +729,8 @@ class _LockRetry:
 
 LEDGER_FILE: Final = "ledger.jsonl"  # Name of the ledger in the folder of a session
 
-# Largest ledger that is read: twenty times that of 707 illuminants, to limit the memory for a foreign file.
+# Largest ledger that is read, in bytes: twenty times the size for 707 illuminants, to limit the memory for a foreign
+# file.
 _MOST_LEDGER_BYTES: Final = 1 << 30
 
 PLACE: Final = "place"  # Key of the record with the place of the session for which signs of life are given

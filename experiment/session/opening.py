@@ -53,7 +53,8 @@ READING_LIMIT_S = 10.0
 # Longest text, blob or row that SQLite reads: the measurement of a frame has some 100 kilobytes.
 _MOST_VALUE_BYTES: Final = 64 << 20
 
-# Largest sizes of files that are read completely: forty times those of 707 illuminants and 32 768 colours.
+# Largest sizes of files that are read completely, in bytes: forty times the sizes for 707 illuminants and 32 768
+# colours.
 MOST_BYTES: Final = {"chart.json": 256 << 20, "illuminations.csv": 16 << 20, "session.toml": 1 << 20}
 
 _TABLES = """

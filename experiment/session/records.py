@@ -107,7 +107,7 @@ class FrameJudge(Protocol):
 
 @runtime_checkable
 class OutlastsPauses(Protocol):
-    """A judge that needs to know about pauses of a run."""
+    """A judge that takes pauses of a run into account."""
 
     def after_pause(self) -> None:
         """Handle a pause of the run for a lasting cause; the next frames reconnect it to the earlier ones.
