@@ -380,10 +380,10 @@ def rebuild(session: Annotated[Path, typer.Argument(help="Session folder.")]) ->
     Reads SESSION/ledger.jsonl, where each run writes what the journal holds a second time. Writes
     SESSION/journal.sqlite; what stands in its place is renamed, not deleted. Frames stay as they are.
     """
-    from experiment.session.folder import busy_sentence, rebuild_journal
+    from experiment.session.folder import busy_message, rebuild_journal
     from experiment.session.journal import JOURNAL_FILE
 
-    with locked_folder(session, busy_sentence(session)):
+    with locked_folder(session, busy_message(session)):
         attempts = rebuild_journal(session)
     print(f"{session / JOURNAL_FILE}: made anew, {attempts} attempts; next: acquire status {session}")
 

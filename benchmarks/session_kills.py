@@ -51,7 +51,7 @@ from experiment.lights import Illumination
 from experiment.session.folder import Session, rebuild_journal
 from experiment.session.journal import IncomingFile, Journal, ledger_path, settled_frames
 from experiment.session.records import ACCEPTED, VOIDED, Check, Judgement, SessionStep, plan_steps
-from experiment.session.repair import unsound_files
+from experiment.session.repair import damaged_files
 from foundation.clock import SIM_START, SimulatedClock
 from foundation.errors import DeviceError, FormatError
 from sim.projectors.projector import SimulatedProjector
@@ -417,7 +417,7 @@ class TroubledSessions:
             colours = {step.number: step.colour for step in session.steps}
             voided = {one.id for one in session.journal.attempts() if one.verdict == VOIDED}
             not_used = {frame.sha256 for frame in session.frames() if frame.attempt in voided}
-            gone = unsound_files(folder, accepted, lambda done, total: None)
+            gone = damaged_files(folder, accepted, lambda done, total: None)
             self.lost += len(counted - {frame.sha256 for frame in accepted} - not_used) + len(gone)
             self.doubled += sorted(frame.step for frame in accepted) != sorted(colours)
             contents = {frame.step: (folder / frame.file).read_bytes() for frame in accepted}
@@ -492,7 +492,7 @@ class KilledPrograms:
         with Session.open(folder) as session:
             accepted = session.journal.accepted_files()
             self.lost += len(counted - {frame.sha256 for frame in session.frames()})
-            self.lost += len(unsound_files(folder, accepted, lambda done, total: None))
+            self.lost += len(damaged_files(folder, accepted, lambda done, total: None))
             self.doubled += sorted(frame.step for frame in accepted) != [step.number for step in session.steps]
             self.doubled += len(accepted) - len({frame.sha256 for frame in accepted})
         shutil.rmtree(folder)

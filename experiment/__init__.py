@@ -1,1 +1,1 @@
-"""The experiment as data: chart, lights, settings, the session on disk, and what counts of a frame say of the print."""
+"""The experiment as data: chart, illuminants, settings, session folder, and measurements of one frame."""

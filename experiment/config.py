@@ -1,6 +1,6 @@
-"""`LAB.toml`: one file to typed, frozen settings; an unknown key is an error that names the nearest known one.
+"""Settings of `LAB.toml`: typed, frozen and checked; an unknown key is an error that names the closest known key.
 
-Nothing here opens anything: paths are resolved against the file's folder, values are checked, that is all.
+Nothing is opened here: paths are resolved against the folder of the file, and values are checked.
 """
 
 from __future__ import annotations
@@ -36,38 +36,35 @@ from foundation.secret_texts import MASK, is_webhook, target_label
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
-# Keys whose values are in no message, nor in `session.toml`: a session is copied, shown and published.
+# Keys whose values must not appear in messages or in `session.toml`, because sessions are copied and published.
 _SECRETS = ("sequence.notify", "notify.alive", "lab.projector.password")
 
-# The rig of a session of which nothing more can be taken: no one writes it into LAB.toml.
+# Rig of a session of which no more frames can be taken. Nobody writes it into LAB.toml.
 NOT_TO_CHOOSE: Final = "imported"
 
-# A file that is named for a secret is read as far as this: passwords and addresses are shorter, and a file that is
-# longer was named by mistake.
+# Bytes that are read of a file with a secret: passwords and addresses are shorter, and a longer file was named by
+# mistake.
 _SECRET_BYTES = 4096
 
 
-def _target_checked(target: str) -> str:
-    """Return the target of notices as it is: a URL with a host, or a command line; empty is nobody.
-
-    Anything else is refused by a ValueError, whose message does not hold it.
-    """
+# A target of notices is a URL with a host, or a command line. No message contains it, because it may hold a secret.
+def _check_target(target: str) -> str:
     if not is_webhook(target):
-        # A quotation that does not end is refused here.
+        # Raises ValueError for an open quotation.
         shlex.split(target)
         return target
-    parts = urlsplit(target)
-    if not parts.hostname or parts.port == 0:
-        raise ValueError("a URL names a host, as in https://ntfy.sh/my-lab")
+    url = urlsplit(target)
+    if not url.hostname or url.port == 0:
+        raise ValueError("the URL has no host; expected a URL such as https://ntfy.sh/my-lab")
     if not target.removesuffix(f"/{MASK}").isascii() or any(character.isspace() for character in target):
-        raise ValueError("a URL has no spaces and no letters but ASCII's; write them as %20 and the like")
+        raise ValueError("the URL has spaces or non-ASCII letters; write them as %20 and similar")
     return target
 
 
 def spdx_expression(licence: str) -> str:
-    """Return an SPDX licence expression in its canonical spelling, ``CC-BY-4.0``; empty stays empty.
+    """Return an SPDX licence expression in canonical spelling, ``CC-BY-4.0``; an empty text stays empty.
 
-    SPDX specification 2.3, annex D, so that programs and lawyers read the same; anything else is a ValueError.
+    SPDX specification 2.3, annex D. Other texts raise a ValueError.
     """
     if not licence.strip():
         return ""
@@ -75,45 +72,42 @@ def spdx_expression(licence: str) -> str:
         return str(canonicalize_license_expression(licence))
     except InvalidLicenseExpression as error:
         raise ValueError(
-            "no SPDX licence expression; expected an identifier of spdx.org/licenses, such as CC-BY-4.0 or CC0-1.0, or "
-            "LicenseRef-NAME for a licence of your own"
+            "not an SPDX licence expression; expected an identifier of spdx.org/licenses, such as CC-BY-4.0 or "
+            "CC0-1.0, or LicenseRef-NAME for your own licence"
         ) from error
 
 
-def _endless(value: object) -> object:
-    """Return infinity for the word ``forever``, and a number as it is."""
+def _parse_seconds(value: object) -> object:
     if not isinstance(value, str):
         return value
     if value.strip().lower() != "forever":
-        raise ValueError('a number of seconds was expected, or "forever"')
+        raise ValueError('a number of seconds is expected, or "forever"')
     return math.inf
 
 
-def _f_number(value: object) -> float | Literal["none"]:
-    """Return an f-number as it is given, or the word ``none``."""
+def _parse_f_number(value: object) -> float | Literal["none"]:
     if value == "none":
         return "none"
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf:
         return float(value)
-    raise ValueError('an f-number above 0 was expected, or "none" for a lens without contacts')
+    raise ValueError('an f-number above 0 is expected, or "none" for a lens without contacts')
 
 
-def _address(host: str) -> str:
-    """Return a name or an address of the network as it is; a ValueError says what something else is."""
+def _check_host(host: str) -> str:
     if host.startswith("/dev/") or re.fullmatch(r"COM\d+", host, re.IGNORECASE):
-        raise ValueError("a serial port, which is given as device; an address was expected, such as 192.168.1.30")
+        raise ValueError("a serial port; an address is expected, such as 192.168.1.30; give the port as device instead")
     if "/" in host:
-        raise ValueError("an address alone was expected, such as 192.168.1.30, without http:// or a path")
-    if (parts := re.fullmatch(r"([^:\[\]]+):(\d+)", host)) is not None:
-        raise ValueError(f'an address alone was expected: write host = "{parts[1]}" and port = {parts[2]}')
+        raise ValueError("only an address is expected, such as 192.168.1.30, without http:// or a path")
+    if (match := re.fullmatch(r"([^:\[\]]+):(\d+)", host)) is not None:
+        raise ValueError(f'only an address is expected; write host = "{match[1]}" and port = {match[2]}')
     return host
 
 
-Host = Annotated[str, AfterValidator(_address)]
+Host = Annotated[str, AfterValidator(_check_host)]
 
 
 class Settings(BaseModel):
-    """What a settings file may say: frozen, and a key that is not known is an error."""
+    """Base of settings tables: frozen, and unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -122,18 +116,18 @@ _AnySettings = TypeVar("_AnySettings", bound=Settings)
 
 
 class CameraSettings(Settings):
-    """How every frame of the session is exposed; the exposure is fixed for a session."""
+    """Exposure of every frame; it is constant in a session."""
 
     iso: Annotated[int, Field(gt=0)] = 100
     """ISO speed."""
-    aperture: Annotated[float | Literal["none"], PlainValidator(_f_number)] = 8.0
-    """f-number; ``"none"`` where the body has no say in it: a lens without contacts, an adapter, a telescope."""
+    aperture: Annotated[float | Literal["none"], PlainValidator(_parse_f_number)] = 8.0
+    """f-number; ``"none"`` if the body does not control the aperture: lens without contacts, adapter, telescope."""
     shutter_s: Positive = 0.5
     """Shutter time in seconds; under a DLP projector at least 0.5 and a whole multiple of 1/60."""
 
     @cached_property
     def exposure(self) -> ExposureSettings:
-        """The same as the camera drivers take it."""
+        """The settings in the form that camera drivers use."""
         return ExposureSettings(self.iso, None if self.aperture == "none" else self.aperture, self.shutter_s)
 
 
@@ -141,182 +135,182 @@ class SequenceSettings(Settings):
     """How the session is taken."""
 
     settle_s: NotNegative = 0.5
-    """Seconds between a colour's appearance on the screen and the release."""
+    """Seconds between the appearance of a colour on the screen and the release."""
     reference_every: Annotated[int, Field(ge=1)] = 25
-    """Lights between two pairs of white and dark frames."""
+    """Number of illuminants between two pairs of white and dark frames."""
     attempts: Annotated[int, Field(ge=1, le=20)] = 3
-    """Tries at a frame before it is left for the next run."""
+    """Attempts at a frame before it is left to the next run."""
     warm_up_s: NotNegative = 1200.0
-    """Seconds that the lamp burns after it was switched on before the first frame."""
-    patience_s: Annotated[float, BeforeValidator(_endless), Field(ge=0)] = 600.0
-    """Seconds that a run pauses for a device or the disk that fails, before it ends: camera, screen, projector, disk
-    alike; ``inf`` or ``"forever"``: until it is mended. Ten minutes outlast a restart of any of them, and a run that
-    ended lets the lamp go out."""
+    """Seconds that the lamp warms up before the first frame."""
+    patience_s: Annotated[float, BeforeValidator(_parse_seconds), Field(ge=0)] = 600.0
+    """Seconds that a run waits for a device (camera, screen, projector) or the disk after a failure, before it ends;
+    ``inf`` or ``"forever"``: no limit. Each of them restarts within ten minutes. When a run ends, the lamp goes out."""
     order: Literal["shuffled", "listed"] = "shuffled"
-    """Order of the lights: shuffled by `seed`, so that neither the lamp's drift nor a picture that did not change runs
-    along with the colour; or as they are listed."""
+    """Order of the illuminants: shuffled by `seed`, so that drift of the lamp and unchanged pictures do not correlate
+    with colour; or as listed."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of the shuffled order."""
     switch_off: bool = True
-    """Whether the projector is switched off when the session is complete."""
+    """Switch the projector off when the session is complete."""
     lamp_if_unfinished: Literal["off", "on"] = "off"
-    """What the lamp does when a run ends by itself before the session is complete: it goes out, for nobody may be
-    there, or burns on, so that the next run needs no warm-up. After Ctrl-C it is left as it is."""
+    """State of the lamp when a run ends with an incomplete session: off, because nobody may be present, or on, so that
+    the next run needs no warm-up. Ctrl-C does not change it."""
     relight: bool = False
-    """Whether a projector that is in standby during a run, as after a power cut, is lit again; the run goes on when it
-    is warm. Not unless asked for: whoever switched it off may have had a reason."""
+    """Switch a projector on again that is in standby during a run, for example after a power cut; the run continues
+    when the lamp is warm. Off by default, because somebody may have switched the projector off on purpose."""
     refused_gb: Annotated[float, Field(gt=0)] = 5.0
-    """Gigabytes that refused and voided frames of one run may take of the disk before it ends: two hundred frames of an
-    18-megapixel body, a quarter of a session's; ``inf``: as many as there is space for."""
-    notify: Annotated[str, AfterValidator(_target_checked), Field(repr=False)] = ""
-    """Who is told when a run pauses, goes on and ends: a URL that gets JSON by POST, or a command that gets the same on
-    its standard input; empty: nobody. Or ``{ env = "NAME" }`` or ``{ file = "PATH" }``, where that is found. Kept out
-    of messages and `session.toml`, but for the host or the program's name."""
+    """Disk space in gigabytes for refused and void frames of one run, after which it ends: 200 frames of 18 megapixels,
+    a quarter of a session; ``inf``: no limit."""
+    notify: Annotated[str, AfterValidator(_check_target), Field(repr=False)] = ""
+    """Receiver of notices when a run pauses, continues and ends: a URL that gets JSON by POST, or a command that gets
+    it on its standard input; empty: none. ``{ env = "NAME" }`` or ``{ file = "PATH" }`` read it from an environment
+    variable or a file. Messages and `session.toml` contain only the host or the name of the program."""
 
 
 class NotifySettings(Settings):
-    """Who is told that a run lives."""
+    """Signs of life of a run."""
 
-    alive: Annotated[str, AfterValidator(_target_checked), Field(repr=False)] = ""
-    """A URL or a command that is told at most once a minute that the run is at work, and at its end how it ended, as
-    `sequence.notify` is told; what expects that, and pages somebody when it does not come, is a dead man's switch."""
+    alive: Annotated[str, AfterValidator(_check_target), Field(repr=False)] = ""
+    """A URL or a command, as in `sequence.notify`, that gets a sign of life of the run at most once a minute, and its
+    result at the end. A service that expects it and alerts somebody if it is missing is a dead man's switch."""
 
 
 class LimitSettings(Settings):
-    """When a frame is refused."""
+    """Limits of exposure beyond which a frame is refused."""
 
     clipped_percent: NotNegative = 0.1
-    """Largest share of photosites at or above 98 % of saturation, per cent."""
+    """Largest fraction of photosites at or above 98 % of saturation, per cent."""
     too_dark_dn: NotNegative = 100.0
-    """A lit frame's brightest photosites must reach this many counts above black."""
+    """Smallest level of the brightest photosites of a lit frame, counts above black."""
     stray_light_percent: NotNegative = 5.0
-    """A dark frame's brightest photosites may reach this share of saturation, per cent."""
+    """Largest level of the brightest photosites of a dark frame, per cent of saturation."""
 
 
 class JudgeSettings(Settings):
-    """What every frame is measured for while the session is taken, and when it is refused.
+    """Limits of the measurements of every frame, beyond which it is refused.
 
-    Pixels are those of the half-size picture, one for each 2×2 block of photosites. The limits are judgement where no
-    measurement is named.
+    Pixels are half-size pixels, one for each 2×2 block of photosites. Limits without a measurement are judgement.
     """
 
     chart: bool = True
-    """Whether the chart is looked for in the frames: false for a bare wall, of which only the light is judged."""
+    """Detect the chart in the frames; false for a bare wall, of which only the light is judged."""
     response: bool = True
-    """Whether a session begins with the projector's primaries and greys, by which the light of all codes is foretold:
-    false saves some twenty frames, and lights are then held against less."""
+    """Start a session with primaries and greys of the projector, from which the light of all codes is predicted; false
+    saves about 20 frames, but illuminants are then checked less."""
     moved_px: NotNegative = 0.2
-    """Largest displacement of the chart from where it lies at rest, px: in the first white frame, or where it was
-    pushed to and stays, if that is less than a pixel away. Ten times the error of the measurement on a dark frame
-    (0.02 at 66 counts), and below 0.3, about the margin that the 25 samples of a cell have."""
+    """Largest displacement of the chart from its rest position, px. That is the position in the first white frame, or a
+    later one less than a pixel away at which it stays. The limit is ten times the error on a dark frame (0.02 px at
+    66 counts), and below the margin of the 25 samples of a patch (about 0.3 px)."""
     blur_px: NotNegative = 0.3
-    """Largest growth of the blur σ since the first white frame, px, as the root of the difference of the squares: less
-    than a lens's own 0.5."""
+    """Largest growth of the blur σ since the first white frame, px, as root of the difference of squares: less than the
+    blur of a lens (0.5 px)."""
     drift_percent: NotNegative = 1.0
-    """Deviation of the lamp's level from the one expected after the frames before that is always allowed, per cent:
-    usual for a warm lamp; `build-lut` warns at as much. Where lights scatter, more is allowed."""
+    """Deviation of the lamp from its expected level that is always allowed, per cent: usual for a warm lamp;
+    `build-lut` warns from the same value. If levels scatter, more is allowed."""
     dark_percent: NotNegative = 5.0
-    """Largest light in a dark frame, of white, per cent: half of what `build-lut` refuses. It warns from 0.5 on, and so
-    does `acquire check`: light that is always there harms deep colours, and no frame gets better by being retaken."""
+    """Largest light in a dark frame, per cent of white: half of the limit of `build-lut`, which warns from 0.5 %, as
+    does `acquire check`. Constant stray light harms dark colours, and repeating a frame does not remove it."""
     ambient_percent: NotNegative = 0.2
-    """Largest change of that light since the first dark frame, of white, per cent: `build-lut` warns at as much."""
+    """Largest change of that light since the first dark frame, per cent of white: `build-lut` warns from the same
+    value."""
     light_deg: NotNegative = 0.5
-    """Angle between the light seen and the one ordered, as predicted from the response frames, that is always allowed,
-    degrees; where the prediction is uncertain, more is. A quarter of the 2 degrees within which a fifth of the 707 have
-    their neighbour."""
+    """Angle between the measured and the predicted illuminant that is always allowed, degrees; if the prediction is
+    uncertain, more is allowed. The prediction uses the response frames. A fifth of the 707 illuminants have a neighbour
+    within 2 degrees, four times this value."""
 
 
 class CitationSettings(Settings):
-    """What a table says of itself that no device tells; `build-lut` writes it into the table and its data sets."""
+    """Information that no device provides; `build-lut` writes it into the look-up table (LUT) and its data sets."""
 
     title: Annotated[str, Field(max_length=500)] = ""
-    """What the table is called where it is cited; empty: its camera and lights."""
+    """Title of the LUT in citations; empty: its camera and illuminants."""
     authors: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = ()
-    """Who made it, each as "Family, Given" or the name of an institution."""
+    """Authors, each as "Family, Given" or the name of an institution."""
     licence: Annotated[str, Field(max_length=500), AfterValidator(spdx_expression)] = ""
-    """Under which licence the table may be used, an SPDX expression such as "CC-BY-4.0"; empty: not recorded."""
+    """Licence of the LUT, an SPDX expression such as "CC-BY-4.0"; empty: not recorded."""
     note: Annotated[str, Field(max_length=20_000)] = ""
-    """What whoever took the session wants readers to know: what was ordered at the print shop, what went wrong."""
+    """Note for readers of the LUT, for example the order at the print shop, or what went wrong."""
     url: Annotated[str, Field(max_length=500)] = ""
-    """Where the table is found, its DOI for example."""
+    """Address of the LUT, for example its DOI."""
     lens: Annotated[str, Field(max_length=500)] = ""
-    """The lens, where it has no contacts, so that raw files do not name it."""
+    """The lens, if it has no contacts and raw files do not name it."""
     projector: Annotated[str, Field(max_length=500)] = ""
-    """The projector, where it has no control port that names it."""
+    """The projector, if it has no control port that names it."""
     camera_serial: Literal["hash", "plain", "withheld"] = "hash"
-    """How the body's serial number is told in the table: its hash tells bodies apart and no more, "plain" is the number
-    itself, "withheld" nothing."""
+    """Serial number of the body in the LUT: "hash" only distinguishes bodies, "plain" is the number itself, "withheld"
+    leaves it out."""
 
 
 class SimulatedSettings(Settings):
-    """The simulated lab."""
+    """The simulated laboratory."""
 
     body: str = "EOS 550D"
-    """Camera body in it: EOS 550D, EOS 6D Mark II, Test; or sensitivities by name or file, as `sim table --camera`."""
+    """Camera body: EOS 550D, EOS 6D Mark II, Test; or sensitivities by name or file, as in `sim table --camera`."""
     camera: dict[str, Any] | None = None
-    """Facts of the body that differ, by the names of sim.world.sensors.Body."""
+    """Properties of the body that differ, with the names of sim.world.sensors.Body."""
     seed: Annotated[int, Field(ge=0)] = 1
-    """Seed of everything that chance decides: paper, noise."""
+    """Seed of all random numbers: paper, noise."""
     room: dict[str, bool | int | float | str] = {}
     """Physical parameters of the room that differ from the default; see sim.world.world.Room."""
     events: tuple[dict[str, Any], ...] = ()
-    """What goes wrong, by frame or time; see sim.world.disturbances. May change within a session, as luck does."""
+    """Disturbances by frame or time; see sim.world.disturbances. They may change within a session."""
 
 
 class CameraCable(Settings):
-    """Where the camera of a real lab is found."""
+    """Connection of the camera of a real laboratory."""
 
     connection: Literal["usb", "ptpip", "gphoto2"] = "usb"
-    """Canon EOS on USB, Canon EOS on the network (PTP/IP), or any body through libgphoto2."""
+    """usb: Canon EOS on USB; ptpip: Canon EOS on the network (PTP/IP); gphoto2: any body through libgphoto2."""
     serial: str | None = None
-    """USB: serial number of the body, where several hang on the machine."""
+    """USB: serial number of the body, if several are connected."""
     usb_port: str | None = None
-    """USB: the port it is plugged into, such as 1-2.4, for bodies without a serial number on USB."""
+    """USB: port of the body, such as 1-2.4, for bodies without a serial number on USB."""
     host: Host | None = None
     """PTP/IP: address of the camera."""
     port: Annotated[int, Field(ge=1, le=65535)] = 15740
     """PTP/IP: TCP port."""
     event_port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """PTP/IP: TCP port of the event connection where it is another."""
+    """PTP/IP: TCP port of the event connection, if different."""
     gphoto2_port: str | None = None
-    """libgphoto2's name of the port; the first camera found if left out."""
+    """Name of the port in libgphoto2; by default the first detected camera."""
     gphoto2_model: str | None = None
-    """libgphoto2's name of the model; found out if left out."""
+    """Name of the model in libgphoto2; detected by default."""
 
 
 class ProjectorCable(Settings):
-    """How the projector of a real lab is controlled, and what its light is like."""
+    """Control and light of the projector of a real laboratory."""
 
     control: Literal["none", "pjlink", "serial"] = "none"
-    """PJLink, or the maker's language over a serial port or TCP; none: someone switches it by hand."""
+    """pjlink: PJLink; serial: language of the manufacturer over a serial port or TCP; none: switched by hand."""
     language: str | None = None
-    """With ``serial``: name of a language (docs/devices.md), or path of a language file (.toml), relative to the
+    """For ``serial``: name of a language (docs/devices.md), or path of a language file (.toml), relative to the
     settings file."""
     host: Host | None = None
     """Address, for PJLink and for languages over TCP."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """TCP port where it is not the language's own."""
+    """TCP port, if different from the default of the language."""
     password: Annotated[str | None, Field(repr=False)] = None
-    """PJLink password, or ``{ env = "NAME" }`` or ``{ file = "PATH" }``, where it is found; not in `session.toml`."""
+    """PJLink password. ``{ env = "NAME" }`` or ``{ file = "PATH" }`` read it from an environment variable or a file. It
+    is not in `session.toml`."""
     device: str | None = None
     """Serial port, such as /dev/ttyUSB0."""
     baud: Annotated[int, Field(ge=300)] | None = None
-    """Baud rate where it is not the language's own."""
+    """Baud rate, if different from the default of the language."""
     refresh_hz: Positive = 60.0
-    """Pictures that it shows a second."""
+    """Pictures per second."""
     colour_wheel_hz: NotNegative = 60.0
-    """Turns of its colour wheel a second; 0: it has none (LCD, LCoS, LED)."""
+    """Turns of the colour wheel per second; 0: none (LCD, LCoS, LED)."""
 
 
 class LightSource(Settings):
-    """The display of this machine that the projector shows."""
+    """The display of this computer that is connected to the projector."""
 
     display: str | int | None = None
-    """Name, position or number of the display; acquire devices lists them."""
+    """Name, position or number of the display; `acquire devices` lists them."""
 
 
 class LabRig(Settings):
-    """The cables of a real lab."""
+    """Connections of a real laboratory."""
 
     camera: CameraCable = CameraCable()
     projector: ProjectorCable = ProjectorCable()
@@ -324,11 +318,11 @@ class LabRig(Settings):
 
 
 class LabSettings(Settings):
-    """Everything that LAB.toml says."""
+    """All settings of LAB.toml."""
 
     rig: Literal["lab", "simulated", "imported"]
-    """What stands at the end of the cables: real devices or the simulated lab; `imported` marks a session whose frames
-    were taken by other means."""
+    """Devices: lab (real devices) or simulated (simulated laboratory). `imported` marks a session with frames
+    that were taken by other means."""
     chart: Path
     """chart.json of the print, relative to the settings file."""
     illuminations: Path
@@ -345,33 +339,33 @@ class LabSettings(Settings):
 
     @property
     def file(self) -> str:
-        """The file that the settings were read from, for messages."""
+        """File of the settings, for messages."""
         return self._file
 
     def read_from(self, file: str) -> LabSettings:
-        """Return the same settings as read from a file."""
-        named = self.model_copy()
-        named._file = file  # noqa: SLF001 - its own class
-        return named
+        """Return a copy of the settings with the name of their file."""
+        copy = self.model_copy()
+        copy._file = file  # noqa: SLF001 - its own class
+        return copy
 
     def to_toml(self) -> str:
-        """Return the settings, defaults included, as the text of `session.toml`; secrets are masked."""
+        """Return the settings with defaults as the text of `session.toml`; secrets are masked."""
         values = self.model_dump(mode="json", exclude_none=True)
         values["sequence"]["notify"] = target_label(self.sequence.notify)
         values["notify"]["alive"] = target_label(self.notify.alive)
-        # A password is needed to take frames, and whoever does that has LAB.toml.
+        # A password is needed only for taking frames, that is with LAB.toml.
         values["lab"]["projector"].pop("password", None)
         return tomli_w.dumps(values)
 
 
 def load_lab(path: Path) -> LabSettings:
-    """Read `LAB.toml`, every path resolved against its folder; a ConfigurationError names what cannot be used."""
+    """Read `LAB.toml` and resolve every path against its folder; `ConfigurationError` if a value is not usable."""
     if path.is_dir():
-        remedy = f"name {path / 'LAB.toml'}"
-        raise ConfigurationError("a folder, a file of settings was expected", about=path, remedy=remedy)
+        remedy = f"give {path / 'LAB.toml'}"
+        raise ConfigurationError("a folder, but a settings file is expected", about=path, remedy=remedy)
     folder = path.resolve().parent
     settings = parse_lab(
-        read_text(path, "acquire init writes one to begin with; it comes before the session", "settings"),
+        read_text(path, "acquire init writes a first one; give it before the session", "settings"),
         str(path),
         folder,
     )
@@ -383,84 +377,85 @@ def load_lab(path: Path) -> LabSettings:
     return settings.model_copy(update=changes)
 
 
-def parse_lab(text: str, where: str, folder: Path | None = None) -> LabSettings:
-    """Return the settings in a TOML text, paths as they stand there; a ConfigurationError names what cannot be used.
+def parse_lab(text: str, source_name: str, folder: Path | None = None) -> LabSettings:
+    """Parse the settings in a TOML text without resolving paths; `ConfigurationError` if a value is not usable.
 
-    `where`: names them in errors. `folder`: what files that hold secrets are relative to; None where secrets are not
-    looked up: in a session's own settings there are none.
+    Parameters
+    ----------
+    text
+        TOML text.
+    source_name
+        Name of the text in errors.
+    folder
+        Folder to which files with secrets are relative; if None, secrets are not read, as in `session.toml`.
     """
-    document = parse_toml(text, where)
+    document = parse_toml(text, source_name)
     if folder is not None:
-        _look_up_secrets(document, folder, where)
-    return checked(LabSettings, document, where).read_from(where)
+        _insert_secrets(document, folder, source_name)
+    return validate_settings(LabSettings, document, source_name).read_from(source_name)
 
 
-def checked(kind: type[_AnySettings], document: dict[str, Any], where: str) -> _AnySettings:
-    """Return the settings in a document; a ConfigurationError names every key that cannot be used, no secret."""
+def validate_settings(model: type[_AnySettings], document: dict[str, Any], source_name: str) -> _AnySettings:
+    """Validate the settings in a document; `ConfigurationError` lists every unusable key without secrets."""
     try:
-        return kind.model_validate(document)
+        return model.model_validate(document)
     except ValidationError as error:
-        found = find_mistakes(kind, document, error, _is_secret, NOT_TO_CHOOSE)
-        # The cause has the values, too.
-        secret = any(_is_secret(".".join(map(str, one["loc"]))) for one in error.errors())
-        raise ConfigurationError(f"{where}:{list_mistakes(found)}") from (None if secret else error)
+        mistakes = find_mistakes(model, document, error, _is_secret, NOT_TO_CHOOSE)
+        # The cause would contain the values.
+        has_secret = any(_is_secret(".".join(map(str, mistake["loc"]))) for mistake in error.errors())
+        raise ConfigurationError(f"{source_name}:{list_mistakes(mistakes)}") from (None if has_secret else error)
 
 
 def _is_secret(key: str) -> bool:
-    """Return whether the value of a key holds a secret: what is above one does, and so does what is below it."""
-    return any(f"{known}.".startswith(f"{key}.") or key.startswith(f"{known}.") for known in _SECRETS)
+    # Tables above a secret contain it, too.
+    return any(f"{secret_key}.".startswith(f"{key}.") or key.startswith(f"{secret_key}.") for secret_key in _SECRETS)
 
 
-def _look_up_secrets(document: dict[str, Any], folder: Path, where: str) -> None:
-    """Put the secrets in the place of what says where they are found.
-
-    A password of devices that this rig does not have is left out: nobody has to know it to rehearse a session.
-    """
-    missing: list[ConfigurationError] = []
+def _insert_secrets(document: dict[str, Any], folder: Path, source_name: str) -> None:
+    errors: list[ConfigurationError] = []
     for key in _SECRETS:
-        *tables, last = key.split(".")
+        *tables, name = key.split(".")
         holder: Any = document
-        for name in tables:
-            holder = cast("dict[str, Any]", holder).get(name) if isinstance(holder, dict) else None
+        for table_name in tables:
+            holder = cast("dict[str, Any]", holder).get(table_name) if isinstance(holder, dict) else None
         table = cast("dict[str, Any]", holder) if isinstance(holder, dict) else {}
-        found = table.get(last)
-        if isinstance(found, dict):
-            place = cast("dict[str, Any]", found)
+        value = table.get(name)
+        if isinstance(value, dict):
+            source = cast("dict[str, Any]", value)
             if tables[0] == "lab" and document.get("rig") != "lab":
-                del table[last]
+                # A session can be rehearsed without the password of devices that its rig does not have.
+                del table[name]
                 continue
             try:
-                table[last] = _found_secret(key, place, folder)
+                table[name] = _read_secret(key, source, folder)
             except ConfigurationError as error:
-                missing.append(error)
-    if missing:
-        raise ConfigurationError(f"{where}:{list_mistakes([str(one) for one in missing])}") from missing[0]
+                errors.append(error)
+    if errors:
+        raise ConfigurationError(f"{source_name}:{list_mistakes([str(mistake) for mistake in errors])}") from errors[0]
 
 
-def _found_secret(key: str, place: dict[str, Any], folder: Path) -> str:
-    match place:
-        case {"env": str(name), **more} if not more:
+def _read_secret(key: str, source: dict[str, Any], folder: Path) -> str:
+    match source:
+        case {"env": str(name), **rest} if not rest:
             secret = os.environ.get(name, "")
             if not secret:
                 raise ConfigurationError(
-                    f"{key}: the environment has no {name}; set it for this command, as in: "
+                    f"{key}: the environment variable {name} is not set; set it for this command: "
                     f"read -rs {name} && export {name}"
                 )
-        case {"file": str(name), **more} if not more:
+        case {"file": str(name), **rest} if not rest:
             path = folder / name
             try:
-                # Neither a device nor a pipe: these never end.
+                # Reading a device or a pipe might never end.
                 if path.exists() and not path.is_file():
-                    raise ConfigurationError(f"{key}: {path} is no file; name one that holds the secret alone")
+                    raise ConfigurationError(f"{key}: {path} is not a file; give a file with only the secret")
                 with path.open(encoding="utf-8-sig") as stream:
                     secret = stream.read(_SECRET_BYTES).partition("\n")[0].strip()
             except (OSError, UnicodeDecodeError, ValueError) as error:
-                reason = (error.strerror if isinstance(error, OSError) else None) or "it is no text"
-                raise ConfigurationError(f"{key}: cannot read {path}: {reason}; name a readable file") from error
+                reason = (error.strerror if isinstance(error, OSError) else None) or "it is not a text"
+                raise ConfigurationError(f"{key}: cannot read {path}: {reason}; give a readable file") from error
             if not secret:
                 raise ConfigurationError(f"{key}: the first line of {path} is empty; write the secret there")
         case _:
-            raise ConfigurationError(
-                f'{key}: expected the text itself, {{ env = "NAME" }} or {{ file = "PATH" }}, and nothing beside'
-            )
+            raise ConfigurationError(f'{key}: expected only the text itself, {{ env = "NAME" }} or {{ file = "PATH" }}')
     return secret

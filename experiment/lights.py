@@ -1,8 +1,8 @@
-"""The lights of an experiment, as many as the paper's 707, their file `illuminations.csv`, and the figure of them.
+"""Illuminants of an experiment (707 in the paper), their file `illuminations.csv`, and their plot.
 
-The paper (section 3.1) asks for chromaticities spread uniformly and for black bodies but gives no recipe. Ours: the
-points of a triangular grid r = i/n, b = j/n, g = 1 − r − b in linear light, and black bodies from 2000 K to 10 000 K;
-each scaled to its brightest channel and encoded with the projector's transfer function (sRGB unless measured).
+The paper (section 3.1) requires uniformly spread chromaticities and black bodies, without a recipe. Here they are the
+points of a triangular grid r = i/n, b = j/n, g = 1 − r − b in linear light, and black bodies from 2000 K to 10 000 K.
+Each is scaled to its brightest channel and encoded with the transfer function of the projector (sRGB unless measured).
 """
 
 from __future__ import annotations
@@ -25,39 +25,35 @@ from foundation.files import atomic_file, csv_text, read_csv, write_atomic
 Kind = Literal["uniform", "blackbody", "spectrum"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")  # Columns of `illuminations.csv` (docs/formats.md)
 
-NAME = "name"  # A further column where lights have names: those of computed tables under spectra of their own
+NAME = "name"  # Additional column with names of illuminants, in computed tables with other spectra
 
-# Steps along an edge of the chromaticity triangle: 666 points, which with 41 black bodies are the paper's 707.
+# Steps along an edge of the chromaticity triangle: 666 points; with 41 black bodies these are the 707 of the paper.
 GRID = 35
 
-CCTS_K = tuple(range(2000, 10001, 200))  # Black bodies of the plan, kelvin: from candle light to blue sky
+CCTS_K = tuple(range(2000, 10001, 200))  # Black bodies of the plan, K: from candle light to blue sky
 
-MOST_CCTS = 10_000  # Most temperatures that a text may name: more are a mistake in the step
+MOST_CCTS = 10_000  # Largest number of temperatures in a text: more come from a mistake in the step
 
 
-FORMATS = ("png", "pdf", "svg")  # Endings of a figure's file name, and Matplotlib's names of these formats
+FORMATS = ("png", "pdf", "svg")  # File extensions of plots, and Matplotlib's names of the formats
 
-# Temperatures that the figure names, kelvin: few enough for their names not to touch.
+# Temperatures with a label in the plot, K: few enough that labels do not touch.
 _NAMED_CCTS_K = (2000, 3000, 4000, 6000, 10000)
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """One light of the plan: its number, its kind, its temperature if a black body, and the codes shown.
-
-    Where light has a spectrum of its own (`kind` ``spectrum``, or a black body that was computed and not shown by a
-    projector), the codes are those that would show its colour, and it has a `name`, such as ``D65``.
-    """
+    """One illuminant of the plan."""
 
     index: int
-    kind: Kind
-    cct_k: float | None
-    colour: Colour
-    name: str | None = None
+    kind: Kind  # "spectrum" for a computed illuminant with its own spectrum
+    cct_k: float | None  # temperature of a black body, K
+    colour: Colour  # codes that the projector shows, or that would show the colour of a computed illuminant
+    name: str | None = None  # name of a computed illuminant, such as "D65"
 
 
 def shown_colour(linear: npt.ArrayLike) -> Colour:
-    """Return the codes that show a linear RGB light (3,) float ≥ 0 at the brightest that its chromaticity allows."""
+    """Return the codes of a linear RGB colour (3,) float ≥ 0, scaled to its brightest channel."""
     linear = np.maximum(np.asarray(linear, dtype=np.float64), 0.0)
     codes = np.rint(255 * encode_srgb(linear / linear.max())).astype(int)
     return Colour(*(int(code) for code in codes))
@@ -71,10 +67,9 @@ def uniform_lights(grid: int = GRID) -> list[npt.NDArray[np.float64]]:
 
 
 def blackbody_light(cct_k: float) -> npt.NDArray[np.float64]:
-    """Return the linear sRGB of a black body, (3,) float64, its brightest channel 1.
+    """Return the linear sRGB of a black body, (3,) float64, with 1 in the brightest channel.
 
-    Planck's law at `cct_k` kelvin, CIE 1931 2° observer, sRGB primaries (IEC 61966-2-1); what lies outside the
-    gamut is clipped to it.
+    Planck's law at `cct_k` kelvin, CIE 1931 2° observer, sRGB primaries (IEC 61966-2-1), clipped to the gamut.
     """
     wavelengths = np.arange(360.0, 781.0)
     linear = np.maximum(linear_srgb(xyz_of(wavelengths, planck(wavelengths, cct_k))), 0.0)
@@ -82,7 +77,7 @@ def blackbody_light(cct_k: float) -> npt.NDArray[np.float64]:
 
 
 def plan_illuminations(grid: int = GRID, ccts_k: Sequence[float] = CCTS_K) -> tuple[Illumination, ...]:
-    """Return the lights of an experiment: the triangular grid first, then the black bodies."""
+    """Return the illuminants of an experiment: the triangular grid first, then the black bodies."""
     lights: list[Illumination] = []
     for linear in uniform_lights(grid) if grid else ():
         lights.append(Illumination(len(lights), "uniform", None, shown_colour(linear)))
@@ -107,118 +102,118 @@ def save_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
 
 
 def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illumination, ...]:
-    """Read `illuminations.csv`; further columns are ignored."""
+    """Read `illuminations.csv`; additional columns are ignored. `computed`: allow names and other spectra."""
     rows = read_csv(path, "make one with: acquire illuminations", "illuminations")[1]
     if not rows or any(column not in rows[0] for column in COLUMNS):
-        raise FormatError(f"{path}: expected lights under the columns {','.join(COLUMNS)}")
+        raise FormatError(f"{path}: illuminants in the columns {','.join(COLUMNS)} expected; run acquire illuminations")
     lights: list[Illumination] = []
     for number, row in enumerate(rows):
         kind, kelvin = row["kind"], row["cct_k"]
         cct_k: float | None = None
         try:
             if kind not in ("uniform", "blackbody", "spectrum") or (kind == "spectrum" and not computed):
-                raise ValueError(f"kind is {kind!r}, expected uniform or blackbody")
+                raise ValueError(f"kind is {kind!r}, uniform or blackbody expected")
             for column in ("index", "red", "green", "blue"):
                 if not row[column].strip().removeprefix("-").isdecimal():
-                    raise ValueError(f"{column} is {row[column] or 'missing'}, expected a whole number")
+                    raise ValueError(f"{column} is {row[column] or 'missing'}, a whole number expected")
             if int(row["index"]) != number:
-                raise ValueError(f"index is {row['index']}, expected {number}")
+                raise ValueError(f"index is {row['index']}, {number} expected")
             if kind == "blackbody":
                 with suppress(ValueError):
                     cct_k = float(kelvin)
                 if cct_k is None or not 0 < cct_k < math.inf:
-                    raise ValueError(f"cct_k is {kelvin or 'missing'}, expected kelvin above 0")
+                    raise ValueError(f"cct_k is {kelvin or 'missing'}, a temperature above 0 K expected")
             colour = Colour(int(row["red"]), int(row["green"]), int(row["blue"]))
             for name, code in zip(Colour._fields, colour, strict=True):
                 if not 0 <= code <= 255:
-                    raise ValueError(f"{name} is {code}; a code is 0 … 255")
+                    raise ValueError(f"{name} is {code}, a code 0 … 255 expected")
         except ValueError as error:
-            raise FormatError(f"{path}, light {number}: {error}") from error
+            raise FormatError(f"{path}, illuminant {number}: {error}; correct this row") from error
         lights.append(Illumination(number, kind, cct_k, colour, (row.get(NAME) or None) if computed else None))
     return tuple(lights)
 
 
 def parse_ccts(text: str) -> tuple[float, ...]:
-    """Return the temperatures in ``FIRST:LAST:STEP`` or ``K,K,…``, kelvin; empty text gives none."""
-    given = f"black bodies {text!r}"
+    """Parse temperatures in K as ``FIRST:LAST:STEP`` or ``K,K,…``; an empty text has none."""
+    description = f"black bodies {text!r}"
     try:
-        named = [float(part) for part in text.split(":" if ":" in text else ",") if part.strip()]
+        ccts = [float(field) for field in text.split(":" if ":" in text else ",") if field.strip()]
     except ValueError as error:
-        raise InputError(f"{given}: expected FIRST:LAST:STEP or K,K,… in kelvin") from error
+        raise InputError(f"{description}: FIRST:LAST:STEP or K,K,… in kelvin expected") from error
     if ":" in text:
-        if len(named) != 3:
-            raise InputError(f"{given}: expected FIRST:LAST:STEP or K,K,… in kelvin")
-        first, last, step = named
-        _require_kelvin((first, last), given)
+        if len(ccts) != 3:
+            raise InputError(f"{description}: FIRST:LAST:STEP or K,K,… in kelvin expected")
+        first, last, step = ccts
+        _require_kelvin((first, last), description)
         steps = (last - first) / step if step else math.nan
         if not 0 <= steps < MOST_CCTS:
             raise InputError(
-                f"{given}: steps of {step:g} K do not lead from {first:g} to {last:g} K in at most {MOST_CCTS} "
-                "temperatures; a falling range has a step below 0"
+                f"{description}: steps of {step:g} K do not go from {first:g} to {last:g} K in at most {MOST_CCTS} "
+                "temperatures; use a step below 0 for a falling range"
             )
         return tuple(first + step * number for number in range(int(steps + 1e-9) + 1))
-    _require_kelvin(named, given)
-    return tuple(named)
+    _require_kelvin(ccts, description)
+    return tuple(ccts)
 
 
-def _require_kelvin(ccts: Sequence[float], given: str) -> None:
+def _require_kelvin(ccts: Sequence[float], description: str) -> None:
     for cct_k in ccts:
         if not 1000 <= cct_k <= 100_000:
-            raise InputError(f"{given}: {cct_k:g} K is not within 1000 … 100 000 K")
+            raise InputError(f"{description}: {cct_k:g} K given, temperatures from 1000 to 100 000 K expected")
 
 
 def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:
-    """Plot the rb-chromaticities of lights (paper, section 3.1), each point in the colour of its light.
+    """Plot the rb-chromaticities of illuminants (paper, section 3.1), each point in its colour.
 
-    Chromaticities are those of the linear light that a projector with the sRGB transfer function sends out:
-    r = R / (R + G + B) and b = B / (R + G + B) of the decoded codes. A light without any light is left out.
+    Chromaticities r = R / (R + G + B) and b = B / (R + G + B) are computed from the decoded codes, that is from linear
+    light with the sRGB transfer function. An illuminant without light is omitted.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     ending = path.suffix.lower().removeprefix(".")
     if ending not in FORMATS:
-        raise InputError(f"a figure cannot be written as {path.name}; end its name with .{', .'.join(FORMATS)}")
-    lit = [light for light in illuminations if any(light.colour)]
-    codes = np.array([light.colour for light in lit]).reshape(-1, 3) / 255
+        raise InputError(f"the plot {path.name} has no known format; end its name with .{', .'.join(FORMATS)}")
+    lit_lights = [light for light in illuminations if any(light.colour)]
+    codes = np.array([light.colour for light in lit_lights]).reshape(-1, 3) / 255
     linear = decode_srgb(codes)
     r, _, b = (linear / linear.sum(axis=1, keepdims=True)).T
-    black_body = np.array([light.kind == "blackbody" for light in lit], dtype=np.bool_)
+    is_black_body = np.array([light.kind == "blackbody" for light in lit_lights], dtype=np.bool_)
 
-    # Matplotlib's own types leave the keyword arguments of every method unknown.
+    # Matplotlib's types do not include the keyword arguments.
     figure: Any = Figure(figsize=(7.2, 6.8), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.plot([0, 1, 0, 0], [0, 0, 1, 0], color="0.75", linewidth=0.8, zorder=1)
     axes.scatter(
-        r[~black_body],
-        b[~black_body],
+        r[~is_black_body],
+        b[~is_black_body],
         s=22,
-        c=codes[~black_body],
+        c=codes[~is_black_body],
         edgecolors="0.55",
         linewidths=0.3,
         zorder=2,
-        label=f"uniform ({int((~black_body).sum())})",
+        label=f"uniform ({int((~is_black_body).sum())})",
     )
     axes.scatter(
-        r[black_body],
-        b[black_body],
+        r[is_black_body],
+        b[is_black_body],
         s=34,
-        c=codes[black_body],
+        c=codes[is_black_body],
         marker="D",
         edgecolors="black",
         linewidths=0.9,
         zorder=3,
-        label=f"black bodies ({int(black_body.sum())})",
+        label=f"black bodies ({int(is_black_body.sum())})",
     )
-    for light, x, y in zip(lit, r, b, strict=True):
+    for light, x, y in zip(lit_lights, r, b, strict=True):
         if light.cct_k in _NAMED_CCTS_K:
-            # Named outside the triangle, so that no light is hidden.
-            away = (1.04 - float(x) - float(y)) / 2
+            # Labels are outside the triangle, so that they hide no point.
+            shift = (1.04 - float(x) - float(y)) / 2
             axes.annotate(
                 f"{light.cct_k:g} K",
                 (float(x), float(y)),
-                xytext=(float(x) + away, float(y) + away),
+                xytext=(float(x) + shift, float(y) + shift),
                 fontsize=9,
                 arrowprops={"arrowstyle": "-", "color": "0.3", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 4},
                 zorder=4,
@@ -229,8 +224,8 @@ def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
     axes.set_ylim(-0.03, 1.03)
     axes.set_aspect("equal")
     axes.legend(loc="upper right", frameon=False)
-    axes.set_title(f"rb-chromaticities of {len(lit)} illuminations")
-    # The day of writing is kept out of the file, so that the same lights give the same PNG.
+    axes.set_title(f"rb-chromaticities of {len(lit_lights)} illuminations")
+    # The date is not written, so that the same illuminants give the same PNG.
     metadata = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}[ending]
     with atomic_file(path) as stream:
         figure.savefig(stream, format=ending, dpi=150, metadata=metadata)

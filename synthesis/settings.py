@@ -15,7 +15,7 @@ from pydantic import Field
 from calibration.citation import OriginRecord
 from calibration.sampling import WINDOW, WINDOWS
 from experiment.chart.layout import design_chart
-from experiment.config import CameraSettings, CitationSettings, Settings, checked
+from experiment.config import CameraSettings, CitationSettings, Settings, validate_settings
 from experiment.lights import plan_illuminations
 from foundation.errors import ConfigurationError
 from foundation.files import read_text
@@ -81,7 +81,7 @@ def load_settings(path: Path | None) -> TableSettings:
 
 def parse_settings(document: dict[str, Any], where: str) -> TableSettings:
     """Return the settings of a TOML document; messages name it `where`."""
-    settings = checked(TableSettings, document, where)
+    settings = validate_settings(TableSettings, document, where)
     if settings.window not in WINDOWS:
         raise ConfigurationError(f"{where}: window = {settings.window}, expected one of {', '.join(map(str, WINDOWS))}")
     return settings

@@ -40,7 +40,7 @@ from drivers.raw.rawfile import (
 )
 from experiment.chart.model import Chart
 from experiment.config import LabSettings, LimitSettings
-from experiment.framing.finding import FoundTag, Framing, find_chart, find_tags
+from experiment.framing.finding import ChartPose, DetectedTag, detect_tags, find_chart
 from experiment.framing.homography import project
 from experiment.framing.pictures import Shift, gauge_boxes, gauges_of, shift_between
 from experiment.measures.exposure import Exposure, measure_exposure
@@ -77,7 +77,7 @@ class Anchor:
     - `of_chart`: whether the chart was found; else the places are just textured ones.
     """
 
-    framing: Framing
+    framing: ChartPose
     gauges: dict[Channel, Plane]
     paper: npt.NDArray[np.int64]
     of_chart: bool
@@ -112,7 +112,7 @@ class Anchor:
         """
         if not self.of_chart or not self.framing.tags:
             return None
-        found = {tag.id: tag.centre_px for tag in find_tags(plane_of(mosaic, channel, black))}
+        found = {tag.id: tag.centre_px for tag in detect_tags(plane_of(mosaic, channel, black))}
         moved = [found[tag.id] - tag.centre_px for tag in self.framing.tags if tag.id in found]
         if len(moved) < max(2, len(self.framing.tags) // 4):
             return None
@@ -193,11 +193,11 @@ def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
     return np.array(found, dtype=np.int64)[bright]
 
 
-def _textures(plane: Plane) -> Framing:
+def _textures(plane: Plane) -> ChartPose:
     values = plane.values
     height, width = values.shape
     energy = cv2.boxFilter(cv2.Laplacian(values, cv2.CV_32F) ** 2, -1, (_TEXTURE_PX, _TEXTURE_PX))
-    tags: list[FoundTag] = []
+    tags: list[DetectedTag] = []
     margin = 2 * _TEXTURE_PX
     half = _TEXTURE_PX / 2
     across, down = _TEXTURES
@@ -211,8 +211,8 @@ def _textures(plane: Plane) -> Framing:
             y, x = divmod(int(part.argmax()), part.shape[1])
             middle = np.array([left + x, top + y]) + plane.offset_px
             corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
-            tags.append(FoundTag(len(tags), corners + middle, 0.0))
-    return Framing(plane, tuple(tags), (), np.eye(3), 0.0, float("nan"), 1.0, True, 0.0)
+            tags.append(DetectedTag(len(tags), corners + middle, 0.0))
+    return ChartPose(plane, tuple(tags), (), np.eye(3), 0.0, float("nan"), 1.0, True, 0.0)
 
 
 VERSION = 1  # Of the format of the bytes
@@ -310,7 +310,7 @@ def _anchor_arrays(anchor: Anchor) -> dict[str, npt.NDArray[Any]]:
 
 def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
     tags = tuple(
-        FoundTag(int(number), corners, 0.0)
+        DetectedTag(int(number), corners, 0.0)
         for number, corners in zip(arrays["anchor_ids"], arrays["anchor_corners"], strict=True)
     )
     residual, module, fill, turned = arrays["anchor_pose"].tolist()
@@ -319,7 +319,7 @@ def _anchor(arrays: Any, facts: list[Any], shape: tuple[int, int]) -> Anchor:
         channel: Plane(channel, np.zeros(shape, dtype=np.float32), (float(offset[0]), float(offset[1])))
         for channel, offset in zip(CHANNELS, arrays["anchor_offsets"], strict=True)
     }
-    framing = Framing(
+    framing = ChartPose(
         gauges[searched], tags, (), arrays["anchor_homography"], residual, module, fill,
         bool(arrays["anchor_inside"][0]), turned,
     )  # fmt: skip

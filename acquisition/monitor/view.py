@@ -39,7 +39,7 @@ import numpy as np
 
 from experiment.lights import Illumination, load_illuminations
 from experiment.session.heartbeat import AGAIN, BEAT_S, LATE_S, Heartbeat, Process, SessionPlace
-from experiment.session.journal import JOURNAL_FILE, Journal, ledger_path, lost_files, open_journal, without_journal
+from experiment.session.journal import JOURNAL_FILE, Journal, ledger_path, lost_files, no_journal_text, open_journal
 from experiment.session.records import (
     ACCEPTED,
     FAILED,
@@ -202,7 +202,7 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
     """Return a session as it stands on the disk; of what was read `before` only what has changed is read again."""
     path = folder / JOURNAL_FILE
     opened = Journal.open(path) if before else open_journal(folder)
-    with closing(opened) as journal, journal.one_moment():
+    with closing(opened) as journal, journal.snapshot():
         steps, verdicts, events = journal.steps(), journal.verdicts(), journal.events()
         accepted = journal.accepted_files()
         known = {view.id: view for view in before.attempts} if before else {}
@@ -340,7 +340,7 @@ def _state_of(
     view: SessionView, now: datetime, process_alive: bool | None, left: int, frame_s: float | None
 ) -> tuple[str, str]:
     heartbeat, here, total = view.heartbeat, view.place, len(view.steps)
-    copied = heartbeat is not None and heartbeat.state != "ended" and heartbeat.is_of(here) is False
+    copied = heartbeat is not None and heartbeat.state != "ended" and heartbeat.belongs_to(here) is False
     over = heartbeat is None or heartbeat.state == "ended" or copied or heartbeat.is_dead(now, process_alive)
     if over and view.unreadable:
         return "incomplete", view.unreadable
@@ -492,7 +492,7 @@ class SessionWatch:
         self._signature = signature
         if not signature:
             if ledger_path(self.folder).exists():
-                self._trouble = Head("gone", without_journal(self.folder))
+                self._trouble = Head("gone", no_journal_text(self.folder))
                 self._known = None
             elif self._known is not None:
                 self._trouble = Head("gone", f"the session {self.folder} is gone; this page goes on when it is back")

@@ -48,7 +48,7 @@ from drivers.presenter import BLACK, Colour, Presenter
 from drivers.projector import Power, Projector, ReportsPictureFault, Severity
 from experiment.config import CameraSettings, LabSettings, ProjectorCable, SequenceSettings
 from experiment.session.journal import LostJournalError
-from experiment.session.opening import HeldJournalError
+from experiment.session.opening import BusyJournalError
 from experiment.session.records import duration_text
 from foundation import errors
 from foundation.clock import Clock, elapsed_s
@@ -477,7 +477,7 @@ _Result = TypeVar("_Result")
 
 def is_curable(fault: CropError) -> bool:
     """Return whether waiting may help: any fault of a device or of the disk, but nothing that the user gave."""
-    return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, HeldJournalError | LostJournalError)
+    return isinstance(fault, DeviceError | StorageError) and not isinstance(fault, BusyJournalError | LostJournalError)
 
 
 class RetryPolicy:

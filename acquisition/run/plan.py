@@ -114,7 +114,7 @@ def outline(settings: LabSettings, folder: Path, session: Session | None, retake
     taken = [frame.taken_at for frame in sorted(session.frames(), key=lambda frame: frame.attempt)]
     gaps = [(after - before).total_seconds() for before, after in pairwise(taken) if after >= before]
     sizes = [frame.size for frame in session.journal.accepted_files()]
-    again = {frame.step for frame in session.asked_again(retake).frames} if retake is not None else set[int]()
+    again = {frame.step for frame in session.plan_retake(retake).frames} if retake is not None else set[int]()
     return Work(
         folder,
         False,

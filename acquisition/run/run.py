@@ -60,9 +60,9 @@ from drivers.presenter import BLACK, WHITE
 from experiment.chart.model import load_chart
 from experiment.config import LabSettings
 from experiment.lights import load_illuminations
-from experiment.session.folder import Session, busy_sentence, session_exists
+from experiment.session.folder import Session, busy_message, session_exists
 from experiment.session.heartbeat import AGAIN, BEAT_S, RunState, SessionPlace
-from experiment.session.journal import beat_beside
+from experiment.session.journal import thread_beat
 from experiment.session.records import (
     ACCEPTED,
     DOUBT,
@@ -75,7 +75,7 @@ from experiment.session.records import (
     TimedAttempt,
     doubts_of,
     duration_text,
-    last_moment,
+    last_frame_time,
     time_left,
 )
 from foundation.clock import Clock, SteadyClock
@@ -494,7 +494,7 @@ def _signs_of(session: Session) -> Generator[SignOfLife]:
     journal = session.journal
     if note := killed_note(session):
         # The lab's clock is not open yet, and may be another than the wall's.
-        journal.note(last_moment(journal.attempts()) or datetime.now(UTC), "killed", note)
+        journal.note(last_frame_time(journal.attempts()) or datetime.now(UTC), "killed", note)
     with signs_of_life(journal.beat, journal.run_state, TRY_S) as alive:
         yield alive
 
@@ -525,7 +525,7 @@ def _begun(settings: LabSettings, folder: Path) -> Session:
     except InputError:
         # It was not there when this run began: another one has made it since, and frames come into it.
         if session_exists(folder):
-            raise InputError(busy_sentence(folder)) from None
+            raise InputError(busy_message(folder)) from None
         raise
 
 
@@ -573,7 +573,7 @@ def clock_note(session: Session, clock: Clock) -> str:
 def killed_note(session: Session) -> str:
     """Return what the journal is to say of the run before, if that did not end in order; else nothing."""
     beat = session.journal.heartbeat()
-    if beat is None or beat.state == "ended" or beat.is_of(SessionPlace.of(session.journal.path)) is False:
+    if beat is None or beat.state == "ended" or beat.belongs_to(SessionPlace.of(session.journal.path)) is False:
         return ""
     at = f"{beat.at.astimezone():%Y-%m-%d %H:%M:%S}"
     return f"the run before gave its last sign of life at {at}, and was killed, or power was lost"
@@ -798,7 +798,7 @@ class _Reports:
 
     def late(self, sentence: str, begun: datetime) -> None:
         """Say, from another thread, that a step takes longer than it should: the run's own thread waits for it."""
-        beat_beside(self._journal.path, "late", sentence, begun + timedelta(seconds=TRY_S))
+        thread_beat(self._journal.path, "late", sentence, begun + timedelta(seconds=TRY_S))
 
     def end(self, how: str, sentence: str) -> None:
         """Note why the run is over; a disk that cannot take that is told of already."""

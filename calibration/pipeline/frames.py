@@ -18,7 +18,7 @@ from calibration.radiometry.primaries import pure_lights
 from calibration.sampling import WINDOW, WINDOWS
 from calibration.spread.predicting import VARYING_BITS
 from calibration.table.lut import Lut, SourceFrame
-from experiment.config import CameraSettings, CitationSettings, checked
+from experiment.config import CameraSettings, CitationSettings, validate_settings
 from experiment.framing.field import Corners
 from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
@@ -183,7 +183,7 @@ def stated_origin(session: Session) -> StatedOrigin:
         document: dict[str, Any] = tomllib.loads(session.settings_text())
         rig: Rig | None = next((known for known in get_args(Rig) if known == document.get("rig")), None)
         where = f"{session.folder / 'session.toml'}: citation"
-        citation = checked(CitationSettings, document.get("citation", {}), where)
+        citation = validate_settings(CitationSettings, document.get("citation", {}), where)
         set_by = CameraSettings.model_validate(document["camera"]) if rig in _SETTING_RIGS else None
     except (CropError, ValidationError, ValueError, KeyError, RecursionError) as error:
         if isinstance(error, CropError | tomllib.TOMLDecodeError):

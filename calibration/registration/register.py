@@ -21,8 +21,8 @@ from calibration.registration.matching import Anchors, Blocks, Matcher, PlaceErr
 from calibration.sampling import SAMPLE_REACH_PX, largest_blur_px
 from drivers.raw.rawfile import CHANNELS, Channel, Mosaic, Plane, frame_black, plane_of
 from experiment.chart.model import Chart
-from experiment.framing.field import SIDE_POINTS, FoundField, field_mm, refine_edges
-from experiment.framing.finding import MIN_CELL_PX, Framing, find_chart
+from experiment.framing.field import SIDE_POINTS, DetectedField, field_mm, refine_edges
+from experiment.framing.finding import MIN_CELL_PX, ChartPose, find_chart
 from experiment.framing.homography import rms
 from experiment.framing.sharpness import blur_px
 from foundation.errors import RegistrationError
@@ -94,7 +94,7 @@ class Registration:
     - `shift_px`: movement since the frame that was registered, (dx, dy).
     """
 
-    framing: Framing
+    framing: ChartPose
     lens: Lens
     displacement: Displacement
     lateral: LateralColour
@@ -220,7 +220,7 @@ def register(
     return registration
 
 
-def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
+def _tag_corners(framing: ChartPose, chart: Chart) -> Anchors:
     tags = {tag.id: tag for tag in chart.tags}
     corners_mm = np.concatenate([tags[tag.id].corners_mm for tag in framing.tags])
     corners_px = np.concatenate([tag.corners_px for tag in framing.tags])
@@ -230,8 +230,8 @@ def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
 
 
 def _clear_edges(
-    field: FoundField, planes: list[Plane], blur: float, lateral: LateralColour
-) -> tuple[FoundField, Anchors, LateralColour]:
+    field: DetectedField, planes: list[Plane], blur: float, lateral: LateralColour
+) -> tuple[DetectedField, Anchors, LateralColour]:
     """Return the field with its outline where green sees it, as it is seen channel by channel, and what lies between.
 
     Points that are clear in no channel are left out.
@@ -249,7 +249,7 @@ def _clear_edges(
     return replace(field, outline_mm=marks.points_mm, outline_px=green, normals=normals), marks, lateral
 
 
-def _completed(field: FoundField, lens: Lens, chart: Chart) -> FoundField:
+def _completed(field: DetectedField, lens: Lens, chart: Chart) -> DetectedField:
     """Return the field with points of its outline also where none was found, at the places that the lens gives them.
 
     Beside pale cells the outline is traced one cell inwards, or not at all; one colour may show it.
@@ -275,7 +275,7 @@ def _completed(field: FoundField, lens: Lens, chart: Chart) -> FoundField:
     return replace(field, outline_mm=points, outline_px=places, normals=normals)
 
 
-def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple[FoundField, _Mask, Lens, _Array]:
+def _field_through_lens(field: DetectedField, frame_size: tuple[int, int]) -> tuple[DetectedField, _Mask, Lens, _Array]:
     """Return the field without outlying points of its outline, which are marks in the margin.
 
     A sheet's curled corners lie pixels off a plane seen through a lens, and have neighbours that do: points are held
@@ -287,7 +287,7 @@ def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple
     kept = np.ones(len(field.outline_mm), dtype=np.bool_)
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
     for _ in range(2):
-        size = field.off_run_px(residual)
+        size = field.curve_residual_px(residual)
         fits = size <= max(_APART * robust_sigma(size), _APART_PX)
         kept[kept] = fits
         field = replace(
@@ -332,7 +332,7 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
         )
 
 
-def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
+def _registered(chart: Chart, framing: ChartPose, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
     seen, expected, paper = matcher.patches()
     there = np.asarray(np.isfinite(seen).all(axis=1))
     residual = marks.residual_px(matcher.in_channels(marks.points_mm))

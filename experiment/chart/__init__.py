@@ -1,1 +1,1 @@
-"""The printed chart: what is on it, where, and the files a print shop is given."""
+"""The printed chart: contents, layout, and the files for a print shop."""

@@ -1,8 +1,8 @@
-"""The chart: every printed cell, tag and reference patch with its place on the sheet, and its file `chart.json`.
+"""The chart: positions of all printed patches, tags and references, and its file `chart.json`.
 
-A value without behaviour of its own: `experiment.chart.layout` designs one, `experiment.chart.printing` prints it,
-registration and sampling read it. Every cell is explicit, so a reader needs no knowledge of the layout rule.
-Millimetres on the print, origin at its top-left corner, x right, y down. Knows nothing of cameras or pixels.
+A chart is data only. `experiment.chart.layout` designs it, `experiment.chart.printing` prints it, and registration and
+sampling read it. Every patch is explicit, so a reader need not know the rule of the layout. Positions are millimetres
+on the print; origin at its top-left corner, x right, y down.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ VERSION = 1  # `format` and `version` of the `chart.json` that this software wri
 
 PAPER_WHITE = (255, 255, 255)  # Printed code of bare paper: no ink
 
-# Family of the AprilTags: codes of 36 bits, any two of which differ in 11 or more (E. Olson, ICRA 2011).
+# Family of the AprilTags: codes of 36 bits that differ in 11 bits or more (E. Olson, ICRA 2011).
 TAG_FAMILY = "36h11"
 
-# Modules along the black square of a tag 36h11: 6 of data and a black border of one; the white rim comes on top.
+# Modules along the black square of a tag 36h11: 6 of data, and a black border of one on each side. The white rim is
+# outside.
 TAG_MODULES = 8
 
 
 def colour_of_index(index: npt.ArrayLike, bits: int) -> npt.NDArray[np.uint8]:
-    """Return the 8-bit RGB codes printed for colour indices.
+    """Return the printed 8-bit RGB codes (..., 3) uint8 of colour indices; the low 8 − bits bits are 0.
 
-    `bits`: bits kept of each channel, 1 … 5 (the paper's 5 gives 32³ colours, section 3.2). Returns (..., 3) uint8, the
-    8 − bits low bits zero.
+    `bits`: bits per channel, 1 … 5 (the paper has 5, that is 32³ colours, section 3.2).
     """
     index = np.asarray(index)
     mask = (1 << bits) - 1
@@ -48,11 +48,11 @@ def colour_of_index(index: npt.ArrayLike, bits: int) -> npt.NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Tag:
-    """One AprilTag: `corners_mm` (4, 2) float64, the black square's corners clockwise from its top-left."""
+    """One AprilTag."""
 
     family: str
     id: int
-    corners_mm: npt.NDArray[np.float64]
+    corners_mm: npt.NDArray[np.float64]  # (4, 2), corners of the black square, clockwise from the top-left
 
 
 _STRICT = ConfigDict(extra="ignore", allow_inf_nan=False, strict=True)
@@ -65,7 +65,7 @@ _Colour = Annotated[int, Field(ge=0, lt=8**5)]
 
 @dataclass(frozen=True)
 class Reference:
-    """One achromatic patch; `rgb` is the printed code, (255, 255, 255) bare paper."""
+    """One achromatic area; `rgb` is its printed code, (255, 255, 255) for bare paper."""
 
     __pydantic_config__ = _STRICT
 
@@ -76,21 +76,30 @@ class Reference:
 
     @property
     def is_white(self) -> bool:
-        """Whether the patch is bare paper."""
+        """Whether the reference is bare paper."""
         return self.rgb == PAPER_WHITE
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """A whole chart.
+    """A chart.
 
-    - `page_mm`: width and height of the sheet.
-    - `bits`: bits kept of each channel, 1 … 5; the chart has 8**bits colours, each exactly once.
-    - `cell_mm`: width and height of a cell.
-    - `centres_mm`: (8**bits, 2) float64, centre of each cell, in the file's order.
-    - `colours`: (8**bits,) int64, colour index of each cell, in the same order.
-    - `tags`, `references`: fiducials and achromatic patches; a print without fiducials has none.
-    - `seed`, `software`: what the chart was designed with and by, if its file states it; printed in the margin.
+    Parameters
+    ----------
+    page_mm
+        Width and height of the sheet.
+    bits
+        Bits per channel, 1 … 5. The chart has each of the 8**bits colours once.
+    cell_mm
+        Width and height of a patch.
+    centres_mm
+        (8**bits, 2) float64, centre of each patch, in the order of the file.
+    colours
+        (8**bits,) int64, colour index of each patch, in the same order.
+    tags, references
+        AprilTags (may be empty), and achromatic areas.
+    seed, software
+        Seed of the layout, and software that made it, if the file has them; printed in the margin.
     """
 
     page_mm: tuple[float, float]
@@ -110,23 +119,23 @@ class Chart:
 
     @cached_property
     def rgb(self) -> npt.NDArray[np.uint8]:
-        """(8**bits, 3) uint8 printed code of each cell, in the file's order."""
+        """(8**bits, 3) uint8, printed code of each patch, in the order of the file."""
         return colour_of_index(self.colours, self.bits)
 
     @cached_property
     def cell_of_colour(self) -> npt.NDArray[np.int64]:
-        """(8**bits,) int64: position in `centres_mm` of each colour index."""
+        """(8**bits,) int64, position in `centres_mm` of each colour index."""
         position = np.empty(self.colour_count, dtype=np.int64)
         position[self.colours] = np.arange(self.colour_count)
         return position
 
     @property
     def white_references(self) -> tuple[Reference, ...]:
-        """The patches of bare paper."""
+        """References of bare paper."""
         return tuple(reference for reference in self.references if reference.is_white)
 
     def to_json(self) -> str:
-        """Return the text of `chart.json`; equal charts give equal text, and what is read from it gives it again."""
+        """Return the text of `chart.json`. Equal charts have equal text, and reading keeps it."""
         document = {
             "format": FORMAT,
             "version": VERSION,
@@ -148,7 +157,7 @@ class Chart:
                 for reference in self.references
             ],
         }
-        # A chart that does not know them gives the text it was read from, so that its hash stays its name.
+        # A chart without them keeps the text that it was read from, so that its hash is stable.
         document |= {
             key: value for key, value in (("seed", self.seed), ("software", self.software)) if value is not None
         }
@@ -156,7 +165,7 @@ class Chart:
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 of `to_json`, the chart's name in provenance."""
+        """SHA-256 of `to_json`, which identifies the chart in provenance."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
     def save(self, path: Path) -> None:
@@ -193,14 +202,14 @@ class _Document(_Strict):
 
 
 def load_chart(path: Path) -> Chart:
-    """Read `chart.json`."""
+    """Read `chart.json`; `FormatError` if it is not a valid chart."""
     try:
         text = path.read_bytes()
     except OSError as error:
-        raise reading_error(path, error, "name the chart.json of the print", "chart") from error
+        raise reading_error(path, error, "give the chart.json of the print", "chart") from error
     if path.suffix.lower() != ".json" and not text.lstrip().startswith(b"{"):
-        remedy = "name chart.json, which acquire chart writes beside what is printed"
-        raise FormatError("no description of a chart, but another file", about=path, remedy=remedy)
+        remedy = "give chart.json, which acquire chart writes next to the files to print"
+        raise FormatError("not a chart.json but another file", about=path, remedy=remedy)
     document = from_json(_Document, text, path, "restore it from a copy")
     count = 8**document.bits
     colours = np.asarray(document.cells.colour, dtype=np.int64)
@@ -208,13 +217,14 @@ def load_chart(path: Path) -> Chart:
         np.sort(colours), np.arange(count, dtype=np.int64)
     ):
         raise FormatError(
-            f"{path}: a chart of {document.bits} bits has one cell for each of its {count} colours, "
-            f"this one has {len(document.cells.centre_mm)} centres and {len(colours)} colours"
+            f"{path}: {len(document.cells.centre_mm)} centres and {len(colours)} colours, but a chart of "
+            f"{document.bits} bits has one patch for each of its {count} colours; restore the file from a copy"
         )
-    numbers = [(tag.family, tag.id) for tag in document.tags]
-    if len(set(numbers)) != len(numbers):
+    tag_names = [(tag.family, tag.id) for tag in document.tags]
+    if len(set(tag_names)) != len(tag_names):
         raise FormatError(
-            f"{path}: each tag of a chart has its own number, here they are {[tag.id for tag in document.tags]}"
+            f"{path}: the tags have the ids {[tag.id for tag in document.tags]}, but each id may occur only once; "
+            "restore the file from a copy"
         )
     return Chart(
         page_mm=document.page_mm,

@@ -1,21 +1,21 @@
-"""A PDF of one page of filled rectangles as print shops take it, PDF/X-4 (ISO 15930-7:2010), and its ICC profiles.
+"""Write a one-page PDF of filled rectangles for print shops, PDF/X-4 (ISO 15930-7:2010), and its ICC profiles.
 
-What the standard asks of such a page, with the clauses of ISO 32000-1 (PDF 1.7) that define it:
+Requirements of the standard, with the clauses of ISO 32000-1 (PDF 1.7) that define them:
 
-- Version 1.6, a binary comment behind the head, no encryption, a file identifier (7.5.2, 14.4).
-- MediaBox and TrimBox, the latter not beyond the former (14.11.2); the sheet is trimmed to its own size.
-- Device colours only of the kind that the output intent has (14.11.5): DeviceRGB, with an RGB output intent whose
-  profile is embedded. The page itself holds plain codes, and nothing changes them where colours are not managed.
-- XMP metadata with the version of PDF/X, dates, identifiers and whether it is trapped (14.3.2, 14.11.6).
-- Nothing that needs a font, a reader's action or another file; no transparency, no transfer function.
+- Version 1.6, a binary comment after the header, no encryption, a file identifier (7.5.2, 14.4).
+- MediaBox and TrimBox, the latter within the former (14.11.2); here the TrimBox is the sheet.
+- Device colours of the same kind as the output intent (14.11.5): DeviceRGB, with an embedded RGB profile. The page has
+  plain codes, which nothing changes without colour management.
+- XMP metadata with the version of PDF/X, dates, identifiers and trapping (14.3.2, 14.11.6).
+- No fonts, actions or external files; no transparency, no transfer functions.
 
-The profiles say what RGB codes are taken for where a printer manages colours: sRGB (IEC 61966-2-1). Two of them, since
-a TIFF takes a profile of an input or display and the output intent of PDF/X one of an output device; neither describes
-a printer. Sources: ICC.1:2001-04 (version 2.4): header 6.1, required tags 6.3, lut16Type 6.5.8, textDescriptionType
-6.5.17; the primaries of sRGB adapted to D50 by the Bradford transform, as in the ICC's own sRGB profiles.
+The profiles declare sRGB (IEC 61966-2-1) for colour-managed printing; neither describes a printer. A TIFF takes an
+input or display profile, the output intent of PDF/X one of an output device. Sources: ICC.1:2001-04 (version 2.4):
+header 6.1, required tags 6.3, lut16Type 6.5.8, textDescriptionType 6.5.17. The primaries of sRGB are adapted to D50 by
+the Bradford transform, as in the sRGB profiles of the ICC.
 
-Written by hand, without dates, so that the same chart gives the same bytes: libraries that write PDF put fonts, dates
-or their own dictionaries into it, and none that is kept writes PDF/X.
+This is our own code because libraries that write PDF add fonts, dates or dictionaries, and no maintained one writes
+PDF/X. Without dates, the same chart gives the same bytes.
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ import numpy.typing as npt
 from foundation.colorimetry import decode_srgb, encode_srgb
 from foundation.files import atomic_file
 
-# The date that the metadata must have: one for all, so that the same chart gives the same bytes.
+# Date in the metadata, which is required. It is constant, so that the same chart gives the same bytes.
 DATE = "2000-01-01T00:00:00+00:00"
 
-# What the output intent calls the printing condition: none that is registered, for no printer is characterised.
+# Name of the printing condition in the output intent: not a registered one, because no printer is characterised.
 CONDITION = "RGB codes, unmanaged"
 
-# The output intent in words.
+# Description of the printing condition in the output intent.
 CONDITION_INFO = (
     "The codes name inks: print them without colour management. A workflow that manages colours all the same takes "
     "them as sRGB."
 )
 
-# XYZ of red, green and blue at full, columns, relative to D50.
+# XYZ of full red, green and blue (columns), relative to D50.
 _PRIMARIES = np.array(
     [[0.4360747, 0.3850649, 0.1430804], [0.2225045, 0.7168786, 0.0606169], [0.0139322, 0.0971045, 0.7141733]]
 )
 
-_WHITE = (0.9642, 1.0, 0.8249)  # D50, the white of the profile connection space (ICC.1:2001-04, 6.1.11)
+_WHITE = (0.9642, 1.0, 0.8249)  # D50, white of the profile connection space (ICC.1:2001-04, 6.1.11)
 
-_CURVE = 4096  # Entries of a curve, the most that lut16Type takes
+_CURVE = 4096  # Entries of a curve, the maximum of lut16Type
 
-_DISPLAY_CURVE = 1024  # Entries of a curve of the display profile, as in the ICC's own
+_DISPLAY_CURVE = 1024  # Entries of a curve of the display profile, as in that of the ICC
 
-_GAMUT_GRID = 17  # Points along each side of the gamut's table: a warning needs no more
+_GAMUT_GRID = 17  # Points along each side of the gamut table: enough for a warning
 
-_FULL = 65535  # Encoding of 1 of a device value, 16 bits (ICC.1:2001-04, 6.5.8)
+_FULL = 65535  # Encoding of the device value 1, 16 bits (ICC.1:2001-04, 6.5.8)
 
-_ONE_XYZ = 32768  # Encoding of 1 of X, Y or Z as u1Fixed15 (ICC.1:2001-04, 5.3.4.2)
+_ONE_XYZ = 32768  # Encoding of X, Y or Z = 1 as u1Fixed15 (ICC.1:2001-04, 5.3.4.2)
 
 Box = tuple[float, float, float, float]
 Code = tuple[int, int, int]
@@ -96,7 +96,7 @@ def save_page(path: Path, size_pt: tuple[float, float], content: bytes, title: s
         f"<< /Type /Page /Parent 2 0 R /MediaBox {box} /TrimBox {box} /BleedBox {box} /Resources << >> "
         "/Contents 4 0 R >>".encode("ascii"),
         _stream("/Filter /FlateDecode", packed),
-        # Not compressed, so that programs that do not know PDF find it (ISO 16684-1, 7.3).
+        # Not compressed, so that programs without PDF support can read it (ISO 16684-1, 7.3).
         _stream("/Type /Metadata /Subtype /XML", metadata),
         f"<< /Type /OutputIntent /S /GTS_PDFX /OutputConditionIdentifier {_string(CONDITION)} "
         f"/Info {_string(CONDITION_INFO)} /DestOutputProfile 7 0 R >>".encode("ascii"),
@@ -122,14 +122,13 @@ def save_page(path: Path, size_pt: tuple[float, float], content: bytes, title: s
 
 
 def _number(value: float) -> str:
-    """Return a number as PDF has it, to a hundred-thousandth: 35 nm on paper, a 300th of an 8-bit code."""
+    # To a hundred-thousandth: 35 nm on paper, a 300th of an 8-bit code.
     return f"{value:.5f}".rstrip("0").rstrip(".")
 
 
 def _string(text: str) -> str:
-    """Return a literal string; what is no ASCII becomes a question mark (ISO 32000-1, 7.3.4.2)."""
-    plain = text.encode("ascii", "replace").decode()
-    return "(" + plain.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)") + ")"
+    ascii_text = text.encode("ascii", "replace").decode()
+    return "(" + ascii_text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)") + ")"
 
 
 def _stream(entries: str, data: bytes) -> bytes:
@@ -137,7 +136,7 @@ def _stream(entries: str, data: bytes) -> bytes:
 
 
 def _metadata(title: str, subject: str, name: str) -> str:
-    """Return the XMP packet (ISO 16684-1), with what PDF/X-4 asks for; `name` is 64 hexadecimal digits."""
+    """Return the XMP packet (ISO 16684-1) that PDF/X-4 requires; `name` is 64 hexadecimal digits."""
     identifier = f"uuid:{name[:8]}-{name[8:12]}-{name[12:16]}-{name[16:20]}-{name[20:32]}"
     return f"""<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/">
@@ -163,16 +162,17 @@ def _metadata(title: str, subject: str, name: str) -> str:
 
 
 def srgb_output_profile() -> bytes:
-    """Return a profile of an output device whose RGB codes look as sRGB's: exact both ways, by tables of two points.
+    """Return an ICC profile of an output device with sRGB as RGB codes.
 
-    It is of the class ``prtr``, which output intents need (ISO 32000-1, 14.11.5), with the tags of a table-based output
-    profile. All rendering intents are alike: relative to the medium's white.
+    The class is ``prtr``, which output intents need (ISO 32000-1, 14.11.5), with the tags of a table-based output
+    profile. All rendering intents are equal: relative to the white of the medium. Tables of two points are exact in
+    both directions.
     """
     corners = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
-    # Between the corners XYZ is linear in linear RGB, so that two points a side are exact.
+    # XYZ is linear in linear RGB between the corners, so two points a side are exact.
     xyz, rgb = np.rint(_ONE_XYZ * (corners @ _PRIMARIES.T)).astype(np.uint16), (_FULL * corners).astype(np.uint16)
     to_pcs = _lut16(np.eye(3), _curves(decode_srgb(np.linspace(0, 1, _CURVE))), xyz, _LINEAR)
-    # The matrix works on encoded values, of which 1 is 65535 / 32768 in XYZ.
+    # The matrix is applied to encoded values; an encoded 1 is 65535 / 32768 in XYZ.
     from_xyz = np.linalg.inv(_PRIMARIES) * _FULL / _ONE_XYZ
     from_pcs = _lut16(from_xyz, _LINEAR, rgb, _curves(encode_srgb(np.linspace(0, 1, _CURVE))))
     tags = {
@@ -187,7 +187,7 @@ def srgb_output_profile() -> bytes:
 
 
 def srgb_display_profile() -> bytes:
-    """Return a profile of a display whose RGB codes are sRGB: three primaries and a curve, class ``mntr``."""
+    """Return an ICC profile of a display with sRGB as RGB codes: three primaries and a curve, class ``mntr``."""
     curve = np.rint(_FULL * decode_srgb(np.linspace(0, 1, _DISPLAY_CURVE))).astype(">u2").tobytes()
     curve = b"curv" + bytes(4) + struct.pack(">I", _DISPLAY_CURVE) + curve
     tags = {
@@ -201,15 +201,14 @@ def srgb_display_profile() -> bytes:
 
 
 def _curves(curve: _Array) -> npt.NDArray[np.uint16]:
-    """Return a curve, 0 … 1, three times over, (3, N) uint16."""
     return np.tile(np.rint(_FULL * np.clip(curve, 0, 1)).astype(np.uint16), (3, 1))
 
 
-_LINEAR = _curves(np.array([0.0, 1.0]))  # A curve that changes nothing
+_LINEAR = _curves(np.array([0.0, 1.0]))  # The identity as a curve
 
 
 def _gamut() -> bytes:
-    """Return the gamut tag: 0 where a colour can be shown, more where it cannot."""
+    # 0 for colours in the gamut, more for those outside.
     side = np.linspace(0, _FULL / _ONE_XYZ, _GAMUT_GRID)
     xyz = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     rgb = xyz @ np.linalg.inv(_PRIMARIES).T
@@ -218,14 +217,14 @@ def _gamut() -> bytes:
 
 
 def _lut16(
-    matrix: _Array, entering: npt.NDArray[np.uint16], table: npt.NDArray[np.uint16], leaving: npt.NDArray[np.uint16]
+    matrix: _Array, inputs: npt.NDArray[np.uint16], table: npt.NDArray[np.uint16], outputs: npt.NDArray[np.uint16]
 ) -> bytes:
-    """Return a lut16Type: matrix, curves, table (points, channels), curves."""
+    """Return a lut16Type: matrix, input curves, table (points, channels), output curves."""
     grid = round(len(table) ** (1 / 3))
     head = struct.pack(">4s4x3Bx", b"mft2", 3, table.shape[1], grid)
     numbers = np.rint(matrix * 65536).astype(">i4").tobytes()
-    sizes = struct.pack(">2H", entering.shape[1], leaving.shape[1])
-    return head + numbers + sizes + b"".join(part.astype(">u2").tobytes() for part in (entering, table, leaving))
+    sizes = struct.pack(">2H", inputs.shape[1], outputs.shape[1])
+    return head + numbers + sizes + b"".join(values.astype(">u2").tobytes() for values in (inputs, table, outputs))
 
 
 def _xyz(values: tuple[float, ...]) -> bytes:
@@ -237,21 +236,21 @@ def _text(text: str) -> bytes:
 
 
 def _description(text: str) -> bytes:
-    """Return a textDescriptionType in ASCII alone; the two other scripts are empty."""
+    # textDescriptionType with ASCII only; the two other scripts are empty.
     data = text.encode("ascii") + b"\0"
     return b"desc" + bytes(4) + struct.pack(">I", len(data)) + data + bytes(8) + bytes(3) + bytes(67)
 
 
 def _profile(kind: bytes, tags: Mapping[str, bytes]) -> bytes:
-    """Return a profile of RGB with XYZ as connection space; equal tags share their data."""
+    """Return an RGB profile with connection space XYZ; tags with equal data share it."""
     offset = 128 + 4 + 12 * len(tags)
     entries, body = b"", b""
-    places: dict[bytes, int] = {}
+    offsets: dict[bytes, int] = {}
     for name, data in tags.items():
-        if data not in places:
-            places[data] = offset + len(body)
+        if data not in offsets:
+            offsets[data] = offset + len(body)
             body += data + bytes(-len(data) % 4)
-        entries += struct.pack(">4s2I", name.encode("ascii"), places[data], len(data))
+        entries += struct.pack(">4s2I", name.encode("ascii"), offsets[data], len(data))
     size = offset + len(body)
     white = np.rint(np.array(_WHITE) * 65536).astype(">i4").tobytes()
     head = struct.pack(">I4sI4s4s4s", size, bytes(4), 0x02400000, kind, b"RGB ", b"XYZ ")

@@ -1,11 +1,10 @@
-"""The chart as a print: a list of rectangles on bare paper, field and marks, and from it a TIFF, a PDF and a preview.
+"""Files of the print: TIFF, PDF and preview, drawn as a list of rectangles on bare paper.
 
-- A file is at true size: print it at 100 %, never "fit to page". In the TIFF every cell and every tag module is the
-  same whole number of pixels, because modules of unequal size move the corners that detectors find.
-- The codes name inks rather than colours: what they look like is measured. They stand untagged on the page of the PDF
-  and in the TIFF; the PDF's output intent, which PDF/X asks for, and the tagged TIFF say what they are taken for where
-  colours are managed all the same.
-- An A0 sheet at 600 dpi has 1.7 GB of pixels; it is never held: rows that look alike are drawn once and packed strip
+- A file has true size: print it at 100 %, never with "fit to page". In the TIFF, all patches and tag modules are the
+  same whole number of pixels, because unequal modules move the corners that detectors measure.
+- The codes name inks, not colours; the colours are measured later. They are untagged on the page of the PDF and in the
+  TIFF. The output intent of the PDF (required by PDF/X) and the tagged TIFF declare sRGB for colour-managed printing.
+- An A0 sheet at 600 dpi has 1.7 GB of pixels, so it is never in memory: equal rows are drawn once and compressed strip
   by strip.
 """
 
@@ -27,79 +26,64 @@ from experiment.chart.pdf_x import filled, save_page, srgb_display_profile
 from foundation.errors import InputError
 from foundation.files import atomic_file, write_atomic
 
-POINTS_PER_MM = 72 / MM_PER_INCH  # Points of a PDF's user space, 72 to the inch (ISO 32000-1, 8.3.2.3)
+POINTS_PER_MM = 72 / MM_PER_INCH  # Points per millimetre: a PDF has 72 points to the inch (ISO 32000-1, 8.3.2.3)
 
-# Rows of a strip of the TIFF: 5 MB of an A0 sheet at 600 dpi, little to hold and long enough to compress.
+# Rows in a strip of the TIFF: 5 MB of an A0 sheet at 600 dpi, small in memory and long enough to compress.
 _STRIP_ROWS = 64
 
-_BANDS = 64  # Bands of like rows that are painted at a time: the picture is never held, however many edges a sheet has
+_BANDS = 64  # Bands of equal rows that are painted at a time, which limits memory on sheets with many edges
 
-_SUPERSAMPLING = 8  # Pixels along each side of a preview's pixel: edges are then good to 1/8 of it
+_SUPERSAMPLING = 8  # Fine pixels along each side of a preview pixel: edges are then accurate to 1/8 of it
 
-# How far a cell of the PDF reaches below its neighbours, so that no hairline of paper shows between them, and how
-# much smaller than its box each part is drawn, so that rounding does not paint the next pixel.
+# Overlap of a patch of the PDF with the next patches, so that no hairline of paper shows between them. And reduction of
+# each rectangle, so that rounding does not paint the next pixel.
 _LAP_PX, _INSET_PX = 0.2, 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """What is printed on bare paper, in painter's order: a later rectangle covers an earlier one.
+    """Rectangles on bare paper; later ones cover earlier ones."""
 
-    - `page_mm`: width and height of the sheet.
-    - `rectangles_mm`: (N, 4) float64, left, top, right, bottom; origin at the sheet's top-left corner, x right, y down.
-    - `rgb`: (N, 3) uint8, printed code of each rectangle; (255, 255, 255) is bare paper.
-    - `tiles`: how many of the last rectangles are cells and references, side by side, row by row.
-    """
-
-    page_mm: tuple[float, float]
-    rectangles_mm: npt.NDArray[np.float64]
-    rgb: npt.NDArray[np.uint8]
-    tiles: int = 0
+    page_mm: tuple[float, float]  # width and height of the sheet
+    rectangles_mm: npt.NDArray[np.float64]  # (N, 4), left, top, right, bottom, from the top-left corner of the sheet
+    rgb: npt.NDArray[np.uint8]  # (N, 3), printed code of each rectangle; (255, 255, 255) is bare paper
+    tiles: int = 0  # number of the last rectangles that are adjacent patches and references, row by row
 
 
 def drawing(chart: Chart) -> Drawing:
-    """Return the whole sheet: the marks in its margins (`experiment.chart.margins`), then the field.
-
-    The field's rectangles are in the order tags (white rim, black square, white modules), cells and references row by
-    row.
-    """
+    """Return the whole sheet: marks in the margins (`experiment.chart.margins`), then tags, patches and references."""
     field = field_drawing(chart)
     marks = _marks_px(chart).astype(np.float64) * PX_MM
-    return Drawing(
-        chart.page_mm,
-        np.concatenate([marks, field.rectangles_mm]),
-        np.concatenate([np.zeros((len(marks), 3), dtype=np.uint8), field.rgb]),
-        field.tiles,
-    )
+    rgb = np.concatenate([np.zeros((len(marks), 3), dtype=np.uint8), field.rgb])
+    return Drawing(chart.page_mm, np.concatenate([marks, field.rectangles_mm]), rgb, field.tiles)
 
 
 def field_drawing(chart: Chart, within_mm: tuple[float, float, float, float] | None = None) -> Drawing:
-    """Return the rectangles of tags, cells and references."""
+    """Return the rectangles of tags (white rim, black square, white modules), then of patches and references.
+
+    `within_mm`: left, top, right, bottom; parts that are not completely inside are omitted.
+    """
     left, top, right, bottom = (-math.inf, -math.inf, math.inf, math.inf) if within_mm is None else within_mm
     boxes = _part_boxes(chart)
     codes = np.array([reference.rgb for reference in chart.references], dtype=np.uint8).reshape(-1, 3)
-    # A thousandth of a millimetre is nothing on paper and more than what numbers in a file are rounded by.
-    near = np.array([left, top, -right, -bottom]) - 1e-3
-    inside = np.asarray((boxes * [1, 1, -1, -1] >= near).all(axis=1))
+    # A thousandth of a millimetre is invisible on paper, and more than the rounding in a file.
+    limits = np.array([left, top, -right, -bottom]) - 1e-3
+    is_inside = np.asarray((boxes * [1, 1, -1, -1] >= limits).all(axis=1))
     rectangles, rgb = [np.empty((0, 4))], [np.empty((0, 3), dtype=np.uint8)]
-    for number, tag in enumerate(chart.tags):
-        if inside[number]:
-            parts, shades = _tag_rectangles(tag)
-            rectangles.append(parts)
+    for index, tag in enumerate(chart.tags):
+        if is_inside[index]:
+            tag_rectangles, shades = _tag_rectangles(tag)
+            rectangles.append(tag_rectangles)
             rgb.append(shades)
-    rest = np.flatnonzero(inside[len(chart.tags) :])
-    tiles, colours = boxes[len(chart.tags) :][rest], np.concatenate([chart.rgb, codes])[rest]
+    tile_indices = np.flatnonzero(is_inside[len(chart.tags) :])
+    tiles, colours = boxes[len(chart.tags) :][tile_indices], np.concatenate([chart.rgb, codes])[tile_indices]
     order = np.lexsort(tiles[:, :2].round(3).T)
-    return Drawing(
-        chart.page_mm,
-        np.concatenate([*rectangles, tiles[order]]),
-        np.concatenate([*rgb, colours[order]]),
-        len(order),
-    )
+    all_rectangles = np.concatenate([*rectangles, tiles[order]])
+    return Drawing(chart.page_mm, all_rectangles, np.concatenate([*rgb, colours[order]]), len(order))
 
 
 def _part_boxes(chart: Chart) -> npt.NDArray[np.float64]:
-    """Return the boxes (N, 4) float64 mm of tags with their white rims, then cells, then references."""
+    """Return the boxes (N, 4) float64 mm of tags with white rims, then of patches, then of references."""
     rims = [_tag_rectangles(tag)[0][:1] for tag in chart.tags]
     half = np.array(chart.cell_mm) / 2
     cells = np.concatenate([chart.centres_mm - half, chart.centres_mm + half], axis=1)
@@ -109,7 +93,7 @@ def _part_boxes(chart: Chart) -> npt.NDArray[np.float64]:
 
 
 def field_px(chart: Chart) -> Boxes:
-    """Return the box of all tags and cells, (4,) int64 px at 600 dpi: left, top, right, bottom."""
+    """Return the box of all tags and patches, (4,) int64 px at 600 dpi: left, top, right, bottom."""
     boxes = whole_px(_part_boxes(chart)[: len(chart.tags) + len(chart.centres_mm)])
     return np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
 
@@ -117,25 +101,26 @@ def field_px(chart: Chart) -> Boxes:
 def _marks_px(chart: Chart) -> Boxes:
     field = field_px(chart)
     references = whole_px(_part_boxes(chart)[len(chart.tags) + len(chart.centres_mm) :])
-    outside = ((references[:, :2] < field[:2]) | (references[:, 2:] > field[2:])).any(axis=1)
+    is_outside = ((references[:, :2] < field[:2]) | (references[:, 2:] > field[2:])).any(axis=1)
     width, height = (int(side / PX_MM) for side in chart.page_mm)
-    return margin_marks(field, (width, height), references[outside], label_lines(chart))
+    return margin_marks(field, (width, height), references[is_outside], label_lines(chart))
 
 
 def tag_modules(tag: Tag) -> npt.NDArray[np.bool_]:
-    """Return the modules of a tag's black square, (8, 8) bool, true where white, as the print is seen upright.
+    """Return the modules of a tag, (8, 8) bool, true for white, as seen on the upright print.
 
-    The picture is OpenCV's of `DICT_APRILTAG_36h11`, which is the picture of the AprilTag authors turned by half a
-    turn; their detectors give the same ids and the corners in the order [1, 0, 3, 2] of `corners_mm`.
+    OpenCV's `DICT_APRILTAG_36h11` shows the tags of the AprilTag authors rotated by half a turn. Their detectors return
+    the same ids, and the corners of `corners_mm` in the order [1, 0, 3, 2].
     """
     import cv2
 
     if tag.family != TAG_FAMILY:
-        raise InputError(f"tag {tag.id} is of family {tag.family}; only {TAG_FAMILY} can be printed")
+        raise InputError(f"tag {tag.id} has family {tag.family}, {TAG_FAMILY} expected; use a chart by acquire chart")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     if not 0 <= tag.id < len(dictionary.bytesList):
         raise InputError(
-            f"tag {tag.id} does not exist; family {TAG_FAMILY} has the numbers 0 to {len(dictionary.bytesList) - 1}"
+            f"tag id {tag.id} does not exist, 0 to {len(dictionary.bytesList) - 1} expected for family {TAG_FAMILY}; "
+            "use a chart by acquire chart"
         )
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, tag.id, TAG_MODULES)) > 127
 
@@ -145,7 +130,7 @@ def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.u
     right, bottom = tag.corners_mm[2]
     upright = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
     if not (right > left and bottom > top and np.allclose(tag.corners_mm, upright, atol=1e-3)):
-        raise InputError(f"tag {tag.id} does not stand upright on the chart; only upright tags can be printed")
+        raise InputError(f"tag {tag.id} is rotated, but only upright tags can be printed; use a chart by acquire chart")
     size = np.array([right - left, bottom - top]) / TAG_MODULES
     rim = np.array([left, top, right, bottom]) + np.concatenate([-size, size])
     rows, columns = np.nonzero(tag_modules(tag))
@@ -157,50 +142,49 @@ def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.u
 
 
 def label_lines(chart: Chart) -> tuple[str, str]:
-    """Return the two lines printed in the margin: what distinguishes this sheet from others, and how to print it."""
+    """Return the two lines printed in the margin: identity of the sheet, and how to print it."""
     width, height = chart.page_mm
     bits = "1 bit" if chart.bits == 1 else f"{chart.bits} bits"
-    parts = [f"CroP chart, {bits}, {width:g} x {height:g} mm", f"chart.json {chart.sha256[:16]}"]
-    parts += [] if chart.seed is None else [f"seed {chart.seed}"]
-    parts += [] if chart.software is None else [chart.software.encode("ascii", "replace").decode()]
-    return ", ".join(parts), "Print at 100 %, colour management off, on matte paper; the rulers are in millimetres."
+    facts = [f"CroP chart, {bits}, {width:g} x {height:g} mm", f"chart.json {chart.sha256[:16]}"]
+    facts += [] if chart.seed is None else [f"seed {chart.seed}"]
+    facts += [] if chart.software is None else [chart.software.encode("ascii", "replace").decode()]
+    return ", ".join(facts), "Print at 100 %, colour management off, on matte paper; the rulers are in millimetres."
 
 
 def label(chart: Chart) -> str:
-    """Return what the margin says (`label_lines`) as one line."""
+    """Return `label_lines` as one line."""
     return ". ".join(label_lines(chart))
 
 
 def _bands(
-    drawn: Drawing, pixels_per_mm: float, size: tuple[int, int]
+    sheet: Drawing, pixels_per_mm: float, size: tuple[int, int]
 ) -> Iterator[tuple[int, int, npt.NDArray[np.uint8]]]:
-    """Yield the picture from top to bottom: rows `top` … `bottom` − 1, which all look alike, and one of them.
+    """Yield bands of equal rows from top to bottom: `top`, `bottom`, and one row (width, 3) uint8.
 
-    `size` is its width and height in pixels, edges go to the nearest pixel; a row is (width, 3) uint8.
+    `size`: width and height of the image in pixels. Edges are rounded to pixels.
     """
     width, height = size
-    edges = np.rint(drawn.rectangles_mm * pixels_per_mm).astype(np.int64)
-    edges = np.clip(edges, 0, [width, height, width, height])
-    across, down = (np.unique(np.append(edges[:, axis::2], [0, end])) for axis, end in enumerate(size))
-    (left, right), (top, bottom) = np.searchsorted(across, edges[:, 0::2]).T, np.searchsorted(down, edges[:, 1::2]).T
-    # Between two neighbouring edges everything looks alike, so that a rectangle is painted once for many rows.
-    for first in range(0, len(down) - 1, _BANDS):
-        edges_down = down[first : first + _BANDS + 1].tolist()
-        parts = np.full((len(edges_down) - 1, len(across) - 1, 3), PAPER_WHITE, dtype=np.uint8)
-        for k in np.flatnonzero((top < first + len(parts)) & (bottom > first)).tolist():
-            parts[max(top[k] - first, 0) : bottom[k] - first, left[k] : right[k]] = drawn.rgb[k]
-        for (begin, end), row in zip(pairwise(edges_down), parts, strict=True):
-            yield begin, end, np.repeat(row, np.diff(across), axis=0)
+    boxes = np.rint(sheet.rectangles_mm * pixels_per_mm).astype(np.int64)
+    boxes = np.clip(boxes, 0, [width, height, width, height])
+    xs, ys = (np.unique(np.append(boxes[:, axis::2], [0, end])) for axis, end in enumerate(size))
+    (left, right), (top, bottom) = np.searchsorted(xs, boxes[:, 0::2]).T, np.searchsorted(ys, boxes[:, 1::2]).T
+    # Between two adjacent edges all rows are equal, so a rectangle is painted once for many rows.
+    for first in range(0, len(ys) - 1, _BANDS):
+        band_edges = ys[first : first + _BANDS + 1].tolist()
+        band_rows = np.full((len(band_edges) - 1, len(xs) - 1, 3), PAPER_WHITE, dtype=np.uint8)
+        for k in np.flatnonzero((top < first + len(band_rows)) & (bottom > first)).tolist():
+            band_rows[max(top[k] - first, 0) : bottom[k] - first, left[k] : right[k]] = sheet.rgb[k]
+        for (start, end), row in zip(pairwise(band_edges), band_rows, strict=True):
+            yield start, end, np.repeat(row, np.diff(xs), axis=0)
 
 
 def _packed_strips(bands: Iterator[tuple[int, int, npt.NDArray[np.uint8]]], height: int) -> Iterator[bytes]:
-    """Yield the picture as deflated strips of `_STRIP_ROWS` rows, the last one shorter."""
     rows: list[npt.NDArray[np.uint8]] = []
     for top, bottom, row in bands:
         for y in range(top, bottom):
             rows.append(row)
             if len(rows) == _STRIP_ROWS or y == height - 1:
-                # Rows repeat so much that a harder setting saves a quarter of the size for three times the time.
+                # Rows repeat so often that stronger compression saves a quarter of the size for three times the time.
                 yield zlib.compress(np.stack(rows).tobytes(), 1)
                 rows = []
 
@@ -211,26 +195,27 @@ def _require_whole_pixels(chart: Chart, dpi: int) -> None:
         pixels = length * dpi / MM_PER_INCH
         if dpi < 1 or round(pixels) < 1 or abs(pixels - round(pixels)) > 1e-3:
             raise InputError(
-                f"at {dpi} dpi a part of {length:.3f} mm would be {pixels:.2f} pixels, and only whole ones print "
-                f"evenly; choose {_even_resolutions(lengths)} dpi, or print the PDF"
+                f"at {dpi} dpi a length of {length:.3f} mm is {pixels:.2f} pixels, a whole number is expected; "
+                f"choose {_whole_pixel_resolutions(lengths)} dpi, or print the PDF"
             )
 
 
-def _even_resolutions(lengths: list[float]) -> str:
-    """Return the names of the usual resolutions, dpi, at which all lengths (mm) are whole pixels."""
+def _whole_pixel_resolutions(lengths: list[float]) -> str:
     pixels = {dpi: [length * dpi / MM_PER_INCH for length in lengths] for dpi in (1200, 600, 360)}
-    even = [f"{dpi}" for dpi, sizes in pixels.items() if all(abs(size - round(size)) <= 1e-3 for size in sizes)]
-    return " or ".join(even) or "another number of"
+    whole = [f"{dpi}" for dpi, sizes in pixels.items() if all(abs(size - round(size)) <= 1e-3 for size in sizes)]
+    return " or ".join(whole) or "another number of"
 
 
 def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI, tagged: bool = False) -> None:
-    """Write the sheet as an RGB TIFF at true size: 8 bits, deflate.
+    """Write the sheet as an RGB TIFF of true size: 8 bits, deflate.
 
-    An A0 sheet at 600 dpi is 28 087 × 19 866 pixels.
-
-    `dpi`: dots per inch; one at which cells and tag modules are whole pixels: 600, 360, or another multiple of 24 for
-    charts of `experiment.chart.layout`. `tagged`: whether the codes are tagged as sRGB, for a shop that prints through
-    its printer's profile.
+    Parameters
+    ----------
+    dpi
+        Resolution at which patches and tag modules are whole pixels: 600, 360, or another multiple of 24 for charts of
+        `experiment.chart.layout`. An A0 sheet at 600 dpi has 28 087 × 19 866 pixels.
+    tagged
+        Whether the codes are tagged as sRGB, for a shop that prints through the profile of its printer.
     """
     import tifffile
 
@@ -256,44 +241,45 @@ def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI, tagged: bool = Fa
 
 
 def save_pdf(chart: Chart, path: Path) -> None:
-    """Write the sheet as a PDF/X-4 of one page of exactly its size: filled rectangles of plain codes in DeviceRGB.
+    """Write the sheet as a PDF/X-4 with one page of its size: filled rectangles in DeviceRGB.
 
     The same chart gives the same bytes.
     """
     save_drawing(drawing(chart), path, label(chart), f"chart.json has SHA-256 {chart.sha256}")
 
 
-def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, more: bytes = b"") -> None:
-    """Write any drawing as a PDF/X-4 of one page of exactly its size: filled rectangles of plain codes."""
+def save_drawing(sheet: Drawing, path: Path, title: str, subject: str, operators: bytes = b"") -> None:
+    """Write any drawing as a PDF/X-4 with one page of its size. `operators`: operators added to the page."""
     width, height = (side * POINTS_PER_MM for side in sheet.page_mm)
     corners = sheet.rectangles_mm * POINTS_PER_MM
-    # Renderers paint every pixel that a part touches: a hair less on each side keeps rounding out of the next pixel.
+    # Renderers paint every pixel that a rectangle touches, so each is slightly smaller, and rounding leaves the next
+    # pixel alone.
     hair, lap = _INSET_PX * PX_MM * POINTS_PER_MM, _LAP_PX * PX_MM * POINTS_PER_MM
     corners += np.array([hair, hair, -hair, -hair])
     corners[len(corners) - sheet.tiles :, 2:] += lap
     left, top, right, bottom = corners.T
     boxes = np.stack([left, height - bottom, right - left, bottom - top], axis=1)
     changes = np.flatnonzero((np.diff(sheet.rgb.astype(np.int64), axis=0) != 0).any(axis=1)) + 1
-    # Neighbours of one colour share a path: it keeps the painter's order and saves bytes.
-    parts: list[bytes] = []
+    # Successive rectangles of one colour share a path, which keeps the order and saves bytes.
+    paths: list[bytes] = []
     for first, last in zip([0, *changes.tolist()], [*changes.tolist(), len(corners)], strict=True):
         red, green, blue = (int(code) for code in sheet.rgb[first])
         rows = ((box[0], box[1], box[2], box[3]) for box in boxes[first:last].tolist())
-        parts.append(filled(rows, (red, green, blue)))
-    save_page(path, (width, height), b"".join([*parts, more]), title, subject)
+        paths.append(filled(rows, (red, green, blue)))
+    save_page(path, (width, height), b"".join([*paths, operators]), title, subject)
 
 
 def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
-    """Return a small picture of the sheet, (height, width_px, 3) uint8 RGB, each pixel the mean of what it covers."""
+    """Return a small image of the sheet, (height, width_px, 3) uint8 RGB, with area-averaged pixels."""
     import cv2
     from scipy import sparse
 
     if width_px < 1:
-        raise InputError(f"a preview of {width_px} pixels has no width; give 1 or more")
+        raise InputError(f"a preview of {width_px} pixels is requested; give a width of 1 or more")
     height_px = max(1, round(width_px * chart.page_mm[1] / chart.page_mm[0]))
     fine = (width_px * _SUPERSAMPLING, height_px * _SUPERSAMPLING)
     bands = list(_bands(drawing(chart), fine[0] / chart.page_mm[0], fine))
-    # A mean by whole numbers of pixels; OpenCV takes it a good deal faster than numpy.
+    # Means over whole pixels, for which OpenCV is much faster than numpy.
     means = np.stack(
         [
             cv2.resize(row[None].astype(np.float32), (width_px, 1), interpolation=cv2.INTER_AREA)[0]
@@ -303,14 +289,14 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     band_tops, band_bottoms = np.array([[top, bottom] for top, bottom, _ in bands]).T
     tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
     shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)
-    # A row lies over few bands.
+    # Sparse, because a row overlaps few bands.
     weights = sparse.csr_array(np.maximum(shared, 0) / _SUPERSAMPLING)
     picture = np.asarray(weights @ means.reshape(len(bands), -1), dtype=np.float64)
     return np.rint(picture).reshape(height_px, width_px, 3).astype(np.uint8)
 
 
 def save_preview(chart: Chart, path: Path, width_px: int = 2400) -> None:
-    """Write `preview` as a PNG; see there."""
+    """Write `preview` as a PNG."""
     import cv2
 
     _, png = cv2.imencode(".png", np.ascontiguousarray(preview(chart, width_px)[:, :, ::-1]))

@@ -1,9 +1,8 @@
-"""What goes to the print shop with the sheet: a proof page on A4, and how to print both.
+"""Proof page on A4, and instructions for the print shop.
 
-The proof is cut from the sheet at true size, so that colour management, scale and sharpness can be judged for little
-money before the sheet is ordered. It is made of the sheet's own rectangles and marks; besides, a strip of greys is
-printed twice, as rectangles and as an image: printers that manage colours treat the two differently, and a seam shows
-it.
+The proof shows a part of the sheet at true size, to judge colour management, scale and sharpness cheaply before the
+sheet is ordered. A strip of greys is printed twice, as rectangles and as an image: printers with colour management
+treat them differently, and a seam becomes visible.
 """
 
 from __future__ import annotations
@@ -17,61 +16,55 @@ import numpy.typing as npt
 from experiment.chart.margins import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, margin_marks, text_boxes, whole_px
 from experiment.chart.model import Chart
 from experiment.chart.pdf_x import row_of_pixels
-from experiment.chart.printing import (
-    POINTS_PER_MM,
-    Drawing,
-    field_drawing,
-    field_px,
-    label_lines,
-    save_drawing,
-)
+from experiment.chart.printing import POINTS_PER_MM, Drawing, field_drawing, field_px, label_lines, save_drawing
 from foundation.files import write_atomic
 
-PAGE_MM = (297.0, 210.0)  # A4, landscape (ISO 216): every printer takes it
+PAGE_MM = (297.0, 210.0)  # A4, landscape (ISO 216), which every printer has
 
-WINDOW_MM = (262.0, 107.0)  # Room for the piece of the field: what rulers, targets, greys and text leave of the page
+# Largest size of the part of the patches: rulers, targets, greys and text need the rest of the page
+WINDOW_MM = (262.0, 107.0)
 
-CORNER_PX = (360, 330)  # Left and top of the piece of the field
+CORNER_PX = (360, 330)  # Left and top of the part of the patches, px at 600 dpi
 
-# Place and size of the greys: below the piece of the field, and about as wide.
+# Position and size of the greys: below the part of the patches, and about as wide.
 WEDGE_TOP_MM, WEDGE_HEIGHT_MM, WEDGE_STEP_MM = 137.0, 12.0, 8.0
 
-WEDGE_CODES = (*range(0, 256, 8), 255)  # The 32 levels of a channel that the chart's colours have, and bare paper
+WEDGE_CODES = (*range(0, 256, 8), 255)  # The 32 levels of a channel of the chart, and bare paper
 
-# Place of the text, from line to line, and its dots: capitals are 1.9 mm high.
+# Position, line distance and dot size of the text: capitals are 1.9 mm high.
 TEXT_TOP_MM, TEXT_LINE_MM, TEXT_DOT_PX = 154.0, 4.8, 3
 
-# What the proof page says.
+# Text on the proof page.
 LOOK_FOR = (
-    "1 Scale: each 100 mm of both rulers measure 100 mm with a steel rule, to 0.3 mm. Else something scaled the page.",
+    "1 Scale: each 100 mm of both rulers are 100 mm on a steel ruler, within 0.3 mm. Else the page was scaled.",
     "2 Colour management: the grey steps consist of two halves, the upper drawn, the lower an image of the same codes.",
-    "  A seam between them, or a colour cast that one of them has, means that colours are managed: switch it off.",
-    "3 Range: neighbouring steps can be told apart at both ends, and steps become lighter from left to right without",
-    "  a jump. The last step is bare paper. No cell is mottled or striped.",
-    "4 Sharpness: the star's spokes part down to 1 mm from its middle or nearer, the bars are clean to the seventh",
-    "  group (2 line pairs a millimetre), the edges of the black squares are straight and show no halo.",
-    "5 Surface: matte from every side, no varnish, no lamination. Let it dry for a day before judging colours.",
-    "Keep the page: the sheet must be printed with the same paper, ink and settings.",
+    "  A seam or a difference in colour between them shows that colour management is on: switch it off.",
+    "3 Range: adjacent steps look different at both ends, and steps become lighter from left to right without",
+    "  a jump. The last step is bare paper. No patch is mottled or striped.",
+    "4 Sharpness: the spokes of the star are separate up to 1 mm from its centre or closer, the bars up to the",
+    "  seventh group (2 line pairs a millimetre). The edges of the black squares are straight, without a halo.",
+    "5 Surface: matte from every side, no varnish, no lamination. Let it dry for a day before you judge colours.",
+    "Keep this page: the sheet must be printed with the same paper, ink and settings.",
 )
 
 
 def proof_drawing(chart: Chart) -> Drawing:
-    """Return the proof page: a piece of the field from its top-left corner with rulers and targets, greys, and text."""
+    """Return the proof page: the top-left part of the chart with rulers and targets, greys, and text."""
     left, top, right, bottom = field_px(chart).tolist()
     cell = [side / PX_MM for side in chart.cell_mm]
-    # Whole cells; a tag or a wide reference that the window cuts is left out.
+    # Whole patches; tags and references that the window cuts are omitted.
     sides = [
         min(high - low, round(math.floor(room / PX_MM / size) * size))
         for low, high, room, size in zip((left, top), (right, bottom), WINDOW_MM, cell, strict=True)
     ]
     window = np.array([left, top, left + sides[0], top + sides[1]]) * PX_MM
-    piece = field_drawing(chart, (window[0], window[1], window[2], window[3]))
+    cutout = field_drawing(chart, (window[0], window[1], window[2], window[3]))
     shift = (np.array(CORNER_PX) - (left, top)) * PX_MM
     box = np.array([*CORNER_PX, CORNER_PX[0] + sides[0], CORNER_PX[1] + sides[1]], dtype=np.int64)
     page_px = (int(PAGE_MM[0] / PX_MM), int(PAGE_MM[1] / PX_MM))
-    below = whole_px([[0, WEDGE_TOP_MM, PAGE_MM[0], PAGE_MM[1]]])
-    name = f"PROOF of a piece of {label_lines(chart)[0]}"
-    marks = margin_marks(box, page_px, below, (name, label_lines(chart)[1]))
+    text_area = whole_px([[0, WEDGE_TOP_MM, PAGE_MM[0], PAGE_MM[1]]])
+    title = f"PROOF of a piece of {label_lines(chart)[0]}"
+    marks = margin_marks(box, page_px, text_area, (title, label_lines(chart)[1]))
     text = [_line(line, row) for row, line in enumerate(LOOK_FOR)]
     black = np.concatenate([marks, *text]).astype(np.float64) * PX_MM
     wedge = _wedge_boxes()
@@ -79,9 +72,9 @@ def proof_drawing(chart: Chart) -> Drawing:
     shades = np.repeat(np.array(WEDGE_CODES, dtype=np.uint8)[:, None], 3, axis=1)
     return Drawing(
         PAGE_MM,
-        np.concatenate([black, wedge, piece.rectangles_mm + np.tile(shift, 2)]),
-        np.concatenate([np.zeros((len(black), 3), dtype=np.uint8), shades, piece.rgb]),
-        piece.tiles,
+        np.concatenate([black, wedge, cutout.rectangles_mm + np.tile(shift, 2)]),
+        np.concatenate([np.zeros((len(black), 3), dtype=np.uint8), shades, cutout.rgb]),
+        cutout.tiles,
     )
 
 
@@ -111,16 +104,16 @@ def save_proof(chart: Chart, path: Path) -> None:
 
 
 def instructions(chart: Chart, tiff: bool = True) -> str:
-    """Return instructions for the print shop, with the sheet's own sizes; `tiff` is whether there is one."""
+    """Return instructions for the print shop with the sizes of the sheet; `tiff`: whether there is a TIFF."""
     width, height = chart.page_mm
     left, top, right, bottom = (field_px(chart) * PX_MM).tolist()
     across, down = (math.floor((end - start) / 100) * 100 for start, end in ((left, right), (top, bottom)))
     pixels = " × ".join(f"{round(side / MM_PER_INCH * DESIGN_DPI)}" for side in chart.page_mm)
     raster = f" or chart.tif ({pixels} pixels, {DESIGN_DPI} dpi, untagged); both show the same" if tiff else ""
     scale = (
-        f"Marks 0 and {across} below the field are {across} mm apart, 0 and {down} on its left {down} mm."
+        f"Marks 0 and {across} below the patches are {across} mm apart, 0 and {down} on its left {down} mm."
         if min(across, down) > 0
-        else "The rulers' marks are as far apart as their numbers say, in mm."
+        else "The distances of the marks on the rulers are their numbers, in mm."
     )
     return f"""How to print this chart
 =======================
@@ -128,25 +121,25 @@ def instructions(chart: Chart, tiff: bool = True) -> str:
 {label_lines(chart)[0]}
 
 Send chart.pdf (vector){raster}.
-First print proof.pdf on A4 with the same printer, paper and settings; it says what to look for.
+First print proof.pdf on A4 with the same printer, paper and settings; its text lists what to check.
 
 For the print shop
 ------------------
-Page            {width:g} × {height:g} mm on one sheet, not tiled. Margins hold marks: print them too.
+Page            {width:g} × {height:g} mm on one sheet, not tiled. The margins contain marks: print them too.
 Scale           100 %, "actual size"; never "fit to page". On a roll, cut along the corner marks.
 File            chart.pdf is PDF/X-4: vector, trim box = sheet, no fonts, no transparency, no bleed. Its page is
                 untagged RGB (DeviceRGB).
 Colours         NO COLOUR MANAGEMENT. Print as you print a profiling target: the RGB numbers in the file must reach the
-                printer's driver as they are. RGB stays RGB; the driver alone makes inks of it.
+                driver of the printer unchanged. RGB stays RGB; only the driver converts it to inks.
 In the RIP      Colour management: off / "none" / "as target (profiling chart)". Input profile for RGB: none. Embedded
                 profiles and the PDF's output intent: IGNORE. Rendering intent, black point compensation, grey balance,
                 "pure hues", spot colour replacement, "enhancement", ink saving: off. Calibration (linearisation) of the
-                printer: as always.
-In a driver     "No colour adjustment" / "application manages colours", from a program that converts nothing
+                printer: as usual.
+In a driver     "No colour adjustment" / "application manages colours", from a program that does not convert colours
                 (Adobe Color Printer Utility, ColorSync Utility "print as colour target").
-If asked for    "Which profile?": none. "CMYK?": no; do not convert. The output intent of the PDF says sRGB, for PDF/X
-a profile       demands one: it is no order to convert.
-Quality         The printer's best, at least 600 dpi; no smoothing, sharpening or interpolation of the image.
+If you need     "Which profile?": none. "CMYK?": no; do not convert. The output intent of the PDF is sRGB only because
+a profile       PDF/X requires one; do not convert to it.
+Quality         The best of the printer, at least 600 dpi; no smoothing, sharpening or interpolation of the image.
 Paper           Matte, white, heavy enough to hang flat (180 g/m² or more), if possible without optical brighteners.
 Finish          None: no varnish, no lamination, no mounting under film or glass.
 Drying          A day, flat and unrolled, before anything is measured.
@@ -154,11 +147,11 @@ Drying          A day, flat and unrolled, before anything is measured.
 When it comes back
 ------------------
 Scale           {scale}
-                Check with a steel rule. 3 mm in a metre is allowed, since paper moves with humidity.
-Sharpness       The stars and bars in the margin are as clean as on the proof.
-Colours         The patches of one grey (there are many) look alike wherever they stand.
+                Check with a steel ruler. 3 mm in a metre is allowed, because paper changes with humidity.
+Sharpness       The stars and bars in the margin are as sharp as on the proof.
+Colours         The references of one grey (there are many) look the same everywhere on the sheet.
 Mounting        Flat, on a board or wall, held all round, no glass; waves below 3 mm. Do not trim into the margins.
-Keep            This folder: chart.json is what the photographs are read with. Its name is printed above the field.
+Keep            This folder: chart.json is needed to read the photographs. Its hash is printed above the patches.
 """
 
 

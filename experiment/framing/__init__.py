@@ -1,1 +1,1 @@
-"""Where the chart is in a frame: planes of the mosaic, homography, AprilTags, outline, sharpness, movement."""
+"""Find the chart in a frame: homography, tags, outline, sharpness and movement."""

@@ -1,4 +1,4 @@
-"""How sharp a chart's picture is: the blur of its tags' and its field's edges, in half-size pixels."""
+"""Sharpness of an image of the chart: blur of the edges of its tags or of its patch area, in half-size pixels."""
 
 from __future__ import annotations
 
@@ -10,57 +10,56 @@ from scipy.special import ndtr
 
 from drivers.raw.rawfile import Plane
 from experiment.chart.model import TAG_MODULES
-from experiment.framing.field import FoundField
-from experiment.framing.finding import FoundTag, Framing
+from experiment.framing.field import DetectedField
+from experiment.framing.finding import ChartPose, DetectedTag
 
 _Points = npt.NDArray[np.float64]
 
-# σ of the print's edges up to which cells of any size are found to a few hundredths of a pixel; beyond it the 25
-# samples of a cell of 10 px take in more than 1 % of light from its neighbours.
+# σ up to which patches of any size are located to a few hundredths of a pixel. Beyond it, more than 1 % of the light in
+# the 25 samples of a patch of 10 px comes from its neighbours.
 MAX_BLUR_PX = 1.0
 
-# σ that are tried, half-size px: from less than a photosite's own to far beyond use, 7 % apart.
+# Tried σ in half-size px, 7 % apart: from less than one photosite alone causes to far beyond use.
 _BLURS = np.geomspace(0.15, 4, 48)
 
-# Places of the field's outline at which blur is measured: enough for a median that marks in the margin do not move.
+# Points of the outline at which blur is measured: enough for a median that is not moved by marks in the margin.
 _OUTLINE_PLACES = 80
 
-# How much around a place of the field's outline is looked at: one cell, and not the marks in the margin.
+# Half-size px that are read around a point of the outline: one patch inwards, and no marks in the margin.
 _INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0
 
 
-def blur_px(framing: Framing) -> float:
-    """Return how soft the picture is: σ of the Gaussian that printed edges have been blurred with, px.
+def blur_px(pose: ChartPose) -> float:
+    """Return the blur of the image: median over edges of the σ of the blurring Gaussian, half-size px.
 
-    Median over edges: the tags', or of a chart without tags its field's against the margin. Across a tag's edge lie the
-    tag's data, its black border, its white rim and what is beyond, the middle two one module wide: a staircase of four
-    unknown levels and known steps, blurred. The σ whose staircase fits the pixels best, each at its own distance from
-    the edge, is taken; nothing is interpolated, which would blur as well (a slanted edge, as in ISO 12233). It
-    contains what lens, focus and movement do, and the photosites' own size and spacing: 0.29 px for green (two
-    photosites half a pixel apart), 0.14 px for red and blue. Good to 0.01 px up to a quarter of a module, beyond that
-    read up to a tenth high, as the corners themselves are less sure.
+    The edges belong to the tags, or to the patch area if the chart has no tags. NaN if no edge is measured. The value
+    includes lens, focus and movement, and the size and spacing of the photosites: 0.29 px for green (two photosites
+    half a pixel apart), 0.14 px for red and blue. It is accurate to 0.01 px up to a quarter of a tag module. Above that
+    it is up to a tenth too high, because the tag corners are less accurate.
     """
-    if framing.field is not None:
-        found = _outline_blurs(framing.plane, framing.field)[1]
+    if pose.field is not None:
+        blurs = _outline_blurs(pose.plane, pose.field)[1]
     else:
-        found = np.concatenate([_edge_blurs(framing.plane, tag) for tag in framing.tags])
-    return float(np.median(found)) if len(found) else float("nan")
+        blurs = np.concatenate([_edge_blurs(pose.plane, tag) for tag in pose.tags])
+    return float(np.median(blurs)) if len(blurs) else float("nan")
 
 
-def edge_blurs(framing: Framing) -> tuple[_Points, npt.NDArray[np.float64]]:
-    """Return where blur was measured, (N, 2) half-size px, and its σ there, (N,) px, as in `blur_px`.
+def edge_blurs(pose: ChartPose) -> tuple[_Points, npt.NDArray[np.float64]]:
+    """Return the points (N, 2) half-size px at which blur was measured, and the σ there, (N,) px, as in `blur_px`.
 
-    One place a tag, with the median of its four edges; of a chart without tags, places along its field's outline.
+    One point per tag, with the median of its four edges, or points along the outline if the chart has no tags.
     """
-    if framing.field is not None:
-        return _outline_blurs(framing.plane, framing.field)
-    seen = [(tag.centre_px, edges) for tag in framing.tags if len(edges := _edge_blurs(framing.plane, tag))]
-    places = np.array([place for place, _ in seen], dtype=np.float64).reshape(-1, 2)
-    return places, np.array([float(np.median(edges)) for _, edges in seen])
+    if pose.field is not None:
+        return _outline_blurs(pose.plane, pose.field)
+    blurred_tags = [(tag.centre_px, edges) for tag in pose.tags if len(edges := _edge_blurs(pose.plane, tag))]
+    centres = np.array([centre for centre, _ in blurred_tags], dtype=np.float64).reshape(-1, 2)
+    return centres, np.array([float(np.median(edges)) for _, edges in blurred_tags])
 
 
-def _edge_blurs(plane: Plane, tag: FoundTag) -> npt.NDArray[np.float64]:
-    """Return the σ of each of a tag's four edges; none where the picture ends."""
+def _edge_blurs(plane: Plane, tag: DetectedTag) -> npt.NDArray[np.float64]:
+    # Across an edge of a tag lie its data, black border, white rim and the surroundings; border and rim are one module
+    # wide. So four unknown levels with three known steps are blurred and fitted to the pixels, each at its own distance
+    # from the edge. Interpolation would add blur (slanted edge, as in ISO 12233).
     module = tag.side_px / TAG_MODULES
     corners = tag.corners_px - plane.offset_px
     left, top = np.floor(corners.min(axis=0) - module).astype(int)
@@ -71,51 +70,51 @@ def _edge_blurs(plane: Plane, tag: FoundTag) -> npt.NDArray[np.float64]:
     values = plane.values[top:bottom, left:right].ravel().astype(np.float64)
     rows, columns = np.mgrid[top:bottom, left:right]
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
-    found = np.empty(4)
+    blurs = np.empty(4)
     for edge, (start, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
         length = float(np.linalg.norm(end - start))
         tangent = (end - start) / length
         along = (pixels - start) @ tangent / length
         # Corners run clockwise with y down, so this points out of the tag.
         across = (pixels - start) @ np.array([tangent[1], -tangent[0]])
-        # Clear of the corners, where another edge is near.
+        # Away from the corners, where another edge is near.
         near = (along > 0.2) & (along < 0.8) & (np.abs(across) < module)
-        seen, aside = values[near], across[near]
-        found[edge] = _sigma(seen, aside, (-module, 0.0, module))
-    return found
+        counts, distances = values[near], across[near]
+        blurs[edge] = _sigma(counts, distances, (-module, 0.0, module))
+    return blurs
 
 
-def _outline_blurs(plane: Plane, field: FoundField) -> tuple[_Points, npt.NDArray[np.float64]]:
-    """Return places all round the field's edge, (N, 2) px, and the edge's σ there; none where the picture ends."""
+def _outline_blurs(plane: Plane, field: DetectedField) -> tuple[_Points, npt.NDArray[np.float64]]:
+    """Return points around the patch area, (N, 2) px, and the edge's σ there."""
     height, width = plane.values.shape
     reach = int(np.ceil(_INWARDS_PX + _ALONG_PX))
-    found: list[float] = []
-    places: list[_Points] = []
-    for number in range(0, len(field.outline_px), max(1, len(field.outline_px) // _OUTLINE_PLACES)):
-        place, normal = field.outline_px[number] - plane.offset_px, field.normals[number]
-        left, top = np.floor(place).astype(int) - reach
+    blurs: list[float] = []
+    points: list[_Points] = []
+    for index in range(0, len(field.outline_px), max(1, len(field.outline_px) // _OUTLINE_PLACES)):
+        point, normal = field.outline_px[index] - plane.offset_px, field.normals[index]
+        left, top = np.floor(point).astype(int) - reach
         if left < 0 or top < 0 or left + 2 * reach + 2 > width or top + 2 * reach + 2 > height:
             continue
         rows, columns = np.mgrid[top : top + 2 * reach + 2, left : left + 2 * reach + 2]
-        pixels = np.column_stack([columns.ravel(), rows.ravel()]) - place
+        pixels = np.column_stack([columns.ravel(), rows.ravel()]) - point
         across = pixels @ normal
         along = pixels @ np.array([-normal[1], normal[0]])
         near = (np.abs(along) < _ALONG_PX) & (across > -_INWARDS_PX) & (across < _OUTWARDS_PX)
-        seen = plane.values[top : top + 2 * reach + 2, left : left + 2 * reach + 2].ravel()[near].astype(np.float64)
-        found.append(_sigma(seen, across[near], (0.0,)))
-        places.append(field.outline_px[number])
-    return np.array(places, dtype=np.float64).reshape(-1, 2), np.array(found)
+        counts = plane.values[top : top + 2 * reach + 2, left : left + 2 * reach + 2].ravel()[near].astype(np.float64)
+        blurs.append(_sigma(counts, across[near], (0.0,)))
+        points.append(field.outline_px[index])
+    return np.array(points, dtype=np.float64).reshape(-1, 2), np.array(blurs)
 
 
-def _sigma(seen: _Points, aside: _Points, steps_at: Sequence[float]) -> float:
-    """Return the σ whose blurred staircase fits counts best: steps of unknown height at places across an edge."""
+def _sigma(counts: _Points, distances: _Points, step_positions: Sequence[float]) -> float:
+    # Blurred steps of unknown height are fitted for each σ.
     sigma = _BLURS[:, None]
-    steps = [ndtr((aside - at) / sigma) for at in steps_at]
-    # The slope of the edge itself takes up what its place is off.
-    slope = np.exp(-0.5 * (aside / sigma) ** 2)
+    steps = [ndtr((distances - position) / sigma) for position in step_positions]
+    # The derivative of the edge absorbs an error of its position.
+    slope = np.exp(-0.5 * (distances / sigma) ** 2)
     basis = np.linalg.qr(np.stack([np.ones_like(slope), *steps, slope], axis=-1)).Q
-    misfit = (seen**2).sum() - ((seen @ basis) ** 2).sum(axis=-1)
+    misfit = (counts**2).sum() - ((counts @ basis) ** 2).sum(axis=-1)
     best = int(np.clip(misfit.argmin(), 1, len(_BLURS) - 2))
-    before, least, after = misfit[best - 1 : best + 2]
-    part = 0.5 * (before - after) / max(before - 2 * least + after, 1e-12)
-    return float(_BLURS[best] * (_BLURS[1] / _BLURS[0]) ** float(np.clip(part, -1, 1)))
+    previous, lowest, following = misfit[best - 1 : best + 2]
+    offset = 0.5 * (previous - following) / max(previous - 2 * lowest + following, 1e-12)
+    return float(_BLURS[best] * (_BLURS[1] / _BLURS[0]) ** float(np.clip(offset, -1, 1)))

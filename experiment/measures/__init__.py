@@ -1,1 +1,1 @@
-"""What counts say of the sensor, the light and the print: fits, smooth fields, linearity, stains."""
+"""Measurements of frames: sensor, light, print, robust fits and smooth fields."""

@@ -1,8 +1,8 @@
-"""Weighted linear least squares without threads, and the polynomial bases that are fitted with it.
+"""Weighted linear least squares without threads, and polynomial bases for the fits.
 
-Frames are decoded by threads of ours: a linear-algebra library that starts its own beside them is slower for a few
-dozen unknowns. The inner loops stand at the end, compiled without licence to reorder sums, so that a table's bytes
-depend on neither processor nor thread. Bases are Legendre polynomials, as normal equations need them.
+Frames are decoded in threads. A linear-algebra library that starts its own threads is slower for a few dozen unknowns.
+The inner loops are compiled without permission to reorder sums, so that a look-up table (LUT) depends on neither
+processor nor thread. Bases are Legendre polynomials, which keep normal equations well conditioned.
 """
 
 from __future__ import annotations
@@ -16,39 +16,36 @@ import numpy.typing as npt
 from foundation.compiled import compiled
 from foundation.robust import MAD_TO_SIGMA
 
-# The highest order that flat fields are fitted with: a basis of a lower one is the beginning of this one's.
+# Highest order of flat fields. A basis of lower order is the beginning of this one.
 _CACHED_ORDER: Final = 8
 
 
-_LINE_ROUNDS = 8  # Reweighted solutions in a row of a line
+_LINE_ROUNDS = 8  # Iterations of a line fit
 
-# Of the median residual: what a point's residual counts for at least, so that none on the line has all the weight.
+# Smallest residual for the weights, relative to the median residual, so that a point on the line does not get all the
+# weight.
 _LEAST_RESIDUAL = 0.1
 
-# Points that the terms are added up for at a time: three channels of them, and a line of the basis, stay in the
-# processor's second cache.
+# Points per block of the sum: three channels and one row of the basis then fit into the level 2 cache.
 _POINTS_AT_A_TIME = 2048
 
-_RIDGE = 1e-10  # Share of the normal matrix's mean diagonal that is added to it: keeps equal columns solvable
+_RIDGE = 1e-10  # Ridge relative to the mean diagonal of the normal matrix: keeps equal columns solvable
 
-_CUT = 6.0  # Robust standard deviations from which on a residual has no weight (J. W. Tukey's biweight).
+_CUT = 6.0  # Residuals beyond this many robust standard deviations get no weight (J. W. Tukey's biweight).
 
 _Array = npt.NDArray[np.float64]
 
 
 def product(matrix: _Array, vector: _Array) -> _Array:
-    """Return a matrix times a vector, or times the columns of another matrix, computed in this thread alone.
-
-    `matrix`: (N, K) float64. `vector`: (K,) or (K, M) float64. Returns (N,) or (N, M) float64.
-    """
+    """Return a matrix (N, K) float64 times a vector (K,) or matrix (K, M), computed in the calling thread."""
     return np.asarray(np.einsum("nk,k...->n...", matrix, vector), dtype=np.float64)
 
 
 def linear_combinations(basis: _Array, factors: _Array) -> _Array:
-    """Return the sums Σₖ factors[c, k] · basis[k, n], computed in this thread alone.
+    """Return the sums (3, N) float64 over k of factors[c, k] · basis[k, n], computed in the calling thread.
 
-    `basis`: (K, N) float64, term by term, so that the compiled loop runs along the points. `factors`: (3, K) float64;
-    terms whose factor is 0 cost nothing. Returns (3, N) float64.
+    `basis`: (K, N) float64, so that the compiled loop runs along the points. `factors`: (3, K) float64; a factor of 0
+    costs no time.
     """
     sums = np.empty((len(factors), basis.shape[1]))
     _fill_combinations(basis, factors, sums)
@@ -56,34 +53,39 @@ def linear_combinations(basis: _Array, factors: _Array) -> _Array:
 
 
 def least_squares(design: _Array, values: _Array, weights: _Array) -> _Array:
-    """Return the solution x (K,) float64 that minimises Σ w (values − design x)².
+    """Return the x (K,) float64 that minimises Σ w (values − design x)².
 
-    By the normal equations, whose condition is the square of the design's: fit for orthogonal-like bases of order
-    unity. A ridge of 1e-10 of the normal matrix's mean diagonal keeps equal columns solvable.
+    The normal equations square the condition of the design, so its columns should be nearly orthogonal and of order 1.
 
     `design`: (N, K) float64. `values`: (N,) float64. `weights`: (N,) float64, ≥ 0.
     """
-    return _weighted_fit(*(_plain(array) for array in (design, values, weights)))
+    return _weighted_fit(*(_contiguous(array) for array in (design, values, weights)))
 
 
 def robust_least_squares(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Array, _Array]:
-    """Return the solution, weights and residuals of least squares that outliers do not move.
+    """Fit by least squares with low weights for outliers.
 
-    Iteratively reweighted by Tukey's biweight, cut at six robust standard deviations of the residuals (P. J. Huber,
-    E. M. Ronchetti, *Robust Statistics*, 2nd edition, chapter 7); otherwise as `least_squares`.
+    Iteratively reweighted with Tukey's biweight, which ends at six robust standard deviations (P. J. Huber, E. M.
+    Ronchetti, *Robust Statistics*, 2nd edition, chapter 7); otherwise like `least_squares`.
 
-    `design`: (N, K) float64. `values`: (N,) float64. Returns (K,) float64. Returns (N,) float64, 0 … 1. Returns (N,)
-    float64, values − design x.
+    Parameters
+    ----------
+    design, values
+        (N, K) and (N,) float64.
+    rounds
+        Number of iterations.
+
+    Returns
+    -------
+        Solution (K,), weights (N,) 0 … 1, and residuals (N,), values − design x.
     """
-    return _robust_fit(_plain(design), _plain(values), rounds)
+    return _robust_fit(_contiguous(design), _contiguous(values), rounds)
 
 
 def least_absolute_line(x: _Array, y: _Array) -> tuple[float, float]:
-    """Return intercept and slope of the line that minimises Σ ``|y − line|``, so that a few points do not decide.
+    """Return intercept and slope of the line through points x, y (N,) that minimises Σ ``|y − line|``.
 
     Reweighted least squares (E. J. Schlossmacher, J. Am. Stat. Assoc. 68 (1973) 857).
-
-    `x`, `y`: (N,) float64.
     """
     design, weights = np.column_stack([np.ones(len(x)), x]), np.ones(len(x))
     solution = np.array([0.0, 1.0])
@@ -95,23 +97,34 @@ def least_absolute_line(x: _Array, y: _Array) -> tuple[float, float]:
 
 
 def held_out_squares(design: _Array, values: _Array, weights: _Array, counts: tuple[int, ...]) -> _Array:
-    """Return the mean squared error at points left out, for fits by more and more columns of one design.
+    """Return the cross-validated mean squared error of fits by the first `counts[m]` columns of a design.
 
-    `design`: (N, K) float64. `values`: (N,) float64. `weights`: (N,) float64, ≥ 0; points of weight 0 count neither for
-    the fits nor for their errors. Returns (M,) float64, the weighted mean for each count; every point as the fit to all
-    others predicts it.
+    Every point is predicted by the fit to all others.
+
+    Parameters
+    ----------
+    design, values
+        (N, K) and (N,) float64.
+    weights
+        (N,) float64, ≥ 0. Points of weight 0 count neither for the fits nor for their errors.
+    counts
+        Numbers of columns, rising, K at most.
+
+    Returns
+    -------
+        Weighted mean error (M,) float64.
     """
     fits = np.array(counts, dtype=np.int64)
-    return _held_out_squares(_plain(design), _plain(values), _plain(weights), fits)
+    return _held_out_squares(_contiguous(design), _contiguous(values), _contiguous(weights), fits)
 
 
-def _plain(array: _Array) -> _Array:
-    """Return an array as float64, C order, writable: numba compiles a function anew for each other kind."""
+def _contiguous(array: _Array) -> _Array:
+    # float64, C order, writable: numba compiles a function again for each other kind.
     return np.require(array, np.float64, ["C", "W"])
 
 
 def page_powers(order: int) -> list[tuple[int, int]]:
-    """Return the degrees (i, j) in x and y of the terms of a polynomial of total order `order`, lower totals first.
+    """Return the degrees (i, j) in x and y of the terms of total order up to `order`, in rising order.
 
     >>> page_powers(2)
     [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
@@ -120,7 +133,7 @@ def page_powers(order: int) -> list[tuple[int, int]]:
 
 
 def order_of(count: int) -> int:
-    """Return the total order of a polynomial of `count` terms: the inverse of the number of `page_powers`.
+    """Return the total order of a polynomial with `count` terms, as in `page_powers`.
 
     >>> order_of(6)
     2
@@ -129,18 +142,18 @@ def order_of(count: int) -> int:
 
 
 def page_polynomial(points_mm: npt.ArrayLike, page_mm: tuple[float, float], order: int) -> _Array:
-    """Return the basis at points of the page: products P_i(x) P_j(y) of Legendre polynomials, x, y −1 … 1 on the page.
+    """Return the basis P_i(x) P_j(y) of Legendre polynomials at points of the page, x, y −1 … 1 on the page.
 
-    `points_mm`: (N, 2) float mm on the print. Returns (N, terms) float64, read-only, terms as in `page_powers`.
+    `points_mm`: (N, 2) float, mm on the print. Returns (N, terms) float64, read-only, terms as in `page_powers`.
     """
     points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 2)
-    # Terms stand in rising order, so a lower order's basis is the beginning of a higher one's.
+    # Terms are in rising order, so a basis of lower order is the beginning of a higher one.
     return _page_basis(points.tobytes(), page_mm, max(order, _CACHED_ORDER))[:, : len(page_powers(order))]
 
 
+# Cached, because every frame has the same patches and references.
 @lru_cache(maxsize=8)
 def _page_basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Array:
-    """Return the basis at points (N, 2) float64, read-only; the same cells and references come with every frame."""
     unit = 2 * np.frombuffer(points).reshape(-1, 2) / np.asarray(page_mm, dtype=np.float64) - 1
     x, y = (np.polynomial.legendre.legvander(unit[:, axis], order) for axis in (0, 1))
     basis = np.stack([x[:, i] * y[:, j] for i, j in page_powers(order)], axis=1)
@@ -148,17 +161,23 @@ def _page_basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Arr
     return basis
 
 
-def light_terms(page_mm: tuple[float, float], around: bool = False) -> tuple[_Array, tuple[int, ...]]:
-    """Return what light on a page may look like, from its simplest shapes on.
+def light_terms(page_mm: tuple[float, float], outside_only: bool = False) -> tuple[_Array, tuple[int, ...]]:
+    """Return polynomials over the page that describe the fall-off of light, simplest shapes first.
 
-    A lens's fall-off is a sum of even powers of the distance from its axis (cos⁴ of the angle to it, and less where the
-    mount shades the rim), a projector's is smooth about another point. So after a slope and a bend come the fourth and
-    the sixth power of the distance from a centre, before the terms of third and fourth order that no axis explains, and
-    the eighth before those of fifth and sixth. A centre that is free is the page's middle and, to first order of where
-    it lies, the slopes of the power: x r², y r² with r⁴.
+    The fall-off of a lens is a sum of even powers of the distance from its axis: cos⁴ of the angle, and less if the
+    mount shades the rim. The fall-off of a projector is smooth about another point.
 
-    Returns (legendre, T) float64, each column a polynomial over the page in the terms of `page_powers`; orthogonal to
-    those before it over the page, of mean square 1.
+    Parameters
+    ----------
+    page_mm
+        Width and height of the page.
+    outside_only
+        Whether references surround the patches and are not between them; then up to third order only.
+
+    Returns
+    -------
+        Terms (legendre, T) float64: each column is a polynomial in the terms of `page_powers`, orthogonal to the
+        columns before it, with mean square 1 over the page. And the numbers of terms after which a fit may end.
     """
     half = float(np.hypot(*page_mm)) / 2
     node, _ = np.polynomial.legendre.leggauss(_CACHED_ORDER + 2)
@@ -172,10 +191,12 @@ def light_terms(page_mm: tuple[float, float], around: bool = False) -> tuple[_Ar
     def radial(half_power: int) -> list[_Array]:
         return [x * r2 ** (half_power - 1), y * r2 ** (half_power - 1), r2**half_power]
 
-    # Of third order two terms besides x r² and y r², of fourth four besides r⁴, and so on.
+    # After slope and bend come the powers r⁴ and r⁶ of the distance from a centre, then the other terms of third and
+    # fourth order; r⁸ comes before the terms of fifth and sixth order. x r² and y r² move the centre to first order.
+    # They replace two of the terms of third order, r⁴ one of fourth, and so on.
     groups = (
         [power(0), power(1), power(2), power(3)]
-        if around
+        if outside_only
         else [
             power(0), power(1), power(2), radial(2), radial(3), power(3)[:2], power(4)[:4], radial(4),
             [*power(5)[:4], *power(6)[:6]],
@@ -195,7 +216,7 @@ def light_terms(page_mm: tuple[float, float], around: bool = False) -> tuple[_Ar
 
 
 def code_powers(degree: int) -> list[tuple[int, int, int]]:
-    """Return the degrees in red, green and blue of each term of a polynomial in codes of total degree `degree`.
+    """Return the degrees in red, green and blue of the terms of total degree up to `degree`.
 
     >>> code_powers(1)
     [(0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)]
@@ -204,10 +225,9 @@ def code_powers(degree: int) -> list[tuple[int, int, int]]:
 
 
 def code_polynomial(rgb: npt.ArrayLike, degree: int) -> _Array:
-    """Return the basis of printed codes: products of three Legendre polynomials, codes 0 … 255 taken to −1 … 1.
+    """Return the basis of printed codes: products of three Legendre polynomials of codes scaled to −1 … 1.
 
-    `rgb`: (C, 3) int printed codes, 0 … 255. `degree`: total degree. Returns (C, terms) float64, terms as in
-    `code_powers`.
+    `rgb`: (C, 3) int, printed codes 0 … 255. Returns (C, terms) float64, terms as in `code_powers`.
     """
     unit = 2 * np.asarray(rgb, dtype=np.float64) / 255 - 1
     axes = [np.asarray(np.polynomial.legendre.legvander(unit[:, axis], degree), dtype=np.float64) for axis in range(3)]
@@ -216,7 +236,6 @@ def code_polynomial(rgb: npt.ArrayLike, degree: int) -> _Array:
 
 @compiled
 def _fill_combinations(basis: _Array, factors: _Array, out: _Array) -> None:
-    """Fill out (3, N) with the sums over k of factors[c, k] · basis[k, n]; basis (K, N), factors (3, K); float64."""
     out[:] = 0
     for start in range(0, basis.shape[1], _POINTS_AT_A_TIME):
         end = min(start + _POINTS_AT_A_TIME, basis.shape[1])
@@ -232,7 +251,6 @@ def _fill_combinations(basis: _Array, factors: _Array, out: _Array) -> None:
 
 @compiled
 def _weighted_fit(design: _Array, values: _Array, weights: _Array) -> _Array:
-    """Return the x (K,) that minimises Σ w (values − design x)²; design (N, K), values and weights (N,), float64."""
     gram, solution = _normal_equations(design, values, weights)
     _solve_positive_definite(gram, solution)
     return solution
@@ -240,12 +258,6 @@ def _weighted_fit(design: _Array, values: _Array, weights: _Array) -> _Array:
 
 @compiled
 def _robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Array, _Array]:
-    """Return solution (K,), weights (N,) and residuals (N,) of a fit that outliers do not move.
-
-    Least squares by the normal equations, reweighted by Tukey's biweight.
-
-    `design`: (N, K) float64, C order. `values`: (N,) float64.
-    """
     count, unknowns = design.shape
     weights, residual = np.ones(count), values.copy()
     solution = np.zeros(unknowns)
@@ -265,14 +277,9 @@ def _robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _A
 
 @compiled
 def _held_out_squares(design: _Array, values: _Array, weights: _Array, counts: npt.NDArray[np.int64]) -> _Array:
-    """Return, for fits by the first counts[m] columns, the weighted mean (M,) of squared errors at points left out.
-
-    Each point as predicted by the fit to all others: its residual over 1 − its leverage (R. D. Cook, S. Weisberg,
-    *Residuals and Influence in Regression*, section 2.2), so that no fit is made twice. Of nested fits the leverages
-    are sums of one row of the design in the coordinates in which the largest fit's normal matrix is 1.
-
-    `design`, `values`, `weights`: (N, K), (N,) and (N,) float64, C order. `counts`: (M,) int64, rising, K at most.
-    """
+    # The error of a held-out point is its residual / (1 − leverage), so no fit is repeated (R. D. Cook, S. Weisberg,
+    # *Residuals and Influence in Regression*, section 2.2). In coordinates in which the normal matrix of the largest
+    # fit is 1, the leverages of nested fits are sums over one row of the design.
     points, unknowns = design.shape
     gram, right = _normal_equations(design, values, weights)
     _factorise(gram)
@@ -301,7 +308,7 @@ def _held_out_squares(design: _Array, values: _Array, weights: _Array, counts: n
 
 @compiled
 def _normal_equations(design: _Array, values: _Array, weights: _Array) -> tuple[_Array, _Array]:
-    """Return the lower half of the normal matrix (K, K), its ridge added, and the right side (K,)."""
+    """Return the lower half of the normal matrix (K, K) with its ridge, and the right side (K,)."""
     count, unknowns = design.shape
     gram, right = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
     for point in range(count):
@@ -341,7 +348,7 @@ def _solve_lower(factor: _Array, solution: _Array) -> None:
 
 @compiled
 def _solve_positive_definite(gram: _Array, solution: _Array) -> None:
-    """Replace a right side by the solution, given the lower half of a positive definite matrix (Cholesky)."""
+    # Cholesky; `gram` has the lower half of the matrix.
     unknowns = len(solution)
     _factorise(gram)
     _solve_lower(gram, solution)

@@ -1,4 +1,4 @@
-"""How the chart stands in a picture: turned about the axis of view, and tilted against the sensor."""
+"""Orientation of the chart in an image: rotation about the optical axis, and tilt against the sensor."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import numpy.typing as npt
 
 
 def off_level_deg(rotation_deg: float) -> tuple[float, int]:
-    """Return the angle between the chart's rows and the picture's, and the quarter turns besides.
-
-    The angle is in degrees, −45 … 45, clockwise; quarter turns are −1 … 2.
+    """Split a rotation into quarter turns (−1 … 2) and the remaining angle (−45 … 45 degrees, clockwise).
 
     >>> off_level_deg(92.0), off_level_deg(358.5), off_level_deg(180.0)
     ((2.0, 1), (-1.5, 0), (0.0, 2))
@@ -20,9 +18,9 @@ def off_level_deg(rotation_deg: float) -> tuple[float, int]:
 
 
 def keystone(corners_px: npt.NDArray[np.float64]) -> tuple[float, float]:
-    """Return by how much left and right, then top and bottom, differ in length: the longer over the shorter, less 1.
+    """Return the ratios of opposite sides minus 1, longer / shorter: left and right, then top and bottom.
 
-    `corners_px`: (4, 2) float64 px, the page's corners clockwise from the printed top-left.
+    `corners_px`: (4, 2) float64 px, corners of the page clockwise from the printed top-left.
     """
     top, right, bottom, left = np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1).tolist()
     return max(left / right, right / left) - 1, max(top / bottom, bottom / top) - 1

@@ -1,21 +1,12 @@
-"""Stains, folds, shadows and reflections on the print: cells whose colour is not that of their code.
+"""Stains, folds, shadows and reflections on the print: patches that do not have the colour of their code.
 
-A stain leaves its cells of one colour each, so that neither rim nor noise of a cell shows it, and the table would hold
-the colours of a dirty print. It is recognised by a whole neighbourhood that deviates at once, while the same codes,
-which lie at random over the sheet, are right everywhere else.
+A stain changes whole patches, so that neither edges nor noise of a patch show it, and the look-up table (LUT) would
+contain the colours of a dirty print. It is detected as a neighbourhood that deviates, while the same codes elsewhere on
+the sheet are correct. A deviation must be significant and large enough to matter; it is listed and never corrected.
 
-Rules that hold inside:
-
-- What a code gives is predicted from the codes next to it in colour, which lie elsewhere on the sheet: no model of ink
-  or paper, and next to nothing in common with the cell's own place.
-- A cell is judged by its neighbourhood: one deviating cell is the prediction's error or noise. Next to a stain it is
-  judged alone as well, for only half of the neighbourhood of a cell at a stain's rim is stained; that half must show.
-- Codes of which two values are equal are predicted by others of which they are.
-- Charts of less than `LEAST_BITS` cannot be judged: between four levels of a code curvature does not change slowly.
-- A deviation must be significant and large enough to matter. What is found is listed, never corrected.
-- A stain takes of each cell a share of its light, a reflection adds to each as much. So the light that cells of a place
-  show is a line over the light that they should have: its slope is the share of their own that they keep, and what it
-  leaves at 0 is the light added (dichromatic reflection: S. Shafer, Color Research & Application 10, 1985, eq. 1).
+A stain takes a fraction of the light of a patch, a reflection adds the same light to all. So the measured light of the
+patches of a spot is a line over the expected light. Its slope is the kept fraction, its intercept the added light
+(dichromatic reflection: S. Shafer, Color Research & Application 10, 1985, eq. 1).
 """
 
 from __future__ import annotations
@@ -31,50 +22,52 @@ from scipy.spatial import cKDTree
 from experiment.measures.least_squares import least_absolute_line
 from foundation.robust import robust_sigma
 
-NEIGHBOURS = 13  # A cell and the twelve within two cells of it: a tenth of a thumb's stain at 5 mm a cell
+NEIGHBOURS = 13  # A patch and the twelve within two patches of it: a tenth of a thumb-sized stain at 5 mm a patch
 
-STAINED = 0.02  # Deviation of a neighbourhood from its codes, a share, from which its cells are listed as unfit
+STAINED = 0.02  # Relative deviation of a neighbourhood from which its patches are listed as unfit
 
-# Deviation from which cells are counted and shown. Clean prints in the simulated room stay below, to one cell.
+# Relative deviation from which patches are counted and shown. All patches but one of clean prints in the simulated
+# laboratory are below.
 DOUBTFUL = 0.01
 
-SIGNIFICANT = 6.0  # Standard errors that it must be, too; by chance one neighbourhood in 5·10⁸
+SIGNIFICANT = 6.0  # Deviation in standard errors that is required too; by chance one neighbourhood in 5·10⁸
 
-RIM_SIGMA = 4.0  # Usual deviations of single cells that a cell next to a stain must deviate by to belong to it
+# Deviation of a patch next to a stain, in standard deviations of single patches, from which it belongs to the stain
+RIM_SIGMA = 4.0
 
-LEAST_COUNTS = 30.0  # Darker cells are not judged: a count of stray light is 3 % of them
+LEAST_COUNTS = 30.0  # Darker patches are not judged: one count of stray light is 3 % of them
 
-# Bits of a channel: with 2, curvature changes too fast between the four levels of a code to be predicted.
+# Fewest bits per channel: with 2, the curvature over the four levels of a code cannot be predicted.
 LEAST_BITS = 3
 
 
-LEAST_CELLS = 6  # Cells of a place for a line through them to mean anything
+LEAST_CELLS = 6  # Fewest patches for a line fit
 
-# Share of the cells from which on a place counts: that of the limit on unfit cells. A glint on fewer is listed, and
-# what it leaves around them is a few cells' error.
+# Fraction of the patches from which a spot counts: the limit on unfit patches. A smaller glint is listed, and its
+# remaining effect is an error of a few patches.
 LARGE_SPOT = 0.005
 
-# Share of their own light that cells keep under a reflection at least: less, and something covers them (as in the
-# table of causes, where a hand is named below it).
+# Smallest fraction of its light that a patch keeps under a reflection. With less, it is covered (the table of causes
+# reports a hand below this value).
 OWN_KEPT = 0.85
 
-_ROUNDS = 3  # Repetitions at most, each without the stained cells of the one before in the predictions
+_ROUNDS = 3  # Largest number of repetitions, each without the previously stained patches in the predictions
 
-_LEAST_KNOWN = 9  # Codes of the 25 across an axis that must be known for their median to be a curvature
+_LEAST_KNOWN = 9  # Fewest known codes of the 25 across an axis for a median curvature
 
-_LEAST_TIED = 3  # Codes with two equal values that must be known for their median to be a bend
+_LEAST_TIED = 3  # Fewest known codes with two equal values for a median bend
 
-_LEAST_NEIGHBOURS = 5  # Cells of a neighbourhood that must be known for its mean to count
+_LEAST_NEIGHBOURS = 5  # Fewest known patches of a neighbourhood for its mean
 
-# Stained cells of a neighbourhood from which on it need not deviate itself for a cell to belong to the stain.
-_MANY_BESIDE = 2
+# With this many stained neighbours, a patch belongs to the stain even if its neighbourhood does not deviate.
+_MANY_STAINED = 2
 
-_BRIGHT_PERCENTILE = 99.0  # Of the cells' levels, what is taken for paper white
+_BRIGHT_PERCENTILE = 99.0  # Percentile of the patch levels that counts as white paper
 
-_BESIDE = 2.3  # Distance, in sides of a cell, up to which deviating cells are of one place: one may lie between them
+_SPOT_DISTANCE = 2.3  # Largest distance between patches of one spot, in patch sides: one patch may lie between them
 
-# Distance, in sides of a cell, from the cells of a spot up to which light is looked for in cells that are not listed:
-# two rings, of which the first is half in the neighbourhoods of the spot (chosen).
+# Largest distance from a spot, in patch sides, at which added light is measured in unlisted patches: two rings, of
+# which the first is half in the neighbourhoods of the spot (judgement).
 _AROUND = 2.5
 
 _Array = npt.NDArray[np.float64]
@@ -84,234 +77,235 @@ _Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Stains:
-    """How cells differ from what their codes give elsewhere.
+    """Deviations of C patches from the colours of their codes elsewhere on the sheet."""
 
-    - `deviation`: (C, 3) float64, of each cell's neighbourhood, seen over expected less 1; NaN where it is not known.
-    - `error`: (C, 3) float64, its standard error.
-    - `alone`: (C, 3) float64, deviation of each cell by itself, noise and the prediction's error included; NaN
-      likewise.
-    - `stained`: (C,) bool, cells to be listed.
-    - `level`: (C, 3) float64, mean counts above black that were judged.
-    - `places_mm`: (C, 2) where the cells lie on the sheet.
-    """
-
-    deviation: _Array
-    error: _Array
-    alone: _Array
-    stained: _Mask
-    level: _Array
-    places_mm: _Array
+    deviation: _Array  # (C, 3), measured / expected − 1 of the neighbourhood of each patch; NaN if unknown
+    error: _Array  # (C, 3), standard error of `deviation`
+    alone: _Array  # (C, 3), deviation of each patch alone, with noise and error of the prediction; NaN if unknown
+    stained: _Mask  # (C,), patches to be listed
+    level: _Array  # (C, 3), mean counts above black
+    places_mm: _Array  # (C, 2), positions of the patches on the sheet
 
     @property
     def doubtful(self) -> _Mask:
-        """(C,) bool, cells in neighbourhoods that deviate by 1 % or more: a fold's flanks, a faint stain, a shadow."""
-        return _beyond(self.deviation, self.error, DOUBTFUL)
+        """(C,) bool, patches in neighbourhoods that deviate by 1 % or more: folds, faint stains, shadows."""
+        return _is_significant(self.deviation, self.error, DOUBTFUL)
 
     @property
     def known(self) -> bool:
-        """Whether anything is known of the print."""
+        """Whether any deviation is known."""
         return bool(np.isfinite(self.deviation).any())
 
     def largest_deviation(self) -> _Array:
-        """Return (C,) float64 the signed deviation of the channel that deviates most; 0 where it is not known."""
-        return _largest(self.deviation)
+        """Return the signed deviation (C,) float64 of the channel that deviates most; 0 if unknown."""
+        return _largest_of_channels(self.deviation)
 
     def deviation_of(self, cell: int) -> float:
-        """Return a stained cell's deviation, with its sign: of its neighbourhood, or its own where that is larger."""
-        both = np.array([_largest(self.deviation[[cell]])[0], _largest(self.alone[[cell]])[0]])
-        return float(both[np.abs(both).argmax()])
+        """Return the signed deviation of a stained patch: of its neighbourhood or its own, whichever is larger."""
+        deviations = np.array(
+            [_largest_of_channels(self.deviation[[cell]])[0], _largest_of_channels(self.alone[[cell]])[0]]
+        )
+        return float(deviations[np.abs(deviations).argmax()])
 
 
-def _largest(deviation: _Array) -> _Array:
-    """Return (N,) the deviation (N, 3), with its sign, of the channel that deviates most; 0 where none is known."""
-    known = np.nan_to_num(deviation)
-    return np.take_along_axis(known, np.abs(known).argmax(axis=1)[:, None], axis=1)[:, 0]
+def _largest_of_channels(deviation: _Array) -> _Array:
+    """Return the signed deviation (N,) of the channel that deviates most; 0 if none is known."""
+    finite = np.nan_to_num(deviation)
+    return np.take_along_axis(finite, np.abs(finite).argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
 def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | None = None) -> Stains:
-    """Return which cells lie in neighbourhoods that are not of their codes' colours.
+    """Find patches in neighbourhoods that do not have the colours of their codes.
 
-    `level`: (8**bits, 3) float64, mean counts above black of each colour under even light, in the order of colour
-    indices, the field divided out; best the mean of all white frames. `centres_mm`: (8**bits, 2) mm, where each colour
-    lies on the sheet. `usable`: (8**bits,) bool, cells whose level means anything: not covered, cut off or clipped; all
-    if not given.
+    Parameters
+    ----------
+    level
+        (8**bits, 3) float64, mean counts above black by colour index, divided by the flat field; best of all white
+        frames.
+    centres_mm
+        (8**bits, 2) float64, position of each colour on the sheet.
+    bits
+        Bits per channel of the chart.
+    usable
+        (8**bits,) bool, patches that are not covered, cut off or clipped; all by default.
     """
     if bits < LEAST_BITS:
         unknown = np.full(level.shape, np.nan)
         return Stains(unknown, unknown, unknown, np.zeros(len(level), dtype=np.bool_), level, centres_mm)
     usable = np.ones(len(level), dtype=np.bool_) if usable is None else usable
-    near = np.asarray(cKDTree(centres_mm).query(centres_mm, k=min(NEIGHBOURS, len(level)))[1])
-    near = near.reshape(len(level), -1)
-    trusted = usable.copy()
+    # The prediction uses codes that are next in colour and lie elsewhere on the sheet: no model of ink or paper, and
+    # little in common with the position of the patch.
+    neighbours = np.asarray(cKDTree(centres_mm).query(centres_mm, k=min(NEIGHBOURS, len(level)))[1])
+    neighbours = neighbours.reshape(len(level), -1)
+    clean = usable.copy()
     deviation, error, log_ratios = (np.full(level.shape, np.nan) for _ in range(3))
     stained = np.zeros(len(level), dtype=np.bool_)
-    # A stain spoils the predictions that rest on its cells, too; without them, its rim and depth are sharper.
+    # Stained patches spoil predictions too; without them, edge and depth of a stain are more accurate.
     for _ in range(_ROUNDS):
-        log_ratios = _log_ratios(np.where(trusted[:, None], level, np.nan), level, usable, bits)
-        deviation, error = _of_neighbourhoods(log_ratios, near)
-        found = _beyond(deviation, error, STAINED)
-        if (found == stained).all():
+        log_ratios = _log_ratios(np.where(clean[:, None], level, np.nan), level, usable, bits)
+        deviation, error = _neighbourhood_means(log_ratios, neighbours)
+        significant = _is_significant(deviation, error, STAINED)
+        if (significant == stained).all():
             break
-        stained = found
-        trusted = usable & ~stained
+        stained = significant
+        clean = usable & ~stained
     with np.errstate(invalid="ignore"):
-        off = (np.abs(np.expm1(log_ratios)) > np.maximum(RIM_SIGMA * _usual(log_ratios), STAINED)).any(axis=1)
-    # Part of a neighbourhood that a stain reaches deviates, too; a cell that does so alone is its prediction's error.
-    beside = stained[near].sum(axis=1)
-    reached = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (beside >= _MANY_BESIDE)
-    rim = off & reached & (beside > 0)
+        limit = np.maximum(RIM_SIGMA * _patch_sigma(log_ratios), STAINED)
+        is_deviating = (np.abs(np.expm1(log_ratios)) > limit).any(axis=1)
+    # Next to a stain a patch is judged alone, because only half of its neighbourhood is stained. That half must
+    # deviate; a patch that deviates without it has an error of prediction.
+    stained_neighbours = stained[neighbours].sum(axis=1)
+    is_affected = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (stained_neighbours >= _MANY_STAINED)
+    rim = is_deviating & is_affected & (stained_neighbours > 0)
     return Stains(deviation, error, np.expm1(log_ratios), stained | rim, level, centres_mm)
 
 
-def _usual(log_ratios: _Array) -> _Array:
-    """Return (3,) the standard deviation of single cells, by the median of their sizes."""
-    there = np.isfinite(log_ratios)
-    return np.array([robust_sigma(log_ratios[there[:, c], c]) if there[:, c].any() else 0 for c in range(3)])
+def _patch_sigma(log_ratios: _Array) -> _Array:
+    is_finite = np.isfinite(log_ratios)
+    return np.array([robust_sigma(log_ratios[is_finite[:, c], c]) if is_finite[:, c].any() else 0 for c in range(3)])
 
 
-def _beyond(deviation: _Array, error: _Array, least: float) -> _Mask:
-    """Return (C,) where a deviation is both significant and at least `least`; NaN is not."""
-    return np.asarray((np.abs(deviation) > np.maximum(SIGNIFICANT * error, least)).any(axis=1))
+def _is_significant(deviation: _Array, error: _Array, threshold: float) -> _Mask:
+    return np.asarray((np.abs(deviation) > np.maximum(SIGNIFICANT * error, threshold)).any(axis=1))
 
 
-def _log_ratios(trusted: _Array, level: _Array, usable: _Mask, bits: int) -> _Array:
-    """Return (C, 3) log of each cell over what its neighbours in colour predict, NaN where they cannot.
-
-    Along each axis of the code the mean of both neighbours' logarithms predicts the cell's, but for the curvature,
-    which changes slowly across the axis and is taken out as the median over the codes beside. Where two values of a
-    code are equal there is a bend, too: black replaces as much ink as all three have in common.
-    """
+def _log_ratios(clean_level: _Array, level: _Array, usable: _Mask, bits: int) -> _Array:
+    """Return the log ratio (C, 3) of each patch to the prediction by its neighbours in colour; NaN without them."""
+    # Along each axis of the code, the mean logarithm of both neighbours predicts the patch, except for the curvature.
+    # The curvature changes slowly across the axis, so its median over neighbouring codes is subtracted. At equal values
+    # of a code there is a bend, because black replaces the ink that all three colours have in common.
     side = 1 << bits
     with np.errstate(invalid="ignore", divide="ignore"):
-        logs = np.log(np.where(trusted > LEAST_COUNTS, trusted, np.nan)).reshape(side, side, side, 3)
-        own = np.log(np.where((level > LEAST_COUNTS) & usable[:, None], level, np.nan)).reshape(side, side, side, 3)
-    total, count = np.zeros_like(own), np.zeros_like(own)
+        logs = np.log(np.where(clean_level > LEAST_COUNTS, clean_level, np.nan)).reshape(side, side, side, 3)
+        own_logs = np.log(np.where((level > LEAST_COUNTS) & usable[:, None], level, np.nan)).reshape(logs.shape)
+    sums, count = np.zeros_like(own_logs), np.zeros_like(own_logs)
     for axis in range(3):
-        before, after = (np.roll(logs, step, axis=axis) for step in (1, -1))
-        second = own - 0.5 * (before + after)
+        previous, following = (np.roll(logs, step, axis=axis) for step in (1, -1))
+        curvature = own_logs - 0.5 * (previous + following)
         edge: list[slice | list[int]] = [slice(None)] * 3
         edge[axis] = [0, side - 1]
-        second[tuple(edge)] = np.nan
-        second -= _beside(second, axis)
-        second -= _at_ties(second, axis)
-        there = np.isfinite(second)
-        total += np.where(there, second, 0)
-        count += there
+        curvature[tuple(edge)] = np.nan
+        curvature -= _median_over_neighbour_codes(curvature, axis)
+        curvature -= _median_at_equal_codes(curvature, axis)
+        is_finite = np.isfinite(curvature)
+        sums += np.where(is_finite, curvature, 0)
+        count += is_finite
     with np.errstate(invalid="ignore", divide="ignore"):
-        return (total / np.where(count > 0, count, np.nan)).reshape(-1, 3)
+        return (sums / np.where(count > 0, count, np.nan)).reshape(-1, 3)
 
 
-def _beside(cube: _Array, axis: int) -> _Array:
-    """Return the median (n, n, n, 3) over the 25 codes of one value along an axis, up to two steps away across it."""
-    across = [other for other in range(3) if other != axis]
-    reach = [(2, 2) if other in across else (0, 0) for other in range(3)]
-    padded = np.pad(cube, (*reach, (0, 0)), constant_values=np.nan)
+def _median_over_neighbour_codes(cube: _Array, axis: int) -> _Array:
+    """Return the median (n, n, n, 3) over the 25 codes with the same value on an axis, up to two steps away."""
+    across = [other_axis for other_axis in range(3) if other_axis != axis]
+    padding = [(2, 2) if other_axis in across else (0, 0) for other_axis in range(3)]
+    padded = np.pad(cube, (*padding, (0, 0)), constant_values=np.nan)
     n = cube.shape[0]
     shifted: list[_Array] = []
-    for one in range(5):
-        for other in range(5):
+    for i in range(5):
+        for j in range(5):
             window = [slice(None)] * 3
-            window[across[0]], window[across[1]] = slice(one, one + n), slice(other, other + n)
+            window[across[0]], window[across[1]] = slice(i, i + n), slice(j, j + n)
             shifted.append(padded[tuple(window)])
-    around = np.stack(shifted)
-    # NaN sorts last, so the middle of what is known stands at half their number.
-    known = np.isfinite(around).sum(axis=0)
-    ranked = np.sort(around, axis=0)
-    low, high = (np.maximum(known - 1, 0) // 2)[None], (known // 2)[None]
+    stack = np.stack(shifted)
+    # NaN is sorted last, so the median is at half the number of finite values.
+    known_count = np.isfinite(stack).sum(axis=0)
+    ranked = np.sort(stack, axis=0)
+    low, high = (np.maximum(known_count - 1, 0) // 2)[None], (known_count // 2)[None]
     middle = 0.5 * (np.take_along_axis(ranked, low, axis=0) + np.take_along_axis(ranked, high, axis=0))[0]
-    return np.where(known >= _LEAST_KNOWN, middle, np.nan)
+    return np.where(known_count >= _LEAST_KNOWN, middle, np.nan)
 
 
-def _at_ties(second: _Array, axis: int) -> _Array:
-    """Return the median (n, n, n, 3) over the codes whose value along an axis equals one across it; 0 elsewhere.
+def _median_at_equal_codes(curvature: _Array, axis: int) -> _Array:
+    """Return the median (n, n, n, 3) over similar codes with equal values on an axis and another one; 0 elsewhere.
 
-    Of codes of like values, in which the third value is below, equal or above; NaN where too few are known.
+    Codes with a third value that is below, equal or above are separate. NaN if too few codes are known.
     """
-    values = np.indices(second.shape[:3])
-    found = np.zeros_like(second)
-    for other in {0, 1, 2} - {axis}:
-        third = np.sign(values[3 - axis - other] - values[axis])
+    values = np.indices(curvature.shape[:3])
+    medians = np.zeros_like(curvature)
+    for other_axis in {0, 1, 2} - {axis}:
+        third = np.sign(values[3 - axis - other_axis] - values[axis])
         for side in (-1, 0, 1):
-            tied = np.nonzero((values[axis] == values[other]) & (third == side))
-            value, bends = values[axis][tied], second[tied]
-            known = np.isfinite(bends).all(axis=1)
-            usual = np.full_like(bends, np.nan)
-            for one in np.unique(value):
-                alike = bends[known & (np.abs(value - one) <= 1)]
-                if len(alike) >= _LEAST_TIED:
-                    usual[value == one] = np.median(alike, axis=0)
-            found[tied] = usual
-    return found
+            tied = np.nonzero((values[axis] == values[other_axis]) & (third == side))
+            value, bends = values[axis][tied], curvature[tied]
+            is_finite = np.isfinite(bends).all(axis=1)
+            group_medians = np.full_like(bends, np.nan)
+            for code in np.unique(value):
+                similar = bends[is_finite & (np.abs(value - code) <= 1)]
+                if len(similar) >= _LEAST_TIED:
+                    group_medians[value == code] = np.median(similar, axis=0)
+            medians[tied] = group_medians
+    return medians
 
 
-def _of_neighbourhoods(log_ratios: _Array, near: npt.NDArray[np.intp]) -> tuple[_Array, _Array]:
-    """Return the mean (C, 3) over each neighbourhood and its standard error; NaN where too few cells are known."""
-    there = np.isfinite(log_ratios)
-    spread = _usual(log_ratios)
-    # A single cell may be far off; in a neighbourhood it weighs no more than four usual deviations beyond the median.
-    values = log_ratios[near]
+def _neighbourhood_means(log_ratios: _Array, neighbours: npt.NDArray[np.intp]) -> tuple[_Array, _Array]:
+    """Return the mean (C, 3) over each neighbourhood and its standard error; NaN if too few patches are known."""
+    is_finite = np.isfinite(log_ratios)
+    sigma = _patch_sigma(log_ratios)
+    # Limit the deviation of a single patch to four standard deviations from the median.
+    values = log_ratios[neighbours]
     with np.errstate(invalid="ignore"):
-        known = there[near]
-        count = known.sum(axis=1)
-        middle = np.nanmedian(np.where(known.any(axis=1, keepdims=True), values, 0.0), axis=1)
-        bounded = np.clip(values, (middle - 4 * spread)[:, None], (middle + 4 * spread)[:, None])
-        mean = np.where(known, bounded, 0).sum(axis=1) / np.maximum(count, 1)
-        inside = np.where(known, (bounded - mean[:, None]) ** 2, 0).sum(axis=1) / np.maximum(count - 1, 1)
-        error = np.sqrt(np.maximum(inside, spread**2) / np.maximum(count, 1))
-    enough = count >= _LEAST_NEIGHBOURS
-    return np.where(enough, np.expm1(mean), np.nan), np.where(enough, error, np.nan)
+        is_known = is_finite[neighbours]
+        count = is_known.sum(axis=1)
+        median = np.nanmedian(np.where(is_known.any(axis=1, keepdims=True), values, 0.0), axis=1)
+        bounded = np.clip(values, (median - 4 * sigma)[:, None], (median + 4 * sigma)[:, None])
+        mean = np.where(is_known, bounded, 0).sum(axis=1) / np.maximum(count, 1)
+        variance = np.where(is_known, (bounded - mean[:, None]) ** 2, 0).sum(axis=1) / np.maximum(count - 1, 1)
+        error = np.sqrt(np.maximum(variance, sigma**2) / np.maximum(count, 1))
+    has_enough = count >= _LEAST_NEIGHBOURS
+    return np.where(has_enough, np.expm1(mean), np.nan), np.where(has_enough, error, np.nan)
 
 
 def cell_mm(stains: Stains) -> float:
-    """Return the side of the square that a cell stands for, mm."""
+    """Return the side of the square area of one patch, mm."""
     size = np.ptp(stains.places_mm, axis=0)
     return float(np.sqrt(size[0] * size[1] / len(stains.places_mm)))
 
 
 def joined_cells(stains: Stains, cells: _Index) -> list[_Index]:
-    """Return cells (N,) int64 in groups of those that lie next to each other, the largest first."""
+    """Group adjacent patches (N,) int64, the largest group first."""
     if not len(cells):
         return []
-    pairs = cKDTree(stains.places_mm[cells]).query_pairs(_BESIDE * cell_mm(stains), output_type="ndarray")
+    pairs = cKDTree(stains.places_mm[cells]).query_pairs(_SPOT_DISTANCE * cell_mm(stains), output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
     count, label = connected_components(graph, directed=False)
     return sorted((cells[label == number] for number in range(int(count))), key=len, reverse=True)
 
 
 def spots_of(stains: Stains) -> list[_Index]:
-    """Return the cells (N,) int64 of each spot of deviating cells, the largest first."""
+    """Return the patches (N,) int64 of each spot of deviating patches, the largest first."""
     return joined_cells(stains, np.flatnonzero(stains.stained | stains.doubtful))
 
 
 def spot_colour(stains: Stains, spot: _Index) -> _Array:
-    """Return the median deviation (3,) float64 of a spot's cells by channel, a share; 0 where none is known."""
+    """Return the median deviation (3,) float64 of the patches of a spot, relative; 0 if unknown."""
     alone = stains.alone[spot]
-    return np.array([float(np.median(one[np.isfinite(one)])) if np.isfinite(one).any() else 0.0 for one in alone.T])
+    finite = [channel[np.isfinite(channel)] for channel in alone.T]
+    return np.array([float(np.median(values)) if len(values) else 0.0 for values in finite])
 
 
 def light_of_spot(stains: Stains, spot: _Index, channel: int) -> tuple[float, float]:
-    """Return the light added in a spot, of paper white, and the share of their own that its cells (N,) int64 keep.
+    """Return the light added in a spot, relative to white paper, and the fraction of their light that its patches keep.
 
-    By least absolute deviations in one channel; NaN of too few cells.
+    Line through one channel by least absolute deviations; NaN for too few patches.
     """
-    seen, alone = stains.level[:, channel], stains.alone[:, channel]
-    there = spot[np.isfinite(alone[spot]) & (alone[spot] > -0.99)]
-    if len(there) < LEAST_CELLS:
+    levels, alone = stains.level[:, channel], stains.alone[:, channel]
+    patches = spot[np.isfinite(alone[spot]) & (alone[spot] > -0.99)]
+    if len(patches) < LEAST_CELLS:
         return np.nan, np.nan
-    top = float(np.nanpercentile(seen, _BRIGHT_PERCENTILE))
-    y = seen[there] / top
-    x = y / (1 + alone[there])
+    white_level = float(np.nanpercentile(levels, _BRIGHT_PERCENTILE))
+    y = levels[patches] / white_level
+    x = y / (1 + alone[patches])
     return least_absolute_line(x, y)
 
 
 def added_light(stains: Stains) -> float:
-    """Return the light that a large reflection adds to cells that are not listed, 0 … 1 of paper white; 0 without one.
+    """Return the light that a large reflection adds to patches that are not listed, 0 … 1 of white paper.
 
-    Spots are those of more than `LARGE_SPOT` of the cells that are brighter than their codes and keep `OWN_KEPT` of
-    their own light. What deviates enough is listed as unfit and does no harm; a broad reflection goes on around it, and
-    there the light is measured. Of several spots the most.
+    A reflection is a spot of more than `LARGE_SPOT` of the patches, brighter than their codes, that keep `OWN_KEPT` of
+    their own light. The patches of the spot are listed as unfit and do no harm. A broad reflection continues around it,
+    and is measured there. The largest value of all reflections; 0 without one.
     """
-    found = 0.0
+    largest = 0.0
     for spot in spots_of(stains):
         if len(spot) <= LARGE_SPOT * len(stains.places_mm):
             break
@@ -319,8 +313,8 @@ def added_light(stains: Stains) -> float:
         channel = int(np.argmax(np.abs(colour)))
         if not (colour[channel] > 0 and light_of_spot(stains, spot, channel)[1] >= OWN_KEPT):
             continue
-        away = np.asarray(cKDTree(stains.places_mm[spot]).query(stains.places_mm)[0])
-        around = np.flatnonzero((away < _AROUND * cell_mm(stains)) & ~stains.stained)
-        added, _ = light_of_spot(stains, around, channel)
-        found = max(found, float(np.nan_to_num(added)))
-    return found
+        distances = np.asarray(cKDTree(stains.places_mm[spot]).query(stains.places_mm)[0])
+        surrounding = np.flatnonzero((distances < _AROUND * cell_mm(stains)) & ~stains.stained)
+        added, _ = light_of_spot(stains, surrounding, channel)
+        largest = max(largest, float(np.nan_to_num(added)))
+    return largest

@@ -1,1 +1,1 @@
-"""A session on disk: its plan, its journal, its folder, and how far it has come."""
+"""A session on disk: plan, journal, folder, and progress."""

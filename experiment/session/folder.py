@@ -1,8 +1,8 @@
-"""A session: the folder in which an experiment is taken; nothing here touches a device.
+"""The folder of a session, without any device.
 
-A frame counts as taken when its raw file is complete on disk (written, flushed, renamed) *and* its journal row is
-committed, in that order. Whatever a crash leaves between the two is set aside, never counted, never deleted. The
-journal is the truth; `frames.csv` is derived from it.
+A frame counts as taken when its raw file is complete on disk (written, flushed, renamed) and its journal row is
+committed, in this order. Files that a crash leaves between the two are renamed, never counted and never deleted. The
+journal is authoritative; `frames.csv` is derived from it.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from experiment.session.journal import (
     ReceivedFile,
     ledger_path,
     lost_files,
+    no_journal_text,
     open_journal,
     read_ledger,
     time_text,
-    without_journal,
 )
 from experiment.session.opening import MOST_BYTES
 from experiment.session.records import AcceptedFile, FrameRecord, SessionStep
 from experiment.session.repair import (
     BAD,
+    damaged_files,
     lights_text,
     newest_report,
     parse_lights,
     require_frames_folder,
-    unsound_files,
 )
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import (
@@ -61,18 +61,12 @@ FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure
 
 @dataclass(frozen=True)
 class Retake:
-    """What is to be taken again.
+    """Illuminants and frames that are to be repeated."""
 
-    - `lights`: their numbers.
-    - `frames`: accepted frames that will be voided.
-    - `reason`: why, for the journal; empty where they have been.
-    - `text`: the lights as a record of the journal; empty where a report names the frames.
-    """
-
-    lights: tuple[int, ...]
-    frames: tuple[AcceptedFile, ...]
-    reason: str
-    text: str = ""
+    lights: tuple[int, ...]  # numbers of the illuminants
+    frames: tuple[AcceptedFile, ...]  # accepted frames that will be voided
+    reason: str  # reason for the journal; empty if the frames are already void
+    text: str = ""  # the illuminants as a record of the journal; empty if a report names the frames
 
 
 _Loaded = TypeVar("_Loaded")
@@ -81,35 +75,34 @@ _Loaded = TypeVar("_Loaded")
 class Session:
     """An open session folder; close it, or use it in a `with` block.
 
-    `hold`: what holds the folder against other runs, released at the end; None for a reader.
+    `hold`: lock of the folder against other runs, released on close; None for a reader.
     """
 
     def __init__(self, folder: Path, journal: Journal, hold: ExitStack | None = None) -> None:
         self.folder = folder
-        self.frames_folder: Final = folder / "frames"
-        """Where the raw files are, exactly as the camera wrote them."""
+        self.frames_folder: Final = folder / "frames"  # raw files, exactly as the camera wrote them
         self.journal = journal
         self._hold = hold
         require_plain_folder(folder, MOST_BYTES, ("frames", "previews"))
         self.chart: Chart = _own_copy(load_chart, folder / "chart.json", "chart")
         self.illuminations: tuple[Illumination, ...] = _own_copy(
-            load_illuminations, folder / "illuminations.csv", "lights"
+            load_illuminations, folder / "illuminations.csv", "illuminants"
         )
         self.steps: tuple[SessionStep, ...] = journal.steps()
         self._require_planned_lights()
 
+    # With other illuminants than planned, frames would get wrong codes.
     def _require_planned_lights(self) -> None:
-        """Refuse lights that are not those of the plan: what was shown would bear other codes."""
         for step in self.steps:
             if step.illumination is None:
                 continue
-            known = self.illuminations[step.illumination : step.illumination + 1]
-            if not known or known[0].colour != step.colour:
-                says = "has no such light" if not known else f"says {_codes(known[0].colour)}"
+            csv_rows = self.illuminations[step.illumination : step.illumination + 1]
+            if not csv_rows or csv_rows[0].colour != step.colour:
+                difference = "has no such illuminant" if not csv_rows else f"has {_codes(csv_rows[0].colour)}"
                 raise FormatError(
-                    f"{self.folder / 'illuminations.csv'} is not what the session was taken with: light "
-                    f"{step.illumination} was planned as {_codes(step.colour)}, the file {says}; "
-                    "restore it from a copy"
+                    f"{self.folder / 'illuminations.csv'} was changed after the session was planned: the file "
+                    f"{difference}, illuminant {step.illumination} was planned as {_codes(step.colour)}; restore it "
+                    "from a copy"
                 )
 
     @classmethod
@@ -121,9 +114,14 @@ class Session:
         illuminations: Sequence[Illumination],
         steps: Sequence[SessionStep] = (),
     ) -> Session:
-        """Make a new session folder, whole or not at all, and open it.
+        """Create a new session folder, completely or not at all, and open it for a run.
 
-        `steps`: the plan: every frame to take, in order.
+        Parameters
+        ----------
+        settings
+            Text of `session.toml`.
+        steps
+            The plan: every frame to take, in order.
         """
         with atomic_folder(folder, "the session") as new:
             (new / "frames").mkdir()
@@ -135,7 +133,7 @@ class Session:
 
     @classmethod
     def open(cls, folder: Path) -> Session:
-        """Open a session folder to read it, also while it is being taken; nothing in it is created or changed."""
+        """Open a session folder for reading, also while frames are taken; nothing is created or changed."""
         journal_path(folder)
         journal = open_journal(folder)
         try:
@@ -151,24 +149,29 @@ class Session:
         patience_s: float = PATIENCE_S,
         announce: Callable[[str], object] = lambda sentence: None,
     ) -> Session:
-        """Open a session folder to take frames into it.
+        """Open a session folder for taking frames. It is locked until it is closed.
 
-        It is held until it is closed, and `frames.csv` is made anew.
+        Parameters
+        ----------
+        patience_s
+            Seconds to wait for other programs that hold the journal.
+        announce
+            Called with messages for the user.
         """
         path = folder / JOURNAL_FILE
         if not _is_file(path) and not _is_file(ledger_path(folder)):
             journal_path(folder)
-        with ExitStack() as opened:
-            opened.enter_context(locked_folder(folder, busy_sentence(folder)))
+        with ExitStack() as resources:
+            resources.enter_context(locked_folder(folder, busy_message(folder)))
             if not _is_file(path):
                 rebuild_journal(folder)
-                announce(f"journal: {path} was gone, and was made anew from {ledger_path(folder)}")
+                announce(f"journal: {path} was missing and was restored from {ledger_path(folder)}")
             journal = Journal.open_for_run(path, patience_s, announce)
-            opened.callback(journal.close)
-            journal.keep_twice(ledger_path(folder))
-            session = cls(folder, journal, opened)
+            resources.callback(journal.close)
+            journal.attach_ledger(ledger_path(folder))
+            session = cls(folder, journal, resources)
             session.write_frames_csv()
-            session._hold = opened.pop_all()
+            session._hold = resources.pop_all()
         return session
 
     def __enter__(self) -> Session:
@@ -185,85 +188,83 @@ class Session:
             self._hold.close()
 
     def settings_text(self) -> str:
-        """Return the text of `session.toml`; one that says nothing is damaged."""
+        """Return the text of `session.toml`; `FormatError` if it is empty."""
         path, remedy = self.folder / "session.toml", "restore it from a copy"
         text = read_text(path, remedy, "the session's settings")
         if not text.strip():
-            raise FormatError(
-                "empty; the settings with which a session was begun stand in it", about=path, remedy=remedy
-            )
+            raise FormatError("empty; the settings of the session are expected", about=path, remedy=remedy)
         return text
 
     def receive(self, stem: str, fill: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
-        """Let a raw file be written into `frames/`; it is complete and on the disk when this returns."""
+        """Write a raw file into `frames/` with `fill`; it is complete and on disk when this returns."""
         with IncomingFile(self.frames_folder / stem) as incoming:
             return incoming.complete(fill(incoming.stream))
 
     def add_steps(self, steps: Sequence[SessionStep]) -> None:
-        """Put steps at the end of the plan; their numbers must be free."""
+        """Append steps to the plan; their numbers must be free."""
         self.journal.add_steps(steps)
         self.steps = self.journal.steps()
 
     def verify(self, observe: Callable[[int, int], None] = lambda done, total: None) -> tuple[str, ...]:
-        """Void the accepted frames whose files are gone or changed, so that they are taken again; return why, each."""
-        unsound = unsound_files(self.folder, self.journal.accepted_files(), observe)
-        for attempt, reason in unsound.items():
+        """Void accepted frames with missing or changed files, so that they are repeated; return the reasons."""
+        damaged = damaged_files(self.folder, self.journal.accepted_files(), observe)
+        for attempt, reason in damaged.items():
             self.journal.void([attempt], datetime.now(UTC), reason)
-        return tuple(unsound.values())
+        return tuple(damaged.values())
 
-    def asked_again(self, selection: str) -> Retake:
-        """Return what a selection such as "12,40-44" or "bad" would take again; nothing is written.
+    def plan_retake(self, selection: str) -> Retake:
+        """Return the frames that a selection such as "12,40-44" or "bad" would repeat; nothing is written.
 
         Raises
         ------
         InputError
-            It names no light of the session, or "bad" and no report names a frame.
+            If the selection contains no illuminant of the session, or is "bad" and no report names a frame.
         """
         accepted = self.journal.accepted_files()
-        known = range(len(self.illuminations))
+        valid_numbers = range(len(self.illuminations))
         if selection.strip() == BAD:
             refused = newest_report(self.folder, {frame.sha256: frame.attempt for frame in self.frames()})
             if not refused.sha256:
                 raise InputError(
-                    f"--retake bad: {refused.report}, the newest report on {self.folder}, names no frame to be taken "
-                    "again; leave --retake out, or name the lights, as in --retake 12,40-44"
+                    f"--retake bad: {refused.report}, the newest report on {self.folder}, has no frame to repeat; "
+                    "omit --retake, or give numbers of illuminants, as in --retake 12,40-44"
                 )
-            chosen = tuple(frame for frame in accepted if frame.sha256 in refused.sha256)
-            lights = parse_lights(refused.lights, known) if refused.lights else ()
-            return Retake(lights, chosen, f"refused by build-lut, as {refused.report} says")
-        lights = parse_lights(selection, known)
-        asked = lights_text(lights)
-        done = {frame.illumination for frame in accepted}
-        if self.journal.records().get("retake") == asked and not done.issuperset(lights):
-            # It was asked for before, and is not done yet.
-            return Retake(lights, (), "", asked)
-        chosen = tuple(frame for frame in accepted if frame.illumination in lights)
-        return Retake(lights, chosen, f"to be taken again, as asked for with --retake {asked}", asked)
+            retaken = tuple(frame for frame in accepted if frame.sha256 in refused.sha256)
+            lights = parse_lights(refused.lights, valid_numbers) if refused.lights else ()
+            return Retake(lights, retaken, f"refused by build-lut, see {refused.report}")
+        lights = parse_lights(selection, valid_numbers)
+        text = lights_text(lights)
+        accepted_lights = {frame.illumination for frame in accepted}
+        if self.journal.records().get("retake") == text and not accepted_lights.issuperset(lights):
+            # The same request was made before, and is not finished.
+            return Retake(lights, (), "", text)
+        retaken = tuple(frame for frame in accepted if frame.illumination in lights)
+        return Retake(lights, retaken, f"to be repeated, as requested with --retake {text}", text)
 
     def retake(self, selection: str) -> tuple[int, ...]:
-        """Void accepted frames so that they are taken again; return the lights that this is about."""
-        asked = self.asked_again(selection)
-        if asked.text and asked.reason:
-            self.journal.record("retake", asked.text)
-        self.journal.void([frame.attempt for frame in asked.frames], datetime.now(UTC), asked.reason)
-        return asked.lights
+        """Void accepted frames so that they are repeated; return their illuminants."""
+        plan = self.plan_retake(selection)
+        if plan.text and plan.reason:
+            self.journal.record("retake", plan.text)
+        self.journal.void([frame.attempt for frame in plan.frames], datetime.now(UTC), plan.reason)
+        return plan.lights
 
     def done_steps(self) -> set[int]:
-        """Return the numbers of the steps whose frame was taken, accepted, and is still there in full size."""
+        """Return the numbers of the steps with an accepted frame and a file of full size."""
         accepted = self.journal.accepted_files()
         return {frame.step for frame in accepted} - {frame.step for frame in lost_files(self.folder, accepted)}
 
     def frames(self) -> list[FrameRecord]:
-        """Return every frame that was taken and judged, in the order of the plan, refused ones included."""
+        """Return every frame that was taken and judged, also refused ones, in the order of the plan."""
         return self.journal.frames()
 
     def lost_files(self) -> list[AcceptedFile]:
-        """Return the frames that count, one a step, whose files are not there in full size any more."""
+        """Return the current frame of each step with a missing or shorter file."""
         require_frames_folder(self.folder)
         return lost_files(self.folder, self.journal.accepted_files())
 
     def write_frames_csv(self) -> None:
-        """Derive `frames.csv` anew from the journal."""
+        """Write `frames.csv` from the journal."""
         rows = (
             [
                 frame.kind,
@@ -279,7 +280,7 @@ class Session:
         write_atomic(self.folder / "frames.csv", csv_text([FRAME_COLUMNS, *rows]))
 
     def set_aside_strays(self) -> list[Path]:
-        """Clear what a crash left: hidden partial files go, complete files that no row counts are renamed."""
+        """Delete hidden partial files of a crash, and rename complete files without a row in the journal."""
         try:
             return self._set_aside_strays()
         except OSError as error:
@@ -287,48 +288,47 @@ class Session:
 
     def _set_aside_strays(self) -> list[Path]:
         require_frames_folder(self.folder)
-        counted = {frame.file for frame in self.frames()}
-        moved: list[Path] = []
+        recorded = {frame.file for frame in self.frames()}
+        renamed: list[Path] = []
         for path in sorted(self.frames_folder.iterdir()):
             if is_partial(path.name):
                 path.unlink()
-            elif f"frames/{path.name}" not in counted and not path.name.endswith(".stray"):
+            elif f"frames/{path.name}" not in recorded and not path.name.endswith(".stray"):
                 target = path.with_name(path.name + ".stray")
                 number = 1
                 while target.exists():
                     number += 1
                     target = path.with_name(f"{path.name}.{number}.stray")
                 path.rename(target)
-                moved.append(target)
-        return moved
+                renamed.append(target)
+        return renamed
 
 
 def session_exists(folder: Path) -> bool:
-    """Return whether `folder` is a session; refuse when it holds something else."""
+    """Return whether `folder` is a session; refuse a folder with other contents."""
     if _is_file(folder / JOURNAL_FILE) or _is_file(ledger_path(folder)):
         return True
     if _is_file(folder / "session.toml") and (folder / "frames").is_dir():
-        raise FormatError(without_journal(folder))
+        raise FormatError(no_journal_text(folder))
     _require_mounted(folder)
     require_free(folder, "the session")
     return False
 
 
-def _own_copy(load: Callable[[Path], _Loaded], path: Path, what: str) -> _Loaded:
-    """Return what a session's own copy of a file holds that LAB.toml named; one that is lost is had there again."""
+def _own_copy(load: Callable[[Path], _Loaded], path: Path, content: str) -> _Loaded:
     try:
         return load(path)
     except FormatError as error:
         remedy = (
-            f"restore it from a copy of the session, or copy the {what} there with which it was begun, as its "
-            "session.toml names them"
+            f"restore it from a copy of the session, or copy the {content} of the session there; session.toml has "
+            "their path"
         )
         raise FormatError(error.problem, about=error.about, remedy=remedy, value=error.value) from error
 
 
-def busy_sentence(folder: Path) -> str:
-    """Return what is said where another program takes a session."""
-    return f"{folder} is being taken by another program; wait for it, or look with acquire status"
+def busy_message(folder: Path) -> str:
+    """Return the message for a session that another program takes."""
+    return f"another program takes the session {folder}; wait for its end, or follow it with acquire status"
 
 
 def journal_path(folder: Path) -> Path:
@@ -336,37 +336,36 @@ def journal_path(folder: Path) -> Path:
     path = folder / JOURNAL_FILE
     if not _is_file(path):
         if _is_file(ledger_path(folder)) or (_is_file(folder / "session.toml") and (folder / "frames").is_dir()):
-            raise FormatError(without_journal(folder))
+            raise FormatError(no_journal_text(folder))
         _require_mounted(folder)
         raise FormatError(
-            f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import"
+            f"{folder} is not a session: it has no {JOURNAL_FILE}; give a folder made by acquire run or import"
         )
     return path
 
 
 def _require_mounted(folder: Path) -> None:
-    if place := unmounted_folder(folder):
+    if mount_point := unmounted_folder(folder):
         raise StorageError(
-            f"nothing is mounted at {place}, where /etc/fstab has a disk, so that {folder} is not the folder on it",
-            remedy="mount it, or name a folder on another disk",
+            f"no disk is mounted at {mount_point}, where /etc/fstab has one, so {folder} is not the folder on it",
+            remedy="mount the disk, or give a folder on another disk",
         )
-    if os.path.isdir(folder / "frames"):  # noqa: PTH112 - a disk that cannot be asked is told by what comes next
+    if os.path.isdir(folder / "frames"):  # noqa: PTH112 - a fault of the disk is reported later
         raise FormatError(
-            f"{folder} is no session, and has frames/: a part of one, or what was left below the place where a disk is "
-            f"mounted; see that the disk of the session is mounted, or name another folder; keep what is there until "
-            "it is known what it is",
+            f"{folder} is not a session but has frames/: it is part of one, or remained under the mount point of a "
+            "disk; mount the disk of the session, or give another folder; keep these files until you know their origin",
         )
 
 
 def rebuild_journal(folder: Path) -> int:
-    """Make a session's journal anew from its ledger; return how many attempts it holds.
+    """Restore the journal of a session from its ledger; return its number of attempts.
 
-    The journal that is there keeps its bytes under another name.
+    The existing journal is kept under another name.
     """
     ledger = ledger_path(folder)
     rows = read_ledger(ledger)
     if "plan" not in rows:
-        raise FormatError(f"{ledger} holds no plan; restore the session from a copy")
+        raise FormatError(f"{ledger} has no plan; restore the session from a copy")
     try:
         Journal.rebuild(folder / JOURNAL_FILE, rows)
     except OSError as error:

@@ -1,16 +1,15 @@
-"""The journal of a session, `journal.sqlite`: the plan, every attempt at its frames, their verdicts, and events.
+"""The journal of a session, `journal.sqlite`: plan, attempts at frames, verdicts and events.
 
-- It is written before and after each frame; every write is a transaction of its own and on the disk when the call
-  returns, since a committed row is what makes a frame count. Rows are never deleted; an accepted frame can be voided.
-- While a run has it open the journal is in SQLite's write-ahead mode, where that works: readers see the last commit and
-  hold nobody up. When the run ends in order it is one file again. A reader creates, migrates and changes nothing.
-- A session may be a stranger's: what an SQLite file can hold beside rows is refused when the journal is opened
-  (`experiment.session.opening`), so that nothing behind this has to expect it.
-- Files are deleted, replaced and cut, and nobody says so; SQLite does not look twice at pages that it has read. So a
-  run looks whether the journal on the disk is its own, and whole (`_JournalGuard`).
-- Its facts stand a second time in `ledger.jsonl`, from which a journal that was lost is made anew. A line of it is a
-  transaction: the rows that it put or changed, by table, as a JSON object, on the disk before the journal commits the
-  same. Signs of life, and where the session lies, are no facts. What a crash cut off is the last line alone.
+- Every write is a transaction that is on disk when the call returns, because a committed row makes a frame count. Rows
+  are never deleted; an accepted frame can be voided.
+- During a run the journal is in SQLite's write-ahead mode if that works: readers see the last commit and block nobody.
+  After a normal end it is one file again. A reader creates and changes nothing.
+- A session may come from somebody else: `experiment.session.opening` refuses everything except valid rows.
+- Another program may delete, replace or truncate the file, and SQLite does not read pages again. So a run checks that
+  the journal on disk is its own and complete (`_JournalGuard`).
+- All facts are also written to `ledger.jsonl`, from which a lost journal is restored. Each line is a transaction: its
+  rows by table as a JSON object, on disk before the journal commits it. Signs of life and the place of the session are
+  not in it. A crash can truncate only the last line.
 
 Source: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvantages".
 """
@@ -37,7 +36,6 @@ from drivers.presenter import Colour
 from experiment.session.heartbeat import INVENTED_NUMBERS, Heartbeat, Process, RunState, SessionPlace, file_system_of
 from experiment.session.opening import (
     Retry,
-    beside,
     close_after_run,
     connect,
     create_file,
@@ -45,8 +43,9 @@ from experiment.session.opening import (
     open_for_run,
     open_to_read,
     reading_fault,
-    restoring,
+    restore_remedy,
     set_aside,
+    side_file,
     writing_error,
 )
 from experiment.session.records import (
@@ -78,16 +77,16 @@ from foundation.files import (
     write_atomic,
 )
 
-JOURNAL_FILE = "journal.sqlite"  # Name of the journal in a session's folder
+JOURNAL_FILE = "journal.sqlite"  # Name of the journal in the folder of a session
 
-# How long a write waits for another program's unless the caller says otherwise: as long as a run waits for a device
-# by default (`sequence.patience_s`).
+# Seconds that a write waits for another program by default: as long as a run waits for a device
+# (`sequence.patience_s`).
 PATIENCE_S = 600.0
 
 
 @dataclass(frozen=True)
 class ReceivedFile:
-    """A raw file that is complete on the disk, not yet counted."""
+    """A raw file that is complete on disk, and not counted yet."""
 
     path: Path
     size: int
@@ -96,16 +95,16 @@ class ReceivedFile:
 
 
 class _Abandoned(Exception):
-    """Ends a file that is not wanted."""
+    """Signals that an incoming file is discarded."""
 
 
 class IncomingFile:
-    """A raw file in the making under a hidden name; gone at the end of a `with` block unless it was completed."""
+    """A raw file that is being written under a hidden name; deleted at the end of a `with` block unless completed."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._final = path
-        # A folder that is gone means a disk that was unmounted: what lies under its name is another one.
+        # A missing folder means that the disk was unmounted: the path below it is another disk.
         self._file = atomic_file(path, lambda: self._final, make_parents=False)
         self._open = True
         self.stream: BinaryIO = self._file.__enter__()
@@ -120,12 +119,13 @@ class IncomingFile:
             self._leave(kind, error, trace)
 
     def complete(self, captured: CapturedFrame) -> ReceivedFile:
-        """Check the size, hash, flush and rename the file; from any thread."""
+        """Check the size, then hash, flush and rename the file; callable from any thread."""
         try:
             size = self.stream.seek(0, 2)
             if size != captured.size or size == 0:
                 raise DeviceError(
-                    f"{captured.name}: the camera says {captured.size} bytes, {size} arrived; the frame is taken again"
+                    f"{captured.name}: {size} bytes arrived, {captured.size} expected by the camera; the frame is "
+                    "repeated"
                 )
             self.stream.seek(0)
             sha256 = stream_sha256(self.stream)
@@ -137,7 +137,7 @@ class IncomingFile:
         return ReceivedFile(self._final, size, sha256, captured)
 
     def abandon(self) -> None:
-        """Remove the file unless it was completed; a second call does nothing."""
+        """Delete the file unless it is complete; a second call does nothing."""
         self._leave(_Abandoned, _Abandoned(), None)
 
     def _leave(self, kind: Any, error: Any, trace: Any) -> None:
@@ -147,9 +147,9 @@ class IncomingFile:
 
 
 class Journal:
-    """An open journal; close it after use. Used from one thread.
+    """An open journal, for one thread; close it after use.
 
-    `retry`: with which other programs are waited for; None for a reader, for whom SQLite waits.
+    `retry`: repeats operations while other programs hold the file; None for a reader, for whom SQLite waits.
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection, retry: Retry | None = None) -> None:
@@ -163,14 +163,14 @@ class Journal:
 
     @staticmethod
     def create(path: Path, steps: Sequence[SessionStep]) -> None:
-        """Write a new journal with the plan and nothing else."""
-        alone = _LockRetry(path, 0, lambda sentence: None)
-        with closing(Journal(path, create_file(path), alone)) as journal:
+        """Write a new journal that contains only the plan."""
+        no_retry = _LockRetry(path, 0, lambda sentence: None)
+        with closing(Journal(path, create_file(path), no_retry)) as journal:
             journal.add_steps(steps)
 
     @classmethod
     def open(cls, path: Path) -> Journal:
-        """Open a journal to read it, also while a run writes it; nothing is created or changed."""
+        """Open a journal for reading, also during a run; nothing is created or changed."""
         return cls(path, open_to_read(path))
 
     @classmethod
@@ -180,18 +180,18 @@ class Journal:
         patience_s: float = PATIENCE_S,
         announce: Callable[[str], object] = lambda sentence: None,
     ) -> Journal:
-        """Open a journal to write it."""
+        """Open a journal for writing."""
         retry = _LockRetry(path, patience_s, announce)
         return cls(path, open_for_run(path, retry), retry)
 
     @staticmethod
     def rebuild(path: Path, rows: Rows) -> None:
-        """Write a journal anew that holds these facts; what stands in its place keeps its bytes under another name."""
+        """Write a journal with these facts; the existing file is kept under another name."""
         copy = partial_path(path)
         copy.unlink(missing_ok=True)
         with closing(create_file(copy)) as connection, connection:
             connection.execute("BEGIN")
-            for table, row in ((table, row) for table, of_table in rows.items() for row in of_table.values()):
+            for table, row in ((table, row) for table, table_rows in rows.items() for row in table_rows.values()):
                 marks = ", ".join("?" * len(row))
                 connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
         Journal.open(copy).close()
@@ -199,8 +199,8 @@ class Journal:
         copy.replace(path)
         sync_folder(path.parent)
 
-    def keep_twice(self, ledger: Path) -> None:
-        """Keep all facts in a second place, too, and watch that the journal stays the one that is open."""
+    def attach_ledger(self, ledger: Path) -> None:
+        """Write all facts to a ledger, too, and check from now on that the journal on disk is the open one."""
         try:
             rows = self._retry.run(lambda: rows_of(self._connection))
         except sqlite3.DatabaseError as error:
@@ -209,7 +209,7 @@ class Journal:
         self._guard = _JournalGuard(self.path, self._ledger)
 
     def require_whole(self) -> None:
-        """Raise where the journal on the disk is not the one that is open, or does not hold what was written."""
+        """Raise `LostJournalError` if the journal on disk is not the open one, or is incomplete."""
         if self._guard is not None:
             self._guard.require_same()
             self._guard.require_whole()
@@ -224,24 +224,24 @@ class Journal:
             self._connection.close()
 
     def retry_locked(self, patience_s: float, announce: Callable[[str], object]) -> None:
-        """Change how long a write waits for other programs, and who is told that it does; see `open_for_run`."""
+        """Change the waiting time of writes for other programs, and the receiver of its message."""
         self._retry = _LockRetry(self.path, patience_s, announce)
 
     @contextmanager
-    def one_moment(self) -> Generator[None]:
-        """Let all that is read inside be of one moment: a verdict is never seen without its checks."""
+    def snapshot(self) -> Generator[None]:
+        """Read everything inside from one state, so that no verdict is without its checks."""
         self._rows("BEGIN")
         yield
         self._rows("ROLLBACK")
 
     def steps(self) -> tuple[SessionStep, ...]:
-        """Return the plan, in taking order."""
+        """Return the plan, in the order of taking."""
         rows = self._rows("SELECT step, kind, illumination, red, green, blue FROM plan ORDER BY step")
         self._require_known_kinds(row[1] for row in rows)
         return tuple([_step(*row) for row in rows])
 
     def add_steps(self, steps: Sequence[SessionStep]) -> None:
-        """Put steps at the end of the plan; their numbers must be free."""
+        """Append steps to the plan; their numbers must be free."""
         with self._writing() as change:
             for step in steps:
                 red, green, blue = step.colour
@@ -249,7 +249,7 @@ class Journal:
                 change.put("plan", row | {"red": red, "green": green, "blue": blue})
 
     def begin(self, step: SessionStep, file: str, at: datetime) -> int:
-        """Note that an attempt at `step` begins, to be saved as `file`; return the attempt's id."""
+        """Record the start of an attempt at `step`, to be saved as `file`; return the id of the attempt."""
         row = {"step": step.number, "kind": step.kind, "illumination": step.illumination}
         with self._writing() as change:
             return change.put_numbered("attempts", row | {"file": file, "started_at": time_text(at)})
@@ -264,9 +264,9 @@ class Journal:
         exposure_s: float,
         ended_at: datetime,
     ) -> None:
-        """Note that an attempt's raw file is complete and how it was judged; only now does the frame count.
+        """Record the complete raw file and the judgement of an attempt; only now the frame counts.
 
-        `exposure_s`: the exposure asked for, seconds.
+        `timings`: seconds of each stage by name. `exposure_s`: requested exposure, seconds.
         """
         file = received.path.relative_to(self.path.parent).as_posix()
         verdict = ACCEPTED if judgement.accepted else REFUSED
@@ -284,12 +284,12 @@ class Journal:
                 change.put("timings", {"attempt": attempt, "name": name, "seconds": seconds})
 
     def fail(self, attempt: int, at: datetime, reason: str) -> None:
-        """Note that an attempt gave no frame."""
+        """Record that an attempt gave no frame."""
         with self._writing() as change:
             change.set_attempt(attempt, {"ended_at": time_text(at), "verdict": FAILED, "reason": reason})
 
     def void(self, attempts: Iterable[int], at: datetime, reason: str) -> None:
-        """Note that frames that were accepted must not be used after all; their rows and files stay."""
+        """Record that accepted frames must not be used; their rows and files remain."""
         accepted = {frame.attempt for frame in self.accepted_files()} & set(attempts)
         if not accepted:
             return
@@ -299,55 +299,55 @@ class Journal:
             detail = f"{counted(len(accepted), 'frame')}: {reason}"
             change.put_numbered("events", {"at": time_text(at), "what": VOIDED, "detail": detail})
 
-    def note(self, at: datetime, what: str, detail: str = "") -> None:
-        """Note an event."""
+    def note(self, at: datetime, event: str, detail: str = "") -> None:
+        """Record an event."""
         with self._writing() as change:
-            change.put_numbered("events", {"at": time_text(at), "what": what, "detail": detail})
+            change.put_numbered("events", {"at": time_text(at), "what": event, "detail": detail})
 
     def beat(self, state: RunState, sentence: str, until: datetime) -> None:
-        """Give a sign of life, in place of the one before."""
+        """Record a sign of life, which replaces the previous one."""
         with self._writing():
             _put_beat(self._connection, self.path, state, sentence, until)
         self._gives_signs = state != "ended"
 
     def record(self, key: str, text: str) -> None:
-        """Note what a session is taken with, such as a device's identity, in place of what stood under `key`."""
+        """Record a fact of the session, such as the identity of a device; replaces the text of `key`."""
         with self._writing() as change:
             change.put("records", {"key": key, "text": text})
 
     def records(self) -> dict[str, str]:
-        """Return what the session was taken with, by key."""
+        """Return the facts of the session, by key."""
         return dict(self._rows(f"SELECT key, text FROM records WHERE key <> '{PLACE}' ORDER BY key"))
 
     def heartbeat(self) -> Heartbeat | None:
-        """Return the newest sign of life; None if none was ever given."""
+        """Return the newest sign of life, if there is any."""
         rows = self._rows("SELECT at, pid, started, host, boot, state, sentence, until FROM heartbeat")
         if not rows:
             return None
         at, *process, state, sentence, until = rows[0]
-        said = self._rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
-        place = SessionPlace.from_text(said[0][0]) if said else None
-        begun, due = datetime.fromisoformat(at), datetime.fromisoformat(until)
-        return Heartbeat(begun, Process(*process), state, sentence, due, place)
+        place_rows = self._rows(f"SELECT text FROM records WHERE key = '{PLACE}'")
+        session_place = SessionPlace.from_text(place_rows[0][0]) if place_rows else None
+        at_time, until_time = datetime.fromisoformat(at), datetime.fromisoformat(until)
+        return Heartbeat(at_time, Process(*process), state, sentence, until_time, session_place)
 
     def run_state(self) -> RunState | None:
-        """Return what the newest sign of life says that the run does; None if none was ever given."""
+        """Return the state in the newest sign of life, if there is any."""
         rows = self._rows("SELECT state FROM heartbeat")
         return rows[0][0] if rows else None
 
     def attempts(self, numbers: Sequence[int] | None = None) -> list[Attempt]:
-        """Return attempts, those of these numbers or all, oldest first."""
-        among, values = _among("id", numbers)
+        """Return the attempts with these numbers, or all, oldest first."""
+        condition, values = _condition_of("id", numbers)
         rows = self._rows(
             "SELECT id, step, kind, illumination, file, started_at, ended_at, taken_at, verdict, reason"
-            f" FROM attempts WHERE {among} ORDER BY id",
+            f" FROM attempts WHERE {condition} ORDER BY id",
             values,
         )
         self._require_known_kinds(row[2] for row in rows)
         return [_attempt(*row) for row in rows]
 
     def verdicts(self) -> list[tuple[int, datetime, str | None]]:
-        """Return of every attempt, oldest first, number, start and verdict: what a whole night is looked through by."""
+        """Return number, start and verdict of every attempt, oldest first, for scanning a whole session."""
         rows = self._rows("SELECT id, started_at, verdict, kind FROM attempts ORDER BY id")
         self._require_known_kinds(row[3] for row in rows)
         return [(number, datetime.fromisoformat(at), verdict) for number, at, verdict, _ in rows]
@@ -358,36 +358,36 @@ class Journal:
         return [SessionEvent(datetime.fromisoformat(at), *event) for at, *event in rows]
 
     def details(self, attempts: Sequence[int] | None = None) -> dict[int, AttemptDetails]:
-        """Return what is kept of attempts, those of these numbers or all, by number, oldest first; see `begin`.
+        """Return the details of the attempts with these numbers, or of all, by number, oldest first.
 
-        Attempts of which nothing is kept are left out.
+        Attempts without details are omitted.
         """
-        among, numbers = _among("attempt", attempts)
-        seen: dict[int, tuple[float, float, float]] = {
+        condition, numbers = _condition_of("attempt", attempts)
+        paper_rgb: dict[int, tuple[float, float, float]] = {
             attempt: (red, green, blue)
             for attempt, red, green, blue in self._rows(
-                f"SELECT attempt, red, green, blue FROM measurements WHERE red IS NOT NULL AND {among}", numbers
+                f"SELECT attempt, red, green, blue FROM measurements WHERE red IS NOT NULL AND {condition}", numbers
             )
         }
         checks: dict[int, list[Check]] = {}
         for attempt, *check in self._rows(
             "SELECT attempt, name, value, low, high, unit, reason FROM checks"
-            f" WHERE {among} ORDER BY attempt, position",
+            f" WHERE {condition} ORDER BY attempt, position",
             numbers,
         ):
             checks.setdefault(attempt, []).append(Check(*check))
         timings: dict[int, dict[str, float]] = {}
         for attempt, name, seconds in self._rows(
-            f"SELECT attempt, name, seconds FROM timings WHERE {among} ORDER BY rowid", numbers
+            f"SELECT attempt, name, seconds FROM timings WHERE {condition} ORDER BY rowid", numbers
         ):
             timings.setdefault(attempt, {})[name] = seconds
         return {
-            number: AttemptDetails(seen.get(number), tuple(checks.get(number, ())), timings.get(number, {}))
-            for number in sorted(seen.keys() | checks.keys() | timings.keys())
+            number: AttemptDetails(paper_rgb.get(number), tuple(checks.get(number, ())), timings.get(number, {}))
+            for number in sorted(paper_rgb.keys() | checks.keys() | timings.keys())
         }
 
     def measurements(self) -> Iterator[tuple[SessionStep, int, bytes, bool]]:
-        """Return what the judge keeps of each frame, in taking order: step, attempt, bytes, and whether it counts."""
+        """Yield the data of the judge for each frame, in order: step, attempt, bytes, whether the frame counts."""
         plan = {step.number: step for step in self.steps()}
         for attempt, step, data, verdict in self._rows(
             "SELECT id, step, data, verdict FROM attempts JOIN measurements ON attempt = id ORDER BY id"
@@ -396,30 +396,30 @@ class Journal:
                 yield plan[step], attempt, data, verdict == ACCEPTED
 
     def accepted_files(self) -> list[AcceptedFile]:
-        """Return every frame that was accepted, oldest first."""
+        """Return every accepted frame, oldest first."""
         rows = self._rows(
             "SELECT id, step, illumination, file, size, sha256 FROM attempts WHERE verdict=? ORDER BY id", (ACCEPTED,)
         )
         return [_accepted_file(*row) for row in rows]
 
-    def lacking(self, frames: Frames) -> Frames:
-        """Return the frames among these that are not here, or have another verdict."""
-        return _lacking_frames(
+    def missing_frames(self, frames: Frames) -> Frames:
+        """Return the given frames that are missing here or have another verdict."""
+        return _missing_frames(
             frames, {*self._rows("SELECT id, sha256, verdict FROM attempts WHERE sha256 IS NOT NULL")}
         )
 
     def unused_bytes(self, after: int) -> int:
-        """Return how many bytes the raw files of refused and voided attempts with numbers above `after` take."""
+        """Return the size of the raw files of refused and voided attempts with numbers above `after`."""
         query = "SELECT COALESCE(SUM(size), 0) FROM attempts WHERE id > ? AND verdict IN (?, ?)"
         return int(self._rows(query, (after, REFUSED, VOIDED))[0][0])
 
     def kept_files(self, step: SessionStep) -> int:
-        """Return how many raw files, accepted or refused, `step` has already."""
+        """Return the number of raw files of `step`, accepted or refused."""
         query = "SELECT COUNT(*) FROM attempts WHERE step=? AND sha256 IS NOT NULL"
         return int(self._rows(query, (step.number,))[0][0])
 
     def frames(self) -> list[FrameRecord]:
-        """Return every frame that was taken and judged, in the order of the plan, refused ones included."""
+        """Return every frame that was taken and judged, also refused ones, in the order of the plan."""
         rows = self._rows(
             "SELECT step, kind, illumination, file, sha256, taken_at, exposure_s, verdict, reason, id FROM attempts"
             " WHERE sha256 IS NOT NULL ORDER BY step, id"
@@ -442,12 +442,12 @@ class Journal:
     def _require_known_kinds(self, kinds: Iterable[str]) -> None:
         if unknown := sorted({*kinds} - {*KINDS}):
             raise FormatError(
-                f"{self.path} holds a frame of the kind {unknown[0]!r}, this software knows {', '.join(KINDS)}; use "
-                "the software that took the session"
+                f"{self.path} has a frame of kind {unknown[0]!r}, this software reads the kinds {', '.join(KINDS)}; "
+                "use the software that took the session"
             )
 
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        """Return all rows at once, so that nothing is held once they are read."""
+        # All rows at once, so that no lock remains.
         try:
             return self._retry.run(lambda: self._connection.execute(query, values).fetchall())
         except sqlite3.DatabaseError as error:
@@ -455,10 +455,7 @@ class Journal:
 
     @contextmanager
     def _writing(self) -> Generator[_Change]:
-        """Make what is written inside one transaction, which is on the disk when the block ends.
-
-        What is lost with the journal stands in the ledger all the same.
-        """
+        """Write everything inside in one transaction, which is on disk at the end of the block."""
         try:
             self._retry.run(lambda: self._connection.execute("BEGIN IMMEDIATE"))
             change = _Change(self._connection)
@@ -466,18 +463,19 @@ class Journal:
             if self._ledger is not None and change.rows:
                 self._append(self._ledger, change.rows)
             if self._gives_signs and change.rows:
-                # A frame is a sign of life, too: a run that is killed was there when its last one was written.
+                # A frame is a sign of life, too: a run that is killed was alive at its last frame.
                 self._connection.execute("UPDATE heartbeat SET at = ?", (time_text(datetime.now(UTC)),))
             if self._guard is not None:
                 self._guard.require_same()
             self._retry.run(lambda: self._connection.execute("COMMIT"))
             if self._guard is not None:
-                self._guard.wrote()
+                self._guard.remember()
             if self._ledger is not None:
-                self._ledger.keep()
+                self._ledger.confirm()
         except LostJournalError:
+            # The ledger keeps a transaction that is lost with the journal.
             if self._ledger is not None:
-                self._ledger.keep()
+                self._ledger.confirm()
             raise
         except sqlite3.DatabaseError as error:
             raise writing_error(self.path, error) from error
@@ -487,19 +485,19 @@ class Journal:
                     self._connection.execute("ROLLBACK")
 
     def _append(self, ledger: _Ledger, rows: Mapping[str, Sequence[Row]]) -> None:
-        if not ledger.is_there():
-            # Of the file that is open: that on the disk may be gone as well.
+        if not ledger.is_intact():
+            # From the open file, because the journal on disk may be missing, too.
             ledger.restore(rows_of(self._connection))
         ledger.append(rows)
 
 
 def open_journal(folder: Path) -> Journal:
-    """Open a session's journal to read it; refuse one that lacks what the ledger has, an older one for instance."""
-    # A run writes the ledger first: read in this order, the journal is behind by one transaction at most.
+    """Open the journal of a session for reading; refuse one that lacks frames of the ledger."""
+    # A run writes the ledger first: in this order, the journal misses one transaction at most.
     settled = settled_frames(ledger_path(folder))
     journal = Journal.open(folder / JOURNAL_FILE)
     try:
-        _require_none_lacking(ledger_path(folder), journal.lacking(settled))
+        _require_no_missing_frames(ledger_path(folder), journal.missing_frames(settled))
     except BaseException:
         journal.close()
         raise
@@ -507,9 +505,9 @@ def open_journal(folder: Path) -> Journal:
 
 
 def lost_files(folder: Path, accepted: Sequence[AcceptedFile]) -> list[AcceptedFile]:
-    """Return, of the accepted frames that count, one a step, those whose files are not there in full size."""
+    """Return the current frame of each step with a missing or shorter file."""
     newest = {frame.step: frame for frame in accepted}
-    # As text: a path object for each of 800 frames takes twice as long as the look.
+    # As text: creating 800 path objects takes twice as long as the check.
     return [frame for frame in newest.values() if not _has_size(f"{folder}/{frame.file}", frame.size)]
 
 
@@ -520,14 +518,14 @@ def _has_size(path: str, size: int) -> bool:
         return False
 
 
-def without_journal(folder: Path) -> str:
-    """Return what is said, and what helps, where a session's journal is gone."""
+def no_journal_text(folder: Path) -> str:
+    """Return the message with remedy for a session without journal."""
     path = folder / JOURNAL_FILE
-    return f"{folder} holds the frames of a session, and its journal {path.name} is gone; {restoring(path)}"
+    return f"{folder} has the frames of a session, but its journal {path.name} is missing; {restore_remedy(path)}"
 
 
-def beat_beside(path: Path, state: RunState, sentence: str, until: datetime) -> None:
-    """Give a sign of life from another thread than the one that has the journal open; none where that fails."""
+def thread_beat(path: Path, state: RunState, sentence: str, until: datetime) -> None:
+    """Write a sign of life from another thread than the one with the open journal; failures are ignored."""
     with suppress(sqlite3.Error), closing(connect(path, "rw")) as connection:
         connection.execute("BEGIN IMMEDIATE")
         _put_beat(connection, path, state, sentence, until)
@@ -535,9 +533,9 @@ def beat_beside(path: Path, state: RunState, sentence: str, until: datetime) -> 
 
 
 def _put_beat(connection: sqlite3.Connection, path: Path, state: RunState, sentence: str, until: datetime) -> None:
-    own, at, place = Process.own(), datetime.now(UTC), SessionPlace.of(path)
-    if place is not None:
-        connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, place.to_text()))
+    own, at, session_place = Process.own(), datetime.now(UTC), SessionPlace.of(path)
+    if session_place is not None:
+        connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (PLACE, session_place.to_text()))
     connection.execute(
         "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
         (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
@@ -545,27 +543,27 @@ def _put_beat(connection: sqlite3.Connection, path: Path, state: RunState, sente
 
 
 class _Change:
-    """A transaction: what is put into it is written, and remembered for the ledger."""
+    """A transaction; its rows are written to the journal and collected for the ledger."""
 
     def __init__(self, connection: sqlite3.Connection) -> None:
         self._connection = connection
         self.rows: dict[str, list[Row]] = {}
 
     def put(self, table: str, row: Row) -> int:
-        """Write a row, in place of one of the same key among the records; return its number."""
+        """Write a row, or replace one with the same key in `records`; return its number."""
         verb = "INSERT OR REPLACE" if table == "records" else "INSERT"
         marks = ", ".join("?" * len(row))
         cursor = self._connection.execute(
             f"{verb} INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values())
         )
-        # SQLite keeps what is no number as NULL.
-        plain = {name: None if isinstance(value, float) and value != value else value for name, value in row.items()}
-        self.rows.setdefault(table, []).append(plain)
+        # SQLite stores NaN as NULL.
+        stored = {name: None if isinstance(value, float) and value != value else value for name, value in row.items()}
+        self.rows.setdefault(table, []).append(stored)
         assert cursor.lastrowid is not None
         return cursor.lastrowid
 
     def put_numbered(self, table: str, row: Row) -> int:
-        """Write a row of a table that numbers its rows; return the number."""
+        """Write a row of a table with numbered rows; return the number."""
         number = self.put(table, row)
         self.rows[table][-1] = {"id": number, **row}
         return number
@@ -578,18 +576,18 @@ class _Change:
 
 
 def time_text(at: datetime) -> str:
-    """Return a time as journal and `frames.csv` have it: ISO 8601 with microseconds and zone."""
+    """Return a time as in the journal and `frames.csv`: ISO 8601 with microseconds and zone."""
     return at.isoformat(timespec="microseconds")
 
 
-# Rows of each kind that are kept as values: whoever watches a session reads its 800 frames again after each.
+# Cached rows of each kind: a reader that follows a session reads its 800 frames again after each frame.
 _ROWS_KEPT: Final = 8192
 
 _accepted_file: Final = lru_cache(_ROWS_KEPT)(AcceptedFile)
 
 
-def _among(column: str, numbers: Sequence[int] | None) -> tuple[str, tuple[str, ...]]:
-    """Return the condition that a column is one of some numbers, however many there are, and its value; None: any."""
+def _condition_of(column: str, numbers: Sequence[int] | None) -> tuple[str, tuple[str, ...]]:
+    # SQL condition that a column is one of the numbers, and its value.
     if numbers is None:
         return "TRUE", ()
     return f"{column} IN (SELECT value FROM json_each(?))", (json.dumps(list(numbers)),)
@@ -621,83 +619,82 @@ def _time(text: str | None) -> datetime | None:
 
 
 def _verdict_text(verdict: str, reason: str) -> str:
-    """Return a verdict as readers of frames know it: accepted, or refused with the reason."""
     if verdict == ACCEPTED:
         return ACCEPTED
     return f"{REFUSED}: {reason}" if reason else REFUSED
 
 
 @dataclass(frozen=True)
-class _Look:
-    """A file as it is now: its numbers, its size, and when it was written last, ns."""
+class _FileState:
+    """State of a file."""
 
-    numbers: tuple[int, int]
+    numbers: tuple[int, int]  # device and inode
     size: int
-    written: int
+    written: int  # time of the last write, ns
 
 
 class _JournalGuard:
-    """Watches the journal that a run has open; `ledger` holds the same facts."""
+    """Checks the journal that a run has open; `ledger` has the same facts."""
 
     def __init__(self, path: Path, ledger: _Ledger) -> None:
         self._path, self._ledger = path, ledger
-        self._files = (path, beside(path, "-wal"))
-        self._folders = {folder: self._look(folder) for folder in (path.parent, path.parent / "frames")}
+        self._files = (path, side_file(path, "-wal"))
+        self._folders = {folder: self._file_state(folder) for folder in (path.parent, path.parent / "frames")}
         self._trusts_numbers = not file_system_of(path).startswith(INVENTED_NUMBERS)
-        self._known: dict[Path, _Look] = {}
-        self.wrote()
+        self._states: dict[Path, _FileState] = {}
+        self.remember()
 
-    def wrote(self) -> None:
-        """Note that the run itself has written the journal."""
-        self._known = {file: look for file in self._files if (look := self._look(file)) is not None}
+    def remember(self) -> None:
+        """Remember the state of the journal after a write of the run itself."""
+        self._states = {file: state for file in self._files if (state := self._file_state(file)) is not None}
 
     def require_same(self) -> None:
-        """Raise `LostJournalError` where the journal is not as the run left it."""
-        for folder, before in self._folders.items():
-            now = self._look(folder)
-            if now is None or before is None or (self._trusts_numbers and now.numbers != before.numbers):
-                raise StorageError(f"{folder} is gone, or another one", remedy="see that its disk is mounted")
+        """Raise `LostJournalError` if the journal changed since the last write of the run."""
+        for folder, previous in self._folders.items():
+            current = self._file_state(folder)
+            if current is None or previous is None or (self._trusts_numbers and current.numbers != previous.numbers):
+                raise StorageError(f"{folder} is missing or was replaced", remedy="check that its disk is mounted")
         is_written = False
-        for file, before in self._known.items():
-            now = self._look(file)
-            if now is None:
-                self._lost(file, "was deleted")
-            elif self._trusts_numbers and now.numbers != before.numbers:
-                self._lost(file, "was replaced by another file")
-            elif now.size < before.size:
-                self._lost(file, f"was cut from {before.size} to {now.size} bytes")
-            is_written |= now != before
+        for file, previous in self._states.items():
+            current = self._file_state(file)
+            if current is None:
+                self._raise_lost(file, "was deleted")
+            elif self._trusts_numbers and current.numbers != previous.numbers:
+                self._raise_lost(file, "was replaced by another file")
+            elif current.size < previous.size:
+                self._raise_lost(file, f"was truncated from {previous.size} to {current.size} bytes")
+            is_written |= current != previous
         if is_written:
             self.require_whole()
-            self.wrote()
+            self.remember()
 
     def require_whole(self) -> None:
-        """Raise `LostJournalError` where the journal, as everybody else reads it, does not hold what the run wrote."""
+        """Raise `LostJournalError` if other readers of the journal do not see the rows of the run."""
         try:
             with closing(connect(self._path, "ro")) as connection:
-                sound = connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
-                same = sound and rows_of(connection) == self._ledger.rows()
+                is_sound = connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
+                is_same = is_sound and rows_of(connection) == self._ledger.rows()
         except sqlite3.DatabaseError as error:
             fault = reading_fault(self._path, error)
             if isinstance(fault, StorageError):
                 raise fault from error
-            same = False
-        if not same:
-            self._lost(self._path, "was written to by another program, and does not hold what the run wrote")
+            is_same = False
+        if not is_same:
+            self._raise_lost(self._path, "was written by another program and does not have the rows of the run")
 
-    def _look(self, path: Path) -> _Look | None:
+    def _file_state(self, path: Path) -> _FileState | None:
         try:
-            found = path.stat()
+            stat = path.stat()
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
             raise storage_error(path, error, "look at") from error
-        return _Look((found.st_dev, found.st_ino), found.st_size, found.st_mtime_ns)
+        return _FileState((stat.st_dev, stat.st_ino), stat.st_size, stat.st_mtime_ns)
 
-    def _lost(self, file: Path, how: str) -> None:
+    def _raise_lost(self, file: Path, change: str) -> None:
         raise LostJournalError(
-            f"{file} {how} while the run had it open; every frame and verdict stands in ledger.jsonl, too",
-            remedy=f"acquire rebuild {self._path.parent} makes the journal anew; then run the same command again",
+            f"{file} {change} during the run; ledger.jsonl still has all frames and verdicts",
+            remedy=f"restore the journal with acquire rebuild {self._path.parent}, then run the same command again",
         )
 
 
@@ -705,7 +702,7 @@ _T = TypeVar("_T")
 
 
 class LostJournalError(StorageError):
-    """The journal that a run has open is not the one on the disk any more: waiting does not bring it back."""
+    """The journal on disk is not the one that the run has open; waiting does not help."""
 
 
 class _LockRetry:
@@ -717,27 +714,28 @@ class _LockRetry:
         self._announce = announce
 
     def run(self, attempt: Callable[[], _T]) -> _T:
-        """Return what `attempt` returns, after trying it again while another program holds the journal."""
-        begun, announced = time.monotonic(), False
+        """Return the result of `attempt`, repeated while another program holds the journal."""
+        started, announced = time.monotonic(), False
         while True:
             try:
                 return attempt()
             except sqlite3.OperationalError as error:
-                if not is_busy(error) or time.monotonic() - begun >= self._seconds:
+                if not is_busy(error) or time.monotonic() - started >= self._seconds:
                     raise
                 if not announced:
-                    self._announce(f"another program holds {self._path}; the run goes on when it has finished")
+                    self._announce(f"another program holds {self._path}; the run continues when it is free")
                     announced = True
 
 
-LEDGER_FILE: Final = "ledger.jsonl"  # Its name in a session's folder
+LEDGER_FILE: Final = "ledger.jsonl"  # Name of the ledger in the folder of a session
 
-# Of a ledger that is read: twenty times what 707 lights have, so that a stranger's fills no memory.
+# Largest ledger that is read, in bytes: twenty times the size for 707 illuminants, to limit the memory for a foreign
+# file.
 _MOST_LEDGER_BYTES: Final = 1 << 30
 
-PLACE: Final = "place"  # Key of the record that says for which folder signs of life are given
+PLACE: Final = "place"  # Key of the record with the place of the session for which signs of life are given
 
-# What tells the rows of a table apart.
+# Key columns of each table.
 _ROW_KEYS: Final = {
     "plan": ("step",),
     "attempts": ("id",),
@@ -748,20 +746,20 @@ _ROW_KEYS: Final = {
     "records": ("key",),
 }
 
-# Columns of an attempt that are not known when it begins, as the journal has them then.
-_BEGUN: Final = dict.fromkeys(("ended_at", "taken_at", "exposure_s", "size", "sha256", "verdict")) | {"reason": ""}
+# Columns of an attempt that are unknown at its start, with their values.
+_START: Final = dict.fromkeys(("ended_at", "taken_at", "exposure_s", "size", "sha256", "verdict")) | {"reason": ""}
 
 Row = dict[str, Any]
 Rows = dict[str, dict[tuple[Any, ...], Row]]  # Rows by table and key, columns by name
 
 
 def ledger_path(folder: Path) -> Path:
-    """Return the path of a session's ledger."""
+    """Return the path of the ledger of a session."""
     return folder / LEDGER_FILE
 
 
 def rows_of(connection: sqlite3.Connection) -> Rows:
-    """Return the facts that a journal of this version holds."""
+    """Return the facts in a journal of this version."""
     rows: Rows = {}
     for table in _ROW_KEYS:
         cursor = connection.execute(f"SELECT * FROM {table} ORDER BY rowid")
@@ -769,16 +767,15 @@ def rows_of(connection: sqlite3.Connection) -> Rows:
         for values in cursor.fetchall():
             _put_row(rows, table, dict(zip(names, values, strict=True)))
     rows.get("records", {}).pop((PLACE,), None)
-    return {table: of_table for table, of_table in rows.items() if of_table}
+    return {table: table_rows for table, table_rows in rows.items() if table_rows}
 
 
 def read_ledger(path: Path) -> Rows:
-    """Return the facts that a ledger holds."""
-    return _gathered(_read_transactions(path))
+    """Return the facts in a ledger."""
+    return _merge_transactions(_read_transactions(path))
 
 
 def _read_transactions(path: Path, size: int = _MOST_LEDGER_BYTES + 1) -> list[Mapping[str, Sequence[Row]]]:
-    """Return the transactions in the first `size` bytes of a ledger."""
     try:
         with open_inside(path.parent, path.name) as stream:
             content = stream.read(size)
@@ -789,7 +786,7 @@ def _read_transactions(path: Path, size: int = _MOST_LEDGER_BYTES + 1) -> list[M
     return list(_transactions(path, content.split(b"\n")))
 
 
-def _gathered(transactions: Sequence[Mapping[str, Sequence[Row]]]) -> Rows:
+def _merge_transactions(transactions: Sequence[Mapping[str, Sequence[Row]]]) -> Rows:
     rows: Rows = {}
     for transaction in transactions:
         for table, changes in transaction.items():
@@ -799,7 +796,7 @@ def _gathered(transactions: Sequence[Mapping[str, Sequence[Row]]]) -> Rows:
 
 
 def _transactions(path: Path, lines: Sequence[bytes]) -> Iterator[Mapping[str, Sequence[Row]]]:
-    """Yield what each line says; what stands behind the last line break was cut off."""
+    """Yield the transaction of each line. Text after the last line break is incomplete and ignored."""
     for number, line in enumerate(lines[:-1], 1):
         try:
             yield {table: [_checked_row(table, row) for row in rows] for table, rows in json.loads(line).items()}
@@ -810,72 +807,66 @@ def _transactions(path: Path, lines: Sequence[bytes]) -> Iterator[Mapping[str, S
 
 
 def _checked_row(table: str, row: Row) -> Row:
-    """Return a row as the journal has it; the names in it become part of statements."""
+    # Names are checked because they become part of SQL statements.
     if any(key not in row for key in _ROW_KEYS[table]) or not all(name.isidentifier() for name in row):
         raise ValueError(f"a row of {table} without its key")
     if not all(value is None or isinstance(value, str | int | float) for value in row.values()):
-        raise ValueError(f"a row of {table} with what is no number and no text")
+        raise ValueError(f"a row of {table} with a value that is neither number nor text")
     if not is_inside_name(row.get("file", "frames")):
-        raise ValueError(f"the file {row['file']!r}, which is none of the session")
+        raise ValueError(f"the file {row['file']!r}, which is outside the session")
     return row if "data" not in row else {**row, "data": base64.b64decode(row["data"], validate=True)}
 
 
 def _put_row(rows: Rows, table: str, row: Row) -> None:
     key = tuple(row[name] for name in _ROW_KEYS[table])
-    rows.setdefault(table, {}).setdefault(key, dict(_BEGUN) if table == "attempts" else {}).update(row)
+    rows.setdefault(table, {}).setdefault(key, dict(_START) if table == "attempts" else {}).update(row)
 
 
 def _ledger_line(rows: Mapping[str, Sequence[Row]]) -> bytes:
 
-    def plain(value: object) -> str:
+    def encoded(value: object) -> str:
         return base64.b64encode(cast("bytes", value)).decode()
 
-    return json.dumps(rows, default=plain, ensure_ascii=False, separators=(",", ":")).encode() + b"\n"
+    return json.dumps(rows, default=encoded, ensure_ascii=False, separators=(",", ":")).encode() + b"\n"
 
 
 def _ledger_lines(rows: Rows) -> bytes:
-    """Return facts as lines: the plan and the records, each attempt with what is known of it, and the events."""
-    alone = [{table: list(rows[table].values())} for table in ("plan", "records") if table in rows]
+    single_tables = [{table: list(rows[table].values())} for table in ("plan", "records") if table in rows]
     attempts: dict[int, dict[str, list[Row]]] = {}
-    for table, column in (
-        ("attempts", "id"),
-        ("checks", "attempt"),
-        ("measurements", "attempt"),
-        ("timings", "attempt"),
-    ):
+    for table, key in (("attempts", "id"), ("checks", "attempt"), ("measurements", "attempt"), ("timings", "attempt")):
         for row in rows.get(table, {}).values():
-            attempts.setdefault(row[column], {}).setdefault(table, []).append(row)
+            attempts.setdefault(row[key], {}).setdefault(table, []).append(row)
     events = [{"events": list(rows["events"].values())}] if "events" in rows else []
-    return b"".join(_ledger_line(one) for one in [*alone, *attempts.values(), *events])
+    return b"".join(_ledger_line(transaction) for transaction in [*single_tables, *attempts.values(), *events])
 
 
 class _Ledger:
     """A ledger that a run writes; close it after use.
 
-    `rows`: what the journal holds. Where the file says something else it is written anew; a journal that lacks
-    frames which the file has is refused by a FormatError.
+    `rows`: facts of the journal. A file with other facts is written again; if it has frames that the journal lacks, a
+    `FormatError` is raised.
     """
 
     def __init__(self, path: Path, rows: Rows) -> None:
         self._path = path
         try:
-            is_there = path.is_file()
+            exists = path.is_file()
         except OSError as error:
             raise storage_error(path, error, "look at") from error
-        if not is_there or not self._is_of(rows):
+        if not exists or not self._has_facts(rows):
             write_atomic(path, _ledger_lines(rows))
-        self._handle, self._end = self._opened()
+        self._handle, self._end = self._open_file()
         self._next = self._end
 
     def close(self) -> None:
         """Release the file; a second call does nothing."""
         if self._handle >= 0:
             handle, self._handle = self._handle, -1
-            with suppress(OSError):  # All that it was given is on the disk.
+            with suppress(OSError):  # All data are on disk already.
                 os.close(handle)
 
     def append(self, changes: Mapping[str, Sequence[Row]]) -> None:
-        """Put a transaction down, in place of one that was never kept; it is on the disk when this returns."""
+        """Write a transaction, in place of one that was not confirmed; it is on disk when this returns."""
         line = _ledger_line(changes)
         try:
             os.pwrite(self._handle, line, self._end)
@@ -887,41 +878,41 @@ class _Ledger:
             raise storage_error(self._path, error) from error
         self._next = self._end + len(line)
 
-    def keep(self) -> None:
-        """Let the last transaction stay: the journal has it, too, or is lost."""
+    def confirm(self) -> None:
+        """Keep the last transaction: the journal has it, too, or is lost."""
         self._end = self._next
 
-    def is_there(self) -> bool:
-        """Return whether the file that is written is the one on the disk, in full size."""
+    def is_intact(self) -> bool:
+        """Return whether the open file is the one on disk, in full size."""
         try:
-            found, own = self._path.stat(), os.fstat(self._handle)
+            on_disk, opened = self._path.stat(), os.fstat(self._handle)
         except OSError:
             return False
-        return (found.st_dev, found.st_ino, found.st_size) == (own.st_dev, own.st_ino, self._next)
+        return (on_disk.st_dev, on_disk.st_ino, on_disk.st_size) == (opened.st_dev, opened.st_ino, self._next)
 
     def restore(self, rows: Rows) -> None:
-        """Write the file anew, which was removed or changed while it was open."""
+        """Write the file again after it was deleted or changed during the run."""
         self.close()
         write_atomic(self._path, _ledger_lines(rows))
-        self._handle, self._end = self._opened()
+        self._handle, self._end = self._open_file()
         self._next = self._end
 
     def rows(self) -> Rows:
-        """Return the facts in the file, without a transaction that the journal does not have yet."""
-        return _gathered(_read_transactions(self._path, self._end))
+        """Return the facts in the file, without an unconfirmed transaction."""
+        return _merge_transactions(_read_transactions(self._path, self._end))
 
-    def _is_of(self, rows: Rows) -> bool:
-        """Return whether the file holds these facts; refuse where it knows of frames that are not among them."""
+    def _has_facts(self, rows: Rows) -> bool:
         try:
             transactions = _read_transactions(self._path)
         except FormatError:
             return False
-        if _gathered(transactions) == rows:
+        if _merge_transactions(transactions) == rows:
             return True
-        _require_none_lacking(self._path, _lacking_frames(_frames_in(_gathered(transactions[:-1])), _frames_in(rows)))
+        settled = _frames_in(_merge_transactions(transactions[:-1]))
+        _require_no_missing_frames(self._path, _missing_frames(settled, _frames_in(rows)))
         return False
 
-    def _opened(self) -> tuple[int, int]:
+    def _open_file(self) -> tuple[int, int]:
         try:
             handle = os.open(self._path, os.O_RDWR)
             return handle, os.fstat(handle).st_size
@@ -933,32 +924,28 @@ Frames = set[tuple[int, str, str | None]]  # Frames by attempt and hash, with th
 
 
 def settled_frames(path: Path) -> Frames:
-    """Return the frames that a journal must hold that is opened after this: all but those of the last transaction.
+    """Return the frames that a journal opened later must have: all except the last transaction.
 
-    None where there is no ledger, or a damaged one, which says nothing against a journal that is whole.
+    Empty if the ledger is missing or damaged, which is no fault of an intact journal.
     """
     with suppress(FormatError, StorageError):
         if os.path.isfile(path):  # noqa: PTH113 - it never raises
-            return _frames_in(_gathered(_read_transactions(path)[:-1]))
+            return _frames_in(_merge_transactions(_read_transactions(path)[:-1]))
     return set()
 
 
-def _lacking_frames(settled: Frames, known: Frames) -> Frames:
-    """Return the settled frames that are not among those known, or have another verdict there.
-
-    A frame that is known to be voided is no older state of it, since no verdict follows that one.
-    """
-    voided = {(attempt, sha256) for attempt, sha256, verdict in known if verdict == VOIDED}
-    return {frame for frame in settled - known if frame[:2] not in voided}
+def _missing_frames(settled: Frames, journal_frames: Frames) -> Frames:
+    # A void frame in the journal is not an older state, because no verdict follows that one.
+    voided = {(attempt, sha256) for attempt, sha256, verdict in journal_frames if verdict == VOIDED}
+    return {frame for frame in settled - journal_frames if frame[:2] not in voided}
 
 
-def _require_none_lacking(path: Path, lacking: Frames) -> None:
-    """Refuse a journal that lacks frames of the ledger `path`, or verdicts on them."""
-    if lacking:
+def _require_no_missing_frames(path: Path, missing: Frames) -> None:
+    if missing:
         raise FormatError(
-            f"the journal of {path.parent} lacks {counted(len(lacking), 'frame')} that {path} has, or what was said of "
-            "them: it is an older one, or was damaged",
-            remedy=f"acquire rebuild {shlex.quote(str(path.parent))} makes it anew",
+            f"the journal of {path.parent} lacks {counted(len(missing), 'frame')} that {path} has, or their verdicts: "
+            "it is older or damaged",
+            remedy=f"restore it with acquire rebuild {shlex.quote(str(path.parent))}",
         )
 
 

@@ -1,8 +1,8 @@
-"""How a journal's SQLite file is opened, on whatever disk it lies, what it may hold, and what its faults mean.
+"""Open the SQLite file of a journal on any disk, check its contents, and explain its faults.
 
-A reader never writes; a run brings the file up to date and into write-ahead mode. What both trust has been checked: the
-schema holds tables alone, for views, triggers and generated columns run SQL of others, and each row what its column is
-meant to hold: no text for a number, and no path that leads outside the session.
+A reader never writes. A run switches the file to write-ahead mode. Both check the file first: the schema has only
+tables, because views, triggers and generated columns run foreign SQL. Each row has valid types, and no path leads out
+of the session.
 
 Sources: sqlite.org/wal.html, sqlite.org/lockingv3.html, sqlite.org/fileformat.html.
 """
@@ -39,21 +39,22 @@ _T = TypeVar("_T")
 
 _log = logging.getLogger(__name__)
 
-_DAMAGED: Final = "it is damaged, or not to be trusted"
+_DAMAGED: Final = "it is damaged or was manipulated"
 
 JOURNAL_VERSION = 2  # `PRAGMA user_version` of the journals that this software writes and reads (docs/formats.md)
 
-# How long SQLite itself waits for another program before it gives the control back: as long as Ctrl-C may wait.
+# Seconds that SQLite itself waits for another program before it returns: Ctrl-C may be delayed by as much.
 TRY_S = 1.0
 
-# How long a reader waits where the journal is not in write-ahead mode: a commit takes milliseconds, a disk may stall
-# for seconds.
+# Seconds that a reader waits if the journal is not in write-ahead mode: a commit takes milliseconds, but a disk may
+# block for seconds.
 READING_LIMIT_S = 10.0
 
-# Longest text, blob or row that SQLite makes of a journal: what the judge keeps of a frame is some 100 kilobytes.
+# Longest text, blob or row that SQLite reads: the measurement of a frame has some 100 kilobytes.
 _MOST_VALUE_BYTES: Final = 64 << 20
 
-# Largest sizes of what is read whole beside a journal: forty times those of 707 lights and 32 768 colours.
+# Largest sizes of files that are read completely, in bytes: forty times the sizes for 707 illuminants and 32 768
+# colours.
 MOST_BYTES: Final = {"chart.json": 256 << 20, "illuminations.csv": 16 << 20, "session.toml": 1 << 20}
 
 _TABLES = """
@@ -96,40 +97,40 @@ CREATE TABLE heartbeat (
 CREATE TABLE records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
 """
 
-# What SQLite answers where it would have to write in order to read.
+# Errors of SQLite if reading would need writing.
 _CANNOT_IN_PLACE = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
 
-# What a file system answers that has no locks (fcntl(2); Lustre, FUSE, NFS without its lock service).
+# Errors of a file system without locks (fcntl(2); Lustre, FUSE, NFS without its lock service).
 _NO_LOCKS = {errno.ENOLCK, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EBADF}
 
-# Faults of a disk that can be read all the same.
+# Faults of a disk that can still be read.
 _READABLE_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
 
-_SIDE_FILES = ("-wal", "-shm", "-journal")  # What SQLite keeps beside a journal, by suffix
+_SIDE_FILES = ("-wal", "-shm", "-journal")  # Suffixes of SQLite's files next to a journal
 
-_PROBE_BYTES = 65536  # As much as a commit writes, with the pages of its log
+_PROBE_BYTES = 65536  # Size of a commit with the pages of its log
 
-# File systems on which several machines work and share no memory, as /proc/self/mounts names them.
+# File systems that several computers can use without shared memory, as in /proc/self/mounts.
 _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "ceph", "fuse.glusterfs", "lustre"}
 
 
-def restoring(path: Path) -> str:
-    """Return what helps where a journal is damaged or gone."""
-    # A disk that does not tell has a fault of its own, which is said before this.
+def restore_remedy(path: Path) -> str:
+    """Return the remedy for a damaged or missing journal."""
+    # A fault of the disk is reported before this.
     if os.path.isfile(path.with_name("ledger.jsonl")):  # noqa: PTH113 - it never raises
-        return f"acquire rebuild {shlex.quote(str(path.parent))} makes it anew from ledger.jsonl"
+        return f"restore it from ledger.jsonl with acquire rebuild {shlex.quote(str(path.parent))}"
     return "restore it from a copy"
 
 
-class HeldJournalError(StorageError):
-    """Another program held the journal for as long as a write waits: waiting once more would only double that."""
+class BusyJournalError(StorageError):
+    """Another program held the journal for the whole waiting time of a write; waiting again does not help."""
 
 
 class Retry(Protocol):
-    """Tries again what another program's hold on the journal hinders."""
+    """Repeats an operation while another program holds the journal."""
 
     def run(self, attempt: Callable[[], _T], /) -> _T:
-        """Return what `attempt` returns, in the end."""
+        """Return the result of `attempt`."""
         ...
 
 
@@ -139,24 +140,24 @@ def is_busy(error: sqlite3.DatabaseError) -> bool:
 
 
 def create_file(path: Path) -> sqlite3.Connection:
-    """Return a connection to a new journal with its tables and nothing in them."""
+    """Create a journal with empty tables and return a connection to it."""
     try:
         connection = connect(path, "rwc")
         _make_tables(connection)
     except sqlite3.DatabaseError as error:
-        raise StorageError(f"cannot write {path}: {error}; free space or choose another disk") from error
+        raise StorageError(f"cannot write {path}: {error}; free some space or choose another disk") from error
     return connection
 
 
 def open_to_read(path: Path) -> sqlite3.Connection:
-    """Return a connection that cannot write."""
+    """Return a read-only connection."""
     require_plain_folder(path.parent, MOST_BYTES)
     try:
-        # A run has all three; without the third nobody is at work, and reading in place would make it.
-        if _is_write_ahead(path) and not beside(path, "-shm").exists():
-            connection = _copied(path)
+        # A run has all three files. Without the third there is no run, and reading in place would create it.
+        if _is_write_ahead(path) and not side_file(path, "-shm").exists():
+            connection = _copy_to_memory(path)
         else:
-            connection = _opened_or_copied(path)
+            connection = _open_or_copy(path)
         _require_journal(path, connection)
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_fault(path, error) from error
@@ -164,9 +165,9 @@ def open_to_read(path: Path) -> sqlite3.Connection:
 
 
 def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
-    """Return a connection that writes, after bringing the journal into write-ahead mode.
+    """Return a writing connection, after switching the journal to write-ahead mode.
 
-    The caller holds the session's folder, so that no other run is at work. Who else writes is waited for.
+    The caller has locked the folder of the session against other runs. Other writers are waited for with `retry`.
     """
     require_plain_folder(path.parent, MOST_BYTES)
     try:
@@ -175,10 +176,10 @@ def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_fault(path, error) from error
     try:
-        with suppress(OSError):  # Left by a run that was killed while it made a copy.
+        with suppress(OSError):  # Left by a run that was killed during a copy.
             partial_path(path).unlink(missing_ok=True)
         if not _on_network(path):
-            connection = _in_write_ahead(path, connection, retry)
+            connection = _switch_to_write_ahead(path, connection, retry)
     except OSError as error:
         connection.close()
         raise storage_error(path, error) from error
@@ -189,33 +190,33 @@ def open_for_run(path: Path, retry: Retry) -> sqlite3.Connection:
 
 
 def close_after_run(connection: sqlite3.Connection) -> None:
-    """Put the journal back to one file unless somebody reads it, and close it; a second call does nothing."""
+    """Merge the journal into one file unless it is being read, and close it; a second call does nothing."""
     try:
         connection.execute("PRAGMA journal_mode = DELETE").fetchall()
     except sqlite3.Error:
-        pass  # Somebody reads it, the disk is gone, or it is closed: the next run or reader copes with what is there.
+        pass  # It is being read or closed, or the disk is missing: the next run or reader handles this.
     finally:
         connection.close()
 
 
 def set_aside(path: Path) -> None:
-    """Give a journal that is not to be used any more, and what SQLite keeps beside it, names that nothing reads."""
+    """Rename a journal that is not used any more, with SQLite's files next to it."""
     number = 1
-    while any(beside(path, f"{suffix}.{number}.lost").exists() for suffix in ("", *_SIDE_FILES)):
+    while any(side_file(path, f"{suffix}.{number}.lost").exists() for suffix in ("", *_SIDE_FILES)):
         number += 1
     for suffix in ("", *_SIDE_FILES):
         with suppress(FileNotFoundError):
-            beside(path, suffix).rename(beside(path, f"{suffix}.{number}.lost"))
+            side_file(path, suffix).rename(side_file(path, f"{suffix}.{number}.lost"))
 
 
 def connect(path: Path, mode: Literal["ro", "rw", "rwc"]) -> sqlite3.Connection:
-    """Return a connection in a mode of SQLite's URIs, nothing checked; without locks where the file system has none."""
+    """Return a connection in a mode of SQLite's URIs, without checks; without locks if the file system has none."""
     try:
         return _connect_with(path, mode)
     except sqlite3.OperationalError:
         if not _is_lockless(path):
             raise
-    _log.warning("%s: this file system has no locks; see to it that no other program writes it", path)
+    _log.warning("%s: this file system has no locks; make sure that no other program writes the file", path)
     return _connect_with(path, f"{mode}&nolock=1")
 
 
@@ -227,24 +228,21 @@ def _connect_with(path: Path, parameters: str) -> sqlite3.Connection:
         isolation_level=None,
     )
     try:
-        # A committed row must survive a power cut: it is what makes a frame count.
+        # A committed row must survive a power cut, because it makes a frame count.
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchall()
     except sqlite3.DatabaseError:
         connection.close()
         raise
     except UnicodeDecodeError as error:
-        # The message of SQLite quotes the damaged schema byte by byte.
+        # SQLite's message quotes the damaged schema byte by byte.
         connection.close()
-        raise sqlite3.DatabaseError(f"malformed database schema, which is no text: {error.reason}") from error
+        raise sqlite3.DatabaseError(f"malformed database schema, not a text: {error.reason}") from error
     return connection
 
 
 def _is_lockless(path: Path) -> bool:
-    """Return whether the file system refuses locks altogether.
-
-    Only asked where no connection could be opened: closing a file gives up all locks that the process has on it.
-    """
+    # Called only if no connection could be opened: closing a file releases all locks of the process on it.
     try:
         with path.open("rb") as stream:
             fcntl.lockf(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -253,23 +251,23 @@ def _is_lockless(path: Path) -> bool:
     return False
 
 
-def _opened_or_copied(path: Path) -> sqlite3.Connection:
-    """Return a reader of the file in its place, or of a copy where SQLite would have to write in order to read."""
+def _open_or_copy(path: Path) -> sqlite3.Connection:
+    # A copy is needed if SQLite would have to write in order to read.
     try:
         return connect(path, "ro")
     except sqlite3.OperationalError as error:
         if _primary_code(error) not in _CANNOT_IN_PLACE:
             raise
-        return _copied(path)
+        return _copy_to_memory(path)
 
 
-def _copied(path: Path) -> sqlite3.Connection:
+def _copy_to_memory(path: Path) -> sqlite3.Connection:
     memory = sqlite3.connect(":memory:", isolation_level=None)
     with tempfile.TemporaryDirectory(prefix="crop-") as scratch:
         copy = Path(scratch) / path.name
         for suffix in ("", "-wal", "-journal"):
-            if (source := beside(path, suffix)).exists() or not suffix:
-                shutil.copyfile(source, beside(copy, suffix))
+            if (source := side_file(path, suffix)).exists() or not suffix:
+                shutil.copyfile(source, side_file(copy, suffix))
         with closing(connect(copy, "rw")) as connection:
             connection.backup(memory)
     memory.execute("PRAGMA query_only = ON")
@@ -277,29 +275,24 @@ def _copied(path: Path) -> sqlite3.Connection:
 
 
 def _is_write_ahead(path: Path) -> bool:
-    """Return whether the file's header says write-ahead mode (sqlite.org/fileformat.html, 1.3.3: offset 18 is 2).
-
-    Only asked while no `-shm` is there: closing a file gives up all locks that the process has on it.
-    """
-    if beside(path, "-shm").exists():
+    # Offset 18 of the header is 2 (sqlite.org/fileformat.html, 1.3.3). The file is opened only without `-shm`: closing
+    # it releases all locks of the process on it.
+    if side_file(path, "-shm").exists():
         return True
     with path.open("rb") as stream:
         return stream.read(20)[18:] == b"\x02\x02"
 
 
-def _in_write_ahead(path: Path, connection: sqlite3.Connection, retry: Retry) -> sqlite3.Connection:
-    """Return a connection in write-ahead mode, where the file system allows it.
-
-    The mode cannot be changed while somebody reads. A reader who will not end keeps the file that he has, under no
-    name; the run goes on with a copy.
-    """
+def _switch_to_write_ahead(path: Path, connection: sqlite3.Connection, retry: Retry) -> sqlite3.Connection:
+    # The mode cannot be changed during a read. A reader that does not end keeps its file, which then has no name, and
+    # the run continues with a copy.
     try:
         connection.execute("PRAGMA journal_mode = WAL").fetchall()
     except sqlite3.OperationalError as error:
         if not is_busy(error):
             raise
         copy = partial_path(path)
-        # No other writer may be at work meanwhile.
+        # No other program may write during the copy.
         retry.run(lambda: connection.execute("BEGIN IMMEDIATE"))
         with closing(connect(path, "ro")) as source, closing(connect(copy, "rwc")) as target:
             source.backup(target)
@@ -314,12 +307,11 @@ def _in_write_ahead(path: Path, connection: sqlite3.Connection, retry: Retry) ->
 
 
 def _on_network(path: Path) -> bool:
-    """Return whether the file lies on a file system that several machines work on; False where that is not known."""
     return file_system_of(path) in _NETWORK
 
 
-def beside(path: Path, suffix: str) -> Path:
-    """Return the file that SQLite keeps beside a journal under a suffix."""
+def side_file(path: Path, suffix: str) -> Path:
+    """Return a file that SQLite keeps next to a journal."""
     return path.with_name(path.name + suffix)
 
 
@@ -332,24 +324,24 @@ def _make_tables(connection: sqlite3.Connection) -> None:
 
 
 def _require_journal(path: Path, connection: sqlite3.Connection) -> None:
-    """Close the connection and refuse a file that is of another version, lacks a table, or holds what no run writes."""
+    """Refuse a file with another version, missing tables or invalid rows, and close its connection."""
     try:
-        # Bounds what SQLite makes of a stranger's file, and lets nothing in its schema do more than hold rows.
+        # Limit the memory for a foreign file, and allow nothing in its schema except rows.
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_VALUE_BYTES)
         connection.execute("PRAGMA trusted_schema = OFF")
         _require_plain_schema(path, connection)
         version = connection.execute("PRAGMA user_version").fetchone()[0]
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not version and not tables:
-            raise FormatError(f"{path} is damaged: it is empty; {restoring(path)}")
+            raise FormatError(f"{path} is damaged: it is empty; {restore_remedy(path)}")
         if version != JOURNAL_VERSION:
             raise FormatError(
-                f"{path} is of version {version}, this software reads version {JOURNAL_VERSION}; use the software that "
-                "wrote it"
+                f"{path} has version {version}, this software reads version {JOURNAL_VERSION}; use the software that "
+                "wrote the file"
             )
-        if lacking := _COLUMNS.keys() - tables:
+        if missing := _COLUMNS.keys() - tables:
             raise FormatError(
-                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; {restoring(path)}"
+                f"{path} is damaged: the table {' and '.join(sorted(missing))} is missing; {restore_remedy(path)}"
             )
         require_sound_rows(path, connection)
     except BaseException:
@@ -358,56 +350,53 @@ def _require_journal(path: Path, connection: sqlite3.Connection) -> None:
 
 
 def reading_fault(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
-    """Return why a journal cannot be read, and what helps.
-
-    SQLite calls a file damaged whose disk does not read it, and a copy must not take the place of a sound journal: so
-    the disk is tried, and the file checked again.
-    """
+    """Return the error for a journal that cannot be read, with a remedy."""
+    # SQLite also reports damage if the disk fails, and an intact journal must not be replaced by a copy. So the disk is
+    # tested, and the file checked again.
     if isinstance(error, OSError):
-        gone = isinstance(error, FileNotFoundError)
-        return reading_error(path, error, restoring(path) if gone else "check its permissions")
+        is_missing = isinstance(error, FileNotFoundError)
+        return reading_error(path, error, restore_remedy(path) if is_missing else "check its permissions")
     if is_busy(error):
-        return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
+        return FormatError(f"cannot read {path}: {error}; end the other program that holds it")
     code = _primary_code(error)
     fault = _disk_fault(path)
-    # Where permissions are in the way, the disk is not.
-    openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy(fault) is not None)
-    failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and openable)
-    if fault is not None and (failed or fault.errno not in _READABLE_FAULTS):
+    # If permissions are missing, the disk is not at fault.
+    is_openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy(fault) is not None)
+    has_failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and is_openable)
+    if fault is not None and (has_failed or fault.errno not in _READABLE_FAULTS):
         return reading_error(path, fault, "check the permissions of its folder")
-    if failed or (_is_damage(error) and _is_sound(path)):
+    if has_failed or (_is_damage(error) and _is_sound(path)):
         return StorageError(
-            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, {RUN_AGAIN}"
+            f"cannot read {path}: {error}, and the disk reports no reason; check the disk and its cable, {RUN_AGAIN}"
         )
     if not _is_damage(error):
         return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
-    return FormatError(f"{path} is damaged: {error}; {restoring(path)}")
+    return FormatError(f"{path} is damaged: {error}; {restore_remedy(path)}")
 
 
 def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | InputError | StorageError:
-    """Return why a journal cannot be written, and what helps; the disk itself is asked what ails it."""
+    """Return the error for a journal that cannot be written, with a remedy; the disk is tested."""
     if is_busy(error):
-        return HeldJournalError(
+        return BusyJournalError(
             f"cannot write {path}: {error}; end the other program that holds the session, then run the same command "
             "again"
         )
     if (fault := _disk_fault(path)) is not None:
         return storage_error(path, fault)
     if _primary_code(error) == sqlite3.SQLITE_FULL:
-        remedy = "free space"
+        remedy = "free some space"
     elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
-        remedy = "see that the folder may be written and the disk is there"
+        remedy = "check that the folder is writable and the disk is connected"
     elif _is_damage(error) and not _is_sound(path):
-        return FormatError(f"{path} is damaged: {error}; {restoring(path)}")
+        return FormatError(f"{path} is damaged: {error}; {restore_remedy(path)}")
     else:
         remedy = "check the disk and its cable"
     return StorageError(f"cannot write {path}: {error}; {remedy}, {RUN_AGAIN}")
 
 
 def _disk_fault(path: Path) -> OSError | None:
-    """Return what the disk answers when something is written beside the journal; None if it does not mind."""
     try:
-        # Without a name, so that nothing is left behind.
+        # A file without a name, so that nothing remains.
         with tempfile.TemporaryFile(dir=path.parent, buffering=0) as stream:
             stream.write(bytes(_PROBE_BYTES))
             os.fsync(stream.fileno())
@@ -421,7 +410,6 @@ def _is_damage(error: sqlite3.DatabaseError) -> bool:
 
 
 def _is_sound(path: Path) -> bool:
-    """Return whether a journal that was called damaged is whole, read once more."""
     try:
         with closing(connect(path, "ro")) as connection:
             return connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
@@ -433,7 +421,7 @@ def _primary_code(error: sqlite3.DatabaseError) -> int:
     return getattr(error, "sqlite_errorcode", 0) & 0xFF
 
 
-# What a row may hold, in SQL; {0} is the column.
+# Conditions of values in SQL; {0} is the column.
 _WHOLE = "typeof({0}) = 'integer' AND {0} BETWEEN 0 AND 1000000000"
 
 _MAYBE_WHOLE = "({0} IS NULL OR " + _WHOLE + ")"
@@ -457,8 +445,8 @@ _ZONE = "[+-]??:??"
 _FORMS = f"{{0}} GLOB '{_MOMENT}.{6 * '[0-9]'}{_ZONE}' OR {{0}} GLOB '{_MOMENT}{_ZONE}'"
 
 
-# SQLite asks for digits in all but parts of a second, and knows the zones that there are; but it ends a text at a zero
-# byte, takes 30 February for 2 March, and 24:00 for the next day. Cheapest first, for a page asks every two seconds.
+# SQLite checks digits except in fractions of a second, and the zones. But it ends a text at a zero byte, and accepts 30
+# February as 2 March, and 24:00. Cheapest condition first, because a page reads every two seconds.
 _TIME = (
     f"typeof({{0}}) = 'text' AND ({_FORMS}) AND length(CAST({{0}} AS BLOB)) = length({{0}}) "
     "AND {0} BETWEEN '1970' AND '9999' AND julianday({0}) IS NOT NULL AND substr({0}, 12, 2) < '24' "
@@ -470,7 +458,7 @@ _MAYBE_TIME = "({0} IS NULL OR {0} = '' OR (" + _TIME + "))"
 
 _SHA256 = "({0} IS NULL OR (typeof({0}) = 'text' AND length({0}) <= 64 AND trim({0}, '0123456789abcdef') = ''))"
 
-# What a row must fulfil, by table and column; times as `datetime.fromisoformat` reads them.
+# Conditions by table and column; times must be readable by `datetime.fromisoformat`.
 _COLUMNS: Final = {
     "plan": {
         "step": _WHOLE,
@@ -530,8 +518,8 @@ _COLUMNS: Final = {
     "records": {"key": _TEXT, "text": _TEXT},
 }
 
-_TOGETHER: Final = {
-    # A frame that has a hash was taken at a time with an exposure (0 where nobody knows), and has a verdict.
+_JOINT_CONDITIONS: Final = {
+    # A frame with a hash has a time, an exposure (0 if unknown) and a verdict.
     "attempts": "(sha256 IS NULL OR (taken_at <> '' AND exposure_s BETWEEN 0 AND 1e9 AND size IS NOT NULL "
     "AND verdict IS NOT NULL))",
     "measurements": "(red IS NULL OR (green IS NOT NULL AND blue IS NOT NULL))",
@@ -539,34 +527,34 @@ _TOGETHER: Final = {
 
 
 def _require_plain_schema(path: Path, connection: sqlite3.Connection) -> None:
-    """Refuse a journal with views, triggers, virtual tables or computed columns; a FormatError names it."""
     for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
-        plain = kind == "table" and not str(sql or "").lstrip().upper().startswith("CREATE VIRTUAL")
-        # SQLite makes an index of each primary key, without a text.
-        if not (plain or (kind == "index" and sql is None)):
+        is_plain = kind == "table" and not str(sql or "").lstrip().upper().startswith("CREATE VIRTUAL")
+        # SQLite creates an index for each primary key, without a text.
+        if not (is_plain or (kind == "index" and sql is None)):
             raise FormatError(
-                f"{path} holds the {kind} {str(name)[:80]!r}, which no journal has; {_DAMAGED}; {restoring(path)}"
+                f"{path} has the {kind} {str(name)[:80]!r}, which is not part of a journal; {_DAMAGED}; "
+                f"{restore_remedy(path)}"
             )
 
 
 def require_sound_rows(path: Path, connection: sqlite3.Connection) -> None:
-    """Refuse a journal with values that no run writes; costs milliseconds."""
+    """Refuse a journal with values that no run writes; takes milliseconds."""
     for table in _COLUMNS:
         columns = {row[1]: row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")}
-        lacking = _COLUMNS[table].keys() - columns.keys()
-        if lacking or any(columns.values()):
+        missing = _COLUMNS[table].keys() - columns.keys()
+        if missing or any(columns.values()):
             raise FormatError(
-                f"{path}: the columns of {table} are not those of a journal; {_DAMAGED}; {restoring(path)}"
+                f"{path}: the table {table} has other columns than a journal; {_DAMAGED}; {restore_remedy(path)}"
             )
-        sound = " AND ".join([f"({form.format(column)})" for column, form in _COLUMNS[table].items()])
-        together = _TOGETHER.get(table, "1")
-        query = f"SELECT COUNT(*) FROM {table} WHERE ({sound} AND {together}) IS NOT TRUE"
-        if found := connection.execute(query).fetchone()[0]:
+        row_condition = " AND ".join([f"({condition.format(column)})" for column, condition in _COLUMNS[table].items()])
+        joint_condition = _JOINT_CONDITIONS.get(table, "1")
+        query = f"SELECT COUNT(*) FROM {table} WHERE ({row_condition} AND {joint_condition}) IS NOT TRUE"
+        if bad_rows := connection.execute(query).fetchone()[0]:
             raise FormatError(
-                f"{path}: {found} rows of {table} hold values that no run writes; {_DAMAGED}; {restoring(path)}"
+                f"{path}: {bad_rows} rows of {table} have values that no run writes; {_DAMAGED}; {restore_remedy(path)}"
             )
     for (file,) in connection.execute("SELECT file FROM attempts"):
         if not is_inside_name(file):
             raise FormatError(
-                f"{path} names the file {file[:200]!r}, which is none of the session; {_DAMAGED}; {restoring(path)}"
+                f"{path} has the file {file[:200]!r}, which is outside the session; {_DAMAGED}; {restore_remedy(path)}"
             )

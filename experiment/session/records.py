@@ -1,8 +1,7 @@
-"""A session as values: its plan, and what its journal keeps of attempts, frames, events and verdicts.
+"""Values of a session: its plan, and attempts, frames, events and verdicts in its journal.
 
-What is measured, and by which limits, is the affair of whoever judges (`FrameJudge`); the journal keeps a judgement
-whole, so that every refusal can be read again with its numbers, and a run that is taken up again knows what the frames
-before looked like.
+A `FrameJudge` decides about measurements and limits. The journal keeps every judgement completely, so that each
+refusal can be read again with its numbers, and a resumed run has the measurements of earlier frames.
 """
 
 from __future__ import annotations
@@ -20,46 +19,39 @@ from experiment.lights import Illumination
 
 ACCEPTED = "accepted"  # Verdict of a frame that may be used
 
-REFUSED = "refused"  # Verdict of a frame that is there and cannot be used
+REFUSED = "refused"  # Verdict of a complete frame that cannot be used
 
-FAILED = "failed"  # Verdict of an attempt that gave no frame
+FAILED = "failed"  # Verdict of an attempt without a frame
 
-VOIDED = "voided"  # Verdict of a frame that was accepted and must not be used: what was found out later says why
+VOIDED = "voided"  # Verdict of a frame that was accepted first and must not be used because of a later finding
 
 
-DOUBT = "doubt"  # The event that tells what stops nothing, and is to be seen in the morning
+DOUBT = "doubt"  # Event of a finding that does not stop the run and is reported at its end
 
-# Attempts by which the time left is told: enough that retakes and references do not sway their median, few enough to
-# follow a change of the settings.
+# Attempts from which the remaining time is estimated: enough that repeated frames and references do not change the
+# median, and few enough to follow a change of the settings.
 RECENT = 50
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing looked at in a frame.
+    """One check of a frame."""
 
-    - `name`: what was looked at: "movement", "file", "screen"; what is a figure of a table has its name.
-    - `value`: what was found, in `unit`; None if it cannot be told in a number.
-    - `low`, `high`: limits of `value`; None where that side is open.
-    - `unit`: "%", "px", "DN"; empty for a pure number.
-    - `reason`: empty if the frame passed. Else the cause and its remedy, one sentence.
-    """
-
-    name: str
-    value: float | None = None
-    low: float | None = None
-    high: float | None = None
-    unit: str = ""
-    reason: str = ""
+    name: str  # "movement", "file", "screen" …; that of the figure if the look-up table (LUT) has such a figure
+    value: float | None = None  # result in `unit`; None if it is not a number
+    low: float | None = None  # lower limit of `value`; None without limit
+    high: float | None = None  # upper limit of `value`; None without limit
+    unit: str = ""  # "%", "px", "DN"; empty for a pure number
+    reason: str = ""  # cause and remedy of a failure, in one sentence; empty if the frame passed
 
     @property
     def passed(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether the frame passed this check."""
         return not self.reason
 
     @property
     def is_beyond(self) -> bool:
-        """Whether the value lies outside its limits: it may follow from another check's cause, or be followed."""
+        """Whether the value is outside its limits. The frame may pass all the same if another check has the cause."""
         if self.value is None:
             return False
         return (self.low is not None and self.value < self.low) or (self.high is not None and self.value > self.high)
@@ -67,54 +59,48 @@ class Check:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is said of one frame.
+    """Judgement of one frame."""
 
-    - `checks`: everything that was looked at, in the order in which causes are to be named.
-    - `seen`: camera RGB of the paper above black, counts; None if it was not measured.
-    - `measurement`: what the judge needs of this frame later, opaque to all others.
-    - `preview`: the frame as JPEG for the eye; empty if there is none.
-    - `voids`: what was taken before cannot be trusted: of a refused reference all since the last good one, of another
-      refused frame all since the run began, or since its last pause for something lasting.
-    - `lasting`: taking the frame again will not help before somebody has removed the cause.
-    """
-
-    checks: tuple[Check, ...]
-    seen: tuple[float, float, float] | None = None
-    measurement: bytes = b""
-    preview: bytes = b""
+    checks: tuple[Check, ...]  # in the order in which causes are reported
+    seen: tuple[float, float, float] | None = None  # camera RGB of the paper above black, counts; None if not measured
+    measurement: bytes = b""  # data of the judge for later frames, opaque to all others
+    preview: bytes = b""  # JPEG of the frame; empty if there is none
+    # Earlier frames cannot be trusted. For a refused reference: all since the last good one. For another refused frame:
+    # all since the start of the run, or since its last pause for a lasting cause.
     voids: bool = False
-    lasting: bool = False
+    lasting: bool = False  # repeating the frame does not help until somebody has removed the cause
 
     @classmethod
     def of_reason(cls, name: str, reason: str | None) -> Judgement:
-        """Return the judgement of a single check without a number; the frame is accepted if the reason is None."""
+        """Return the judgement of one check without a value; accepted if `reason` is None."""
         return cls((Check(name, reason=reason or ""),))
 
     @property
     def accepted(self) -> bool:
-        """Whether the frame may be used: no check has a reason against it."""
+        """Whether the frame may be used: all checks passed."""
         return all(check.passed for check in self.checks)
 
     @property
     def reason(self) -> str:
-        """The first reason against the frame; empty if it is accepted."""
+        """Reason of the first failed check; empty if the frame is accepted."""
         return next((check.reason for check in self.checks if check.reason), "")
 
 
 class FrameJudge(Protocol):
-    """Judges the frames of a session as they are taken.
+    """Judges the frames of a session while they are taken.
 
-    Both methods are called from one thread, never two at once, and in the order in which the frames were taken.
+    Both methods are called from one thread, in the order in which the frames were taken.
     """
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
-        """Return what is said of a raw file that is complete on the disk."""
+        """Judge a complete raw file."""
         ...
 
     def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
-        """Take in a frame of an earlier run: the `measurement` of its judgement, and whether it still counts.
+        """Restore a frame of an earlier run from the `measurement` of its judgement.
 
-        Called for all of them before the first frame is judged.
+        It is called for all earlier frames before the first frame is judged. `accepted`: whether the frame still
+        counts.
         """
         ...
 
@@ -124,19 +110,19 @@ class OutlastsPauses(Protocol):
     """A judge that takes pauses of a run into account."""
 
     def after_pause(self) -> None:
-        """Take in that the run paused for something lasting, and that what is judged next links it to what was before.
+        """Handle a pause of the run for a lasting cause; the next frames reconnect it to the earlier ones.
 
-        Called when everything that was taken before is judged, and when nothing is being judged.
+        It is called when all earlier frames are judged, and while no frame is being judged.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """One try at a step as the journal has it.
+    """One attempt at a step, as in the journal.
 
-    Times are those of the lab's clock, None where it has not come so far. The verdict is None while it is under way, or
-    if it was cut off.
+    Times are of the clock of the laboratory, None before they are reached. The verdict is None for an attempt that is
+    not finished or was interrupted.
     """
 
     id: int
@@ -152,41 +138,31 @@ class Attempt:
 
     @property
     def has_frame(self) -> bool:
-        """Whether a raw file came of it; the name of one that failed may be that of the next try."""
+        """Whether it has a raw file. A failed attempt may have the file name of the next one."""
         return self.taken_at is not None
 
 
 @dataclass(frozen=True)
 class AttemptDetails:
-    """What a journal keeps of an attempt beside its row.
+    """Details of an attempt in other tables of the journal."""
 
-    - `seen`: camera RGB of the paper above black, counts; None if it was not measured.
-    - `checks`: what was looked at, in the judge's order.
-    - `timings`: seconds of each part of it, by name.
-    """
-
-    seen: tuple[float, float, float] | None = None
-    checks: tuple[Check, ...] = ()
-    timings: Mapping[str, float] = field(default_factory=dict[str, float])
+    seen: tuple[float, float, float] | None = None  # camera RGB of the paper above black, counts; None if not measured
+    checks: tuple[Check, ...] = ()  # in the order of the judge
+    timings: Mapping[str, float] = field(default_factory=dict[str, float])  # seconds of each stage, by name
 
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """A frame that counts as taken and judged; the row of `frames.csv`.
-
-    `file` is relative to the session's folder; `illumination` is None but for lights; `verdict` is
-    ``accepted`` or ``refused: reason``, also of a frame that was accepted at first; `attempt` is its number in the
-    journal, by which frames are in the order taken whatever a clock said.
-    """
+    """A frame that was taken and judged: one row of `frames.csv`."""
 
     kind: FrameKind
-    illumination: int | None
-    file: str
+    illumination: int | None  # index of the illuminant; None for other kinds
+    file: str  # relative to the folder of the session
     sha256: str
     taken_at: datetime
     exposure_s: float
-    verdict: str
-    attempt: int = 0
+    verdict: str  # "accepted" or "refused: reason", also for a voided frame
+    attempt: int = 0  # number in the journal: the order in which frames were taken, independent of clocks
 
     @property
     def accepted(self) -> bool:
@@ -196,7 +172,7 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class AcceptedFile:
-    """The raw file of an accepted frame: of which attempt, step and light, its name in the session, its bytes."""
+    """Raw file of an accepted frame."""
 
     attempt: int
     step: int
@@ -208,7 +184,7 @@ class AcceptedFile:
 
 @dataclass(frozen=True)
 class SessionEvent:
-    """What happened at some time that is no frame: start, stop, warm-up, a device's fault."""
+    """An event that is not a frame: start, stop, warm-up, failure of a device."""
 
     at: datetime
     what: str
@@ -217,54 +193,57 @@ class SessionEvent:
 
 
 def doubts_of(events: Iterable[SessionEvent]) -> list[str]:
-    """Return what stopped no run and is to be seen in the morning, each once, in the order of the events."""
+    """Return the findings that did not stop the run, each once, in the order of the events."""
     return list(dict.fromkeys(event.detail for event in events if event.what == DOUBT))
 
 
-def last_moment(attempts: Iterable[Attempt]) -> datetime | None:
-    """Return when the last of those attempts was over that gave a frame; None where none did."""
+def last_frame_time(attempts: Iterable[Attempt]) -> datetime | None:
+    """Return the end of the last attempt with a frame; None if there is none."""
     ends = (attempt.ended_at for attempt in attempts if attempt.has_frame and attempt.ended_at is not None)
     return max(ends, default=None)
 
 
 def preview_path(folder: Path, file: str) -> Path:
-    """Return where the preview of a raw file is, if there is one; `folder` is the session, `file` as in the journal.
-
-    Only the name of `file` counts, so that no row of a journal leads out of `previews/`.
-    """
+    """Return the path of the preview of a raw file in the folder of a session, whether it exists or not."""
+    # Only the name of `file` counts, so that no row of a journal leads out of `previews/`.
     return folder / "previews" / f"{Path(file).stem}.jpg"
 
 
 @dataclass(frozen=True)
 class TimedAttempt:
-    """How long after the one before an attempt came, seconds, None behind a pause; and whether it gave its frame."""
+    """Duration and success of an attempt."""
 
-    seconds: float | None
-    gained: bool
+    seconds: float | None  # interval since the previous attempt; None after a pause
+    gained: bool  # the attempt gave an accepted frame
 
 
-def time_left(attempts: Iterable[TimedAttempt], left: int) -> float | None:
-    """Return how long the frames that are left will take, seconds; None while that is unknown.
+def time_left(attempts: Iterable[TimedAttempt], remaining_frames: int) -> float | None:
+    """Estimate the time for the remaining frames, s; None if it is unknown.
 
-    Each frame costs as many attempts as frames have cost lately, retakes and references included; each attempt the
-    median interval, so that a pause does not count for ever.
+    It is the recent number of attempts for each frame, with repetitions and references, times the median interval.
 
-    `attempts`: those that are judged, oldest first; the newest `RECENT` count.
+    Parameters
+    ----------
+    attempts
+        Judged attempts, oldest first; the newest `RECENT` count.
+    remaining_frames
+        Number of frames that are not taken yet.
 
     Examples
     --------
     >>> night = [TimedAttempt(seconds, gained=seconds != 7) for seconds in (None, 5, 300, 5, 7, 7)]
-    >>> time_left(night, left=10)
+    >>> time_left(night, remaining_frames=10)
     105.0
     """
-    if not left:
+    if not remaining_frames:
         return 0.0
     recent = deque(attempts, RECENT)
     intervals = [attempt.seconds for attempt in recent if attempt.seconds is not None]
     gained = sum(attempt.gained for attempt in recent)
     if not intervals or not gained:
         return None
-    return statistics.median(intervals) * len(recent) / gained * left
+    # The median, so that a pause does not count for ever.
+    return statistics.median(intervals) * len(recent) / gained * remaining_frames
 
 
 def duration_text(seconds: float | None) -> str:
@@ -278,25 +257,26 @@ def duration_text(seconds: float | None) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
-# What a frame shows: one of the planned lights, full white, the picture's black, or a colour by which the projector
-# is known. Frames of the last kind are looked at while a session is taken, and never part of a table.
+# Kind of a frame: a planned illuminant, full white, black of the picture, or a colour for the response of the
+# projector. Response frames are judged while a session is taken, and are not part of a LUT.
 FrameKind = Literal["light", "white", "dark", "response"]
 
-KINDS: tuple[FrameKind, ...] = get_args(FrameKind)  # Every kind, as journals name them
+KINDS: tuple[FrameKind, ...] = get_args(FrameKind)  # All kinds, as in the journal
 
-REFERENCES: tuple[FrameKind, ...] = ("white", "dark")  # Kinds of frames that lights are held against
+REFERENCES: tuple[FrameKind, ...] = ("white", "dark")  # Kinds of frames with which frames of illuminants are compared
 
-# Highest code of a response frame; 255 is left to white and to the lights, so that none is taken for one of them.
+# Highest code of a response frame; 255 is left to white and to illuminants, so that no response frame is mistaken for
+# one.
 TOP = 250
 
-PRIMARIES = (Colour(TOP, 0, 0), Colour(0, TOP, 0), Colour(0, 0, TOP))  # The projector's red, green and blue, each alone
+# Red, green and blue of the projector, each alone
+PRIMARIES = (Colour(TOP, 0, 0), Colour(0, TOP, 0), Colour(0, 0, TOP))
 
-MIDDLE = 136  # Code of a quarter of the light, at which each primary's own curve is compared with that of grey
+MIDDLE = 136  # Code of a quarter of the light, at which the curve of each primary is compared with that of grey
 
-# What a session shows first so that the light of any codes can be predicted: the primaries; greys that give the curve
-# from codes to light; pairs of primaries, for what light is added where they overlap; and each primary at half code,
-# for what its curve has of its own. The steps are chosen: even in code, and closer where the curve is steep in
-# proportion.
+# First frames of a session, from which the light of any codes is predicted: primaries; greys for the curve from codes
+# to light; pairs of primaries for light that is added if both are on; and primaries at half code for their own curves.
+# Steps are chosen: equal in code, and closer where the curve is relatively steep.
 RESPONSE = (
     *PRIMARIES,
     *(Colour(code, code, code) for code in (TOP, 232, 208, 184, 160, 136, 112, 88, 64, 48, 32, 16)),
@@ -307,22 +287,16 @@ RESPONSE = (
 
 @dataclass(frozen=True)
 class SessionStep:
-    """One frame of the plan.
+    """One frame of the plan."""
 
-    - `number`: its place in taking order, from 0.
-    - `kind`: what it shows.
-    - `illumination`: index of its light in `illuminations.csv`; None for frames of other kinds.
-    - `colour`: codes that the projector shows, 0 … 255.
-    """
-
-    number: int
+    number: int  # position in the order of taking, from 0
     kind: FrameKind
-    illumination: int | None
-    colour: Colour
+    illumination: int | None  # index of the illuminant in `illuminations.csv`; None for other kinds
+    colour: Colour  # codes that the projector shows, 0 … 255
 
     @property
     def stem(self) -> str:
-        """The file name without suffix, e.g. ``0007_light_005``; sorts in taking order."""
+        """File name without extension, for example ``0007_light_005``; sorts in the order of taking."""
         tail = "" if self.illumination is None else f"_{self.illumination:03d}"
         return f"{self.number:04d}_{self.kind}{tail}"
 
@@ -334,21 +308,21 @@ def plan_steps(
     seed: int | None = None,
     response: Sequence[Colour] = (),
 ) -> tuple[SessionStep, ...]:
-    """Return the whole session as data: a white and a dark frame first, every `reference_every` lights, and last.
+    """Return the plan of a session: a white and a dark frame first, every `reference_every` illuminants, and last.
 
-    `seed`: shuffles the lights, so that neither time nor a frame that is repeated runs along with colour; the same seed
-    gives the same order (numpy's PCG64). None keeps their order.
+    `seed`: seed of the shuffled order (numpy's PCG64), so that neither time nor repeated frames correlate with colour;
+    None keeps the order. `response`: colours of the response frames, after the first pair.
     """
     steps: list[SessionStep] = []
 
     def add(kind: FrameKind, illumination: int | None, colour: Colour) -> None:
         steps.append(SessionStep(len(steps), kind, illumination, colour))
 
-    for position, light in enumerate(illuminations if seed is None else _shuffled(illuminations, seed)):
-        if position % reference_every == 0:
+    for index, light in enumerate(illuminations if seed is None else _shuffled(illuminations, seed)):
+        if index % reference_every == 0:
             add("white", None, WHITE)
             add("dark", None, BLACK)
-        if position == 0:
+        if index == 0:
             for colour in response:
                 add("response", None, colour)
         add("light", light.index, light.colour)
@@ -358,15 +332,15 @@ def plan_steps(
 
 
 def link_steps(first_number: int) -> tuple[SessionStep, ...]:
-    """Return what a run that is taken up again shows first, to link it to what was taken before.
+    """Return the first frames of a resumed run, which link it to the earlier frames.
 
-    A grey and the primaries, by which the projector is known again, and a white and a dark frame, so that lights lie
-    between references of one level of the lamp.
+    A grey and the primaries show the response of the projector again. A white and a dark frame give the illuminants a
+    reference with the same lamp.
     """
     colours = (Colour(TOP, TOP, TOP), *PRIMARIES)
-    shown: list[tuple[FrameKind, Colour]] = [*(("response", colour) for colour in colours), ("white", WHITE)]
-    shown.append(("dark", BLACK))
-    return tuple(SessionStep(number, kind, None, colour) for number, (kind, colour) in enumerate(shown, first_number))
+    frames: list[tuple[FrameKind, Colour]] = [*(("response", colour) for colour in colours), ("white", WHITE)]
+    frames.append(("dark", BLACK))
+    return tuple(SessionStep(number, kind, None, colour) for number, (kind, colour) in enumerate(frames, first_number))
 
 
 def _shuffled(illuminations: Sequence[Illumination], seed: int) -> list[Illumination]:

@@ -1,7 +1,7 @@
-"""What puts a session right: files that are damaged, and lights that are to be taken again.
+"""Find damaged files of a session, and illuminants that are to be repeated.
 
-Raw files are held against the hashes in the journal; the session voids what is missing, cut off or altered, so that the
-next run takes it again. Nothing is deleted.
+Raw files are compared with the hashes in the journal. The session voids frames with missing, truncated or changed
+files, so that the next run repeats them. Nothing is deleted.
 """
 
 from __future__ import annotations
@@ -20,93 +20,89 @@ from foundation.compiled import ordered_map, processor_count
 from foundation.errors import RUN_AGAIN, FormatError, InputError, StorageError
 from foundation.files import file_sha256, storage_error
 
-BAD = "bad"  # What stands for the lights that the newest report refused
+BAD = "bad"  # Selection of the illuminants that the newest report refused
 
 
-# Files that the disk does not read (EIO) and that are given up: bad sectors are few; of a loose cable all are.
+# Files with a read error (EIO) that are given up: bad sectors are few, a loose cable affects all files.
 MOST_UNREADABLE = 3
 
-# Files hashed at a time at most: chosen; SHA-256 runs at .5 to 2 GB/s a thread, faster together than any disk.
+# Largest number of files hashed at a time (judgement): SHA-256 runs at 0.5 to 2 GB/s a thread, so the threads together
+# are faster than any disk.
 MOST_THREADS = 8
 
 _RANGE = re.compile(r"\s*(\d{1,9})\s*(?:[-–]\s*(\d{1,9})\s*)?")
 
 
-def unsound_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callable[[int, int], None]) -> dict[int, str]:
-    """Return why frames cannot be used any longer, by attempt: their files are gone or changed."""
+def damaged_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callable[[int, int], None]) -> dict[int, str]:
+    """Return the attempts with missing or changed files, and the reasons."""
     try:
         require_frames_folder(folder)
     except OSError as error:
         raise storage_error(folder / "frames", error) from error
-    found: dict[int, str] = {}
+    reasons: dict[int, str] = {}
     threads = min(processor_count(), MOST_THREADS)
     observe(0, len(frames))
-    reasons = ordered_map(lambda frame: _fault(folder, frame), frames, threads)
-    unread: list[tuple[AcceptedFile, OSError]] = []
-    for done, (frame, reason) in enumerate(zip(frames, reasons, strict=True), 1):
-        if isinstance(reason, OSError):
-            unread.append((frame, reason))
-            found[frame.attempt] = f"{frame.file} cannot be read: {reason.strerror}; it is taken again"
-        elif reason:
-            found[frame.attempt] = reason
-        observe(done, len(frames))
-    _require_readable(folder, unread)
-    return found
+    faults = ordered_map(lambda frame: _fault(folder, frame), frames, threads)
+    unreadable: list[tuple[AcceptedFile, OSError]] = []
+    for count, (frame, fault) in enumerate(zip(frames, faults, strict=True), 1):
+        if isinstance(fault, OSError):
+            unreadable.append((frame, fault))
+            reasons[frame.attempt] = f"{frame.file} cannot be read: {fault.strerror}; the frame is repeated"
+        elif fault:
+            reasons[frame.attempt] = fault
+        observe(count, len(frames))
+    _require_readable(folder, unreadable)
+    return reasons
 
 
 def require_frames_folder(folder: Path) -> None:
-    """Refuse a session whose folder of raw files is missing: all of them would be taken again."""
+    """Refuse a session without its folder of raw files; otherwise all frames would be repeated."""
     if not (folder / "frames").is_dir():
         raise FormatError(
-            f"{folder / 'frames'} is missing, where the session's raw files are; restore it from a copy, or begin a "
-            "new session"
+            f"{folder / 'frames'} with the raw files of the session is missing; restore it from a copy, or start a new "
+            "session"
         )
 
 
 def _require_readable(folder: Path, unread: Sequence[tuple[AcceptedFile, OSError]]) -> None:
-    """Refuse files that cannot be read where they may be sound: their frames are not given up for a cable."""
-    others = [(frame, error) for frame, error in unread if error.errno != errno.EIO]
-    lasting = others or (unread if len(unread) > MOST_UNREADABLE else ())
+    # The frames may be intact, and should not be repeated because of a cable.
+    other_faults = [(frame, error) for frame, error in unread if error.errno != errno.EIO]
+    lasting = other_faults or (unread if len(unread) > MOST_UNREADABLE else ())
     if lasting:
         frame, error = lasting[0]
-        more = f" and {len(lasting) - 1} more" if lasting[1:] else ""
+        rest = f" and {len(lasting) - 1} more" if lasting[1:] else ""
         raise StorageError(
-            f"cannot read {folder / frame.file}{more}: {error.strerror}; check the disk, its cable and the "
-            f"permissions, or move the files elsewhere to have their frames taken again, {RUN_AGAIN}"
+            f"cannot read {folder / frame.file}{rest}: {error.strerror}; check the disk, its cable and the "
+            f"permissions, or move the files elsewhere to repeat their frames, {RUN_AGAIN}"
         ) from error
 
 
 def _fault(folder: Path, frame: AcceptedFile) -> str | OSError:
-    """Return what is wrong with a frame's file, or why it cannot be read; empty if nothing is."""
+    """Return the damage of the file of a frame, or the error of reading it; empty if there is none."""
     path = folder / frame.file
     try:
         size = path.stat().st_size
         if size != frame.size:
-            return f"{frame.file} has {size} of {frame.size} bytes; it is taken again"
+            return f"{frame.file} has {size} bytes, {frame.size} expected; the frame is repeated"
         changed = file_sha256(path) != frame.sha256
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
-        return f"{frame.file} is missing; it is taken again"
+        return f"{frame.file} is missing; the frame is repeated"
     except OSError as error:
         return error
-    return f"{frame.file} has changed since it was taken: its SHA-256 is another; it is taken again" if changed else ""
+    return f"{frame.file} has changed since it was taken: its SHA-256 differs; the frame is repeated" if changed else ""
 
 
 @dataclass(frozen=True)
 class RefusedFrames:
-    """What a report says of lights that are to be taken again.
+    """Illuminants and frames that a report refuses."""
 
-    - `report`: the file that says so.
-    - `lights`: their numbers, as `parse_lights` reads them; empty for none.
-    - `sha256`: hashes of their frames.
-    """
-
-    report: Path
-    lights: str
-    sha256: frozenset[str]
+    report: Path  # file of the report
+    lights: str  # numbers of the illuminants, as `parse_lights` reads them; may be empty
+    sha256: frozenset[str]  # hashes of the frames
 
 
-def parse_lights(text: str, known: Collection[int]) -> tuple[int, ...]:
-    """Return the lights of ``12,40-44``, rising, each once.
+def parse_lights(text: str, valid_numbers: Collection[int]) -> tuple[int, ...]:
+    """Parse numbers of illuminants such as ``12,40-44``; return them sorted, each once.
 
     Examples
     --------
@@ -114,28 +110,28 @@ def parse_lights(text: str, known: Collection[int]) -> tuple[int, ...]:
     (2, 3, 4, 7)
     """
     lights: set[int] = set()
-    for part in text.split(","):
-        found = _RANGE.fullmatch(part)
-        if found is None:
+    for item in text.split(","):
+        match = _RANGE.fullmatch(item)
+        if match is None:
             raise InputError(
-                f"--retake {text!r}: {part.strip()!r} is no light; name lights as 12,40-44, or {BAD} for those that "
-                "build-lut refused"
+                f"--retake {text!r}: {item.strip()!r} is not the number of an illuminant; give numbers as 12,40-44, "
+                f"or {BAD} for the illuminants that build-lut refused"
             )
-        first, last = int(found[1]), int(found[2] or found[1])
+        first, last = int(match[1]), int(match[2] or match[1])
         if last < first:
-            raise InputError(f"--retake {text!r}: {part.strip()} runs backwards; name it {last}-{first}")
-        unknown = next((light for light in (first, last) if light not in known), None)
+            raise InputError(f"--retake {text!r}: {item.strip()} is a falling range; write {last}-{first}")
+        unknown = next((light for light in (first, last) if light not in valid_numbers), None)
         if unknown is not None:
             raise InputError(
-                f"--retake {text!r}: the session has no light {unknown}, its {len(known)} lights are "
-                f"{min(known, default=0)} … {max(known, default=0)}"
+                f"--retake {text!r}: the session has no illuminant {unknown}; give one of its {len(valid_numbers)} "
+                f"illuminants, {min(valid_numbers, default=0)} … {max(valid_numbers, default=0)}"
             )
-        lights.update(light for light in range(first, last + 1) if light in known)
+        lights.update(light for light in range(first, last + 1) if light in valid_numbers)
     return tuple(sorted(lights))
 
 
 def lights_text(lights: Collection[int]) -> str:
-    """Return lights as `parse_lights` reads them.
+    """Return numbers of illuminants as a text that `parse_lights` reads.
 
     Examples
     --------
@@ -151,24 +147,26 @@ def lights_text(lights: Collection[int]) -> str:
     return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in ranges)
 
 
-def newest_report(session: Path, taken: Mapping[str, int]) -> RefusedFrames:
-    """Return what the newest report on a session's frames, beside the session or in it, says is to be taken again.
+def newest_report(session: Path, attempts: Mapping[str, int]) -> RefusedFrames:
+    """Return the refused frames of the newest report on a session, in it or next to it.
 
-    The newest is the one whose newest frame was taken last: what clocks said when reports were written counts only
-    between reports on the same frames.
+    The newest report has the newest frame. The times of the files decide only between reports
+    on the same frames, because a clock may have been wrong.
+
+    `taken`: attempt of each frame of the session, by hash.
     """
     home = session.resolve()
-    found: list[tuple[int, int, RefusedFrames]] = []
+    reports: list[tuple[int, int, RefusedFrames]] = []
     for path in [*home.parent.glob("*/report.json"), *home.glob("*/report.json")]:
         with suppress(OSError, ValueError, TypeError, KeyError):
-            says: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            refused = RefusedFrames(path, str(says["retake"]), frozenset(map(str, says["retake_sha256"])))
-            newest = taken[says["newest_sha256"]]
-            if says["registered_sha256"] in taken:
-                found.append((newest, path.stat().st_mtime_ns, refused))
-    if not found:
+            content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            refused = RefusedFrames(path, str(content["retake"]), frozenset(map(str, content["retake_sha256"])))
+            newest = attempts[content["newest_sha256"]]
+            if content["registered_sha256"] in attempts:
+                reports.append((newest, path.stat().st_mtime_ns, refused))
+    if not reports:
         raise FormatError(
-            f"no report of build-lut on {session} lies beside it in {home.parent}; build the table there "
-            f"(build-lut {session} {session}-lut), or name the lights, as in --retake 12,40-44"
+            f"{home.parent} has no report of build-lut on {session}; build the look-up table there "
+            f"(build-lut {session} {session}-lut), or give numbers of illuminants, as in --retake 12,40-44"
         )
-    return max(found, key=lambda entry: entry[:2])[2]
+    return max(reports, key=lambda entry: entry[:2])[2]

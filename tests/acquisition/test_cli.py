@@ -72,9 +72,9 @@ def test_cells_that_a_camera_cannot_separate_are_made_and_warned_of(
 ) -> None:
     assert chart("out", "--bits", "2", "--page", "900x34", "--no-tiff") == 0
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("warning: cells of 2.12 mm are small for a camera")
+    assert line.startswith("warning: patches of 2.12 mm are small for a camera")
     # 0.94 × 2601 and 3132 px for 900 mm: 2.72 and 3.27 px a millimetre, of which a module has 0.847 and a cell 2.117.
-    assert "EOS 550D: 5.8 px a cell, 2.3 px a tag module; EOS 6D Mark II: 6.9 px a cell, 2.8 px a tag module" in line
+    assert "EOS 550D: 5.8 px a patch, 2.3 px a tag module; EOS 6D Mark II: 6.9 px a patch, 2.8 px a tag module" in line
     assert load_chart(Path("out/chart.json")).cell_mm[0] == pytest.approx(50 * 25.4 / 600)
 
 

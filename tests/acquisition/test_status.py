@@ -122,7 +122,7 @@ def test_a_copy_of_a_session_at_work_is_no_run(
     shutil.copytree(folder, copy)
     told = say(copy, capsys)
     assert f"state   copied from {folder.resolve()} at 20" in told
-    assert "or later, and the run there goes on; look there" in told
+    assert "or later, and the run there continues; use" in told
     assert "left    4 frames; this copy gets none\n" in told
     assert main(["status", "--json", str(copy)]) == 0
     values = json.loads(capsys.readouterr().out)

@@ -133,7 +133,7 @@ def test_a_table_and_its_entry_are_one_object(lut: Path, capsys: pytest.CaptureF
         (["--info", "lut"], "--info is a command, not an option: build-lut info"),
         (["-v", "--check", "session"], "build-lut check"),
         (["--window", 4, "session", "lut"], "4 pixels"),
-        (["nowhere", "lut"], "nowhere is no session"),
+        (["nowhere", "lut"], "nowhere is not a session"),
         (["info", "nowhere"], "nowhere is no table"),
         (["compare", "a", "b"], "a is no table"),
     ],

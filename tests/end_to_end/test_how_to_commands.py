@@ -84,7 +84,7 @@ PAGES = {
     "monitor.md": Page(skipped={"": _SERVES}),
     "night-run.md": Page(
         _LAB | {"session": "session"},
-        refused={"acquire run LAB.toml session/ --retake bad": "names no frame to be taken again"},
+        refused={"acquire run LAB.toml session/ --retake bad": "has no frame to repeat"},
         skipped={"acquire monitor": _SERVES},
     ),
     "rendering.md": Page(_GENERATE | {"lights.csv": "gt.txt"}, fresh={"generate": "out"}),
@@ -102,7 +102,7 @@ PAGES = {
     "taking-a-session.md": Page(
         _LAB,
         written={"12,40-44": "1,2-3"},
-        refused={"acquire run LAB.toml SESSION --retake bad": "no report of build-lut on SESSION lies beside it"},
+        refused={"acquire run LAB.toml SESSION --retake bad": "has no report of build-lut on SESSION"},
     ),
     "train-and-cross-validate.md": Page(
         {"DATA": "dataset", "OTHER": "dataset"},

@@ -20,7 +20,7 @@ from acquisition.run.run import RunOutcome, take_session
 from drivers.presenter import Colour
 from experiment.lights import Illumination
 from experiment.session.folder import Session, rebuild_journal, session_exists
-from experiment.session.journal import Journal, LostJournalError, Rows, beat_beside, ledger_path, read_ledger, rows_of
+from experiment.session.journal import Journal, LostJournalError, Rows, ledger_path, read_ledger, rows_of, thread_beat
 from experiment.session.opening import open_to_read
 from experiment.session.records import ACCEPTED
 from foundation.clock import SimulatedClock
@@ -245,7 +245,7 @@ def test_a_program_that_writes_the_journal_and_leaves_its_facts_alone_ends_no_ru
     folder = lab.session.folder
 
     def beat(folder: Path) -> None:
-        beat_beside(folder / "journal.sqlite", "late", "the camera hangs", datetime.now(UTC))
+        thread_beat(folder / "journal.sqlite", "late", "the camera hangs", datetime.now(UTC))
 
     assert run(lab, 5, beat).complete
     lab.session.close()

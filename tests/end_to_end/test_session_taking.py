@@ -90,7 +90,7 @@ def test_ctrl_c_at_every_frame_ends_in_the_same_frames(lab: Path, undisturbed: P
     assert frame_hashes(interrupted) == frame_hashes(undisturbed)
 
 
-@pytest.mark.parametrize(("text", "said"), [(None, "No such file"), ("garbage", "expected lights under the columns")])
+@pytest.mark.parametrize(("text", "said"), [(None, "No such file"), ("garbage", "illuminants in the columns")])
 def test_a_look_reads_the_lights_too(
     lab: Path, text: str | None, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,4 +1,4 @@
-"""LAB.toml: every mistake is one sentence that names the key, the value and the remedy."""
+"""LAB.toml: every mistake is reported with the key, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     assert settings.illuminations == tmp_path.resolve() / "lights.csv"
 
 
-def test_keys_that_are_left_out_have_the_value_that_the_documentation_shows() -> None:
+def test_defaults_match_the_documentation() -> None:
     text = (Path(__file__).parents[2] / "docs/lab.md").read_text(encoding="utf-8").split("```")[1].removeprefix("toml")
     top, *sections = text.split("\n[")
     assert len(sections) == 12
@@ -37,10 +37,10 @@ def test_keys_that_are_left_out_have_the_value_that_the_documentation_shows() ->
         name = section.partition("]")[0]
         if name not in ("simulated.room", "simulated.camera"):
             assert parse_lab(f"{top}\n[{section}", "LAB.toml") == parse_lab(top, "LAB.toml"), name
-            # What is left out of the list has no value.
-            shown = set(re.findall(r"^(?:# )?(\w+) =", section, re.MULTILINE)) | set(re.findall(r"\w+", section))
+            # Keys that are not in the list have no value.
+            documented = set(re.findall(r"^(?:# )?(\w+) =", section, re.MULTILINE)) | set(re.findall(r"\w+", section))
             defaults: dict[str, Any] = attrgetter(name)(parse_lab(top, "LAB.toml")).model_dump()
-            assert {key for key, value in defaults.items() if value not in (None, {}, ())} <= shown, name
+            assert {key for key, value in defaults.items() if value not in (None, {}, ())} <= documented, name
     room: dict[str, Any] = parse_lab(text.split("[simulated.camera]")[0], "LAB.toml").simulated.room
     assert Room(**room) == Room()
     # The port of PTP/IP, as IANA has it.
@@ -48,7 +48,7 @@ def test_keys_that_are_left_out_have_the_value_that_the_documentation_shows() ->
 
 
 @pytest.mark.parametrize(
-    ("section", "key", "least", "most", "beyond"),
+    ("section", "key", "lowest", "highest", "outside"),
     [
         ("camera", "iso", 1, 10**6, (0,)),
         ("camera", "shutter_s", 1e-4, 1e4, (0.0,)),
@@ -69,13 +69,13 @@ def test_keys_that_are_left_out_have_the_value_that_the_documentation_shows() ->
         ("lab.projector", "colour_wheel_hz", 0.0, 1e4, (-0.1,)),
     ],
 )
-def test_numbers_are_taken_up_to_their_limits(
-    section: str, key: str, least: float, most: float, beyond: tuple[float, ...]
+def test_numbers_are_accepted_up_to_their_limits(
+    section: str, key: str, lowest: float, highest: float, outside: tuple[float, ...]
 ) -> None:
-    for value in (least, most):
+    for value in (lowest, highest):
         settings = parse_lab(f"{MINIMAL}[{section}]\n{key} = {value}\n", "LAB.toml")
         assert attrgetter(f"{section}.{key}")(settings) == value
-    for value in beyond:
+    for value in outside:
         with pytest.raises(ConfigurationError, match=rf"{section}\.{key} = {value}"):
             parse_lab(f"{MINIMAL}[{section}]\n{key} = {value}\n", "LAB.toml")
 
@@ -90,12 +90,12 @@ def test_numbers_are_taken_up_to_their_limits(
         (MINIMAL.replace('chart = "c/chart.json"\n', ""), "chart is missing"),
         (MINIMAL.replace("simulated", "labor"), "expected one of 'lab', 'simulated'"),
         (MINIMAL + "[citation]\nauthors = 'Ban, N.'\n", 'in square brackets: ["Ban, N."]'),
-        (MINIMAL + "[lab.projector]\nhost = '/dev/ttyUSB0'\n", "a serial port, which is given as device"),
+        (MINIMAL + "[lab.projector]\nhost = '/dev/ttyUSB0'\n", "a serial port; an address is expected"),
         (MINIMAL + "[lab.camera]\nhost = 'http://1.2.3.4/'\n", "without http://"),
         (MINIMAL + "[lab.camera]\nhost = '1.2.3.4:80'\n", 'host = "1.2.3.4" and port = 80'),
         (MINIMAL + '[camera]\niso = "ISO"', "camera.iso = 'ISO': a whole number was expected"),
         (MINIMAL + "[camera]\nshutter_s = 0", "a number above 0 was expected"),
-        (MINIMAL + '[sequence]\npatience_s = "for ever"', 'a number of seconds was expected, or "forever"'),
+        (MINIMAL + '[sequence]\npatience_s = "for ever"', 'a number of seconds is expected, or "forever"'),
         (MINIMAL + "[lab.projector]\npassword = 1234", 'password = …: a text was expected, in quotation marks: "…"'),
         (MINIMAL + "[lab.camera]\nserial = 1234", 'serial = 1234: a text was expected, in quotation marks: "1234"'),
         (
@@ -105,41 +105,41 @@ def test_numbers_are_taken_up_to_their_limits(
         ("rig = ", "is not TOML"),
     ],
 )
-def test_a_mistake_is_named(text: str, expected: str) -> None:
+def test_names_a_mistake(text: str, expected: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         parse_lab(text, "LAB.toml")
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_all_mistakes_are_told_at_once() -> None:
+def test_reports_all_mistakes_together() -> None:
     with pytest.raises(ConfigurationError) as caught:
         parse_lab('rig = "labor"\n[camera]\niso = "a"\nshuter_s = 1\n[lab.projector]\npassword = 7\n', "LAB.toml")
     head, *mistakes = str(caught.value).splitlines()
     assert "6 mistakes" in head
     for key in ("rig", "chart", "illuminations", "camera.iso", "camera.shuter_s", "lab.projector.password = …"):
-        assert sum(key in one for one in mistakes) == 1
+        assert sum(key in mistake for mistake in mistakes) == 1
     assert caught.value.__cause__ is None
 
 
-def test_a_wrong_line_that_holds_a_secret_is_not_shown() -> None:
+def test_hides_a_wrong_line_with_a_secret() -> None:
     for line in ("password = s3cret", "password = 12,5s3cret"):
         with pytest.raises(ConfigurationError) as caught:
             parse_lab(MINIMAL + f"[lab.projector]\n{line}\n", "LAB.toml")
         assert "s3cret" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("encoding", "told"), [("latin-1", "line 2 has the byte 0xe9"), ("utf-16", "in UTF-16")])
-def test_another_encoding_is_named_with_what_helps(tmp_path: Path, encoding: str, told: str) -> None:
+@pytest.mark.parametrize(("encoding", "message"), [("latin-1", "line 2 has the byte 0xe9"), ("utf-16", "in UTF-16")])
+def test_names_another_encoding_with_a_remedy(tmp_path: Path, encoding: str, message: str) -> None:
     lab = tmp_path / "LAB.toml"
     lab.write_bytes(f"\n# papier glacé\n{MINIMAL}".encode(encoding))
-    with pytest.raises(FormatError, match=told) as caught:
+    with pytest.raises(FormatError, match=message) as caught:
         load_lab(lab)
     assert "UTF-8" in caught.value.remedy
 
 
 @pytest.mark.parametrize("text", ["inf", '"Forever"'])
-def test_patience_may_have_no_end(text: str) -> None:
+def test_patience_can_be_unlimited(text: str) -> None:
     settings = parse_lab(MINIMAL + f"[sequence]\npatience_s = {text}\n", "LAB.toml")
     assert settings.sequence.patience_s == math.inf
     assert parse_lab(settings.to_toml(), "session.toml").sequence.patience_s == math.inf
@@ -157,7 +157,7 @@ def test_patience_may_have_no_end(text: str) -> None:
         ("'/opt/my lab/notify' s3cret", "/opt/my lab/notify …"),
     ],
 )
-def test_no_secret_gets_into_the_session(target: str, label: str) -> None:
+def test_session_contains_no_secret(target: str, label: str) -> None:
     settings = LabSettings.model_validate(
         {
             "rig": "lab",
@@ -178,13 +178,13 @@ def test_no_secret_gets_into_the_session(target: str, label: str) -> None:
     ("line", "expected"),
     [
         ('notify = "curl \'s3cret"', "sequence.notify = …: No closing quotation"),
-        ('notify = "https:///s3cret"', "a URL names a host"),
+        ('notify = "https:///s3cret"', "the URL has no host"),
         ('notify = "https://s3cret:99999/"', "sequence.notify = …: Port out of range"),
-        ('notify = "https://x/s3cret word"', "a URL has no spaces"),
+        ('notify = "https://x/s3cret word"', "the URL has spaces"),
         ('notify = ["s3cret"]', "sequence.notify = …: a text was expected"),
     ],
 )
-def test_a_mistake_in_a_secret_is_named_without_it(line: str, expected: str) -> None:
+def test_names_a_mistake_without_the_secret(line: str, expected: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         parse_lab(MINIMAL + f"[sequence]\n{line}\n", "LAB.toml")
     assert expected in str(caught.value)
@@ -192,19 +192,19 @@ def test_a_mistake_in_a_secret_is_named_without_it(line: str, expected: str) -> 
     assert caught.value.__cause__ is None
 
 
-def test_a_folder_of_a_lab_is_answered_with_its_file(tmp_path: Path) -> None:
+def test_refuses_folder_with_a_remedy(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError) as told:
         load_lab(tmp_path)
-    assert told.value.remedy == f"name {tmp_path / 'LAB.toml'}"
+    assert told.value.remedy == f"give {tmp_path / 'LAB.toml'}"
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
+def test_names_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"nowhere\.toml"):
         load_lab(tmp_path / "nowhere.toml")
 
 
 @pytest.mark.parametrize("name", ["simulated.toml", "lab.toml"])
-def test_the_settings_that_a_lab_begins_with_are_read(name: str) -> None:
+def test_reads_the_templates(name: str) -> None:
     settings = load_lab(Path(__file__).parents[2] / "acquisition" / "data" / name)
     require_whole_turns(settings.camera, settings.lab.projector)
 
@@ -221,7 +221,7 @@ host = "h"
 
 @pytest.fixture
 def lab_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
-    """Return a maker of a LAB.toml beside a file with a secret in it."""
+    """Return a function that writes a LAB.toml next to files with secrets."""
     monkeypatch.setenv("PJLINK", "s3cret-env")
     monkeypatch.delenv("NOWHERE", raising=False)
     (tmp_path / "word.txt").write_bytes(b"\xef\xbb\xbf s3cret-file \r\nsecond line\n")
@@ -238,68 +238,68 @@ def lab_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., P
 
 
 @pytest.mark.parametrize(
-    ("line", "found"),
+    ("line", "secret"),
     [
         ('password = "s3cret-key"', "s3cret-key"),
         ('password = { env = "PJLINK" }', "s3cret-env"),
         ('password = { file = "word.txt" }', "s3cret-file"),
     ],
 )
-def test_a_secret_is_found_where_the_settings_say(lab_with: Callable[..., Path], line: str, found: str) -> None:
+def test_reads_a_secret_from_its_source(lab_with: Callable[..., Path], line: str, secret: str) -> None:
     settings = load_lab(lab_with(line))
-    assert settings.lab.projector.password == found
+    assert settings.lab.projector.password == secret
     assert "s3cret" not in settings.to_toml()
     assert "s3cret" not in repr(settings)
     notify = REAL + "[sequence]\n" + line.replace("password", "notify")
-    assert load_lab(lab_with("", notify)).sequence.notify == found
+    assert load_lab(lab_with("", notify)).sequence.notify == secret
 
 
 @pytest.mark.parametrize(
-    ("place", "expected"),
+    ("source", "expected"),
     [
         ('{ env = "NOWHERE" }', "NOWHERE"),
         ('{ file = "gone.txt" }', "gone.txt: No such file"),
         ('{ file = "empty.txt" }', "empty.txt is empty"),
-        ('{ file = "binary" }', "binary: it is no text"),
-        ('{ file = "pipe" }', "pipe is no file; name one"),
-        ('{ env = "PJLINK", file = "word.txt" }', "and nothing beside"),
-        ("{ env = 3 }", "expected the text itself"),
-        ("{}", "expected the text itself"),
+        ('{ file = "binary" }', "binary: it is not a text"),
+        ('{ file = "pipe" }', "pipe is not a file; give a file"),
+        ('{ env = "PJLINK", file = "word.txt" }', "expected only the text itself"),
+        ("{ env = 3 }", "expected only the text itself"),
+        ("{}", "expected only the text itself"),
     ],
 )
-def test_a_secret_that_is_not_there_is_named(lab_with: Callable[..., Path], place: str, expected: str) -> None:
+def test_names_a_missing_secret(lab_with: Callable[..., Path], source: str, expected: str) -> None:
     with pytest.raises(ConfigurationError, match=rf"lab\.projector\.password: .*{expected}") as caught:
-        load_lab(lab_with(f"password = {place}"))
+        load_lab(lab_with(f"password = {source}"))
     assert "s3cret" not in str(caught.value)
 
 
-def test_all_secrets_that_are_not_there_are_named_at_once(lab_with: Callable[..., Path]) -> None:
+def test_names_all_missing_secrets_together(lab_with: Callable[..., Path]) -> None:
     sequence = '[sequence]\nnotify = { file = "gone.txt" }\n[notify]\nalive = { env = "PJLINK" }'
     with pytest.raises(ConfigurationError, match="2 mistakes") as caught:
         load_lab(lab_with(f'password = {{ env = "NOWHERE" }}\n{sequence}'))
-    _, *told = str(caught.value).splitlines()
-    assert [one.split(":")[0].strip() for one in told] == ["sequence.notify", "lab.projector.password"]
+    _, *mistakes = str(caught.value).splitlines()
+    assert [mistake.split(":")[0].strip() for mistake in mistakes] == ["sequence.notify", "lab.projector.password"]
     assert "s3cret" not in str(caught.value)
 
 
-def test_nobody_needs_a_password_to_rehearse(lab_with: Callable[..., Path]) -> None:
+def test_simulated_rig_needs_no_password(lab_with: Callable[..., Path]) -> None:
     settings = load_lab(lab_with('password = { env = "NOWHERE" }', REAL.replace('"lab"', '"simulated"')))
     assert settings.lab.projector.password is None
 
 
 @pytest.mark.parametrize("line", ['[lab]\nprojector = "s3cret"', '[[lab.projector]]\npassword = "s3cret"'])
-def test_what_holds_a_secret_is_not_shown_either(line: str) -> None:
+def test_hides_a_table_with_a_secret(line: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         parse_lab(MINIMAL + line, "LAB.toml")
     assert "s3cret" not in str(caught.value)
     assert caught.value.__cause__ is None
 
 
-def test_settings_of_a_windows_editor_are_read(tmp_path: Path) -> None:
-    """Notepad begins a file with the byte order mark of UTF-8."""
+def test_accepts_a_byte_order_mark(tmp_path: Path) -> None:
+    """Notepad starts a file with the byte order mark of UTF-8."""
     text = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "lights.csv"\n[simulated]\nbody = "Test"\n'
-    read: list[LabSettings] = []
+    settings: list[LabSettings] = []
     for mark in (b"", b"\xef\xbb\xbf"):
         (tmp_path / "LAB.toml").write_bytes(mark + text.encode())
-        read.append(load_lab(tmp_path / "LAB.toml"))
-    assert read[0] == read[1]
+        settings.append(load_lab(tmp_path / "LAB.toml"))
+    assert settings[0] == settings[1]

@@ -1,4 +1,4 @@
-"""What each room computes of inputs of many kinds, held to what it was."""
+"""Results of every room for many kinds of input, compared with pinned numbers."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ from tests.calibration.whole import brief, of_fields
 from tests.experiment.test_config import MINIMAL
 from tests.pinned import Pinned
 
-LOOSE = {"same": 1e-4, "nothing": 1e-6}
-"""Of what an iterative fit ends at."""
+LOOSE = {"same": 1e-4, "nothing": 1e-6}  # Tolerances of iterative fits
 
 
 def of_chart(chart: Chart) -> list[Any]:
-    """Return where everything of a chart is, in brief."""
-    references = [[*one.centre_mm, *one.rgb] for one in chart.references]
-    tags = [[one.id, *np.ravel(one.corners_mm)] for one in chart.tags]
+    """Return all positions and codes of a chart, summarised."""
+    references = [[*item.centre_mm, *item.rgb] for item in chart.references]
+    tags = [[item.id, *np.ravel(item.corners_mm)] for item in chart.tags]
     chart = replace(chart, software=None)
     sizes = [chart.page_mm, chart.cell_mm, len(chart.references), len(chart.white_references), len(chart.tags)]
     return [sizes, brief(chart.centres_mm), brief(chart.rgb), brief(references), brief(tags), chart.sha256]
@@ -48,14 +47,14 @@ def test_settings(pinned: Pinned) -> None:
 
 
 def test_a_series_of_exposures(pinned: Pinned) -> None:
-    random, found = np.random.default_rng(7), []
+    random, results = np.random.default_rng(7), []
     times = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
     share = times[:, None, None] / 0.7 * np.exp(random.uniform(np.log(0.03), np.log(0.95), (400, 3)))
     for bend in (1.0, 1.02, 0.97):
-        seen = share**bend + random.standard_normal(share.shape) * 2e-4
-        found.append([brief(one) for one in deviations(seen, times)])
-        found.append([brief(one) for one in deviations(seen[2:], times[2:] * 1.02)])
-    pinned("series of exposures", found, **LOOSE)
+        levels = share**bend + random.standard_normal(share.shape) * 2e-4
+        results.append([brief(array) for array in deviations(levels, times)])
+        results.append([brief(array) for array in deviations(levels[2:], times[2:] * 1.02)])
+    pinned("series of exposures", results, **LOOSE)
 
 
 @pytest.mark.slow

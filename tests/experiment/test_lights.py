@@ -1,4 +1,4 @@
-"""The 707 lights against published black bodies and the sRGB standard, and their file."""
+"""The 707 illuminants against published black bodies and the sRGB standard, and their file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def codes(lights: tuple[Illumination, ...]) -> list[tuple[int, int, int]]:
     return [light.colour for light in lights]
 
 
-def test_the_plan_is_666_uniform_lights_and_41_black_bodies(plan: tuple[Illumination, ...]) -> None:
+def test_plan_has_666_uniform_illuminants_and_41_black_bodies(plan: tuple[Illumination, ...]) -> None:
     assert len(plan) == 707
     assert [light.index for light in plan] == list(range(707))
     assert [light.kind for light in plan] == ["uniform"] * 666 + ["blackbody"] * 41
@@ -38,19 +38,19 @@ def test_the_plan_is_666_uniform_lights_and_41_black_bodies(plan: tuple[Illumina
     assert all(max(code) == 255 for code in codes(plan))
 
 
-def test_uniform_lights_hold_the_primaries_and_stand_on_the_grid(plan: tuple[Illumination, ...]) -> None:
-    shown = set(codes(plan[:666]))
-    assert {(255, 0, 0), (0, 255, 0), (0, 0, 255)} <= shown
+def test_uniform_illuminants_are_on_the_grid(plan: tuple[Illumination, ...]) -> None:
+    uniform_codes = set(codes(plan[:666]))
+    assert {(255, 0, 0), (0, 255, 0), (0, 0, 255)} <= uniform_codes
     linear = np.array(uniform_lights())
     np.testing.assert_allclose(linear.sum(axis=1), 1)
     assert linear.min() == 0
     np.testing.assert_allclose(35 * linear, np.rint(35 * linear), atol=1e-9)
-    # What is shown has the chromaticity of its grid point but for the rounding of the codes.
+    # The codes have the chromaticity of the grid point, except for rounding.
     light = decode_srgb(np.array(codes(plan[:666])) / 255)
     np.testing.assert_allclose(light / light.sum(axis=1, keepdims=True), linear, atol=0.002)
 
 
-def test_temperatures_are_read() -> None:
+def test_parses_temperatures() -> None:
     assert parse_ccts("2000:3000:250") == (2000, 2250, 2500, 2750, 3000)
     assert parse_ccts("2000:2999:500") == (2000, 2500)
     assert parse_ccts("3000:2000:-500") == (3000, 2500, 2000)
@@ -62,24 +62,24 @@ def test_temperatures_are_read() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("10000:2000:200", "200 K .*10000 to 2000 K"),
         ("2000:10000:0", "steps of 0 K"),
         ("2000:10000:1e-6", "in at most 10000 temperatures"),
-        ("1:1e12:1", "1 K is not within 1000"),
-        ("warm", "expected FIRST:LAST:STEP"),
-        ("999", "999 K is not within"),
-        ("100001", "100001 K is not within"),
+        ("1:1e12:1", "1 K given, temperatures from 1000"),
+        ("warm", "FIRST:LAST:STEP or"),
+        ("999", "999 K given"),
+        ("100001", "100001 K given"),
         ("1000:11000:1", "in at most 10000 temperatures"),
     ],
 )
-def test_temperatures_that_are_none_are_refused(text: str, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_refuses_wrong_temperatures(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         parse_ccts(text)
 
 
-def test_lights_do_not_overwrite_their_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refuses_a_plot_as_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["illuminations", str(tmp_path / "a.png"), "--grid", "1"]) == 2
     assert "a.png" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
@@ -90,36 +90,36 @@ colours = st.builds(Colour, st.integers(0, 255), st.integers(0, 255), st.integer
 
 
 @given(st.lists(st.tuples(ccts_k, colours), min_size=1, max_size=8))
-def test_any_lights_are_read_again(
+def test_reads_any_illuminants_that_it_writes(
     tmp_path_factory: pytest.TempPathFactory, drawn: list[tuple[float | None, Colour]]
 ) -> None:
-    made = tuple(
+    illuminants = tuple(
         Illumination(number, "uniform" if cct_k is None else "blackbody", cct_k, colour)
         for number, (cct_k, colour) in enumerate(drawn)
     )
     path = tmp_path_factory.mktemp("lights") / "illuminations.csv"
-    path.write_text(illuminations_to_csv(made))
-    assert load_illuminations(path) == made
+    path.write_text(illuminations_to_csv(illuminants))
+    assert load_illuminations(path) == illuminants
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "lights under the columns"),
-        (HEADER, "lights under the columns"),
-        ("index,kind,red,green,blue\n0,uniform,1,2,3\n", "lights under the columns"),
-        (HEADER + "0,uniform,,1,2\n", "light 0: blue is missing"),
-        (HEADER + "0,uniform,,1.5,2,3\n", "light 0: red is 1.5"),
-        (HEADER + "0,uniform,,1,256,3\n", "light 0: green is 256; a code is 0 … 255"),
-        (HEADER + "0,sun,,1,2,3\n", "light 0: kind is 'sun'"),
-        (HEADER + "0,uniform,,1,2,3\n2,uniform,,1,2,3\n", "light 1: index is 2, expected 1"),
-        (HEADER + "0,blackbody,,1,2,3\n", "light 0: cct_k is missing"),
-        (HEADER + "0,blackbody,-5,1,2,3\n", "light 0: cct_k is -5"),
-        (HEADER + "0,blackbody,inf,1,2,3\n", "light 0: cct_k is inf"),
+        ("", "illuminants in the columns"),
+        (HEADER, "illuminants in the columns"),
+        ("index,kind,red,green,blue\n0,uniform,1,2,3\n", "illuminants in the columns"),
+        (HEADER + "0,uniform,,1,2\n", "illuminant 0: blue is missing"),
+        (HEADER + "0,uniform,,1.5,2,3\n", "illuminant 0: red is 1.5"),
+        (HEADER + "0,uniform,,1,256,3\n", "illuminant 0: green is 256, a code 0 … 255 expected"),
+        (HEADER + "0,sun,,1,2,3\n", "illuminant 0: kind is 'sun'"),
+        (HEADER + "0,uniform,,1,2,3\n2,uniform,,1,2,3\n", "illuminant 1: index is 2, 1 expected"),
+        (HEADER + "0,blackbody,,1,2,3\n", "illuminant 0: cct_k is missing"),
+        (HEADER + "0,blackbody,-5,1,2,3\n", "illuminant 0: cct_k is -5"),
+        (HEADER + "0,blackbody,inf,1,2,3\n", "illuminant 0: cct_k is inf"),
         (HEADER + "0," + "u" * 200_000 + ",,1,2,3\n", "field larger than field limit"),
     ],
 )
-def test_a_bad_file_is_refused_in_one_sentence(text: str, message: str, tmp_path: Path) -> None:
+def test_refuses_bad_file(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "illuminations.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(FormatError) as refused:
@@ -129,7 +129,7 @@ def test_a_bad_file_is_refused_in_one_sentence(text: str, message: str, tmp_path
     assert "\n" not in str(refused.value)
 
 
-def test_what_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
+def test_refuses_missing_and_binary_files(tmp_path: Path) -> None:
     binary = tmp_path / "picture.csv"
     binary.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
     for path in (tmp_path / "none.csv", tmp_path, binary):

@@ -28,7 +28,7 @@ from drivers.serial_projectors.driver import LineProjector
 from drivers.serial_projectors.language import built_in_languages, load_language
 from experiment.config import CameraCable, LabSettings, ProjectorCable
 from experiment.session.folder import Session
-from experiment.session.records import last_moment
+from experiment.session.records import last_frame_time
 from foundation.clock import Clock, SteadyClock, SystemClock
 from foundation.errors import ConfigurationError, CropError
 from foundation.holds import hold
@@ -89,7 +89,7 @@ def _hold_lab(file: str, opened: ExitStack) -> None:
 
 def session_clock(session: Session | None) -> SteadyClock:
     """Return this machine's time for a session, going on behind its last frame; None for one that has none."""
-    return SteadyClock(SystemClock(), None if session is None else last_moment(session.journal.attempts()))
+    return SteadyClock(SystemClock(), None if session is None else last_frame_time(session.journal.attempts()))
 
 
 def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:

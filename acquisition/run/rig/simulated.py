@@ -21,7 +21,7 @@ from experiment.chart.model import Chart
 from experiment.chart.printing import drawing
 from experiment.config import LabSettings
 from experiment.session.folder import Session
-from experiment.session.records import last_moment
+from experiment.session.records import last_frame_time
 from foundation.clock import SIM_START, SimulatedClock
 from foundation.errors import ConfigurationError
 from sim.buses.usb import MemoryTransport
@@ -46,7 +46,7 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     """
     before = _taken_before(session)
     exposed = Counter(colour for _, colour in before)
-    last = None if session is None else last_moment(session.journal.attempts())
+    last = None if session is None else last_frame_time(session.journal.attempts())
     clock = SimulatedClock(last or SIM_START)
     screen = Screen()
     simulated = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)

@@ -49,7 +49,7 @@ from experiment.chart.layout import design_chart
 from experiment.config import LabSettings, SequenceSettings
 from experiment.lights import Illumination
 from experiment.session.folder import Session
-from experiment.session.opening import HeldJournalError
+from experiment.session.opening import BusyJournalError
 from experiment.session.records import plan_steps
 from foundation.clock import SimulatedClock
 from foundation.errors import (
@@ -535,7 +535,7 @@ def test_a_full_disk_never_loses_the_frame_in_the_camera(tmp_path: Path) -> None
 
 def test_a_journal_that_another_program_held_for_the_whole_patience_is_not_waited_for_again() -> None:
     def held() -> None:
-        raise HeldJournalError("cannot write journal.sqlite: database is locked")
+        raise BusyJournalError("cannot write journal.sqlite: database is locked")
 
     clock = SimulatedClock()
     begun = clock.monotonic()

@@ -272,7 +272,7 @@ class TestDryRun:
         assert "3 frames to take (3 light); 5 frames of 8 done" in capsys.readouterr().out
         assert contents(lab.parent) == before
         assert main(["run", str(lab), str(night), "--dry-run", "--retake", "9"]) == 2
-        assert "has no light 9" in capsys.readouterr().err
+        assert "has no illuminant 9" in capsys.readouterr().err
         assert main(["run", str(lab), str(night), "--dry-run"]) == 0
         assert contents(lab.parent) == before
         text = capsys.readouterr().out

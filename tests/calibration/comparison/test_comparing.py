@@ -443,7 +443,7 @@ def test_a_frame_that_ends_the_build_of_a_session_can_be_taken_again(small: Lab,
         pass
     assert {path.name for path in tmp_path.iterdir()} == {"dim", "dim.refused"}
     with Session.open(tmp_path / "dim") as session:
-        assert [frame.illumination for frame in session.asked_again("bad").frames] == [1]
+        assert [frame.illumination for frame in session.plan_retake("bad").frames] == [1]
 
 
 @pytest.mark.slow

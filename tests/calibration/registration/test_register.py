@@ -24,7 +24,7 @@ from calibration.sampling import SAMPLE_REACH_PX
 from drivers.presenter import Colour
 from drivers.raw.rawfile import CHANNELS, Mosaic, read_raw
 from experiment.chart.layout import A_SERIES_MM, design_chart, paper_chart
-from experiment.framing.field import SIDE_POINTS, FoundField, field_mm
+from experiment.framing.field import SIDE_POINTS, DetectedField, field_mm
 from foundation.errors import RegistrationError
 from sim.world.world import Room
 from tests.calibration.lab import QUARTER, Lab, hang, hang_chart
@@ -343,7 +343,7 @@ def test_an_outline_is_completed_where_it_was_not_found_with_normals_that_point_
     sides = [start + share * (end - start) for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     # The second side, at the right, was not found; nor was half of the third, below.
     known = np.concatenate([sides[0], sides[2][: SIDE_POINTS // 2], sides[3]])
-    field = FoundField(np.zeros((4, 2)), np.eye(3), known, np.zeros_like(known), np.zeros_like(known), 1.0)
+    field = DetectedField(np.zeros((4, 2)), np.eye(3), known, np.zeros_like(known), np.zeros_like(known), 1.0)
     found = registering._completed(field, lens, chart)
     added, normals = found.outline_mm[len(known) :], found.normals[len(known) :]
     np.testing.assert_array_equal(found.outline_mm[: len(known)], known)

@@ -1,4 +1,4 @@
-"""The layout's laws: nothing overlaps, every colour stands once, tags and references are where they serve best."""
+"""Layout of the chart: no overlap, every colour once, positions of tags and references."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 PX_MM = 25.4 / 600
 MARGIN_MM = 8.0
 
-# bits 4 and 5 are large: one seed says as much.
+# Charts of 4 and 5 bits are large, so one seed is enough.
 charts = st.builds(
     cache(design_chart),
     bits=st.sampled_from([1, 2, 3]),
@@ -35,7 +35,7 @@ charts = st.builds(
 
 
 def slots_px(chart: Chart) -> npt.NDArray[np.int64]:
-    """(N, 4) left, top, right, bottom of cells, references and whole tags with their rims, pixels at 600 dpi."""
+    """(N, 4) left, top, right, bottom of patches, references and tags with rims, pixels at 600 dpi."""
     boxes = [np.concatenate([chart.centres_mm - 125 / 2 * PX_MM, chart.centres_mm + 125 / 2 * PX_MM], axis=1)]
     for reference in chart.references:
         centre, half = np.array(reference.centre_mm), np.array(reference.size_mm) / 2
@@ -49,7 +49,7 @@ def slots_px(chart: Chart) -> npt.NDArray[np.int64]:
 
 @settings(max_examples=25)
 @given(charts)
-def test_slots_tile_the_field_without_overlap_or_gap_inside_the_margin(chart: Chart) -> None:
+def test_slots_cover_the_area_once(chart: Chart) -> None:
     boxes = slots_px(chart)
     (x0, y0), (x1, y1) = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
     covered = np.zeros((int(y1 - y0) // 125, int(x1 - x0) // 125), dtype=np.int64)
@@ -66,8 +66,8 @@ def test_slots_tile_the_field_without_overlap_or_gap_inside_the_margin(chart: Ch
 
 @settings(max_examples=25)
 @given(charts)
-def test_every_colour_stands_once_and_every_quarter_has_every_level(chart: Chart) -> None:
-    """But where there are fewer than four of a grey."""
+def test_every_colour_once_and_every_grey_in_every_quarter(chart: Chart) -> None:
+    """Except for greys with fewer than four references."""
     assert sorted(chart.colours.tolist()) == list(range(8**chart.bits))
     levels = Counter(reference.rgb for reference in chart.references)
     assert set(levels) == {(code, code, code) for code in (*GREY_CODES, 255)}
@@ -85,7 +85,7 @@ def test_every_colour_stands_once_and_every_quarter_has_every_level(chart: Chart
 
 @settings(max_examples=25)
 @given(charts)
-def test_tags_are_numbered_row_by_row_reach_the_edges_and_stand_close_enough(chart: Chart) -> None:
+def test_order_and_distances_of_tags(chart: Chart) -> None:
     corners = np.array([tag.corners_mm for tag in chart.tags])
     assert [tag.id for tag in chart.tags] == list(range(len(chart.tags)))
     assert len(chart.tags) >= 4
@@ -107,7 +107,7 @@ def test_tags_are_numbered_row_by_row_reach_the_edges_and_stand_close_enough(cha
         assert steps.max() <= 38 * 125
 
 
-def test_the_paper_s_chart_on_a0() -> None:
+def test_default_chart_on_a0() -> None:
     chart = design_chart()
     boxes = slots_px(chart)
     assert ((boxes[:, 2:].max(axis=0) - boxes[:, :2].min(axis=0)) / 125).tolist() == [221, 155]
@@ -120,7 +120,7 @@ def test_the_paper_s_chart_on_a0() -> None:
     }
 
 
-def test_the_greys_halve_the_light_of_srgb_and_are_no_colours_of_the_chart() -> None:
+def test_greys_are_stops_and_no_colours_of_the_chart() -> None:
     # IEC 61966-2-1: code 188 is linear 0.5029, and so on by hand.
     for code, linear in zip(GREY_CODES, (0.5, 0.25, 0.125, 0.0625), strict=True):
         assert ((code / 255 + 0.055) / 1.055) ** 2.4 == pytest.approx(linear, rel=0.01)
@@ -142,18 +142,16 @@ def test_the_greys_halve_the_light_of_srgb_and_are_no_colours_of_the_chart() -> 
         (2, (18.0, 500.0), 1, "A8"),
         (2, (0.0, 500.0), 1, "above 0"),
         (2, (float("nan"), 500.0), 1, "above 0"),
-        (2, "Letter", 1, "'Letter' is not known; name one of A0"),
+        (2, "Letter", 1, "'Letter' is not known; give one of A0"),
         (5, (6000.0, 6000.0), 1, "family 36h11 has 587"),
     ],
 )
-def test_what_cannot_be_designed_says_what_can(
-    bits: int, page: str | tuple[float, float] | None, seed: int, message: str
-) -> None:
+def test_refuses_impossible_charts(bits: int, page: str | tuple[float, float] | None, seed: int, message: str) -> None:
     with pytest.raises(InputError, match=message):
         design_chart(bits, page, seed)
 
 
-def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:
+def test_paper_chart_is_a_plain_grid() -> None:
     chart = paper_chart()
     assert chart.page_mm == (1189, 841)
     assert chart.cell_mm == pytest.approx((4.58, 6.45), abs=0.02)
@@ -166,7 +164,7 @@ def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:
     assert np.diff(xs) == pytest.approx(chart.cell_mm[0])
     assert np.diff(ys) == pytest.approx(chart.cell_mm[1])
     assert min(xs[0] - chart.cell_mm[0] / 2, ys[0] - chart.cell_mm[1] / 2) >= MARGIN_MM
-    # The documented order: neighbours in a row differ by one step, as do those in a column but for blue between blocks.
+    # The documented order: neighbours differ by one step, except for blue between blocks above each other.
     codes = chart.rgb.reshape(128, 256, 3).astype(int)
     across, down = np.abs(np.diff(codes, axis=1)), np.abs(np.diff(codes, axis=0))
     assert (across.sum(axis=2) == 8).all()

@@ -1,4 +1,4 @@
-"""The margins' marks: where they say, clear of the field, and readable."""
+"""Marks in the margins: positions, distance to the patches, and shape."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ charts = st.builds(design, bits=st.integers(1, 3), page=st.none(), seed=st.integ
 
 
 def marks_px(chart: Chart) -> npt.NDArray[np.int64]:
-    """(N, 4) marks of a sheet, which are whole pixels at 600 dpi."""
+    """(N, 4) marks of a sheet, checked to be whole pixels at 600 dpi."""
     sheet = drawing(chart)
     marks = len(sheet.rgb) - len(field_drawing(chart).rgb)
     exact = sheet.rectangles_mm[:marks] / PX_MM
@@ -41,8 +41,8 @@ def marks_px(chart: Chart) -> npt.NDArray[np.int64]:
     return np.rint(exact).astype(np.int64)
 
 
-def clear_of_the_field(chart: Chart) -> npt.NDArray[np.int64]:
-    """Check that no mark leaves the sheet or comes nearer to the field than 1.5 mm; return the marks."""
+def require_clear_marks(chart: Chart) -> npt.NDArray[np.int64]:
+    """Check that all marks are on the sheet and at least 1.5 mm from the patches; return the marks."""
     marks = marks_px(chart)
     parts = field_drawing(chart).rectangles_mm / PX_MM
     low, high = parts[:, :2].min(axis=0), parts[:, 2:].max(axis=0)
@@ -54,18 +54,18 @@ def clear_of_the_field(chart: Chart) -> npt.NDArray[np.int64]:
 
 @settings(max_examples=12)
 @given(charts)
-def test_marks_never_touch_the_field_or_leave_the_sheet(chart: Chart) -> None:
-    assert len(clear_of_the_field(chart)) > 500
+def test_marks_keep_clear_of_patches_and_stay_on_the_sheet(chart: Chart) -> None:
+    assert len(require_clear_marks(chart)) > 500
 
 
 @pytest.mark.parametrize("page", ["A0", "A1"])
-def test_marks_keep_clear_of_the_whites_in_the_margin_of_the_paper_s_grid(page: str) -> None:
+def test_marks_keep_clear_of_references_in_the_margin(page: str) -> None:
     chart = paper_chart(page)
     marks = marks_px(chart)
     assert len(marks) > 4000
-    away = np.array(chart.cell_mm) / 2 / PX_MM + 34.9
+    distance = np.array(chart.cell_mm) / 2 / PX_MM + 34.9
     low, high = (extreme / PX_MM for extreme in (chart.centres_mm.min(axis=0), chart.centres_mm.max(axis=0)))
-    assert not ((marks[:, 2:] > low - away) & (marks[:, :2] < high + away)).all(axis=1).any()
+    assert not ((marks[:, 2:] > low - distance) & (marks[:, :2] < high + distance)).all(axis=1).any()
     for reference in chart.references:
         low = (np.array(reference.centre_mm) - np.array(reference.size_mm) / 2) / PX_MM
         high = low + np.array(reference.size_mm) / PX_MM
@@ -73,27 +73,29 @@ def test_marks_keep_clear_of_the_whites_in_the_margin_of_the_paper_s_grid(page: 
 
 
 @pytest.mark.parametrize("chart", [design_chart(2), design_chart(3, "A3")], ids=["A7", "A3"])
-def test_the_rulers_ticks_are_true(chart: Chart) -> None:
+def test_ticks_of_the_rulers_are_accurate(chart: Chart) -> None:
     marks = marks_px(chart)
     field = field_drawing(chart).rectangles_mm / PX_MM
     (left, top), (right, bottom) = np.rint(field[:, :2].min(axis=0)), np.rint(field[:, 2:].max(axis=0))
-    below = marks[(marks[:, 1] == bottom + 35) & (marks[:, 2] - marks[:, 0] == 4)]
-    beside = marks[(marks[:, 2] == left - 35) & (marks[:, 3] - marks[:, 1] == 4)]
-    for ticks, start, end, axis in ((below, left, right, 0), (beside, top, bottom, 1)):
-        places = np.sort(ticks[:, axis]) - start
-        assert len(places) >= int((end - start) * PX_MM)
-        millimetres = np.arange(len(places))
-        # No error adds up: each tick is the whole pixel nearest to its millimetre; 127 mm are 3000 pixels exactly.
-        assert np.abs(places * PX_MM - millimetres).max() <= 25.4 / 600 / 2 + 1e-9
-        if len(places) > 127:
-            assert places[127] == 3000
+    bottom_ticks = marks[(marks[:, 1] == bottom + 35) & (marks[:, 2] - marks[:, 0] == 4)]
+    left_ticks = marks[(marks[:, 2] == left - 35) & (marks[:, 3] - marks[:, 1] == 4)]
+    for ticks, start, end, axis in ((bottom_ticks, left, right, 0), (left_ticks, top, bottom, 1)):
+        positions = np.sort(ticks[:, axis]) - start
+        assert len(positions) >= int((end - start) * PX_MM)
+        millimetres = np.arange(len(positions))
+        # Errors do not accumulate: each tick is the whole pixel closest to its millimetre; 127 mm are 3000 pixels
+        # exactly.
+        assert np.abs(positions * PX_MM - millimetres).max() <= 25.4 / 600 / 2 + 1e-9
+        if len(positions) > 127:
+            assert positions[127] == 3000
     lengths = {
-        int(place - left): int(length) for place, length in zip(below[:, 0], below[:, 3] - below[:, 1], strict=True)
+        int(position - left): int(length)
+        for position, length in zip(bottom_ticks[:, 0], bottom_ticks[:, 3] - bottom_ticks[:, 1], strict=True)
     }
     assert lengths[0] > lengths[round(10 / PX_MM)] > lengths[round(5 / PX_MM)] > lengths[round(1 / PX_MM)]
 
 
-def test_the_edge_falls_by_one_in_twelve_and_the_star_has_twelve_spokes() -> None:
+def test_slope_of_the_edge_and_spokes_of_the_star() -> None:
     edge = edge_boxes()
     for u in (0, 6, 150, 287):
         covering = edge[(edge[:, 0] <= u) & (u < edge[:, 2])]
@@ -108,7 +110,7 @@ def test_the_edge_falls_by_one_in_twelve_and_the_star_has_twelve_spokes() -> Non
     assert picture.mean() == pytest.approx(np.pi / 8, abs=0.02)
 
 
-def test_a_chart_of_another_maker_without_margins_is_drawn(a7: Chart) -> None:
+def test_draws_a_chart_without_margins(a7: Chart) -> None:
     high = a7.tags[-1].corners_mm[2] + 50 * PX_MM
     tight = replace(a7, page_mm=(float(high[0]) + 0.5, float(high[1]) + 0.5))
-    clear_of_the_field(tight)
+    require_clear_marks(tight)

@@ -1,4 +1,4 @@
-"""`chart.json`: what is written is read again, and a bad file is refused in one sentence."""
+"""`chart.json`: writing, reading, and refusal of bad files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from foundation.errors import FormatError
 
 pytestmark = pytest.mark.slow
 
-# Written by hand from the format's description, with keys that this version does not know.
+# Written by hand from the description of the format, with unknown keys.
 BY_HAND = """{"format": "crop.chart", "version": 1, "page_mm": [60, 40.5], "bits": 1, "cell_mm": [5, 4],
 "made by": "hand",
 "cells": {"centre_mm": [[1,2],[3,4],[5,6],[7,8],[9,10],[11,12],[13,14],[15,16.25]], "colour": [7,6,5,4,3,2,1,0]},
@@ -25,7 +25,7 @@ BY_HAND = """{"format": "crop.chart", "version": 1, "page_mm": [60, 40.5], "bits
                {"name": "grey", "rgb": [99,99,99], "centre_mm": [40,30], "size_mm": [6,4]}]}"""
 
 
-def test_a_file_written_by_hand(tmp_path: Path) -> None:
+def test_reads_a_file_written_by_hand(tmp_path: Path) -> None:
     path = tmp_path / "chart.json"
     path.write_text(BY_HAND)
     chart = load_chart(path)
@@ -45,7 +45,7 @@ def test_a_file_written_by_hand(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("chart", [design_chart(1), design_chart(3, seed=4), paper_chart("A4", 3)])
-def test_what_is_saved_is_read_again(chart: Chart, tmp_path: Path) -> None:
+def test_reads_what_it_saves(chart: Chart, tmp_path: Path) -> None:
     chart.save(tmp_path / "chart.json")
     again = load_chart(tmp_path / "chart.json")
     np.testing.assert_allclose(again.centres_mm, chart.centres_mm, rtol=0, atol=1e-6)
@@ -53,17 +53,17 @@ def test_what_is_saved_is_read_again(chart: Chart, tmp_path: Path) -> None:
     assert again.sha256 == chart.sha256
 
 
-def set_(*keys: str | int, to: object) -> Callable[[dict[str, Any]], None]:
+def set_value(*keys: str | int, to: object) -> Callable[[dict[str, Any]], None]:
     def change(document: dict[str, Any]) -> None:
-        part: Any = document
+        item: Any = document
         for key in keys[:-1]:
-            part = part[key]
-        part[keys[-1]] = to
+            item = item[key]
+        item[keys[-1]] = to
 
     return change
 
 
-def two_of_one_number(document: dict[str, Any]) -> None:
+def repeat_tags(document: dict[str, Any]) -> None:
     document["tags"] *= 2
 
 
@@ -77,27 +77,25 @@ def drop(key: str) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (set_("format", to="crop.lut"), "format"),
-        (set_("version", to=2), "version"),
+        (set_value("format", to="crop.lut"), "format"),
+        (set_value("version", to=2), "version"),
         (drop("page_mm"), "page_mm"),
-        (set_("page_mm", to=[60]), "page_mm"),
-        (set_("page_mm", 0, to=float("nan")), "page_mm"),
-        (set_("cell_mm", 0, to=0), "cell_mm"),
-        (set_("bits", to=6), "bits"),
-        (set_("bits", to=2), "64 colours"),
-        (set_("cells", "colour", 0, to=0), "one cell for each of its 8 colours"),
-        (set_("cells", "centre_mm", to=[[1, 2]]), "1 centres and 8 colours"),
-        (set_("cells", "centre_mm", 3, to=["a", 2]), "cells.centre_mm.3"),
-        (set_("tags", 0, "corners_mm", to=[[1, 2], [3, 4], [5, 6]]), "tags.0.corners_mm"),
-        (set_("tags", 0, "id", to=-1), "tags.0.id"),
-        (set_("references", 1, "rgb", to=[99, 99, 256]), "references.1.rgb"),
-        (set_("references", 1, "size_mm", to=[0, 1]), "references.1.size_mm"),
-        (two_of_one_number, "[3, 3]"),
+        (set_value("page_mm", to=[60]), "page_mm"),
+        (set_value("page_mm", 0, to=float("nan")), "page_mm"),
+        (set_value("cell_mm", 0, to=0), "cell_mm"),
+        (set_value("bits", to=6), "bits"),
+        (set_value("bits", to=2), "64 colours"),
+        (set_value("cells", "colour", 0, to=0), "one patch for each of its 8 colours"),
+        (set_value("cells", "centre_mm", to=[[1, 2]]), "1 centres and 8 colours"),
+        (set_value("cells", "centre_mm", 3, to=["a", 2]), "cells.centre_mm.3"),
+        (set_value("tags", 0, "corners_mm", to=[[1, 2], [3, 4], [5, 6]]), "tags.0.corners_mm"),
+        (set_value("tags", 0, "id", to=-1), "tags.0.id"),
+        (set_value("references", 1, "rgb", to=[99, 99, 256]), "references.1.rgb"),
+        (set_value("references", 1, "size_mm", to=[0, 1]), "references.1.size_mm"),
+        (repeat_tags, "[3, 3]"),
     ],
 )
-def test_a_bad_chart_is_refused_in_one_sentence(
-    change: Callable[[dict[str, Any]], None], message: str, tmp_path: Path
-) -> None:
+def test_refuses_bad_chart(change: Callable[[dict[str, Any]], None], message: str, tmp_path: Path) -> None:
     document = json.loads(BY_HAND)
     change(document)
     path = tmp_path / "chart.json"
@@ -110,7 +108,7 @@ def test_a_bad_chart_is_refused_in_one_sentence(
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b"\xff\xfe\x00"])
-def test_what_is_no_json_object_is_refused(content: bytes, tmp_path: Path) -> None:
+def test_refuses_files_without_json_object(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "chart.json"
     path.write_bytes(content)
     with pytest.raises(FormatError, match=r"chart\.json: damaged") as refused:
@@ -118,7 +116,7 @@ def test_what_is_no_json_object_is_refused(content: bytes, tmp_path: Path) -> No
     assert "\n" not in str(refused.value)
 
 
-def test_the_print_is_no_description_of_it(tmp_path: Path) -> None:
+def test_refuses_the_pdf_with_a_remedy(tmp_path: Path) -> None:
     pdf = tmp_path / "chart.pdf"
     pdf.write_bytes(b"%PDF-1.6\n\xff")
     with pytest.raises(FormatError) as caught:

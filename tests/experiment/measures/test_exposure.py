@@ -1,4 +1,4 @@
-"""Brightness and clipping of a frame are those of its counts."""
+"""Brightness and clipping of a frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def mosaic(level: int, clipped: int = 0) -> Mosaic:
     return Mosaic(counts, "RGGB", np.full((2, 2), 2048.0), 15831, "a camera", counts, Area(0, 0, 320, 480), ())
 
 
-def test_the_measure_is_that_of_the_counts() -> None:
+def test_measures_level_and_clipping() -> None:
     assert measure_exposure(mosaic(4000, clipped=100)).clipped == pytest.approx(100 / (320 * 480))
     exposure = measure_exposure(mosaic(4000))
     assert exposure.clipped == 0

@@ -1,4 +1,4 @@
-"""What is measured of a decoded frame."""
+"""Measurements of one decoded frame."""
 
 from __future__ import annotations
 
@@ -17,45 +17,45 @@ def mosaic(black: float = 2048.0) -> Mosaic:
 
 
 @pytest.mark.slow
-def test_a_frame_is_measured_by_means_of_its_colours_and_shares_of_odd_photosites() -> None:
+def test_measures_means_and_counts_clipped_photosites() -> None:
     frame = mosaic()
-    whole = measures.measure(frame)
-    np.testing.assert_allclose(whole.tiles, np.tile([1000.0, 2200, 1500], (24 * 16, 1)))
-    np.testing.assert_allclose(whole.strips, np.tile([1000.0, 2200, 1500], (160 * 4, 1)))
-    assert (whole.brightest_dn, whole.range_dn, whole.black) == (2400, 15831 - 2048, 2048)
-    assert (whole.clipped, whole.empty, whole.black_measured) == (0, 0, False)
-    assert whole.samples.shape == (8192, 2)
-    assert (whole.samples == 2048 + np.array([2000, 2400])).all()
+    even = measures.measure(frame)
+    np.testing.assert_allclose(even.tiles, np.tile([1000.0, 2200, 1500], (24 * 16, 1)))
+    np.testing.assert_allclose(even.strips, np.tile([1000.0, 2200, 1500], (160 * 4, 1)))
+    assert (even.brightest_dn, even.range_dn, even.black) == (2400, 15831 - 2048, 2048)
+    assert (even.clipped, even.empty, even.black_measured) == (0, 0, False)
+    assert even.samples.shape == (8192, 2)
+    assert (even.samples == 2048 + np.array([2000, 2400])).all()
     # 98 % of saturation is 15514.4; half of black 1024.
     frame.counts[100, 100:110] = 15514
     frame.counts[101, 100:107] = 15515
     frame.counts[200, 200:205] = 1024
     frame.counts[201, 200:203] = 1023
-    odd = measures.measure(frame)
-    assert (odd.clipped, odd.empty) == pytest.approx((7 / 320 / 480, 3 / 320 / 480))
-    # Rows 100 and 101 are of the sixth row of tiles, columns 100 to 109 of the sixth column.
+    uneven = measures.measure(frame)
+    assert (uneven.clipped, uneven.empty) == pytest.approx((7 / 320 / 480, 3 / 320 / 480))
+    # Rows 100 and 101 are in the sixth row of tiles, columns 100 to 109 in the sixth column.
     rise = 5 * (15514 - 2048 - 1000)
-    assert odd.tiles[5 * 24 + 5, 0] == pytest.approx(1000 + rise / 100)
-    assert odd.strips[50 * 4, 0] == pytest.approx(1000 + rise / 60)
-    assert odd.digest != whole.digest
+    assert uneven.tiles[5 * 24 + 5, 0] == pytest.approx(1000 + rise / 100)
+    assert uneven.strips[50 * 4, 0] == pytest.approx(1000 + rise / 60)
+    assert uneven.digest != even.digest
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("black", "empty"), [(63.0, 0), (64.0, 4)])
-def test_counts_below_black_are_none_of_a_sensor_where_there_is_black(black: float, empty: int) -> None:
+def test_counts_photosites_far_below_black(black: float, empty: int) -> None:
     frame = mosaic(black)
     frame.counts[10, 10:14] = 0
     assert measures.measure(frame).empty == empty / frame.counts.size
 
 
 @pytest.mark.parametrize(("floor", "slope", "top"), [(36.0, 0.55, 800.0), (0.5, 0.2, 40.0), (4.0, 0.0, 800.0)])
-def test_noise_is_read_from_the_greens_of_one_block(floor: float, slope: float, top: float) -> None:
+def test_measures_noise_from_pairs_of_greens(floor: float, slope: float, top: float) -> None:
     random = np.random.default_rng(4)
     level = random.uniform(0, top, 40_000)
     greens = level[:, None] + random.standard_normal((len(level), 2)) * np.sqrt(floor + slope * level)[:, None]
-    # Some blocks lie across an edge between two cells.
+    # Some blocks are on an edge between two patches.
     greens[::50, 0] += 200
-    found = measures._noise(greens)
-    at = top * np.array([0.25, 0.5, 1.0])
-    np.testing.assert_allclose(found.variance(at), floor + slope * at, rtol=0.12)
-    assert found.variance(-100.0) == found.variance(0.0) == found.floor
+    noise = measures._noise(greens)
+    levels = top * np.array([0.25, 0.5, 1.0])
+    np.testing.assert_allclose(noise.variance(levels), floor + slope * levels, rtol=0.12)
+    assert noise.variance(-100.0) == noise.variance(0.0) == noise.floor

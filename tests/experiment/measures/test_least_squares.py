@@ -1,7 +1,4 @@
-"""The compiled fits and sums against NumPy's plain answers.
-
-Bases of polynomials: their terms, and the order that a number of terms has.
-"""
+"""Compiled fits and sums against NumPy, and the terms of polynomial bases."""
 
 from __future__ import annotations
 
@@ -27,7 +24,7 @@ PLACES = np.random.default_rng(3).random((400, 2)) * PAGE
 
 
 @pytest.mark.parametrize("order", range(8))
-def test_terms_and_orders_agree(order: int) -> None:
+def test_numbers_of_terms_and_orders_agree(order: int) -> None:
     assert len(page_powers(order)) == (order + 1) * (order + 2) // 2
     assert order_of(len(page_powers(order))) == order
     assert page_polynomial(PLACES, PAGE, order).shape == (len(PLACES), len(page_powers(order)))
@@ -43,31 +40,31 @@ def test_terms_are_products_of_legendre_polynomials() -> None:
 
 
 @pytest.mark.parametrize("around", [False, True])
-def test_shapes_of_light_are_nested_and_orthogonal_over_the_page(around: bool) -> None:
+def test_light_terms_are_nested_and_orthogonal(around: bool) -> None:
     terms, counts = light_terms(PAGE, around)
-    # A constant, a slope, a bend; then powers of the distance from a centre that is free, before what no axis explains.
+    # A constant, a slope, a bend; then powers of the distance from a free centre, before the other terms.
     assert counts == ((1, 3, 6, 10) if around else (1, 3, 6, 9, 12, 14, 18, 21, 31))
     assert terms.shape[1] == counts[-1]
     norm = np.array([1 / ((2 * i + 1) * (2 * j + 1)) for i, j in page_powers(8)])
     assert terms.T @ (terms * norm[:, None]) == pytest.approx(np.eye(terms.shape[1]), abs=1e-9)
-    # Each count holds all of a lower one, and the highest order is as it is said.
+    # Each count includes all terms of lower order, and no term is above the highest order.
     assert np.abs(terms[len(page_powers(3 if around else 8)) :]).max(initial=0) < 1e-9
 
 
 @pytest.mark.parametrize(("power", "count"), [(1, 6), (2, 9), (3, 12)])
-def test_a_fall_off_about_a_centre_a_little_aside_needs_few_terms(power: int, count: int) -> None:
+def test_decentred_fall_off_needs_few_terms(power: int, count: int) -> None:
     terms, counts = light_terms(PAGE)
     assert count in counts
     basis = page_polynomial(PLACES, PAGE, 8) @ terms[:, :count]
-    aside = (PLACES - (205, 148)) / np.hypot(*PAGE) * 2
-    wanted = (aside**2).sum(axis=1) ** power
-    left = wanted - basis @ np.asarray(np.linalg.lstsq(basis, wanted)[0], dtype=np.float64)
-    # Second order of 6 of 250 mm, which four more terms hold.
-    assert np.abs(left).max() < 0.002
+    offsets = (PLACES - (205, 148)) / np.hypot(*PAGE) * 2
+    expected = (offsets**2).sum(axis=1) ** power
+    residual = expected - basis @ np.asarray(np.linalg.lstsq(basis, expected)[0], dtype=np.float64)
+    # The decentring of 6 mm of 250 mm has an effect of second order, for which there are four more terms.
+    assert np.abs(residual).max() < 0.002
 
 
 @pytest.mark.parametrize("unknowns", [1, 3, 10, 28])
-def test_without_outliers_the_fit_is_least_squares(unknowns: int) -> None:
+def test_fit_without_outliers_is_least_squares(unknowns: int) -> None:
     random = np.random.default_rng(unknowns)
     design = random.uniform(-1, 1, (500, unknowns))
     values = design @ random.uniform(-1, 1, unknowns) + random.normal(0, 0.01, 500)
@@ -80,12 +77,12 @@ def test_without_outliers_the_fit_is_least_squares(unknowns: int) -> None:
     assert weights == pytest.approx(np.maximum(1 - (residual / (6 * sigma)) ** 2, 0) ** 2, abs=1e-5)
 
 
-def test_a_few_points_do_not_decide_where_a_line_lies() -> None:
+def test_line_ignores_outliers() -> None:
     x = np.linspace(0, 1, 40)
     y = 0.25 + 0.5 * x
     y[::5] += np.linspace(0.1, 3, 8)
     assert least_absolute_line(x, y) == pytest.approx((0.25, 0.5), abs=2e-4)
-    # Where nothing else is known it is that of least squares.
+    # Two points determine the line.
     assert least_absolute_line(x[:2], np.array([1.0, 3.0])) == pytest.approx((1, 78))
 
 
@@ -97,19 +94,19 @@ def test_weights_count_as_repetitions() -> None:
     assert least_squares(design, values, times.astype(np.float64)) == pytest.approx(plain, abs=1e-8)
 
 
-def test_a_tenth_of_outliers_does_not_move_the_fit() -> None:
+def test_fit_ignores_outliers() -> None:
     random = np.random.default_rng(9)
     design, truth = random.uniform(-1, 1, (500, 6)), random.uniform(-1, 1, 6)
     values = design @ truth + random.normal(0, 0.01, 500)
     values[:50] += random.uniform(1, 3, 50)
     solution, weights, _ = robust_least_squares(design, values, 6)
-    # Six standard errors of 450 values about lines of RMS 0.58.
+    # Six standard errors of 450 values, for columns of RMS 0.58.
     assert solution == pytest.approx(truth, abs=6 * 0.01 / 0.58 / np.sqrt(450))
     assert not weights[:50].any()
     assert (weights[50:] > 0.3).mean() > 0.95
 
 
-def test_columns_that_are_equal_are_solved_all_the_same() -> None:
+def test_solves_equal_columns() -> None:
     line = np.linspace(-1, 1, 50)
     design = np.column_stack([np.ones(50), line, line])
     solution, _, residual = robust_least_squares(design, 2 + 3 * line, 1)
@@ -118,26 +115,26 @@ def test_columns_that_are_equal_are_solved_all_the_same() -> None:
 
 
 @pytest.mark.slow
-def test_terms_are_combined_point_by_point() -> None:
+def test_linear_combinations_match_matrix_product() -> None:
     random = np.random.default_rng(2)
     basis, factors = random.random((28, 5000)), random.random((3, 28))
     factors[1, 5:] = 0
     assert linear_combinations(basis, factors) == pytest.approx(factors @ basis, rel=1e-12)
 
 
-def test_errors_at_points_left_out_are_those_of_fits_without_them() -> None:
+def test_held_out_errors_match_repeated_fits() -> None:
     random = np.random.default_rng(6)
     design, weights = random.uniform(-1, 1, (30, 6)), random.uniform(0, 1, 30)
     weights[3] = 0
     values = design @ random.uniform(-1, 1, 6) + random.normal(0, 0.3, 30)
     counts = (1, 3, 4, 6)
-    plain: list[float] = []
+    expected: list[float] = []
     for count in counts:
         root, squares = np.sqrt(weights)[:, None], 0.0
         for left_out in np.flatnonzero(weights):
-            others = np.arange(30) != left_out
-            rooted = (design[:, :count] * root)[others]
-            solution = np.asarray(np.linalg.lstsq(rooted, (values * root[:, 0])[others])[0], dtype=np.float64)
+            kept = np.arange(30) != left_out
+            rooted = (design[:, :count] * root)[kept]
+            solution = np.asarray(np.linalg.lstsq(rooted, (values * root[:, 0])[kept])[0], dtype=np.float64)
             squares += float(weights[left_out] * (values[left_out] - design[left_out, :count] @ solution) ** 2)
-        plain.append(squares / weights.sum())
-    assert held_out_squares(design, values, weights, counts) == pytest.approx(plain, rel=1e-6)
+        expected.append(squares / weights.sum())
+    assert held_out_squares(design, values, weights, counts) == pytest.approx(expected, rel=1e-6)

@@ -1,4 +1,4 @@
-"""How the chart stands in a picture."""
+"""Orientation of the chart in an image."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from experiment.measures.pose import keystone, off_level_deg
         (-179.0, 1.0, 2),
     ],
 )
-def test_quarter_turns_are_counted_besides(rotation_deg: float, off: float, quarters: int) -> None:
+def test_separates_quarter_turns(rotation_deg: float, off: float, quarters: int) -> None:
     assert off_level_deg(rotation_deg) == (pytest.approx(off), quarters)
 
 

@@ -1,4 +1,4 @@
-"""Saturation as a frame shows it, and the drift of the black level."""
+"""Saturation level of a frame, and drift of the black level."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tests.calibration.lab import hang
 
 
 @pytest.mark.slow
-def test_saturation_is_what_the_frame_shows(tmp_path: Path) -> None:
+def test_measures_saturation_in_the_frame(tmp_path: Path) -> None:
     lab = hang()
     normal = lab.mosaic(tmp_path)
     assert normal.saturation() == normal.white_level == lab.world.body.saturation
-    # A sensor that saturates below what its file states, as LibRaw's tables have it for the EOS 550D.
+    # A sensor that saturates below the value of its file, as in LibRaw's table for the EOS 550D.
     plateau = 12_800
 
     def saturate(counts: npt.NDArray[np.uint16]) -> None:
@@ -30,6 +30,6 @@ def test_saturation_is_what_the_frame_shows(tmp_path: Path) -> None:
     assert bright.saturation() == plateau
 
 
-def test_black_drift_is_the_worst_position() -> None:
+def test_black_drift_is_the_largest_of_all_positions() -> None:
     assert black_drift([]) == 0
     assert black_drift([np.zeros((2, 2)), np.array([[0, 0.2], [-0.3, 0.1]])]) == pytest.approx(0.3)

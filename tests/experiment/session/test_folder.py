@@ -1,4 +1,4 @@
-"""The session folder: what counts, what is set aside, what is refused."""
+"""The session folder: counted frames, strays, refusals, and failing disks."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def take(session: Session, number: int, content: bytes, reason: str = "") -> Non
     session.journal.commit(attempt, received, judgement, exposure_s=0.5, ended_at=NOW)
 
 
-def test_frames_csv_is_as_the_format_says(session: Session) -> None:
+def test_frames_csv_has_the_documented_format(session: Session) -> None:
     take(session, 0, b"white")
     take(session, 2, b"light", "too dark")
     session.write_frames_csv()
@@ -57,15 +57,15 @@ def test_frames_csv_is_as_the_format_says(session: Session) -> None:
     ]
 
 
-def test_what_counts_is_on_disk_and_in_the_journal(session: Session) -> None:
+def test_counted_frames_are_on_disk_and_in_the_journal(session: Session) -> None:
     take(session, 0, b"frame")
     take(session, 1, b"frame", "dark")
     assert session.done_steps() == {0}
     (session.frames_folder / "0000_white.cr2").write_bytes(b"fra")
-    assert session.done_steps() == set(), "a file that lost bytes is no frame"
+    assert session.done_steps() == set(), "a truncated file is no frame"
 
 
-def test_strays_are_kept_aside_and_leftovers_removed(session: Session) -> None:
+def test_renames_strays_and_deletes_partial_files(session: Session) -> None:
     take(session, 0, b"frame")
     stray = session.frames_folder / "0001_dark.cr2"
     stray.write_bytes(b"complete, but no row counts it")
@@ -80,22 +80,22 @@ def test_strays_are_kept_aside_and_leftovers_removed(session: Session) -> None:
     assert len(list(session.frames_folder.glob("*.stray"))) == 2, "an earlier stray is never overwritten"
 
 
-def test_a_session_is_never_made_over_something(tmp_path: Path, session: Session) -> None:
+def test_never_creates_over_existing_files(tmp_path: Path, session: Session) -> None:
     with pytest.raises(InputError):
         Session.create(session.folder, "", design_chart(bits=1), LIGHTS)
 
 
 @pytest.mark.parametrize(
-    ("lights", "said"),
+    ("lights", "message"),
     [
         ((LIGHTS[0], replace(LIGHTS[1], colour=LIGHTS[2].colour), *LIGHTS[2:]), "planned as 255 1 0"),
-        (LIGHTS[:4], "light 4 .* 255 4 0"),
+        (LIGHTS[:4], "illuminant 4 .* 255 4 0"),
     ],
 )
-def test_lights_edited_since_are_refused(session: Session, lights: tuple[Illumination, ...], said: str) -> None:
+def test_refuses_edited_illuminants(session: Session, lights: tuple[Illumination, ...], message: str) -> None:
     session.close()
     save_illuminations(lights, session.folder / "illuminations.csv")
-    with pytest.raises(FormatError, match=rf"illuminations\.csv .*{said}"):
+    with pytest.raises(FormatError, match=rf"illuminations\.csv .*{message}"):
         Session.open(session.folder)
 
 
@@ -105,9 +105,7 @@ def _empty(path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["chart.json", "illuminations.csv"])
 @pytest.mark.parametrize("damage", [Path.unlink, _empty])
-def test_a_lost_copy_is_restored_and_not_made_anew(
-    session: Session, name: str, damage: Callable[[Path], object]
-) -> None:
+def test_missing_copy_has_a_remedy(session: Session, name: str, damage: Callable[[Path], object]) -> None:
     session.close()
     damage(session.folder / name)
     with pytest.raises(FormatError, match=name.replace(".", r"\.")) as caught:
@@ -116,22 +114,22 @@ def test_a_lost_copy_is_restored_and_not_made_anew(
     assert "acquire illuminations" not in str(caught.value)
 
 
-def test_settings_that_were_emptied_are_damaged(session: Session) -> None:
+def test_refuses_empty_settings(session: Session) -> None:
     (session.folder / "session.toml").write_text("\n")
     with pytest.raises(FormatError, match=r"session\.toml: empty"):
         session.settings_text()
 
 
 @pytest.mark.parametrize("call", ["stat", "iterdir", "unlink", "rename"])
-def test_a_disk_that_fails_is_no_traceback(session: Session, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_a_failing_disk(session: Session, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
     (session.frames_folder / "stray.cr2").write_bytes(b"stray")
     (session.frames_folder / ".0002_light_000.partial").write_bytes(b"half")
     real = getattr(Path, call)
 
-    def fail(path: Path, *given: Any, **named: Any) -> Any:
+    def fail(path: Path, *arguments: Any, **keywords: Any) -> Any:
         if path.is_relative_to(session.frames_folder):
             raise OSError(errno.EIO, "Input/output error", str(path))
-        return real(path, *given, **named)
+        return real(path, *arguments, **keywords)
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, call, fail)
@@ -140,14 +138,14 @@ def test_a_disk_that_fails_is_no_traceback(session: Session, call: str, monkeypa
     assert len(session.set_aside_strays()) == 1, "when the disk is back the same goes through"
 
 
-def test_what_was_left_below_a_mount_point_is_no_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames without a journal and without settings, and an empty place where a disk should be."""
+def test_refuses_files_under_a_mount_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames without journal and settings, and an empty mount point."""
     folder = tmp_path / "night"
     (folder / "frames").mkdir(parents=True)
-    for look in (session_exists, journal_path):
-        with pytest.raises(FormatError) as told:
-            look(folder)
-        assert "remove" not in str(told.value)
+    for check in (session_exists, journal_path):
+        with pytest.raises(FormatError) as refused:
+            check(folder)
+        assert "remove" not in str(refused.value)
     (folder / "frames").rmdir()
     assert not session_exists(folder)
     tables = tmp_path / "fstab", tmp_path / "mounts"
@@ -158,9 +156,9 @@ def test_what_was_left_below_a_mount_point_is_no_session(tmp_path: Path, monkeyp
     monkeypatch.setattr(
         "experiment.session.folder.unmounted_folder", partial(unmounted_folder, fstab=tables[0], mounts=tables[1])
     )
-    for look in (session_exists, journal_path):
+    for check in (session_exists, journal_path):
         with pytest.raises(StorageError):
-            look(folder)
+            check(folder)
     tables[1].write_text(f"/dev/sda1 / ext4 rw 0 0\n/dev/sdb1 {tmp_path} ext4 rw 0 0\n")
     assert unmounted_folder(folder, *tables) is None
     assert unmounted_folder(folder, tmp_path / "none", tables[1]) is None
@@ -168,7 +166,7 @@ def test_what_was_left_below_a_mount_point_is_no_session(tmp_path: Path, monkeyp
     assert unmounted_folder(tmp_path / "two words" / "night", *tables) == tmp_path / "two words"
 
 
-def test_a_journal_that_cannot_be_looked_for_is_not_missing(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreadable_journal_is_not_missing(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(path: Path, **_: object) -> None:
         raise OSError(errno.EIO, "Input/output error", str(path))
 
@@ -200,7 +198,7 @@ def save(session: Session, number: int) -> None:
 
 
 class Night:
-    """A session with one frame, and a run that opens it and saves a second one, on a disk that fails."""
+    """A session with one frame, and a run that saves a second one on a failing disk."""
 
     def __init__(self, folder: Path, disk: FailingCalls) -> None:
         self._pristine, self.folder, self._disk = folder / "pristine", folder / "disk" / "night", disk
@@ -210,7 +208,7 @@ class Night:
             save(session, 0)
 
     def restore(self) -> None:
-        """Put the session back to its one frame."""
+        """Restore the session with its one frame."""
         shutil.rmtree(self.folder, ignore_errors=True)
         shutil.copytree(self._pristine, self.folder)
 
@@ -220,41 +218,41 @@ class Night:
             save(session, 1)
 
     def sweep(self, numbers: Sequence[int], lasting: bool, every: int = 1) -> int:
-        """Let each `every`-th call fail with each fault; return how many runs ended by it."""
-        ended = 0
+        """Let each `every`-th call fail with each fault; return the number of runs that ended by it."""
+        ended_runs = 0
         for number in numbers:
-            for at in range(0, 1000, every):
+            for call_number in range(0, 1000, every):
                 self.restore()
-                ran = self._disk.run(self.run, at, number, lasting=lasting)
-                if ran.error is not None:
-                    ended += 1
-                    assert isinstance(ran.error, StorageError), f"{ran.failed}: {ran.error!r}"
-                    assert "\n" not in str(ran.error)
+                result = self._disk.run(self.run, call_number, number, lasting=lasting)
+                if result.error is not None:
+                    ended_runs += 1
+                    assert isinstance(result.error, StorageError), f"{result.failed}: {result.error!r}"
+                    assert "\n" not in str(result.error)
                     if lasting:
-                        assert os.strerror(number) in str(ran.error), ran.failed
-                self.look(saved=ran.error is None)
-                if ran.failed is None:
-                    assert ran.error is None
+                        assert os.strerror(number) in str(result.error), result.failed
+                self.require_consistent(saved=result.error is None)
+                if result.failed is None:
+                    assert result.error is None
                     break
-        return ended
+        return ended_runs
 
-    def look(self, saved: bool) -> None:
-        """Take the session up on a disk that works: what was saved is there, what was not can be, nothing is twice."""
+    def require_consistent(self, saved: bool) -> None:
+        """Resume the session on a working disk: saved frames exist, others can be taken, and none is double."""
         with Session.open_for_run(self.folder) as session:
             session.set_aside_strays()
             assert session.verify() == ()
-            done = session.done_steps()
-            assert done == {0, 1} if saved else done in ({0}, {0, 1})
-            if 1 not in done:
+            done_steps = session.done_steps()
+            assert done_steps == {0, 1} if saved else done_steps in ({0}, {0, 1})
+            if 1 not in done_steps:
                 save(session, 1)
             assert [(self.folder / frame.file).read_bytes() for frame in session.frames()] == FRAMES
-        listed = (self.folder / "frames.csv").read_text()
-        assert listed.count("accepted") >= 1 + saved
+        frames_csv = (self.folder / "frames.csv").read_text()
+        assert frames_csv.count("accepted") >= 1 + saved
 
 
 @pytest.fixture
 def night() -> Generator[Night]:
-    # Where there is a file system in memory, flushing costs nothing.
+    # On a file system in memory, flushing costs no time.
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as name:
         folder = Path(name).resolve()
@@ -265,27 +263,27 @@ def night() -> Generator[Night]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(why_not() != "", reason=why_not())
-def test_a_call_that_fails_once(night: Night) -> None:
-    # Every ninth of four hundred, so that each of opening, reading, syncing and closing has its turn.
+def test_survives_one_failing_call(night: Night) -> None:
+    # Every ninth of four hundred calls, so that opening, reading, syncing and closing all fail.
     assert night.sweep([errno.EIO], lasting=False, every=9) > 5
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(why_not() != "", reason=why_not())
-def test_a_disk_that_fails_from_some_call_on(night: Night) -> None:
+def test_survives_a_disk_that_stops_working(night: Night) -> None:
     assert night.sweep([errno.EIO], lasting=True, every=13) > 10
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(why_not() != "", reason=why_not())
-def test_each_other_fault_of_a_disk(night: Night) -> None:
+def test_survives_other_disk_faults(night: Night) -> None:
     others = [number for number in DISK_FAULTS if number != errno.EIO]
     assert night.sweep(others, lasting=True, every=41) > 20
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(why_not() != "", reason=why_not())
-def test_a_journal_that_is_damaged_is_called_so(night: Night) -> None:
+def test_reports_a_damaged_journal(night: Night) -> None:
     night.restore()
     path = night.folder / "journal.sqlite"
     data = bytearray(path.read_bytes())
@@ -297,10 +295,10 @@ def test_a_journal_that_is_damaged_is_called_so(night: Night) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(why_not() != "", reason=why_not())
-def test_a_disk_that_was_unmounted_is_not_written_below(night: Night) -> None:
+def test_does_not_write_under_an_unmounted_disk(night: Night) -> None:
     night.restore()
     with Session.open_for_run(night.folder) as session:
-        # What an unmounted disk leaves: the open journal, and nothing under the name.
+        # After unmounting, the journal is open, but the folder is missing.
         shutil.rmtree(session.frames_folder)
         with pytest.raises(StorageError):
             session.receive("0001_dark", capture(FRAMES[1]))

@@ -1,7 +1,4 @@
-"""The journal of a session: what is written is there after the program, and what is no journal is said to be none.
-
-Times that a journal may hold: those that every reader of it can read and compare, and no others.
-"""
+"""The journal of a session: durability, refusal of foreign contents, and a model of all operations."""
 
 from __future__ import annotations
 
@@ -51,9 +48,7 @@ def require_time(journal: sqlite3.Connection, text: str) -> None:
 
 @pytest.mark.parametrize("zone", [UTC, timezone(timedelta(hours=5, minutes=45))])
 @pytest.mark.parametrize("microsecond", [0, 1, 250000])
-def test_times_that_are_written_may_stand_in_a_journal(
-    journal: sqlite3.Connection, zone: timezone, microsecond: int
-) -> None:
+def test_accepts_written_times(journal: sqlite3.Connection, zone: timezone, microsecond: int) -> None:
     at = datetime(2028, 2, 29, 23, 59, 59, microsecond, zone)
     require_time(journal, time_text(at))
     require_time(journal, at.replace(microsecond=0).isoformat())
@@ -76,13 +71,13 @@ def test_times_that_are_written_may_stand_in_a_journal(
         "",
     ],
 )
-def test_times_that_a_reader_could_not_compare_are_refused(journal: sqlite3.Connection, text: str) -> None:
+def test_refuses_times_that_cannot_be_compared(journal: sqlite3.Connection, text: str) -> None:
     with pytest.raises(FormatError, match="1 rows of events"):
         require_time(journal, text)
 
 
 @pytest.mark.parametrize("text", ["0" * 63 + "g", "ab\x00zz", "0" * 65, "A" * 64])
-def test_hashes_that_are_none_are_refused(journal: sqlite3.Connection, text: str) -> None:
+def test_refuses_wrong_hashes(journal: sqlite3.Connection, text: str) -> None:
     journal.execute(
         "INSERT INTO attempts (step, kind, file, started_at, taken_at, exposure_s, size, sha256, verdict) VALUES"
         " (0, 'white', 'frames/a.cr2', ?, ?, 0.5, 1, ?, 'accepted')",
@@ -111,18 +106,18 @@ def commit(journal: Journal, attempt: int, reason: str = "") -> None:
     journal.commit(attempt, received, judgement, exposure_s=0.5, ended_at=NOW + timedelta(seconds=2))
 
 
-def test_what_is_read_at_one_moment_fits_together(path: Path) -> None:
+def test_snapshot_is_consistent(path: Path) -> None:
     with closing(Journal.open_for_run(path)) as run:
         run.note(NOW, "start")
         with closing(Journal.open(path)) as reader:
-            with reader.one_moment():
+            with reader.snapshot():
                 assert len(reader.events()) == 1
                 run.note(NOW, "stop")
                 assert len(reader.events()) == 1
             assert [event.what for event in reader.events()] == ["start", "stop"]
 
 
-def test_a_journal_that_cannot_be_written_says_what_helps(path: Path) -> None:
+def test_reports_a_read_only_journal(path: Path) -> None:
     with (
         closing(Journal.open(path)) as journal,
         pytest.raises(StorageError, match=r"journal\.sqlite: .* readonly"),
@@ -130,13 +125,13 @@ def test_a_journal_that_cannot_be_written_says_what_helps(path: Path) -> None:
         journal.note(NOW, "start")
 
 
-def test_a_damaged_journal(path: Path) -> None:
+def test_refuses_a_damaged_journal(path: Path) -> None:
     path.write_bytes(b"not a database at all" * 100)
     with pytest.raises(FormatError):
         Journal.open(path)
 
 
-def test_a_journal_that_may_not_be_read_is_not_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_permission_is_not_damage(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(file: Path, mode: str) -> None:
         raise PermissionError(13, "Permission denied", str(file))
 
@@ -145,7 +140,7 @@ def test_a_journal_that_may_not_be_read_is_not_damaged(path: Path, monkeypatch: 
         Journal.open(path)
 
 
-def test_a_journal_that_another_holds_is_not_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_held_journal_is_not_damage(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opening, "READING_LIMIT_S", 0)
     with closing(sqlite3.connect(path)) as other:
         other.execute("BEGIN EXCLUSIVE")
@@ -154,7 +149,7 @@ def test_a_journal_that_another_holds_is_not_damaged(path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize("version", [1, 3])
-def test_a_journal_of_another_version_is_refused_by_one_sentence(tmp_path: Path, version: int) -> None:
+def test_refuses_another_version(tmp_path: Path, version: int) -> None:
     path = tmp_path / "journal.sqlite"
     Journal.create(path, ())
     with closing(sqlite3.connect(path)) as journal:
@@ -164,7 +159,7 @@ def test_a_journal_of_another_version_is_refused_by_one_sentence(tmp_path: Path,
             opened(path)
 
 
-def test_a_kind_of_frame_that_is_not_known_is_named(tmp_path: Path) -> None:
+def test_names_an_unknown_kind_of_frame(tmp_path: Path) -> None:
     path = tmp_path / "journal.sqlite"
     Journal.create(path, plan_steps([], 1))
     with closing(Journal.open_for_run(path)) as journal:
@@ -194,7 +189,7 @@ JUDGEMENT = st.builds(
 
 @dataclass
 class Row:
-    """An attempt as the model has it."""
+    """An attempt in the model."""
 
     step: SessionStep
     verdict: str | None = None
@@ -204,7 +199,7 @@ class Row:
 
 @dataclass
 class Model:
-    """What a journal holds, as plain lists."""
+    """Contents of a journal as plain lists."""
 
     rows: list[Row] = field(default_factory=list[Row])
     steps: list[SessionStep] = field(default_factory=lambda: list(MODEL_STEPS))
@@ -226,14 +221,14 @@ OPERATION = st.one_of(
 )
 
 
-def apply(what: str, value: Any, journal: Journal, model: Model, at: datetime) -> None:
-    """Do one thing to the journal and to the model."""
+def apply(operation: str, value: Any, journal: Journal, model: Model, at: datetime) -> None:
+    """Apply one operation to the journal and to the model."""
     open_rows = [number for number, row in enumerate(model.rows, 1) if row.verdict is None]
-    if what == "begin":
+    if operation == "begin":
         step = model.steps[int(value)]
         assert journal.begin(step, f"frames/{len(model.rows)}", at) == len(model.rows) + 1
         model.rows.append(Row(step))
-    elif what == "commit" and open_rows:
+    elif operation == "commit" and open_rows:
         number = open_rows[-1]
         path = journal.path.parent / f"frames/{number}.cr2"
         received = ReceivedFile(path, number, f"{number:064d}", CapturedFrame("a.cr2", number, at))
@@ -242,51 +237,51 @@ def apply(what: str, value: Any, journal: Journal, model: Model, at: datetime) -
         row.judgement = value
         row.reason = next((check.reason for check in value.checks if check.reason), "")
         row.verdict = "refused" if row.reason else "accepted"
-    elif what == "fail" and open_rows:
+    elif operation == "fail" and open_rows:
         journal.fail(open_rows[-1], at, value)
         model.rows[open_rows[-1] - 1].verdict, model.rows[open_rows[-1] - 1].reason = "failed", value
-    elif what == "void":
+    elif operation == "void":
         journal.void(value, at, "the white frame moved")
         voided = [row for number, row in enumerate(model.rows, 1) if number in value and row.verdict == "accepted"]
         for row in voided:
             row.verdict, row.reason = "voided", "the white frame moved"
         if voided:
             model.events.append("voided")
-    elif what == "note":
+    elif operation == "note":
         journal.note(at, value)
         model.events.append(value)
-    elif what == "record":
+    elif operation == "record":
         journal.record(*value)
         model.records[value[0]] = value[1]
-    elif what == "beat":
+    elif operation == "beat":
         journal.beat(value, "", at)
         model.state = value
-    elif what == "add":
-        more = link_steps(len(model.steps))
-        journal.add_steps(more)
-        model.steps += more
+    elif operation == "add":
+        new_steps = link_steps(len(model.steps))
+        journal.add_steps(new_steps)
+        model.steps += new_steps
 
 
 def check(journal: Journal, model: Model) -> None:
-    """Compare all that can be asked of a journal with the model."""
+    """Compare everything that a journal returns with the model."""
     assert list(journal.steps()) == model.steps
     attempts = journal.attempts()
-    assert [(one.verdict, one.reason) for one in attempts] == [(row.verdict, row.reason) for row in model.rows]
+    assert [(item.verdict, item.reason) for item in attempts] == [(row.verdict, row.reason) for row in model.rows]
     judged = {number: row for number, row in enumerate(model.rows, 1) if row.judgement is not None}
     assert journal.details() == {
         number: AttemptDetails(row.judgement.seen, row.judgement.checks, {"settle": float(number)})
         for number, row in judged.items()
         if row.judgement
     }
-    some = sorted(judged)[::2]
-    assert journal.details(some) == {number: journal.details()[number] for number in some}
+    selected = sorted(judged)[::2]
+    assert journal.details(selected) == {number: journal.details()[number] for number in selected}
     assert journal.details([]) == {}
     assert list(journal.measurements()) == [
         (row.step, number, row.judgement.measurement, row.verdict == "accepted")
         for number, row in judged.items()
         if row.judgement and row.judgement.measurement
     ]
-    assert [one.attempt for one in journal.accepted_files()] == [
+    assert [item.attempt for item in journal.accepted_files()] == [
         number for number, row in judged.items() if row.verdict == "accepted"
     ]
     newest = {row.step.number: number for number, row in judged.items() if row.verdict == "accepted"}
@@ -303,17 +298,17 @@ def check(journal: Journal, model: Model) -> None:
 @pytest.mark.slow
 @settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(OPERATION, max_size=14))
-def test_a_journal_is_what_was_written(operations: list[tuple[str, Any]]) -> None:
-    with tempfile.TemporaryDirectory() as place:
-        path, model = Path(place) / "journal.sqlite", Model()
+def test_journal_matches_the_model(operations: list[tuple[str, Any]]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path, model = Path(folder) / "journal.sqlite", Model()
         Journal.create(path, MODEL_STEPS)
         journal = Journal.open_for_run(path)
         try:
-            for second, (what, value) in enumerate(operations):
-                if what == "reopen":
+            for second, (operation, value) in enumerate(operations):
+                if operation == "reopen":
                     journal.close()
                     journal = Journal.open_for_run(path)
-                apply(what, value, journal, model, BEGUN + timedelta(seconds=second))
+                apply(operation, value, journal, model, BEGUN + timedelta(seconds=second))
             check(journal, model)
             with closing(Journal.open(path)) as reader:
                 check(reader, model)
@@ -323,6 +318,8 @@ def test_a_journal_is_what_was_written(operations: list[tuple[str, Any]]) -> Non
             check(reader, model)
 
 
+# Writes a short night and is killed before the n-th, 2n-th … SQLite statement, until one process survives; each in a
+# fork, because imports take longer than the night.
 KILLED = """
 import itertools, os, signal, sqlite3, sys
 from pathlib import Path
@@ -332,8 +329,8 @@ from tests.experiment.session.test_journal import MODEL_STEPS, night
 statements = 0
 connect = sqlite3.connect
 
-def watched(*given, **named):
-    connection = connect(*given, **named)
+def watched(*arguments, **keywords):
+    connection = connect(*arguments, **keywords)
     connection.set_trace_callback(deadly)
     return connection
 
@@ -360,14 +357,12 @@ for number in itertools.count(int(sys.argv[2]), int(sys.argv[2])):
     if ended != -signal.SIGKILL:
         break
 """
-"""Writes a short night and is killed before the n-th, 2n-th … statement that SQLite is given, until one is left alive;
-each in a fork, since the imports take longer than the night."""
 
 GOOD = Judgement((Check("light", 0.1, None, 1.0, "%"), Check("movement", 0.0, None, 0.5, "px")), (1.0, 2.0, 3.0), b"m")
 
 
 def night(journal: Journal) -> list[Callable[[], object]]:
-    """Return what is done to a journal in a short night, one transaction each."""
+    """Return the operations of a short night, one transaction each."""
 
     def commit(number: int) -> None:
         path = journal.path.parent / f"frames/{number}.cr2"
@@ -385,35 +380,35 @@ def night(journal: Journal) -> list[Callable[[], object]]:
 
 
 def state_after(journal: Journal) -> tuple[object, ...]:
-    """Return what a journal holds, without times."""
-    attempts = [(one.id, one.verdict, one.has_frame) for one in journal.attempts()]
-    events = [one.what for one in journal.events()]
+    """Return the contents of a journal without times."""
+    attempts = [(item.id, item.verdict, item.has_frame) for item in journal.attempts()]
+    events = [item.what for item in journal.events()]
     return len(journal.steps()), attempts, journal.details(), events
 
 
 @pytest.mark.slow
-def test_a_kill_at_any_statement_leaves_the_last_transaction_or_the_one_before(tmp_path: Path) -> None:
+def test_kill_loses_at_most_one_transaction(tmp_path: Path) -> None:
     Journal.create(tmp_path / "model.sqlite", MODEL_STEPS)
     with closing(Journal.open_for_run(tmp_path / "model.sqlite")) as model:
         states = [state_after(model)]
         for act in night(model):
             act()
             states.append(state_after(model))
-    # Every seventh of some ninety: the seven kinds of statements of a commit come in all places.
-    said = subprocess.check_output([sys.executable, "-c", KILLED, str(tmp_path), "7"], text=True)
-    *killed, (last, code) = ([int(word) for word in line.split()] for line in said.splitlines())
+    # Every seventh of some ninety: all kinds of statements of a commit occur in all positions.
+    output = subprocess.check_output([sys.executable, "-c", KILLED, str(tmp_path), "7"], text=True)
+    *killed, (last, code) = ([int(word) for word in line.split()] for line in output.splitlines())
     assert {ended for _, ended in killed} == {-signal.SIGKILL}
     assert code == 0
     assert last > 35
     for number, _ in killed:
         path = tmp_path / f"{number}" / "journal.sqlite"
-        done = path.with_name("done")
-        finished = int(done.read_text() or 0) if done.exists() else 0
+        done_file = path.with_name("done")
+        finished = int(done_file.read_text() or 0) if done_file.exists() else 0
         with closing(Journal.open(path)) as reader:
-            found = state_after(reader)
-        assert found in states[finished : finished + 2], f"killed at statement {number}, after {finished} transactions"
+            state = state_after(reader)
+        assert state in states[finished : finished + 2], f"killed at statement {number}, after {finished} transactions"
         with closing(Journal.open_for_run(path)) as again:
-            assert state_after(again) == found
+            assert state_after(again) == state
         with closing(sqlite3.connect(path)) as bare:
             assert bare.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         assert {file.name for file in path.parent.iterdir()} - {"done"} == {"journal.sqlite"}

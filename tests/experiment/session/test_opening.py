@@ -1,4 +1,4 @@
-"""Readers, another writer, and the run: who waits for whom, and what a reader leaves behind."""
+"""Access to a journal by readers, other writers and the run."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ pytestmark = pytest.mark.slow
 STEPS = plan_steps((Illumination(0, "uniform", None, Colour(255, 0, 0)),), 2)
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
 
+# Another program: executes statements on the journal and holds it until its input ends.
 HOLDER = """
 import sqlite3, sys
 connection = sqlite3.connect(sys.argv[1], isolation_level=None)
@@ -37,7 +38,6 @@ for statement in sys.argv[2:]:
 print("held", flush=True)
 sys.stdin.read()
 """
-"""Another program: holds the journal as it is told, until its input ends."""
 
 READER = ("BEGIN", "SELECT * FROM events")
 WRITER = ("BEGIN IMMEDIATE", "INSERT INTO events (at, what, detail) VALUES ('2026-01-01T00:00:00+00:00', 'other', '')")
@@ -62,70 +62,70 @@ def another_program(path: Path, *statements: str) -> Generator[subprocess.Popen[
         assert program.stdout is not None
         assert program.stdout.readline() == "held\n"
         yield program
-        let_go(program)
+        release(program)
 
 
-def let_go(program: subprocess.Popen[str]) -> None:
+def release(program: subprocess.Popen[str]) -> None:
     assert program.stdin is not None
     program.stdin.close()
     program.wait()
 
 
 def files(path: Path) -> dict[str, bytes]:
-    """Return what is in the journal's folder; what SQLite shares in memory is not looked into."""
+    """Return the files in the folder of the journal; SQLite's shared memory is not read."""
     return {
         file.name: b"" if file.name.endswith("-shm") else file.read_bytes() for file in sorted(path.parent.iterdir())
     }
 
 
-def whats(path: Path) -> list[str]:
+def event_names(path: Path) -> list[str]:
     with closing(Journal.open(path)) as journal:
         return [event.what for event in journal.events()]
 
 
-def test_a_reader_never_stops_a_run(path: Path) -> None:
+def test_reader_does_not_block_a_run(path: Path) -> None:
     with (
         closing(Journal.open_for_run(path, 0)) as journal,
         another_program(path, *READER),
     ):
         for _ in range(30):
             journal.note(NOW, "written")
-        assert whats(path) == ["written"] * 30
+        assert event_names(path) == ["written"] * 30
     assert set(files(path)) >= {"journal.sqlite"}
     with closing(Journal.open_for_run(path, 0)) as journal:
         assert len(journal.events()) == 30
     assert set(files(path)) == {"journal.sqlite"}, "the next run leaves one file again"
 
 
-def test_a_reader_who_was_there_before_the_run_does_not_stop_it(path: Path) -> None:
+def test_earlier_reader_does_not_block_a_run(path: Path) -> None:
     with another_program(path, *READER), closing(Journal.open_for_run(path, 0)) as journal:
         journal.note(NOW, "written")
-        assert whats(path) == ["written"]
-    assert whats(path) == ["written"]
+        assert event_names(path) == ["written"]
+    assert event_names(path) == ["written"]
     assert set(files(path)) == {"journal.sqlite"}
 
 
 @pytest.mark.parametrize("at_start", [True, False])
-def test_another_writer_is_waited_for(path: Path, at_start: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waits_for_another_writer(path: Path, at_start: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opening, "TRY_S", 0.01)
-    said: list[str] = []
+    messages: list[str] = []
 
     def announce(sentence: str) -> None:
-        said.append(sentence)
-        let_go(other)
+        messages.append(sentence)
+        release(program)
 
     running = None if at_start else Journal.open_for_run(path)
-    with another_program(path, *WRITER) as other:
+    with another_program(path, *WRITER) as program:
         journal = running or Journal.open_for_run(path, 60, announce)
         with closing(journal):
             if running:
                 journal.retry_locked(60, announce)
             journal.note(NOW, "written")
-    assert said == [f"another program holds {path}; the run goes on when it has finished"]
-    assert whats(path) == ["written"]
+    assert messages == [f"another program holds {path}; the run continues when it is free"]
+    assert event_names(path) == ["written"]
 
 
-def test_patience_ends_with_a_sentence_and_nothing_is_lost(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_ends_with_an_error_and_no_loss(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opening, "TRY_S", 0.01)
     with closing(Journal.open_for_run(path, 0.05)) as journal:
         with (
@@ -134,33 +134,33 @@ def test_patience_ends_with_a_sentence_and_nothing_is_lost(path: Path, monkeypat
         ):
             journal.note(NOW, "not written")
         journal.note(NOW, "written")
-    assert whats(path) == ["written"]
+    assert event_names(path) == ["written"]
 
 
-def test_where_machines_share_no_memory_a_reader_is_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waits_for_readers_on_network_file_systems(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opening, "TRY_S", 0.01)
 
     def shared(_: Path) -> bool:
         return True
 
     monkeypatch.setattr(opening, "_on_network", shared)
-    said: list[str] = []
+    messages: list[str] = []
     with closing(Journal.open_for_run(path, 60)) as journal:
         assert set(files(path)) == {"journal.sqlite"}
         with another_program(path, *READER) as reader:
 
             def announce(sentence: str) -> None:
-                said.append(sentence)
-                let_go(reader)
+                messages.append(sentence)
+                release(reader)
 
             journal.retry_locked(60, announce)
             journal.note(NOW, "written")
-    assert len(said) == 1
-    assert whats(path) == ["written"]
+    assert len(messages) == 1
+    assert event_names(path) == ["written"]
 
 
 def kill_a_run(path: Path) -> None:
-    """Leave what a run leaves that is killed: its last commits are in the side file."""
+    """Leave the files of a killed run, with its last commits in the side file."""
     program = (
         "import os, sys, signal\nfrom datetime import datetime, UTC\nfrom pathlib import Path\n"
         "from experiment.session.journal import Journal\n"
@@ -171,32 +171,34 @@ def kill_a_run(path: Path) -> None:
     assert set(files(path)) == {"journal.sqlite", "journal.sqlite-wal", "journal.sqlite-shm"}
 
 
-def test_a_run_that_was_killed_is_read_and_taken_up(path: Path) -> None:
+def test_reads_and_resumes_a_killed_run(path: Path) -> None:
     kill_a_run(path)
     before = files(path)
-    assert whats(path) == ["last"]
+    assert event_names(path) == ["last"]
     assert files(path) == before
     Journal.open_for_run(path).close()
-    assert whats(path) == ["last"]
+    assert event_names(path) == ["last"]
     assert set(files(path)) == {"journal.sqlite"}
 
 
-@pytest.mark.parametrize("kept", [("", "-wal"), ("", "-wal", "-shm"), ("",)])
-def test_a_copied_journal_is_read_as_it_is(path: Path, tmp_path: Path, kept: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("copied_suffixes", [("", "-wal"), ("", "-wal", "-shm"), ("",)])
+def test_reads_a_copied_journal(path: Path, tmp_path: Path, copied_suffixes: tuple[str, ...]) -> None:
     kill_a_run(path)
     copy = tmp_path / "copy" / "journal.sqlite"
     copy.parent.mkdir()
-    for suffix in kept:
+    for suffix in copied_suffixes:
         shutil.copy(f"{path}{suffix}", f"{copy}{suffix}")
-    before = files(copy)
-    assert whats(copy) == (["last"] if "-wal" in kept else []), "without its -wal the last commits are missing"
-    assert files(copy) == before, "a reader creates nothing"
+    files_before = files(copy)
+    assert event_names(copy) == (["last"] if "-wal" in copied_suffixes else []), (
+        "without its -wal the last commits are missing"
+    )
+    assert files(copy) == files_before, "a reader creates nothing"
     Journal.open_for_run(copy).close()
     assert set(files(copy)) == {"journal.sqlite"}
 
 
-def test_a_commit_that_was_cut_off_is_undone_in_a_copy_only(path: Path) -> None:
-    """As version 1 left it where the power went: a rollback journal that is hot."""
+def test_reader_undoes_an_interrupted_commit_in_a_copy(path: Path) -> None:
+    """The state of version 1 after a power cut: a hot rollback journal."""
     program = (
         "import os, signal, sqlite3, sys\nconnection = sqlite3.connect(sys.argv[1], isolation_level=None)\n"
         "connection.execute('PRAGMA cache_size = 1')\nconnection.execute('PRAGMA cache_spill = 1')\n"
@@ -208,15 +210,15 @@ def test_a_commit_that_was_cut_off_is_undone_in_a_copy_only(path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", program, str(path)], check=False).returncode == -9
     assert set(files(path)) == {"journal.sqlite", "journal.sqlite-journal"}
     before = files(path)
-    assert whats(path) == []
+    assert event_names(path) == []
     assert files(path) == before
     Journal.open_for_run(path).close()
     assert set(files(path)) == {"journal.sqlite"}
 
 
 @contextmanager
-def nobody(folder: Path) -> Generator[None]:
-    """Be somebody without rights in a folder; root, who may write everything, becomes another."""
+def without_permissions(folder: Path) -> Generator[None]:
+    """Work without permissions in a folder; root becomes another user."""
     root = os.geteuid() == 0
     for file in folder.iterdir():
         file.chmod(0o444)
@@ -233,31 +235,31 @@ def nobody(folder: Path) -> Generator[None]:
 
 @pytest.fixture
 def public() -> Generator[Path]:
-    """Lend a journal in a folder that everybody can come to; pytest's own are for one user."""
-    with tempfile.TemporaryDirectory() as place:
-        Path(place).chmod(0o755)
-        folder = Path(place) / "s"
+    """Lend a journal in a folder for all users; those of pytest are for one user."""
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o755)
+        folder = Path(name) / "s"
         folder.mkdir()
         Journal.create(folder / "journal.sqlite", STEPS)
         yield folder / "journal.sqlite"
 
 
 @pytest.mark.parametrize("state", ["at rest", "killed", "killed and copied"])
-def test_a_folder_that_may_not_be_written_is_read(public: Path, state: str) -> None:
+def test_reads_in_a_folder_without_write_permission(public: Path, state: str) -> None:
     if state.startswith("killed"):
         kill_a_run(public)
         if state.endswith("copied"):
             public.with_name("journal.sqlite-shm").unlink()
     before = files(public)
-    with nobody(public.parent):
-        assert whats(public) == (["last"] if state.startswith("killed") else [])
+    with without_permissions(public.parent):
+        assert event_names(public) == (["last"] if state.startswith("killed") else [])
     assert files(public) == before
 
 
-def test_where_there_are_no_locks_it_goes_on_with_a_warning(
+def test_warns_of_a_file_system_without_locks(
     path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """SQLite answers `database is locked` to ENOLCK and `disk I/O error` to EINVAL; both at the first look."""
+    """SQLite reports ENOLCK as `database is locked`, and EINVAL as `disk I/O error`."""
     real = opening._connect_with
 
     def connect(path: Path, parameters: str) -> sqlite3.Connection:
@@ -274,7 +276,7 @@ def test_where_there_are_no_locks_it_goes_on_with_a_warning(
         refused.setattr(fcntl, "lockf", no_locks)
         with closing(Journal.open_for_run(path, 0)) as journal:
             journal.note(NOW, "written")
-        assert whats(path) == ["written"]
+        assert event_names(path) == ["written"]
     assert "this file system has no locks" in caplog.text
     with pytest.raises(FormatError):
         Journal.open(path)

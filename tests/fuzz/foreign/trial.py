@@ -24,7 +24,7 @@ from calibration.table.lut import open_lut
 from calibration.table.verification import describe, find_faults
 from calibration.table.zarr_store import fetch
 from experiment.session.folder import Session
-from experiment.session.repair import unsound_files
+from experiment.session.repair import damaged_files
 from foundation.errors import CropError
 from generator.dataset.reader import file_faults, open_dataset
 from tests.fuzz.foreign.mutations import CANARY, mutate
@@ -145,7 +145,7 @@ def read_session_folder(folder: Path, spare: Path) -> None:
         session.journal.heartbeat()
         session.journal.details()
         session.journal.records()
-        unsound_files(folder, session.journal.accepted_files(), lambda done, total: None)
+        damaged_files(folder, session.journal.accepted_files(), lambda done, total: None)
 
 
 def read_published(folder: Path, spare: Path) -> None:
