@@ -66,7 +66,7 @@ _STAINED: Final = r"clean the print|print it anew"
 _BRILLIANT: Final = r"brilliant"
 _HAND: Final = r"\bhands?\b|shadow"
 _GLARE: Final = r"reflection|glare|mirror"
-_SPREAD: Final = r"bleed|neighbouring cells|neighbours'? (light|colour)|spread|veil|correction"
+_SPREAD: Final = r"bleed|neighbouring (?:cells|patches)|neighbours'? (light|colour)|spread|veil|correction"
 
 
 _NOT_SO: Final = rf"{_STAINED}|{_BRILLIANT}|{_HAND}|{_GLARE}"

@@ -51,7 +51,7 @@ def test_the_worst_row_is_the_verdict() -> None:
 
 def test_a_row_gives_value_expectation_and_consequence() -> None:
     (row,) = judge({"x": 1.5}, [LIMIT]).remarks
-    assert row.text() == "A figure: 1.5 px, at most 1 px expected, refused beyond 2 px; why"
+    assert row.text() == "A figure: 1.5 px, expected at most 1 px, refused above 2 px; why"
 
 
 def record(number: int, kind: str = "light") -> Any:

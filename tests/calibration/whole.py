@@ -114,7 +114,7 @@ def brief(value: Any) -> Any:
 
 def known(evidence: Evidence) -> dict[str, float]:
     """Return the evidence that is there, without what is unsure."""
-    return {name: value for name, value in evidence.known().items() if value and name not in UNSURE}
+    return {name: value for name, value in evidence.measured_values().items() if value and name not in UNSURE}
 
 
 def told(result: BuildResult) -> dict[str, Any]:

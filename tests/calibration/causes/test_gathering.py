@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from calibration.causes.gathering import (
-    MOST_PLACES,
-    PrintPlace,
+    MAX_PLACES,
+    PrintPosition,
     block_evidence,
     blur_evidence,
     brightness_evidence,
@@ -121,7 +121,7 @@ def test_a_place_shows_in_the_frames_that_differ_there_by_a_third_as_much() -> N
     assert (known.added, known.kept, known.scatter) == (0.002, 0.9, 0.01)
     assert (known.softer, known.moved_px) == pytest.approx((0.1, 0.2))
     assert numbers(found) == ["1", "4", "5"]
-    assert found.places == (PrintPlace("1.dng", 50.0, 40.0, 20.0),)
+    assert found.positions == (PrintPosition("1.dng", 50.0, 40.0, 20.0),)
 
 
 def test_what_four_of_five_frames_show_lies_on_the_first() -> None:
@@ -129,7 +129,7 @@ def test_what_four_of_five_frames_show_lies_on_the_first() -> None:
     found = block_evidence(session([Frame("white"), *others]), 0.01)
     assert (found.evidence.showing, found.evidence.in_first) == (0.8, 1)
     assert numbers(found) == ["0"]
-    assert found.places[0].file == "0.dng"
+    assert found.positions[0].file == "0.dng"
     # Blocks of less than four thousandths are none, however little the worst is.
     faint = [Frame(consistency=block(value), number=n) for n, value in enumerate((0.0, 0.005, 0.004, 0.0039))]
     assert block_evidence(session(faint), 0.01).evidence.showing == pytest.approx(2 / 3)
@@ -160,18 +160,18 @@ def test_few_covered_cells_are_told_by_the_frames_in_which_they_are() -> None:
     assert numbers(found) == ["3", "4"]
     # Cells beside each other are one place, as wide as a disc of their area.
     sizes = [2 * np.sqrt(count / np.pi) * CELL_MM for count in (2, 1, 1)]
-    assert [place.size_mm for place in found.places] == pytest.approx(sizes)
-    assert [(place.x_mm, place.y_mm) for place in found.places] == [(45, 20), (0, 60), (70, 0)]
+    assert [place.size_mm for place in found.positions] == pytest.approx(sizes)
+    assert [(place.x_mm, place.y_mm) for place in found.positions] == [(45, 20), (0, 60), (70, 0)]
     assert disturbed_evidence(session(frames[:3]), 0.0) is None
     # Four of the five others show it.
     most = [Frame(), *(Frame(consistency=covered((44, -0.2)), number=n) for n in range(1, 5)), Frame(number=5)]
     found = disturbed_evidence(session(most), 0.0)
     assert found is not None
     assert found.evidence.in_first == 1
-    many = [Frame(consistency=covered((44, -0.2)), number=number) for number in range(MOST_PLACES + 3)]
+    many = [Frame(consistency=covered((44, -0.2)), number=number) for number in range(MAX_PLACES + 3)]
     found = disturbed_evidence(session(many), 0.0)
     assert found is not None
-    assert (len(found.places), len(found.frames)) == (12, 15)
+    assert (len(found.positions), len(found.frames)) == (12, 15)
 
 
 def test_a_spot_is_told_by_its_colour_and_by_the_white_frames_whose_references_show_it() -> None:
@@ -196,9 +196,9 @@ def test_a_spot_is_told_by_its_colour_and_by_the_white_frames_whose_references_s
     assert (known.deviation, known.tint) == pytest.approx((-0.08, 0.5))
     assert numbers(found) == ["1"]
     sizes = [2 * np.sqrt(count / np.pi) * CELL_MM for count in (4, 1)]
-    assert [place.size_mm for place in found.places] == pytest.approx(sizes)
-    assert [(place.x_mm, place.y_mm) for place in found.places] == [(45, 25), (70, 0)]
-    assert {place.file for place in found.places} == {"1.dng"}
+    assert [place.size_mm for place in found.positions] == pytest.approx(sizes)
+    assert [(place.x_mm, place.y_mm) for place in found.positions] == [(45, 25), (70, 0)]
+    assert {place.file for place in found.positions} == {"1.dng"}
     assert spot_evidence(session(frames), 0.0) is None
 
 
@@ -285,7 +285,7 @@ def test_unfit_cells_are_told_by_what_most_of_them_are() -> None:
     # Waves in pixels of cells of ten; what comes from beyond a cell, by the blur and by the lens.
     assert known.waves_px == pytest.approx(0.3)
     assert known.beyond_cell == pytest.approx(0.0132 + 0.01, abs=2e-3)
-    assert [(place.x_mm, place.y_mm, place.size_mm) for place in found.places] == [(0, 20, 0), (40, 20, 0)]
+    assert [(place.x_mm, place.y_mm, place.size_mm) for place in found.positions] == [(0, 20, 0), (40, 20, 0)]
     assert unfit_evidence(session(frames, cells=unfit("stained", "lit")), 0) is None, "no spot, no evidence"
     unknown = unfit_evidence(session(frames, cells=unfit("lit")), 0)
     assert unknown is not None

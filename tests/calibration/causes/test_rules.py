@@ -136,7 +136,7 @@ def test_evidence_decides(subject: Subject, evidence: Evidence, cause: Cause) ->
 
 
 def test_what_is_not_known_decides_nothing() -> None:
-    assert not Evidence().known()
+    assert not Evidence().measured_values()
     for subject in get_args(Subject):
         assert decide(subject, Evidence()).cause is UNKNOWN
 
@@ -146,7 +146,7 @@ def test_the_table_names_what_there_is() -> None:
     assert {rule.cause for rule in RULES} | {UNKNOWN} == set(CAUSES)
     assert len({cause.name for cause in CAUSES}) == len(CAUSES)
     for cause in CAUSES[:-1]:
-        assert cause.says
+        assert cause.description
         assert cause.remedy
     for rule in RULES:
         assert rule.why

@@ -111,7 +111,7 @@ def test_other_noise_is_within_noise(one: Lut, tmp_path: Path, samples: int) -> 
 @pytest.mark.slow
 def test_chances_are_those_of_many_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of tables that differ by noise alone, chances are spread evenly from 0 to 1."""
-    monkeypatch.setattr(comparing, "ERROR_OF_ERRORS", 1.0)
+    monkeypatch.setattr(comparing, "ERROR_FACTOR", 1.0)
     tables = [written(tmp_path / str(seed), seed, lights=LIGHTS) for seed in range(12)]
     pairs = [compare(first, second).lights for first, second in zip(tables[::2], tables[1::2], strict=True)]
     for chances in ([pair.angle_p for pair in pairs], [pair.brightness_p for pair in pairs]):

@@ -36,8 +36,8 @@ def test_figures_that_contradict_themselves_do_not_import(
     wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(light, "WRONG", replace(DARKEST_COUNTS, **{"name": "wrong", **wrong}), raising=False)  # pyrefly: ignore[bad-argument-type]
-    with pytest.raises(ValueError, match=r"wrong|one of the names"):
-        all_figures.collected()
+    with pytest.raises(ValueError, match=r"wrong|duplicate"):
+        all_figures.collect_figures()
 
 
 def test_a_limit_of_single_frames_has_a_name_of_its_own_and_a_reason() -> None:
@@ -51,7 +51,7 @@ def test_a_limit_of_single_frames_has_a_name_of_its_own_and_a_reason() -> None:
 
 
 def test_figures_are_listed_in_the_order_of_their_definitions() -> None:
-    assert all_figures.collected() == FIGURES
+    assert all_figures.collect_figures() == FIGURES
     texts = [Path(module.__file__ or "").read_text() for module in (geometry, radiometry, light, truth)]
     assert [figure.name for figure in FIGURES] == re.findall(r' = Figure\(\n    "(\w+)"', "".join(texts))
     assert {figure.group for figure in FIGURES} == QUESTIONS.keys()
@@ -420,9 +420,9 @@ def test_a_figure_names_what_is_beyond_its_limit() -> None:
     made = table(codes=codes(exchanges=pairs(6)))
     # Four pairs are named of six, white frames after the lights.
     said = where(light.EXCHANGED_LIGHTS, made, 0.0)
-    assert "light 2 and white frame 0" in said
-    assert said.endswith("(and 2 pairs more), 2.5° apart in the first pair")
+    assert "illuminant 2 and white frame 0" in said
+    assert said.endswith("(and 2 more pairs); angle of the first pair 2.5°")
     assert "more" not in where(light.EXCHANGED_LIGHTS, table(codes=codes(exchanges=pairs(4))), 0.0)
-    assert where(light.OFF_BRIGHTNESS, made, 0.1) == "light 2 by -50 %, light 0 by +25 %"
+    assert where(light.OFF_BRIGHTNESS, made, 0.1) == "illuminant 2 by -50 %, illuminant 0 by +25 %"
     assert where(light.REPEATED_FILES, table(frames=TWICE), 0.0) == "4.dng is 0.dng"
     assert where(light.CROSS_CHECKED_SHARE, made, 0.0) == "2 of 3"

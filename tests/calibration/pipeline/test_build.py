@@ -1679,7 +1679,7 @@ def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tm
     # Cells under a hand in the first frame do not look like the chart's and are not compared; references tell of it.
     finding = found["reference_spread" if which == "white 0" else "block_deviation"]
     page = np.array(lab.chart.page_mm)
-    (place,) = finding.places
+    (place,) = finding.positions
     assert place.file == f"frames/{file}.dng"
     left, top, right, bottom = HAND.blobs[0].place
     assert left - 0.05 < place.x_mm / page[0] < right + 0.05
@@ -1744,7 +1744,7 @@ def test_a_stain_is_one(tmp_path: Path) -> None:
     assert causes(found) == {STAIN}
     stain = lab.world.stain
     assert stain is not None
-    place = found["doubtful_share"].places[0]
+    place = found["doubtful_share"].positions[0]
     assert np.hypot(place.x_mm - stain.centre_mm[0], place.y_mm - stain.centre_mm[1]) < 8
     assert 18 < place.size_mm < 40
     assert not retaken_frames(result.verdict, result.figures)

@@ -95,8 +95,8 @@ def test_white_frames_drift_by_less_than_15_per_cent_and_two_degrees(
 ) -> None:
     # The median of three is what two of them have.
     frames = [frame(), frame(white), frame()]
-    assert table_figures._drift_is_one(frames) is is_drift
-    assert table_figures._drift_is_one([frame(white)])
+    assert table_figures._differ_by_drift(frames) is is_drift
+    assert table_figures._differ_by_drift([frame(white)])
 
 
 def test_times_are_since_the_first_white_frame() -> None:

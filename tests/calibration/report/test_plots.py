@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.causes.gathering import PrintPlace
+from calibration.causes.gathering import PrintPosition
 from calibration.comparison.comparing import CellDifferences
 from calibration.comparison.report import draw_map
 from calibration.report import plots
 from calibration.report.plots import (
     draw_chromaticities,
-    draw_places,
+    draw_positions,
     half_size,
     viewable,
 )
@@ -170,7 +170,7 @@ def test_a_name_at_the_edge_of_a_plot_is_turned_inwards() -> None:
 
 
 def test_places_are_circled_and_those_of_one_circle_share_its_numbers() -> None:
-    places = [("one", PrintPlace("a", 30.0, 40.0, 20.0)), ("two", PrintPlace("a", 30.0, 40.0, 20.0)),
-              ("one", PrintPlace("a", 60.0, 40.0, 0.0)), ("three", PrintPlace("a", 1.0, 40.0, 20.0))]  # fmt: skip
-    axes, _ = drawn(draw_places, FRAME, CHART, registered(), places).axes
+    places = [("one", PrintPosition("a", 30.0, 40.0, 20.0)), ("two", PrintPosition("a", 30.0, 40.0, 20.0)),
+              ("one", PrintPosition("a", 60.0, 40.0, 0.0)), ("three", PrintPosition("a", 1.0, 40.0, 20.0))]  # fmt: skip
+    axes, _ = drawn(draw_positions, FRAME, CHART, registered(), places).axes
     assert [text.get_text() for text in axes.texts] == ["1, 2", "1", "3"]

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from calibration.causes.gathering import PrintPlace
+from calibration.causes.gathering import PrintPosition
 from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
-from calibration.report.plots import draw_places
+from calibration.report.plots import draw_positions
 from calibration.report.report import write_report
 from calibration.verdict import BuildResult
 from experiment.session.folder import Session
@@ -33,11 +33,11 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.usefixtures("lens_unmeasured")
 def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    circled: list[tuple[str, PrintPlace]] = []
+    circled: list[tuple[str, PrintPosition]] = []
 
     def blank(draw: Callable[..., None], *arguments: Any) -> bytes:
         # The last picture with places is that of the frame.
-        circled[:] = arguments[-1] if draw is draw_places else circled
+        circled[:] = arguments[-1] if draw is draw_positions else circled
         return b"\x89PNG\r\n\x1a\n"
 
     monkeypatch.setattr("calibration.report.report.png_of", blank)
