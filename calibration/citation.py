@@ -82,10 +82,7 @@ def published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> Mappi
 def with_published_serials(origins: Sequence[FrameOrigin], form: SerialForm) -> list[FrameOrigin]:
     """Return origins with serial numbers in the form chosen by the lab; equal numbers stay equal."""
     published = published_serials(origins, form)
-    return [
-        replace(origin, serial=published[origin.camera, origin.serial]) if origin.serial else origin
-        for origin in origins
-    ]
+    return [replace(item, serial=published[item.camera, item.serial]) if item.serial else item for item in origins]
 
 
 class OriginRecord(Record):
@@ -194,9 +191,7 @@ def origin_record(stated: StatedOrigin, records: Sequence[FrameRecord], origins:
     serial, serial_form = _serial(stated, origins)
     moments = [record.taken_at.astimezone(UTC) for record in records]
     exposure = _most_frequent([(origin.iso, origin.aperture, origin.shutter_s) for origin in exposures])
-    exposure_by = (
-        None if exposure is None and stated.camera is None else "settings" if exposure is None else "raw files"
-    )
+    source = None if exposure is None and stated.camera is None else "settings" if exposure is None else "raw files"
     if exposure is None and stated.camera is not None:
         settings = stated.camera.exposure
         exposure = settings.iso, settings.aperture, settings.shutter_s
@@ -209,7 +204,7 @@ def origin_record(stated: StatedOrigin, records: Sequence[FrameRecord], origins:
         iso=iso or None,
         aperture=aperture or None,
         shutter_s=shutter_s or None,
-        exposure_by=exposure_by,
+        exposure_by=source,
         first_frame=min(moments).isoformat(timespec="seconds") if moments else None,
         last_frame=max(moments).isoformat(timespec="seconds") if moments else None,
         frames=len(records),

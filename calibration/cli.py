@@ -245,8 +245,8 @@ def verify(
         raise FormatError(
             f"{folder} has changed: {len(faults)} faults, expected 0; restore it from a copy, or build it again"
         )
-    frames = "" if session is None else f", and of its {len(table.frames)} frames in {session}"
-    print(f"{folder}: the hashes of all files are correct{frames}")
+    frames = "" if session is None else f" and of its {len(table.frames)} frames in {session}"
+    print(f"{folder}: the hashes of all files{frames} are correct")
 
 
 @_others.command(epilog=EXIT_CODES)

@@ -152,10 +152,8 @@ def blur_rows(image: _Float, taps: _Float, out: _Float) -> None:
             row1, row2 = image[min(max(first, 0), rows - 1)], image[min(max(first + 1, 0), rows - 1)]
             row3, row4 = image[min(max(first + 2, 0), rows - 1)], image[min(max(first + 3, 0), rows - 1)]
             a, b, c, d = padded[tap], padded[tap + 1], padded[tap + 2], padded[tap + 3]
-            for column in range(image.shape[1]):
-                sums[column] = (((sums[column] + a * row1[column]) + b * row2[column]) + c * row3[column]) + d * row4[
-                    column
-                ]
+            for n in range(image.shape[1]):
+                sums[n] = (((sums[n] + a * row1[n]) + b * row2[n]) + c * row3[n]) + d * row4[n]
 
 
 @compiled

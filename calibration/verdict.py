@@ -130,9 +130,8 @@ def _shared_cause(unknown: ProbableCause, follows: Sequence[str], table: TableMe
         own_frames, main_frames = ({frame.sha256 for frame in cause.frames} for cause in (unknown, main))
         if own_frames and own_frames <= main_frames:
             decision = replace(main.decision, follows=name)
-            return replace(
-                unknown, decision=decision, evidence=main.evidence, positions=unknown.positions or main.positions
-            )
+            positions = unknown.positions or main.positions
+            return replace(unknown, decision=decision, evidence=main.evidence, positions=positions)
     return unknown
 
 

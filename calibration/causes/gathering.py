@@ -199,10 +199,8 @@ def unfit_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
             "lit": kinds.count("lit") / len(kinds),
         }
         return Gathered(Evidence(**evidence), (), positions)
-    evidence, object_positions = _residual_evidence(table, table.registered_frame)
-    return Gathered(
-        Evidence(**evidence | {"hot": hot}), (registered,) if evidence else (), object_positions or positions
-    )
+    evidence, covering = _residual_evidence(table, table.registered_frame)
+    return Gathered(Evidence(**evidence | {"hot": hot}), (registered,) if evidence else (), covering or positions)
 
 
 def noisy_evidence(table: TableMeasurements, limit: float) -> Gathered | None:

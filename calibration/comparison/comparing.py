@@ -134,8 +134,7 @@ def compare(
     pairs = light_pairs(one.illuminations, other.illuminations)
     if not pairs:
         raise FormatError(
-            f"{one.folder} and {other.folder} have 0 common illuminants, expected at least 1 with the same kind and "
-            "codes; compare sessions with the same illuminations.csv"
+            f"{one.folder} and {other.folder} have 0 common illuminants, at least 1 expected; compare LUTs of one plan"
         )
     cells, cell_score = _compare_cells(one, other, pairs, progress)
     lights = _compare_lights(one, other, pairs, cell_score)
@@ -185,14 +184,11 @@ def light_pairs(one: Sequence[Illumination], other: Sequence[Illumination]) -> l
 
 def _comparison_warnings(one: Lut, other: Lut, common: int) -> tuple[str, ...]:
     first, second = one.provenance, other.provenance
-    only_in_one, only_in_other = len(one.white) - common, len(other.white) - common
+    a_only, b_only = len(one.white) - common, len(other.white) - common
     same_frames = first.session_sha256 == second.session_sha256 and first.computed is None
     warnings = {
-        f"different cameras, {first.camera} and {second.camera}: differences are expected": first.camera
-        != second.camera,
-        f"{common} common illuminants are compared; {only_in_one} are only in A, {only_in_other} only in B": bool(
-            only_in_one or only_in_other
-        ),
+        f"two cameras, {first.camera} and {second.camera}: differences are expected": first.camera != second.camera,
+        f"{common} common illuminants are compared; {a_only} are only in A, {b_only} only in B": bool(a_only or b_only),
         "both LUTs were built from the same frames: their noise is identical, so agreement proves nothing": same_frames,
     }
     return tuple(warning for warning, applies in warnings.items() if applies)
@@ -281,9 +277,7 @@ def _compare_cells(
         progress(number + 1, len(pairs))
     count, total = sums[0], sums[0].sum()
     if not total:
-        raise FormatError(
-            f"0 patches exceed {MIN_COUNTS:g} counts in both LUTs, expected at least 1; compare longer exposures"
-        )
+        raise FormatError(f"0 patches exceed {MIN_COUNTS:g} counts in both LUTs; compare longer exposures")
     with np.errstate(divide="ignore", invalid="ignore"):
         mean, error = sums[1] / count, np.sqrt(sums[3]) / count
         offset = sums[1].sum(axis=0) / count.sum(axis=0)

@@ -62,9 +62,8 @@ def _are_frames_comparable(table: TableMeasurements) -> bool:
 
 def _are_names_right(table: TableMeasurements) -> bool:
     off_codes_deg, white_frames = table.lights.off_codes_deg, table.lights.white_frames
-    fit_codes = (off_codes_deg is None or not (off_codes_deg > 0).any()) and (
-        white_frames is None or not (white_frames.off_deg > 0).any()
-    )
+    fit_codes = off_codes_deg is None or not (off_codes_deg > 0).any()
+    fit_codes = fit_codes and (white_frames is None or not (white_frames.off_deg > 0).any())
     return fit_codes and _are_frames_comparable(table)
 
 
@@ -280,13 +279,10 @@ def _oversubtracted_share(table: TableMeasurements) -> float | None:
     excess, uncertainty = -lights.additivity.off / 2, table.white_scatter
     if table.sensor.superposition.measured:
         uncertainty = np.hypot(uncertainty, lights.additivity.error / 2)
-    certain_excess = excess - 2 * uncertainty
-    excess_allowed = _DARK_MARGIN * np.maximum(dark, 0) / lights.brightest + uncertainty
-    return (
-        float(certain_excess.max())
-        if (excess > 0).all() and (excess <= excess_allowed).all() and (certain_excess > 0).any()
-        else 0.0
-    )
+    certain = excess - 2 * uncertainty
+    allowed = _DARK_MARGIN * np.maximum(dark, 0) / lights.brightest + uncertainty
+    is_dark_light = (excess > 0).all() and (excess <= allowed).all() and (certain > 0).any()
+    return float(certain.max()) if is_dark_light else 0.0
 
 
 _DARK_MARGIN = 1.25  # Largest excess relative to the dark light: all of it, and its error
@@ -304,15 +300,12 @@ TOO_DARK = Figure(
 
 def _sum_deviation(sign: int) -> Callable[[TableMeasurements], float | None]:
     def measure(table: TableMeasurements) -> float | None:
-        additivity = table.lights.additivity
+        white = table.lights.additivity
         # Light subtracted in excess is judged by TOO_DARK.
-        if (
-            additivity is None
-            or not _are_names_right(table)
-            or (sign < 0 and (_oversubtracted_share(table) or 0) > TOO_DARK.accept)
-        ):
+        is_oversubtracted = sign < 0 and (_oversubtracted_share(table) or 0) > TOO_DARK.accept
+        if white is None or not _are_names_right(table) or is_oversubtracted:
             return None
-        return max(float((sign * additivity.off).max()), 0.0)
+        return max(float((sign * white.off).max()), 0.0)
 
     return measure
 
@@ -405,25 +398,19 @@ def _brightness_text(table: TableMeasurements, accepted: float) -> str:
     if codes is None:
         return ""
     order = sorted(range(len(codes.off_brightness)), key=lambda light: -codes.off_brightness[light])
-    texts = [
-        f"illuminant {k} by {100 * codes.brightness[k]:+.0f} %" for k in order if codes.off_brightness[k] > accepted
-    ]
-    return first_of(texts)
+    beyond = [k for k in order if codes.off_brightness[k] > accepted]
+    return first_of([f"illuminant {k} by {100 * codes.brightness[k]:+.0f} %" for k in beyond])
 
 
 def _frames_off_brightness(table: TableMeasurements, limit: float) -> list[FrameRecord] | None:
     if table.lights.codes is None:
         return None
-    off_brightness = table.lights.codes.off_brightness
+    off = table.lights.codes.off_brightness
 
     def light_of(frame: FrameMeasurements) -> int:
         return sys.maxsize if frame.record.illumination is None else frame.record.illumination
 
-    return [
-        frame.record
-        for frame in table.frames
-        if light_of(frame) < len(off_brightness) and off_brightness[light_of(frame)] > limit
-    ]
+    return [frame.record for frame in table.frames if light_of(frame) < len(off) and off[light_of(frame)] > limit]
 
 
 OFF_BRIGHTNESS = Figure(

@@ -157,12 +157,10 @@ def build(
         )
     _require_dark_frames(session, options)
     _require_white_frames(selected, session, options)
-    report_progress = progress or _no_progress
+    show = progress or _no_progress
     with unfinished_table(out) as unfinished:
-        accumulator, writer, series = _accumulate_all(
-            session, selected, options, linearity, unfinished, report_progress
-        )
-        report_progress(len(accumulator.figures), len(accumulator.figures), "writing the report")
+        accumulator, writer, series = _accumulate_all(session, selected, options, linearity, unfinished, show)
+        show(len(accumulator.figures), len(accumulator.figures), "writing the report")
         figures = table_figures(accumulator, series)
         result = BuildResult(figures, judge(judged_values(figures), judged_by), out)
         if figures.lights.drift is not None and not result.verdict.refused:
@@ -326,9 +324,8 @@ def _measure_frame(accumulator: Accumulator, record: FrameRecord, register_again
     located = locate(baseline, decoded, accumulator.registered, register_again)
     if located is None:
         return None
-    return measure(
-        baseline, sample(baseline, located, accumulator.dark, keep_samples=accumulator.selected.is_even(record))
-    )
+    is_even = accumulator.selected.is_even(record)
+    return measure(baseline, sample(baseline, located, accumulator.dark, keep_samples=is_even))
 
 
 def _new_accumulator(session: Session, selected: SelectedFrames, options: BuildOptions) -> Accumulator:
@@ -420,13 +417,9 @@ def _write_table(accumulator: Accumulator, figures: TableMeasurements, writer: L
         unfit=list(figures.cells.unfit),
         origin=figures.origin,
     )
-    gain_by_light = gain[:, None]
+    per_light = gain[:, None]
     references = references_csv(
-        greys.names,
-        lights.white / gain,
-        lights.white_error / gain,
-        greys.values / gain_by_light,
-        greys.errors / gain_by_light,
+        greys.names, lights.white / gain, lights.white_error / gain, greys.values / per_light, greys.errors / per_light
     )
     files = {UNCERTAINTY: figures.budget.lights_csv(), CELLS: figures.budget.cells_csv()}
     if greys.names:

@@ -103,17 +103,15 @@ def select_frames(session: Session) -> SelectedFrames:
         raise FormatError(
             f"{session.folder} has 0 accepted light or white frames, at least 1 expected; run acquire run"
         )
-    last_by_light = _last_of_each_light(session, accepted)
+    last = _last_of_each_light(session, accepted)
     reference_frames = [record for record in accepted if record.kind in ("white", "dark")]
     whites = list({record.sha256: record for record in reference_frames if record.kind == "white"}.values())
     pure = pure_lights(session.illuminations) or ()
     return SelectedFrames(
-        records=_in_order_taken(session, [*last_by_light.values(), *reference_frames]),
-        lights_without=tuple(light.index for light in session.illuminations if light.index not in last_by_light),
+        records=_in_order_taken(session, [*last.values(), *reference_frames]),
+        lights_without=tuple(light.index for light in session.illuminations if light.index not in last),
         registered=_frame_to_register(session, accepted),
-        primaries=tuple(last_by_light[light] for light in pure)
-        if all(light in last_by_light for light in pure)
-        else (),
+        primaries=tuple(last[light] for light in pure) if all(light in last for light in pure) else (),
         more_whites=tuple(whites[1 : 1 + _MAX_MORE_WHITES]) if session.chart.bits < VARYING_BITS else (),
     )
 
@@ -174,13 +172,8 @@ def stated_origin(session: Session) -> StatedOrigin:
         settings = CameraSettings.model_validate(document["camera"]) if rig in _CONFIGURED_RIGS else None
     except (CropError, ValidationError, ValueError, KeyError, RecursionError) as error:
         if isinstance(error, CropError | tomllib.TOMLDecodeError):
-            reason = (
-                error if isinstance(error, CropError) else f"{session.folder / 'session.toml'} is not TOML: {error}"
-            )
-            _log.warning(
-                "%s; the LUT will not contain origin, authors, exposure and licence. Correct session.toml first",
-                reason,
-            )
+            why = error if isinstance(error, CropError) else f"{session.folder / 'session.toml'} is not TOML: {error}"
+            _log.warning("%s; the LUT will not contain origin, authors, exposure and licence; correct it first", why)
         return StatedOrigin(CitationSettings(), None, None, session.journal.records())
     return StatedOrigin(citation, rig, settings, session.journal.records())
 

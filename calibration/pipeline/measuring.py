@@ -231,8 +231,7 @@ def sites_of(
     `shape`: rows and columns of the half-size frame. `window`: side of the sampling window, px.
     """
     cells, references = (
-        sites_at(registration.to_pixels(points_mm), shape, window)
-        for points_mm in (points.cells_mm, points.references_mm)
+        sites_at(registration.to_pixels(mm), shape, window) for mm in (points.cells_mm, points.references_mm)
     )
     return cells, references
 
@@ -431,14 +430,8 @@ def locate(
     if shift.gauges == 0 or shift.length_px > REREGISTER_PX or is_distorted:
         if not register_again:
             return None
-        registered_again = baseline.register(decoded)
-        return LocatedFrame(
-            decoded,
-            registered_again,
-            registered_again,
-            _movement(baseline, registered, registered_again),
-            reregistered=True,
-        )
+        new = baseline.register(decoded)
+        return LocatedFrame(decoded, new, new, _movement(baseline, registered, new), reregistered=True)
     at = registered
     if shift.length_px > STILL_PX:
         moved = registered.registration.shifted(shift.dx, shift.dy)

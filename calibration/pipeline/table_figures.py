@@ -283,15 +283,14 @@ _FULL_CODE = 255  # Code of a primary at full brightness
 
 def table_figures(accumulator: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
     """Return the measurements of a LUT with all frames added. `linearity`: result of a series of exposures, if any."""
-    even_frame = next(
+    even = next(
         (frame for frame in accumulator.frames if accumulator.selected.is_even(frame.record)), accumulator.frames[0]
     )
     frame_by_light = {frame.record.illumination: frame for frame in accumulator.frames if frame.record.kind == "light"}
     by_light = [frame_by_light[light.index] for light in accumulator.session.illuminations]
     greys = np.array([frame.greys for frame in by_light]), np.array([frame.grey_errors for frame in by_light])
-    return _table_measurements(
-        accumulator, even_frame, len(by_light), _light_figures(accumulator, by_light), greys, linearity
-    )
+    lights = _light_figures(accumulator, by_light)
+    return _table_measurements(accumulator, even, len(by_light), lights, greys, linearity)
 
 
 def check_figures(accumulator: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
@@ -308,9 +307,8 @@ def check_figures(accumulator: Accumulator, linearity: LinearityMeasurements | N
         white_frames=None,
     )
     light_count = len(accumulator.session.illuminations) - len(accumulator.selected.lights_without)
-    return _table_measurements(
-        accumulator, frame, light_count, lights, (frame.greys[None], frame.grey_errors[None]), linearity
-    )
+    greys = frame.greys[None], frame.grey_errors[None]
+    return _table_measurements(accumulator, frame, light_count, lights, greys, linearity)
 
 
 def _table_measurements(
@@ -382,10 +380,7 @@ def _added_light_of_first(baseline: Baseline) -> AddedLight:
 
 def _lens_figures(baseline: Baseline) -> LensFigures:
     if baseline.lens is None:
-        reason = (
-            unsuitable(baseline.chart)
-            or f"no channel of paper reaches {LEAST_COUNTS:g} counts in any frame; expose longer"
-        )
+        reason = unsuitable(baseline.chart) or f"no channel of paper reaches {LEAST_COUNTS:g} counts; expose longer"
         return LensFigures.unknown(reason, baseline.reflectances()[: baseline.chart.colour_count])
     return baseline.lens.figures
 

@@ -384,13 +384,11 @@ def draw_errors(figure: Any, table: TableMeasurements, chart: Chart) -> None:
     stains = table.cells.stains
     if stains.known:
         percent = 100 * stains.largest_deviation()
-        centres_mm = chart.centres_mm[chart.cell_of_colour]
+        mm = chart.centres_mm[chart.cell_of_colour]
         limit = max(1.0, float(np.abs(percent).max()))
-        image = draw_squares(
-            left, chart.page_mm, centres_mm, side_mm, percent, 4.1, cmap="RdBu", vmin=-limit, vmax=limit
-        )
+        image = draw_squares(left, chart.page_mm, mm, side_mm, percent, 4.1, cmap="RdBu", vmin=-limit, vmax=limit)
         figure.colorbar(image, ax=left, label="%, brighter is positive", shrink=0.8)
-        _mark(left, centres_mm[int(np.argmax(np.abs(percent)))])
+        _mark(left, mm[int(np.argmax(np.abs(percent)))])
     else:
         left.text(0.5, 0.5, "too few colours to compare", ha="center", va="center", transform=left.transAxes)
     error = table.registration.uncertainty_px(chart.centres_mm)
@@ -496,29 +494,21 @@ def draw_positions(figure: Any, picture: _Image, chart: Chart, registration: Reg
     for label, position in positions:
         numbers_by_circle.setdefault((position.x_mm, position.y_mm, position.size_mm), []).append(numbers[label])
     labelled: set[tuple[int, ...]] = set()
-    for (x_mm, y_mm, size_mm), circle_numbers in numbers_by_circle.items():
+    for (x_mm, y_mm, size_mm), shown_numbers in numbers_by_circle.items():
         radius = max(size_mm / 2 * 1.15, _MIN_RADIUS * chart.page_mm[0])
         ring = registration.to_pixels(np.array([x_mm, y_mm]) + radius * unit_circle)
         # A white line below keeps the circle visible on every colour.
         axes.plot(ring[:, 0], ring[:, 1], color="white", linewidth=3.4, alpha=0.9)
         axes.plot(ring[:, 0], ring[:, 1], color=MARK, linewidth=1.8)
-        if tuple(circle_numbers) not in labelled:
-            labelled.add(tuple(circle_numbers))
+        if tuple(shown_numbers) not in labelled:
+            labelled.add(tuple(shown_numbers))
             # If a circle extends beyond the frame, the number is placed at its visible part.
             visible = ring[((ring > (0.02 * width, 0.03 * height)) & (ring < (width, height))).all(axis=1)]
             corners = visible if len(visible) else ring
             x, y = corners[np.argmin(corners.sum(axis=1))]
             box = {"facecolor": MARK, "edgecolor": "white", "boxstyle": "round,pad=0.25"}
-            axes.text(
-                x,
-                y,
-                ", ".join(map(str, circle_numbers)),
-                color="white",
-                weight="bold",
-                ha="right",
-                va="bottom",
-                bbox=box,
-            )
+            text = ", ".join(map(str, shown_numbers))
+            axes.text(x, y, text, color="white", weight="bold", ha="right", va="bottom", bbox=box)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
     below.axis("off")
     for row, (label, number) in enumerate(numbers.items()):
@@ -531,8 +521,8 @@ def half_size(mosaic: Mosaic) -> npt.NDArray[np.float32]:
     blocks = mosaic.block_planes()
     image = np.empty((*blocks.shape[2:], 3), dtype=np.float32)
     for column, channel in enumerate(CHANNELS):
-        positions = phases(mosaic)[channel]
-        image[..., column] = sum(blocks[position] - np.float32(black[position]) for position in positions) / np.float32(
-            len(positions)
+        offsets = phases(mosaic)[channel]
+        image[..., column] = sum(blocks[offset] - np.float32(black[offset]) for offset in offsets) / np.float32(
+            len(offsets)
         )
     return image

@@ -116,9 +116,7 @@ def _causes_json(result: BuildResult) -> list[dict[str, Any]]:
                 }
                 for position in cause.positions
             ],
-            "evidence": {
-                evidence_name: _rounded(value) for evidence_name, value in cause.evidence.measured_values().items()
-            },
+            "evidence": {key: _rounded(value) for key, value in cause.evidence.measured_values().items()},
         }
         for name, cause in findings(result.verdict, result.figures).items()
     ]
