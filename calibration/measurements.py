@@ -151,12 +151,8 @@ class LightMeasurements:
 
     def lights_off_codes(self, accepted_deg: float) -> list[int]:
         """Return the illuminants beyond `accepted_deg` from the prediction, the furthest first."""
-        angle_deg = self.off_codes_deg
-        return (
-            []
-            if angle_deg is None
-            else [int(light) for light in np.argsort(-angle_deg) if angle_deg[light] > accepted_deg]
-        )
+        deg = self.off_codes_deg
+        return [] if deg is None else [int(light) for light in np.argsort(-deg) if deg[light] > accepted_deg]
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +193,7 @@ class CellMeasurements:
 
     window: int  # Side of the sampling window, px; S = window²
     unfit: tuple[Unfit, ...]
-    stains: Stains  # Areas whose colours differ from their codes', in the order of colour indices
+    stains: Stains  # Patches with other colours than their codes', in the order of colour indices
     levels: _Array  # (C, 3) float64, each patch in the frame registered first, relative to bare paper
     added: AddedLight  # Light added to some patches, independent of their colour
 
@@ -246,7 +242,7 @@ class TableMeasurements:
         return next(candidates, self.frames[0])
 
     def added_bleed(self, frame: FrameMeasurements) -> float:
-        """Return the light from outside the worst sample's patch that a frame adds to the registered frame's."""
+        """Return the bleed of the worst sample in a frame, minus the bleed in the registered frame."""
         registration, window = self.registration, self.cells.window
         own, first = (bleed(registration.cell_px, px, window) for px in (frame.blur_px, registration.blur_px))
         return own - first

@@ -237,7 +237,6 @@ def _cause_text(cause: ProbableCause | None) -> str:
     decision = cause.decision
     if decision.rule is None:
         return "cause unknown; possible remedy: "
-    # What it goes with says why.
     # The reason is reported with the figure that it follows.
     why = "" if decision.follows else f" ({decision.rule.why})"
     return f"probably {decision.cause.description}{why}; "

@@ -240,7 +240,7 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
     added, kept = light_of_spot(stains, spot, int(np.argmax(np.abs(colour))))
     size_mm, min_deviation = max(position.size_mm, 1e-9), _HALF * abs(deviation)
     hottest = table.dark_frames.hottest
-    deviating_whites = _deviating_whites(table, at_mm, position.size_mm, min_deviation)
+    deviating_whites = _whites_off(table, at_mm, position.size_mm, min_deviation)
     white_residual = len(deviating_whites) / max(len(table.white_frames), 1)
     evidence = Evidence(
         **_frame_evidence(table, at_mm, size_mm, min_deviation),
@@ -263,16 +263,14 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
     elif 0 < white_residual <= _HALF:
         frames = deviating_whites
     elif evidence.even_showing > 0:
-        frames = _deviating_frames(table, at_mm, size_mm, min_deviation)
+        frames = _frames_off(table, at_mm, size_mm, min_deviation)
         frames = [frame for frame in frames if frame.record.kind == "white"]
     if frames:
         position = replace(position, file=frames[0].record.file)
     return Gathered(evidence, tuple(frame.record for frame in frames), (position,))
 
 
-def _deviating_whites(
-    table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float
-) -> list[FrameMeasurements]:
+def _whites_off(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float) -> list[FrameMeasurements]:
     reach = max(size_mm, 3 * cell_mm(table.cells.stains))
     return [
         frame
@@ -345,7 +343,7 @@ def _frame_evidence(table: TableMeasurements, at_mm: _Array, size_mm: float, min
     other_frames = [frame for frame in table.frames if frame is not first]
     if not other_frames:
         return {}
-    deviating_frames = _deviating_frames(table, at_mm, size_mm, min_deviation)
+    deviating_frames = _frames_off(table, at_mm, size_mm, min_deviation)
     whites = [frame for frame in other_frames if frame.record.kind == "white"]
     showing = len(deviating_frames) / len(other_frames)
     return {
@@ -356,16 +354,14 @@ def _frame_evidence(table: TableMeasurements, at_mm: _Array, size_mm: float, min
     }
 
 
-def _deviating_frames(
-    table: TableMeasurements, at_mm: _Array, size_mm: float, min_deviation: float
-) -> list[FrameMeasurements]:
+def _frames_off(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float) -> list[FrameMeasurements]:
     """Return the frames that deviate at a position from the frame registered first, the worst first."""
     first = table.registered_frame
     frames = [
         frame
         for frame in table.frames
         if frame is not first
-        and frame.consistency.block >= max(min_deviation, MIN_BLOCK)
+        and frame.consistency.block >= max(minimum, MIN_BLOCK)
         and float(np.linalg.norm(np.array(frame.consistency.at_mm) - at_mm))
         <= max(size_mm, frame.consistency.extent_mm)
     ]

@@ -33,7 +33,7 @@ class Cause:
 HOT_PHOTOSITES = Cause(
     "hot photosites",
     "hot photosites, which the dark frames show too",
-    "let the camera cool, or have its pixels remapped; the table excludes the listed patches",
+    "let the camera cool, or have its pixels remapped; the LUT excludes the listed patches",
     "nothing",
 )
 OBJECT_IN_FRAME = Cause(
@@ -57,7 +57,7 @@ REFLECTION_IN_FRAME = Cause(
 STAIN = Cause(
     "stain",
     "a stain on the print, which absorbs some colours more than others in all frames",
-    "clean the print or print it anew",
+    "clean the print or print it again",
     "session",
 )
 SHADOW = Cause(
@@ -117,7 +117,7 @@ OTHER_CAMERA = Cause(
 )
 OTHER_EXPOSURE = Cause(
     "other exposure",
-    "frames whose files record another exposure than the other frames or the session's settings",
+    "frames with another recorded exposure than the other frames or the session's settings",
     "expose all frames alike in manual mode: shutter, aperture and ISO speed",
     "frames",
 )
@@ -168,10 +168,10 @@ class Evidence:
     - `frames`: number of compared frames of the print.
     - `showing`: fraction of these frames with the deviation.
     - `even_showing`: fraction of the other white frames with the deviation; 0 if there are none.
-    - `white_residual`: fraction of white frames whose references deviate there by at least half as much.
+    - `white_residual`: fraction of white frames with references that deviate there by at least half as much.
     - `some_whites`: 1 if the references deviate there in some white frames and not in others, else 0.
-    - `spot`: fraction of patches there whose colour differs from their code in the mean of the white frames.
-    - `in_first`: 1 if all frames differ there from the reference frame, so that it is the cause; else 0.
+    - `spot`: fraction of patches there with a wrong colour in the mean of the white frames.
+    - `in_first`: 1 if all frames differ there from the frame that they are compared with; else 0.
     - `share`: fraction of the print that deviates.
     - `deviation`: relative deviation in the channel that deviates most; negative is darker.
     - `tint`: range of the deviation over the channels, divided by its magnitude; 0 if all channels are alike.
@@ -186,9 +186,9 @@ class Evidence:
     - `moved_px`: distance of the chart from its registered position, half-size px.
     - `anew`: fraction of frames in which the chart was registered again.
     - `agreement`: correlation of the patches with the chart at the registered position.
-    - `exposure`: exposure of the frame by its file, divided by that of the other frames.
+    - `exposure`: exposure of the frame by its file, relative to the other frames.
     - `off_codes_deg`: angle between an illuminant's white and the prediction from its codes, degrees.
-    - `named_right`: 1 if an illuminant's white fits its own codes, 0 if it fits those of another illuminant.
+    - `named_right`: 1 if an illuminant's white fits its own codes, 0 if it fits the codes of another illuminant.
     - `cameras`: number of cameras or lenses among the frames, by their files.
     - `room`: light while the projector shows black, as a fraction of white.
     - `room_change`: change of `room` between dark frames, as a fraction of white.
@@ -197,10 +197,10 @@ class Evidence:
     - `lone_primary`: relative difference of one primary in white from the other two, which agree.
     - `mixed`: relative excess of one primary in white over the third, if another one is too low.
     - `colour_scatter`: relative scatter of white's colour between successive white frames, beyond drift.
-    - `other_iso`: number of frames whose file records another ISO speed than the settings or most frames.
+    - `other_iso`: number of frames with another recorded ISO speed than the settings or most frames.
     - `lit`: fraction of the unfit patches with too much light on the print for their level.
-    - `misplaced`: fraction of the unfit patches whose position is too uncertain.
-    - `uneven`: fraction of the unfit patches whose rim and centre differ.
+    - `misplaced`: fraction of the unfit patches with too uncertain a position.
+    - `uneven`: fraction of the unfit patches with different rim and centre.
     - `waves_px`: RMS distance of the tags from a flat sheet, half-size px, for patches of 10 px.
     - `beyond_cell`: fraction of the worst sample's light that the lens brings from outside its patch.
     """

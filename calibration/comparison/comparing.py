@@ -1,7 +1,7 @@
 """Compare two LUTs by illuminant, and report whether noise alone explains their differences, always B relative to A.
 
 Noise is taken from the LUTs: the standard error of a patch is the scatter of its samples divided by the square root of
-their number; that of a white is in `references.csv`. Memory use is one illuminant of each LUT per thread.
+their number; standard errors of whites are in `references.csv`. Memory use is one illuminant of each LUT per thread.
 
 L common illuminants, C colours.
 """
@@ -75,7 +75,7 @@ class LightDifferences:
     other: _Numbers  # (L,), index of the illuminant in B
     angle_deg: _Array  # (L,) degrees between the two whites
     angle_p: _Array  # (L,), probability of such a difference of colour by noise alone
-    brightness: _Array  # (L,), white of B divided by that of A, minus 1; channels weighted by their errors
+    brightness: _Array  # (L,), white of B / white of A − 1; channels weighted by their errors
     brightness_p: _Array  # (L,), probability of such a difference of brightness by noise alone
     # (L,), RMS of the patches' differences, divided by their standard errors; NaN if all are too dark
     cell_score: _Array
@@ -108,7 +108,7 @@ class NoiseAnswer:
 
 @dataclass(frozen=True, eq=False)
 class TableComparison:
-    """Differences of two LUTs; `folders` are those of the LUTs, or of their sessions."""
+    """Differences of two LUTs; `folders` contain the LUTs or their sessions."""
 
     folders: tuple[Path, Path]
     warnings: tuple[str, ...]
@@ -145,7 +145,7 @@ def compare(
 
 @contextmanager
 def table_of(folder: Path, progress: Callable[[int, int, str], None] | None = None) -> Generator[Lut]:
-    """Yield the LUT in a folder, or build that of the session in it.
+    """Yield the LUT in a folder, or build the LUT of the session in it.
 
     A LUT of a session is built in a temporary folder next to it: 707 illuminants need 3.5 GB.
     """
@@ -200,7 +200,7 @@ def differing_lights(lights: LightDifferences) -> _Numbers:
 
 
 def differing_cells(cells: CellDifferences) -> _Numbers:
-    """Return (K,) int64 indices of colours whose mean over the illuminants differs from the others, the worst first."""
+    """Return (K,) int64 indices of colours with significant mean differences over the illuminants, the worst first."""
     deviation = np.abs(cells.mean - cells.offset)
     differing = np.flatnonzero(((deviation > CELL_SIGMAS * cells.noise) & (deviation > CELL_FLOOR)).any(axis=1))
     return differing[np.argsort(-np.nan_to_num(deviation[differing]).max(axis=1))]

@@ -56,7 +56,7 @@ class Explanation:
 
     - `about`: subject of the figure, by which rules are selected.
     - `gather`: returns evidence, frames and places for a LUT and the accepted limit.
-    - `follows`: names of figures with the same causes; theirs is reported if this figure has none of its own.
+    - `follows`: names of figures with the same causes, which are reported if this figure has none of its own.
     """
 
     about: Subject
@@ -152,7 +152,7 @@ class Figure(Limit):
     - `before_session`: True if the trial frames of `acquire check` show it as well as a session does.
     - `of_one_frame`: use in `build-lut check`, which reads one light or white frame and a dark one. The value is
       `known`; `bounded` (more frames can only make it worse, so it is judged only if beyond its limit); or `unknown`.
-    - `where`: text with the frames, illuminants or position beyond the accepted limit; None for those of its cause.
+    - `where`: text with the frames, illuminants or position beyond the accepted limit; None to use its cause.
     - `retake`: the single frames beyond a limit; None if all are, or if the figure does not concern single frames.
     - `cause`: how its cause is determined; None if the figure explains itself.
     - `drawing`: the plot that shows it, if any.
@@ -189,7 +189,7 @@ def worst_outcome(outcomes: Iterable[Outcome]) -> Outcome:
 def format_value(value: float, unit: str) -> str:
     """Return a value as text: fractions in %, two significant digits for degrees, otherwise three.
 
-    `unit` is that of `Limit.unit`.
+    `unit`: as in `Limit`.
     """
     if abs(value) < _ZERO_BELOW:
         value = 0.0

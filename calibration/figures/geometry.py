@@ -150,7 +150,8 @@ CORRECTION_RESIDUAL = Figure(
 )  # fmt: skip
 
 CORRECTION_WORST = Figure(
-    "correction_worst", "The same in the worst patch", "radiometry", "share", "at most", 0.03, None,
+    "correction_worst", "Light of surroundings that may remain in the worst patch", "radiometry", "share", "at most",
+    0.03, None,
     why="veiling glare adds as much to dark patches as to bright ones; the relative error of dark ones is several "
     "times the mean",
     source="geometry: six times the glare's error in a patch of 5 % of paper white; 3 % is three standard deviations "
@@ -210,7 +211,7 @@ BLOCK_RESIDUAL_PX = Figure(
 BLOCKS_GOOD = Figure(
     "blocks_good", "Patch blocks that match the chart", "geometry", "share", "at least", 0.98, MIN_GOOD_BLOCKS,
     why="part of the print is covered, damaged, or from another print", source=JUDGEMENT,
-    remedy="uncover the print, or print it anew",
+    remedy="uncover the print, or print it again",
     measure=lambda table: float(table.registration.blocks.good.mean()), of_one_frame="known",
     cause=Explanation("chart", chart_evidence), drawing="residuals",
 )  # fmt: skip

@@ -171,7 +171,7 @@ LEAK_SHARE = Figure(
 )  # fmt: skip
 
 DARK_DRIFT = Figure(
-    "dark_drift", "Change of that light between dark frames, relative to white", "light", "share", "at most", 0.002,
+    "dark_drift", "Change of the light in dark frames, relative to white", "light", "share", "at most", 0.002,
     0.05,
     why="the light of the room changes; the subtracted light, or a part of each illuminant, is wrong",
     source=JUDGEMENT + ": 1 % of a patch with 20 % of white", remedy="darken the room, and keep daylight out",

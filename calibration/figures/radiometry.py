@@ -47,7 +47,7 @@ _UNFIT_REMEDIES = {
     "covered": "uncover the chart",
     "hot": "let the camera cool",
     "dead": "have the camera's pixels remapped",
-    "stained": "clean the print or print it anew, and light it evenly",
+    "stained": "clean the print or print it again, and light it evenly",
     "disturbed": "keep the space between lamp, print and camera free",
     "unlike": "look at the patch in the frame of that illuminant",
     "misplaced": "hang the print flatter",
@@ -101,7 +101,7 @@ ADDED_LIGHT = Figure(
     why="it is equal on dark and bright patches, and extends beyond the patches listed as unfit",
     source=SIMULATED + ": 0 in healthy rooms; 1 % of paper white makes patches of 10 % of paper white 10 % brighter, "
     "those of 3 % 30 %; a reflection of 3 % causes errors of 57 %",
-    remedy="turn the print or the projector until the print mirrors nothing, or print on matt paper",
+    remedy="turn the print or the projector until it shows no reflection, or print on matt paper",
     measure=lambda table: added_light(table.cells.stains) if table.cells.stains.known else None,
     of_one_frame="known", cause=Explanation("spot", spot_evidence), drawing="errors",
 )  # fmt: skip

@@ -52,6 +52,7 @@ from foundation.errors import RegistrationError
 from foundation.robust import huber_weights, sigma_of
 
 _Array = npt.NDArray[np.float64]
+_Frames = Iterable[DecodedFrame]
 
 # Degree of the polynomial in the codes, with enough patches: describes inks to a fraction of a per cent.
 CODE_DEGREE = 8
@@ -168,10 +169,10 @@ def with_lens(
         baseline.options.window,
     )
     around = view.around(registered.registration, registered.cells, registered.references)
-    candidates = [_mean_spread_frame(baseline, [decoded], view, is_mixed=False) for decoded in primaries]
+    candidates = [_spread_frame(baseline, [decoded], view, is_mixed=False) for decoded in primaries]
     if not any(candidates) or chart.bits < VARYING_BITS:
         # With few patches, noise limits the measurement of the lens.
-        candidates.append(_mean_spread_frame(baseline, chain([first], more_whites), view, is_mixed=True))
+        candidates.append(_spread_frame(baseline, chain([first], more_whites), view, is_mixed=True))
     frames = [frame for frame in candidates if frame is not None]
     reason = "" if baseline.options.lens_correction else "disabled by --no-lens-correction"
     # On a busy machine, threads of linear algebra wait for each other longer than the work takes.
@@ -193,9 +194,7 @@ def _is_still(baseline: Baseline, decoded: DecodedFrame) -> bool:
     return shift.gauges > 0 and shift.length_px <= STILL_PX and shift.largest_px <= 2 * STILL_PX
 
 
-def _mean_spread_frame(
-    baseline: Baseline, frames: Iterable[DecodedFrame], view: PrintView, is_mixed: bool
-) -> SpreadFrame | None:
+def _spread_frame(baseline: Baseline, frames: _Frames, view: PrintView, is_mixed: bool) -> SpreadFrame | None:
     # Mean of the frames of one illuminant in which the chart has not moved. `is_mixed`: several primaries.
     chart, points = baseline.chart, baseline.points
     usable = ~np.concatenate(

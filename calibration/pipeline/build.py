@@ -14,7 +14,7 @@ The stages, their functions and their values::
     LUT            _write_table                  the folder
 
 Threads decode and measure frames in advance with the current `Accumulator`. A result is discarded and measured again if
-the chart was registered again in between. Memory use is that of a few frames for any session.
+the chart was registered again in between. The memory holds a few frames at a time.
 
 The LUT appears complete or not at all. Until then it is a hidden folder next to its final path, and an interrupted
 build resumes from its last checkpoint (`checkpoint`) with an identical result. A checkpoint is used only if its inputs
@@ -351,10 +351,8 @@ def _frame_error(
 ) -> FormatError | QualityError:
     """Return the error that ends the build, after writing a report for `acquire run --retake bad`."""
     content = {"format": REPORT_FORMAT, "version": REPORT_VERSION, "verdict": "refuse", "reason": str(error)}
-    content |= {
-        "session": accumulator.session.folder.name,
-        **retake_json((record,), record.sha256, accumulator.selected.newest.sha256),
-    }
+    content["session"] = accumulator.session.folder.name
+    content |= retake_json((record,), record.sha256, accumulator.selected.newest.sha256)
     write_whole(refused_folder(out) / REPORT_JSON, json.dumps(content, indent=2) + "\n")
     return type(error)(f"{error}; or take {record.file} again: {COMMAND}")
 
@@ -462,8 +460,7 @@ def _require_white_frames(selected: SelectedFrames, session: Session, options: B
         )
 
 
-def _no_progress(done: int, total: int, step: str) -> None:
-    pass
+def _no_progress(done: int, total: int, step: str) -> None: ...
 
 
 def thread_count() -> int:

@@ -209,7 +209,7 @@ class Accumulator:
         return np.sqrt(np.median(self.even_noise2 / frames, axis=0)) / np.maximum(level, 1e-6)
 
     def stains(self, field: _Array) -> Stains:
-        """Return the areas of the print whose colours differ from their codes'.
+        """Return the areas of the print with other colours than their codes'.
 
         `field`: (C, 3) float64, flat field of an evenly lit frame for the colour of each patch. The field of paper
         alone would give errors where the primaries differ in their fields.
@@ -288,7 +288,7 @@ def disturbed_cells(frames: Sequence[FrameMeasurements]) -> dict[int, list[tuple
 def _disturbance(disturbances: list[tuple[int, float]]) -> str:
     light, deviation = max(disturbances, key=lambda disturbance: abs(disturbance[1]))
     others_text = f" and {len(disturbances) - 1} more" if len(disturbances) > 1 else ""
-    difference = f"{abs(deviation):.1%} {'darker' if deviation < 0 else 'brighter'} than its code gives"
+    difference = f"{abs(deviation):.1%} {'darker' if deviation < 0 else 'brighter'} than expected from its code"
     difference_text = difference if deviation else "too dark to be compared"
     return f"under illuminant {light}{others_text}: {difference_text}, next to patches with large deviations"
 

@@ -32,7 +32,7 @@ _MAX_MORE_WHITES = 3  # Additional white frames for the lens of a chart with few
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """Options of a build; by default those of the paper, 25 samples, with black level and spread light subtracted."""
+    """Options of a build; the defaults are those of the paper, with spread light subtracted."""
 
     window: int = WINDOW  # Side of a patch's sampling window, px; one of `calibration.sampling.WINDOWS`
     subtract_dark: bool = False  # Subtract dark light from samples and ground truth

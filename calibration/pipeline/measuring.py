@@ -287,11 +287,9 @@ class Baseline:
         """Raise FormatError if the sensor layout of a frame differs from the first; `source` names the frame."""
         layout = sensor_layout(mosaic)
         if layout != self.layout:
-            actual, expected = (
-                f"{shape[1]}×{shape[0]} photosites {pattern}" for _, shape, pattern in (layout, self.layout)
-            )
+            new, first = (f"{shape[1]}×{shape[0]} photosites {pattern}" for _, shape, pattern in (layout, self.layout))
             raise FormatError(
-                f"{source}: the sensor has {actual}, expected {expected} as in {self.first.file}; take the session "
+                f"{source}: the sensor has {new}, expected {first} as in {self.first.file}; take the session "
                 "again with one camera and one setting"
             )
 

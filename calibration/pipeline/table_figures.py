@@ -283,10 +283,9 @@ _FULL_CODE = 255  # Code of a primary at full brightness
 
 def table_figures(accumulator: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
     """Return the measurements of a LUT with all frames added. `linearity`: result of a series of exposures, if any."""
-    even = next(
-        (frame for frame in accumulator.frames if accumulator.selected.is_even(frame.record)), accumulator.frames[0]
-    )
-    frame_by_light = {frame.record.illumination: frame for frame in accumulator.frames if frame.record.kind == "light"}
+    frames = accumulator.frames
+    even = next((frame for frame in frames if accumulator.selected.is_even(frame.record)), frames[0])
+    frame_by_light = {frame.record.illumination: frame for frame in frames if frame.record.kind == "light"}
     by_light = [frame_by_light[light.index] for light in accumulator.session.illuminations]
     greys = np.array([frame.greys for frame in by_light]), np.array([frame.grey_errors for frame in by_light])
     lights = _light_figures(accumulator, by_light)
@@ -464,7 +463,7 @@ def _code_agreement(
 
 
 def _to_one_exposure(frames: Sequence[FrameMeasurements]) -> _Array:
-    """Return the median exposure divided by that of each frame, (N, 1) float64; 1 if not recorded."""
+    """Return the ratio of the median exposure to each frame's, (N, 1) float64; 1 if not recorded."""
     exposures = np.array([frame.origin.exposure for frame in frames])
     usual = float(np.median(exposures[exposures > 0])) if (exposures > 0).any() else 1.0
     return np.where(exposures > 0, usual / np.maximum(exposures, 1e-12), 1.0)[:, None]

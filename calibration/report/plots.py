@@ -521,8 +521,6 @@ def half_size(mosaic: Mosaic) -> npt.NDArray[np.float32]:
     blocks = mosaic.block_planes()
     image = np.empty((*blocks.shape[2:], 3), dtype=np.float32)
     for column, channel in enumerate(CHANNELS):
-        offsets = phases(mosaic)[channel]
-        image[..., column] = sum(blocks[offset] - np.float32(black[offset]) for offset in offsets) / np.float32(
-            len(offsets)
-        )
+        sites = phases(mosaic)[channel]
+        image[..., column] = sum(blocks[site] - np.float32(black[site]) for site in sites) / np.float32(len(sites))
     return image
