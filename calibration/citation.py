@@ -256,9 +256,7 @@ def bibtex(
     record = origin or OriginRecord()
     year = record.year
     family = record.authors[0].partition(",")[0] if record.authors else "crop"
-    key = "-".join(
-        key_part for key_part in (_key_part(family), _key_part(camera), year or "", sha256[:KEY_DIGITS]) if key_part
-    )
+    key = "-".join(word for word in (_slug(family), _slug(camera), year or "", sha256[:KEY_DIGITS]) if word)
     method = "computed" if computed else "simulated" if record.rig == "simulated" else "photographed"
     fields = {
         "author": " and ".join(_bibtex_name(author) for author in record.authors),
@@ -287,5 +285,5 @@ def _bibtex_name(author: str) -> str:
     return text if "," in author else f"{{{text}}}"
 
 
-def _key_part(text: str) -> str:
+def _slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "", text.casefold())[:40]

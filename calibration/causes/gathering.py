@@ -1,6 +1,6 @@
 """Gather the evidence for the cause of a figure beyond its limit.
 
-Each public function takes a LUT's measurements and the accepted limit, and returns a `Gathered`, or None without
+Each public function takes a LUT's measurements and the accepted limit, and returns a `CauseEvidence`, or None without
 evidence. First come positions on the print, then whole frames, then illuminants.
 """
 
@@ -23,7 +23,7 @@ MIN_BLOCK = 0.004
 # Fraction of the worst frame's deviation above which another frame shows the same fault.
 SAME_FAULT = 0.3
 
-MAX_PLACES = 12  # Positions listed and drawn per figure; more would hide the picture
+MAX_POSITIONS = 12  # Positions listed and drawn per figure; more would hide the picture
 
 # If at least this fraction of frames differs from the first frame at a position, the first frame is at fault.
 IN_FIRST = 0.8
@@ -57,6 +57,7 @@ _DISTURBED = 0.03
 _SAME_EXPOSURE = 0.03
 
 _Array = npt.NDArray[np.float64]
+_Frames = list[FrameMeasurements]
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class PrintPosition:
 
 
 @dataclass(frozen=True)
-class Gathered:
+class CauseEvidence:
     """Evidence for a figure's cause, and the frames and positions that show it."""
 
     evidence: Evidence
@@ -78,12 +79,12 @@ class Gathered:
     positions: tuple[PrintPosition, ...]
 
 
-def block_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def block_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on the block that deviates most, in any frame, from the frame registered first."""
     return _gather_block(table, max(table.frames, key=lambda frame: frame.consistency.block), limit)
 
 
-def _gather_block(table: TableMeasurements, worst: FrameMeasurements, limit: float) -> Gathered:
+def _gather_block(table: TableMeasurements, worst: FrameMeasurements, limit: float) -> CauseEvidence:
     consistency = worst.consistency
     at_mm, size_mm = np.array(consistency.at_mm), max(consistency.extent_mm, 1e-9)
     deviation, tint = _largest_deviation(np.array(consistency.colour))
@@ -108,7 +109,7 @@ def _gather_block(table: TableMeasurements, worst: FrameMeasurements, limit: flo
         # Patches under the object were not compared, because they did not match the chart.
         x, y = object_positions[0].x_mm, object_positions[0].y_mm
     position = PrintPosition(frames[0].record.file, x, y, size_mm)
-    return Gathered(evidence, tuple(frame.record for frame in frames), (position,))
+    return CauseEvidence(evidence, tuple(frame.record for frame in frames), (position,))
 
 
 def covered_deviation(deviations: npt.NDArray[np.float64]) -> float:
@@ -126,13 +127,13 @@ def covered_deviation(deviations: npt.NDArray[np.float64]) -> float:
     return np.nan if is_mixed else float(darker.min())
 
 
-def disturbed_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
+def disturbed_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | None:
     """Gather evidence on the patches that a small object covers in illuminants' frames; None without such patches."""
     worst = max(table.frames, key=lambda frame: len(frame.consistency.disturbed))
     return _gather_disturbed(table, table.added_bleed(worst))
 
 
-def _gather_disturbed(table: TableMeasurements, softer: float) -> Gathered | None:
+def _gather_disturbed(table: TableMeasurements, softer: float) -> CauseEvidence | None:
     # `softer`: light of neighbouring patches that the worst frame's blur adds, relative.
     lights = [frame for frame in table.frames if frame.record.kind == "light" and frame.consistency.disturbed]
     if not lights:
@@ -161,13 +162,13 @@ def _gather_disturbed(table: TableMeasurements, softer: float) -> Gathered | Non
         softer=softer,
     )
     positions: list[PrintPosition] = []
-    for frame in lights[:MAX_PLACES]:
+    for frame in lights[:MAX_POSITIONS]:
         frame_cells = np.array([cell for cell, _ in frame.consistency.disturbed], dtype=np.int64)
         positions += [_position_of(stains, spot, frame.record.file) for spot in joined_cells(stains, frame_cells)]
-    return Gathered(evidence, tuple(frame.record for frame in lights), tuple(positions[:MAX_PLACES]))
+    return CauseEvidence(evidence, tuple(frame.record for frame in lights), tuple(positions[:MAX_POSITIONS]))
 
 
-def spot_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
+def spot_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | None:
     """Gather evidence on the print's largest spot; None if it has none."""
     stains = table.cells.stains
     spots = spots_of(stains)
@@ -175,11 +176,11 @@ def spot_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
         return None
     gathered = _gather_spot(table, stains, spots[0])
     file = gathered.positions[0].file
-    other_positions = tuple(_position_of(stains, spot, file) for spot in spots[1:MAX_PLACES])
+    other_positions = tuple(_position_of(stains, spot, file) for spot in spots[1:MAX_POSITIONS])
     return replace(gathered, positions=(*gathered.positions, *other_positions))
 
 
-def unfit_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
+def unfit_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | None:
     """Gather evidence on the patches with the most frequent kind of unfitness."""
     kinds = [cell.kind for cell in table.cells.unfit]
     common = max(dict.fromkeys(kinds), key=kinds.count, default="stained")
@@ -188,7 +189,7 @@ def unfit_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
     stains, registered = table.cells.stains, table.registered_frame.record
     colours = np.array([cell.colour for cell in table.cells.unfit], dtype=np.int64)
     hot = kinds.count("hot") / len(kinds) if table.dark_frames.files else np.nan
-    points = stains.places_mm[colours[[kind == common for kind in kinds]]][:MAX_PLACES].tolist()
+    points = stains.places_mm[colours[[kind == common for kind in kinds]]][:MAX_POSITIONS].tolist()
     positions = tuple(PrintPosition(registered.file, x, y, 0.0) for x, y in points)
     if common == "disturbed" and (covered := _gather_disturbed(table, 0.0)) is not None:
         return covered
@@ -198,12 +199,12 @@ def unfit_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
             "hot": hot,
             "lit": kinds.count("lit") / len(kinds),
         }
-        return Gathered(Evidence(**evidence), (), positions)
+        return CauseEvidence(Evidence(**evidence), (), positions)
     evidence, covering = _residual_evidence(table, table.registered_frame)
-    return Gathered(Evidence(**evidence | {"hot": hot}), (registered,) if evidence else (), covering or positions)
+    return CauseEvidence(Evidence(**evidence | {"hot": hot}), (registered,) if evidence else (), covering or positions)
 
 
-def noisy_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
+def noisy_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | None:
     """Gather evidence on patches that are noisier than expected for their level."""
     noisy_cells, stains = np.flatnonzero(table.sensor.transfer.noisy), table.cells.stains
     is_in_spot = stains.stained | stains.doubtful
@@ -213,10 +214,10 @@ def noisy_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
     hottest = table.dark_frames.hottest
     hot = float((hottest[noisy_cells] > 0).mean()) if len(hottest) and len(noisy_cells) else np.nan
     file = table.registered_frame.record.file
-    positions = tuple(PrintPosition(file, x, y, 0.0) for x, y in stains.places_mm[noisy_cells[:MAX_PLACES]].tolist())
+    positions = tuple(PrintPosition(file, x, y, 0.0) for x, y in stains.places_mm[noisy_cells[:MAX_POSITIONS]].tolist())
     evidence = gathered.evidence.measured_values()
     frames = gathered.frames if "white_residual" in evidence else ()
-    return Gathered(Evidence(**evidence | _lens_evidence(table) | {"hot": hot}), frames, positions)
+    return CauseEvidence(Evidence(**evidence | _lens_evidence(table) | {"hot": hot}), frames, positions)
 
 
 def _lens_evidence(table: TableMeasurements) -> dict[str, float]:
@@ -232,7 +233,7 @@ def _lens_evidence(table: TableMeasurements) -> dict[str, float]:
     return evidence
 
 
-def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.int64]) -> Gathered:
+def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.int64]) -> CauseEvidence:
     position = _position_of(stains, spot, table.registered_frame.record.file)
     at_mm = np.array([position.x_mm, position.y_mm])
     colour = spot_colour(stains, spot)
@@ -267,7 +268,7 @@ def _gather_spot(table: TableMeasurements, stains: Stains, spot: npt.NDArray[np.
         frames = [frame for frame in frames if frame.record.kind == "white"]
     if frames:
         position = replace(position, file=frames[0].record.file)
-    return Gathered(evidence, tuple(frame.record for frame in frames), (position,))
+    return CauseEvidence(evidence, tuple(frame.record for frame in frames), (position,))
 
 
 def _whites_off(table: TableMeasurements, at_mm: _Array, size_mm: float, minimum: float) -> list[FrameMeasurements]:
@@ -295,13 +296,13 @@ def _residual_evidence(
     at_mm, near_mm = np.array(residuals.at_mm), 0.25 * float(np.hypot(*np.ptp(table.cells.stains.places_mm, axis=0)))
 
     def deviates_too(frame: FrameMeasurements) -> bool:
-        left = frame.paper.left
-        distance_mm = float(np.linalg.norm(np.array(left.at_mm) - at_mm))
-        largest, _ = _largest_deviation(np.array(left.deviation))
+        other = frame.paper.left
+        distance_mm = float(np.linalg.norm(np.array(other.at_mm) - at_mm))
+        largest, _ = _largest_deviation(np.array(other.deviation))
         return abs(largest) >= _HALF * abs(deviation) and distance_mm < near_mm
 
     evidence = {
-        "white_residual": float(np.mean([deviates_too(other) for other in whites])),
+        "white_residual": float(np.mean([deviates_too(white) for white in whites])),
         "deviation": deviation,
         "tint": tint,
         "share": residuals.share,
@@ -311,7 +312,7 @@ def _residual_evidence(
     return evidence, (PrintPosition(frame.record.file, x, y, 0.0),)
 
 
-def reference_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
+def reference_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | None:
     """Gather evidence on the white frame with the largest residuals of references about the flat field."""
     whites = table.white_frames
     if not whites:
@@ -326,12 +327,12 @@ def reference_evidence(table: TableMeasurements, limit: float) -> Gathered | Non
         "rim_frames": _dark_rim_fraction(table),
     }
     if 0 < evidence.get("white_residual", 0.0) <= _HALF:
-        return Gathered(Evidence(**evidence), (worst.record,), positions)
+        return CauseEvidence(Evidence(**evidence), (worst.record,), positions)
     distance_mm = np.linalg.norm(stains.places_mm - residuals.at_mm, axis=1)
     near_spots = [spot for spot in spots_of(stains) if distance_mm[spot].min() < 4 * cell_mm(stains)]
     if not near_spots:
         position = PrintPosition(worst.record.file, *residuals.at_mm, 0.0)
-        return Gathered(Evidence(**evidence), (), (position,))
+        return CauseEvidence(Evidence(**evidence), (), (position,))
     gathered = _gather_spot(table, stains, near_spots[0])
     # The spot's values are based on patches of all colours, and more accurate.
     return replace(gathered, evidence=Evidence(**evidence | gathered.evidence.measured_values()))
@@ -395,19 +396,19 @@ def _hot_fraction(table: TableMeasurements, at_mm: _Array, size_mm: float) -> fl
     return float((hottest[near] > 0).mean()) if near.any() else np.nan
 
 
-def scatter_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def scatter_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on the frame with the largest scatter of patches."""
     worst = max(table.frames, key=lambda frame: frame.consistency.scatter)
     return _gather_frames(table, worst, [frame for frame in table.frames if frame.consistency.scatter > limit])
 
 
-def blur_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def blur_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on the most blurred frame."""
     worst = max(table.frames, key=lambda frame: frame.blur_px)
     return _gather_frames(table, worst, [frame for frame in table.frames if table.added_bleed(frame) > limit])
 
 
-def movement_evidence(table: TableMeasurements, limit: float) -> Gathered | None:
+def movement_evidence(table: TableMeasurements, limit: float) -> CauseEvidence | None:
     """Gather evidence on the frames in which the chart was registered again."""
     registered_again = [frame for frame in table.frames if frame.reregistered]
     if not registered_again:
@@ -415,37 +416,37 @@ def movement_evidence(table: TableMeasurements, limit: float) -> Gathered | None
     return _gather_frames(table, max(registered_again, key=lambda frame: frame.shift.length_px), registered_again)
 
 
-def chart_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def chart_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on the frame in which the chart was registered first."""
     registered = table.registered_frame
     gathered = _gather_frames(table, registered, [registered])
     # The references show an object on the print if other white frames do not contain it.
     evidence, positions = _residual_evidence(table, registered)
-    return Gathered(Evidence(**gathered.evidence.measured_values() | evidence), gathered.frames, positions)
+    return CauseEvidence(Evidence(**gathered.evidence.measured_values() | evidence), gathered.frames, positions)
 
 
-def _gather_frames(table: TableMeasurements, worst: FrameMeasurements, affected: list[FrameMeasurements]) -> Gathered:
-    frames, ordered = table.frames, sorted(affected, key=lambda frame: frame is not worst)
+def _gather_frames(table: TableMeasurements, worst: FrameMeasurements, beyond: _Frames) -> CauseEvidence:
+    frames, ordered = table.frames, sorted(beyond, key=lambda frame: frame is not worst)
     evidence = Evidence(
         frames=float(len(frames)),
-        showing=len(affected) / len(frames),
+        showing=len(beyond) / len(frames),
         scatter=worst.consistency.scatter,
         softer=table.added_bleed(worst),
         moved_px=worst.shift.length_px,
         anew=float(np.mean([frame.reregistered for frame in frames])),
         agreement=table.registration.agreement,
     )
-    affects_all = len(affected) == len(frames)
-    return Gathered(evidence, () if affects_all else tuple(frame.record for frame in ordered), ())
+    affects_all = len(beyond) == len(frames)
+    return CauseEvidence(evidence, () if affects_all else tuple(frame.record for frame in ordered), ())
 
 
-def light_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def light_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on whites that do not add up, drift, or do not fit their codes."""
     frames = table.frames
     evidence = Evidence(frames=float(len(frames)), colour_scatter=_colour_scatter(table))
     exposures = np.array([frame.exposure for frame in frames])
     if len(frames) < 2 or not (exposures > 0).all():
-        return Gathered(evidence, (), ())
+        return CauseEvidence(evidence, (), ())
     # Most illuminants' frames define the session's exposure; white frames are few.
     of_lights = [frame.exposure for frame in frames if frame.record.kind == "light"]
     ratio = exposures / float(np.median(of_lights or exposures))
@@ -453,10 +454,10 @@ def light_evidence(table: TableMeasurements, limit: float) -> Gathered:
     worst = int(np.argmax(log_ratio))
     deviating_frames = np.flatnonzero(log_ratio > 0.5 * log_ratio[worst]) if log_ratio[worst] > _SAME_EXPOSURE else ()
     evidence = replace(evidence, exposure=float(ratio[worst]))
-    return Gathered(evidence, tuple(frames[number].record for number in deviating_frames), ())
+    return CauseEvidence(evidence, tuple(frames[number].record for number in deviating_frames), ())
 
 
-def drift_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def drift_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on differing white frames: their exposures, or an object on the print in one of them."""
     light = light_evidence(table, limit)
     worst = max(table.white_frames, key=lambda frame: frame.consistency.block, default=None)
@@ -464,10 +465,10 @@ def drift_evidence(table: TableMeasurements, limit: float) -> Gathered:
         return light
     block = _gather_block(table, worst, _DISTURBED)
     evidence = block.evidence.measured_values() | light.evidence.measured_values() | {"frames": block.evidence.frames}
-    return Gathered(Evidence(**evidence), block.frames, block.positions)
+    return CauseEvidence(Evidence(**evidence), block.frames, block.positions)
 
 
-def sum_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def sum_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on primaries that do not add up to white, and the frame of the faulty one."""
     light, white = light_evidence(table, limit), table.lights.additivity
     if light.frames or white is None:
@@ -486,7 +487,7 @@ def sum_evidence(table: TableMeasurements, limit: float) -> Gathered:
     else:
         return light
     frames = tuple(frame.record for frame in table.frames if frame.record.illumination == table.primary_lights[primary])
-    return Gathered(evidence, frames, ())
+    return CauseEvidence(evidence, frames, ())
 
 
 # One primary differs alone if its distance from the nearer one is this many times their distance (judgement).
@@ -513,7 +514,7 @@ def _colour_scatter(table: TableMeasurements) -> float:
     return scatter if scatter > np.abs(colour[-1] - colour[0]).max() / len(colour) else 0.0
 
 
-def name_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def name_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on illuminants that do not fit their codes."""
     gathered, codes = light_evidence(table, np.inf), table.lights.codes
     if codes is None:
@@ -528,45 +529,45 @@ def name_evidence(table: TableMeasurements, limit: float) -> Gathered:
     evidence = replace(gathered.evidence, off_codes_deg=float(codes.off_deg.max()))
     if confused:
         evidence = replace(evidence, named_right=0.0)
-    return Gathered(evidence, (*light_records, *white_records), ())
+    return CauseEvidence(evidence, (*light_records, *white_records), ())
 
 
-def brightness_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def brightness_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on illuminants with another brightness than predicted from their codes."""
     gathered, codes = light_evidence(table, limit), table.lights.codes
     if gathered.frames or codes is None:
         return gathered
     deviating_lights = set(np.flatnonzero(codes.off_brightness > limit).tolist())
     frames = tuple(frame.record for frame in table.frames if frame.record.illumination in deviating_lights)
-    return Gathered(gathered.evidence, frames, ())
+    return CauseEvidence(gathered.evidence, frames, ())
 
 
-def camera_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def camera_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on frames of another camera or lens."""
     origins = table.origins
     foreign_frames = origins.other_camera or origins.other_lens
     cameras = 1 + len({frame.found for frame in foreign_frames})
     evidence = Evidence(frames=float(len(table.frames)), cameras=float(cameras))
-    return Gathered(evidence, tuple(frame.record for frame in foreign_frames), ())
+    return CauseEvidence(evidence, tuple(frame.record for frame in foreign_frames), ())
 
 
-def iso_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def iso_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on frames of another ISO speed."""
     frames = tuple(frame.record for frame in table.origins.other_iso)
-    return Gathered(Evidence(frames=float(len(table.frames)), other_iso=float(len(frames))), frames, ())
+    return CauseEvidence(Evidence(frames=float(len(table.frames)), other_iso=float(len(frames))), frames, ())
 
 
-def dark_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def dark_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on the light while the projector shows black."""
     frames = float(len(table.dark_frames.files))
-    return Gathered(Evidence(frames=frames, room=table.dark_share, room_change=table.dark_change), (), ())
+    return CauseEvidence(Evidence(frames=frames, room=table.dark_share, room_change=table.dark_change), (), ())
 
 
-def stray_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def stray_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     """Gather evidence on light missing in the dark frames."""
     stray = table.lights.stray
     if stray is None:
-        return Gathered(Evidence(), (), ())
+        return CauseEvidence(Evidence(), (), ())
     mixed = sum_evidence(table, limit)
     if mixed.evidence.mixed > limit:
         return mixed
@@ -574,4 +575,4 @@ def stray_evidence(table: TableMeasurements, limit: float) -> Gathered:
     frames = tuple(by_light[light] for light in stray.lights_beyond(limit) if light in by_light)
     certain = float(stray.certain.max(initial=0.0))
     evidence = Evidence(frames=float(len(table.frames)), stray=certain, stray_primaries=stray.of_primaries)
-    return Gathered(evidence, frames, ())
+    return CauseEvidence(evidence, frames, ())

@@ -35,6 +35,7 @@ from foundation.files import write_whole
 
 _Array = npt.NDArray[np.float64]
 _Numbers = npt.NDArray[np.int64]
+_Folders = tuple[Path, Path]
 
 # With 700 illuminants and 32 768 patches, any difference is significant. A difference is therefore reported if noise
 # explains it with a probability below this, for the whole LUT, and if it exceeds a floor without practical effect.
@@ -110,7 +111,7 @@ class NoiseAnswer:
 class TableComparison:
     """Differences of two LUTs; `folders` contain the LUTs or their sessions."""
 
-    folders: tuple[Path, Path]
+    folders: _Folders
     warnings: tuple[str, ...]
     lights: LightDifferences
     cells: CellDifferences
@@ -123,24 +124,22 @@ class TableComparison:
 
 
 def compare(
-    one: Lut, other: Lut, progress: LightProgress = lambda done, total: None, folders: tuple[Path, Path] | None = None
+    first: Lut, second: Lut, progress: LightProgress = lambda done, total: None, folders: _Folders | None = None
 ) -> TableComparison:
     """Return the differences of two LUTs of one chart, and whether noise explains them."""
-    if differs := chart_difference(one, other):
+    if differs := chart_difference(first, second):
         raise FormatError(
-            f"{one.folder} and {other.folder} belong to different charts ({differs}), expected the same chart.json; "
+            f"{first.folder} and {second.folder} belong to different charts ({differs}), expected the same chart.json; "
             "give two LUTs or sessions of one chart"
         )
-    pairs = light_pairs(one.illuminations, other.illuminations)
+    pairs = light_pairs(first.illuminations, second.illuminations)
     if not pairs:
-        raise FormatError(
-            f"{one.folder} and {other.folder} have 0 common illuminants, at least 1 expected; compare LUTs of one plan"
-        )
-    cells, cell_score = _compare_cells(one, other, pairs, progress)
-    lights = _compare_lights(one, other, pairs, cell_score)
+        raise FormatError(f"{first.folder}, {second.folder}: 0 common illuminants, expected at least 1; use one plan")
+    cells, cell_score = _compare_cells(first, second, pairs, progress)
+    lights = _compare_lights(first, second, pairs, cell_score)
     answers = _colour_answer(lights), _brightness_answer(lights), _cells_answer(lights, cells)
-    folders = folders or (one.folder, other.folder)
-    return TableComparison(folders, _comparison_warnings(one, other, len(pairs)), lights, cells, answers)
+    folders = folders or (first.folder, second.folder)
+    return TableComparison(folders, _comparison_warnings(first, second, len(pairs)), lights, cells, answers)
 
 
 @contextmanager
@@ -171,23 +170,23 @@ def chart_of(folders: Sequence[Path]) -> Chart | None:
     return next((load_chart(path) for path in charts if path.is_file()), None)
 
 
-def light_pairs(one: Sequence[Illumination], other: Sequence[Illumination]) -> list[tuple[int, int]]:
+def light_pairs(first: Sequence[Illumination], second: Sequence[Illumination]) -> list[tuple[int, int]]:
     """Return the index pairs of illuminants with the same kind, temperature, codes and name, in the order of the first.
 
     Repeated illuminants are paired in their order.
     """
-    indices_by_light: dict[Illumination, list[int]] = {}
-    for light in reversed(other):
-        indices_by_light.setdefault(replace(light, index=0), []).append(light.index)
-    return [(light.index, indices.pop()) for light in one if (indices := indices_by_light.get(replace(light, index=0)))]
+    waiting: dict[Illumination, list[int]] = {}
+    for light in reversed(second):
+        waiting.setdefault(replace(light, index=0), []).append(light.index)
+    return [(light.index, indices.pop()) for light in first if (indices := waiting.get(replace(light, index=0)))]
 
 
-def _comparison_warnings(one: Lut, other: Lut, common: int) -> tuple[str, ...]:
-    first, second = one.provenance, other.provenance
-    a_only, b_only = len(one.white) - common, len(other.white) - common
-    same_frames = first.session_sha256 == second.session_sha256 and first.computed is None
+def _comparison_warnings(first: Lut, second: Lut, common: int) -> tuple[str, ...]:
+    a, b = first.provenance, second.provenance
+    a_only, b_only = len(first.white) - common, len(second.white) - common
+    same_frames = a.session_sha256 == b.session_sha256 and a.computed is None
     warnings = {
-        f"two cameras, {first.camera} and {second.camera}: differences are expected": first.camera != second.camera,
+        f"two cameras, {a.camera} and {b.camera}: differences are expected": a.camera != b.camera,
         f"{common} common illuminants are compared; {a_only} are only in A, {b_only} only in B": bool(a_only or b_only),
         "both LUTs were built from the same frames: their noise is identical, so agreement proves nothing": same_frames,
     }
@@ -227,10 +226,9 @@ def _colour_answer(lights: LightDifferences) -> NoiseAnswer:
 def _brightness_answer(lights: LightDifferences) -> NoiseAnswer:
     brightness = lights.brightness
     # The bootstrap needs at least two values.
-    bootstrapped = stats.bootstrap(
-        (np.resize(brightness, max(len(brightness), 2)),), np.median, n_resamples=999, method="percentile", rng=0
-    )
-    low, high = bootstrapped.confidence_interval
+    data = (np.resize(brightness, max(len(brightness), 2)),)
+    bootstrap = stats.bootstrap(data, np.median, n_resamples=999, method="percentile", rng=0)
+    low, high = bootstrap.confidence_interval
     text = (
         f"{100 * np.median(brightness):+.3f} % median (95 % interval {100 * low:+.3f} to {100 * high:+.3f} %), "
         f"{100 * brightness.min():+.3f} to {100 * brightness.max():+.3f} % over all illuminants"
@@ -251,23 +249,23 @@ def _cells_answer(lights: LightDifferences, cells: CellDifferences) -> NoiseAnsw
 
 
 def _compare_cells(
-    one: Lut, other: Lut, pairs: Sequence[tuple[int, int]], progress: LightProgress
+    first: Lut, second: Lut, pairs: Sequence[tuple[int, int]], progress: LightProgress
 ) -> tuple[CellDifferences, _Array]:
     """Return the differences of the patches, and their RMS (L,) float64 by illuminant, in units of noise."""
-    unfit = sorted({cell.colour for table in (one, other) for cell in table.provenance.unfit})
+    unfit = sorted({cell.colour for table in (first, second) for cell in table.provenance.unfit})
     # A difference divided by its estimated error follows Student's t, with degrees of freedom by Welch-Satterthwaite
     # for variances of means inversely proportional to the number of samples.
-    sizes = np.array([one.samples.shape[2], other.samples.shape[2]], dtype=np.float64)
+    sizes = np.array([first.samples.shape[2], second.samples.shape[2]], dtype=np.float64)
     widening = stats.t((1 / sizes).sum() ** 2 / (1 / sizes**2 / (sizes - 1)).sum()).std()
 
     def work(pair: tuple[int, int]) -> tuple[_Array, _Array]:
-        (first, first_noise), (second, second_noise) = _relative_means(one, pair[0]), _relative_means(other, pair[1])
-        share = second / first - 1
+        (a, a_noise), (b, b_noise) = _relative_means(first, pair[0]), _relative_means(second, pair[1])
+        share = b / a - 1
         share[unfit] = np.nan
-        return share, first_noise + second_noise
+        return share, a_noise + b_noise
 
     # Sums over the illuminants: count, difference, and squares of difference, noise and score.
-    sums = np.zeros((5, one.samples.shape[1], 3))
+    sums = np.zeros((5, first.samples.shape[1], 3))
     scores = np.empty(len(pairs))
     for number, (share, noise) in enumerate(ordered_map(work, pairs, processor_count())):
         is_known = np.isfinite(share)
@@ -296,10 +294,10 @@ def _relative_means(lut: Lut, light: int) -> tuple[_Array, _Array]:
     return means / lut.white[light], np.maximum(scatter, 1 / 12) / samples.shape[1] / means**2
 
 
-def _compare_lights(one: Lut, other: Lut, pairs: Sequence[tuple[int, int]], cell_score: _Array) -> LightDifferences:
+def _compare_lights(first: Lut, second: Lut, pairs: Sequence[tuple[int, int]], cell_score: _Array) -> LightDifferences:
     numbers = np.array(pairs, dtype=np.int64).T
-    whites = np.stack([one.white[numbers[0]], other.white[numbers[1]]])
-    errors = ERROR_FACTOR * np.stack([white_errors(one)[numbers[0]], white_errors(other)[numbers[1]]])
+    whites = np.stack([first.white[numbers[0]], second.white[numbers[1]]])
+    errors = ERROR_FACTOR * np.stack([white_errors(first)[numbers[0]], white_errors(second)[numbers[1]]])
     # Log ratios of channels have normal errors. Their weighted mean is the brightness, the deviations from it are the
     # colour: χ² with two degrees of freedom. A channel below its own error has almost no weight.
     positive_whites = np.maximum(whites, errors)

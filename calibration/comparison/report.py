@@ -85,7 +85,7 @@ def draw_map(figure: Any, chart: Chart, cells: CellDifferences) -> None:
 
 def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | None = None) -> None:
     """Write a comparison into a new folder, completely or not at all; with a map of the print if `chart` is given."""
-    (one, other), cells, same = comparison.folders, comparison.cells, comparison.same_within_noise
+    (first, second), cells, same = comparison.folders, comparison.cells, comparison.same_within_noise
     pictures = [figure(png_of(draw_lights, comparison.lights), "Differences by illuminant.", wide=True)]
     if chart is not None:
         caption = "Differences of patches on the print. Noise is fine grain; stains and shadows have shapes."
@@ -104,7 +104,7 @@ def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | N
     with whole_folder(folder, "the comparison") as partial:
         _write_columns(partial / "lights.csv", vars(comparison.lights))
         _write_columns(partial / "cells.csv", columns)
-        write_whole(partial / "report.html", page(f"{one.name} and {other.name} compared", elements))
+        write_whole(partial / "report.html", page(f"{first.name} and {second.name} compared", elements))
         write_whole(partial / "comparison.json", json.dumps(comparison_json(comparison), indent=2) + "\n")
 
 

@@ -12,7 +12,7 @@ from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 if TYPE_CHECKING:
-    from calibration.causes.gathering import Gathered
+    from calibration.causes.gathering import CauseEvidence
     from calibration.causes.rules import Subject
     from calibration.measurements import TableMeasurements
     from experiment.session.records import FrameRecord
@@ -60,7 +60,7 @@ class Explanation:
     """
 
     about: Subject
-    gather: Callable[[TableMeasurements, float], Gathered | None]
+    gather: Callable[[TableMeasurements, float], CauseEvidence | None]
     follows: tuple[str, ...] = ()
 
 

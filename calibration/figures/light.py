@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.causes.gathering import (
-    Gathered,
+    CauseEvidence,
     brightness_evidence,
     dark_evidence,
     drift_evidence,
@@ -310,7 +310,7 @@ def _sum_deviation(sign: int) -> Callable[[TableMeasurements], float | None]:
     return measure
 
 
-def _sum_evidence(table: TableMeasurements, limit: float) -> Gathered:
+def _sum_evidence(table: TableMeasurements, limit: float) -> CauseEvidence:
     light = sum_evidence(table, limit)
     return light if light.frames else name_evidence(table, OFF_CODES_DEG.accept)
 

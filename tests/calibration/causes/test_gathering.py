@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.causes.gathering import (
-    MAX_PLACES,
+    MAX_POSITIONS,
     PrintPosition,
     block_evidence,
     blur_evidence,
@@ -168,7 +168,7 @@ def test_describes_covered_cells_by_their_frames() -> None:
     result = disturbed_evidence(session(most), 0.0)
     assert result is not None
     assert result.evidence.in_first == 1
-    many = [Frame(consistency=covered((44, -0.2)), number=number) for number in range(MAX_PLACES + 3)]
+    many = [Frame(consistency=covered((44, -0.2)), number=number) for number in range(MAX_POSITIONS + 3)]
     result = disturbed_evidence(session(many), 0.0)
     assert result is not None
     assert (len(result.positions), len(result.frames)) == (12, 15)

@@ -124,7 +124,7 @@ def test_covered_cells_are_unfit_with_their_lights() -> None:
     )  # fmt: skip
     assert disturbed_cells(frames) == {3: [(2, -0.1), (5, 0.3)], 4: [(2, 0.0)]}
     result = causes(empty(), frames=frames)
-    assert result[3].startswith("disturbed: under illuminant 5 and 1 more: 30.0% brighter than its code gives")
+    assert result[3].startswith("disturbed: under illuminant 5 and 1 more: 30.0% brighter than expected from its code")
     assert result[4].startswith("disturbed: under illuminant 2: too dark to be compared")
     assert result[11].startswith("unlike: under illuminant 6")
     assert list(result) == [3, 4, 11]
