@@ -369,7 +369,7 @@ class LocatedFrame:
 
     decoded: DecodedFrame
     registered: RegisteredFrame  # The frame registered last; this one, if it was registered again
-    at: RegisteredFrame  # Sampling positions: those of `registered`, moved by `shift`
+    moved: RegisteredFrame  # Sampling positions: those of `registered`, moved by `shift`
     shift: Shift  # Movement since the previously registered frame
     reregistered: bool
 
@@ -430,13 +430,13 @@ def locate(
             return None
         new = baseline.register(decoded)
         return LocatedFrame(decoded, new, new, _movement(baseline, registered, new), reregistered=True)
-    at = registered
+    moved = registered
     if shift.length_px > STILL_PX:
-        moved = registered.registration.shifted(shift.dx, shift.dy)
-        cells, references = sites_of(moved, baseline.points, decoded.shape, baseline.options.window)
-        lens = baseline.correction(moved, cells, references)
-        at = replace(registered, cells=cells, references=references, lens=lens)
-    return LocatedFrame(decoded, registered, at, shift, reregistered=False)
+        shifted = registered.registration.shifted(shift.dx, shift.dy)
+        cells, references = sites_of(shifted, baseline.points, decoded.shape, baseline.options.window)
+        lens = baseline.correction(shifted, cells, references)
+        moved = replace(registered, cells=cells, references=references, lens=lens)
+    return LocatedFrame(decoded, registered, moved, shift, reregistered=False)
 
 
 def _movement(baseline: Baseline, previous: RegisteredFrame, current: RegisteredFrame) -> Shift:
@@ -448,10 +448,10 @@ def _movement(baseline: Baseline, previous: RegisteredFrame, current: Registered
 
 def sample(baseline: Baseline, located: LocatedFrame, dark: DarkLight | None, keep_samples: bool) -> SampledFrame:
     """Return the samples of a light or white frame. `dark`: light to subtract, if any."""
-    decoded, at, points = located.decoded, located.at, baseline.points
-    references, highest = gather(decoded.mosaic, decoded.black, at.references)
-    means = usable_means(references, highest, at.references, decoded.saturation)
-    to_subtract = _to_subtract(decoded, at, references, dark)
+    decoded, moved, points = located.decoded, located.moved, baseline.points
+    references, highest = gather(decoded.mosaic, decoded.black, moved.references)
+    means = usable_means(references, highest, moved.references, decoded.saturation)
+    to_subtract = _to_subtract(decoded, moved, references, dark)
     dark_of_cells = None
     if to_subtract is not None:
         dark_of_cells, dark_of_references = np.split(to_subtract, [len(points.cells_mm)])
@@ -461,30 +461,30 @@ def sample(baseline: Baseline, located: LocatedFrame, dark: DarkLight | None, ke
     if baseline.primaries is not None:
         shape = shape * baseline.primaries.field_ratio(paper.white)
     if keep_samples:
-        samples, highest = gather(decoded.mosaic, decoded.black, at.cells)
+        samples, highest = gather(decoded.mosaic, decoded.black, moved.cells)
         values, noise = table_values(samples, shape, dark_of_cells), sample_noise(samples)
         if dark_of_cells is not None:
             # Hot photosites and stains are detected in samples that include the dark light.
             added = dark_of_cells if dark is None else dark_of_cells - dark.patches[: len(dark_of_cells)]
             samples -= added[:, None]
     else:
-        values, highest = gather_values(decoded.mosaic, decoded.black, at.cells, shape, dark_of_cells)
+        values, highest = gather_values(decoded.mosaic, decoded.black, moved.cells, shape, dark_of_cells)
         samples = noise = None
     dark_paper = np.zeros(3) if dark is None else dark.paper
     return SampledFrame(located, paper, greys, values, highest, samples, noise, dark_paper)
 
 
 def _to_subtract(
-    decoded: DecodedFrame, at: RegisteredFrame, references: _Samples, dark: DarkLight | None
+    decoded: DecodedFrame, moved: RegisteredFrame, references: _Samples, dark: DarkLight | None
 ) -> _Samples | None:
     """Return the dark light and the light added by the lens, (P, 3) float32 counts; None without either."""
-    if at.lens is None:
+    if moved.lens is None:
         return None if dark is None else dark.patches
-    cells = gather_means(decoded.mosaic, decoded.black, at.cells)
+    cells = gather_means(decoded.mosaic, decoded.black, moved.cells)
     means = np.concatenate([cells, references.mean(axis=1, dtype=np.float64)])
     if dark is not None:
         means -= dark.patches
-    added = at.lens.added(FrameLevels(means, beyond_print(decoded, at.lens.beyond))).astype(np.float32)
+    added = moved.lens.added(FrameLevels(means, beyond_print(decoded, moved.lens.beyond))).astype(np.float32)
     return added if dark is None else added + dark.patches
 
 
@@ -509,7 +509,7 @@ def measure(baseline: Baseline, sampled: SampledFrame) -> MeasuredFrame:
         grey_errors=grey_errors,
         dark=sampled.dark,
         share_at_zero=1 - int(np.count_nonzero(values)) / values.size,
-        blur_px=float(np.sqrt(max(located.at.registration.blur_px**2 + blur_growth_px2, 0.0))),
+        blur_px=float(np.sqrt(max(located.moved.registration.blur_px**2 + blur_growth_px2, 0.0))),
         exposure=origin.exposure,
         origin=origin,
     )
@@ -519,7 +519,7 @@ def measure(baseline: Baseline, sampled: SampledFrame) -> MeasuredFrame:
         decoded.saturation,
         values,
         sampled.highest,
-        located.at.cells.inside,
+        located.moved.cells.inside,
         sampled.samples,
         sampled.noise,
     )

@@ -1,4 +1,4 @@
-"""From a session to a table, against the light that the simulated room really had."""
+"""From a session to a table, against the true light of the simulated room."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_cell_colours_match_paper_under_all_lights(table: Lut, lab: Lab) -> None
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
 def test_samples_keep_sensor_noise(table: Lut, lab: Lab) -> None:
-    """Interpolated samples would have less."""
+    """Interpolated samples would have less noise."""
     light = next(light for light in LIGHTS if light.colour == WHITE)
     samples = table.samples[light.index].astype(np.float64)
     signal = samples.mean(axis=1)
@@ -160,7 +160,7 @@ def test_healthy_session_has_no_unfit_cells(built: BuildResult) -> None:
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
 def test_field_correction_is_reversible(table: Lut, built: BuildResult, session: Session, lab: Lab) -> None:
-    """Multiplied by the field of `lut.json`, the table gives the counts of the frame again."""
+    """Multiplied by the field in `lut.json`, the table gives the counts of the frame."""
     corrections = {correction["name"]: correction for correction in table.provenance.corrections}
     assert list(corrections) == ["black", "half size", "saturation", "field", "rounding", "drift", "primaries"]
     assert len(corrections["field"]["per_light"]) == len(corrections["black"]["per_light"]) == len(LIGHTS)
@@ -177,7 +177,7 @@ def test_field_correction_is_reversible(table: Lut, built: BuildResult, session:
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
 def test_primaries_correction_is_reversible(table: Lut, built: BuildResult, lab: Lab) -> None:
-    """What `lut.json` records of it, and the table's own samples of the primaries, give the factor of every cell."""
+    """`lut.json` and the samples of the primaries give the factor of every cell."""
     recorded = next(corrections for corrections in table.provenance.corrections if corrections["name"] == "primaries")
     assert built.figures.primaries is not None
     places = lab.chart.centres_mm[lab.chart.cell_of_colour]
@@ -265,7 +265,7 @@ def test_a_hot_and_a_dead_photosite_are_named(lab: Lab, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
 @pytest.mark.usefixtures("lens_unmeasured")
 def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Path) -> None:
-    """3 % over the session: each light keeps its own ground truth, and the gain brings them to one lamp."""
+    """3 % over the session: each light keeps its ground truth, and the gains equalise the lamp."""
     lights = LIGHTS[:6]
     steps = len(plan_steps(lights, 2))
 
@@ -578,7 +578,7 @@ STRICT = (replace(next(limit for limit in FIGURES if limit.name == "cell_px"), r
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Generator[Session]:
-    """Lend a session of few colours: of these the lens is not measured, which takes longer than the rest."""
+    """Return a session with few colours, in which the lens is not measured."""
     with take(hang(2, "A6"), tmp_path_factory.mktemp("short") / "session", LIGHTS[:2]) as session:
         yield session
 
@@ -637,19 +637,19 @@ COMMAND = "acquire run LAB.toml SESSION --retake bad"
 
 
 def shadow(counts: npt.NDArray[np.uint16]) -> None:
-    """Lay a shadow on the middle of the print."""
+    """Add a shadow to the centre of the print."""
     height, width = counts.shape
     part = counts[2 * height // 5 : 3 * height // 5, 2 * width // 5 : 3 * width // 5]
     part[...] = (part * 0.6).astype(np.uint16)
 
 
 def nothing(counts: npt.NDArray[np.uint16]) -> None:
-    """Let no light in."""
+    """Remove all light."""
     counts[...] = counts.min()
 
 
 def doctored(lab: Lab, folder: Path, kind: str, number: int | None, paint: Paint) -> Session:
-    """Return a session in which one light's frame, or every white frame but the first, is painted."""
+    """Return a session with one painted frame: of a light, or every white frame but the first."""
 
     def frame(step: SessionStep) -> bytes:
         chosen = step.kind == kind and step.illumination == number and step.number > 0
@@ -659,7 +659,7 @@ def doctored(lab: Lab, folder: Path, kind: str, number: int | None, paint: Paint
 
 
 def take_again(lab: Lab, folder: Path) -> list[str]:
-    """Take what `--retake bad` says; return the names of the steps."""
+    """Take the frames of `--retake bad` again; return the names of the steps."""
     with Session.open_for_run(folder) as session:
         session.retake("bad")
         steps = [step for step in plan_steps(SHORT, 25) if step.number not in session.done_steps()]
@@ -821,7 +821,7 @@ def test_the_tint_of_greys_tells_a_managed_print(
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_uneven_primaries_are_no_dirt_on_the_print(tmp_path: Path) -> None:
-    """A cell's field differs from paper's by what it reflects of each primary; its colour is still its code's."""
+    """A cell's field depends on its reflectance for each primary; its colour is still correct."""
     lab = hang(room=Room(waviness_mm=0.5, primary_difference=0.3, projector_falloff=0.3, lamp_spectrum="led"))
     with taken(lab, tmp_path / "session") as session:
         stains = build(session, tmp_path / "lut").figures.cells.stains
@@ -839,7 +839,7 @@ def test_uneven_primaries_are_no_dirt_on_the_print(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_hot_photosites_side_by_side_are_no_object(tmp_path: Path) -> None:
-    """In two cells that touch, in every frame: under lights these are as far off as what lies there makes them."""
+    """In two adjacent cells, in every frame: they deviate as much as covered ones."""
     lab = hang()
     light = next(light for light in BRIGHT if min(light.colour) > 80)
     codes, places = lab.chart.rgb[lab.chart.cell_of_colour], lab.chart.centres_mm[lab.chart.cell_of_colour]
@@ -865,7 +865,7 @@ def test_hot_photosites_side_by_side_are_no_object(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_hot_photosites_stay_in_the_samples_and_are_told(tmp_path: Path) -> None:
-    """120 a million: of 51 000 photosites in samples some six; a full chart has 3 million."""
+    """120 per million: about six of 51 000 photosites in samples; a full chart has 3 million."""
     lab = hang(room=Room(waviness_mm=0.5, hot_per_million=120.0, hot_dn_per_s=6000.0))
     cool = hang(room=Room(waviness_mm=0.5))
     for name, one in (("hot", lab), ("cool", cool)):
@@ -892,8 +892,8 @@ STRAY_LIGHTS = {
     "red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255), "white": Colour(255, 255, 255),
     "yellow": Colour(255, 180, 0), "warm": Colour(255, 164, 73),
 }  # fmt: skip
+# Limits that refuse nothing, so that a table is built.
 REMARKING = [replace(limit, refuse=None) for limit in FIGURES]
-"""Limits that refuse nothing, so that there are figures to look at."""
 DAYLIGHT = Situation(ambient=(0.008, 0.01, 0.012))
 
 
@@ -966,12 +966,12 @@ CORRECTED = BuildOptions(correct_drift=True)
 
 @pytest.fixture(scope="module")
 def small_lab() -> Lab:
-    """Return a lab of few colours: of these the lens is not measured, which takes longer than all that matters here."""
+    """Return a lab with few colours, in which the lens is not measured."""
     return hang(2, "A6")
 
 
 def session_of(small_lab: Lab, folder: Path, lamp: Callable[[int], float], every: int = 4) -> Session:
-    """Return a session under a lamp whose light at each step is given."""
+    """Return a session with a given lamp brightness at each step."""
 
     def frame(step: SessionStep) -> bytes:
         return small_lab.dng(step.colour, step.number, lamp=lamp(step.number))
@@ -981,7 +981,7 @@ def session_of(small_lab: Lab, folder: Path, lamp: Callable[[int], float], every
 
 @pytest.fixture(scope="module")
 def drifting(small_lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a session whose lamp loses 3 % from its first to its last frame."""
+    """Return a session whose lamp loses 3 % from the first to the last frame."""
     folder = tmp_path_factory.mktemp("drifting") / "session"
     session_of(small_lab, folder, lambda number: 1 - 0.03 * number / 20).close()
     return folder
@@ -989,7 +989,7 @@ def drifting(small_lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def tables(drifting: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Lut, Lut, BuildResult]:
-    """Return the session's table as measured, and with the drift taken out."""
+    """Return the session's table without and with drift correction."""
     folder = tmp_path_factory.mktemp("tables")
     with Session.open(drifting) as session:
         build(session, folder / "plain")
@@ -1126,7 +1126,7 @@ def built_of(
 
 
 def refused(small_lab: Lab, tmp_path: Path, frame: Frame) -> tuple[str, dict[str, object]]:
-    """Return why a session makes no table, and what its report says for programs."""
+    """Return the message of a refusal, and its JSON report."""
     with take(small_lab, tmp_path / "session", EIGHT, frame=frame) as session, pytest.raises(QualityError) as error:
         build(session, tmp_path / "lut", report=figures_alone)
     return str(error.value), json.loads((tmp_path / "lut.refused" / "report.json").read_text())
@@ -1137,7 +1137,7 @@ def remarks(result: BuildResult) -> set[str]:
 
 
 def showing(small_lab: Lab, colours: Mapping[int, Colour]) -> Frame:
-    """Return frames of a session in which some lights show other colours than their names say."""
+    """Return frames of a session in which some lights show other colours."""
 
     def frame(step: SessionStep) -> bytes:
         colour = step.colour if step.illumination is None else colours.get(step.illumination, step.colour)
@@ -1159,7 +1159,7 @@ def test_a_session_with_nothing_wrong_has_no_remark(small_lab: Lab, tmp_path: Pa
 
 @pytest.mark.usefixtures("pinned_builds")
 def test_exchanged_lights_are_refused_and_both_named(small_lab: Lab, tmp_path: Path) -> None:
-    """Any two are found by `tests/calibration/checks/test_light_codes.py`."""
+    """`tests/calibration/checks/test_light_codes.py` tests all pairs."""
     message, report = refused(small_lab, tmp_path, showing(small_lab, {WARM: CODES[COOL], COOL: CODES[WARM]}))
     assert f"exchanged names: illuminant {WARM} and illuminant {COOL}" in message
     assert "brilliant colour" not in message
@@ -1208,7 +1208,7 @@ def test_another_body_of_the_same_model_is_refused(small_lab: Lab, tmp_path: Pat
 
 @pytest.mark.usefixtures("pinned_builds")
 def test_lights_whose_files_state_another_exposure_are_refused(small_lab: Lab, tmp_path: Path) -> None:
-    """Another ISO speed; another shutter time stands in the white frames of the test below."""
+    """Another ISO speed; the test below has another shutter time in white frames."""
 
     def frame(step: SessionStep) -> bytes:
         deviation = step.illumination in (WARM, COOL)
@@ -1264,7 +1264,7 @@ def test_a_session_without_red_says_what_was_not_measured(small_lab: Lab, tmp_pa
 
 @pytest.mark.usefixtures("pinned_builds")
 def test_brilliant_colour_is_called_that(small_lab: Lab, tmp_path: Path) -> None:
-    """A white segment adds three tenths of the least primary: frames of a projector that shows white brighter."""
+    """A white segment adds 30 % of the least primary."""
     dim = hang(2, "A6", room=Room(waviness_mm=0.5, white_level_share=0.5))
     world = dim.world
 
@@ -1311,17 +1311,17 @@ def straight(share: _Array) -> _Array:
 
 
 def knee(share: _Array) -> _Array:
-    """Lose 4 % at saturation, nothing below a half."""
+    """Compress by 4 % at saturation, not below half of it."""
     return share * (1 - 0.04 * np.maximum(share - 0.5, 0) / 0.5)
 
 
 def power(share: _Array) -> _Array:
-    """Bend as a power does: ± 2.9 % over 5 to 95 %, and the ratios of patches show nothing."""
+    """Bend by a power: ± 2.9 % from 5 to 95 %; ratios of patches do not change."""
     return share**1.02
 
 
 def series(bend: Bend, times: _Array, stated: _Array | None = None, frame_error: float = 0.0) -> tuple[_Array, _Array]:
-    """Return what `deviations` finds of 2000 patches, with the noise of 25 samples."""
+    """Return the result of `deviations` for 2000 patches with the noise of 25 samples."""
     random = np.random.default_rng(7)
     reflectance = np.exp(random.uniform(np.log(0.03), np.log(0.95), (2000, 3)))
     light = times * (1 + frame_error * random.standard_normal(len(times)))
@@ -1347,7 +1347,7 @@ def test_measures_bend(bend: Bend, worst: float) -> None:
 
 
 def test_flickering_lamp_causes_no_bend() -> None:
-    """2 % from frame to frame leaves a power of 0.8 %, as uncertain as the times; the patches' own tale stays."""
+    """2 % between frames leaves a power of 0.8 %, as uncertain as the times."""
     level, flickering = series(straight, np.array(TIMES), frame_error=0.02)
     assert np.nanmax(np.abs(flickering)) < 0.03
     _, bent = series(knee, np.array(TIMES), frame_error=0.02)
@@ -1372,7 +1372,7 @@ def test_levels_without_patches_are_empty() -> None:
 
 
 def test_wrong_exposure_times_give_large_deviation() -> None:
-    """As with a flash, or a camera that exposes by itself."""
+    """As with a flash, or with automatic exposure."""
     reflectance = np.exp(np.random.default_rng(1).uniform(-3, 0, (1, 500, 3)))
     assert np.nanmax(np.abs(deviations(0.7 * reflectance.repeat(5, axis=0), np.arange(1.0, 6))[1])) > 0.5
 
@@ -1463,7 +1463,7 @@ def plain() -> Lab:
 
 
 def moved_by(dx: float, dy: float, roll_deg: float = 0.0) -> Lab:
-    """Return the lab with the camera shifted so that the chart lies (dx, dy) half-size pixels further."""
+    """Return the lab with the camera shifted, so that the chart moves by (dx, dy) half-size px."""
     lab = hang_chart(SMALL, "Test", replace(ROOM, roll_deg=ROOM.roll_deg + roll_deg))
     x, y = lab.world.view.centre_px
     lab.world.view = replace(lab.world.view, centre_px=(x + dx, y + dy))
@@ -1471,7 +1471,7 @@ def moved_by(dx: float, dy: float, roll_deg: float = 0.0) -> Lab:
 
 
 def worst_error(lab: Lab, folder: Path) -> float:
-    """Return how far the means of cells lie from the room's truth, as a share of white, the worst of all lights."""
+    """Return the largest error of cell means under any light, relative to white."""
     table = open_lut(folder)
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
     worst = 0.0
@@ -1532,7 +1532,7 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
 def test_command_asks_for_corners(
     plain: Lab, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of red light alone nobody can say which way up the chart hangs; white frames are all refused here."""
+    """Red light alone does not show the orientation of the chart; all white frames are refused here."""
     monkeypatch.setattr("calibration.report.report.write_report", figures_alone)
     lights = renumbered([RED_LIGHT])
     with take(
@@ -1641,8 +1641,8 @@ def test_table_is_independent_of_thread_count(
 # Sessions with one thing wrong: the frame, the place and the cause are named, and a clean one has no remark on it.
 
 
+# The limits without refusals: a table is built, and every fault is a remark.
 REMARKED = tuple(replace(limit, refuse=None) for limit in FIGURES)
-"""The limits, none of which refuses: a table is made, and all that is wrong is a remark."""
 
 
 def measured(session: Session, folder: Path) -> tuple[BuildResult, dict[str, ProbableCause]]:
@@ -1689,7 +1689,7 @@ def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tm
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_what_covers_few_cells_costs_these_cells_and_not_the_table(lab: Lab, tmp_path: Path) -> None:
-    """A fly of two cells' size in one light: with the limits as they are."""
+    """A fly of the size of two cells in one light, with unchanged limits."""
     fly = Situation(blobs=(Blob((0.5, 0.5, 0.54, 0.56), left=0.4),))
     light = next(light.index for light in BRIGHT if min(light.colour) > 80)
     with taken(lab, tmp_path / "session", lambda step: step.illumination == light, situation=fly) as session:
@@ -1722,7 +1722,7 @@ def test_a_reflection_in_one_frame_is_no_hand(lab: Lab, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_a_broad_glare_is_no_stain(lab: Lab, tmp_path: Path) -> None:
-    """3 % of paper's light, as a projector mirrored in a glossy print gives it."""
+    """3 % of paper's light, like a projector mirrored in a glossy print."""
     result, detected = measured(taken(lab, tmp_path / "session", paint=glare(lab, 0.03, 0.3)), tmp_path)
     assert causes(detected) == {REFLECTION}
     assert not retaken_frames(result.verdict, result.figures)
@@ -1746,7 +1746,7 @@ def test_a_stain_is_one(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_one_hot_photosite_in_a_dark_cell_needs_no_word(lab: Lab, tmp_path: Path) -> None:
-    """3000 counts in every frame, dark ones too: the cell is listed, and no block is off for it."""
+    """3000 counts in every frame, also dark ones: the cell is listed, and no block deviates."""
     dark = int(np.argmin(lab.chart.rgb[lab.chart.cell_of_colour].sum(axis=1)))
     x, y = np.rint(2 * lab.world.project(lab.chart.centres_mm[lab.chart.cell_of_colour][[dark]])[0] + 0.5).astype(int)
     visible = lab.world.body.visible
@@ -1781,7 +1781,7 @@ def test_a_frame_out_of_focus_is_called_that(lab: Lab, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_dark_corners_are_no_dirt(tmp_path: Path) -> None:
-    """Corners at 42 to 52 % of the centre's light: the field follows them, and nothing is to be said."""
+    """Corners with 42 to 52 % of the central light: the field describes them."""
     lab = hang(room=Room(waviness_mm=0.5, vignetting=0.45, projector_falloff=0.25))
     _, result = measured(taken(lab, tmp_path / "session"), tmp_path)
     assert not {"reference_spread", "doubtful_share", "block_deviation"} & result.keys()
