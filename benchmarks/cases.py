@@ -62,11 +62,11 @@ WRONG_SHARE: Final = 0.03
 HALF: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.25)
 FAST: Final = ExposureSettings(iso=200, aperture=8.0, shutter_s=0.25)
 
-_STAINED: Final = r"clean the print|print it anew"
+_STAINED: Final = r"clean the print|print it again"
 _BRILLIANT: Final = r"brilliant"
 _HAND: Final = r"\bhands?\b|shadow"
 _GLARE: Final = r"reflection|glare|mirror"
-_SPREAD: Final = r"bleed|neighbouring cells|neighbours'? (light|colour)|spread|veil|correction"
+_SPREAD: Final = r"bleed|neighbouring (?:cells|patches)|neighbours'? (light|colour)|spread|veil|correction"
 
 
 _NOT_SO: Final = rf"{_STAINED}|{_BRILLIANT}|{_HAND}|{_GLARE}"

@@ -1,11 +1,11 @@
-"""The uncertainty budget of a table: what ground truth and cells may be off by, cause by cause, and altogether.
+"""The uncertainty budget of a LUT: components and expanded uncertainty of ground truth and patch means.
 
-Errors are relative, of the white of bare paper under each light and of the mean of each cell, channel by channel. Each
-component is a mean square error: its variance and, where an effect is measured but not taken out, its square.
-Components are independent and add up (JCGM 100:2008, GUM, 5.1); what is stated is expanded, k = 2 (6.2), for about 95 %
-of cases. The noise of samples is no error of a cell: it is the camera's. `calibration.pipeline.table_figures` fills it.
+Errors are relative to bare paper under each illuminant, or to the mean of each patch, by channel. A component is a mean
+square error: its variance, plus the square of an effect that is measured but not corrected. Components are independent
+and add up (JCGM 100:2008, 5.1). Results are expanded with k = 2 (6.2), about 95 %. Sample noise is not an error of a
+patch, but a property of the camera.
 
-L lights, C cells in the order of colour indices.
+L illuminants, C patches in the order of colour indices.
 """
 
 from __future__ import annotations
@@ -20,72 +20,62 @@ import numpy.typing as npt
 
 from calibration.table.lut import CELL_COLUMNS, EXPANDED
 
-COVERAGE: Final = 2.0  # Factor k by which a standard uncertainty is expanded (JCGM 100, 6.2.1)
+COVERAGE: Final = 2.0  # Coverage factor k (JCGM 100, 6.2.1)
 
 _Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """One cause of errors.
+    """One cause of errors."""
 
-    - `name`, `title`: for programs and for people.
-    - `assumed`: whether it is what is usual, since the session does not show it.
-    - `lights`: (L, 3, 3) float64, mean square relative error of each light's white in R, G and B.
-    - `cells`: (C, 3) float64, mean square relative error of each cell's mean, bare paper's error aside, under the light
-      that the chart was registered in.
-    """
-
-    name: str
-    title: str
-    assumed: bool
+    name: str  # For programs
+    title: str  # For people
+    assumed: bool  # True if the session cannot show it and a usual value is assumed
     source: str
-    lights: _Array
-    cells: _Array
+    lights: _Array  # (L, 3, 3) float64, mean square relative error of each illuminant's white in R, G, B
+    cells: _Array  # (C, 3) float64, mean square relative error of each patch mean, without the error of bare paper
 
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """All components of a table.
-
-    `white`: (L, 3) float64 counts above black, the ground truth.
-    """
+    """All components of a LUT."""
 
     components: tuple[Component, ...]
-    white: _Array
+    white: _Array  # (L, 3) float64 counts above black, the ground truth
 
     @staticmethod
     def none() -> Budget:
-        """Return the budget of what is not yet stated."""
+        """Return an empty budget."""
         return Budget((), np.zeros((0, 3)))
 
     @cached_property
     def lights_deg(self) -> _Array:
-        """(K, L) float64 degrees, standard uncertainty of each ground truth's direction by component."""
-        return np.array([direction_deg(self.white, one.lights) for one in self.components])
+        """(K, L) float64 degrees, standard uncertainty of each ground truth by component."""
+        return np.array([direction_deg(self.white, component.lights) for component in self.components])
 
     @cached_property
     def expanded_deg(self) -> _Array:
-        """(L,) float64 degrees, expanded uncertainty of each ground truth's direction."""
+        """(L,) float64 degrees, expanded uncertainty of each ground truth."""
         return COVERAGE * np.sqrt((self.lights_deg**2).sum(axis=0))
 
     @cached_property
     def expanded_cells(self) -> _Array:
-        """(C, 3) float64, expanded relative uncertainty of each cell's mean."""
-        return COVERAGE * np.sqrt(np.sum([one.cells for one in self.components], axis=0))
+        """(C, 3) float64, expanded relative uncertainty of each patch mean."""
+        return COVERAGE * np.sqrt(np.sum([component.cells for component in self.components], axis=0))
 
     def main_cause(self, light: int) -> Component:
-        """Return the largest component of a light."""
+        """Return the largest component of an illuminant."""
         return self.components[int(np.argmax(self.lights_deg[:, light]))]
 
     def lights_csv(self) -> str:
-        """Return the text of `uncertainty.csv`: each light's expanded uncertainty, and standard ones by component."""
-        names = [f"{one.name.replace(' ', '_')}_deg" for one in self.components]
+        """Return the text of `uncertainty.csv`: uncertainties by illuminant, expanded, and standard by component."""
+        names = [f"{component.name.replace(' ', '_')}_deg" for component in self.components]
         rows = zip(self.expanded_deg.tolist(), self.lights_deg.T.tolist(), strict=True)
-        return _csv(["illumination", EXPANDED, *names], ([expanded, *parts] for expanded, parts in rows))
+        return _csv(["illumination", EXPANDED, *names], ([expanded, *standard] for expanded, standard in rows))
 
     def cells_csv(self) -> str:
-        """Return the text of `cells.csv`: the expanded relative uncertainty of each cell's mean in R, G and B."""
+        """Return the text of `cells.csv`: expanded relative uncertainty of each patch mean in R, G and B."""
         return _csv(["colour", *CELL_COLUMNS], self.expanded_cells.tolist())
 
     def to_json(self) -> dict[str, Any]:
@@ -100,14 +90,14 @@ class Budget:
             },
             "components": [
                 {
-                    "name": one.name,
-                    "title": one.title,
-                    "assumed": one.assumed,
-                    "source": one.source,
+                    "name": component.name,
+                    "title": component.title,
+                    "assumed": component.assumed,
+                    "source": component.source,
                     "light_deg": _rounded(by_light),
-                    "cell_share": _rounded(np.sqrt(np.median(one.cells, axis=0))),
+                    "cell_share": _rounded(np.sqrt(np.median(component.cells, axis=0))),
                 }
-                for one, by_light in zip(self.components, self.lights_deg, strict=True)
+                for component, by_light in zip(self.components, self.lights_deg, strict=True)
             ],
         }
 
@@ -118,19 +108,19 @@ def _csv(columns: list[str], rows: Iterable[list[float]]) -> str:
 
 
 def direction_deg(white: _Array, relative: _Array) -> _Array:
-    """Return the root mean square angle (L,) float64, degrees, of vectors (L, 3) whose components are off.
+    """Return the RMS angle (L,) float64, degrees, of vectors `white` (L, 3) with uncertain components.
 
-    First-order propagation (JCGM 100, 5.1.2): of each error the part across the vector counts.
+    First-order propagation (JCGM 100, 5.1.2): only the error perpendicular to the vector counts.
 
     `relative`: (L, 3, 3) float64, mean square of the components' relative errors.
     """
     length = np.linalg.norm(white, axis=1)
     along = white / np.maximum(length, 1e-9)[:, None]
     across = np.eye(3) - along[:, :, None] * along[:, None, :]
-    # Relative errors times the vector, over its length.
-    turned = across * along[:, None, :]
-    found = np.einsum("lij,ljk,lik->l", turned, relative, turned)
-    return np.degrees(np.sqrt(np.maximum(found, 0)))
+    # Relative errors, multiplied by the vector and divided by its length.
+    projection = across * along[:, None, :]
+    variance = np.einsum("lij,ljk,lik->l", projection, relative, projection)
+    return np.degrees(np.sqrt(np.maximum(variance, 0)))
 
 
 def _rounded(values: _Array) -> list[float]:

@@ -1,7 +1,7 @@
-"""`build-lut`: builds the table of a session; `check`, `info`, `verify`, `match`, `compare`, `publish` and `fetch`.
+"""The command `build-lut`, with its subcommands `check`, `info`, `verify`, `match`, `compare`, `publish` and `fetch`.
 
-One function for each command: parse, call, print. Modules that load numpy are imported when a command begins, so that
-help and a wrong option are answered at once (docs/architecture.md).
+One function per command: parse, call, print. Modules that load numpy are imported inside the functions, so that help
+and wrong options are answered immediately (docs/architecture.md).
 """
 
 from __future__ import annotations
@@ -36,40 +36,39 @@ Corners = Annotated[
     tuple[str, str, str, str] | None,
     option(
         "X,Y X,Y X,Y X,Y",
-        "For a chart without tags: the corners of its field of cells in the frame that is registered first, pixels "
-        "of the raw file, clockwise from the printed top-left.",
+        "For a chart without tags: corners of its patches in the frame registered first, in pixels of the raw file, "
+        "clockwise from the printed top left.",
     ),
 ]
 Linearity = Annotated[
     Path | None,
     option(
         "FOLDER",
-        "Judge the sensor's linearity by raw files of the chart in its place, under one light, with exposure times "
-        "from dim to nearly saturated.",
+        "Measure the sensor's linearity with raw files of the chart at its position, under one illuminant, with "
+        "exposure times from dim to almost saturated.",
     ),
 ]
-SessionFolder = Annotated[Path, typer.Argument(help="Folder of a session, made by acquire run or acquire import.")]
-Table = Annotated[Path, typer.Argument(metavar="LUT", help="Folder of a table; demo: for a small one.")]
-NewTable = Annotated[Path, typer.Argument(metavar="LUT", help="New folder for the table.")]
+SessionFolder = Annotated[Path, typer.Argument(help="Folder of a session from acquire run or acquire import.")]
+Table = Annotated[Path, typer.Argument(metavar="LUT", help="Folder of a LUT; demo: for a small example.")]
+NewTable = Annotated[Path, typer.Argument(metavar="LUT", help="New folder for the LUT.")]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run `build-lut` with arguments, those of the process if None, and return its exit code."""
+    """Run `build-lut` with the given arguments, or those of the process, and return its exit code."""
     return console.run(lambda: app(args=argv, prog_name="build-lut"))
 
 
 @app.command(
     cls=_BuildLut,
     no_args_is_help=True,
-    help="Build the look-up table of a session: samples of every colour under every light, and the ground truth.\n\n"
-    "Reads SESSION (chart.json, illuminations.csv, journal.sqlite, frames/) and checks each frame's SHA-256. Finds the "
-    "chart once, follows it if it moves, divides the light's unevenness out, and writes LUT: samples.npy, "
+    help="Build the look-up table (LUT) of a session: samples of all colours under all illuminants, and ground "
+    "truth.\n\nReads SESSION (chart.json, illuminations.csv, journal.sqlite, frames/) and checks the SHA-256 of each "
+    "frame. Registers the chart, follows its movements, corrects the flat field, and writes LUT: samples.npy, "
     "illuminations.csv with the ground truth, references.csv, lut.json, frames.csv, report.html and report.json. LUT "
-    "appears whole or not at all; a build that was stopped goes on when the same command is run again.\n\n"
-    "Every figure is compared with its limit: accept, accept with remarks, or refuse. A refused table is not written; "
-    "its report is then in LUT.refused/, and the exit code is 4.\n\n"
-    "With --append, takes in the frames that have come so far of a session that is being taken; LUT appears with the "
-    "last of them.",
+    "appears completely or not at all. Run the same command again to resume an interrupted build.\n\n"
+    "Every figure is compared with its limit: accept, accept with remarks, or refuse. A refused LUT is not written; "
+    "its report is in LUT.refused/, and the exit code is 4.\n\n"
+    "With --append, adds the available frames of a session in progress; LUT appears after the last frame.",
     epilog=EXIT_CODES,
 )
 @with_json("build-lut")
@@ -77,31 +76,30 @@ def build_lut(
     session: SessionFolder,
     lut: NewTable,
     append: Annotated[
-        bool, typer.Option("--append", help="Take in what has come of a session that is being taken.")
+        bool, typer.Option("--append", help="Add the available frames of a session in progress.")
     ] = False,
-    window: Annotated[int, option("N", "Pixels along the side of a cell's window: 3, 5, 7 or 9.")] = 5,
+    window: Annotated[int, option("N", "Side of a patch's sampling window in pixels: 3, 5, 7 or 9.")] = 5,
     subtract_dark: Annotated[
         bool,
         typer.Option(
             "--subtract-dark",
-            help="Subtract the light of the dark frames, the projector's leak and the room's, from every sample and "
-            "from the ground truth.",
+            help="Subtract the light of the dark frames (projector leak and room light) from samples and ground truth.",
         ),
     ] = False,
     correct_drift: Annotated[
         bool,
         typer.Option(
             "--correct-drift",
-            help="Take the lamp's drift between white frames out of samples and ground truth, so that all lights are "
-            "of one lamp; recorded, and undone by its numbers. Refused where white frames leave it open.",
+            help="Correct samples and ground truth for lamp drift between white frames. The recorded gains can undo "
+            "it. Refused if the white frames do not determine the drift.",
         ),
     ] = False,
     no_lens_correction: Annotated[
         bool,
         typer.Option(
             "--no-lens-correction",
-            help="Leave in the samples what the lens spreads from cell to cell and over the frame, where the print "
-            "proves that it does; measured it is all the same.",
+            help="Keep the light that the lens spreads between patches and over the frame in the samples; it is still "
+            "measured.",
         ),
     ] = False,
     corners: Corners = None,
@@ -109,7 +107,7 @@ def build_lut(
     *,
     output: JsonOutput,
 ) -> None:
-    """Build the table of a session."""
+    """Build the LUT of a session."""
     from calibration.pipeline.build import TableProgress, build, refused_folder
     from calibration.pipeline.build import append as append_frames
     from calibration.pipeline.frames import BuildOptions
@@ -118,29 +116,31 @@ def build_lut(
     from experiment.framing.field import parse_corners
     from experiment.session.folder import Session
 
-    places = None if corners is None else parse_corners(corners)
-    options = BuildOptions(window, subtract_dark, places, correct_drift, not no_lens_correction)
-    kept = refused_folder(lut) / REPORT_JSON
-    before = kept.stat().st_mtime_ns if kept.is_file() else None
-    make = append_frames if append else build
+    corner_points = None if corners is None else parse_corners(corners)
+    options = BuildOptions(window, subtract_dark, corner_points, correct_drift, not no_lens_correction)
+    report_path = refused_folder(lut) / REPORT_JSON
+    previous_mtime = report_path.stat().st_mtime_ns if report_path.is_file() else None
+    build_or_append = append_frames if append else build
     try:
-        with Session.open(session) as opened, progress("finding the chart") as shown:
-            result = make(opened, lut, shown, write_report, options, linearity)
+        with Session.open(session) as opened, progress("registering the chart") as show:
+            result = build_or_append(opened, lut, show, write_report, options, linearity)
     except QualityError:
-        # A report of an earlier build says nothing of this one.
-        if output.is_requested and kept.is_file() and kept.stat().st_mtime_ns != before:
-            output.add(**json.loads(kept.read_text(encoding="utf-8")))
+        # Skip the report of an earlier build.
+        if output.is_requested and report_path.is_file() and report_path.stat().st_mtime_ns != previous_mtime:
+            output.add(**json.loads(report_path.read_text(encoding="utf-8")))
         raise
     if isinstance(result, TableProgress):
         output.add(table=lut, progress=result)
         print(
-            f"{lut}: {result.lights} of {result.lights_planned} lights, {result.new_frames} frames taken in now, "
-            f"{result.frames} in all; run the same command again when more have come"
+            f"{lut}: {result.lights} of {result.lights_planned} illuminants, {result.new_frames} new frames, "
+            f"{result.frames} in total; run the same command again when more frames are available"
         )
         return
     output.add(table=lut)
     _print_result(result, output)
-    print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / REPORT_PAGE}")
+    print(
+        f"{lut}: {result.figures.session.lights} illuminants, {result.figures.session.camera}; see {lut / REPORT_PAGE}"
+    )
 
 
 @_others.command(epilog=EXIT_CODES)
@@ -149,17 +149,17 @@ def check(
     session: SessionFolder,
     picture: Annotated[
         Path | None,
-        option("PNG", "Save the frame with what of the chart was found on it, or was looked for."),
+        option("PNG", "Save the frame with the detected chart, or with the expected one if detection fails."),
     ] = None,
     corners: Corners = None,
     linearity: Linearity = None,
     *,
     output: JsonOutput,
 ) -> None:
-    """Find the chart in a session's best frame and judge it.
+    """Register the chart in a session's best frame and judge the frame.
 
-    Reads SESSION: the best light or white frame and a dark one. Writes nothing but the picture. Figures that take all
-    frames are judged by a build alone. Ends with 4 where a figure is refused.
+    Reads the best light or white frame of SESSION and a dark one. Writes only the picture. Figures that need all frames
+    are judged by a build. Exit code 4 if a figure is refused.
     """
     from calibration.pipeline.build import check as check_session
     from calibration.pipeline.frames import BuildOptions
@@ -175,8 +175,8 @@ def check(
         raise QualityError(f"{session}: {refusal(result.verdict, result.figures)}")
     judged = counted(len(result.verdict.rows), "figure")
     print(
-        f"{session}: the chart is found and is the one expected; this frame tells {judged}, the others take all "
-        f"frames: build-lut {session} LUT"
+        f"{session}: the expected chart is registered; {judged} judged from this frame. Run build-lut {session} LUT to "
+        "judge all figures"
     )
 
 
@@ -184,11 +184,11 @@ def check(
 @with_json("build-lut info")
 def info(
     lut: Table,
-    cite: Annotated[bool, typer.Option("--cite", help="Print its BibTeX entry alone.")] = False,
+    cite: Annotated[bool, typer.Option("--cite", help="Print only its BibTeX entry.")] = False,
     *,
     output: JsonOutput,
 ) -> None:
-    """Print what a table is and what it was made of.
+    """Print the properties and the origin of a LUT.
 
     Reads LUT; writes nothing.
     """
@@ -218,15 +218,13 @@ def info(
 @with_json("build-lut verify")
 def verify(
     lut: Table,
-    session: Annotated[
-        Path | None, typer.Argument(help="Folder of its session, to hash the frames too; else the table alone.")
-    ] = None,
+    session: Annotated[Path | None, typer.Argument(help="Folder of its session, to check its frames, too.")] = None,
     *,
     output: JsonOutput,
 ) -> None:
-    """Hash every byte of a table again and name what has changed; with SESSION, its frames too.
+    """Check the hashes of all files of a LUT, and of its frames if SESSION is given, and list changes.
 
-    Reads LUT and SESSION; writes nothing. Ends with 2 where anything has changed.
+    Reads LUT and SESSION; writes nothing. Exit code 2 if anything has changed.
     """
     from calibration.pipeline.frames import frame_faults
     from calibration.table.lut import open_lut
@@ -235,62 +233,62 @@ def verify(
 
     folder = table_folder(lut)
     table = open_lut(folder, check=False)
-    with progress("reading the samples") as shown:
-        faults = find_faults(table, shown)
+    with progress("reading the samples") as show:
+        faults = find_faults(table, show)
     if session is not None:
-        with Session.open(session) as opened, progress("reading the frames") as shown:
-            faults += frame_faults(table, opened, shown)
+        with Session.open(session) as opened, progress("reading the frames") as show:
+            faults += frame_faults(table, opened, show)
     output.add(table=folder, sha256=table.sha256, frames=None if session is None else len(table.frames), faults=faults)
     for fault in faults:
         print(fault)
     if faults:
         raise FormatError(
-            f"{folder} is not as it was built: {len(faults)} faults; restore it from a copy, or build it again"
+            f"{folder} has changed: {len(faults)} faults, expected 0; restore it from a copy, or build it again"
         )
-    frames = "" if session is None else f", and so are its {len(table.frames)} frames in {session}"
-    print(f"{folder}: every byte is as it was built{frames}")
+    frames = "" if session is None else f" and of its {len(table.frames)} frames in {session}"
+    print(f"{folder}: the hashes of all files{frames} are correct")
 
 
 @_others.command(epilog=EXIT_CODES)
 @with_json("build-lut match")
 def match(
-    one: Annotated[Path, typer.Argument(metavar="LUT1", help="Folder of a table.")],
-    other: Annotated[Path, typer.Argument(metavar="LUT2", help="Folder of another.")],
+    first_lut: Annotated[Path, typer.Argument(metavar="LUT1", help="Folder of a LUT.")],
+    second_lut: Annotated[Path, typer.Argument(metavar="LUT2", help="Folder of another LUT.")],
     *,
     output: JsonOutput,
 ) -> None:
-    """Check whether colours and lights of two tables, of two cameras perhaps, correspond number by number.
+    """Check that colours and illuminants of two LUTs, also of two cameras, correspond by index.
 
-    Reads both; writes nothing. Ends with 2 where they do not correspond.
+    Reads both; writes nothing. Exit code 2 if they do not correspond.
     """
     from calibration.table.lut import open_lut
     from calibration.table.verification import require_match
 
-    folders = table_folder(one), table_folder(other)
+    folders = table_folder(first_lut), table_folder(second_lut)
     tables = open_lut(folders[0]), open_lut(folders[1])
     require_match(*tables)
     output.add(tables=folders, cameras=[table.provenance.camera for table in tables], match=True)
     cameras = " and ".join(table.provenance.camera for table in tables)
-    print(f"{folders[0]} and {folders[1]} ({cameras}): colours and lights correspond number by number")
+    print(f"{folders[0]} and {folders[1]} ({cameras}): colours and illuminants correspond by index")
 
 
 @_others.command(epilog=EXIT_CODES)
 @with_json("build-lut compare")
 def compare(
-    one: Annotated[Path, typer.Argument(metavar="A", help="Folder of a table or a session.")],
-    other: Annotated[Path, typer.Argument(metavar="B", help="Folder of another of the same chart.")],
+    a_folder: Annotated[Path, typer.Argument(metavar="A", help="Folder of a LUT or a session.")],
+    b_folder: Annotated[Path, typer.Argument(metavar="B", help="Folder of another one, of the same chart.")],
     out: Annotated[
         Path | None,
-        option("FOLDER", "Write report.html with its pictures, comparison.json, lights.csv and cells.csv there."),
+        option("FOLDER", "Write report.html with its plots, comparison.json, lights.csv and cells.csv there."),
     ] = None,
     *,
     output: JsonOutput,
 ) -> None:
-    """Compare two tables, or sessions, of one chart: what differs, and whether noise alone explains it.
+    """Compare two LUTs, or sessions, of one chart: differences, and whether noise alone explains them.
 
-    Reads A and B. A session's table is made for the comparison, with the usual options, and thrown away. Writes FOLDER
-    if --out names it. The lights' colour and brightness and every cell are compared. Ends with 0 whatever is found,
-    with 2 where the charts differ or no light is in both, with 4 where a session makes no table.
+    Reads A and B. The LUT of a session is built temporarily with default options. Writes FOLDER if given with --out.
+    Compares colour and brightness of the illuminants, and every patch. Exit code 0 after a comparison, 2 if the charts
+    differ or have no common illuminant, 4 if the LUT of a session is refused.
     """
     from calibration.comparison.comparing import chart_of, table_of
     from calibration.comparison.comparing import compare as compare_tables
@@ -298,30 +296,30 @@ def compare(
 
     if out is not None:
         require_free(out, "the comparison")
-    places = table_folder(one), table_folder(other)
+    folders = table_folder(a_folder), table_folder(b_folder)
     with (
-        progress("reading") as shown,
-        table_of(places[0], shown) as a,
-        table_of(places[1], shown) as b,
+        progress("reading") as show,
+        table_of(folders[0], show) as a,
+        table_of(folders[1], show) as b,
     ):
-        found = compare_tables(a, b, shown, places)
+        comparison = compare_tables(a, b, show, folders)
     if output.is_requested:
-        output.add(**comparison_json(found))
+        output.add(**comparison_json(comparison))
     else:
-        print("\n".join(lines(found)))
+        print("\n".join(lines(comparison)))
     if out is not None:
-        write_comparison(found, out, chart_of(places))
+        write_comparison(comparison, out, chart_of(folders))
 
 
 @_others.command(epilog=EXIT_CODES)
 @with_json("build-lut publish")
 def publish(
     lut: Table,
-    url: Annotated[str, typer.Argument(help="New folder, or place in a store that fsspec knows, such as s3://….")],
+    url: Annotated[str, typer.Argument(help="New folder, or URL of a store supported by fsspec, such as s3://….")],
     *,
     output: JsonOutput,
 ) -> None:
-    """Write a table as a sharded Zarr array to a folder or a store for others.
+    """Publish a LUT as a sharded Zarr array, in a folder or a store.
 
     Reads LUT; writes URL.
     """
@@ -330,51 +328,50 @@ def publish(
 
     folder = table_folder(lut)
     table = open_lut(folder)
-    with progress("writing lights") as shown:
-        publish_table(table, url, shown)
+    with progress("writing illuminants") as show:
+        publish_table(table, url, show)
     output.add(table=folder, url=masked(url), lights=len(table.samples), sha256=table.sha256)
-    print(f"{masked(url)}: {len(table.samples)} lights of {folder}; others get them by")
+    print(f"{masked(url)}: {len(table.samples)} illuminants of {folder}. Others can copy the LUT with")
     print(f"build-lut fetch {masked(url)} LUT --expect {table.sha256}")
 
 
 @_others.command(epilog=EXIT_CODES)
 @with_json("build-lut fetch")
 def fetch(
-    url: Annotated[str, typer.Argument(help="Folder or place in a store where a table was published.")],
+    url: Annotated[str, typer.Argument(help="Folder or URL of a published LUT.")],
     lut: NewTable,
     expect: Annotated[
         str | None,
         option(
             "SHA256",
-            "The table's hash as build-lut info prints it, told by somebody you trust; another table is refused.",
+            "Expected hash as printed by build-lut info, from a source that you trust; other LUTs are refused.",
         ),
     ] = None,
     *,
     output: JsonOutput,
 ) -> None:
-    """Copy a published table to a new folder, where it is used, and verify it.
+    """Copy a published LUT to a new folder and verify it.
 
     Reads URL; writes LUT.
     """
     from calibration.table.zarr_store import fetch as fetch_table
 
-    with progress("reading lights") as shown:
-        table = fetch_table(url, lut, shown, expect)
+    with progress("reading illuminants") as show:
+        table = fetch_table(url, lut, show, expect)
     output.add(table=lut, url=masked(url), lights=len(table.samples), sha256=table.sha256, expected=expect is not None)
-    print(f"{lut}: {len(table.samples)} lights, {printable(table.provenance.camera)}; {_vouched(table, expect)}")
+    print(f"{lut}: {len(table.samples)} illuminants, {printable(table.provenance.camera)}; {_hash_text(table, expect)}")
 
 
-def _vouched(lut: Lut, expect: str | None) -> str:
+def _hash_text(lut: Lut, expect: str | None) -> str:
     if expect is not None:
-        return "it is the table expected, and every file is as it was built"
+        return "it is the expected LUT, and all hashes are correct"
     return (
-        f"every file is as its own hashes say; that it is the table you mean shows its hash, {lut.sha256}: compare it "
-        "with the one you were told, or give that with --expect"
+        f"all files match its own hashes. Compare its hash, {lut.sha256}, with the expected one, or give that with "
+        "--expect"
     )
 
 
 def _print_result(result: BuildResult, output: JsonOutput) -> None:
-    """Print the figures that matter most, the remarks, and the verdict; or add all that `report.json` holds."""
     from calibration.report.report import report_json, summary
     from calibration.verdict import remark
 

@@ -1,7 +1,6 @@
-"""What was measured by a build, or by a check, in named groups of frozen values: verdict, report and table rest on it.
+"""Measurements of a build or a check, in named groups of frozen values. Verdict, report and LUT are based on them.
 
-Nothing is judged here, nothing drawn, no file read. L lights, C colours, G levels of grey, S samples of a cell; counts
-are above black unless called raw.
+L illuminants, C colours, G printed greys, S samples per patch. Counts are above black unless called raw.
 """
 
 from __future__ import annotations
@@ -44,63 +43,45 @@ _Levels = Annotated[FloatArray, AfterValidator(lambda values: values.reshape(-1,
 
 @dataclass(frozen=True, eq=False)
 class FrameMeasurements:
-    """What was measured on one light or white frame.
-
-    - `black`: (2, 2) float64 counts, black level of each position of the Bayer block.
-    - `channel`: the channel in which the chart's movement was measured.
-    - `shift`: movement against the frame that was registered last.
-    - `reregistered`: whether the chart had moved so far that it was registered again in this frame.
-    - `greys`, `grey_errors`: (G, 3) float64 counts above black of each level of grey, field divided out, and their
-      standard errors.
-    - `dark`: (3,) float64 counts, dark light of bare paper that was subtracted; zeros where none was.
-    - `share_at_zero`: share, 0 … 1, of the frame's samples in the table that are 0.
-    - `blur_px`: σ of the frame's blur, half-size px: that of the frame registered last, plus the change since.
-    - `exposure`: shutter time × ISO speed / f-number² by the raw file, s; 0 where it does not state them.
-    """
+    """Measurements of one light or white frame."""
 
     record: FrameRecord
-    black: FloatArray
-    channel: Channel
-    shift: Shift
-    reregistered: bool
+    black: FloatArray  # (2, 2) float64 counts, black level of each position of the Bayer block
+    channel: Channel  # Channel in which the chart's movement was measured
+    shift: Shift  # Movement since the frame that was registered last
+    reregistered: bool  # True if the chart had moved too far and was registered again in this frame
     paper: Paper
     consistency: FrameConsistency
-    greys: _Levels
-    grey_errors: _Levels
-    dark: FloatArray
-    share_at_zero: float
-    blur_px: float
-    exposure: float
+    greys: _Levels  # (G, 3) float64 counts above black of each printed grey, divided by the flat field
+    grey_errors: _Levels  # (G, 3) float64 counts, standard errors of `greys`
+    dark: FloatArray  # (3,) float64 counts, dark light on bare paper that was subtracted; 0 without subtraction
+    share_at_zero: float  # Fraction of the frame's samples in the LUT that are 0
+    blur_px: float  # σ of the frame's blur, half-size px: of the frame registered last, plus the change since then
+    exposure: float  # Shutter time × ISO speed / f-number² by the raw file, s; 0 if unknown
     origin: FrameOrigin
 
 
 @dataclass(frozen=True, eq=False)
 class LinearityMeasurements:
-    """Deviation of counts from proportion to the light (EMVA 1288, release 4.0, linearity error).
+    """Deviation of counts from proportionality to light (EMVA 1288, release 4.0, linearity error)."""
 
-    - `files`: the frames, by rising exposure.
-    - `level`: (B,) float64, shares of saturation, rising.
-    - `deviation`: (3, B) float64, relative, of R, G and B from the straight line that fits best; NaN where no patch has
-      data.
-    """
-
-    files: tuple[str, ...]
-    level: _Array
-    deviation: _Array
+    files: tuple[str, ...]  # Frames by increasing exposure
+    level: _Array  # (B,) float64, increasing, relative to saturation
+    deviation: _Array  # (3, B) float64, relative deviation of R, G, B from the best straight line; NaN without data
 
     @property
     def worst(self) -> float:
-        """The largest deviation, a share."""
+        """Largest relative deviation."""
         return float(np.nanmax(np.abs(self.deviation)))
 
     @property
     def range(self) -> tuple[float, float]:
-        """The lowest and the highest share of saturation for which a channel has data."""
+        """Lowest and highest level with data, relative to saturation."""
         measured = np.flatnonzero(np.isfinite(self.deviation).any(axis=0))
         return float(self.level[measured[0]]), float(self.level[measured[-1]])
 
     def to_json(self) -> list[tuple[float, list[float | None]]]:
-        """Return each level with the deviations of R, G and B, None where there are no data; for `report.json`."""
+        """Return each level with the deviations of R, G and B for `report.json`; None without data."""
 
         def rounded(values: _Array) -> list[float | None]:
             return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values.tolist()]
@@ -111,101 +92,81 @@ class LinearityMeasurements:
 
 @dataclass(frozen=True)
 class SessionMeasurements:
-    """What was read.
-
-    - `registered_file`: the frame that was registered first, relative to the session.
-    - `codes`: codes of each light of the plan, 0 … 255.
-    """
+    """The session that was read."""
 
     folder: Path
     camera: str
-    lights: int
-    registered_file: str
+    lights: int  # Number of illuminants
+    registered_file: str  # Frame that was registered first, relative to the session
     white_references: int
-    codes: tuple[tuple[int, int, int], ...]
+    codes: tuple[tuple[int, int, int], ...]  # 8-bit codes of each planned illuminant
 
 
-# Standard deviation of a frame's brightness, a share, where white frames do not show it (judgement).
+# Relative standard deviation of a frame's brightness, if it cannot be measured (judgement).
 _USUAL_SCATTER = 0.001
 
-_SCATTER_FRAMES = 3  # White frames from which on they show it
+_SCATTER_FRAMES = 3  # White frames needed to measure this scatter
 
 
 @dataclass(frozen=True, eq=False)
 class LightMeasurements:
-    """What was measured of the lights, light by light; a check has one row, of the frame that it read.
+    """Measurements of the illuminants; a check has one row, of its frame."""
 
-    - `white`, `white_error`: (L, 3) float64 counts, the ground truth and its standard error, in the units of the
-      samples.
-    - `gains`: (L, 3) float64, the lamp's light at each light over that in the first white frame; ones where it is not
-      known.
-    - `subtracted`: (L, 3) float64 counts, dark light of bare paper that was subtracted; None where none was to be.
-    - `share_at_zero`: (L,) float64, share of each light's samples in the table that are 0; (0,) after a check.
-    - `additivity`: how white is made of the primaries; None where a frame that is needed is missing.
-    - `codes`: how the whites agree with their codes, by all other lights (`calibration.checks.light_codes`); lights
-      from index L on in `exchanges` and `seen_as` are white frames. None after a check.
-    - `white_frames`: the same of the white frames: of the first alone where the others differ from it as a lamp drifts,
-      or of all. None without.
-    - `drift`: how the lights are brought to one lamp in the table; None where that was not asked for. All else is as
-      measured.
-    - `stray`: light in frames that the dark ones do not show; None without the three primaries each alone or a dark
-      frame.
-    """
-
-    white: _Array
-    white_error: _Array
-    gains: _Array
+    white: _Array  # (L, 3) float64 counts, ground truth in the units of the samples
+    white_error: _Array  # (L, 3) float64 counts, standard error of `white`
+    gains: _Array  # (L, 3) float64, lamp brightness relative to the first white frame; 1 if unknown
+    # (L, 3) float64 counts, dark light on bare paper that was subtracted; None without subtraction
     subtracted: _Array | None
+    # (L,) float64, fraction of each illuminant's samples in the LUT that are 0; (0,) after a check
     share_at_zero: _Array
-    additivity: Additivity | None
+    additivity: Additivity | None  # White against the sum of the primaries; None if a frame is missing
+    # Agreement with the codes; None after a check. Indices from L on in `exchanges` and `seen_as` are white frames
     codes: CodeAgreement | None
+    # The same for white frames: only the first if the others differ by lamp drift, else all. None without any
     white_frames: CodeAgreement | None
+    # Drift correction in the LUT; None if not requested. All other values are as measured
     drift: DriftCorrection | None = None
+    # Light missing in the dark frames; None without frames of the three primaries alone or without a dark frame
     stray: StrayLight | None = None
 
     @property
     def brightest(self) -> _Array:
-        """(3,) float64 counts of bare paper under the brightest light."""
+        """(3,) float64 counts of bare paper under the brightest illuminant."""
         brightest: _Array = self.white[int(np.argmax(self.white.sum(axis=1)))]
         return brightest
 
     @property
     def off_codes_deg(self) -> _Array | None:
-        """(L,) float64 degrees, how far each white is off its codes for certain; None after a check.
+        """(L,) float64 degrees, significant angle between each white and its prediction; None after a check.
 
-        Of lights whose names are exchanged, the angle between the two.
+        For exchanged illuminants, the angle between the two.
         """
         if self.codes is None:
             return None
-        off = self.codes.off_deg.copy()
+        angle_deg = self.codes.off_deg.copy()
         for pair in self.codes.exchanges:
-            both = [light for light in (pair.one, pair.other) if light < len(off)]
-            off[both] = np.maximum(off[both], pair.angle_deg)
-        return off
+            indices = [light for light in (pair.one, pair.other) if light < len(angle_deg)]
+            angle_deg[indices] = np.maximum(angle_deg[indices], pair.angle_deg)
+        return angle_deg
 
     def lights_off_codes(self, accepted_deg: float) -> list[int]:
-        """Return the lights further than `accepted_deg` from what their codes predict, the furthest first."""
-        off = self.off_codes_deg
-        return [] if off is None else [int(light) for light in np.argsort(-off) if off[light] > accepted_deg]
+        """Return the illuminants beyond `accepted_deg` from the prediction, the furthest first."""
+        deg = self.off_codes_deg
+        return [] if deg is None else [int(light) for light in np.argsort(-deg) if deg[light] > accepted_deg]
 
 
 @dataclass(frozen=True, eq=False)
 class GreyMeasurements:
-    """What was measured of the printed levels of grey.
-
-    - `values`, `errors`: (L, G, 3) float64 counts under each light, field divided out, and their standard errors; NaN
-      where no patch of a level can be used.
-    """
+    """Measurements of the printed greys."""
 
     names: tuple[str, ...]
-    values: _Array
-    errors: _Array
+    values: _Array  # (L, G, 3) float64 counts divided by the flat field; NaN if no patch is usable
+    errors: _Array  # (L, G, 3) float64 counts, standard errors of `values`
 
     def tints_deg(self, white: _Array) -> _Array:
-        """Return (G,) degrees between each level and white, under the light with the most of its weakest channel.
+        """Return the angles (G,), degrees, of greys to white under the illuminant with the highest weakest channel.
 
-        `white` (L, 3) float64 is the ground truth; a grey has the light's chromaticity only as far as the print is
-        neutral.
+        `white`: (L, 3) float64 counts, the ground truth.
         """
         if not self.names:
             return np.zeros(0)
@@ -215,83 +176,59 @@ class GreyMeasurements:
 
 @dataclass(frozen=True, eq=False)
 class SensorMeasurements:
-    """What was measured of the sensor.
+    """Measurements of the sensor."""
 
-    - `saturation_counts`: raw count of saturation.
-    - `saturation_measured`: whether a photosite of a cell reached it, so that the count is measured and not the raw
-      file's statement.
-    - `white_level`: saturation as a sample value: counts above black.
-    - `noise`: (3,) float64, median standard deviation of one sample under white, relative to paper white.
-    - `transfer`: photon-transfer curve of the frame that was registered first.
-    - `superposition`: what lights of several primaries show of it beside the primaries alone.
-    """
-
-    saturation_counts: int
-    saturation_measured: bool
-    white_level: int
-    noise: _Array
-    transfer: PhotonTransfer
+    saturation_counts: int  # Raw count of saturation
+    saturation_measured: bool  # True if a photosite of a patch reached saturation; else the count is from the raw file
+    white_level: int  # Saturation in counts above black
+    noise: _Array  # (3,) float64, median standard deviation of one sample under white, relative to paper white
+    transfer: PhotonTransfer  # Photon-transfer curve of the frame registered first
     linearity: LinearityMeasurements | None
-    superposition: Superposition
+    superposition: Superposition  # Nonlinearity by comparing several primaries together and alone
 
 
 @dataclass(frozen=True, eq=False)
 class CellMeasurements:
-    """What was found of the chart's cells.
+    """Measurements of the chart's patches."""
 
-    - `window`: pixels along the side of a cell's window; S = window².
-    - `stains`: where the print does not have its codes' colours, in the order of colour indices.
-    - `levels`: (C, 3) float64, of each cell in the frame that was registered first, bare paper 1.
-    - `added`: light that lies on some of them whatever is printed there.
-    """
-
-    window: int
+    window: int  # Side of the sampling window, px; S = window²
     unfit: tuple[Unfit, ...]
-    stains: Stains
-    levels: _Array
-    added: AddedLight
+    stains: Stains  # Patches with other colours than their codes', in the order of colour indices
+    levels: _Array  # (C, 3) float64, each patch in the frame registered first, relative to bare paper
+    added: AddedLight  # Light added to some patches, independent of their colour
 
 
 @dataclass(frozen=True, eq=False)
 class TableMeasurements:
-    """All that was measured by a build, or by a check.
-
-    - `frames`: figures of every light and white frame read, in the order taken.
-    - `dark_frames`: what the dark frames show; of a check, the first of them.
-    - `origins`: which frames' files state another camera, lens or exposure than most.
-    - `primaries`: the primaries each alone, by which the field of coloured cells is known apart from that of paper;
-      None where the plan has no light of each alone, or one is too dim.
-    - `lens`, `point_spread`: what the lens spreads beside its sharp core, and what of it was subtracted; None where it
-      was not measured.
-    - `origin`: with what, when and by whom the frames were taken.
-    """
+    """All measurements of a build or a check."""
 
     session: SessionMeasurements
     registration: Registration
-    frames: tuple[FrameMeasurements, ...]
+    frames: tuple[FrameMeasurements, ...]  # Every light and white frame, in the order taken
     lights: LightMeasurements
     greys: GreyMeasurements
     sensor: SensorMeasurements
-    dark_frames: DarkSummary
+    dark_frames: DarkSummary  # Dark frames; only the first one in a check
     cells: CellMeasurements
-    origins: OriginFigures
+    origins: OriginFigures  # Frames of another camera, lens or exposure than most
+    # Primaries alone, for the flat field of coloured patches; None if a frame is missing or too dim
     primaries: Primaries | None
-    lens: LensFigures
-    point_spread: PointSpread | None
-    origin: OriginRecord
+    lens: LensFigures  # Light that the lens spreads, and its correction
+    point_spread: PointSpread | None  # None if the spread was not measured
+    origin: OriginRecord  # Camera, settings, time and author of the frames
     budget: Budget
 
     @property
     def is_of_one_frame(self) -> bool:
-        """Whether these are a check's, which reads one light or white frame, and one dark frame."""
+        """True for a check, which reads one light or white frame and one dark frame."""
         return self.lights.codes is None
 
     @property
     def primary_lights(self) -> tuple[int, ...]:
-        """Lights of red, green and blue alone at their full, by their numbers; () where one is missing."""
-        found = {codes: light for light, codes in enumerate(self.session.codes)}
+        """Indices of full red, green and blue alone; () if one is missing."""
+        index_by_codes = {codes: light for light, codes in enumerate(self.session.codes)}
         alone = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
-        return tuple(found[codes] for codes in alone) if found.keys() >= set(alone) else ()
+        return tuple(index_by_codes[codes] for codes in alone) if index_by_codes.keys() >= set(alone) else ()
 
     @property
     def white_frames(self) -> tuple[FrameMeasurements, ...]:
@@ -300,19 +237,19 @@ class TableMeasurements:
 
     @property
     def registered_frame(self) -> FrameMeasurements:
-        """The frame that was registered first; another where that one is not among those measured."""
-        named = (frame for frame in self.frames if frame.record.file == self.session.registered_file)
-        return next(named, self.frames[0])
+        """The frame registered first; the first measured frame if that one was not measured."""
+        candidates = (frame for frame in self.frames if frame.record.file == self.session.registered_file)
+        return next(candidates, self.frames[0])
 
     def added_bleed(self, frame: FrameMeasurements) -> float:
-        """Return how much more light a frame's worst sample has from beyond its cell than the registered frame's."""
+        """Return the bleed of the worst sample in a frame, minus the bleed in the registered frame."""
         registration, window = self.registration, self.cells.window
         own, first = (bleed(registration.cell_px, px, window) for px in (frame.blur_px, registration.blur_px))
         return own - first
 
     @property
     def largest_shift_px(self) -> float:
-        """The chart's largest movement between a frame and the registration that it was sampled by, half-size px."""
+        """Largest movement of the chart between a frame and its registration, half-size px."""
         return max((frame.shift.length_px for frame in self.frames), default=0.0)
 
     @property
@@ -328,27 +265,27 @@ class TableMeasurements:
 
     @property
     def white_scatter(self) -> float:
-        """Standard deviation of a white frame's brightness about its neighbours', a share; what is usual of few."""
+        """Relative standard deviation of a white frame's brightness about its neighbours."""
         whites = np.array([frame.paper.white.sum() for frame in self.white_frames])
         if len(whites) < _SCATTER_FRAMES:
             return _USUAL_SCATTER
-        off = whites[1:-1] - (whites[:-2] + whites[2:]) / 2
-        return float(np.sqrt((off**2).mean() / 1.5) / whites.mean())
+        deviations = whites[1:-1] - (whites[:-2] + whites[2:]) / 2
+        return float(np.sqrt((deviations**2).mean() / 1.5) / whites.mean())
 
     @property
     def dark_share(self) -> float:
-        """Light of bare paper while the projector shows black, of white, in the worst channel; NaN if not measured."""
+        """Light on bare paper while the projector shows black, of white, worst channel; NaN if not measured."""
         share = np.abs(self.dark_frames.light / self._full_white).max()
         return float(share) if np.isfinite(self.dark_frames.light).all() else float("nan")
 
     @property
     def dark_change(self) -> float:
-        """Change of that light between dark frames, of white; NaN of one dark frame."""
+        """Change of this light between dark frames, relative to white; NaN with one dark frame."""
         lights = self.dark_frames.lights
         return float((np.ptp(lights, axis=0) / self._full_white).max()) if len(lights) > 1 else float("nan")
 
     @property
     def _full_white(self) -> _Array:
-        """(3,) float64 counts of bare paper under white, or under the brightest light where no white was taken."""
+        # The brightest illuminant replaces missing white frames.
         whites = [frame.paper.white for frame in self.white_frames]
         return np.mean(whites, axis=0) if whites else self.lights.brightest

@@ -1,8 +1,7 @@
-"""Whether a table may be used: figures against their limits, why one is beyond, what to take again, all in words.
+"""Judge a LUT: compare figures with limits, explain values beyond them, and select frames to take again.
 
-Judging is a pure function of values. A value that could not be measured is not judged. Taken again are frames that are
-beyond a refusing limit by themselves, and those that are a cause; what all frames share is not mended so. All that
-differs from figure to figure stands in the figure (`calibration.figures`).
+Judging is a pure function of values. A value that could not be measured is not judged. Frames are taken again if they
+exceed a refusing limit individually, or if they are the cause; a fault common to all frames is not corrected by this.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from calibration.causes.gathering import PrintPlace
+from calibration.causes.gathering import PrintPosition
 from calibration.causes.rules import UNKNOWN, Decision, Evidence, decide
 from calibration.figures.all_figures import BY_NAME, FIGURES
 from calibration.figures.figure import Figure, Outcome, worst_outcome
@@ -21,14 +20,14 @@ from experiment.session.records import FrameRecord
 from experiment.session.repair import lights_text
 from foundation.errors import counted, first_few
 
-COMMAND = "acquire run LAB.toml SESSION --retake bad"  # What takes frames again, as the report names them
+COMMAND = "acquire run LAB.toml SESSION --retake bad"  # Repeats the frames listed in the report
 
-_THEN = "what else is refused may follow from these, else take the session anew"
+_THEN = "if the LUT is still refused, take the session again"
 
 
 @dataclass(frozen=True)
 class JudgedValue:
-    """One measured value, its figure, and what follows."""
+    """One measured value with its figure and outcome."""
 
     figure: Figure
     value: float
@@ -36,150 +35,143 @@ class JudgedValue:
 
     @property
     def measured(self) -> str:
-        """The value for people."""
+        """The value with its unit."""
         return self.figure.text(self.value)
 
     def text(self) -> str:
-        """Return value, expectation and consequence, for a line of text."""
+        """Return value, expectation and consequence in one line."""
         figure = self.figure
-        refused = "" if figure.refuse is None else f", refused beyond {figure.text(figure.refuse)}"
-        return f"{figure.title}: {self.measured}, {figure.expected} expected{refused}; {figure.why}"
+        side = "above" if figure.sense == "at most" else "below"
+        refusal = "" if figure.refuse is None else f", refused {side} {figure.text(figure.refuse)}"
+        return f"{figure.title}: {self.measured}, expected {figure.expected}{refusal}; {figure.why}"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The judgement on a table, value by value."""
+    """Judged values of a LUT."""
 
     rows: tuple[JudgedValue, ...]
 
     @property
     def outcome(self) -> Outcome:
-        """The worst of the rows."""
+        """The worst outcome."""
         return worst_outcome(row.outcome for row in self.rows)
 
     @property
     def refused(self) -> tuple[JudgedValue, ...]:
-        """The rows for which no table is made."""
+        """Values for which the LUT is refused."""
         return tuple(row for row in self.rows if row.outcome == "refuse")
 
     @property
     def remarks(self) -> tuple[JudgedValue, ...]:
-        """The rows beyond what is expected, with which a table is made all the same."""
+        """Values beyond the accepted limit with which a LUT is still built."""
         return tuple(row for row in self.rows if row.outcome == "accept with remarks")
 
 
 @dataclass(frozen=True, eq=False)
 class BuildResult:
-    """A table, or a check, as measured and judged.
-
-    - `lut`: the table's folder; None after a check.
-    """
+    """Measurements and verdict of a LUT or a check."""
 
     figures: TableMeasurements
     verdict: Verdict
-    lut: Path | None
+    lut: Path | None  # The LUT's folder; None after a check
 
 
 @dataclass(frozen=True)
 class ProbableCause:
-    """Why a figure is beyond its limit.
+    """Cause of a figure beyond its limit."""
 
-    - `decision`: the cause, and the rule that says so.
-    - `frames`: the frames in which it shows, the worst first; empty where all share it.
-    """
-
-    figure: str
-    decision: Decision
+    figure: str  # Name of the figure
+    decision: Decision  # The cause, and the rule that applied
     evidence: Evidence
-    frames: tuple[FrameRecord, ...]
-    places: tuple[PrintPlace, ...]
+    frames: tuple[FrameRecord, ...]  # Frames that show it, the worst first; empty if all do
+    positions: tuple[PrintPosition, ...]
 
     @property
     def is_known(self) -> bool:
-        """Whether a cause is named."""
+        """True if a rule applied."""
         return self.decision.cause is not UNKNOWN
 
     @property
     def is_of_frames(self) -> bool:
-        """Whether it is mended by taking the frames named again."""
-        return self.decision.cause.mends == "frames" and bool(self.frames)
+        """True if repeating the listed frames corrects it."""
+        return self.decision.cause.repeats == "frames" and bool(self.frames)
 
 
 def judged_values(table: TableMeasurements) -> dict[str, float]:
-    """Return the values that are judged, by the names of their figures; without those that are not known."""
+    """Return the values to judge by figure name, without those that are unknown."""
     values = ((figure.name, figure.judged_value(table)) for figure in FIGURES)
     return {name: value for name, value in values if value is not None}
 
 
 def judge(values: Mapping[str, float], figures: Sequence[Figure] = FIGURES) -> Verdict:
-    """Return the verdict on values by name; a figure whose value is missing is passed over."""
-    known = ((figure, values[figure.name]) for figure in figures if figure.name in values)
-    return Verdict(tuple(JudgedValue(figure, value, figure.outcome(value)) for figure, value in known))
+    """Return the verdict on values by figure name; figures without a value are skipped."""
+    measured = ((figure, values[figure.name]) for figure in figures if figure.name in values)
+    return Verdict(tuple(JudgedValue(figure, value, figure.outcome(value)) for figure, value in measured))
 
 
 def explain(figure: Figure, table: TableMeasurements) -> ProbableCause | None:
-    """Return why a figure is beyond its limit; None for one that explains itself, such as the size of a cell."""
+    """Return the cause of a figure beyond its limit; None if the figure explains itself, such as the patch size."""
     gathered = None if figure.cause is None else figure.cause.gather(table, figure.accept)
     if figure.cause is None or gathered is None:
         return None
     decision = decide(figure.cause.about, gathered.evidence)
-    found = ProbableCause(figure.name, decision, gathered.evidence, gathered.frames, gathered.places)
-    return found if found.is_known else _as_another(found, figure.cause.follows, table)
+    cause = ProbableCause(figure.name, decision, gathered.evidence, gathered.frames, gathered.positions)
+    return cause if cause.is_known else _shared_cause(cause, figure.cause.follows, table)
 
 
-def _as_another(unknown: ProbableCause, follows: Sequence[str], table: TableMeasurements) -> ProbableCause:
-    """Return a finding with the cause of a figure that it goes with, in the same frames; as it is where there is none.
-
-    What lies on the print in a frame spreads its cells; a light that bears another's name has another's brightness.
-    """
+def _shared_cause(unknown: ProbableCause, follows: Sequence[str], table: TableMeasurements) -> ProbableCause:
+    """Return a cause that another figure shows in the same frames; the unknown cause if there is none."""
+    # For example, an object on the print in a frame increases the scatter of its patches, too.
     for name in follows:
         main = explain(BY_NAME[name], table)
         if main is None or not main.is_known or not main.frames:
             continue
-        own, others = ({frame.sha256 for frame in finding.frames} for finding in (unknown, main))
-        if own and own <= others:
+        own_frames, main_frames = ({frame.sha256 for frame in cause.frames} for cause in (unknown, main))
+        if own_frames and own_frames <= main_frames:
             decision = replace(main.decision, follows=name)
-            return replace(unknown, decision=decision, evidence=main.evidence, places=unknown.places or main.places)
+            positions = unknown.positions or main.positions
+            return replace(unknown, decision=decision, evidence=main.evidence, positions=positions)
     return unknown
 
 
 def findings(verdict: Verdict, table: TableMeasurements) -> dict[str, ProbableCause]:
-    """Return what each row beyond its limit is probably caused by, by the name of its figure."""
+    """Return the probable cause of each value beyond its limit, by figure name."""
     explained = (explain(row.figure, table) for row in (*verdict.refused, *verdict.remarks))
-    return {found.figure: found for found in explained if found is not None}
+    return {cause.figure: cause for cause in explained if cause is not None}
 
 
 def retake_command(records: Sequence[FrameRecord]) -> str:
-    """Return the command that takes frames again: by the lights' numbers, or by the report where one is a reference."""
+    """Return the command that repeats frames: by illuminant numbers, or from the report for other frames."""
     lights = [record.illumination for record in records if record.kind == "light"]
     numbers = [light for light in lights if light is not None]
     return COMMAND if len(numbers) < len(records) else COMMAND.replace("bad", lights_text(numbers))
 
 
 def retaken_frames(verdict: Verdict, table: TableMeasurements) -> tuple[FrameRecord, ...]:
-    """Return the frames to be taken again, in the order taken."""
-    found = findings(verdict, table)
-    named = {frame.sha256 for row in verdict.refused for frame in _frames_of(row, table, found) or ()}
-    for finding in found.values():
-        if finding.is_of_frames:
-            named |= {frame.sha256 for frame in finding.frames}
-    # Dark frames have no figures among the others; only where they come from can be refused.
+    """Return the frames to repeat, in the order taken."""
+    causes = findings(verdict, table)
+    hashes = {frame.sha256 for row in verdict.refused for frame in _frames_beyond(row, table, causes) or ()}
+    for cause in causes.values():
+        if cause.is_of_frames:
+            hashes |= {frame.sha256 for frame in cause.frames}
+    # Dark frames have no figures of their own, and can only be refused for camera or exposure.
     foreign = [frame.record for frame in (*table.origins.other_camera, *table.origins.other_exposure)]
     records = [*(frame.record for frame in table.frames), *(record for record in foreign if record.kind == "dark")]
-    return tuple(sorted((record for record in records if record.sha256 in named), key=lambda record: record.attempt))
+    return tuple(sorted((record for record in records if record.sha256 in hashes), key=lambda record: record.attempt))
 
 
 def is_mended_by_retaking(verdict: Verdict, table: TableMeasurements) -> bool:
-    """Return whether each refusal is of single frames, so that a table could be made once these are taken again."""
-    found = findings(verdict, table)
+    """Return True if every refusal concerns single frames, so that repeating them makes a LUT possible."""
+    causes = findings(verdict, table)
     return bool(verdict.refused) and all(
-        _frames_of(row, table, found) or (row.figure.name in found and found[row.figure.name].is_of_frames)
+        _frames_beyond(row, table, causes) or (row.figure.name in causes and causes[row.figure.name].is_of_frames)
         for row in verdict.refused
     )
 
 
 def retake_json(records: tuple[FrameRecord, ...], registered_sha256: str, newest_sha256: str) -> dict[str, Any]:
-    """Return what `acquire run --retake bad` reads of a report (docs/formats.md)."""
+    """Return the part of a report that `acquire run --retake bad` reads (docs/formats.md)."""
     return {
         "retake": lights_text([record.illumination for record in records if record.illumination is not None]),
         "retake_sha256": [record.sha256 for record in records],
@@ -188,91 +180,89 @@ def retake_json(records: tuple[FrameRecord, ...], registered_sha256: str, newest
     }
 
 
-def _frames_of(
-    row: JudgedValue, table: TableMeasurements, found: Mapping[str, ProbableCause]
+def _frames_beyond(
+    row: JudgedValue, table: TableMeasurements, causes: Mapping[str, ProbableCause]
 ) -> list[FrameRecord] | None:
-    """Return the frames that are beyond a row's refusing limit.
+    """Return the frames beyond a row's refusing limit.
 
-    None where its value is not of single frames, or has a cause that would be in them again.
+    None if the value does not concern single frames, or if repeated frames would have the same cause.
     """
-    figure, finding = row.figure, found.get(row.figure.name)
-    if finding is not None and finding.is_known and finding.decision.cause.mends != "frames":
+    figure, cause = row.figure, causes.get(row.figure.name)
+    if cause is not None and cause.is_known and cause.decision.cause.repeats != "frames":
         return None
     return None if figure.refuse is None or figure.retake is None else figure.retake(table, figure.refuse)
 
 
 def refusal(verdict: Verdict, table: TableMeasurements, *, reported: bool = False) -> str:
-    """Return why there is no table and what helps, in a line; of the first of the verdict's refused rows."""
-    found = findings(verdict, table)
-    # What is explained explains more than what comes first.
-    known = [row for row in verdict.refused if row.figure.name in found and found[row.figure.name].is_known]
+    """Return in one line why the LUT is refused and what to do; explains the most informative of the refused rows."""
+    causes = findings(verdict, table)
+    # A row with a known cause is more informative than the first one.
+    explained = [row for row in verdict.refused if row.figure.name in causes and causes[row.figure.name].is_known]
     foremost = [row for row in verdict.refused if row.figure.foremost]
-    worst = (*foremost, *known, *verdict.refused)[0]
-    more = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
-    detail, remedy = detail_and_remedy(worst.figure, table)
-    finding = found.get(worst.figure.name)
-    if finding is not None and finding.is_known:
-        remedy = finding.decision.cause.remedy
-    what, frames = "take the session anew", retaken_frames(verdict, table)
+    main_row = (*foremost, *explained, *verdict.refused)[0]
+    others_text = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
+    detail, remedy = detail_and_remedy(main_row.figure, table)
+    cause = causes.get(main_row.figure.name)
+    if cause is not None and cause.is_known:
+        remedy = cause.decision.cause.remedy
+    action, frames = "take the session again", retaken_frames(verdict, table)
     command = COMMAND if reported else retake_command(frames)
     if frames and (reported or command != COMMAND):
-        again = f"take {counted(len(frames), 'frame')} again"
-        mended = is_mended_by_retaking(verdict, table)
-        what = f"{again}: {command}" if mended else f"{again} first ({command}); {_THEN}"
-    return f"{_with_place(worst, table)}{detail}{more}; {_cause_text(finding)}{remedy}, and {what}"
+        repeat_text = f"take {counted(len(frames), 'frame')} again"
+        is_sufficient = is_mended_by_retaking(verdict, table)
+        action = f"{repeat_text}: {command}" if is_sufficient else f"{repeat_text} first ({command}); {_THEN}"
+    return f"{_text_with_position(main_row, table)}{detail}{others_text}; {_cause_text(cause)}{remedy}, and {action}"
 
 
 def remark(row: JudgedValue, table: TableMeasurements) -> str:
-    """Return a row that is remarked on: value, expectation, place, cause, remedy and command, in a line."""
-    finding, again = explain(row.figure, table), ""
+    """Return a remark in one line: value, expectation, position, cause, remedy and command."""
+    cause, repeat_text = explain(row.figure, table), ""
     detail, remedy = detail_and_remedy(row.figure, table)
-    if finding is not None and finding.is_known:
-        remedy = finding.decision.cause.remedy
-        if finding.is_of_frames:
-            again = f", and take {counted(len(finding.frames), 'frame')} again: {retake_command(finding.frames)}"
-    return f"{_with_place(row, table)}{detail}; {_cause_text(finding)}{remedy}{again}"
+    if cause is not None and cause.is_known:
+        remedy = cause.decision.cause.remedy
+        if cause.is_of_frames:
+            repeat_text = f", and take {counted(len(cause.frames), 'frame')} again: {retake_command(cause.frames)}"
+    return f"{_text_with_position(row, table)}{detail}; {_cause_text(cause)}{remedy}{repeat_text}"
 
 
 def detail_and_remedy(figure: Figure, table: TableMeasurements) -> tuple[str, str]:
-    """Return what is added to a figure's value beyond a limit, "" where nothing is, and its remedy."""
-    found = None if figure.found is None else figure.found(table)
-    return ("", figure.remedy) if found is None else found
+    """Return the addition to a figure's value beyond a limit, or "", and its remedy."""
+    detail = None if figure.detail is None else figure.detail(table)
+    return ("", figure.remedy) if detail is None else detail
 
 
-def _cause_text(finding: ProbableCause | None) -> str:
-    """Return the probable cause and why, before a remedy; that it is unknown, where it was asked for."""
-    if finding is None:
+def _cause_text(cause: ProbableCause | None) -> str:
+    if cause is None:
         return ""
-    decision = finding.decision
+    decision = cause.decision
     if decision.rule is None:
-        return "the cause is not known from what was measured; it may help to "
-    # What it goes with says why.
+        return "cause unknown; possible remedy: "
+    # The reason is reported with the figure that it follows.
     why = "" if decision.follows else f" ({decision.rule.why})"
-    return f"probably {decision.cause.says}{why}; "
+    return f"probably {decision.cause.description}{why}; "
 
 
-def _with_place(row: JudgedValue, table: TableMeasurements) -> str:
-    """Return a value against its limit, and where the worst of it is."""
-    place = place_of(row.figure, table)
-    return f"{row.text()}, {place}" if place else row.text()
+def _text_with_position(row: JudgedValue, table: TableMeasurements) -> str:
+    position = position_text(row.figure, table)
+    return f"{row.text()}, {position}" if position else row.text()
 
 
-def place_of(figure: Figure, table: TableMeasurements) -> str:
-    """Return the frames, lights or place of a figure that is beyond its limit; "" if it has none."""
-    return places_text(explain(figure, table)) if figure.where is None else figure.where(table, figure.accept)
+def position_text(figure: Figure, table: TableMeasurements) -> str:
+    """Return the frames, illuminants or position of a figure beyond its limit, or ""."""
+    return positions_text(explain(figure, table)) if figure.where is None else figure.where(table, figure.accept)
 
 
-def places_text(finding: ProbableCause | None) -> str:
-    """Return the frames and the place on the print of a finding; "" where it has neither."""
-    if finding is None:
+def positions_text(cause: ProbableCause | None) -> str:
+    """Return the frames and the position on the print of a cause, or ""."""
+    if cause is None:
         return ""
-    files = [frame.file for frame in finding.frames]
+    files = [frame.file for frame in cause.frames]
     described = [f"in {first_few(files)}"] if files else []
-    if finding.places:
-        place = finding.places[0]
-        described.append(f"about {place.x_mm:.0f}, {place.y_mm:.0f} mm from the sheet's top-left corner")
-        if place.size_mm > 0:
-            described.append(f"{place.size_mm:.0f} mm across")
+    if cause.positions:
+        position = cause.positions[0]
+        described.append(f"about {position.x_mm:.0f}, {position.y_mm:.0f} mm from the sheet's top-left corner")
+        if position.size_mm > 0:
+            described.append(f"{position.size_mm:.0f} mm across")
         if not files:
-            described[0] = f"seen in {place.file} {described[0]}"
+            described[0] = f"seen in {position.file} {described[0]}"
     return ", ".join(described)

@@ -90,7 +90,9 @@ def causes_page() -> str:
     parts = [_CAUSES_HEAD]
     parts += ["## What helps\n", "| cause | what it is | what helps | to be taken again |\n|---|---|---|---|"]
     parts += [
-        f"| {one.name} | {one.says} | {one.remedy} | {_AGAIN[one.mends]} |" for one in CAUSES if one is not UNKNOWN
+        f"| {one.name} | {one.description} | {one.remedy} | {_AGAIN[one.repeats]} |"
+        for one in CAUSES
+        if one is not UNKNOWN
     ]
     parts += ["\n## The table\n", "| cause | figures | holds where | because |\n|---|---|---|---|"]
     for rule in RULES:

@@ -46,7 +46,7 @@ from calibration.figures.light import LEAK_SHARE
 from calibration.figures.single_frames import EVENNESS, KEYSTONE, TURN
 from calibration.figures.truth import BRIGHTEST_SHARE
 from calibration.measurements import TableMeasurements
-from calibration.verdict import JudgedValue, detail_and_remedy, explain, places_text
+from calibration.verdict import JudgedValue, detail_and_remedy, explain, positions_text
 from drivers.camera import keep_awake
 from drivers.presenter import WHITE, Colour, ReportsWarnings
 from drivers.projector import Projector, Severity
@@ -251,8 +251,8 @@ def _figure_finding(row: JudgedValue, table: TableMeasurements) -> Finding:
     cause = explain(row.figure, table)
     if cause is not None and cause.is_known:
         remedy = cause.decision.cause.remedy
-        detail += f", probably {cause.decision.cause.says}"
-    place = places_text(cause)
+        detail += f", probably {cause.decision.cause.description}"
+    place = positions_text(cause)
     said = f"{row.figure.title}: {row.measured}{detail}{f', {place}' if place else ''}"
     return judged(row.figure, row.value, said, remedy)
 

@@ -1,1 +1,1 @@
-"""Why a figure is beyond its limit: evidence, a table of rules that decides among causes, and what mends each."""
+"""Causes of figures beyond their limits: the evidence, the rules that decide, and the remedies."""

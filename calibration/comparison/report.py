@@ -1,4 +1,4 @@
-"""A comparison as text, as JSON, and as a folder: `report.html`, `comparison.json`, `lights.csv`, `cells.csv`."""
+"""Output of a comparison: text, JSON, and a folder with `report.html`, `comparison.json`, `lights.csv`, `cells.csv`."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _ANSWERS = {True: "yes", False: "no"}
 
 
 def lines(comparison: TableComparison) -> list[str]:
-    """Return a comparison as text: warnings, each answer, and the answer to all."""
-    found = [f"{'A, B:':24}{', '.join(map(str, comparison.places))}"]
-    found += [f"warning: {warning}" for warning in comparison.warnings]
+    """Return a comparison as text: warnings, the result of each quantity, and the overall result."""
+    texts = [f"{'A, B:':24}{', '.join(map(str, comparison.folders))}"]
+    texts += [f"warning: {warning}" for warning in comparison.warnings]
     for answer in comparison.answers:
         same = _ANSWERS[answer.same_within_noise]
-        found += [f"{f'{answer.name}:':24}{answer.said}", f"{'':24}same within noise: {same}"]
-    return [*found, f"{'Same within noise:':24}{_ANSWERS[comparison.same_within_noise]}"]
+        texts += [f"{f'{answer.name}:':24}{answer.said}", f"{'':24}same within noise: {same}"]
+    return [*texts, f"{'Same within noise:':24}{_ANSWERS[comparison.same_within_noise]}"]
 
 
 def comparison_json(comparison: TableComparison) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def comparison_json(comparison: TableComparison) -> dict[str, Any]:
             "format": "crop.comparison",
             "version": 1,
             "same_within_noise": comparison.same_within_noise,
-            "tables": comparison.places,
+            "tables": comparison.folders,
             "warnings": comparison.warnings,
             "answers": comparison.answers,
             "angle_deg": {"median": np.median(lights.angle_deg), "worst": lights.angle_deg.max()},
@@ -58,44 +58,44 @@ def comparison_json(comparison: TableComparison) -> dict[str, Any]:
 
 
 def draw_lights(figure: Any, lights: LightDifferences) -> None:
-    """Draw angle, brightness and cells of every light, each with the line up to which it is called the same."""
+    """Draw angle, brightness and patch difference of every illuminant, with the limits of sameness."""
     figure.set_size_inches(10, 3.1)
-    drawn = (
+    panels = (
         (lights.angle_deg, ANGLE_FLOOR_DEG, "angle between whites, °"),
         (100 * lights.brightness, 0, "brightness, B over A, %"),
-        (lights.cell_score, CELL_SCORE, "cells, RMS in units of noise"),
+        (lights.cell_score, CELL_SCORE, "patches, RMS in units of noise"),
     )
-    for axes, (values, line, title) in zip(figure.subplots(1, 3), drawn, strict=True):
+    for axes, (values, line, title) in zip(figure.subplots(1, 3), panels, strict=True):
         axes.plot(lights.one, values, ".", color=INK, markersize=3)
         axes.axhline(line, color=MARK, linewidth=0.8, linestyle=(0, (4, 3)))
-        axes.set(title=title, xlabel="light of A")
+        axes.set(title=title, xlabel="illuminant of A")
 
 
 def draw_map(figure: Any, chart: Chart, cells: CellDifferences) -> None:
-    """Draw the cells' mean differences where they lie on the print, in the channel that differs most."""
+    """Draw the mean differences of the patches on the print, in the channel that differs most."""
     figure.set_size_inches(10, 8.6 * chart.page_mm[1] / chart.page_mm[0])
     axes = figure.subplots()
-    off = np.nan_to_num(cells.mean - cells.offset)
-    largest = 100 * np.take_along_axis(off, np.abs(off).argmax(axis=1)[:, None], axis=1)[:, 0]
+    deviation = np.nan_to_num(cells.mean - cells.offset)
+    largest = 100 * np.take_along_axis(deviation, np.abs(deviation).argmax(axis=1)[:, None], axis=1)[:, 0]
     reach = max(0.5, float(np.percentile(np.abs(largest), 99)))
-    places, side_mm = chart.centres_mm[chart.cell_of_colour], float(np.mean(chart.cell_mm))
-    image = draw_squares(axes, chart.page_mm, places, side_mm, largest, 8.2, cmap="RdBu", vmin=-reach, vmax=reach)
+    centres_mm, side_mm = chart.centres_mm[chart.cell_of_colour], float(np.mean(chart.cell_mm))
+    image = draw_squares(axes, chart.page_mm, centres_mm, side_mm, largest, 8.2, cmap="RdBu", vmin=-reach, vmax=reach)
     figure.colorbar(image, ax=axes, label="B over A, %", shrink=0.8, extend="both")
 
 
 def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | None = None) -> None:
-    """Write a comparison into a new folder, whole or not at all; with a map of the print if its chart is given."""
-    (one, other), cells, same = comparison.places, comparison.cells, comparison.same_within_noise
-    pictures = [figure(draw_png(draw_lights, comparison.lights), "Light by light.", wide=True)]
+    """Write a comparison into a new folder, completely or not at all; with a map of the print if `chart` is given."""
+    (first, second), cells, same = comparison.folders, comparison.cells, comparison.same_within_noise
+    pictures = [figure(draw_png(draw_lights, comparison.lights), "Differences by illuminant.", wide=True)]
     if chart is not None:
-        caption = "The cells on the print. Noise is a fine grain; a stain, a shadow or another field has a shape."
+        caption = "Differences of patches on the print. Noise is fine grain; stains and shadows have shapes."
         pictures.append(figure(draw_png(draw_map, chart, cells), caption, wide=True))
-    answers = [(_ANSWERS[each.same_within_noise], each.name, each.said) for each in comparison.answers]
-    kind, sentence = ("accept", "The same within noise.") if same else ("remark", "They differ by more than noise.")
-    parts = [
-        verdict(kind, sentence),
+    answers = [(_ANSWERS[answer.same_within_noise], answer.name, answer.said) for answer in comparison.answers]
+    outcome, sentence = ("accept", "The same within noise.") if same else ("remark", "The difference exceeds noise.")
+    elements = [
+        verdict(outcome, sentence),
         *(note(f"Note: {warning}.") for warning in comparison.warnings),
-        table("Same within noise", ("", "of", "measured"), answers, (False, False, False)),
+        table("Same within noise", ("", "quantity", "measured"), answers, (False, False, False)),
         *pictures,
     ]
     columns = {"colour": np.arange(len(cells.mean)), "lights": cells.lights.max(axis=1)}
@@ -104,7 +104,7 @@ def write_comparison(comparison: TableComparison, folder: Path, chart: Chart | N
     with atomic_folder(folder, "the comparison") as partial:
         _write_columns(partial / "lights.csv", vars(comparison.lights))
         _write_columns(partial / "cells.csv", columns)
-        write_atomic(partial / "report.html", page(f"{one.name} and {other.name} compared", parts))
+        write_atomic(partial / "report.html", page(f"{first.name} and {second.name} compared", elements))
         write_atomic(partial / "comparison.json", json.dumps(comparison_json(comparison), indent=2) + "\n")
 
 

@@ -1,1 +1,1 @@
-"""The judged figures, one object each: `figure` says what one is, `all_figures` lists those of the other files."""
+"""The judged figures: `figure` defines their type, the other modules the figures, `all_figures` their list."""

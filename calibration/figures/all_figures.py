@@ -1,4 +1,4 @@
-"""All figures, in the order in which they are judged and reported: that of their definitions, file by file."""
+"""All figures in the order of judging and reporting: the order of their definitions, module by module."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from calibration.figures import geometry, light, radiometry, truth
 from calibration.figures.figure import Figure
 
 
-def collected() -> tuple[Figure, ...]:
-    """Return the figures of the files; a ValueError says of one that contradicts itself or another."""
+def collect_figures() -> tuple[Figure, ...]:
+    """Return the figures of all modules; raise ValueError if one contradicts itself or another."""
     modules = (geometry, radiometry, light, truth)
-    found = tuple(value for module in modules for value in vars(module).values() if isinstance(value, Figure))
-    names = {figure.name for figure in found}
-    times = Counter(figure.name for figure in found)
-    for figure in found:
+    figures = tuple(value for module in modules for value in vars(module).values() if isinstance(value, Figure))
+    names = {figure.name for figure in figures}
+    name_counts = Counter(figure.name for figure in figures)
+    for figure in figures:
         if not (figure.title and figure.why and figure.source):
-            raise ValueError(f"{figure.name}: a figure has a title, and limits with their reason and source")
+            raise ValueError(f"{figure.name}: title, why and source are required")
         if figure.refuse is not None and (figure.refuse > figure.accept) != (figure.sense == "at most"):
-            raise ValueError(f"{figure.name}: refused at {figure.refuse}, accepted {figure.sense} {figure.accept}")
+            raise ValueError(f"{figure.name}: refuse = {figure.refuse} contradicts {figure.sense} {figure.accept}")
         if figure.cause is not None and not names.issuperset(figure.cause.follows):
-            raise ValueError(f"{figure.name}: it follows {figure.cause.follows}, which are not all figures")
-    if twice := sorted(name for name, count in times.items() if count > 1):
-        raise ValueError(f"two figures have one of the names {', '.join(twice)}")
-    at: dict[int, str] = {}
-    for figure in found:
+            raise ValueError(f"{figure.name}: follows = {figure.cause.follows} contains an unknown figure")
+    if duplicates := sorted(name for name, count in name_counts.items() if count > 1):
+        raise ValueError(f"duplicate figure names: {', '.join(duplicates)}")
+    owner_by_position: dict[int, str] = {}
+    for figure in figures:
         for line in figure.lines:
-            if line.place in at:
-                raise ValueError(f"{figure.name}: place {line.place} of the summary has a line of {at[line.place]}")
-            at[line.place] = figure.name
-    return found
+            if line.position in owner_by_position:
+                raise ValueError(f"{figure.name}: line {line.position} belongs to {owner_by_position[line.position]}")
+            owner_by_position[line.position] = figure.name
+    return figures
 
 
-FIGURES: tuple[Figure, ...] = collected()
+FIGURES: tuple[Figure, ...] = collect_figures()
 BY_NAME: dict[str, Figure] = {figure.name: figure for figure in FIGURES}

@@ -1,1 +1,1 @@
-"""From the frames of a session to a table, step by step."""
+"""The stages from the frames of a session to a LUT."""

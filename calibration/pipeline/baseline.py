@@ -1,10 +1,9 @@
-"""What all frames of a table share, made once from the first, those of the primaries, and more white ones.
+"""Create the baseline that all frames of a LUT share, from the first frame, the primaries and further white frames.
 
-The shape of the first frame's light is the base of all others', and its cells are what those of every frame are
-compared with; the frames of the primaries show how the field of a coloured cell differs from that of paper, and what
-the lens spreads.
+The flat field of the first frame is the base of all others, and its patches are the reference for every frame. The
+frames of the primaries show the field of coloured patches relative to paper, and the light that the lens spreads.
 
-C cells, W white references, N grey references; places on the print in millimetres, in frames in half-size pixels.
+C patches, W white and N grey references; positions on the print in mm, in frames in half-size px.
 """
 
 from __future__ import annotations
@@ -53,22 +52,23 @@ from foundation.errors import RegistrationError
 from foundation.robust import huber_weights, robust_sigma
 
 _Array = npt.NDArray[np.float64]
+_Frames = Iterable[DecodedFrame]
 
-# Of the polynomial in the codes, where there are cells enough: describes inks to a fraction of a per cent.
+# Degree of the polynomial in the codes, with enough patches: describes inks to a fraction of a per cent.
 CODE_DEGREE = 8
 
-LIGHT_ORDER = 4  # Of the polynomial over the page, where there are cells enough
+LIGHT_ORDER = 4  # Order of the polynomial over the page, with enough patches
 
-_LEAST_CELLS_A_TERM = 5  # Cells for each term of the polynomial in the codes; with fewer its degree is lowered
+_MIN_CELLS_PER_TERM = 5  # Patches per term of the polynomial in the codes; with fewer, its degree is lowered
 
-_LEAST_COUNTS = 10.0  # Counts above black below which a cell's logarithm is mostly noise
+_MIN_COUNTS = 10.0  # Counts above black below which a patch's logarithm is mostly noise
 
-# Counts from which on a cell weighs no more by being brighter: the polynomial's own error exceeds the noise.
-_EVEN_COUNTS = 300.0
+# Counts at which weights of patches approach their maximum: the polynomial's error exceeds noise from there on.
+_FULL_WEIGHT_COUNTS = 300.0
 
-_PAPER_WORTH = 10.0  # Cells that a white reference counts for: its colour needs no polynomial
+_PAPER_WEIGHT = 10.0  # Weight of a white reference, in patches: its colour needs no polynomial
 
-_ROUNDS = 5  # Reweighted solutions in a row; Huber's weights, squared, have settled by then
+_ROUNDS = 5  # Reweighted solutions; Huber's weights, squared, have converged by then
 
 
 def baseline_of(
@@ -80,25 +80,25 @@ def baseline_of(
     *,
     measures_lens: bool = True,
 ) -> Baseline:
-    """Return what all frames share.
+    """Return the baseline.
 
-    `first`: the frame that is registered first. `primaries`: those of red, green and blue alone; the chart may lie
-    elsewhere in them. `more_whites`: more frames of the first one's light, which show the same of the lens with other
-    noise. `measures_lens`: whether the light that the lens spreads is measured, which takes a minute.
+    `first`: frame to register first. `primaries`: frames of red, green and blue alone; the chart may have moved in
+    them. `more_whites`: more frames of the same illuminant, to reduce noise in measuring the lens. `measures_lens`:
+    measure the light that the lens spreads, which takes a minute.
     """
     points = ChartPoints.of(chart)
     registered = register_frame(first, chart, points, options)
-    baseline = _of_first(chart, points, options, first, registered)
-    baseline = replace(baseline, superposition=_superposition(baseline, first, primaries))
+    baseline = _baseline_of_first(chart, points, options, first, registered)
+    baseline = replace(baseline, superposition=_measure_superposition(baseline, first, primaries))
     if measures_lens:
         baseline = with_lens(baseline, first, primaries, more_whites)
     return _with_primaries(baseline, primaries)
 
 
-def _of_first(
+def _baseline_of_first(
     chart: Chart, points: ChartPoints, options: BuildOptions, first: DecodedFrame, registered: RegisteredFrame
 ) -> Baseline:
-    """Return the baseline of a frame in which the chart is registered, its lens corrected where that is said there."""
+    """Return the baseline of a registered frame, with the lens corrected if `registered` has a correction."""
     cells = gather(first.mosaic, first.black, registered.cells)[0].astype(np.float64)
     references, highest = gather(first.mosaic, first.black, registered.references)
     spread = cells.var(axis=1, ddof=1)
@@ -111,9 +111,9 @@ def _of_first(
     whites = usable_means(references, highest, registered.references, first.saturation)[: len(points.whites_mm)]
     base = PaperReader(points.whites_mm, points.cells_mm, chart.page_mm).read(whites, first.record.file)[0].field
     if not chart.tags:
-        # Its references are in the margin, and do not show what light there is in the middle.
-        there, codes = compared_cells(chart, registered), chart.rgb[chart.cell_of_colour]
-        base = field_of_cells(codes, points.cells_mm, level, there, points.whites_mm, whites, chart.page_mm)
+        # References are only in the margin, and do not show the light in the centre.
+        usable, codes = compared_cells(chart, registered), chart.rgb[chart.cell_of_colour]
+        base = field_of_cells(codes, points.cells_mm, level, usable, points.whites_mm, whites, chart.page_mm)
     order = MAX_ORDER if chart.tags else MAX_ORDER_AROUND
     return Baseline(
         chart=chart,
@@ -130,21 +130,20 @@ def _of_first(
     )
 
 
-def _superposition(baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame]) -> Superposition:
-    """Return what the first frame shows of linearity beside the primaries; what is usual without them."""
+def _measure_superposition(baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame]) -> Superposition:
     usual, frames = baseline.superposition, [first, *primaries]
     if not primaries:
         return usual
     if not all(_is_still(baseline, decoded) for decoded in frames):
         return Superposition.usual(usual.full, MOVED)
-    seen, peaks = zip(*(baseline.patches(one.mosaic, one.black) for one in frames), strict=True)
-    clipped = [peak >= CLIPPING_SHARE * one.saturation for peak, one in zip(peaks, frames, strict=True)]
-    usable = np.isfinite(seen).all(axis=(0, 2)) & ~np.any(clipped, axis=0)
+    means, peaks = zip(*(baseline.patches(decoded.mosaic, decoded.black) for decoded in frames), strict=True)
+    clipped = [peak >= CLIPPING_SHARE * decoded.saturation for peak, decoded in zip(peaks, frames, strict=True)]
+    usable = np.isfinite(means).all(axis=(0, 2)) & ~np.any(clipped, axis=0)
     chart, points = baseline.chart, baseline.points
     usable[: chart.colour_count] &= compared_cells(chart, baseline.first)
     return superposition(
-        seen[1:],
-        seen[0],
+        means[1:],
+        means[0],
         usual.full,
         usable,
         printed_predictors(chart.rgb[chart.cell_of_colour], points.printed),
@@ -155,7 +154,7 @@ def _superposition(baseline: Baseline, first: DecodedFrame, primaries: Sequence[
 def with_lens(
     baseline: Baseline, first: DecodedFrame, primaries: Sequence[DecodedFrame], more_whites: Iterable[DecodedFrame]
 ) -> Baseline:
-    """Return the baseline with the lens measured, and corrected where the print proves that it spreads light."""
+    """Return the baseline with the measured lens, and corrected for it if the print proves that it spreads light."""
     chart, points = baseline.chart, baseline.points
     if unsuitable(chart):
         return baseline
@@ -170,23 +169,23 @@ def with_lens(
         baseline.options.window,
     )
     around = view.around(registered.registration, registered.cells, registered.references)
-    seen = [_spread_frame(baseline, [decoded], view, mixed=False) for decoded in primaries]
-    if not any(seen) or chart.bits < VARYING_BITS:
-        # Few cells show so little of the lens that their noise matters.
-        seen.append(_spread_frame(baseline, chain([first], more_whites), view, mixed=True))
-    frames = [frame for frame in seen if frame is not None]
-    left_out = "" if baseline.options.lens_correction else "left out by --no-lens-correction"
-    # Threads of linear algebra wait for one another on a busy machine for longer than it takes.
+    candidates = [_spread_frame(baseline, [decoded], view, is_mixed=False) for decoded in primaries]
+    if not any(candidates) or chart.bits < VARYING_BITS:
+        # With few patches, noise limits the measurement of the lens.
+        candidates.append(_spread_frame(baseline, chain([first], more_whites), view, is_mixed=True))
+    frames = [frame for frame in candidates if frame is not None]
+    reason = "" if baseline.options.lens_correction else "disabled by --no-lens-correction"
+    # On a busy machine, threads of linear algebra wait for each other longer than the work takes.
     with threadpool_limits(limits=1, user_api="blas"):
-        found = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS, left_out)
-    if found is None:
+        measurement = measure_spread(frames, around, chart.page_mm, chart.bits, LEAST_COUNTS, reason)
+    if measurement is None:
         return baseline
-    lens = LensCorrection(view, *found)
+    lens = LensCorrection(view, *measurement)
     measured = replace(baseline, lens=lens)
     if not measured.corrects_lens:
         return measured
     correction = FrameCorrection.of(lens.spread, view, around)
-    corrected = _of_first(chart, points, baseline.options, first, replace(registered, lens=correction))
+    corrected = _baseline_of_first(chart, points, baseline.options, first, replace(registered, lens=correction))
     return replace(corrected, lens=lens, superposition=baseline.superposition)
 
 
@@ -195,11 +194,8 @@ def _is_still(baseline: Baseline, decoded: DecodedFrame) -> bool:
     return shift.gauges > 0 and shift.length_px <= STILL_PX and shift.largest_px <= 2 * STILL_PX
 
 
-def _spread_frame(baseline: Baseline, same: Iterable[DecodedFrame], view: PrintView, mixed: bool) -> SpreadFrame | None:
-    """Return the mean of frames of one light as the lens is measured on it; None where the chart has moved in all.
-
-    `mixed` is whether several primaries light it.
-    """
+def _spread_frame(baseline: Baseline, frames: _Frames, view: PrintView, is_mixed: bool) -> SpreadFrame | None:
+    # Mean of the frames of one illuminant in which the chart has not moved. `is_mixed`: several primaries.
     chart, points = baseline.chart, baseline.points
     usable = ~np.concatenate(
         [
@@ -208,7 +204,7 @@ def _spread_frame(baseline: Baseline, same: Iterable[DecodedFrame], view: PrintV
         ]
     )
     total, beyond, count, file = np.zeros((len(usable), 3)), np.zeros(3), 0, ""
-    for decoded in same:
+    for decoded in frames:
         if not _is_still(baseline, decoded):
             continue
         means, highest = baseline.patches(decoded.mosaic, decoded.black)
@@ -219,10 +215,10 @@ def _spread_frame(baseline: Baseline, same: Iterable[DecodedFrame], view: PrintV
     if not count:
         return None
     whites, sensor = points.white_patches, baseline.superposition
-    # Counts that are lost near black would look like a lack of light that the lens spreads, and hide a veil.
-    means, beyond = (seen / count for seen in (total, beyond))
+    # Counts lost near black would look like less spread light, and hide veiling glare.
+    means, beyond = (values / count for values in (total, beyond))
     usual = np.median(means[whites], axis=0)
-    means, beyond = (seen * (1 - sensor.beside(np.maximum(seen, 0), usual)[0]) for seen in (means, beyond))
+    means, beyond = (values * (1 - sensor.beside(np.maximum(values, 0), usual)[0]) for values in (means, beyond))
     paper, _ = baseline.paper.read(np.where(usable[whites, None], means[whites], np.nan), file)
     red, green, blue = np.sqrt(sensor.beside(DARK_LEVEL * paper.white, paper.white)[1]).tolist()
     return SpreadFrame(
@@ -230,7 +226,7 @@ def _spread_frame(baseline: Baseline, same: Iterable[DecodedFrame], view: PrintV
         field=paper.field.at(view.grid.points_mm),
         white=paper.white,
         usable=usable,
-        unevenness=LOOSE_UNEVENNESS if mixed else USUAL_UNEVENNESS,
+        unevenness=LOOSE_UNEVENNESS if is_mixed else USUAL_UNEVENNESS,
         frames=count,
         bend=(red, green, blue),
         printed=np.concatenate([np.full(chart.colour_count, -1), points.printed]),
@@ -238,7 +234,7 @@ def _spread_frame(baseline: Baseline, same: Iterable[DecodedFrame], view: PrintV
 
 
 def _with_primaries(baseline: Baseline, frames: Sequence[DecodedFrame]) -> Baseline:
-    """Return the baseline with what frames of the primaries show; as it is if there are none, or one cannot be used."""
+    """Return the baseline with the primaries; unchanged if they are missing or unusable."""
     lights: list[int] = []
     papers: list[Paper] = []
     cells: list[_Array] = []
@@ -269,20 +265,20 @@ def field_of_cells(
     paper: _Array,
     page_mm: tuple[float, float],
 ) -> FlatField:
-    """Return the field of a frame from its cells.
+    """Return the flat field of a frame from its patches.
 
-    `rgb`: (C, 3) int printed codes, 0 … 255. `cells_mm`: (C, 2) float64 mm, the cells' centres. `level`: (C, 3) float64
-    mean counts above black. `usable`: (C,) bool, cells that lie in the frame and are not covered. `paper_mm`, `paper`:
-    (N, 2) mm, white references, and (N, 3) their mean counts above black; NaN where one cannot be used.
+    `rgb`: (C, 3) int printed codes, 0 … 255. `cells_mm`: (C, 2) float64 mm, centres. `level`: (C, 3) float64 mean
+    counts above black. `usable`: (C,) bool, inside the frame and not covered. `paper_mm`: (N, 2) mm, white references.
+    `paper`: (N, 3) their mean counts above black; NaN if unusable.
     """
     degree = CODE_DEGREE
-    while degree > 1 and len(cells_mm) < _LEAST_CELLS_A_TERM * len(code_powers(degree)):
+    while degree > 1 and len(cells_mm) < _MIN_CELLS_PER_TERM * len(code_powers(degree)):
         degree -= 1
-    # In few blocks of few cells a light of higher order cannot be separated from the inks' interaction.
+    # With few patches, a higher order of light cannot be separated from the interaction of inks.
     order = LIGHT_ORDER if degree == CODE_DEGREE else min(2, degree)
     codes = code_polynomial(rgb, degree)
     light, at_paper = page_polynomial(cells_mm, page_mm, order), page_polynomial(paper_mm, page_mm, order)
-    # Light's constant is the colours' too; bare paper need not be what ink of code 255 is.
+    # Light and colours share one constant; bare paper has its own, because code 255 may print ink.
     design = np.block(
         [
             [codes, light[:, 1:], np.zeros((len(codes), 1))],
@@ -291,20 +287,20 @@ def field_of_cells(
     )
     factors: list[tuple[_Array, ...]] = []
     for channel in range(3):
-        seen = np.concatenate([level[:, channel], paper[:, channel]])
-        there = np.concatenate([usable, np.ones(len(paper), dtype=np.bool_)]) & (np.nan_to_num(seen) > _LEAST_COUNTS)
-        if there.sum() < 2 * design.shape[1]:
+        counts = np.concatenate([level[:, channel], paper[:, channel]])
+        is_used = np.concatenate([usable, np.ones(len(paper), dtype=np.bool_)]) & (np.nan_to_num(counts) > _MIN_COUNTS)
+        if is_used.sum() < 2 * design.shape[1]:
             factors.append(())
             continue
-        value, rows = np.log(seen[there]), np.ascontiguousarray(design[there])
-        trust = seen[there] / (seen[there] + _EVEN_COUNTS)
-        trust *= np.where(np.arange(len(seen))[there] < len(codes), 1.0, _PAPER_WORTH)
-        weights, solution = trust, np.zeros(design.shape[1])
+        value, rows = np.log(counts[is_used]), np.ascontiguousarray(design[is_used])
+        base_weights = counts[is_used] / (counts[is_used] + _FULL_WEIGHT_COUNTS)
+        base_weights *= np.where(np.arange(len(counts))[is_used] < len(codes), 1.0, _PAPER_WEIGHT)
+        weights, solution = base_weights, np.zeros(design.shape[1])
         for _ in range(_ROUNDS):
             solution = least_squares(rows, value, weights)
-            off = np.abs(value - rows @ solution)
-            spread = max(robust_sigma(off), 1e-6)
-            weights = trust * huber_weights(off, spread) ** 2
+            residual = np.abs(value - rows @ solution)
+            spread = max(robust_sigma(residual), 1e-6)
+            weights = base_weights * huber_weights(residual, spread) ** 2
         shape = np.exp(light[:, 1:] @ solution[codes.shape[1] : -1])
         smooth = least_squares(np.ascontiguousarray(light), shape, np.ones(len(shape)))
         factors.append((smooth / float((light @ smooth).mean()),))

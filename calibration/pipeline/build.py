@@ -1,4 +1,4 @@
-"""A session becomes a table, in a straight line of stages; each takes a value and returns the next one.
+"""Build a LUT from a session, in a straight line of stages; each takes a value and returns the next one.
 
 The stages, their functions and their values::
 
@@ -8,19 +8,17 @@ The stages, their functions and their values::
     located        measuring.locate              LocatedFrame
     sampled        measuring.sample              SampledFrame
     measured       measuring.measure             MeasuredFrame
-    collected      Accumulator.with_frame        Accumulator
+    accumulated    Accumulator.with_frame        Accumulator
     figures        table_figures.table_figures   TableMeasurements
     verdict        calibration.verdict.judge     Verdict
-    table          _write_table                  the folder
+    LUT            _write_table                  the folder
 
-Threads take frames from decoded to measured before their turn, with what is collected at that moment (`_measured`); a
-frame counts only if the frame registered last is still the same, and is measured again otherwise. The memory is that of
-a few frames whatever the session.
+Threads decode and measure frames in advance with the current `Accumulator`. A result is discarded and measured again if
+the chart was registered again in between. The memory holds a few frames at a time.
 
-The table appears whole or not at all. Until then it stands beside its place under a hidden name, and a build that was
-stopped, anywhere, goes on from its last checkpoint and ends in the bytes of one that was not. A checkpoint is a record
-and its file of arrays (`checkpoint`): the accumulator, and the hashes of the samples on the disk. It is used only if it
-was made of what is asked for now and the samples have these hashes.
+The LUT appears complete or not at all. Until then it is a hidden folder next to its final path, and an interrupted
+build resumes from its last checkpoint (`checkpoint`) with an identical result. A checkpoint is used only if its inputs
+and options are unchanged and the samples on disk have the recorded hashes.
 """
 
 from __future__ import annotations
@@ -89,29 +87,29 @@ from foundation.folders import clear_folder
 from foundation.records import to_plain
 from foundation.version import software
 
-CHECKPOINT_EVERY = 16  # Frames from one checkpoint to the next: what a build that is killed has to do again
+CHECKPOINT_EVERY = 16  # Frames between checkpoints: the largest number that a killed build repeats
 
-# Raised when samples, ground truth or unfit cells come out otherwise, so that no table is made by two methods.
+# Version of the method: increased if samples, ground truth or unfit patches change, so that no LUT mixes methods.
 METHOD = 17
 
-MOST_THREADS = 8  # Each thread holds a raw file and its counts, 110 MB for a 6D Mark II: more would not stay below 2 GB
+MAX_THREADS = 8  # A thread needs 110 MB for a raw file and its counts (6D Mark II); the limit is 2 GB in total
 
 _Result = TypeVar("_Result")
 
-# A frame as measured before its turn; None where the chart has to be registered again in it.
+# A frame measured in advance; None if the chart must be registered again in it.
 EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
 
-# Writes the report of a result and its session into a folder; `calibration.report.report.write_report`.
+# Writes the report of a result and its session into a folder: `calibration.report.report.write_report`.
 WriteReport = Callable[[BuildResult, Session, Path], None]
 
 
 @dataclass(frozen=True)
 class TableProgress:
-    """How far a table has come that still lacks frames; `new_frames` of them were taken in now."""
+    """Progress of a LUT that still lacks frames."""
 
     lights: int
     lights_planned: int
-    new_frames: int
+    new_frames: int  # Frames added by this call
     frames: int
 
 
@@ -124,39 +122,58 @@ def build(
     linearity: Path | None = None,
     judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
-    """Build the table of a session, whole or not at all, and return it with its figures.
+    """Build the LUT of a session, completely or not at all, and judge it.
 
-    `out`: the table's folder, which must not be there. `progress`: told frames done, frames in all, and what is done.
-    `report`: writes a report into the folder before it gets its name. `linearity`: a measurement of the sensor to
-    correct by. `judged_by`: the figures of the verdict. Raises FormatError where frames, or the linearity, cannot make
-    a table, InputError where the folder may not be written.
+    Parameters
+    ----------
+    session : Session
+    out : Path
+        Folder of the LUT; it must not exist.
+    progress : ReportProgress, optional
+        Called with the number of finished frames, of all frames, and the current step.
+    report : WriteReport, optional
+        Writes a report into the folder before it gets its final name.
+    options : BuildOptions
+    linearity : Path, optional
+        Folder with a series of exposures, to measure the sensor's linearity.
+    judged_by : Sequence[Figure]
+        Figures of the verdict.
+
+    Raises
+    ------
+    FormatError
+        If the frames or the series cannot be used.
+    QualityError
+        If the LUT is refused.
+    InputError
+        If the folder cannot be written.
     """
     selected = select_frames(session)
     if selected.lights_without:
         raise FormatError(
-            f"{session.folder}: {len(selected.lights_without)} of {len(session.illuminations)} lights have no accepted "
-            f"frame: {first_few(selected.lights_without)}; finish the session with acquire run, then build the table; "
-            "or take in what there is with build-lut --append"
+            f"{session.folder}: {len(selected.lights_without)} of {len(session.illuminations)} illuminants have no "
+            f"accepted frame: {first_few(selected.lights_without)}; all are expected. Finish the session with acquire "
+            "run, or add the available frames with build-lut --append"
         )
     _require_dark_frames(session, options)
     _require_white_frames(selected, session, options)
     show = progress or _no_progress
     with unfinished_table(out) as unfinished:
-        done, writer, series = _take_in_all(session, selected, options, linearity, unfinished, show)
-        show(len(done.figures), len(done.figures), "writing the report")
-        figures = table_figures(done, series)
+        accumulator, writer, series = _accumulate_all(session, selected, options, linearity, unfinished, show)
+        show(len(accumulator.figures), len(accumulator.figures), "writing the report")
+        figures = table_figures(accumulator, series)
         result = BuildResult(figures, judge(judged_values(figures), judged_by), out)
         if figures.lights.drift is not None and not result.verdict.refused:
-            # A build that is killed meanwhile finds other samples than its checkpoint names, and begins anew.
+            # A build killed here finds samples that differ from its checkpoint, and starts again.
             for light, gain in enumerate(figures.lights.drift.gains):
                 writer.put(light, corrected(writer.get(light), gain))
-        # The table lists the hashes of its report.
+        # The LUT lists the hashes of its report, so the report is written first.
         if report is not None:
             report(result, session, unfinished.folder)
-        _write_table(done, figures, writer)
+        _write_table(accumulator, figures, writer)
         if result.verdict.refused:
             unfinished.keep = False
-            raise _refused(result, out, unfinished.folder)
+            raise _refusal_error(result, out, unfinished.folder)
         unfinished.publish()
         return result
 
@@ -170,25 +187,25 @@ def append(
     linearity: Path | None = None,
     judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult | TableProgress:
-    """Take in the frames that have come so far of a session that is being taken.
+    """Add the frames available so far of a session in progress.
 
-    The table is made under a hidden name and appears when the plan's last frame has been taken in, the same to the byte
-    as if it had been built at once. Parameters and errors are those of `build`, except that lights may be missing.
+    The LUT is built under a hidden name. It appears after the last frame, with the same bytes as from one `build`.
+    Parameters and errors are those of `build`, but illuminants may be missing.
     """
     selected = select_frames(session)
-    # The plan of a session that was put together otherwise may be empty; its lights are the plan then.
+    # An imported session may have an empty plan; its illuminants are the plan then.
     if not selected.lights_without and {step.number for step in session.steps} <= session.done_steps():
         return build(session, out, progress, report, options, linearity, judged_by)
     _require_dark_frames(session, options)
     with unfinished_table(out) as unfinished:
-        stored = unfinished.load(_identity(session, selected, options), _frame_keys(selected))
-        frames, before = len(selected.records), 0 if stored is None else len(stored.frames)
-        if before < frames:
-            show = progress or _no_progress
-            done, writer, _ = _take_in_all(session, selected, options, linearity, unfinished, show)
-            unfinished.save(_checkpoint(done, writer))
+        checkpoint = unfinished.load(_identity(session, selected, options), _frame_keys(selected))
+        frames, previous_count = len(selected.records), 0 if checkpoint is None else len(checkpoint.frames)
+        if previous_count < frames:
+            report_progress = progress or _no_progress
+            accumulator, writer, _ = _accumulate_all(session, selected, options, linearity, unfinished, report_progress)
+            unfinished.save(_checkpoint(accumulator, writer))
         lights = len(session.illuminations)
-        return TableProgress(lights - len(selected.lights_without), lights, frames - before, frames)
+        return TableProgress(lights - len(selected.lights_without), lights, frames - previous_count, frames)
 
 
 def check(
@@ -198,9 +215,9 @@ def check(
     picture: Path | None = None,
     judged_by: Sequence[Figure] = FIGURES,
 ) -> BuildResult:
-    """Register a session's best frame and judge it; write nothing but a picture.
+    """Register the chart in a session's best frame and judge this frame; writes only the picture.
 
-    `picture`: where to draw what was found on the frame, or looked for, PNG; None for nowhere.
+    `picture`: PNG path for the frame with the detected or expected chart; None for no picture.
     """
     _require_dark_frames(session, options)
     selected = select_frames(session)
@@ -209,30 +226,30 @@ def check(
         baseline = baseline_of(session.chart, first, replace(options, subtract_dark=False))
     except RegistrationError as error:
         if picture is None:
-            raise RegistrationError(f"{error}; see what is there with --picture PNG") from error
+            raise RegistrationError(f"{error}; use --picture PNG to see the frame") from error
         write_atomic(picture, annotated_png(first.mosaic, session.chart, None))
         raise RegistrationError(f"{error}; see {picture}") from error
     if picture is not None:
         write_atomic(picture, annotated_png(first.mosaic, session.chart, baseline.first.registration.framing))
     located = LocatedFrame(first, baseline.first, baseline.first, IN_PLACE, reregistered=False)
-    done = Accumulator.empty(session, selected, baseline, first.saturation)
-    done = done.with_frame(measure(baseline, sample(baseline, located, dark=None, keep_samples=True)))
+    accumulator = Accumulator.empty(session, selected, baseline, first.saturation)
+    accumulator = accumulator.with_frame(measure(baseline, sample(baseline, located, dark=None, keep_samples=True)))
     dark = selected.first_dark
     if dark is not None:
-        done = done.with_frame(measure_dark(baseline, decode_frame(session, dark), baseline.first))
+        accumulator = accumulator.with_frame(measure_dark(baseline, decode_frame(session, dark), baseline.first))
     series = None if linearity is None else read_linearity(linearity, baseline)
-    figures = check_figures(done, series)
+    figures = check_figures(accumulator, series)
     return BuildResult(figures, judge(judged_values(figures), judged_by), None)
 
 
 def judge_trial(
     session: Session, saturation: int, options: BuildOptions = PAPER_OPTIONS, linearity: Path | None = None
 ) -> BuildResult:
-    """Judge a few trial frames as those of a whole session; write nothing.
+    """Judge a few trial frames like a whole session; writes nothing.
 
-    The lens is not measured, which takes a minute; nor are the figures that rest on it.
+    The lens, and the figures that depend on it, are not measured, because that takes a minute.
 
-    `saturation`: the raw count at which the sensor saturates. `linearity`: a folder with a series of exposures.
+    `saturation`: raw count of saturation. `linearity`: folder with a series of exposures.
     """
     selected = select_frames(session)
     first = decode_frame(session, selected.registered)
@@ -240,12 +257,12 @@ def judge_trial(
     baseline = baseline_of(session.chart, first, options, primaries, measures_lens=False)
     series = None if linearity is None else read_linearity(linearity, baseline)
     empty = Accumulator.empty(session, selected, baseline, min(saturation, first.saturation))
-    done, _ = deque(_collected(empty, selected.records), maxlen=1).pop()
-    figures = table_figures(done, series)
+    accumulator, _ = deque(_accumulate(empty, selected.records), maxlen=1).pop()
+    figures = table_figures(accumulator, series)
     return BuildResult(figures, judge(judged_values(figures), FIGURES), None)
 
 
-def _take_in_all(
+def _accumulate_all(
     session: Session,
     selected: SelectedFrames,
     options: BuildOptions,
@@ -253,97 +270,90 @@ def _take_in_all(
     unfinished: UnfinishedTable,
     progress: ReportProgress,
 ) -> tuple[Accumulator, LutWriter, LinearityMeasurements | None]:
-    """Return what all frames give, after taking in those that an earlier program has not, with their samples written.
-
-    With them what a series of exposures shows, which is read first: it may be none.
-    """
     records = selected.records
-    stored = unfinished.load(_identity(session, selected, options), _frame_keys(selected))
-    writer, stored = _writer(session, options, unfinished, stored)
-    progress(0, len(records), "finding the chart")
-    done = _begin(session, selected, options)
-    series = None if linearity is None else read_linearity(linearity, done.baseline)
-    if stored is not None:
-        done = done.restored(stored.values, stored.arrays)
-    before = len(done.figures)
+    checkpoint = unfinished.load(_identity(session, selected, options), _frame_keys(selected))
+    writer, checkpoint = _open_writer(session, options, unfinished, checkpoint)
+    progress(0, len(records), "registering the chart")
+    accumulator = _new_accumulator(session, selected, options)
+    series = None if linearity is None else read_linearity(linearity, accumulator.baseline)
+    if checkpoint is not None:
+        accumulator = accumulator.restored(checkpoint.values, checkpoint.arrays)
+    previous_count = len(accumulator.figures)
     try:
-        for collected, frame in _collected(done, records[before:]):
-            done = collected
-            record = records[len(done.figures) - 1]
+        for updated, frame in _accumulate(accumulator, records[previous_count:]):
+            accumulator = updated
+            record = records[len(accumulator.figures) - 1]
             if isinstance(frame, MeasuredFrame) and record.kind == "light" and record.illumination is not None:
                 writer.put(record.illumination, frame.values)
-            if (len(done.figures) - before) % CHECKPOINT_EVERY == 0:
-                unfinished.save(_checkpoint(done, writer))
-            progress(len(done.figures), len(records), record.file)
+            if (len(accumulator.figures) - previous_count) % CHECKPOINT_EVERY == 0:
+                unfinished.save(_checkpoint(accumulator, writer))
+            progress(len(accumulator.figures), len(records), record.file)
     except ChangedFrame:
         raise
     except (FormatError, QualityError) as error:
-        raise _stopped_by(error, records[len(done.figures)], done, unfinished.out) from error
-    return done, writer, series
+        raise _frame_error(error, records[len(accumulator.figures)], accumulator, unfinished.out) from error
+    return accumulator, writer, series
 
 
-def _collected(
-    done: Accumulator, records: Sequence[FrameRecord]
+def _accumulate(
+    accumulator: Accumulator, records: Sequence[FrameRecord]
 ) -> Generator[tuple[Accumulator, MeasuredFrame | MeasuredDarkFrame]]:
-    """Yield what is collected after each frame, and that frame as measured; threads measure those that follow."""
+    """Yield the accumulator after each frame, with the measured frame; threads measure the next ones."""
 
     def measure_early(record: FrameRecord) -> EarlyMeasurement:
-        # In a thread, with what is collected at that moment.
-        return _measured(done, record, register_again=False)
+        # Runs in a thread, with the accumulator of that moment.
+        return _measure_frame(accumulator, record, register_again=False)
 
     def others_wait_for(record: FrameRecord) -> bool:
-        return done.baseline.options.subtract_dark and record.kind == "dark"
+        return accumulator.baseline.options.subtract_dark and record.kind == "dark"
 
-    for record, early in prefetched(measure_early, records, others_wait_for):
-        frame = early
-        if frame is None or frame.registered is not done.registered:
-            frame = _measured(done, record, register_again=True)
+    for record, prefetched_frame in prefetched(measure_early, records, others_wait_for):
+        frame = prefetched_frame
+        if frame is None or frame.registered is not accumulator.registered:
+            frame = _measure_frame(accumulator, record, register_again=True)
             assert frame is not None
-        done = done.with_frame(frame)
-        yield done, frame
+        accumulator = accumulator.with_frame(frame)
+        yield accumulator, frame
 
 
-def _measured(done: Accumulator, record: FrameRecord, register_again: bool) -> EarlyMeasurement:
-    """Return what a frame shows beside those taken in: from its file to its figures. Thread-safe.
-
-    None where the chart has to be registered again and `register_again` is False.
-    """
-    baseline = done.baseline
-    decoded = decode_frame(done.session, record)
+def _measure_frame(accumulator: Accumulator, record: FrameRecord, register_again: bool) -> EarlyMeasurement:
+    baseline = accumulator.baseline
+    decoded = decode_frame(accumulator.session, record)
     if record.kind == "dark":
-        return measure_dark(baseline, decoded, done.registered)
-    located = locate(baseline, decoded, done.registered, register_again)
+        return measure_dark(baseline, decoded, accumulator.registered)
+    located = locate(baseline, decoded, accumulator.registered, register_again)
     if located is None:
         return None
-    return measure(baseline, sample(baseline, located, done.dark, keep_samples=done.selected.is_even(record)))
+    is_even = accumulator.selected.is_even(record)
+    return measure(baseline, sample(baseline, located, accumulator.dark, keep_samples=is_even))
 
 
-def _begin(session: Session, selected: SelectedFrames, options: BuildOptions) -> Accumulator:
-    """Return what there is before any frame: what all frames share, and the dark light of the first dark frame."""
+def _new_accumulator(session: Session, selected: SelectedFrames, options: BuildOptions) -> Accumulator:
     first = decode_frame(session, selected.registered)
     primaries = [decode_frame(session, record) for record in selected.primaries]
-    more_whites = _whole_frames(session, selected.more_whites)
+    more_whites = _readable_frames(session, selected.more_whites)
     baseline = baseline_of(session.chart, first, options, primaries, more_whites)
-    # The counts of these frames are not held any longer: they are read again in their turn.
+    # These frames are read again in their turn, to save memory.
     dark = selected.first_dark if options.subtract_dark else None
     measured_dark = None if dark is None else measure_dark(baseline, decode_frame(session, dark), baseline.first)
     return Accumulator.empty(session, selected, baseline, first.saturation, measured_dark)
 
 
-def _whole_frames(session: Session, records: Sequence[FrameRecord]) -> Iterator[DecodedFrame]:
-    """Yield frames; what is wrong with one is said when its turn comes."""
+def _readable_frames(session: Session, records: Sequence[FrameRecord]) -> Iterator[DecodedFrame]:
     for record in records:
+        # A fault of a frame is reported in its turn.
         with contextlib.suppress(CropError):
             yield decode_frame(session, record)
 
 
-def _stopped_by(
-    error: FormatError | QualityError, record: FrameRecord, done: Accumulator, out: Path
+def _frame_error(
+    error: FormatError | QualityError, record: FrameRecord, accumulator: Accumulator, out: Path
 ) -> FormatError | QualityError:
-    """Return why the build ends at a frame, after naming it in a report that `acquire run --retake bad` reads."""
-    says = {"format": REPORT_FORMAT, "version": REPORT_VERSION, "verdict": "refuse", "reason": str(error)}
-    says |= {"session": done.session.folder.name, **retake_json((record,), record.sha256, done.selected.newest.sha256)}
-    write_atomic(refused_folder(out) / REPORT_JSON, json.dumps(says, indent=2) + "\n")
+    """Return the error that ends the build, after writing a report for `acquire run --retake bad`."""
+    content = {"format": REPORT_FORMAT, "version": REPORT_VERSION, "verdict": "refuse", "reason": str(error)}
+    content["session"] = accumulator.session.folder.name
+    content |= retake_json((record,), record.sha256, accumulator.selected.newest.sha256)
+    write_atomic(refused_folder(out) / REPORT_JSON, json.dumps(content, indent=2) + "\n")
     return type(error)(f"{error}; or take {record.file} again: {COMMAND}")
 
 
@@ -352,27 +362,27 @@ def prefetched(
     records: Sequence[FrameRecord],
     others_wait_for: Callable[[FrameRecord], bool],
 ) -> Generator[tuple[FrameRecord, _Result]]:
-    """Yield each frame with what `work` returned for it, in order, while threads work on those that follow."""
+    """Yield each frame with its result of `work`, in order, while threads process the following frames."""
     count = thread_count()
     with ThreadPoolExecutor(count) as pool:
-        begun: deque[tuple[FrameRecord, Future[_Result]]] = deque()
-        todo = deque(records)
+        running: deque[tuple[FrameRecord, Future[_Result]]] = deque()
+        waiting = deque(records)
         try:
-            while todo or begun:
-                while todo and len(begun) <= count and not any(others_wait_for(record) for record, _ in begun):
-                    record = todo.popleft()
-                    begun.append((record, pool.submit(work, record)))
-                record, future = begun[0]
+            while waiting or running:
+                while waiting and len(running) <= count and not any(others_wait_for(record) for record, _ in running):
+                    record = waiting.popleft()
+                    running.append((record, pool.submit(work, record)))
+                record, future = running[0]
                 result = future.result()
                 yield record, result
-                begun.popleft()
+                running.popleft()
         finally:
-            for _, future in begun:
+            for _, future in running:
                 future.cancel()
 
 
-def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWriter) -> None:
-    session, records, lights, greys = done.session, done.records, figures.lights, figures.greys
+def _write_table(accumulator: Accumulator, figures: TableMeasurements, writer: LutWriter) -> None:
+    session, records, lights, greys = accumulator.session, accumulator.records, figures.lights, figures.greys
     by_light = {frame.record.illumination: frame for frame in figures.frames if frame.record.kind == "light"}
     frames = [by_light[light.index] for light in session.illuminations]
     applied = corrections(
@@ -387,7 +397,7 @@ def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWrite
     )
     if figures.primaries is not None:
         applied.append(figures.primaries.correction(lights.white))
-    lens = done.baseline.lens
+    lens = accumulator.baseline.lens
     if lens is not None and figures.lens.corrected:
         applied.append(lens.correction())
     gain = np.ones(lights.white.shape)
@@ -395,7 +405,7 @@ def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWrite
         gain = lights.drift.gains
         applied.append(applied_drift(gain))
     provenance = Provenance(
-        camera=done.baseline.camera,
+        camera=accumulator.baseline.camera,
         bits=session.chart.bits,
         white_level=figures.sensor.white_level,
         corrections=applied,
@@ -415,29 +425,28 @@ def _write_table(done: Accumulator, figures: TableMeasurements, writer: LutWrite
     writer.finish(session.illuminations, lights.white / gain, provenance, source_frames(records), files)
 
 
-def _refused(result: BuildResult, out: Path, folder: Path) -> QualityError:
-    """Return why there is no table; its report is kept beside the place where the table would be."""
-    refused = refused_folder(out)
-    kept = [name for name in (REPORT_PAGE, REPORT_JSON) if (folder / name).exists()]
-    for name in kept:
-        write_atomic(refused / name, (folder / name).read_bytes())
-    where = f"; see {refused / kept[0]}" if kept else ""
+def _refusal_error(result: BuildResult, out: Path, folder: Path) -> QualityError:
+    report_folder = refused_folder(out)
+    saved = [name for name in (REPORT_PAGE, REPORT_JSON) if (folder / name).exists()]
+    for name in saved:
+        write_atomic(report_folder / name, (folder / name).read_bytes())
+    hint = f"; see {report_folder / saved[0]}" if saved else ""
     figures = result.figures
     return QualityError(
-        f"{figures.session.folder}: no table is made. {refusal(result.verdict, figures, reported=bool(kept))}{where}"
+        f"{figures.session.folder}: the LUT is refused. {refusal(result.verdict, figures, reported=bool(saved))}{hint}"
     )
 
 
 def refused_folder(out: Path) -> Path:
-    """Return where the report of a refused table goes: `LUT.refused` beside `LUT`."""
+    """Return the folder for the report of a refused LUT: `LUT.refused` next to `LUT`."""
     return out.with_name(f"{out.name}.refused")
 
 
 def _require_dark_frames(session: Session, options: BuildOptions) -> None:
     if options.subtract_dark and not any(record.kind == "dark" and record.accepted for record in session.frames()):
         raise FormatError(
-            f"{session.folder} has no accepted dark frame, and --subtract-dark takes the light to subtract from them; "
-            "take the session with acquire run, which takes dark frames, or build the table without --subtract-dark"
+            f"{session.folder} has no accepted dark frame; --subtract-dark needs at least 1. Take the session with "
+            "acquire run, which takes dark frames, or build the LUT without --subtract-dark"
         )
 
 
@@ -445,19 +454,18 @@ def _require_white_frames(selected: SelectedFrames, session: Session, options: B
     count = sum(record.kind == "white" for record in selected.records)
     if options.correct_drift and count < LEAST_WHITES:
         raise FormatError(
-            f"{session.folder} has {counted(count, 'accepted white frame')}, and --correct-drift takes the lamp's "
-            f"drift from {LEAST_WHITES} or more; take the session with acquire run, which takes one every "
-            "sequence.reference_every lights, or build the table without --correct-drift"
+            f"{session.folder} has {counted(count, 'accepted white frame')}; --correct-drift needs at least "
+            f"{LEAST_WHITES}. Take the session with acquire run, which takes one every sequence.reference_every "
+            "illuminants, or build the LUT without --correct-drift"
         )
 
 
-def _no_progress(done: int, total: int, what: str) -> None:
-    """Show nothing."""
+def _no_progress(done: int, total: int, step: str) -> None: ...
 
 
 def thread_count() -> int:
-    """Return how many frames are read and measured at a time: one a processor, as far as memory allows."""
-    return min(processor_count(), MOST_THREADS)
+    """Return the number of frames to process in parallel: one per processor, limited by memory."""
+    return min(processor_count(), MAX_THREADS)
 
 
 def _identity(session: Session, selected: SelectedFrames, options: BuildOptions) -> dict[str, Any]:
@@ -465,7 +473,7 @@ def _identity(session: Session, selected: SelectedFrames, options: BuildOptions)
         "software": software(),
         "method": METHOD,
         "stored": stored_names(),
-        # The drift is taken out of the finished samples.
+        # Drift is corrected in the finished samples, after the last checkpoint.
         "options": to_plain(replace(options, correct_drift=False)),
         "chart": session.chart.sha256,
         "lights": hashlib.sha256(repr(session.illuminations).encode()).hexdigest(),
@@ -479,21 +487,20 @@ def _frame_keys(selected: SelectedFrames) -> list[str]:
     return [f"{record.kind},{record.illumination},{record.sha256}" for record in selected.records]
 
 
-def _checkpoint(done: Accumulator, writer: LutWriter) -> Checkpoint:
-    identity = _identity(done.session, done.selected, done.baseline.options)
-    frames = _frame_keys(done.selected)[: len(done.figures)]
-    return Checkpoint(identity, frames, done.to_json() | {"sha256": writer.sha256}, done.to_arrays())
+def _checkpoint(accumulator: Accumulator, writer: LutWriter) -> Checkpoint:
+    identity = _identity(accumulator.session, accumulator.selected, accumulator.baseline.options)
+    frames = _frame_keys(accumulator.selected)[: len(accumulator.figures)]
+    return Checkpoint(identity, frames, accumulator.to_json() | {"sha256": writer.sha256}, accumulator.to_arrays())
 
 
-def _writer(
-    session: Session, options: BuildOptions, unfinished: UnfinishedTable, stored: Checkpoint | None
+def _open_writer(
+    session: Session, options: BuildOptions, unfinished: UnfinishedTable, checkpoint: Checkpoint | None
 ) -> tuple[LutWriter, Checkpoint | None]:
-    """Return the writer of the samples, and the checkpoint if the samples on the disk are those that it names."""
     shape = len(session.illuminations), session.chart.colour_count, options.samples
-    if stored is not None:
-        written = {int(light): sha256 for light, sha256 in stored.values["sha256"].items()}
+    if checkpoint is not None:
+        written = {int(light): sha256 for light, sha256 in checkpoint.values["sha256"].items()}
         writer = LutWriter(unfinished.folder, *shape, written=written)
         if not writer.damaged():
-            return writer, stored
+            return writer, checkpoint
     clear_folder(unfinished.folder)
     return LutWriter(unfinished.folder, *shape), None

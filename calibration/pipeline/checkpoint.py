@@ -1,8 +1,7 @@
-"""A table that is being made: its hidden folder, and the checkpoint from which a build that was killed goes on.
+"""The hidden folder of an unfinished LUT, and the checkpoint from which a killed build resumes.
 
-The checkpoint is a finished piece (`foundation.pieces`) in the file `RECORD`. Its arrays lie beside that file, in one
-that is named after the number of frames taken in: it is written before the record names it, and the one before is
-removed after that.
+A checkpoint is a piece (`foundation.pieces`) in the file `RECORD`, with its arrays in a separate file named after the
+number of frames. The arrays are written before the record refers to them, and the previous arrays are removed last.
 """
 
 from __future__ import annotations
@@ -25,28 +24,23 @@ from foundation.files import partial_path, sha256_of, storage_error, sync_folder
 from foundation.folders import locked_folder, publish_folder, require_free
 from foundation.pieces import Piece, read_pieces
 
-RECORD = "checkpoint"  # Name of the record file in the hidden folder, and the beginning of the names of files of arrays
+RECORD = "checkpoint"  # File name of the record, and prefix of the array files
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """How far a table has come.
+    """State of an unfinished LUT."""
 
-    - `identity`: what it is made of and by what; a build goes on from a checkpoint of the same identity only.
-    - `frames`: what names each frame taken in, in their order.
-    - `values`: anything JSON can hold; numbers are restored to the last bit.
-    """
-
-    identity: dict[str, Any]
-    frames: list[str]
-    values: dict[str, Any]
+    identity: dict[str, Any]  # Inputs and options; a build resumes only with the same identity
+    frames: list[str]  # Keys of the frames added so far, in their order
+    values: dict[str, Any]  # JSON values; numbers are restored exactly
     arrays: dict[str, npt.NDArray[Any]]
 
 
 class UnfinishedTable:
-    """The hidden folder of a table that is being made; made by `unfinished_table`.
+    """The hidden folder of an unfinished LUT; opened by `unfinished_table`.
 
-    `keep`: whether a later program may go on from here; no where that would lead to the same end.
+    `keep`: True if a later program may resume; False if it would be refused again.
     """
 
     def __init__(self, folder: Path, out: Path) -> None:
@@ -55,20 +49,20 @@ class UnfinishedTable:
         self.keep = True
 
     def load(self, identity: dict[str, Any], frames: list[str]) -> Checkpoint | None:
-        """Return how far an earlier program came; None where there is no checkpoint, or it was made of something else.
+        """Return the checkpoint of an earlier program; None if there is none, or if its inputs differ.
 
-        A build goes on from a checkpoint of the same identity that took in the first of its `frames`.
+        A build resumes from a checkpoint with the same identity and the first of its `frames`.
         """
         record = self.folder / RECORD
         if not record.is_file() or not (self.folder / SAMPLES).is_file():
             return None
         for name, piece in read_pieces(record.read_bytes()).items():
-            begun = frames[: int(name)]
-            same = begun and piece.inputs == _hash_of(identity, begun)
-            if same and piece.is_complete(lambda file: (self.folder / file).open("rb")):
-                with np.load(self.folder / _arrays_of(begun), allow_pickle=False) as stored:
+            finished_frames = frames[: int(name)]
+            is_same = finished_frames and piece.inputs == _hash_of(identity, finished_frames)
+            if is_same and piece.is_complete(lambda file: (self.folder / file).open("rb")):
+                with np.load(self.folder / _arrays_of(finished_frames), allow_pickle=False) as stored:
                     arrays: dict[str, npt.NDArray[Any]] = {key: stored[key] for key in stored.files}
-                return Checkpoint(identity, begun, json.loads(piece.values), arrays)
+                return Checkpoint(identity, finished_frames, json.loads(piece.values), arrays)
         return None
 
     def save(self, checkpoint: Checkpoint) -> None:
@@ -77,25 +71,25 @@ class UnfinishedTable:
         np.savez(stream, allow_pickle=False, **checkpoint.arrays)
         arrays, data = _arrays_of(checkpoint.frames), stream.getvalue()
         write_atomic(self.folder / arrays, data)
-        inputs = _hash_of(checkpoint.identity, checkpoint.frames)
+        inputs_hash = _hash_of(checkpoint.identity, checkpoint.frames)
         files = {arrays: sha256_of(data)}
-        piece = Piece(str(len(checkpoint.frames)), inputs, files, json.dumps(checkpoint.values))
+        piece = Piece(str(len(checkpoint.frames)), inputs_hash, files, json.dumps(checkpoint.values))
         write_atomic(self.folder / RECORD, piece.to_line())
-        self._remove(kept={RECORD, arrays})
+        self._remove(keep={RECORD, arrays})
 
     def publish(self) -> None:
-        """Give the table its final name."""
-        require_free(self.out, "the table")
+        """Move the folder to its final path."""
+        require_free(self.out, "the LUT")
         try:
             self._remove()
             sync_folder(self.folder)
         except OSError as error:
             raise storage_error(self.out, error) from error
-        publish_folder(self.folder, self.out, "the table")
+        publish_folder(self.folder, self.out, "the LUT")
 
-    def _remove(self, kept: set[str] | None = None) -> None:
+    def _remove(self, keep: set[str] | None = None) -> None:
         for path in self.folder.glob(f"{RECORD}*"):
-            if path.name not in (kept or ()):
+            if path.name not in (keep or ()):
                 path.unlink()
 
 
@@ -109,10 +103,10 @@ def _hash_of(identity: dict[str, Any], frames: list[str]) -> str:
 
 @contextmanager
 def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
-    """Open, or make, the hidden folder of the table `out`; what is not published stays if it holds a checkpoint."""
-    require_free(out, "the table")
+    """Open or create the hidden folder of the LUT `out`; it is kept afterwards only with a checkpoint."""
+    require_free(out, "the LUT")
     folder = partial_path(out)
-    busy = f"{out} is being made by another program; wait for it, or name another place"
+    busy = f"{out} is being built by another program; wait until it has finished, or give another folder"
     with locked_folder(folder, busy, target=out):
         unfinished = UnfinishedTable(folder, out)
         try:

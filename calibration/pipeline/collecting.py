@@ -1,9 +1,7 @@
-"""What the frames of a session give together: each is taken in, and which cells are not to be used is found.
+"""Accumulate the frames of a session, and list the unfit patches.
 
-Frames enter in the order taken. What one adds depends on those before it alone, so that a build that was stopped goes
-on to the same bits.
-
-C cells of S samples, in the order of colour indices.
+Frames are added in the order taken. The result of each depends only on the previous ones, so that an interrupted build
+resumes with identical results. C patches of S samples, in the order of colour indices.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ from experiment.session.folder import Session
 from experiment.session.records import FrameRecord
 from foundation.records import from_plain, to_plain
 
-# Of the cells' levels, what is taken for paper white: the brightest of all may be a reflection.
+# Percentile of the patches' levels used as paper white: the brightest may be a reflection.
 _BRIGHTEST_PERCENTILE = 99.5
 
 _Array = npt.NDArray[np.float64]
@@ -49,37 +47,24 @@ _Figures = tuple[FrameMeasurements | DarkFrameFigures, ...]
 
 @dataclass(frozen=True, eq=False)
 class Accumulator:
-    """What the frames of a session that were taken in so far have given; each frame makes a new one.
-
-    - `saturation`: raw count of saturation, the lowest that a frame shows.
-    - `dark`: what is subtracted from the frames that follow; None where nothing is.
-    - `estimate`: of the dark light; only dark frames that are subtracted enter it.
-    - `highest`: (C,) uint16, the highest raw count of each cell.
-    - `highest_at`: (C,) int64, the light under which it was reached; −1 for a white frame.
-    - `outside`: (C,) bool, whether a cell was cut off in a frame.
-    - `covered`: (C,) bool, whether a cell did not look like the chart's in a frame in which the chart was registered.
-    - `place_error`: (C,) float64 half-size px, what a cell's place may be off by, the worst of the frames in
-      which the chart was registered; over the clearance of its samples (`Registration.clearance`).
-    - `even_sum`: (C, S, 3) float32, sum of the frames of even light, counts above black.
-    - `even_noise2`: (C, 3) float64, sum of the variances of one sample in these frames, counts².
-    """
+    """State after the frames added so far; adding a frame returns a new one."""
 
     session: Session
     selected: SelectedFrames
     baseline: Baseline
     figures: _Figures
-    saturation: int
+    saturation: int  # Raw count of saturation, the lowest of all frames
     registered: RegisteredFrame
-    dark: DarkLight | None
-    estimate: DarkLightEstimate
+    dark: DarkLight | None  # Light to subtract from the following frames, if any
+    estimate: DarkLightEstimate  # Of the dark light; includes only dark frames that are subtracted
     hot: HotPixels
-    highest: npt.NDArray[np.uint16]
-    highest_at: npt.NDArray[np.int64]
-    outside: npt.NDArray[np.bool_]
-    covered: npt.NDArray[np.bool_]
-    place_error: _Array
-    even_sum: npt.NDArray[np.float32]
-    even_noise2: _Array
+    highest: npt.NDArray[np.uint16]  # (C,), highest raw count of each patch
+    highest_at: npt.NDArray[np.int64]  # (C,), illuminant of that count; −1 for a white frame
+    outside: npt.NDArray[np.bool_]  # (C,), patch cut off in a frame
+    covered: npt.NDArray[np.bool_]  # (C,), patch unlike the chart where it was registered
+    place_error: _Array  # (C,) px, largest expanded uncertainty of position, divided by `Registration.clearance`
+    even_sum: npt.NDArray[np.float32]  # (C, S, 3) counts above black, sum of the evenly lit frames
+    even_noise2: _Array  # (C, 3) counts², sum of the variances of one sample in these frames
     even_frames: int
 
     @staticmethod
@@ -90,14 +75,14 @@ class Accumulator:
         saturation: int,
         first_dark: MeasuredDarkFrame | None = None,
     ) -> Accumulator:
-        """Return what there is before any frame.
+        """Return the state before the first frame.
 
-        `saturation`: the raw count that the first registered frame shows. `first_dark`: the first dark frame, whose
-        light is subtracted from the frames before it; None if none is.
+        `saturation`: raw count of the first registered frame. `first_dark`: dark frame to subtract from the frames
+        before it.
         """
         count, samples, first = baseline.chart.colour_count, baseline.options.samples, baseline.first
         inside = np.concatenate([first.cells.inside, first.references.inside])
-        found = Accumulator(
+        empty = Accumulator(
             session=session,
             selected=selected,
             baseline=baseline,
@@ -116,46 +101,46 @@ class Accumulator:
             even_noise2=np.zeros((count, 3)),
             even_frames=0,
         )
-        return found if first_dark is None else replace(found, dark=found._learned(first_dark).dark)
+        return empty if first_dark is None else replace(empty, dark=empty._with_dark_light(first_dark).dark)
 
     @cached_property
     def frames(self) -> tuple[FrameMeasurements, ...]:
-        """Figures of the light and white frames."""
+        """Measurements of the light and white frames."""
         return tuple(figures for figures in self.figures if isinstance(figures, FrameMeasurements))
 
     @property
     def darks(self) -> tuple[DarkFrameFigures, ...]:
-        """Figures of the dark frames."""
+        """Measurements of the dark frames."""
         return tuple(figures for figures in self.figures if isinstance(figures, DarkFrameFigures))
 
     @property
     def records(self) -> list[FrameRecord]:
-        """The frames taken in."""
+        """Records of the added frames."""
         return [figures.record for figures in self.figures]
 
     def with_frame(self, measured: MeasuredFrame | MeasuredDarkFrame) -> Accumulator:
-        """Return what there is after the next frame."""
-        before = self if measured.registered is self.registered else self._registered_again(measured.registered)
-        after = replace(before, figures=(*before.figures, measured.figures))
+        """Return the state with the next frame added."""
+        previous = self if measured.registered is self.registered else self._registered_again(measured.registered)
+        updated = replace(previous, figures=(*previous.figures, measured.figures))
         if isinstance(measured, MeasuredDarkFrame):
-            after = replace(after, hot=before.hot.with_frame(measured.excess))
-            return after._learned(measured) if self.baseline.options.subtract_dark else after  # noqa: SLF001 - its own class
+            updated = replace(updated, hot=previous.hot.with_frame(measured.excess))
+            return updated._with_dark_light(measured) if self.baseline.options.subtract_dark else updated  # noqa: SLF001 - its own class
         light = measured.figures.record.illumination
-        brighter = measured.highest > before.highest
-        after = replace(
-            after,
-            saturation=min(before.saturation, measured.saturation),
-            highest=np.where(brighter, measured.highest, before.highest),
-            highest_at=np.where(brighter, -1 if light is None else light, before.highest_at),
-            outside=before.outside | ~measured.inside,
+        brighter = measured.highest > previous.highest
+        updated = replace(
+            updated,
+            saturation=min(previous.saturation, measured.saturation),
+            highest=np.where(brighter, measured.highest, previous.highest),
+            highest_at=np.where(brighter, -1 if light is None else light, previous.highest_at),
+            outside=previous.outside | ~measured.inside,
         )
         if measured.samples is None or measured.noise is None:
-            return after
+            return updated
         return replace(
-            after,
-            even_sum=before.even_sum + measured.samples,
-            even_noise2=before.even_noise2 + measured.noise**2,
-            even_frames=before.even_frames + 1,
+            updated,
+            even_sum=previous.even_sum + measured.samples,
+            even_noise2=previous.even_noise2 + measured.noise**2,
+            even_frames=previous.even_frames + 1,
         )
 
     def _registered_again(self, registered: RegisteredFrame) -> Accumulator:
@@ -169,8 +154,7 @@ class Accumulator:
             place_error=np.maximum(self.place_error, error),
         )
 
-    def _learned(self, measured: MeasuredDarkFrame) -> Accumulator:
-        """Return what there is with a dark frame taken into the estimate of what is subtracted from those after it."""
+    def _with_dark_light(self, measured: MeasuredDarkFrame) -> Accumulator:
         points, reader = self.baseline.points, self.baseline.paper
         means = measured.means[points.white_patches]
         inside = measured.registered.references.inside[: len(points.whites_mm), None]
@@ -180,19 +164,19 @@ class Accumulator:
         return replace(self, estimate=estimate, dark=dark)
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a checkpoint stores as text; the rest is `to_arrays`."""
+        """Return the part of a checkpoint stored as text; see also `to_arrays`."""
         return {"registered": self.registered.file, "figures": to_plain(self.figures, _Figures)}
 
     def to_arrays(self) -> _Arrays:
-        """Return what a checkpoint stores as arrays, (...) of any dtype, by name: those of this value and its parts."""
-        parts = {"": self, "estimate.": self.estimate, "hot.": self.hot, "dark.": self.dark}
-        return {prefix + name: each for prefix, part in parts.items() for name, each in _arrays_of(part).items()}
+        """Return the part of a checkpoint stored as arrays (...), by name."""
+        owners = {"": self, "estimate.": self.estimate, "hot.": self.hot, "dark.": self.dark}
+        return {prefix + name: array for prefix, owner in owners.items() for name, array in _arrays_of(owner).items()}
 
     def restored(self, values: Mapping[str, Any], arrays: _Arrays) -> Accumulator:
-        """Return what was stored of a build of the same frames, `arrays` (...) of any dtype; this one is empty."""
-        found = from_plain(_Figures, values["figures"], self.session.folder, "begin the build anew")
+        """Return the stored state of a build; this state must be empty. `arrays`: (...) by name."""
+        stored_figures = from_plain(_Figures, values["figures"], self.session.folder, "start the build again")
         figures = tuple(
-            replace(each, record=record) for each, record in zip(found, self.selected.records, strict=False)
+            replace(value, record=record) for value, record in zip(stored_figures, self.selected.records, strict=False)
         )
         registered = self.baseline.first
         if values["registered"] != registered.file:
@@ -200,8 +184,8 @@ class Accumulator:
             registered = self.baseline.register(decode_frame(self.session, record))
 
         def stored(prefix: str) -> dict[str, Any]:
-            named = {name.removeprefix(prefix): each for name, each in arrays.items() if name.startswith(prefix)}
-            return {name: each if each.ndim else each.item() for name, each in named.items() if "." not in name}
+            chosen = {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
+            return {name: value if value.ndim else value.item() for name, value in chosen.items() if "." not in name}
 
         dark = stored("dark.")
         return replace(
@@ -215,100 +199,98 @@ class Accumulator:
         )
 
     def dark_summary(self) -> DarkSummary:
-        """Return what the dark frames show."""
+        """Return the summary of the dark frames."""
         return dark_summary(self.darks, self.hot)
 
     def noise(self) -> _Array:
-        """Return (3,) float64, median standard deviation of one sample in the even frames, of the brightest cells'."""
+        """Return (3,) float64, median standard deviation of one sample in evenly lit frames, of paper white."""
         frames = max(self.even_frames, 1)
         level = np.percentile(self.even_sum.mean(axis=1) / frames, _BRIGHTEST_PERCENTILE, axis=0)
         return np.sqrt(np.median(self.even_noise2 / frames, axis=0)) / np.maximum(level, 1e-6)
 
     def stains(self, field: _Array) -> Stains:
-        """Return where the print does not have its codes' colours.
+        """Return the areas of the print with other colours than their codes'.
 
-        `field` (C, 3) float64 is that of a frame of even light, of each cell's own colour as far as it is known: by the
-        field of paper alone, cells of one side would be off where the primaries light the print in different ways.
+        `field`: (C, 3) float64, flat field of an evenly lit frame for the colour of each patch. The field of paper
+        alone would give errors where the primaries differ in their fields.
         """
         cells_mm = self.baseline.points.cells_mm
         level = self.even_sum.mean(axis=1, dtype=np.float64) / max(self.even_frames, 1) / field
         return find_stains(level, cells_mm, self.baseline.chart.bits, ~(self.outside | self.covered))
 
     def unfit(self, stains: Stains, frames: Sequence[FrameMeasurements], added: AddedLight) -> tuple[Unfit, ...]:
-        """Return the cells not to be used, each with the first cause that applies; `frames`: what is said of them."""
-        lit_by_others = added.certain_share_of(self.baseline.levels).max(axis=1)
+        """Return the unfit patches, each with the first cause that applies. `frames`: their measurements."""
+        added_share = added.certain_share_of(self.baseline.levels).max(axis=1)
         disturbed = disturbed_cells(frames)
-        lit = [(frame.consistency.alone, frame.record.illumination) for frame in frames]
-        alone = {colour: light for cells, light in lit if light is not None for colour in cells}
-        even, dark = max(self.even_frames, 1), self.dark_summary()
-        hottest = dark.hottest if len(dark.hottest) else np.zeros(self.baseline.chart.colour_count)
-        dead = has_dead_photosite(self.even_sum / even)
-        uneven = unevenness(self.even_sum / even, np.sqrt(self.even_noise2) / even)
-        allowed, samples = CLIPPING_SHARE * self.saturation, self.even_sum.shape[1]
-        found: list[Unfit] = []
+        alone_by_frame = [(frame.consistency.alone, frame.record.illumination) for frame in frames]
+        light_by_colour = {colour: light for cells, light in alone_by_frame if light is not None for colour in cells}
+        even_count, summary = max(self.even_frames, 1), self.dark_summary()
+        hottest = summary.hottest if len(summary.hottest) else np.zeros(self.baseline.chart.colour_count)
+        dead = has_dead_photosite(self.even_sum / even_count)
+        uneven = unevenness(self.even_sum / even_count, np.sqrt(self.even_noise2) / even_count)
+        limit, samples = CLIPPING_SHARE * self.saturation, self.even_sum.shape[1]
+        unfit_cells: list[Unfit] = []
         for colour in range(self.baseline.chart.colour_count):
             cause = ""
             if self.outside[colour]:
-                cause = f"outside: its {samples} pixels do not all lie in the frame"
-            elif self.highest[colour] >= allowed:
+                cause = f"outside: some of its {samples} pixels are outside the frame; move the chart into the picture"
+            elif self.highest[colour] >= limit:
                 light = int(self.highest_at[colour])
-                under = f"light {light}" if light >= 0 else "white"
-                cause = f"clipped: {int(self.highest[colour])} counts under {under}, below {allowed:.0f} allowed"
+                under = f"illuminant {light}" if light >= 0 else "white"
+                cause = f"clipped: {int(self.highest[colour])} counts under {under}, less than {limit:.0f} expected"
             elif self.covered[colour]:
-                cause = "covered: it does not look like the chart's (covered, damaged, or printed otherwise)"
+                cause = "covered: it does not match the chart (covered, damaged, or another print)"
             elif self.place_error[colour] > MAX_PLACE_ERROR_PX:
                 cause = (
-                    f"misplaced: its place is known to {self.place_error[colour]:.2f} px, {MAX_PLACE_ERROR_PX:g} px "
-                    "allowed; the print waves there, or little of it is seen"
+                    f"misplaced: uncertainty of its position {self.place_error[colour]:.2f} px, expected at most "
+                    f"{MAX_PLACE_ERROR_PX:g} px; the print is wavy or partly hidden there"
                 )
-            elif lit_by_others[colour] > MOST_ADDED:
-                cause = (
-                    f"lit: {lit_by_others[colour]:.1%} of its level is light that lies on the print there (reflection)"
-                )
+            elif added_share[colour] > MOST_ADDED:
+                cause = f"lit: {added_share[colour]:.1%} of its level is added light on the print (reflection)"
             elif stains.stained[colour]:
                 deviation = stains.deviation_of(colour)
-                how = f"{abs(deviation):.1%} {'darker' if deviation < 0 else 'brighter'}"
-                cause = f"stained: it is, or its surroundings are, {how} than their codes elsewhere on the print"
+                difference = f"{abs(deviation):.1%} {'darker' if deviation < 0 else 'brighter'}"
+                cause = f"stained: its area is {difference} than the same codes elsewhere on the print"
             elif hottest[colour] > 0:
-                cause = f"hot: a photosite stands out by {hottest[colour]:.0f} counts in every dark frame"
+                cause = f"hot: a photosite exceeds the others by {hottest[colour]:.0f} counts in every dark frame"
             elif dead[colour]:
-                cause = "dead: a photosite sees less than half of the light of its cell"
+                cause = "dead: a photosite receives less than half of the light of its patch"
             elif uneven[colour] > 0:
-                cause = f"uneven: rim and middle differ by {uneven[colour]:.1%} under white"
+                cause = f"uneven: rim and centre differ by {uneven[colour]:.1%} under white"
             elif colour in disturbed:
                 cause = f"disturbed: {_disturbance(disturbed[colour])}"
-            elif colour in alone:
-                cause = f"unlike: under light {alone[colour]} it is far from its code, and its neighbours are not"
+            elif colour in light_by_colour:
+                cause = f"unlike: under illuminant {light_by_colour[colour]} the patch alone differs from its code"
             if cause:
-                found.append(Unfit(colour=colour, cause=cause))
-        return tuple(found)
+                unfit_cells.append(Unfit(colour=colour, cause=cause))
+        return tuple(unfit_cells)
 
 
 def stored_names() -> list[str]:
-    """Return the names that a checkpoint stores; a build does not go on from one that was made with others."""
-    parts = (Accumulator, FrameMeasurements, DarkFrameFigures, DarkLight, DarkLightEstimate, HotPixels)
-    return [f"{part.__name__}.{field.name}" for part in parts for field in fields(part)]
+    """Return the names in a checkpoint; a build does not resume from one with other names."""
+    stored_types = (Accumulator, FrameMeasurements, DarkFrameFigures, DarkLight, DarkLightEstimate, HotPixels)
+    return [f"{stored_type.__name__}.{field.name}" for stored_type in stored_types for field in fields(stored_type)]
 
 
 def disturbed_cells(frames: Sequence[FrameMeasurements]) -> dict[int, list[tuple[int, float]]]:
-    """Return the lights under which something covered cells, and how far these are off; by the cells' colours.
+    """Return the illuminants under which patches were covered, with the relative deviations, by colour index.
 
-    White frames' do not count: a table has no samples of them.
+    White frames are excluded, because a LUT has no samples of them.
     """
-    found: dict[int, list[tuple[int, float]]] = {}
+    disturbances: dict[int, list[tuple[int, float]]] = {}
     for frame in frames:
         if frame.record.illumination is not None:
-            for colour, off in frame.consistency.disturbed:
-                found.setdefault(colour, []).append((frame.record.illumination, off))
-    return found
+            for colour, deviation in frame.consistency.disturbed:
+                disturbances.setdefault(colour, []).append((frame.record.illumination, deviation))
+    return disturbances
 
 
-def _disturbance(under: list[tuple[int, float]]) -> str:
-    light, off = max(under, key=lambda one: abs(one[1]))
-    more = f" and {len(under) - 1} more" if len(under) > 1 else ""
-    deviation = f"{abs(off):.1%} {'darker' if off < 0 else 'brighter'} than its code gives"
-    how = deviation if off else "too dark to be compared"
-    return f"under light {light}{more} it is {how}, next to cells that are far off"
+def _disturbance(disturbances: list[tuple[int, float]]) -> str:
+    light, deviation = max(disturbances, key=lambda disturbance: abs(disturbance[1]))
+    others_text = f" and {len(disturbances) - 1} more" if len(disturbances) > 1 else ""
+    difference = f"{abs(deviation):.1%} {'darker' if deviation < 0 else 'brighter'} than expected from its code"
+    difference_text = difference if deviation else "too dark to be compared"
+    return f"under illuminant {light}{others_text}: {difference_text}, next to patches with large deviations"
 
 
 def _covered_cells(baseline: Baseline, registered: RegisteredFrame) -> npt.NDArray[np.bool_]:

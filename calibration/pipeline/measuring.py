@@ -1,11 +1,10 @@
-"""One frame's way: decoded → located → sampled → measured, by the baseline, which all frames of a table share.
+"""The steps of one frame: decoded → located → sampled → measured, with the baseline that all frames of a LUT share.
 
-- Cells are in the order of colour indices, not in the chart's own; references follow them, the white ones first.
-- A frame is measured with the baseline, the frame registered last, and the dark light (that of the last dark frame, or
-  of the first for frames before it), and with nothing else, so that any thread may measure it in any order.
+Patches are in the order of colour indices. References follow them, the white ones first. A frame is measured with the
+baseline, the frame registered last and the dark light of the last dark frame only (before it, of the first one).
+Therefore any thread may measure it in any order.
 
-C cells of S samples, W white references, N grey references; places on the print in millimetres, in frames in half-size
-pixels.
+C patches of S samples, W white and N grey references; positions on the print in mm, in frames in half-size px.
 """
 
 from __future__ import annotations
@@ -70,27 +69,24 @@ _Samples = npt.NDArray[np.float32]
 
 IN_PLACE = Shift(0.0, 0.0, 0.0, 0)  # No movement
 
-_TAKEN_AGAIN = "or take it again: acquire run LAB.toml SESSION finds such frames by itself"
+_RETAKE_HINT = "or take it again with acquire run LAB.toml SESSION, which detects such frames"
 
-_OUTLIER_SIGMAS = 6.0  # Robust standard deviations from the median beyond which a patch is covered or dirty
+# Robust standard deviations from the median above which a patch counts as covered or dirty.
+_OUTLIER_SIGMAS = 6.0
 
-_FEW_PATCHES = 4  # Patches up to which none is left out: of so few, none is surely the one that is wrong
+_MAX_WITHOUT_OUTLIERS = 4  # Number of patches too small to identify a wrong one
 
 
 @dataclass(frozen=True, eq=False)
 class GreyLevels:
-    """The printed levels of grey of a chart.
+    """The printed levels of grey of a chart."""
 
-    - `names`: one for each level, brightest first.
-    - `level`: (N,) int64, the level of each grey reference.
-    """
-
-    names: tuple[str, ...]
-    level: npt.NDArray[np.int64]
+    names: tuple[str, ...]  # One per level, brightest first
+    level: npt.NDArray[np.int64]  # (N,), level of each grey reference
 
     @classmethod
     def of(cls, references: Sequence[Reference]) -> GreyLevels:
-        """Return the levels among references, one for each printed code."""
+        """Return the levels of references, one per printed code."""
         codes = sorted({reference.rgb for reference in references}, reverse=True)
         first = {reference.rgb: reference.name for reference in reversed(references)}
         return cls(
@@ -98,13 +94,12 @@ class GreyLevels:
             np.array([codes.index(reference.rgb) for reference in references], dtype=np.int64),
         )
 
-    def read(self, seen: _Array, field: _Array) -> tuple[_Array, _Array]:
-        """Return the value and standard error (G, 3) float64 of each level, counts, NaN where no patch can be used.
+    def read(self, means: _Array, field: _Array) -> tuple[_Array, _Array]:
+        """Return value and standard error (G, 3) float64 of each level, counts; NaN without a usable patch.
 
-        `seen`: (N, 3) mean counts above black of each patch, NaN where it cannot be used. `field`: (N, 3) the field at
-        each patch.
+        `means`: (N, 3) counts above black of each patch, NaN if unusable. `field`: (N, 3) flat field at each patch.
         """
-        flat = seen / field
+        flat = means / field
         value, error = np.full((len(self.names), 3), np.nan), np.full((len(self.names), 3), np.nan)
         for number in range(len(self.names)):
             patches = flat[self.level == number]
@@ -114,28 +109,24 @@ class GreyLevels:
             middle = np.median(patches, axis=0)
             scale = MAD_TO_SIGMA * np.median(np.abs(patches - middle), axis=0) + 1e-9
             near = (np.abs(patches - middle) < _OUTLIER_SIGMAS * scale).all(axis=1)
-            kept = patches[near] if len(patches) > _FEW_PATCHES else patches
-            value[number] = kept.mean(axis=0)
-            error[number] = kept.std(axis=0, ddof=1) / np.sqrt(len(kept)) if len(kept) > 1 else np.nan
+            used = patches[near] if len(patches) > _MAX_WITHOUT_OUTLIERS else patches
+            value[number] = used.mean(axis=0)
+            error[number] = used.std(axis=0, ddof=1) / np.sqrt(len(used)) if len(used) > 1 else np.nan
         return value, error
 
 
 @dataclass(frozen=True, eq=False)
 class ChartPoints:
-    """The points of a chart that are sampled.
+    """Positions on a chart that are sampled."""
 
-    - `cells_mm`: (C, 2) float64 mm, centres of the cells in the order of colour indices.
-    - `whites_mm`, `greys_mm`: (W, 2) and (N, 2) float64 mm, centres of the white and of the grey references.
-    """
-
-    cells_mm: _Array
-    whites_mm: _Array
-    greys_mm: _Array
+    cells_mm: _Array  # (C, 2) mm, centres of the patches in the order of colour indices
+    whites_mm: _Array  # (W, 2) mm, centres of the white references
+    greys_mm: _Array  # (N, 2) mm, centres of the grey references
     levels: GreyLevels
 
     @staticmethod
     def of(chart: Chart) -> ChartPoints:
-        """Return the points of a chart."""
+        """Return the positions of a chart."""
         whites = [reference for reference in chart.references if reference.is_white]
         greys = [reference for reference in chart.references if not reference.is_white]
         whites_mm, greys_mm = (
@@ -150,33 +141,28 @@ class ChartPoints:
 
     @property
     def white_patches(self) -> slice:
-        """Where the white references are among cells and references."""
+        """Indices of the white references among patches and references."""
         return slice(len(self.cells_mm), len(self.cells_mm) + len(self.whites_mm))
 
     @property
     def printed(self) -> npt.NDArray[np.int64]:
-        """(W + N,) int64, what each reference is printed with: 0 for nothing, else one more than its level of grey."""
+        """(W + N,) int64, print of each reference: 0 for bare paper, else 1 + its level of grey."""
         return np.concatenate([np.zeros(len(self.whites_mm), dtype=np.int64), 1 + self.levels.level])
 
 
 class ChangedFrame(FormatError):
-    """A frame's file is gone, or is not what was taken; the next run of the session takes it again by itself."""
+    """A missing or changed frame file; the next run of the session takes it again automatically."""
 
 
 @dataclass(frozen=True, eq=False)
 class DecodedFrame:
-    """A frame as read.
-
-    - `black`: (2, 2) float64 counts, black level of each position of the block.
-    - `strongest`: the channel with the brightest paper.
-    - `saturation`: raw count of saturation, as far as it can be seen in this frame.
-    """
+    """A frame as read."""
 
     record: FrameRecord
     mosaic: Mosaic
-    black: _Array
-    strongest: Channel
-    saturation: int
+    black: _Array  # (2, 2) counts, black level of each position of the Bayer block
+    strongest: Channel  # Channel with the brightest paper
+    saturation: int  # Raw count of saturation, as far as this frame shows it
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -186,28 +172,28 @@ class DecodedFrame:
 
 
 def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
-    """Return a frame as read from its file, whose SHA-256 is checked first."""
+    """Return a frame from its file, after checking the SHA-256."""
     path = session.folder / record.file
     try:
         data = read_buffer(path)
     except FileNotFoundError as error:
         raise ChangedFrame(
-            f"{path} is missing, but the session's journal counts it; restore the file from a copy, {_TAKEN_AGAIN}"
+            f"{path} is missing, but listed in the session's journal; restore the file from a copy, {_RETAKE_HINT}"
         ) from error
     except OSError as error:
         raise FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk") from error
-    found = hashlib.sha256(data).hexdigest()
-    if found != record.sha256:
+    sha256 = hashlib.sha256(data).hexdigest()
+    if sha256 != record.sha256:
         raise ChangedFrame(
-            f"{path} is not the file that was taken: its SHA-256 is {found[:16]}…, the journal says "
-            f"{record.sha256[:16]}…; restore the file from a copy, {_TAKEN_AGAIN}"
+            f"{path} has changed: its SHA-256 is {sha256[:16]}…, expected "
+            f"{record.sha256[:16]}…; restore the file from a copy, {_RETAKE_HINT}"
         )
     mosaic = decode_raw(data, path, is_verified=True)
     fault = filled_fault(mosaic.counts, mosaic.black, mosaic.white_level)
     if fault is not None:
         raise FormatError(
-            f"{path} is no whole frame: {fault}; restore the file from a copy, or take it again: acquire run LAB.toml "
-            "SESSION --retake with the number of its light"
+            f"{path} is incomplete: {fault}; restore the file from a copy, or take it again: acquire run LAB.toml "
+            "SESSION --retake with the number of its illuminant"
         )
     black = frame_black(mosaic)
     return DecodedFrame(record, mosaic, black, strongest_channel(mosaic, black), mosaic.saturation())
@@ -215,18 +201,14 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
 
 @dataclass(frozen=True, eq=False)
 class RegisteredFrame:
-    """A frame in which the chart was registered; it holds for those after it until the chart moves too far.
-
-    - `gauges`: the frame around its tags, or the outline of its field, to measure movements against.
-    - `lens`: corrects frames sampled at these places for what the lens spreads; None where nothing is corrected.
-    """
+    """A frame with a registered chart; valid for the following frames until the chart moves too far."""
 
     file: str
     registration: Registration
     cells: Sites
     references: Sites
-    gauges: dict[Channel, Plane]
-    lens: FrameCorrection | None = None
+    gauges: dict[Channel, Plane]  # Areas around the tags, or the outline of the patches, to measure movement
+    lens: FrameCorrection | None = None  # Corrects frames sampled at these positions for light spread by the lens
 
 
 def register_frame(
@@ -244,17 +226,17 @@ def register_frame(
 def sites_of(
     registration: Registration, points: ChartPoints, shape: tuple[int, int], window: int
 ) -> tuple[Sites, Sites]:
-    """Return the sites of the cells and of the references.
+    """Return the sampling sites of patches and references.
 
-    `shape` is rows and columns of the half-size frame, `window` the pixels along a window's side.
+    `shape`: rows and columns of the half-size frame. `window`: side of the sampling window, px.
     """
     cells, references = (
-        sites_at(registration.to_pixels(places), shape, window) for places in (points.cells_mm, points.references_mm)
+        sites_at(registration.to_pixels(mm), shape, window) for mm in (points.cells_mm, points.references_mm)
     )
     return cells, references
 
 
-# What all frames of a session have in common: visible area, shape of the sensor, Bayer pattern.
+# Common to all frames of a session: visible area, shape of the sensor, Bayer pattern.
 SensorLayout = tuple[Area, tuple[int, ...], str]
 
 
@@ -265,35 +247,26 @@ def sensor_layout(mosaic: Mosaic) -> SensorLayout:
 
 @dataclass(frozen=True, eq=False)
 class Baseline:
-    """What all frames of a table share; `baseline_of` makes it before the first frame is measured.
-
-    - `camera`, `layout`: maker and model, and the sensor's layout, the same in all frames.
-    - `whites`: (W, 3) float64 counts above black of its white references; NaN where one cannot be used.
-    - `means`: (C + W + N, 3) float64 counts above black of its cells and references.
-    - `paper`: reads flat field and white of frames, with the shape of this one's as base.
-    - `superposition`: what the first frame and those of the primaries show of the sensor's linearity; what is usual if
-      one of them is lacking, or the chart has moved in it.
-    - `primaries`: the primaries each alone; None where they were not given or cannot be used.
-    - `lens`: what the lens spreads beside its sharp core, measured; None where it was not, or could not be.
-    """
+    """Data shared by all frames of a LUT; created by `baseline_of` from the first frame."""
 
     chart: Chart
     points: ChartPoints
     options: BuildOptions
-    camera: str
+    camera: str  # Maker and model
     layout: SensorLayout
     first: RegisteredFrame
-    whites: _Array
-    means: _Array
-    paper: PaperReader
+    whites: _Array  # (W, 3) counts above black of the white references; NaN if unusable
+    means: _Array  # (C + W + N, 3) counts above black of patches and references
+    paper: PaperReader  # Reads flat field and white of a frame, based on the shape of the first frame
     transfer: PhotonTransfer
+    # Linearity from the first frame and the primaries; a usual value if these are missing or moved
     superposition: Superposition
-    primaries: Primaries | None = None
-    lens: LensCorrection | None = None
+    primaries: Primaries | None = None  # The primaries alone; None if missing or unusable
+    lens: LensCorrection | None = None  # Measured light spread; None if not measured
 
     @cached_property
     def consistency_check(self) -> ConsistencyCheck:
-        """The check of frames against the first, each cell by the field of its own colour as far as it is known."""
+        """Check of frames against the first, with the field for each patch's colour if known."""
         level = self.means[: len(self.points.cells_mm)]
         if self.primaries is None:
             field = self.paper.base.at(self.points.cells_mm)
@@ -306,52 +279,49 @@ class Baseline:
 
     @property
     def levels(self) -> _Array:
-        """(C, 3) float64, of each cell in the first frame, bare paper 1."""
+        """(C, 3) float64, each patch in the first frame, relative to bare paper."""
         paper, at_cells = self.paper.read(self.whites, self.first.file)
         return self.means[: len(at_cells)] / (at_cells * np.maximum(paper.white, 1e-9))
 
-    def require_layout(self, mosaic: Mosaic, what: str) -> None:
-        """Refuse a frame, called `what`, whose sensor or setting is not that of the first."""
-        found = sensor_layout(mosaic)
-        if found != self.layout:
-            has, had = (f"{shape[1]}×{shape[0]} photosites {pattern}" for _, shape, pattern in (found, self.layout))
+    def require_layout(self, mosaic: Mosaic, source: str) -> None:
+        """Raise FormatError if the sensor layout of a frame differs from the first; `source` names the frame."""
+        layout = sensor_layout(mosaic)
+        if layout != self.layout:
+            new, first = (f"{shape[1]}×{shape[0]} photosites {pattern}" for _, shape, pattern in (layout, self.layout))
             raise FormatError(
-                f"{what}: the sensor has {has}, that of {self.first.file} {had}; a session has one camera with one "
-                "setting, so take the session anew"
+                f"{source}: the sensor has {new}, expected {first} as in {self.first.file}; take the session "
+                "again with one camera and one setting"
             )
 
     def register(self, decoded: DecodedFrame) -> RegisteredFrame:
-        """Return a later frame with the chart registered in it; errors are those of `register_frame`."""
-        # A chart without tags hangs as in the first frame, so that a build that goes on has it the same way up.
+        """Return a later frame with the chart registered in it; errors as in `register_frame`."""
+        # A chart without tags keeps its orientation, so that a resumed build gives the same result.
         registered = register_frame(decoded, self.chart, self.points, self.options, self.first.registration)
         lens = self.correction(registered.registration, registered.cells, registered.references)
         return replace(registered, lens=lens)
 
     def correction(self, registration: Registration, cells: Sites, references: Sites) -> FrameCorrection | None:
-        """Return what corrects the lens in frames that are sampled at these places; None where nothing is corrected."""
+        """Return the lens correction for frames sampled at these positions; None without correction."""
         if self.lens is None or not self.corrects_lens:
             return None
         return self.lens.of(registration, cells, references)
 
     @property
     def corrects_lens(self) -> bool:
-        """Whether frames are corrected for what the lens spreads."""
+        """True if frames are corrected for light spread by the lens."""
         return self.lens is not None and self.options.lens_correction and self.lens.spread.proven
 
-    def movement(self, mosaic: Mosaic, black: _Array, channel: Channel, what: str) -> Shift:
-        """Return how far the chart has moved in a frame since the first one.
-
-        `black`: (2, 2) float64 counts.
-        """
-        self.require_layout(mosaic, what)
+    def movement(self, mosaic: Mosaic, black: _Array, channel: Channel, source: str) -> Shift:
+        """Return the movement of the chart since the first frame. `black`: (2, 2) float64 counts."""
+        self.require_layout(mosaic, source)
         framing = self.first.registration.framing
         return shift_between(self.first.gauges[channel], framing, gauges_of(mosaic, channel, black, framing))
 
     def patches(self, mosaic: Mosaic, black: _Array) -> tuple[_Array, npt.NDArray[np.uint16]]:
-        """Return what a frame has where cells and references were in the first one.
+        """Return the patches of a frame at their positions in the first frame.
 
-        `black`: (2, 2) float64 counts. Returns (C + W + N, 3) float64 counts above black; NaN where a patch does not
-        lie in the frame. Returns (C + W + N,) uint16, the highest raw count of each patch.
+        `black`: (2, 2) float64 counts. Returns (C + W + N, 3) float64 mean counts above black, NaN outside the frame,
+        and (C + W + N,) uint16, the highest raw count of each patch.
         """
         means: list[_Array] = []
         peaks: list[npt.NDArray[np.uint16]] = []
@@ -362,28 +332,28 @@ class Baseline:
         return np.concatenate(means), np.concatenate(peaks)
 
     def reflectances(self) -> _Array:
-        """Return the reflectance (C + W + N, 3) float64 of cells and references in the first frame, bare paper 1."""
+        """Return the reflectance (C + W + N, 3) float64 of patches and references in the first frame, bare paper 1."""
         paper, shape = self.paper.read(self.whites, self.first.file)
         field = np.concatenate([shape, paper.field.at(self.points.references_mm)])
         return reflectances(self.means, field, paper.white)
 
 
 def beyond_print(decoded: DecodedFrame, beyond: Sites) -> _Array:
-    """Return the mean (3,) float64 counts above black of what lies behind the print; 0 where it is not seen."""
+    """Return the mean (3,) float64 counts above black of the background behind the print; 0 if not visible."""
     if not len(beyond.rows):
         return np.zeros(3)
     return gather_means(decoded.mosaic, decoded.black, beyond).mean(axis=0)
 
 
 def compared_cells(chart: Chart, registered: RegisteredFrame) -> npt.NDArray[np.bool_]:
-    """Return which cells (C,) are inside the frame and look like the chart's."""
+    """Return the patches (C,) that are inside the frame and match the chart."""
     return registered.cells.inside & ~registered.registration.mismatched_cells[chart.cell_of_colour]
 
 
 def usable_means(
     samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites, saturation: int
 ) -> _Array:
-    """Return the means (N, 3) float64, counts above black, of patches; NaN where one is cut off or clipped.
+    """Return the means (N, 3) float64, counts above black, of patches; NaN if outside the frame or clipped.
 
     `samples`: (N, S, 3) float32 counts above black. `highest`: (N,) uint16, the highest raw count of each patch.
     `saturation`: raw count of saturation.
@@ -395,163 +365,135 @@ def usable_means(
 
 @dataclass(frozen=True, eq=False)
 class LocatedFrame:
-    """A frame and where the chart lies in it.
-
-    - `registered`: the frame registered last: this one, if the chart had to be registered again.
-    - `at`: where it is sampled: as there, moved along by `shift`.
-    - `shift`: movement against the frame that was registered before.
-    """
+    """A frame with the position of the chart in it."""
 
     decoded: DecodedFrame
-    registered: RegisteredFrame
-    at: RegisteredFrame
-    shift: Shift
+    registered: RegisteredFrame  # The frame registered last; this one, if it was registered again
+    moved: RegisteredFrame  # Sampling positions: those of `registered`, moved by `shift`
+    shift: Shift  # Movement since the previously registered frame
     reregistered: bool
 
 
 @dataclass(frozen=True, eq=False)
 class SampledFrame:
-    """A light or white frame as sampled.
-
-    - `paper`: flat field and white.
-    - `greys`: (N, 3) float64 counts above black of the grey references; NaN where one cannot be used.
-    - `values`: (C, S, 3) uint16, the table's samples.
-    - `highest`: (C,) uint16, the highest raw count of each cell.
-    - `samples`, `noise`: (C, S, 3) float32 counts above black and (C, 3) float64 counts, their noise; None if not asked
-      for.
-    - `dark`: (3,) float64 counts, dark light of bare paper that was subtracted; zeros if none was.
-    """
+    """A light or white frame with its samples."""
 
     located: LocatedFrame
     paper: Paper
-    greys: _Array
-    values: npt.NDArray[np.uint16]
-    highest: npt.NDArray[np.uint16]
-    samples: _Samples | None
-    noise: _Array | None
-    dark: _Array
+    greys: _Array  # (N, 3) counts above black of the grey references; NaN if unusable
+    values: npt.NDArray[np.uint16]  # (C, S, 3), samples of the LUT
+    highest: npt.NDArray[np.uint16]  # (C,), highest raw count of each patch
+    samples: _Samples | None  # (C, S, 3) counts above black; None if not requested
+    noise: _Array | None  # (C, 3) counts, noise of one sample; None if not requested
+    dark: _Array  # (3,) counts, subtracted dark light on bare paper; 0 if none
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFrame:
-    """A light or white frame as measured, without its counts.
-
-    - `registered`: the frame registered last, with which it was measured.
-    - `inside`: (C,) bool, whether all pixels of a cell lie in the frame.
-    - `values`, `highest`, `samples`, `noise`: as sampled.
-    """
+    """Measurements and samples of a light or white frame."""
 
     figures: FrameMeasurements
-    registered: RegisteredFrame
+    registered: RegisteredFrame  # The frame registered last, used for the measurement
     saturation: int
     values: npt.NDArray[np.uint16]
     highest: npt.NDArray[np.uint16]
-    inside: npt.NDArray[np.bool_]
+    inside: npt.NDArray[np.bool_]  # (C,), all pixels of a patch are inside the frame
     samples: _Samples | None
     noise: _Array | None
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredDarkFrame:
-    """A dark frame as measured; C cells of S samples.
-
-    - `registered`: the frame registered last, with which it was measured.
-    - `excess`: (C, S, 3) int16 counts, how far samples stand above their cells.
-    - `means`: (C + W + N, 3) float64 counts above black of cells, then references.
-    """
+    """Measurements of a dark frame."""
 
     figures: DarkFrameFigures
-    registered: RegisteredFrame
-    excess: npt.NDArray[np.int16]
-    means: _Array
+    registered: RegisteredFrame  # The frame registered last, used for the measurement
+    excess: npt.NDArray[np.int16]  # (C, S, 3) counts of samples above their patch
+    means: _Array  # (C + W + N, 3) counts above black of patches and references
 
 
 def locate(
     baseline: Baseline, decoded: DecodedFrame, registered: RegisteredFrame, register_again: bool
 ) -> LocatedFrame | None:
-    """Return where the chart lies in a frame, by that of the frame registered last.
+    """Return the position of the chart in a frame, relative to the frame registered last.
 
-    If it has moved too far for that, it is registered again, or None is returned if `register_again` is False.
+    If the chart has moved too far, it is registered again; None if `register_again` is False.
     """
     baseline.require_layout(decoded.mosaic, decoded.record.file)
     channel, framing = decoded.strongest, registered.registration.framing
     gauges = gauges_of(decoded.mosaic, channel, decoded.black, framing)
     shift = shift_between(registered.gauges[channel], framing, gauges)
-    # A turn or a change of distance moves the tags differently; moving the grid along would not help.
-    turned = shift.largest_px > shift.length_px + STILL_PX
-    if shift.gauges == 0 or shift.length_px > REREGISTER_PX or turned:
+    # After a rotation or a change of distance the tags move differently; a shifted grid would not fit.
+    is_distorted = shift.largest_px > shift.length_px + STILL_PX
+    if shift.gauges == 0 or shift.length_px > REREGISTER_PX or is_distorted:
         if not register_again:
             return None
-        found = baseline.register(decoded)
-        return LocatedFrame(decoded, found, found, _movement(baseline, registered, found), reregistered=True)
-    at = registered
+        new = baseline.register(decoded)
+        return LocatedFrame(decoded, new, new, _movement(baseline, registered, new), reregistered=True)
+    moved = registered
     if shift.length_px > STILL_PX:
-        moved = registered.registration.shifted(shift.dx, shift.dy)
-        cells, references = sites_of(moved, baseline.points, decoded.shape, baseline.options.window)
-        lens = baseline.correction(moved, cells, references)
-        at = replace(registered, cells=cells, references=references, lens=lens)
-    return LocatedFrame(decoded, registered, at, shift, reregistered=False)
+        shifted = registered.registration.shifted(shift.dx, shift.dy)
+        cells, references = sites_of(shifted, baseline.points, decoded.shape, baseline.options.window)
+        lens = baseline.correction(shifted, cells, references)
+        moved = replace(registered, cells=cells, references=references, lens=lens)
+    return LocatedFrame(decoded, registered, moved, shift, reregistered=False)
 
 
-def _movement(baseline: Baseline, before: RegisteredFrame, after: RegisteredFrame) -> Shift:
-    """Return how far the cells have moved from one registered frame to another, however far that is."""
+def _movement(baseline: Baseline, previous: RegisteredFrame, current: RegisteredFrame) -> Shift:
     cells_mm = baseline.points.cells_mm
-    by = after.registration.to_pixels(cells_mm) - before.registration.to_pixels(cells_mm)
-    dx, dy = np.median(by, axis=0).tolist()
-    return Shift(dx, dy, float(np.linalg.norm(by, axis=1).max()), len(by))
+    displacement = current.registration.to_pixels(cells_mm) - previous.registration.to_pixels(cells_mm)
+    dx, dy = np.median(displacement, axis=0).tolist()
+    return Shift(dx, dy, float(np.linalg.norm(displacement, axis=1).max()), len(displacement))
 
 
 def sample(baseline: Baseline, located: LocatedFrame, dark: DarkLight | None, keep_samples: bool) -> SampledFrame:
-    """Return the samples of a light or white frame. `dark`: what is subtracted from them; nothing if None."""
-    decoded, at, points = located.decoded, located.at, baseline.points
-    references, highest = gather(decoded.mosaic, decoded.black, at.references)
-    seen = usable_means(references, highest, at.references, decoded.saturation)
-    to_subtract = _to_subtract(decoded, at, references, dark)
-    of_cells = None
+    """Return the samples of a light or white frame. `dark`: light to subtract, if any."""
+    decoded, moved, points = located.decoded, located.moved, baseline.points
+    references, highest = gather(decoded.mosaic, decoded.black, moved.references)
+    means = usable_means(references, highest, moved.references, decoded.saturation)
+    to_subtract = _to_subtract(decoded, moved, references, dark)
+    dark_of_cells = None
     if to_subtract is not None:
-        of_cells, of_references = np.split(to_subtract, [len(points.cells_mm)])
-        seen -= of_references
-    whites, greys = np.split(seen, [len(points.whites_mm)])
+        dark_of_cells, dark_of_references = np.split(to_subtract, [len(points.cells_mm)])
+        means -= dark_of_references
+    whites, greys = np.split(means, [len(points.whites_mm)])
     paper, shape = baseline.paper.read(whites, decoded.record.file)
     if baseline.primaries is not None:
         shape = shape * baseline.primaries.field_ratio(paper.white)
     if keep_samples:
-        kept, highest = gather(decoded.mosaic, decoded.black, at.cells)
-        values, noise = table_values(kept, shape, of_cells), sample_noise(kept)
-        if of_cells is not None:
-            # Hot photosites and stains are looked for in samples that still have the dark light.
-            added = of_cells if dark is None else of_cells - dark.patches[: len(of_cells)]
-            kept -= added[:, None]
+        samples, highest = gather(decoded.mosaic, decoded.black, moved.cells)
+        values, noise = table_values(samples, shape, dark_of_cells), sample_noise(samples)
+        if dark_of_cells is not None:
+            # Hot photosites and stains are detected in samples that include the dark light.
+            added = dark_of_cells if dark is None else dark_of_cells - dark.patches[: len(dark_of_cells)]
+            samples -= added[:, None]
     else:
-        values, highest = gather_values(decoded.mosaic, decoded.black, at.cells, shape, of_cells)
-        kept = noise = None
+        values, highest = gather_values(decoded.mosaic, decoded.black, moved.cells, shape, dark_of_cells)
+        samples = noise = None
     dark_paper = np.zeros(3) if dark is None else dark.paper
-    return SampledFrame(located, paper, greys, values, highest, kept, noise, dark_paper)
+    return SampledFrame(located, paper, greys, values, highest, samples, noise, dark_paper)
 
 
 def _to_subtract(
-    decoded: DecodedFrame, at: RegisteredFrame, references: _Samples, dark: DarkLight | None
+    decoded: DecodedFrame, moved: RegisteredFrame, references: _Samples, dark: DarkLight | None
 ) -> _Samples | None:
-    """Return what is subtracted from each patch, (P, 3) float32 counts: dark light, and what the lens added.
-
-    `references` are the references' samples. None where nothing is subtracted.
-    """
-    if at.lens is None:
+    """Return the dark light and the light added by the lens, (P, 3) float32 counts; None without either."""
+    if moved.lens is None:
         return None if dark is None else dark.patches
-    cells = gather_means(decoded.mosaic, decoded.black, at.cells)
+    cells = gather_means(decoded.mosaic, decoded.black, moved.cells)
     means = np.concatenate([cells, references.mean(axis=1, dtype=np.float64)])
     if dark is not None:
         means -= dark.patches
-    added = at.lens.added(FrameLevels(means, beyond_print(decoded, at.lens.beyond))).astype(np.float32)
+    added = moved.lens.added(FrameLevels(means, beyond_print(decoded, moved.lens.beyond))).astype(np.float32)
     return added if dark is None else added + dark.patches
 
 
 def measure(baseline: Baseline, sampled: SampledFrame) -> MeasuredFrame:
-    """Return what a light or white frame shows."""
+    """Return the measurements of a light or white frame."""
     located, points, values = sampled.located, baseline.points, sampled.values
     decoded, shift, origin = located.decoded, located.shift, located.decoded.mosaic.origin
     greys, grey_errors = points.levels.read(sampled.greys, sampled.paper.field.at(points.greys_mm))
-    # σ of the registered frame's blur, and what the gauges are softer than in it.
+    # Blur of the registered frame, plus the growth of the blur at the gauges.
     blur_growth_px2 = 0.0 if located.reregistered else shift.blur_growth_px2
     mean = patch_means(values)
     variance = baseline.transfer.variance(mean) / baseline.options.samples
@@ -567,7 +509,7 @@ def measure(baseline: Baseline, sampled: SampledFrame) -> MeasuredFrame:
         grey_errors=grey_errors,
         dark=sampled.dark,
         share_at_zero=1 - int(np.count_nonzero(values)) / values.size,
-        blur_px=float(np.sqrt(max(located.at.registration.blur_px**2 + blur_growth_px2, 0.0))),
+        blur_px=float(np.sqrt(max(located.moved.registration.blur_px**2 + blur_growth_px2, 0.0))),
         exposure=origin.exposure,
         origin=origin,
     )
@@ -577,14 +519,14 @@ def measure(baseline: Baseline, sampled: SampledFrame) -> MeasuredFrame:
         decoded.saturation,
         values,
         sampled.highest,
-        located.at.cells.inside,
+        located.moved.cells.inside,
         sampled.samples,
         sampled.noise,
     )
 
 
 def measure_dark(baseline: Baseline, decoded: DecodedFrame, registered: RegisteredFrame) -> MeasuredDarkFrame:
-    """Return what a dark frame shows; no tag is seen in it, so the chart is assumed to lie where it did."""
+    """Return the measurements of a dark frame, in which the chart is assumed to be at its last position."""
     baseline.require_layout(decoded.mosaic, decoded.record.file)
     whites_mm = baseline.points.whites_mm
     cells, _ = gather(decoded.mosaic, decoded.black, registered.cells)

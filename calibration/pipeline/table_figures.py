@@ -1,11 +1,9 @@
-"""The figures of a whole table, or of a check, collected from its frames; and what is made of all of them.
+"""Measurements of a whole LUT or of a check, from its accumulated frames, including the uncertainty budget.
 
-- A series of exposures of the chart, in its place: how linear the sensor is (`read_linearity`). No sample depends on
-  it.
-- The components of the uncertainty budget (`budget_of`): what each cause may leave, from what a session shows of it.
-  What it does not show is what is usual, and says so; nothing is taken to be 0.
+An effect that the session does not show is assumed to have its usual size, never 0, and is marked as assumed. The
+linearity series (`read_linearity`) does not affect the samples.
 
-L lights, C cells in the order of colour indices.
+L illuminants, C patches in the order of colour indices.
 """
 
 from __future__ import annotations
@@ -52,98 +50,91 @@ from foundation.errors import FormatError, InputError
 
 _Array = npt.NDArray[np.float64]
 
-# Standard uncertainty of a frame's black level, counts, beyond what its frames' scatter shows (judgement: masked
-# photosites give .03).
+# Standard uncertainty of the black level, counts, in addition to the scatter of frames (judgement: masked photosites
+# give 0.03).
 _BLACK_COUNTS = 0.05
 
-# Standard deviation of photosites' response that is not seen beside their noise (usual of cameras: 0.3 to 1 %).
+# Relative standard deviation of photosite response that noise hides (usual for cameras: 0.3 to 1 %).
 _RESPONSE = 0.003
 
-_SINGLE_DARK = 0.2  # Relative change of dark light over a session, where one dark frame does not show it (judgement)
+_DARK_CHANGE = 0.2  # Relative change of dark light over a session with a single dark frame (judgement)
 
-# Share of the dark light by which dark frames differ from what is there in the lights', where no light shows it
-# (judgement).
-_USUAL_TOO_DARK = 0.2
+# Difference between dark light in dark frames and in illuminants' frames, relative, if not measured (judgement).
+_USUAL_OVERSUBTRACTION = 0.2
 
-# Relative: a lamp that flickers, or a wheel that is cut, within an exposure (judgement: half-second exposures; Heinz
-# et al. 2018).
+# Relative error by lamp flicker, or an incomplete turn of the wheel, in an exposure (judgement: 0.5 s; Heinz et al.
+# 2018).
 _FLICKER = 5e-5
 
-_STRAY = 1e-4  # Relative: light from beside the print where no figure shows it (judgement)
+_STRAY = 1e-4  # Relative light from outside the print, if not measured (judgement)
 
-# Share of the mean square of these two that all channels have in common: a lamp flickers as a whole, a wheel is cut
-# in one primary; walls send back the light that is shown, in their own colour (judgement).
+# Fraction of the mean square of these two common to all channels: a lamp flickers in all, a wheel ends in one primary;
+# walls reflect the illuminant in their own colour (judgement).
 _COMMON = 0.75
 
 
 def budget_of(table: TableMeasurements) -> Budget:
-    """Return the budget of what was measured."""
+    """Return the uncertainty budget of the measurements."""
     white = np.maximum(table.lights.white, 1e-9)
     cells = np.maximum(table.cells.levels, LEAST_LEVEL)
     return Budget(
         (
-            _noise(table, white, cells),
-            _lens(table, white),
-            _darkness(table, white, cells),
-            _linearity(table, white, cells),
-            _added_light(table, white, cells),
-            _flicker(white, cells),
-            _geometry(table, white, cells),
+            _noise_component(table, white, cells),
+            _lens_component(table, white),
+            _darkness_component(table, white, cells),
+            _linearity_component(table, white, cells),
+            _added_light_component(table, white, cells),
+            _flicker_component(white, cells),
+            _geometry_component(table, white, cells),
         ),
         white,
     )
 
 
 def _diagonal(squares: _Array) -> _Array:
-    """Return errors that are independent in each channel, (L, 3, 3), of mean squares (L, 3)."""
+    """Return covariances (L, 3, 3) of errors that are independent in each channel, from mean squares (L, 3)."""
     return squares[:, :, None] * np.eye(3)
 
 
 def _partly_common(size: float, lights: int) -> _Array:
-    """Return mean square relative errors (L, 3, 3) of a size that `_COMMON` of is in all channels alike."""
+    """Return covariances (L, 3, 3) of a relative error, of which the fraction `_COMMON` is common to all channels."""
     square = size**2 * (_COMMON * np.ones((3, 3)) + (1 - _COMMON) * np.eye(3))
     return np.broadcast_to(square, (lights, 3, 3))
 
 
-def _noise(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    """Return the noise of white and, of cells, that of the field there and their own photosites' response.
-
-    The field has as much of the references' noise as it has terms, white that of one.
-    """
+def _noise_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
+    # The field has the references' noise once per term of its polynomial, white once.
     square = (table.lights.white_error / white) ** 2
     field = max(len(factor) for frame in table.frames for factor in frame.paper.field.coefficients[0])
     response = (table.sensor.transfer.response**2 + _RESPONSE**2) / table.cells.window**2
     return Component(
         "noise", "noise of the white references", False,
-        "scatter of the white references about each frame's field, and the photosites' response within a cell; its "
-        "noise from frame to frame is the camera's and no error",
+        "scatter of the white references about each frame's flat field, and photosite response within a patch; the "
+        "camera's noise between frames is no error",
         _diagonal(square), np.broadcast_to(field * square.min(axis=0) + response, cells.shape),
     )  # fmt: skip
 
 
-def _lens(table: TableMeasurements, white: _Array) -> Component:
+def _lens_component(table: TableMeasurements, white: _Array) -> Component:
     lens = table.lens
-    source = "what the light about each cell says of the lens, and cannot say" if lens.measured else lens.why_not
+    source = "measured with the light around each patch, with its uncertainty" if lens.measured else lens.why_not
     return Component(
-        "lens", "spread and veil of the lens", not lens.measured, source,
+        "lens", "light spread and veiling glare of the lens", not lens.measured, source,
         np.broadcast_to(lens.white_covariance, (len(white), 3, 3)), lens.cells_error**2,
     )  # fmt: skip
 
 
-def _darkness(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    """Return the errors of black level and, where dark light was subtracted, of what was.
-
-    Without that, a light's ground truth is that of all light that was there.
-    """
+def _darkness_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
+    # Without subtraction, the ground truth includes all light, so that dark light is no error.
     lights, dark = table.lights, table.dark_frames
     black = np.array([frame.black.mean() for frame in table.frames])
     error = np.full(3, _BLACK_COUNTS**2 + float(np.var(black)) / max(len(black), 1))
-    source, assumed = "the black level of masked photosites", False
+    source, assumed = "black level of masked photosites", False
     if lights.subtracted is not None and dark.lights:
         light = np.maximum(dark.light, 0)
-        changes = np.var(dark.lights, axis=0, ddof=1) if len(dark.lights) > 1 else (_SINGLE_DARK * light) ** 2
-        error = error + dark.error**2 + changes + _too_dark(table, light) ** 2
-        source = "scatter of the dark frames; what lights of several primaries have beyond the primaries' sum"
+        changes = np.var(dark.lights, axis=0, ddof=1) if len(dark.lights) > 1 else (_DARK_CHANGE * light) ** 2
+        error = error + dark.error**2 + changes + _oversubtracted_counts(table, light) ** 2
+        source = "scatter of the dark frames; illuminants of several primaries against the primaries' sum"
         assumed = lights.additivity is None or len(dark.lights) < 2
     at_cells = error / np.maximum(lights.brightest, 1e-9) ** 2
     return Component(
@@ -153,164 +144,157 @@ def _darkness(table: TableMeasurements, white: _Array, cells: _Array) -> Compone
     )  # fmt: skip
 
 
-def _too_dark(table: TableMeasurements, dark: _Array) -> _Array:
-    """Return how much too much dark light (3,) counts was perhaps subtracted, of `dark` (3,) counts that was.
-
-    White then has twice as much beyond the sum of the primaries, each of which lacks it; a projector that adds light of
-    its own to white looks the same.
-    """
-    found = table.lights.additivity
-    if found is None:
-        return _USUAL_TOO_DARK * dark
-    beyond = np.sqrt(found.off**2 + found.error**2 + table.white_scatter**2) * table.lights.brightest
-    return np.minimum(beyond / 2, dark)
+def _oversubtracted_counts(table: TableMeasurements, dark: _Array) -> _Array:
+    # If `dark` (3,) counts are too high, white exceeds the primaries' sum by twice the excess, because each primary
+    # lacks it. A projector that adds light to white looks the same.
+    additivity = table.lights.additivity
+    if additivity is None:
+        return _USUAL_OVERSUBTRACTION * dark
+    excess = np.sqrt(additivity.off**2 + additivity.error**2 + table.white_scatter**2) * table.lights.brightest
+    return np.minimum(excess / 2, dark)
 
 
-def _linearity(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    found = table.sensor.superposition
+def _linearity_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
+    superposition = table.sensor.superposition
     paper = np.maximum(table.lights.brightest, 1e-9)
     level = np.maximum(cells, LEAST_LEVEL) * paper
     source = (
-        "red, green and blue alone against a light that is made of them"
-        if found.unmeasured is None
-        else f"usual of cameras: 1 % at saturation, 0.05 % of it near black; {found.unmeasured.why}"
+        "red, green and blue alone against an illuminant that combines them"
+        if superposition.unmeasured is None
+        else f"usual for cameras: 1 % at saturation, 0.05 % of saturation near black; {superposition.unmeasured.why}"
     )
     return Component(
-        "linearity", "deviation of counts from proportion", not found.measured, source,
-        found.white_covariance(white), found.errors(level, np.broadcast_to(paper, level.shape)),
+        "linearity", "deviation of counts from proportionality", not superposition.measured, source,
+        superposition.white_covariance(white), superposition.errors(level, np.broadcast_to(paper, level.shape)),
     )  # fmt: skip
 
 
-def _added_light(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    shown = 0.0 if table.lights.stray is None else table.lights.stray.share
-    lights = _partly_common(_STRAY, len(white)) + shown**2 * np.eye(3)
-    at_cells = (_STRAY**2 + shown**2 + table.cells.added.mean_square) / cells**2
+def _added_light_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
+    measured_share = 0.0 if table.lights.stray is None else table.lights.stray.share
+    lights = _partly_common(_STRAY, len(white)) + measured_share**2 * np.eye(3)
+    at_cells = (_STRAY**2 + measured_share**2 + table.cells.added.mean_square) / cells**2
     return Component(
-        "added light", "reflections and light of single frames", table.lights.stray is None,
-        "light that lies on dark and bright cells alike; codes of 0, and white against the primaries", lights, at_cells,
+        "added light", "reflections, and light in single frames", table.lights.stray is None,
+        "light that is equal on dark and bright patches; codes of 0, and white against the primaries", lights, at_cells,
     )  # fmt: skip
 
 
-def _flicker(white: _Array, cells: _Array) -> Component:
+def _flicker_component(white: _Array, cells: _Array) -> Component:
     return Component(
         "flicker", "flicker within an exposure", True,
-        "usual of lamps and wheels; a drift from frame to frame is in each light's own ground truth",
+        "usual for lamps and wheels; drift between frames is included in each ground truth",
         _partly_common(_FLICKER, len(white)), np.broadcast_to(_FLICKER**2, cells.shape),
     )  # fmt: skip
 
 
-def _geometry(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
-    """Return what reaches a cell's mean from its neighbours by the sharp core, and by where the cell was found.
-
-    A place that is known to some error blurs the cell's rim by as much, in the mean.
-    """
+def _geometry_component(table: TableMeasurements, white: _Array, cells: _Array) -> Component:
+    # An uncertain position blurs the rim of a patch by as much, on average.
     registration, window = table.registration, table.cells.window
     blur_px = np.hypot(registration.blur_px, registration.uncertainty_px(table.cells.stains.places_mm))
     of_neighbours = mean_bleed(registration.cell_px, blur_px, window)[:, None]
     contrast = np.sqrt(((cells - cells.mean(axis=0)) ** 2 + cells.var(axis=0)) / cells**2)
-    nothing = np.zeros((len(white), 3, 3))
+    no_error = np.zeros((len(white), 3, 3))
     return Component(
-        "geometry", "places of cells and sharp core", False,
-        "blur and places as registered; neighbours as the print has them in the mean",
-        nothing, (of_neighbours * contrast) ** 2,
+        "geometry", "positions of patches, and blur", False,
+        "registered blur and positions, with average neighbours",
+        no_error, (of_neighbours * contrast) ** 2,
     )  # fmt: skip
 
 
-_LEAST_BITS = 3  # Bits of a channel from which on neighbours in colour predict a cell
+_MIN_BITS = 3  # Bits per channel needed to predict a patch from its neighbours in colour
 
-# Frames of different exposure times (judgement): with fewer, errors of the stated times look like nonlinearity.
-LEAST_FRAMES = 4
+# Number of different exposure times (judgement): with fewer, errors of recorded times look like nonlinearity.
+MIN_EXPOSURES = 4
 
 
 def read_linearity(folder: Path, baseline: Baseline) -> LinearityMeasurements:
-    """Return what a series of exposures shows.
+    """Return the linearity measured with a series of exposures.
 
-    `folder`: raw files of the chart where the session's first registered frame has it, under one steady light, with one
-    ISO speed and aperture, from dim to the brink of saturation; eight are usual. Hidden files are passed over.
+    `folder`: raw files of the chart at its position in the session, under one steady illuminant, with one ISO speed and
+    aperture, from dim to almost saturated; eight are usual. Hidden files are ignored.
     """
     try:
         paths = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     except OSError as error:
         raise InputError(
-            f"cannot read the series of exposures {folder}: {error.strerror}; name a folder of raw files"
+            f"cannot read the series of exposures {folder}: {error.strerror}; give a folder of raw files"
         ) from error
-    if len(paths) < LEAST_FRAMES:
+    if len(paths) < MIN_EXPOSURES:
         raise InputError(
-            f"{folder} holds {len(paths)} files, at least {LEAST_FRAMES} raw files of the chart with different "
-            "exposure times expected, better 8 from dim to nearly saturated"
+            f"{folder} contains {len(paths)} files, expected at least {MIN_EXPOSURES}. Take raw files of the chart "
+            "with different exposure times, preferably 8, from dim to almost saturated"
         )
-    seen: list[_Array] = []
+    means_by_file: list[_Array] = []
     times: list[float] = []
     settings: list[tuple[int | None, float | None]] = []
     limits: list[float] = []
     for path in paths:
         mosaic = read_raw(path)
         if not mosaic.shutter_s:
-            raise FormatError(f"{path} does not state its exposure time; take the series with a camera that writes it")
+            raise FormatError(f"{path} has no exposure time; take the series with a camera that records it")
         times.append(mosaic.shutter_s)
         settings.append((mosaic.iso, mosaic.aperture))
         if settings[-1] != settings[0]:
             raise FormatError(
                 f"{path} was taken with ISO {mosaic.iso}, f/{mosaic.aperture}, {paths[0].name} with ISO "
-                f"{settings[0][0]}, f/{settings[0][1]}; a series differs in its exposure time alone"
+                f"{settings[0][0]}, f/{settings[0][1]}; take the series again and change only the exposure time"
             )
         black = frame_black(mosaic)
         limit = mosaic.saturation()
         _require_in_place(baseline.movement(mosaic, black, strongest_channel(mosaic, black), str(path)), path)
         means, highest = baseline.patches(mosaic, black)
         means[highest >= CLIPPING_SHARE * limit] = np.nan
-        seen.append(means)
+        means_by_file.append(means)
         limits.append(limit - float(black.mean()))
-    if len(set(times)) < LEAST_FRAMES:
+    if len(set(times)) < MIN_EXPOSURES:
         raise InputError(
-            f"{folder}: {len(set(times))} different exposure times, at least {LEAST_FRAMES} expected; "
-            "take the series with times from dim to nearly saturated"
+            f"{folder}: {len(set(times))} different exposure times, expected at least {MIN_EXPOSURES}; "
+            "take the series with times from dim to almost saturated"
         )
     order: list[int] = np.argsort(times, kind="stable").tolist()
-    level, deviation = deviations(np.stack(seen)[order] / min(limits), np.array(times)[order])
+    level, deviation = deviations(np.stack(means_by_file)[order] / min(limits), np.array(times)[order])
     if np.isnan(deviation).all():
         raise InputError(
             f"{folder}: no patch is between {LOWEST:.0%} and {HIGHEST:.0%} of saturation in two frames; "
-            "take the series with times less far apart, from dim to nearly saturated"
+            "take the series with smaller steps, from dim to almost saturated"
         )
     return LinearityMeasurements(tuple(paths[number].name for number in order), level, deviation)
 
 
 def _require_in_place(shift: Shift, path: Path) -> None:
     if shift.gauges == 0 or shift.largest_px > REREGISTER_PX:
-        moved = f"it has moved by {shift.largest_px:.2f} px, {REREGISTER_PX:g} allowed"
+        fault = f"it has moved by {shift.largest_px:.2f} px, at most {REREGISTER_PX:g} px expected"
         if shift.gauges == 0:
-            moved = "its tags, or the outline of its field, are not seen"
+            fault = "its tags, or the outline of its patches, are not visible"
         raise FormatError(
-            f"{path}: the chart is not where the session has it ({moved}); take the series with camera and print as "
-            "they stand in the session, before it or after it"
+            f"{path}: the chart is not at its position in the session ({fault}); take the series directly before or "
+            "after the session, without moving camera or print"
         )
 
 
-# Counts that a channel's ground truth has at least, so that it is a direction even where no light is measured.
-_LEAST_WHITE = 1e-3
+# Lower limit of the ground truth, counts, so that it has a direction even without light.
+_MIN_WHITE = 1e-3
 
-# Drift of white, as a share and in degrees, up to which white frames are believed: a table is refused beyond.
-_MOST_DRIFT, _MOST_DRIFT_DEG = 0.15, 2.0
+# Drift of white, relative and in degrees, beyond which a LUT is refused; larger differences are not drift.
+_MAX_DRIFT, _MAX_DRIFT_DEG = 0.15, 2.0
 
-_FULL_CODE = 255  # Code of a primary at its brightest
+_FULL_CODE = 255  # Code of a primary at full brightness
 
 
-def table_figures(done: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
-    """Return the figures of a table, all of whose frames have been taken in.
-
-    `linearity`: what a series of exposures shows; None where none was given.
-    """
-    even = next((frame for frame in done.frames if done.selected.is_even(frame.record)), done.frames[0])
-    lit = {frame.record.illumination: frame for frame in done.frames if frame.record.kind == "light"}
-    by_light = [lit[light.index] for light in done.session.illuminations]
+def table_figures(accumulator: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
+    """Return the measurements of a LUT with all frames added. `linearity`: result of a series of exposures, if any."""
+    frames = accumulator.frames
+    even = next((frame for frame in frames if accumulator.selected.is_even(frame.record)), frames[0])
+    frame_by_light = {frame.record.illumination: frame for frame in frames if frame.record.kind == "light"}
+    by_light = [frame_by_light[light.index] for light in accumulator.session.illuminations]
     greys = np.array([frame.greys for frame in by_light]), np.array([frame.grey_errors for frame in by_light])
-    return _figures(done, even, len(by_light), _light_figures(done, by_light), greys, linearity)
+    lights = _light_figures(accumulator, by_light)
+    return _table_measurements(accumulator, even, len(by_light), lights, greys, linearity)
 
 
-def check_figures(done: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
-    """Return the figures of a check, which has taken in the frame that is registered, and a dark one where there is."""
-    (frame,) = done.frames
+def check_figures(accumulator: Accumulator, linearity: LinearityMeasurements | None) -> TableMeasurements:
+    """Return the measurements of a check, with the registered frame and a dark frame, if there is one."""
+    (frame,) = accumulator.frames
     lights = LightMeasurements(
         white=frame.paper.white[None],
         white_error=frame.paper.error[None],
@@ -321,32 +305,33 @@ def check_figures(done: Accumulator, linearity: LinearityMeasurements | None) ->
         codes=None,
         white_frames=None,
     )
-    with_frame = len(done.session.illuminations) - len(done.selected.lights_without)
-    return _figures(done, frame, with_frame, lights, (frame.greys[None], frame.grey_errors[None]), linearity)
+    light_count = len(accumulator.session.illuminations) - len(accumulator.selected.lights_without)
+    greys = frame.greys[None], frame.grey_errors[None]
+    return _table_measurements(accumulator, frame, light_count, lights, greys, linearity)
 
 
-def _figures(
-    done: Accumulator,
-    even: FrameMeasurements,
+def _table_measurements(
+    accumulator: Accumulator,
+    even_frame: FrameMeasurements,
     lights_taken: int,
     lights: LightMeasurements,
     greys: tuple[_Array, _Array],
     linearity: LinearityMeasurements | None,
 ) -> TableMeasurements:
-    """Return all figures; `even` is the frame that shows how even cells are."""
-    session, baseline, saturation = done.session, done.baseline, done.saturation
+    # `even_frame` shows the uniformity of patches.
+    session, baseline, saturation = accumulator.session, accumulator.baseline, accumulator.saturation
     stated = stated_origin(session)
-    origins = [one.origin for one in done.figures]
+    origins = [frame.origin for frame in accumulator.figures]
     published = with_published_serials(origins, stated.citation.camera_serial)
-    stains, dark = done.stains(_field_at_cells(baseline, even)), done.dark_summary()
-    frames = _without_hot(done.frames, dark.hottest, stains.places_mm)
+    stains, dark = accumulator.stains(_field_at_cells(baseline, even_frame)), accumulator.dark_summary()
+    frames = _without_hot(accumulator.frames, dark.hottest, stains.places_mm)
     added = _added_light_of_first(baseline)
     table = TableMeasurements(
         session=SessionMeasurements(
             folder=session.folder,
             camera=baseline.camera,
             lights=lights_taken,
-            registered_file=done.selected.registered.file,
+            registered_file=accumulator.selected.registered.file,
             white_references=len(session.chart.white_references),
             codes=tuple(light.colour for light in session.illuminations),
         ),
@@ -356,21 +341,21 @@ def _figures(
         greys=GreyMeasurements(baseline.points.levels.names, *greys),
         sensor=SensorMeasurements(
             saturation_counts=saturation,
-            saturation_measured=bool((done.highest >= saturation).any()),
-            white_level=round(saturation - float(np.mean([frame.black.mean() for frame in done.frames]))),
-            noise=done.noise(),
+            saturation_measured=bool((accumulator.highest >= saturation).any()),
+            white_level=round(saturation - float(np.mean([frame.black.mean() for frame in accumulator.frames]))),
+            noise=accumulator.noise(),
             transfer=baseline.transfer,
             linearity=linearity,
             superposition=baseline.superposition,
         ),
         dark_frames=dark,
         cells=CellMeasurements(
-            baseline.options.window, done.unfit(stains, frames, added), stains, baseline.levels, added
+            baseline.options.window, accumulator.unfit(stains, frames, added), stains, baseline.levels, added
         ),
         origins=origin_figures(
-            list(zip(done.records, published, strict=True)), None if stated.camera is None else stated.camera.iso
+            list(zip(accumulator.records, published, strict=True)), None if stated.camera is None else stated.camera.iso
         ),
-        origin=origin_record(stated, done.records, origins),
+        origin=origin_record(stated, accumulator.records, origins),
         primaries=baseline.primaries,
         lens=_lens_figures(baseline),
         point_spread=None if baseline.lens is None else baseline.lens.spread,
@@ -380,9 +365,9 @@ def _figures(
 
 
 def _added_light_of_first(baseline: Baseline) -> AddedLight:
-    """Return the light that lies on parts of the print in the first frame, whatever is printed there."""
+    """Return the light added to parts of the print in the first frame, independent of colour."""
     chart, levels, cells_mm = baseline.chart, baseline.levels, baseline.points.cells_mm
-    if chart.bits < _LEAST_BITS:
+    if chart.bits < _MIN_BITS:
         return AddedLight.none(len(cells_mm))
     paper, _ = baseline.paper.read(baseline.whites, baseline.first.file)
     white = np.maximum(paper.white, 1e-9)
@@ -393,44 +378,39 @@ def _added_light_of_first(baseline: Baseline) -> AddedLight:
 
 
 def _lens_figures(baseline: Baseline) -> LensFigures:
-    """Return what is said of the lens of a session, measured or not, corrected or not."""
     if baseline.lens is None:
-        why = unsuitable(baseline.chart) or f"no channel of paper has {LEAST_COUNTS:g} counts in a frame to measure on"
-        return LensFigures.unknown(why, baseline.reflectances()[: baseline.chart.colour_count])
+        reason = unsuitable(baseline.chart) or f"no channel of paper reaches {LEAST_COUNTS:g} counts; expose longer"
+        return LensFigures.unknown(reason, baseline.reflectances()[: baseline.chart.colour_count])
     return baseline.lens.figures
 
 
-def _field_at_cells(baseline: Baseline, even: FrameMeasurements) -> _Array:
-    """Return the field (C, 3) float64 by which the cells of a frame are evened, each by that of its own colour."""
-    field = even.paper.field.at(baseline.points.cells_mm)
-    return field if baseline.primaries is None else field * baseline.primaries.field_ratio(even.paper.white)
+def _field_at_cells(baseline: Baseline, even_frame: FrameMeasurements) -> _Array:
+    """Return the flat field (C, 3) float64 of a frame at the patches, for the colour of each."""
+    field = even_frame.paper.field.at(baseline.points.cells_mm)
+    return field if baseline.primaries is None else field * baseline.primaries.field_ratio(even_frame.paper.white)
 
 
 def _without_hot(
     frames: tuple[FrameMeasurements, ...], hottest: _Array, cells_mm: _Array
 ) -> tuple[FrameMeasurements, ...]:
-    """Return frames in which no cell counts as covered for the hot photosite that it holds.
-
-    `hottest` (C,) counts as of the dark frames, whenever these were taken; (0,) without any.
-    """
+    # A patch with a hot photosite does not count as covered. `hottest`: (C,) counts, or (0,) without dark frames.
     if not len(hottest):
         return frames
     hot = hottest > 0
-    return tuple(replace(one, consistency=one.consistency.without_hot(hot, cells_mm)) for one in frames)
+    return tuple(replace(frame, consistency=frame.consistency.without_hot(hot, cells_mm)) for frame in frames)
 
 
-def _light_figures(done: Accumulator, by_light: Sequence[FrameMeasurements]) -> LightMeasurements:
-    """Return what was measured of the lights, whose frames are `by_light`."""
-    illuminations, options = done.session.illuminations, done.baseline.options
+def _light_figures(accumulator: Accumulator, by_light: Sequence[FrameMeasurements]) -> LightMeasurements:
+    illuminations, options = accumulator.session.illuminations, accumulator.baseline.options
     error = np.array([frame.paper.error for frame in by_light])
-    # A channel without light may be measured at or below 0; its standard error is what is known of it.
-    white = np.maximum([frame.paper.white for frame in by_light], np.maximum(error, _LEAST_WHITE))
-    whites = [frame for frame in done.frames if frame.record.kind == "white"]
+    # A channel without light may be measured at or below 0; its upper limit is then its standard error.
+    white = np.maximum([frame.paper.white for frame in by_light], np.maximum(error, _MIN_WHITE))
+    whites = [frame for frame in accumulator.frames if frame.record.kind == "white"]
     paper = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
     gains = drift_gains(*_times_s(by_light, whites), paper)
-    dark = np.zeros(3) if options.subtract_dark else done.dark_summary().light
+    dark = np.zeros(3) if options.subtract_dark else accumulator.dark_summary().light
     full_white = whites[0].paper.white if whites else None
-    compared = whites[:1] if _drift_is_one(whites) else whites
+    compared = whites[:1] if _differ_by_drift(whites) else whites
     agreement = _code_agreement(
         illuminations, by_light, compared, dark, gains if len(compared) < 2 else np.ones_like(gains)
     )
@@ -440,7 +420,7 @@ def _light_figures(done: Accumulator, by_light: Sequence[FrameMeasurements]) -> 
         gains=gains,
         subtracted=np.array([frame.dark for frame in by_light]) if options.subtract_dark else None,
         share_at_zero=np.array([frame.share_at_zero for frame in by_light]),
-        additivity=additivity(illuminations, white, full_white, dark, gains, done.baseline.superposition),
+        additivity=additivity(illuminations, white, full_white, dark, gains, accumulator.baseline.superposition),
         codes=agreement.rows(slice(len(by_light))),
         white_frames=agreement.rows(slice(len(by_light), None)) if whites else None,
         stray=_stray_light(illuminations, by_light, whites, dark, gains),
@@ -448,14 +428,14 @@ def _light_figures(done: Accumulator, by_light: Sequence[FrameMeasurements]) -> 
     )
 
 
-def _drift_is_one(whites: Sequence[FrameMeasurements]) -> bool:
-    """Return whether white frames differ as a lamp drifts, and not as frames of other lights or exposures do."""
+def _differ_by_drift(whites: Sequence[FrameMeasurements]) -> bool:
+    # Frames of other illuminants or exposures differ by more than lamp drift.
     levels = np.array([frame.paper.white for frame in whites]).reshape(-1, 3)
     if len(levels) < 2:
         return True
     middle = np.median(levels, axis=0)
-    turned = angles_deg(levels, np.broadcast_to(middle, levels.shape)).max()
-    return bool(np.abs(levels / np.maximum(middle, _LEAST_WHITE) - 1).max() < _MOST_DRIFT and turned < _MOST_DRIFT_DEG)
+    largest_deg = angles_deg(levels, np.broadcast_to(middle, levels.shape)).max()
+    return bool(np.abs(levels / np.maximum(middle, _MIN_WHITE) - 1).max() < _MAX_DRIFT and largest_deg < _MAX_DRIFT_DEG)
 
 
 def _code_agreement(
@@ -465,25 +445,25 @@ def _code_agreement(
     dark: _Array,
     gains: _Array,
 ) -> CodeAgreement:
-    """Return how the lights, and white frames behind them, agree with their codes; stated exposures aside."""
+    """Return the agreement of illuminants, followed by white frames, with their codes, at equal exposures."""
     frames = [*by_light, *whites]
     codes = np.array([*(light.colour for light in illuminations), *((255, 255, 255) for _ in whites)])
     factor = _to_one_exposure(frames)
     drift = np.concatenate([gains, np.ones((len(whites), 3))])
     error = np.array([frame.paper.error for frame in frames])
-    there = np.isfinite(dark)
-    white = np.array([frame.paper.white for frame in frames]) - np.where(there, dark, 0)
+    is_known = np.isfinite(dark)
+    white = np.array([frame.paper.white for frame in frames]) - np.where(is_known, dark, 0)
     return code_agreement(
         codes,
         white * factor / drift,
         error * factor / drift,
-        dark_known=bool(there.all()),
+        dark_known=bool(is_known.all()),
         drift_known=len(whites) == 1,
     )
 
 
 def _to_one_exposure(frames: Sequence[FrameMeasurements]) -> _Array:
-    """Return the usual exposure over that of each frame, (N, 1) float64, as files state them; 1 where they do not."""
+    """Return the ratio of the median exposure to each frame's, (N, 1) float64; 1 if not recorded."""
     exposures = np.array([frame.origin.exposure for frame in frames])
     usual = float(np.median(exposures[exposures > 0])) if (exposures > 0).any() else 1.0
     return np.where(exposures > 0, usual / np.maximum(exposures, 1e-12), 1.0)[:, None]
@@ -496,19 +476,18 @@ def _stray_light(
     dark: _Array,
     gains: _Array,
 ) -> StrayLight | None:
-    """Return what light is in frames that the dark ones do not show; None where it cannot be known."""
     frames, lights = [*by_light, *whites], len(by_light)
     factor = _to_one_exposure(frames) / np.concatenate([gains, np.ones((len(whites), 3))])
     white = (np.array([frame.paper.white for frame in frames]) - dark) * factor
     error = np.array([frame.paper.error for frame in frames]) * factor
     codes = np.array([light.colour for light in illuminations], dtype=np.int64)
-    # Lights of full white are white frames, too: the more there are, the better the lamp's flicker is known.
+    # Illuminants of full white count as white frames, to measure the lamp's flicker more accurately.
     full = np.concatenate([white[lights:], white[:lights][(codes == _FULL_CODE).all(axis=1)]])
     return stray_light(codes, white[:lights], error[:lights], full, pure_lights(illuminations))
 
 
 def _times_s(by_light: Sequence[FrameMeasurements], whites: Sequence[FrameMeasurements]) -> tuple[_Array, _Array]:
-    """Return when lights (L,) and white frames (W,) were taken, seconds since the first of these, if any."""
+    """Return the times of illuminants (L,) and white frames (W,), s since the first white frame, if any."""
     start = (*whites, *by_light)[0].record.taken_at
     at_s, white_at_s = (
         np.array([(frame.record.taken_at - start).total_seconds() for frame in frames]) for frames in (by_light, whites)

@@ -1,8 +1,7 @@
-"""The table's report: one page that shows by eye what the figures claim, and the same figures for programs.
+"""The report of a LUT: `report.html` for people and `report.json` for programs (docs/formats.md).
 
-`report.json`, whose form is stated in docs/formats.md, holds figures, limits and verdict; `report.html`, one file to be
-mailed, opens with the verdict, what to do, and the pictures that are looked at first. All figures follow in groups,
-each with its pictures, by the names that figures give of them (`Figure.drawing`).
+`report.html` is one file. It starts with the verdict, the remedies and the most important plots. All figures follow in
+groups, each with its plots (`Figure.drawing`).
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from calibration.figures.figure import QUESTIONS, Drawing, Group, Outcome, Summa
 from calibration.figures.light import ADDITIVITY, LINEARITY
 from calibration.measurements import TableMeasurements
 from calibration.report.plots import (
-    LabelledPlace,
+    LabelledPosition,
     cell_noise,
     draw_budget,
     draw_chromaticities,
@@ -32,7 +31,7 @@ from calibration.report.plots import (
     draw_errors,
     draw_field,
     draw_noise,
-    draw_places,
+    draw_positions,
     draw_registration,
     draw_residuals,
     half_size,
@@ -48,8 +47,8 @@ from calibration.verdict import (
     findings,
     is_mended_by_retaking,
     judged_values,
-    place_of,
-    places_text,
+    position_text,
+    positions_text,
     retake_command,
     retake_json,
     retaken_frames,
@@ -61,14 +60,14 @@ from foundation.files import write_atomic
 from foundation.pages import render
 from foundation.plots import draw_png
 
-# Points across and down the page whose places are told: enough to see how it hung, and how it bent, roughly.
-PLACES = (7, 5)
+# Points across and down the page reported in `chart_places`: enough for its pose and approximate curl.
+GRID_POINTS = (7, 5)
 
 _Array = npt.NDArray[np.float64]
 
 
 def report_json(result: BuildResult) -> dict[str, Any]:
-    """Return the content of `report.json`: verdict, figures, and every limit with its reason."""
+    """Return the content of `report.json`: verdict, figures and limits."""
     table, verdict = result.figures, result.verdict
     off_codes_deg, primaries = table.lights.off_codes_deg, table.primaries
     newest = max((frame.record for frame in table.frames), key=lambda record: record.attempt)
@@ -79,58 +78,55 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "session": table.session.folder.name,
         "camera": table.session.camera,
         "lights": table.session.lights,
-        "channels": _channels(table),
-        "chart_places": _chart_places(table),
-        "geometry": _geometry(table),
+        "channels": _channels_json(table),
+        "chart_places": _grid_json(table),
+        "geometry": _geometry_json(table),
         "uncertainty": table.budget.to_json(),
         "superposition": table.sensor.superposition.to_json(),
         "lens": table.lens.to_json() | ({} if table.point_spread is None else table.point_spread.to_json()),
-        "off_codes_deg": None if off_codes_deg is None else _short(off_codes_deg),
-        "codes": None if table.lights.codes is None else _codes(table.lights.codes),
+        "off_codes_deg": None if off_codes_deg is None else _rounded_values(off_codes_deg),
+        "codes": None if table.lights.codes is None else _codes_json(table.lights.codes),
         "origin": table.origin.model_dump(mode="json"),
-        "origins": _origins(table),
+        "origins": _foreign_frames(table),
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
         "figures": {name: _rounded(value) for name, value in judged_values(table).items()},
-        "causes": _causes(result),
+        "causes": _causes_json(result),
         **retake_json(retaken_frames(verdict, table), table.registered_frame.record.sha256, newest.sha256),
         "limits": [row.figure.limit_json() | {"outcome": row.outcome} for row in verdict.rows],
     }
 
 
-def _causes(result: BuildResult) -> list[dict[str, Any]]:
+def _causes_json(result: BuildResult) -> list[dict[str, Any]]:
     return [
         {
             "figure": name,
-            "cause": found.decision.cause.name,
-            "follows": found.decision.follows,
-            "why": "" if found.decision.rule is None else found.decision.rule.why,
-            "remedy": found.decision.cause.remedy,
-            "mends": found.decision.cause.mends,
-            "command": retake_command(found.frames) if found.is_of_frames else "",
-            "files": [frame.file for frame in found.frames],
+            "cause": cause.decision.cause.name,
+            "follows": cause.decision.follows,
+            "why": "" if cause.decision.rule is None else cause.decision.rule.why,
+            "remedy": cause.decision.cause.remedy,
+            "mends": cause.decision.cause.repeats,
+            "command": retake_command(cause.frames) if cause.is_of_frames else "",
+            "files": [frame.file for frame in cause.frames],
             "places": [
                 {
-                    "file": place.file,
-                    "x_mm": _rounded(place.x_mm),
-                    "y_mm": _rounded(place.y_mm),
-                    "size_mm": _rounded(place.size_mm),
+                    "file": position.file,
+                    "x_mm": _rounded(position.x_mm),
+                    "y_mm": _rounded(position.y_mm),
+                    "size_mm": _rounded(position.size_mm),
                 }
-                for place in found.places
+                for position in cause.positions
             ],
-            "evidence": {known: _rounded(value) for known, value in found.evidence.known().items()},
+            "evidence": {key: _rounded(value) for key, value in cause.evidence.measured_values().items()},
         }
-        for name, found in findings(result.verdict, result.figures).items()
+        for name, cause in findings(result.verdict, result.figures).items()
     ]
 
 
-def _chart_places(table: TableMeasurements) -> dict[str, Any]:
-    """Return where points of the page lie in the frame that was registered first, half-size px.
-
-    Of two tables of one chart these tell how it hung elsewhere.
-    """
+def _grid_json(table: TableMeasurements) -> dict[str, Any]:
+    """Return the pixel positions of grid points of the page in the frame registered first, half-size px."""
     registration = table.registration
     width, height = registration.colours.page_mm
-    across, down = PLACES
+    across, down = GRID_POINTS
     points = [(x, y) for y in np.linspace(0.05, 0.95, down) * height for x in np.linspace(0.05, 0.95, across) * width]
     return {
         "frame": table.session.registered_file,
@@ -139,24 +135,24 @@ def _chart_places(table: TableMeasurements) -> dict[str, Any]:
     }
 
 
-def _geometry(table: TableMeasurements) -> dict[str, Any]:
+def _geometry_json(table: TableMeasurements) -> dict[str, Any]:
     registration = table.registration
-    inner, outer = registration.places_known_px
+    inner_px, rim_px = registration.places_known_px
     lateral = registration.lateral
     return {
-        "uncertainty_px": _rounded(inner),
-        "rim_uncertainty_px": _rounded(outer),
+        "uncertainty_px": _rounded(inner_px),
+        "rim_uncertainty_px": _rounded(rim_px),
         "lateral_corner_px": {channel: _rounded(lateral.corner_px(channel)) for channel in ("R", "B")},
         "lateral_error_px": {channel: _rounded(lateral.corner_error_px(channel)) for channel in ("R", "B")},
     }
 
 
-def _codes(codes: CodeAgreement) -> dict[str, Any]:
+def _codes_json(codes: CodeAgreement) -> dict[str, Any]:
     return {
-        "angle_deg": _short(codes.angle_deg),
-        "error_deg": _short(codes.error_deg),
-        "brightness": _short(codes.brightness),
-        "off_brightness": _short(codes.off_brightness),
+        "angle_deg": _rounded_values(codes.angle_deg),
+        "error_deg": _rounded_values(codes.error_deg),
+        "brightness": _rounded_values(codes.brightness),
+        "off_brightness": _rounded_values(codes.off_brightness),
         "seen_as": {str(light): int(codes.seen_as[light]) for light in np.flatnonzero(codes.seen_as >= 0).tolist()},
         "exchanges": [asdict(pair) for pair in codes.exchanges],
         "held": int(codes.held.sum()),
@@ -165,7 +161,7 @@ def _codes(codes: CodeAgreement) -> dict[str, Any]:
     }
 
 
-def _origins(table: TableMeasurements) -> dict[str, Any]:
+def _foreign_frames(table: TableMeasurements) -> dict[str, Any]:
     return {
         name: [
             {"file": frame.record.file, "found": frame.found, "expected": frame.expected}
@@ -175,12 +171,12 @@ def _origins(table: TableMeasurements) -> dict[str, Any]:
     }
 
 
-def _short(values: _Array) -> list[float]:
+def _rounded_values(values: _Array) -> list[float]:
     return [float(f"{value:.3g}") for value in values.tolist()]
 
 
-def _channels(table: TableMeasurements) -> dict[str, Any]:
-    """Return what is known for each channel; what could not be measured is null."""
+def _channels_json(table: TableMeasurements) -> dict[str, Any]:
+    """Return the values of each channel; null if not measured."""
     transfer, dark, lights = table.sensor.transfer, table.dark_frames, table.lights
     linearity, registration = table.sensor.linearity, table.registration
     return {
@@ -189,21 +185,21 @@ def _channels(table: TableMeasurements) -> dict[str, Any]:
         LINEARITY.name: None if linearity is None else linearity.to_json(),
         "dark_frames": len(dark.files),
         "dark_subtracted": lights.subtracted is not None,
-        "dark_counts": _numbers(dark.light),
-        "dark_error": _numbers(dark.error),
-        "dark_noise": _numbers(dark.noise),
-        ADDITIVITY.name: None if lights.additivity is None else _numbers(lights.additivity.off),
+        "dark_counts": _finite_values(dark.light),
+        "dark_error": _finite_values(dark.error),
+        "dark_noise": _finite_values(dark.noise),
+        ADDITIVITY.name: None if lights.additivity is None else _finite_values(lights.additivity.off),
         "stray": None if lights.stray is None else lights.stray.to_json(),
-        "gain_e_per_count": _numbers(transfer.gain_e),
-        "read_noise_counts": _numbers(transfer.read_noise),
-        "response_spread": _numbers(transfer.response),
+        "gain_e_per_count": _finite_values(transfer.gain_e),
+        "read_noise_counts": _finite_values(transfer.read_noise),
+        "response_spread": _finite_values(transfer.response),
         "noisy_colours": np.flatnonzero(transfer.noisy).tolist(),
-        "grey_tint_deg": dict(zip(table.greys.names, _numbers(table.greys.tints_deg(lights.white)), strict=True)),
+        "grey_tint_deg": dict(zip(table.greys.names, _finite_values(table.greys.tints_deg(lights.white)), strict=True)),
     }
 
 
-def _numbers(values: _Array) -> list[float | None]:
-    """Return values (N,) with six significant digits; None for what is not finite, which JSON cannot hold."""
+def _finite_values(values: _Array) -> list[float | None]:
+    """Return values (N,) with six significant digits; None for values that JSON cannot hold."""
     return [_rounded(value) if np.isfinite(value) else None for value in values.tolist()]
 
 
@@ -211,59 +207,59 @@ def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-MOST_FRAMES = 4  # Frames that are drawn with their places: each is read again, and more are looked at by nobody
+MAX_FRAMES = 4  # Frames drawn with their positions; each is read again
 
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
-    """Write `report.html` and `report.json` into a table's folder; costs some seconds."""
+    """Write `report.html` and `report.json` into a LUT's folder; takes some seconds."""
     pictures = _pictures(result, session)
-    write_atomic(folder / REPORT_PAGE, page(result, pictures, _place_pictures(result, session)))
+    write_atomic(folder / REPORT_PAGE, page(result, pictures, _position_pictures(result, session)))
     write_atomic(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
 
 
 def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
-    """Return the pictures: first chart, lights, errors and noise, then those of the groups."""
+    """Return the plots: the main ones first, then those of the groups."""
     table = result.figures
     chart, registration = session.chart, table.registration
     frame = half_size(read_raw(session.folder / table.session.registered_file))
-    primaries = "No frames of red, green and blue alone show whether these light the print alike."
+    primaries = "Fields of the primaries were not measured: frames of red, green and blue alone are missing."
     if table.primaries is not None:
         primaries = (
-            f"Red, green and blue differ by up to {100 * table.primaries.difference:.1f} % in how they light it; what "
-            "that makes of each cell by its colour is divided out too."
+            f"The fields of red, green and blue differ by up to {100 * table.primaries.difference:.1f} %; each patch "
+            "is corrected for the field of its colour."
         )
     return [
-        *_first_pictures(result, session, frame),
+        *_main_pictures(result, session, frame),
         _Picture(
             "Residuals of the registration",
-            "Left: how far the cells moved the map from what the tags and the lens alone give, which is the paper's "
-            "waviness. Right: the residual of each block of cells, magnified; short arrows without order are noise.",
+            "Left: displacement of the patches from a plane imaged by the lens, which is the waviness of the paper. "
+            "Right: residual of each block of patches, magnified; short arrows in random directions are noise.",
             draw_png(draw_residuals, chart, registration),
             "geometry",
             "residuals",
         ),
         _Picture(
-            "The light on the print",
-            "Shape of the light under the frame that was registered, from its white references; it is divided out of "
-            f"samples and ground truth. Contours are 2 % apart. {primaries}",
+            "Light on the print",
+            "Flat field of the registered frame, from its white references. Samples and ground truth are divided by "
+            f"it. Contours are 2 % apart. {primaries}",
             draw_png(draw_field, chart, table.registered_frame.paper.field),
             "light",
             "field",
         ),
         _Picture(
-            "The course of the session",
-            "Black level, movement and blur of the chart, bare paper under white, how far cells are off their codes' "
-            "colours, and the white references used, frame by frame; the worst frame of each is ringed. All cells are "
-            "off where the focus is lost, a block of them where a hand or a shadow lies on the print.",
+            "Course of the session",
+            "Black level, movement and blur of the chart, bare paper under white, deviation of patches from their "
+            "codes' colours, and number of white references, frame by frame; rings mark the worst frames. A loss of "
+            "focus affects all patches; a hand or a shadow on the print affects a block of patches.",
             draw_png(draw_course, table),
             "radiometry",
             "course",
         ),
         _Picture(
-            "What the ground truth may be off by",
-            f"Left: the expanded uncertainty (k = {COVERAGE:g}) of each light's direction, shared out among its causes "
-            "by their squares; lights in the order of it, the worst first. Right: that of each cell's mean by its "
-            "level, noise apart. " + "; ".join(f"{one.title}: {one.source}" for one in table.budget.components) + ".",
+            "Uncertainty of the ground truth",
+            f"Left: expanded uncertainty (k = {COVERAGE:g}) of each illuminant, divided among its components by their "
+            "squares; the worst illuminant first. Right: expanded uncertainty of each patch mean against its level, "
+            "without noise. " + "; ".join(f"{item.title}: {item.source}" for item in table.budget.components) + ".",
             draw_png(draw_budget, table.budget, table.cells.levels),
             "truth",
             "budget",
@@ -271,180 +267,173 @@ def _pictures(result: BuildResult, session: Session) -> list[_Picture]:
     ]
 
 
-def _first_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np.float32]) -> list[_Picture]:
-    """Return what a scientist looks at first: chart, lights, errors, noise."""
+def _main_pictures(result: BuildResult, session: Session, frame: npt.NDArray[np.float32]) -> list[_Picture]:
     table, chart = result.figures, session.chart
     registration, window = table.registration, table.cells.window
     codes = np.array([light.colour for light in session.illuminations])
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
-    seen = f"seen by the {table.session.camera}"
+    source = f"recorded by the {table.session.camera}"
     expanded = table.budget.expanded_deg
-    truth = int(np.argmax(expanded)) if len(expanded) > 1 else None
-    ringed = "" if truth is None else f" Ringed is light {truth}, whose ground truth is known worst."
+    worst = int(np.argmax(expanded)) if len(expanded) > 1 else None
+    ring_text = "" if worst is None else f" A circle marks illuminant {worst}, with the most uncertain ground truth."
     return [
         _Picture(
-            "The chart as registered",
-            f"{table.session.registered_file}, contrast stretched, with the tags as found; below, magnified: the "
-            f"outline of every cell and the pixels of its {window**2} samples, in the corners and in the middle.",
+            "The registered chart",
+            f"{table.session.registered_file}, contrast stretched, with the detected tags. Below, magnified: outlines "
+            f"of patches and pixels of their {window**2} samples, in the corners and in the centre.",
             draw_png(draw_registration, frame, chart, registration, window),
             name="chart",
         ),
         _Picture(
-            "The lights",
-            "rb-chromaticities of the lights as projected, as the camera sees them on bare paper (the ground truth), "
-            f"and the latter in their colours. Rings are black bodies.{ringed}",
-            draw_png(draw_chromaticities, codes, black_body, table.lights.white, seen, truth),
+            "The illuminants",
+            "rb-chromaticities of the illuminants as projected, as recorded on bare paper (the ground truth), and the "
+            f"latter in their colours. Rings are black bodies.{ring_text}",
+            draw_png(draw_chromaticities, codes, black_body, table.lights.white, source, worst),
             name="lights",
         ),
         _Picture(
-            "Where cells err",
-            "Left: how far cells and their neighbours are off their codes' colours elsewhere on the sheet. Right: how "
-            "well the place of each cell is known. The worst cell of each is ringed.",
+            "Errors of patches",
+            "Left: deviation of patches and their neighbours from the same codes elsewhere on the sheet. Right: "
+            "uncertainty of the position of each patch. Rings mark the worst patches.",
             draw_png(draw_errors, table, chart),
             name="errors",
         ),
         _Picture(
-            "The noise",
-            "Left: variance of one sample over its level, medians of cells of like levels and the fitted curve (read "
-            "noise, photons, unequal photosites). Right: what that makes of signal over noise.",
+            "Noise",
+            "Left: variance of one sample against its level, as medians of patches of similar levels, and the fitted "
+            "curve (read noise, photons, photosite response). Right: the resulting signal-to-noise ratio.",
             draw_png(draw_noise, cell_noise(frame, chart, registration, window), table.sensor.transfer, window**2),
             name="noise",
         ),
     ]
 
 
-def _place_pictures(result: BuildResult, session: Session) -> list[_Picture]:
-    by_file: dict[str, list[LabelledPlace]] = {}
-    for name, found in findings(result.verdict, result.figures).items():
-        cause = found.decision.cause.name if found.is_known else "cause not known"
-        for place in found.places:
-            by_file.setdefault(place.file, []).append((f"{BY_NAME[name].title}: {cause}", place))
+def _position_pictures(result: BuildResult, session: Session) -> list[_Picture]:
+    by_file: dict[str, list[LabelledPosition]] = {}
+    for name, finding in findings(result.verdict, result.figures).items():
+        cause = finding.decision.cause.name if finding.is_known else "cause unknown"
+        for position in finding.positions:
+            by_file.setdefault(position.file, []).append((f"{BY_NAME[name].title}: {cause}", position))
     pictures: list[_Picture] = []
-    for file, places in list(by_file.items())[:MOST_FRAMES]:
+    for file, positions in list(by_file.items())[:MAX_FRAMES]:
         picture = half_size(read_raw(session.folder / file))
-        drawn = draw_png(draw_places, picture, session.chart, result.figures.registration, places)
+        png = draw_png(draw_positions, picture, session.chart, result.figures.registration, positions)
         caption = (
-            f"{file}, contrast stretched, with what is beyond its limits circled; places lie as in the frame that was "
+            f"{file}, contrast stretched. Circles mark deviations beyond their limits, at their positions in the frame "
             "registered first."
         )
-        pictures.append(_Picture(f"Where it is: {Path(file).stem}", caption, drawn))
+        pictures.append(_Picture(f"Position: {Path(file).stem}", caption, png))
     return pictures
 
 
-MOST_UNFIT = 200  # Unfit cells that are listed; all of them are in lut.json, and a page of thousands is read by nobody
+MAX_UNFIT = 200  # Unfit patches listed on the page; lut.json lists all
 
-# Outcomes, the worst first, as the page says them.
-_WORDS: dict[Outcome, str] = {"refuse": "refuse", "accept with remarks": "remark", "accept": "accept"}
+# Outcomes as on the page, the worst first.
+_OUTCOME_WORDS: dict[Outcome, str] = {"refuse": "refuse", "accept with remarks": "remark", "accept": "accept"}
 
-_ORDER: tuple[Outcome, ...] = tuple(_WORDS)
+_OUTCOME_ORDER: tuple[Outcome, ...] = tuple(_OUTCOME_WORDS)
 
 
 @dataclass(frozen=True)
 class _Picture:
-    """A picture of the report, PNG, with its heading and what it shows.
-
-    `group` is the one it is folded with; None for those that stand open on top. `name` is what figures say of it.
-    """
+    """A plot of the report, PNG, with heading and caption."""
 
     heading: str
     caption: str
     png: bytes
-    group: Group | None = None
-    name: Drawing | None = None
+    group: Group | None = None  # The group in which it is folded; None for pictures at the top
+    name: Drawing | None = None  # As in `Figure.drawing`
 
 
 @dataclass(frozen=True)
 class _Row:
-    """A judged value; beyond its limit with what helps, and where it is."""
+    """A judged value; beyond its limit with remedy and position."""
 
     judged: JudgedValue
     remedy: str
-    place: str
+    position: str
 
 
 def page(
     result: BuildResult,
     pictures: Sequence[_Picture],
-    places: Sequence[_Picture] = (),
+    position_pictures: Sequence[_Picture] = (),
 ) -> str:
-    """Return the text of `report.html`: verdict, what to do, what to look at first, then all figures in groups.
+    """Return the text of `report.html`: verdict, remedies, main plots, then all figures in groups.
 
-    `places` are pictures of what is beyond a limit.
+    `position_pictures`: frames with marked deviations.
     """
     table, verdict = result.figures, result.verdict
-    found, beyond = findings(verdict, table), len(verdict.refused) + len(verdict.remarks)
+    causes, beyond_count = findings(verdict, table), len(verdict.refused) + len(verdict.remarks)
     rows = [
         _Row(
             row,
-            _remedy(row, found.get(row.figure.name), table),
-            "" if row.outcome == "accept" else place_of(row.figure, table),
+            _remedy(row, causes.get(row.figure.name), table),
+            "" if row.outcome == "accept" else position_text(row.figure, table),
         )
-        for row in sorted(verdict.rows, key=lambda row: _ORDER.index(row.outcome))
+        for row in sorted(verdict.rows, key=lambda row: _OUTCOME_ORDER.index(row.outcome))
     ]
     simulated = ", taken in the simulated laboratory" if table.origin.rig == "simulated" else ""
     return render(
         "calibration.report",
         "report.html",
-        title=f"Table of {table.session.lights} lights, {table.session.camera}",
+        title=f"LUT of {table.session.lights} illuminants, {table.session.camera}",
         taken=f"Session {table.session.folder.name}{simulated}",
-        words=_WORDS,
+        words=_OUTCOME_WORDS,
         outcome=verdict.outcome,
         sentence={
             "accept": "Accepted: every figure is within its limit.",
             "accept with remarks": f"Accepted with remarks on {len(verdict.remarks)} of {len(verdict.rows)} figures.",
-            "refuse": f"Refused: {len(verdict.refused)} of {len(verdict.rows)} figures are beyond what can be used.",
+            "refuse": f"Refused: {len(verdict.refused)} of {len(verdict.rows)} figures exceed their refusing limits.",
         }[verdict.outcome],
         usable=not verdict.refused,
-        todo=rows[:beyond],
-        again=_again(result),
-        causes=[_cause(each) for each in found.values()],
-        first=[*places, *(picture for picture in pictures if picture.group is None)],
+        todo=rows[:beyond_count],
+        retake=_retake(result),
+        causes=[_cause_row(cause) for cause in causes.values()],
+        first=[*position_pictures, *(picture for picture in pictures if picture.group is None)],
         drawn={picture.name for picture in pictures if picture.name is not None},
-        groups=[_group(group, rows, table, pictures) for group in QUESTIONS],
+        groups=[_group_content(group, rows, table, pictures) for group in QUESTIONS],
         origin=origin_lines(table.origin),
         unfit=table.cells.unfit,
-        most_unfit=MOST_UNFIT,
+        most_unfit=MAX_UNFIT,
     ).text
 
 
 def summary(table: TableMeasurements, group: Group | None = None) -> list[SummaryRow]:
-    """Return the lines that say how good a table is, in their order: of all figures, or of a group's.
-
-    Of one frame, those of figures that it tells.
-    """
+    """Return the summary lines of all figures, or of a group; for a check, only of figures that one frame shows."""
     session = table.session
-    told = [one for one in FIGURES if not table.is_of_one_frame or one.of_one_frame != "unknown"]
-    lines = (line for one in told if group in (None, one.group) for line in one.lines)
-    found = (line.row(table) for line in sorted(lines, key=lambda line: line.place))
-    rows = [row for row in found if row is not None]
+    figures = [figure for figure in FIGURES if not table.is_of_one_frame or figure.of_one_frame != "unknown"]
+    lines = (line for figure in figures if group in (None, figure.group) for line in figure.lines)
+    candidates = (line.row(table) for line in sorted(lines, key=lambda line: line.position))
+    rows = [row for row in candidates if row is not None]
     if group not in (None, "geometry"):
         return rows
     return [
-        SummaryRow("Lights", str(session.lights), "with an accepted frame"),
-        SummaryRow("Frame registered", session.registered_file, ""),
+        SummaryRow("Illuminants", str(session.lights), "with an accepted frame"),
+        SummaryRow("Registered frame", session.registered_file, ""),
         *rows,
     ]
 
 
-def _group(
+def _group_content(
     group: Group, rows: Sequence[_Row], table: TableMeasurements, pictures: Sequence[_Picture]
 ) -> dict[str, Any]:
-    own = [row for row in rows if row.judged.figure.group == group]
-    beyond = sum(row.judged.outcome != "accept" for row in own)
-    within = f"{beyond} beyond their limits" if beyond else "all within their limits"
+    group_rows = [row for row in rows if row.judged.figure.group == group]
+    beyond_count = sum(row.judged.outcome != "accept" for row in group_rows)
+    outcome_text = f"{beyond_count} beyond their limits" if beyond_count else "all within their limits"
     return {
         "name": group,
         "question": QUESTIONS[group],
-        "beyond": beyond,
-        "summary": f"{counted(len(own), 'figure')}, {within}",
-        "rows": own,
+        "beyond": beyond_count,
+        "summary": f"{counted(len(group_rows), 'figure')}, {outcome_text}",
+        "rows": group_rows,
         "lines": summary(table, group),
         "pictures": [picture for picture in pictures if picture.group == group],
     }
 
 
-def _again(result: BuildResult) -> dict[str, Any] | None:
-    """Return which frames are to be taken again and how; None where taking frames again does not help."""
+def _retake(result: BuildResult) -> dict[str, Any] | None:
+    """Return the frames to take again, and the command; None if this does not help."""
     records = retaken_frames(result.verdict, result.figures)
     if not records:
         return None
@@ -452,26 +441,26 @@ def _again(result: BuildResult) -> dict[str, Any] | None:
         "count": counted(len(records), "frame"),
         "files": first_few([record.file for record in records]),
         "command": COMMAND,
-        "mends": is_mended_by_retaking(result.verdict, result.figures),
+        "is_sufficient": is_mended_by_retaking(result.verdict, result.figures),
     }
 
 
-def _remedy(row: JudgedValue, found: ProbableCause | None, table: TableMeasurements) -> str:
-    """Return what helps against what is beyond a limit; "" where nothing is."""
+def _remedy(row: JudgedValue, cause: ProbableCause | None, table: TableMeasurements) -> str:
+    """Return the remedy for a value beyond its limit, or ""."""
     if row.outcome == "accept":
         return ""
     _, remedy = detail_and_remedy(row.figure, table)
-    if found is None or not remedy:
+    if cause is None or not remedy:
         return remedy
-    return found.decision.cause.remedy if found.is_known else f"it may help to {remedy}"
+    return cause.decision.cause.remedy if cause.is_known else f"possible remedy: {remedy}"
 
 
-def _cause(found: ProbableCause) -> dict[str, Any]:
+def _cause_row(cause: ProbableCause) -> dict[str, Any]:
     return {
-        "title": BY_NAME[found.figure].title,
-        "cause": found.decision.cause.name,
-        "rule": found.decision.rule,
-        "command": retake_command(found.frames) if found.is_of_frames else "",
-        "places": places_text(found),
-        "evidence": ", ".join(f"{name} {value:.3g}" for name, value in found.evidence.known().items()),
+        "title": BY_NAME[cause.figure].title,
+        "cause": cause.decision.cause.name,
+        "rule": cause.decision.rule,
+        "command": retake_command(cause.frames) if cause.is_of_frames else "",
+        "positions": positions_text(cause),
+        "evidence": ", ".join(f"{name} {value:.3g}" for name, value in cause.evidence.measured_values().items()),
     }

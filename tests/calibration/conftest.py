@@ -1,4 +1,4 @@
-"""The small lab of these tests, rendered once: the Test body before 512 colours, a session taken in it, its table."""
+"""The small lab of these tests, rendered once: Test body, 512 colours, one session and its table."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ def session(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Generator[Ses
 
 @pytest.fixture(scope="session")
 def built(session: Session, tmp_path_factory: pytest.TempPathFactory) -> BuildResult:
-    """Return the table of the session with its report, whose pictures are blank; to be read, not changed."""
+    """Return the table of the session, with a report of blank pictures; read only."""
     with blank_pictures():
         return build(session, tmp_path_factory.mktemp("table") / "lut", report=write_report)
 
 
 @pytest.fixture
 def pinned_builds(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, pinned: Pinned) -> Iterator[None]:
-    """Pin the numbers of every table that a test builds by `build` of its module."""
+    """Pin the numbers of every table that a test builds with `build` of its module."""
     module: Any = request.module
     known: Callable[..., BuildResult] = module.build
-    found: list[Any] = []
+    detected: list[Any] = []
 
     def kept(session: Session, out: Path, *given: Any, report: Any = None, **named: Any) -> BuildResult:
         def seen(result: BuildResult, session: Session, folder: Path) -> None:
-            found.append(told(result))
+            detected.append(told(result))
             if report is not None:
                 report(result, session, folder)
 
@@ -55,10 +55,10 @@ def pinned_builds(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(module, "build", kept)
     yield
-    if found:
-        pinned(f"build, {words_of_test(request)}", found, **LIMITS)
+    if detected:
+        pinned(f"build, {words_of_test(request)}", detected, **LIMITS)
 
 
 def words_of_test(request: pytest.FixtureRequest) -> str:
-    """Return a test's name in words."""
+    """Return a test's name in words, which names its pins."""
     return re.sub(r"[^a-z0-9.-]+", " ", request.node.name.removeprefix("test_").lower()).strip()

@@ -1,4 +1,4 @@
-"""A lab for these tests: a chart hung before a simulated body, and sessions taken in it."""
+"""A lab for these tests: a chart in front of a simulated body, and sessions taken in it."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ from sim.world.sensors import BODIES, Body, Rectangle
 from sim.world.world import Room, World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
+# Software printed in the margin of charts; another version would change the picture.
 SOFTWARE = "croplab 0.1.0"
-"""What designed the charts: it stands in the margin, so that another version would be another picture."""
 Paint = Callable[[npt.NDArray[np.uint16]], None]
 TAKEN_AT = datetime(2024, 3, 1, 9, 0, tzinfo=UTC)
 
@@ -65,15 +65,14 @@ class Lab:
     ) -> bytes:
         """Return a frame's file.
 
-        `paint` may alter the whole sensor's counts before it is written; `stated` is what the file says of the
-        exposure, if not the truth.
+        `paint` may change the sensor's counts; `stated` is the exposure recorded in the file, if it differs.
         """
         counts = self.world.expose(colour, settings, key=(key,), lamp=lamp, situation=situation)
         if paint is not None:
             paint(counts)
         stream = BytesIO()
-        said = settings if stated is None else stated
-        write_dng(stream, counts, self.world.body, settings=said, taken_at=TAKEN_AT, serial=serial)
+        recorded = settings if stated is None else stated
+        write_dng(stream, counts, self.world.body, settings=recorded, taken_at=TAKEN_AT, serial=serial)
         return stream.getvalue()
 
     def mosaic(
@@ -90,52 +89,51 @@ class Lab:
         return read_raw(path)
 
     def truth_px(self, points_mm: npt.NDArray[np.float64], mosaic: Mosaic) -> npt.NDArray[np.float64]:
-        """Return where points are seen, in the half-size pixels of a mosaic as read."""
+        """Return the true positions of points, half-size px of the decoded mosaic."""
         visible = self.world.body.visible
         aside = np.array([mosaic.visible.left - visible.left, mosaic.visible.top - visible.top]) / 2
         return self.world.project(points_mm) - aside
 
     def corners_px(self, mosaic: Mosaic) -> npt.NDArray[np.float64] | None:
-        """Return corners as a person gives them, whole raw pixels, some off; None for a chart with tags."""
+        """Return corners as given by a person, whole raw pixels with small errors; None for a chart with tags."""
         if self.chart.tags:
             return None
         return (self.truth_px(field_mm(self.chart), mosaic) + np.array([(4, -3), (-3, 2), (2, 4), (-4, -2)])).round()
 
     def miss_px(self, mosaic: Mosaic) -> npt.NDArray[np.float64]:
-        """Return how far the registered cells lie from the truth, px."""
+        """Return the distance of registered cells from the truth, px."""
         places = register(mosaic, self.chart, corners=self.corners_px(mosaic)).to_pixels(self.chart.centres_mm)
         return np.linalg.norm(places - self.truth_px(self.chart.centres_mm, mosaic), axis=1)
 
 
 @cache
 def designed(bits: int, page: str, seed: int) -> tuple[Chart, Print]:
-    """Return a chart and its sheet, drawn once."""
     chart = replace(design_chart(bits, A_SERIES_MM[page], seed), software=SOFTWARE)
     picture = drawing(chart)
     return chart, Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
 
 
 def hang(bits: int = 3, page: str = "A5", body: str = "Test", seed: int = 1, room: Room | None = None) -> Lab:
-    """Return a lab; the paper of a small page waves less than the room's default."""
+    """Return a lab; paper of a small page is less wavy than the default."""
     chart, sheet = designed(bits, page, seed)
     return Lab(chart, World(sheet, BODIES[body], Room(waviness_mm=0.5) if room is None else room))
 
 
 def hang_chart(chart: Chart, body: str | Body, room: Room) -> Lab:
-    """Return a lab with a chart of one's own."""
+    """Return a lab with the given chart."""
     chart = replace(chart, software=SOFTWARE)
     picture = drawing(chart)
     seen_by = BODIES[body] if isinstance(body, str) else body
     return Lab(chart, World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), seen_by, room))
 
 
+# Half the sides of an EOS 550D: ten times the photosites of the Test body.
 QUARTER = replace(
     BODIES["EOS 550D"],
     sensor=(1784, 2742),
     visible=Rectangle(51, 142, 1733, 2600),
     masked=(Rectangle(0, 0, 1784, 140),),
 )
-"""A frame of half an EOS 550D's sides: ten times the photosites of the Test body."""
 
 
 def take(
@@ -164,7 +162,7 @@ def figures_alone(result: BuildResult, session: Session, folder: Path) -> None:
 
 @contextmanager
 def blank_pictures() -> Generator[None]:
-    """Leave the pictures of reports blank within: drawing them takes three times as long as a small build."""
+    """Leave the pictures of reports blank; drawing them takes three times as long as a small build."""
 
     def blank(draw: Callable[..., None], *arguments: object) -> bytes:
         return b"\x89PNG\r\n\x1a\n"
@@ -177,7 +175,7 @@ def blank_pictures() -> Generator[None]:
 
 @pytest.fixture
 def lens_unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no chart show the lens where nothing asks for it: of 512 colours it takes a third of a small build."""
+    """Disable the measurement of the lens, which takes a third of a small build."""
 
     def unsuitable(chart: Chart) -> str:
         return "not measured in this test"
@@ -186,14 +184,14 @@ def lens_unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"calibration.pipeline.{module}.unsuitable", unsuitable)
 
 
+# Size of stored renderings: sixteen of the Test body.
 RENDERED_BYTES = 100_000_000
-"""Of renderings that are kept: sixteen of the Test body."""
 
 Rendering = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 _rendered: dict[tuple[object, ...], Rendering] = {}
 
+# Number of frames with stored registration.
 REGISTERED_FRAMES = 8
-"""Frames whose registration is kept."""
 
 _registered: dict[tuple[object, ...], Registration] = {}
 
@@ -201,14 +199,14 @@ _registered: dict[tuple[object, ...], Registration] = {}
 def registered_once(
     mosaic: Mosaic, chart: Chart, what: str, corners: npt.ArrayLike | None, near: Registration | None
 ) -> Registration:
-    """Register a frame, of equal ones the first alone: a session's first frame is that of each build."""
+    """Register equal frames once; all builds of a session share the first frame."""
     counts = hashlib.sha256(mosaic.sensor.tobytes()).digest()
     key = (counts, mosaic.pattern, mosaic.black.tobytes(), mosaic.visible, mosaic.masked, chart.sha256, str(corners))
     if near is not None or key not in _registered:
-        found = register(mosaic, chart, what, corners, near)
+        result = register(mosaic, chart, what, corners, near)
         if near is not None:
-            return found
-        _registered[key] = found
+            return result
+        _registered[key] = result
         while len(_registered) > REGISTERED_FRAMES:
             del _registered[next(iter(_registered))]
     return _registered[key]
@@ -216,10 +214,7 @@ def registered_once(
 
 @pytest.fixture(scope="module", autouse=True)
 def rendered_once() -> Generator[None]:
-    """Render worlds that are equal once a process, and register frames that are.
-
-    The same charts hang in the same rooms in hundreds of tests.
-    """
+    """Render equal worlds, and register equal frames, once per process; hundreds of tests share them."""
     render = World._render_new
 
     def kept(self: World, situation: Situation) -> Rendering:
@@ -229,16 +224,16 @@ def rendered_once() -> Generator[None]:
         drawn = hashlib.sha256(sheet.rectangles_mm.tobytes() + sheet.rgb.tobytes()).digest()
         # A test may put stain, fold or camera elsewhere than the room says.
         view = self.view
-        seen = (view.rotation.tobytes(), view.distance_mm, view.focal_px, view.centre_px, view.distortion)
-        worn = (self.stain, self.fold)
-        key = (type(self), self.body, room, worn, seen, sheet.page_mm, drawn, situation.view)
+        view_key = (view.rotation.tobytes(), view.distance_mm, view.focal_px, view.centre_px, view.distortion)
+        marks = (self.stain, self.fold)
+        key = (type(self), self.body, room, marks, view_key, sheet.page_mm, drawn, situation.view)
         # The one that was asked for last is the last to go.
-        _rendered[key] = found = _rendered.pop(key, None) or render(self, situation)
-        for array in found:
+        _rendered[key] = result = _rendered.pop(key, None) or render(self, situation)
+        for array in result:
             array.flags.writeable = False
         while sum(light.nbytes for light, _ in _rendered.values()) > RENDERED_BYTES:
             del _rendered[next(iter(_rendered))]
-        return found
+        return result
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(World, "_render_new", kept)
@@ -247,7 +242,7 @@ def rendered_once() -> Generator[None]:
 
 
 def renumbered(lights: Sequence[Illumination]) -> tuple[Illumination, ...]:
-    """Return lights as a plan of their own, numbered from 0."""
+    """Return lights numbered from 0."""
     return tuple(replace(light, index=index) for index, light in enumerate(lights))
 
 

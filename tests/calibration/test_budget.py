@@ -1,4 +1,4 @@
-"""The uncertainty budget's arithmetic, against draws of what it states."""
+"""Arithmetic of the uncertainty budget, against random draws."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ WHITE = np.array([[2400.0, 5200.0, 900.0], [300.0, 120.0, 4000.0]])
 
 
 def correlated() -> np.ndarray:
-    """Return relative errors of which most is common to all channels, (2, 3, 3)."""
+    """Return relative errors (2, 3, 3) that are mostly common to all channels."""
     own = np.array([[1e-3, 2e-3, 4e-3], [2e-3, 5e-3, 1e-3]])
     return own[:, :, None] * np.eye(3) * own[:, None, :] + 1e-4
 
@@ -22,35 +22,35 @@ def component(lights: np.ndarray, name: str = "noise") -> Component:
     return Component(name, name, assumed=False, source="drawn", lights=lights, cells=np.full((8, 3), 1e-4))
 
 
-def test_a_direction_s_error_is_that_of_draws() -> None:
+def test_direction_error_matches_random_draws() -> None:
     random, covariance = np.random.default_rng(1), correlated()
     for light in range(2):
-        off = random.multivariate_normal(np.zeros(3), covariance[light], 20000)
-        angles = angles_deg(WHITE[light] * (1 + off), np.broadcast_to(WHITE[light], off.shape))
+        errors = random.multivariate_normal(np.zeros(3), covariance[light], 20000)
+        angles = angles_deg(WHITE[light] * (1 + errors), np.broadcast_to(WHITE[light], errors.shape))
         assert direction_deg(WHITE, covariance)[light] == pytest.approx(np.sqrt((angles**2).mean()), rel=0.03)
 
 
-def test_about_19_of_20_draws_lie_within_what_is_stated() -> None:
+def test_expanded_uncertainty_covers_95_percent() -> None:
     random, covariance = np.random.default_rng(2), correlated()
     budget = Budget((component(covariance / 2), component(covariance / 2, "lens")), WHITE)
     for light in range(2):
-        off = random.multivariate_normal(np.zeros(3), covariance[light], 5000)
-        angles = angles_deg(WHITE[light] * (1 + off), np.broadcast_to(WHITE[light], off.shape))
+        errors = random.multivariate_normal(np.zeros(3), covariance[light], 5000)
+        angles = angles_deg(WHITE[light] * (1 + errors), np.broadcast_to(WHITE[light], errors.shape))
         assert 0.93 < (angles <= budget.expanded_deg[light]).mean() < 0.995
 
 
-def test_what_is_common_to_all_channels_turns_nothing() -> None:
+def test_common_error_does_not_change_direction() -> None:
     assert direction_deg(WHITE, np.full((2, 3, 3), 0.01)) == pytest.approx(0, abs=1e-6)
 
 
-def test_components_add_by_their_squares_and_the_largest_is_named() -> None:
+def test_components_add_in_squares() -> None:
     budget = Budget((component(correlated()), component(4 * correlated(), "lens")), WHITE)
     assert budget.expanded_deg == pytest.approx(COVERAGE * np.sqrt(5) * budget.lights_deg[0])
     assert budget.main_cause(0).name == "lens"
     assert budget.expanded_cells == pytest.approx(COVERAGE * np.sqrt(2e-4))
 
 
-def test_files_name_their_columns() -> None:
+def test_files_have_column_names() -> None:
     budget = Budget((component(correlated(), "added light"),), WHITE)
     head, first, *_ = budget.lights_csv().splitlines()
     assert head == f"illumination,{EXPANDED},added_light_deg"
@@ -59,7 +59,7 @@ def test_files_name_their_columns() -> None:
     assert len(budget.cells_csv().splitlines()) == 9
 
 
-def test_the_report_has_the_median_cell_and_the_worst() -> None:
+def test_report_has_median_and_worst_cell() -> None:
     cells = np.full((9, 3), 1e-4)
     cells[4, 1] = 9e-4
     budget = Budget((Component("noise", "noise", False, "drawn", correlated(), cells),), WHITE)

@@ -1,4 +1,4 @@
-"""What a table says of its origin: from raw files, journal, settings and the lab, and how it is cited."""
+"""Origin of a table from raw files, journal, settings and lab, and its citation."""
 
 from __future__ import annotations
 
@@ -49,76 +49,78 @@ def stated(citation: CitationSettings | None = None, rig: str | None = "lab") ->
     return StatedOrigin(known, rig, CameraSettings(iso=200), DEVICES)  # pyrefly: ignore[bad-argument-type]
 
 
-def test_the_raw_files_come_before_settings_and_journal() -> None:
+def test_raw_files_precede_settings_and_journal() -> None:
     other = replace(BODY, iso=400)
-    found = origin_record(stated(CitationSettings(lens="by hand", camera_serial="plain")), RECORDS, [other, BODY, BODY])
-    assert (found.camera_serial, found.lens, found.iso, found.exposure_by) == (
+    result = origin_record(
+        stated(CitationSettings(lens="by hand", camera_serial="plain")), RECORDS, [other, BODY, BODY]
+    )
+    assert (result.camera_serial, result.lens, result.iso, result.exposure_by) == (
         "1234567890",
         BODY.lens,
         100,
         "raw files",
     )
     # 23:30 at UTC + 2 is 21:30; the frames were taken a minute apart and are listed out of order.
-    assert (found.first_frame, found.last_frame) == ("2026-03-01T21:30:00+00:00", "2026-03-01T21:32:00+00:00")
-    assert (found.projector, found.taken_by, found.frames) == ("Acme 3000", "croplab 0.1.0", 3)
+    assert (result.first_frame, result.last_frame) == ("2026-03-01T21:30:00+00:00", "2026-03-01T21:32:00+00:00")
+    assert (result.projector, result.taken_by, result.frames) == ("Acme 3000", "croplab 0.1.0", 3)
 
 
-def test_what_raw_files_do_not_state_comes_from_settings_journal_and_lab() -> None:
-    found = origin_record(stated(CitationSettings(lens="Nikkor 50", camera_serial="plain")), RECORDS, [FrameOrigin()])
-    assert (found.iso, found.aperture, found.exposure_by) == (200, 8.0, "settings")
-    assert (found.lens, found.camera_serial) == ("Nikkor 50", "77")
+def test_missing_raw_values_come_from_other_sources() -> None:
+    result = origin_record(stated(CitationSettings(lens="Nikkor 50", camera_serial="plain")), RECORDS, [FrameOrigin()])
+    assert (result.iso, result.aperture, result.exposure_by) == (200, 8.0, "settings")
+    assert (result.lens, result.camera_serial) == ("Nikkor 50", "77")
 
 
-def test_a_lens_without_an_aperture_has_none_in_the_origin() -> None:
+def test_lens_without_aperture_records_none() -> None:
     known = replace(stated(), camera=CameraSettings(iso=200, aperture="none"))
-    found = origin_record(known, RECORDS, [FrameOrigin()])
-    assert (found.iso, found.aperture, found.shutter_s) == (200, None, 0.5)
+    result = origin_record(known, RECORDS, [FrameOrigin()])
+    assert (result.iso, result.aperture, result.shutter_s) == (200, None, 0.5)
 
 
-def test_settings_of_a_session_that_set_no_camera_are_no_exposure() -> None:
+def test_settings_without_camera_give_no_exposure() -> None:
     known = StatedOrigin(CitationSettings(), "imported", None, {})
-    found = origin_record(known, RECORDS, [FrameOrigin()])
-    assert (found.iso, found.shutter_s, found.exposure_by, found.projector) == (None, None, None, None)
-    assert dict(origin_lines(found))["Exposure"] == NOT_RECORDED
+    result = origin_record(known, RECORDS, [FrameOrigin()])
+    assert (result.iso, result.shutter_s, result.exposure_by, result.projector) == (None, None, None, None)
+    assert dict(origin_lines(result))["Exposure"] == NOT_RECORDED
 
 
-def test_the_lab_names_a_projector_without_a_control_port() -> None:
+def test_lab_names_projector_without_control_port() -> None:
     known = stated(CitationSettings(projector="Barco on the left"))
     assert origin_record(known, RECORDS, [BODY]).projector == "Barco on the left"
 
 
 @pytest.mark.parametrize("form", ["hash", "withheld"])
-def test_a_serial_number_that_is_not_told_stands_nowhere(form: str) -> None:
+def test_withheld_serial_appears_nowhere(form: str) -> None:
     citation = CitationSettings.model_validate({"camera_serial": form})
-    found = origin_record(stated(citation), RECORDS, [BODY])
-    text = found.model_dump_json() + json.dumps(origin_lines(found))
-    told = with_published_serials([BODY, replace(BODY, serial="99")], citation.camera_serial)
-    assert BODY.serial not in text + repr(told)
-    assert found.camera_serial_is == form
+    result = origin_record(stated(citation), RECORDS, [BODY])
+    text = result.model_dump_json() + json.dumps(origin_lines(result))
+    published = with_published_serials([BODY, replace(BODY, serial="99")], citation.camera_serial)
+    assert BODY.serial not in text + repr(published)
+    assert result.camera_serial_is == form
     assert ("(hash)" in text) is (form == "hash")
     # Frames of another body must still be told apart.
-    assert told[0].serial != told[1].serial
+    assert published[0].serial != published[1].serial
 
 
 @pytest.mark.slow
-def test_the_hash_is_the_bodys_alone() -> None:
+def test_hash_identifies_body() -> None:
     assert serial_hash("A", "1") == serial_hash("A", "1")
     assert len({serial_hash("A", "1"), serial_hash("A", "2"), serial_hash("B", "1")}) == 3
     assert re.fullmatch("[0-9a-f]{32}", serial_hash("A", "1"))
 
 
-def test_lab_toml_states_the_citation() -> None:
+def test_lab_toml_contains_citation() -> None:
     head = 'rig = "simulated"\nchart = "c"\nilluminations = "i"\n[citation]\n'
-    found = parse_lab(head + 'authors = ["Family, Given", "Institute"]\nlicence = "mit"\n', "LAB.toml")
-    assert found.citation.licence == "MIT"
-    assert parse_lab(found.to_toml(), "session.toml").citation == found.citation
+    result = parse_lab(head + 'authors = ["Family, Given", "Institute"]\nlicence = "mit"\n', "LAB.toml")
+    assert result.citation.licence == "MIT"
+    assert parse_lab(result.to_toml(), "session.toml").citation == result.citation
     with pytest.raises(ConfigurationError, match=r"citation\.licence"):
         parse_lab(head + 'licence = "public domain"\n', "LAB.toml")
     with pytest.raises(ConfigurationError):
         parse_lab(head + 'license = "MIT"\n', "LAB.toml")
 
 
-def test_an_entry_has_what_is_known_and_names_what_is_not() -> None:
+def test_entry_lists_missing_fields() -> None:
     origin = OriginRecord(authors=["Knuth, Donald", "A & B Institute"], last_frame="2026-03-01T00:00:00+00:00")
     entry = bibtex("Canon EOS 550D", 707, "croplab 0.1.0", "ab" * 32, origin)
     assert "author = {Knuth, Donald and {A \\& B Institute}}" in entry
@@ -130,18 +132,18 @@ def test_an_entry_has_what_is_known_and_names_what_is_not() -> None:
     assert "% not recorded by the table: author, year, url, licence" in older
 
 
-def test_text_that_tex_would_run_is_printed() -> None:
+def test_escapes_tex_commands() -> None:
     hostile = tex_text(r"50 % \input{x} $a_1$ #~^")
     unescaped = re.sub(r"\\[{}&%$#_]|\\text\w+\{\}", "", hostile)
     assert not re.search(r"[\\{}&%$#_~^]", unescaped)
 
 
-def test_a_simulated_table_is_not_called_photographed() -> None:
+def test_simulated_table_is_cited_as_simulated() -> None:
     assert "simulated" in bibtex("C", 1, "s", "0" * 64, OriginRecord(rig="simulated"))
     assert "computed" in bibtex("C", 1, "s", "0" * 64, None, computed=True)
 
 
-def test_a_table_without_an_origin_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_without_origin_is_not_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write(tmp_path / "lut")
     assert "origin" not in json.loads((tmp_path / "lut" / "lut.json").read_text())
     assert main(["info", str(tmp_path / "lut")]) == 0
@@ -153,7 +155,7 @@ def test_a_table_without_an_origin_says_so(tmp_path: Path, capsys: pytest.Captur
     assert open_lut(tmp_path / "lut").sha256 in printed_entry
 
 
-def test_an_origin_is_carried_by_the_file_unchanged() -> None:
+def test_origin_survives_file() -> None:
     origin = origin_record(stated(CitationSettings(note="dust on the lens", licence="CC-BY-4.0")), RECORDS, [BODY])
     text = json.dumps(
         {
@@ -166,26 +168,24 @@ def test_an_origin_is_carried_by_the_file_unchanged() -> None:
     assert parse_provenance(known.to_json().encode(), Path("lut.json")).origin == origin
 
 
-def test_an_address_ends_no_entry() -> None:
+def test_address_cannot_end_entry() -> None:
     origin = OriginRecord(url="https://doi.example/10.1/{a}\\b\n c")
     assert "url = {https://doi.example/10.1/abc}," in bibtex("Test", 3, "croplab", "0" * 64, origin)
 
 
-def test_bodies_without_their_numbers_are_counted_as_they_come() -> None:
+def test_counts_bodies_with_withheld_serials() -> None:
     origins = [FrameOrigin("Test", serial) for serial in ("7", "8", "7")]
-    told = [one.serial for one in with_published_serials(origins, "withheld")]
-    assert told == ["withheld (1)", "withheld (2)", "withheld (1)"]
+    published = [one.serial for one in with_published_serials(origins, "withheld")]
+    assert published == ["withheld (1)", "withheld (2)", "withheld (1)"]
 
 
-def test_a_citation_that_is_written_into_a_session_by_hand_is_stated(
-    session: Session, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_reads_citation_from_session(session: Session, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     shutil.copytree(session.folder, tmp_path / "session")
     settings = tmp_path / "session" / "session.toml"
     for licence, stated in (("CC-BY-4.0", True), ("free as air", False)):
         citation = {"authors": ["Ban, N."], "licence": licence}
         settings.write_text(tomli_w.dumps({"rig": "imported", "citation": citation}))
         with Session.open(tmp_path / "session") as opened:
-            found = stated_origin(opened).citation
-        assert (found.authors == ("Ban, N.",)) == stated
+            result = stated_origin(opened).citation
+        assert (result.authors == ("Ban, N.",)) == stated
         assert ("citation: licence" in caplog.text) == (not stated)

@@ -1,4 +1,4 @@
-"""`build-lut` on tables that are there: described, verified, compared; and what it says of an unfinished one."""
+"""`build-lut` with existing tables: info, verify, match; and the output for an unfinished one."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ Command = Callable[..., tuple[int, str, str]]
 def command(capsys: pytest.CaptureFixture[str]) -> Command:
     def run(*arguments: object) -> tuple[int, str, str]:
         code = main([*map(str, arguments)])
-        said = capsys.readouterr()
-        return code, said.out, said.err
+        output = capsys.readouterr()
+        return code, output.out, output.err
 
     return run
 
@@ -38,7 +38,7 @@ def lut(built: BuildResult) -> Path:
     return built.lut
 
 
-def test_info_tells_what_the_table_is(lut: Path, command: Command) -> None:
+def test_info_prints_table(lut: Path, command: Command) -> None:
     code, out, _ = command("info", lut)
     assert code == 0
     assert "Canon CroP Test" in out
@@ -47,23 +47,23 @@ def test_info_tells_what_the_table_is(lut: Path, command: Command) -> None:
     assert "black, half size, saturation, field, rounding" in out
 
 
-def test_a_check_tells_nothing_that_one_frame_cannot(session: Session, command: Command) -> None:
+def test_check_reports_only_figures_of_one_frame(session: Session, command: Command) -> None:
     code, out, _ = command("check", session.folder)
     assert code == 0
     assert "remark: Frames" not in out
     assert "Movement of the chart" not in out
     assert "Drift of white" not in out
-    assert "Tags found" in out
+    assert "Detected tags" in out
 
 
-def test_verify_accepts_what_is_whole(lut: Path, session: Session, command: Command) -> None:
+def test_verify_accepts_intact_table(lut: Path, session: Session, command: Command) -> None:
     assert command("verify", lut)[0] == 0
     code, out, _ = command("verify", lut, session.folder)
     assert code == 0
-    assert "every byte is as it was built" in out
+    assert "the hashes of all files" in out
 
 
-def test_verify_names_the_light_that_has_changed(lut: Path, session: Session, command: Command, tmp_path: Path) -> None:
+def test_verify_names_changed_light(lut: Path, session: Session, command: Command, tmp_path: Path) -> None:
     shutil.copytree(lut, tmp_path / "lut")
     shutil.copytree(session.folder, tmp_path / "session")
     path = tmp_path / "lut" / "samples.npy"
@@ -81,10 +81,10 @@ def test_verify_names_the_light_that_has_changed(lut: Path, session: Session, co
 def test_match_compares_two_tables(lut: Path, command: Command) -> None:
     code, out, _ = command("match", lut, lut)
     assert code == 0
-    assert "colours and lights correspond" in out
+    assert "colours and illuminants correspond" in out
 
 
-def test_append_says_how_far_the_table_is(session: Session, command: Command, tmp_path: Path) -> None:
+def test_append_prints_progress(session: Session, command: Command, tmp_path: Path) -> None:
     shutil.copytree(session.folder, tmp_path / "session")
     last = next((tmp_path / "session" / "frames").glob("*light_012*"))
     with Session.open(tmp_path / "session") as copy:
@@ -92,7 +92,7 @@ def test_append_says_how_far_the_table_is(session: Session, command: Command, tm
     _refuse(tmp_path / "session", victim.file)
     code, out, _ = command("--append", tmp_path / "session", tmp_path / "lut")
     assert code == 0
-    assert f"{len(LIGHTS) - 1} of {len(LIGHTS)} lights" in out
+    assert f"{len(LIGHTS) - 1} of {len(LIGHTS)} illuminants" in out
     assert command("info", tmp_path / "lut")[2].count("in the making") == 1
 
 
@@ -106,7 +106,7 @@ def _refuse(folder: Path, file: str) -> None:
     (folder / "ledger.jsonl").unlink()
 
 
-def test_a_session_that_is_named_as_a_command_is_built(
+def test_builds_session_named_like_command(
     session: Session, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -115,16 +115,16 @@ def test_a_session_that_is_named_as_a_command_is_built(
     assert Path("lut/lut.json").is_file()
 
 
-def test_the_default_window_is_the_paper_s() -> None:
+def test_default_window_is_five() -> None:
     (window,) = [option for option in get_command(app).params if "--window" in option.opts]
     assert window.default == WINDOW
 
 
-def test_a_table_and_its_entry_are_one_object(lut: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = json_of(main, ["info", lut], capsys)
+def test_info_json_contains_entry(lut: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result = json_of(main, ["info", lut], capsys)
     assert main(["info", str(lut), "--cite"]) == 0
-    assert found["bibtex"] == capsys.readouterr().out
-    assert found["sha256"] in found["bibtex"]
+    assert result["bibtex"] == capsys.readouterr().out
+    assert result["sha256"] in result["bibtex"]
 
 
 @pytest.mark.parametrize(
@@ -132,13 +132,13 @@ def test_a_table_and_its_entry_are_one_object(lut: Path, capsys: pytest.CaptureF
     [
         (["--info", "lut"], "--info is a command, not an option: build-lut info"),
         (["-v", "--check", "session"], "build-lut check"),
-        (["--window", 4, "session", "lut"], "4 pixels"),
+        (["--window", 4, "session", "lut"], "4 px"),
         (["nowhere", "lut"], "nowhere is not a session"),
         (["info", "nowhere"], "nowhere is no table"),
         (["compare", "a", "b"], "a is no table"),
     ],
 )
-def test_what_cannot_be_meant_is_said(
+def test_refuses_meaningless_options(
     arguments: list[object], said: str, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -149,5 +149,5 @@ def test_what_cannot_be_meant_is_said(
 
 
 @pytest.mark.parametrize("arguments", [["nowhere"], ["check", "nowhere", "lut"], ["lut", "--chart", "x"]])
-def test_what_is_missing_or_too_much_is_the_user_s_fault(arguments: list[str], command: Command) -> None:
+def test_refuses_missing_or_extra_arguments(arguments: list[str], command: Command) -> None:
     assert command(*arguments)[0] == 2

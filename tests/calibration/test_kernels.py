@@ -1,4 +1,4 @@
-"""Compiled loops against a few plain lines of NumPy and SciPy."""
+"""Compiled loops against plain NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from calibration.kernels import (
 _Array = npt.NDArray[np.float64]
 
 
-def test_values_come_between_the_second_lowest_and_second_highest_around_them() -> None:
+def test_clips_values_to_neighbours() -> None:
     random = np.random.default_rng(1)
     values = random.normal(size=400)
     values[random.random(400) < 0.55] = np.nan
@@ -34,15 +34,15 @@ def test_values_come_between_the_second_lowest_and_second_highest_around_them() 
     expected = np.full(400, np.nan)
     counts = np.isfinite(values[around]).sum(axis=1)
     for place in np.flatnonzero(np.isfinite(values) & (counts >= 3)).tolist():
-        known = np.sort(values[around[place]][np.isfinite(values[around[place]])])
-        expected[place] = np.clip(values[place], known[1], known[-2])
+        neighbours_sorted = np.sort(values[around[place]][np.isfinite(values[around[place]])])
+        expected[place] = np.clip(values[place], neighbours_sorted[1], neighbours_sorted[-2])
     assert {2, 3, 4} <= set(counts[np.isfinite(values)].tolist())
-    found = np.empty(400)
-    clipped_to_neighbours(values, around, found)
-    np.testing.assert_array_equal(found, expected)
+    result = np.empty(400)
+    clipped_to_neighbours(values, around, result)
+    np.testing.assert_array_equal(result, expected)
 
 
-def test_moments_are_exact_for_any_counts() -> None:
+def test_moments_are_exact() -> None:
     values = np.random.default_rng(2).integers(65000, 65536, (40, 9, 3)).astype(np.uint16)
     means, variances = np.empty((40, 3)), np.empty((40, 3))
     moments(values, means, variances)
@@ -51,16 +51,16 @@ def test_moments_are_exact_for_any_counts() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 7, 9])
-def test_a_column_is_blurred_by_its_taps_with_its_border_repeated(count: int) -> None:
+def test_blurs_columns_with_repeated_border(count: int) -> None:
     random = np.random.default_rng(3)
     image, taps = random.random((23, 5)).astype(np.float32), random.random(count).astype(np.float32)
-    found = np.empty_like(image)
-    blur_rows(image, taps, found)
+    result = np.empty_like(image)
+    blur_rows(image, taps, result)
     expected = ndimage.correlate1d(image.astype(np.float64), taps.astype(np.float64), axis=0, mode="nearest")
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    np.testing.assert_allclose(result, expected, rtol=1e-5)
 
 
-def test_slots_show_their_inks_in_the_light_of_the_place() -> None:
+def test_prints_slots_in_local_light() -> None:
     random = np.random.default_rng(4)
     shares, light, inks = random.random((40, 3)).astype(np.float32), random.random((40, 3)), random.random((3, 3))
     image = np.empty((40, 3), dtype=np.float32)
@@ -69,7 +69,7 @@ def test_slots_show_their_inks_in_the_light_of_the_place() -> None:
     np.testing.assert_allclose(image, np.einsum("nk,nkc->nc", shares, lit), rtol=1e-6)
 
 
-def test_patches_get_the_far_light_of_their_slot_for_their_own() -> None:
+def test_adds_far_light() -> None:
     random = np.random.default_rng(5)
     image, levels, added = random.random((6, 5, 3)).astype(np.float32), random.random((8, 3)), random.random((8, 3))
     row, column = random.integers(0, 6, 8), random.integers(0, 5, 8)
@@ -80,7 +80,7 @@ def test_patches_get_the_far_light_of_their_slot_for_their_own() -> None:
 
 
 def light_between(low: float, high: float, sigma: float, window: int, offset: float) -> float:
-    """Return the share of a window's light that comes from between two places: pixel by pixel, what each one's has."""
+    """Return the fraction of a window's light from between two positions, summed over its pixels."""
     shares = [
         np.diff(stats.norm(offset + pixel, sigma).cdf([low, high]))[0]
         for pixel in range(-(window // 2), window // 2 + 1)
@@ -89,25 +89,25 @@ def light_between(low: float, high: float, sigma: float, window: int, offset: fl
 
 
 @pytest.mark.slow
-def test_a_slot_s_parts_have_the_light_that_lies_between_their_edges() -> None:
+def test_window_shares_match_integrals() -> None:
     pitches, offsets = np.array([7.0, 11.0]), np.array([-0.6, 0.0, 0.4])
-    found = np.empty((2, 3, ACROSS * PARTS))
-    window_shares(3.0, pitches, offsets, 3, found)
+    result = np.empty((2, 3, ACROSS * PARTS))
+    window_shares(3.0, pitches, offsets, 3, result)
     # Five slots about the middle one's, each of five parts; the outermost have what is beyond.
     edges = np.arange(1, 25) / 5 - 2.5
     for p, pitch in enumerate(pitches):
         for o, offset in enumerate(offsets):
             borders = [-math.inf, *(edges * pitch), math.inf]
             expected = [light_between(low, high, 3.0, 3, offset) for low, high in pairwise(borders)]
-            np.testing.assert_allclose(found[p, o], expected, atol=1e-12)
+            np.testing.assert_allclose(result[p, o], expected, atol=1e-12)
     # Of a point on the edge between two pixels half lies in either.
     whole, _ = integrate.quad(stats.norm(0, 3.0).pdf, -0.7, 0.7)
-    window_shares(3.0, np.array([7.0]), np.array([0.0]), 1, found[:1, :1])
-    assert found[0, 0, 12] == pytest.approx(whole)
+    window_shares(3.0, np.array([7.0]), np.array([0.0]), 1, result[:1, :1])
+    assert result[0, 0, 12] == pytest.approx(whole)
 
 
-def test_light_around_patches_is_that_of_each_part_of_the_slots_about_them() -> None:
-    """Two patches in a print of three by two slots beside each other, with paper, ink and what lies behind around."""
+def test_light_around_matches_sum_of_parts() -> None:
+    """Two patches in a print of three by two slots, surrounded by paper, ink and background."""
     random = np.random.default_rng(5)
     count, rows, columns = 2, 6, 7
     row, column = np.array([2, 3]), np.array([2, 3])
@@ -131,7 +131,7 @@ def test_light_around_patches_is_that_of_each_part_of_the_slots_about_them() -> 
     weights_around(row, column, neighbours, parts, offset, pitch, shares, grid, amount, weights, others)
 
     def along(kernel: int, length: float, at: float) -> _Array:
-        """Return the shares (25,) between those of whole pitches and half offsets, bilinearly."""
+        """Return the shares (25,), interpolated bilinearly between whole pitches and half offsets."""
         table = shares[kernel]
         whole, rest = divmod(float(np.clip(length - 8, 0, 1.999)), 1)
         left, part = divmod(float(np.clip(at + 0.5, 0, 0.999)) * 2, 1)
@@ -157,8 +157,8 @@ def test_light_around_patches_is_that_of_each_part_of_the_slots_about_them() -> 
     np.testing.assert_allclose(weights.sum(axis=1) + others.sum(axis=1), amount.sum(axis=2), rtol=1e-5)
 
     levels, light, inks = random.random((2, 3)), random.random((2, 3)), random.random((3, 3))
-    found = np.empty((2, 3))
-    light_around(neighbours, weights, others, levels, light, inks, found)
+    result = np.empty((2, 3))
+    light_around(neighbours, weights, others, levels, light, inks, result)
     for patch, channel in np.ndindex(2, 3):
         expected = sum(
             weights[patch, slot, channel] * levels[neighbours[patch, slot], channel]
@@ -168,4 +168,4 @@ def test_light_around_patches_is_that_of_each_part_of_the_slots_about_them() -> 
         # What lies behind the print has a light of its own.
         expected += others[patch, :2, channel] @ inks[:2, channel] * light[patch, channel]
         expected += others[patch, 2, channel] * inks[2, channel]
-        assert found[patch, channel] == pytest.approx(expected, rel=1e-5)
+        assert result[patch, channel] == pytest.approx(expected, rel=1e-5)

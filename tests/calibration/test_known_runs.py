@@ -1,4 +1,4 @@
-"""What each room computes of made-up inputs of many kinds, held to what it was."""
+"""Results of each room for made-up inputs, compared with pinned numbers."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ from tests.calibration.whole import brief, of_fields
 from tests.pinned import Pinned
 
 _Array = npt.NDArray[np.float64]
+# Tolerance for results of iterative fits.
 LOOSE = {"same": 1e-4, "nothing": 1e-8}
-"""Of what an iterative fit ends at."""
 
 
 def test_limits_of_figures(pinned: Pinned) -> None:
@@ -48,18 +48,18 @@ def test_limits_of_figures(pinned: Pinned) -> None:
 
 
 def test_causes(pinned: Pinned) -> None:
-    """Evidence at the limits of every rule, and a little beyond: how many kinds of subject have the rule's cause."""
+    """Evidence at the limits of every rule, and slightly beyond: number of subjects with its cause."""
     random = np.random.default_rng(1)
     decided: dict[str, list[int]] = {}
     for number, rule in enumerate(RULES):
-        found = decided.setdefault(f"{rule.cause.name} {number}", [])
+        result = decided.setdefault(f"{rule.cause.name} {number}", [])
         for by in (0.0, 1e-6, -1e-6):
             at = {one.name: (one.low if np.isfinite(one.low) else one.high) + by for one in rule.conditions}
             beside = {
                 name: float(random.choice([0, 0.02, 0.5, 1])) for name in evidence_names() if random.random() < 0.1
             }
             for evidence in (Evidence(**at), Evidence(**(beside | at))):
-                found.append(sum(decide(subject, evidence).cause is rule.cause for subject in get_args(Subject)))
+                result.append(sum(decide(subject, evidence).cause is rule.cause for subject in get_args(Subject)))
     pinned("causes at the limits of the rules", decided)
 
 
@@ -67,13 +67,13 @@ def test_causes(pinned: Pinned) -> None:
 @pytest.mark.parametrize("name", ["two", "red and white", "primaries", "eight"])
 def test_lights_against_their_codes(name: str, pinned: Pinned) -> None:
     white, error = random_session(SESSIONS[name], len(name))
-    found = [agreement(SESSIONS[name], white, error)]
+    result = [agreement(SESSIONS[name], white, error)]
     if name != "eight":
         codes = np.array(SESSIONS[name])
         white[[0, 1]] = white[[1, 0]]
-        found.append(light_codes.code_agreement(codes, white, error, dark_known=False, drift_known=True))
-        found.append(light_codes.code_agreement(codes, white, error, dark_known=True, drift_known=False))
-    pinned(f"lights against their codes, {name}", [brief(one) for one in found], **LOOSE)
+        result.append(light_codes.code_agreement(codes, white, error, dark_known=False, drift_known=True))
+        result.append(light_codes.code_agreement(codes, white, error, dark_known=True, drift_known=False))
+    pinned(f"lights against their codes, {name}", [brief(one) for one in result], **LOOSE)
 
 
 def test_stray_light(pinned: Pinned) -> None:
@@ -101,18 +101,18 @@ def test_frames_against_the_print(pinned: Pinned) -> None:
 
 def test_small_places(pinned: Pinned) -> None:
     sheet, random = Sheet(4, 32), np.random.default_rng(3)
-    found: list[Any] = []
+    result: list[Any] = []
     for scale in (1.0, 1.3):
         deviation = scale * random.normal(0, 0.01, (2, len(sheet.places)))
         tree = cKDTree(sheet.places)
-        for cells, off in ((2, -0.2), (3, 0.07), (6, -0.05), (1, 0.5), (12, 0.045)):
-            deviation[:, tree.query(sheet.places[random.integers(len(sheet.places))], k=cells)[1]] += off
+        for cells, mismatched in ((2, -0.2), (3, 0.07), (6, -0.05), (1, 0.5), (12, 0.045)):
+            deviation[:, tree.query(sheet.places[random.integers(len(sheet.places))], k=cells)[1]] += mismatched
         deviation[1, ::17] = np.nan
         usable = random.random(len(sheet.places)) < 0.95
         one = SmallPlaces(sheet.rgb, sheet.places, usable).disturbed(deviation, np.full_like(deviation, 0.01))
         hot = random.random(len(sheet.places)) < 0.2
-        found.append([*one, *cells_without_hot(one[0], one[2], hot, sheet.places)])
-    pinned("small places that something covers", found)
+        result.append([*one, *cells_without_hot(one[0], one[2], hot, sheet.places)])
+    pinned("small places that something covers", result)
 
 
 @pytest.mark.slow
@@ -128,12 +128,12 @@ def test_superposition(pinned: Pinned) -> None:
         for sensor in (proportional, compressed, short_of_counts)
         for more in kinds
     }
-    told = {
+    numbers = {
         name: [brief(one), *map(brief, one.relative(LEVELS)), brief(one.errors(LEVELS, LEVELS[::-1])), one.to_json(),
                *map(brief, one.beside(LEVELS, LEVELS[::-1])), brief(one.white_covariance(LEVELS[:3] * np.eye(3)))]
         for name, one in runs.items()
     }  # fmt: skip
-    pinned("superposition of three sensors", told, **LOOSE)
+    pinned("superposition of three sensors", numbers, **LOOSE)
 
 
 def test_the_lamp_s_drift(pinned: Pinned) -> None:
@@ -153,7 +153,7 @@ def test_the_lamp_s_drift(pinned: Pinned) -> None:
 
 
 def test_noise(pinned: Pinned) -> None:
-    random, found = np.random.default_rng(8), []
+    random, result = np.random.default_rng(8), []
     for cells, samples, response in ((3000, 25, 0.004), (512, 25, 0.0), (40, 9, 0.01), (12, 81, 0.004)):
         level = np.exp(random.uniform(np.log(15), np.log(9000), (cells, 3)))
         variance = np.array([36.0, 18, 30]) + level / [1.8, 3.6, 1.9] + (response * level) ** 2
@@ -161,11 +161,11 @@ def test_noise(pinned: Pinned) -> None:
         seen_there[: cells // 20, : samples // 2] *= 1.1
         one = photon_transfer(seen_there.mean(axis=1), seen_there.var(axis=1, ddof=1), samples)
         noise = sampling.sample_noise(seen_there)
-        found.append([brief(one), one.noisy.nonzero()[0], brief(one.variance(level)), brief(noise)])
-        found.append(
+        result.append([brief(one), one.noisy.nonzero()[0], brief(one.variance(level)), brief(noise)])
+        result.append(
             [brief(sampling.unevenness(seen_there, noise)), *map(brief, sampling.rim_difference(seen_there, noise))]
         )
-        found.append([brief(one) for one in sampling.noise_levels(level[:, 1], variance[:, 1], samples)])
+        result.append([brief(one) for one in sampling.noise_levels(level[:, 1], variance[:, 1], samples)])
     sizes = list(product((7.9, 8.6, 10.0, 12.4, 17.0), (0.3, 0.5, 0.7, 1.1)))
     windows = [sampling.largest_window(*size) for size in sizes]
     shares = [sampling.bleed(*size, window) for size in sizes for window in (3, 5, 7)]
@@ -173,7 +173,7 @@ def test_noise(pinned: Pinned) -> None:
         sampling.mean_bleed(cell, np.array([0.2, 0.5, 0.9, 2.0]), window) for cell in (8.0, 11.0) for window in (3, 5)
     ]
     medians = [sampling.median_of_variance(degrees) for degrees in (1, 2, 8, 24, 80)]
-    pinned("noise of samples and light of neighbours", [found, windows, shares, means, medians], **LOOSE)
+    pinned("noise of samples and light of neighbours", [result, windows, shares, means, medians], **LOOSE)
 
 
 @pytest.mark.slow
@@ -199,7 +199,7 @@ def test_dark_frames(pinned: Pinned) -> None:
 
 
 class Followed:
-    """A displacement with an error of its own."""
+    """A displacement with its own error."""
 
     def errors_px(self, points: _Array, information: _Array, at: _Array) -> _Array:
         return 0.02 + 1e-4 * at[:, 0] + 1e-9 * float(information.sum()) + 0 * points[: len(at), 0]
@@ -209,7 +209,7 @@ def test_places_of_cells(pinned: Pinned) -> None:
     rows, columns = RASTER.shape
     random = np.random.default_rng(11)
     shift = np.stack(np.meshgrid(np.linspace(-0.3, 0.2, columns), np.linspace(0, 0.4, rows)), axis=-1)
-    found: list[Any] = []
+    result: list[Any] = []
     for strength, noise in ((100.0, 0.0), (1e4, 0.05), (1.0, 0.5)):
         comparison = compared(shift + random.normal(0, noise, shift.shape), strength)
         anchors = np.array([[1.0, 2.0]]), np.eye(2)[None]
@@ -220,10 +220,10 @@ def test_places_of_cells(pinned: Pinned) -> None:
         errors = [
             matching.place_errors(comparison, RASTER, 1, followed, anchors, 0.01, alike) for alike in (False, True)
         ]
-        found.append([*map(brief, blocks), *(brief(one.error_px) for one in errors)])
+        result.append([*map(brief, blocks), *(brief(one.error_px) for one in errors)])
     marks = random.uniform(0, 100, (300, 2))
     unfollowed = matching.unfollowed_px(marks[:40] + 0.5, marks, random.normal(0, 0.2, (300, 2)), 0.7, 20.0)
-    pinned("places of cells", [found, brief(unfollowed)], **LOOSE)
+    pinned("places of cells", [result, brief(unfollowed)], **LOOSE)
 
 
 @pytest.mark.slow
@@ -232,16 +232,16 @@ def test_tiles(pinned: Pinned) -> None:
     seen_there = np.float32(0.7) * moved(image, 0.4, -0.3) + np.float32(100)
     weight = np.ones(TILED.shape, dtype=np.float32)
     weight[30:60, 20:90] = 0
-    found: list[Any] = []
+    result: list[Any] = []
     for size, window, without in ((TILE, 80, False), (TILE, 40, True), (16, 64, False)):
         one = tiles.compare_tiles(TILED, size, image, seen_there, weight, window, to_pixels, 10.0, without)
-        found.append([brief(one), brief(one.weakened(3)), brief(one.after(one.pull * 0 + 0.1))])
+        result.append([brief(one), brief(one.weakened(3)), brief(one.after(one.pull * 0 + 0.1))])
     blocks = tiles.find_blocks(TILED, image, seen_there, weight > 0.5, 40, 6, 64)
     jacobians = tiles.jacobians(lambda points: points**2 / 50, np.array([[3.0, 4.0], [50, 9]]), np.array([0.5, 2.0]))
     match = ndimage.gaussian_filter(np.random.default_rng(1).random((9, 11)), 1.5)
     pinned(
         "tiles of a picture that moved",
-        [found, brief(blocks), jacobians, *tiles._peak(match), brief(tiles.box_mean(image[..., 0], 5)),
+        [result, brief(blocks), jacobians, *tiles._peak(match), brief(tiles.box_mean(image[..., 0], 5)),
          brief(tiles.sums_of(image[..., 1], 7)), brief(tiles.tile_middles(image[..., 2], 7))],
         **LOOSE,
     )  # fmt: skip
@@ -249,7 +249,7 @@ def test_tiles(pinned: Pinned) -> None:
 
 @pytest.mark.slow
 def test_colours_of_a_print(pinned: Pinned) -> None:
-    random, found = np.random.default_rng(12), []
+    random, result = np.random.default_rng(12), []
     for bits, finely in ((1, False), (2, False), (3, False), (4, True)):
         chart = paper_chart("A4", bits) if bits > 2 else paper_chart("A6", bits)
         points = chart.centres_mm
@@ -260,30 +260,30 @@ def test_colours_of_a_print(pinned: Pinned) -> None:
         model = colours.fit_colours(chart.rgb.astype(np.float64), points, seen_there, chart.page_mm, finely)
         expected = model.seen(chart.rgb, points)
         paper = np.full_like(expected, 6000.0)
-        off = colours.mismatched(seen_there, expected, paper, chart)
-        found.append(
+        mismatched = colours.mismatched(seen_there, expected, paper, chart)
+        result.append(
             [
                 brief(model),
                 brief(expected),
-                off.nonzero()[0][:60],
-                int(off.sum()),
+                mismatched.nonzero()[0][:60],
+                int(mismatched.sum()),
                 colours.agreement(seen_there, expected),
             ]
         )
-    pinned("colours of a print", found, **LOOSE)
+    pinned("colours of a print", result, **LOOSE)
 
 
 @pytest.mark.slow
 def test_lenses_and_sheets(pinned: Pinned) -> None:
-    random, found = np.random.default_rng(13), []
+    random, result = np.random.default_rng(13), []
     points = np.stack(np.meshgrid(np.linspace(0, 1189, 7), np.linspace(0, 841, 5)), axis=-1).reshape(-1, 2)
     homography = np.array([[2.0, 0.03, 90], [-0.02, 2.1, 60], [1e-5, -2e-5, 1]])
     lens = Lens(homography, np.array([1300.0, 866]), 1500.0, np.array([-0.05, 0.02, 1e-3, -5e-4]))
     exact = lens.to_pixels(points)
     for noise, count in ((0.0, 35), (0.3, 35), (0.1, 8)):
         fitted, residual = fit_lens(points[:count], exact[:count] + random.normal(0, noise, (count, 2)), (2601, 1733))
-        found.append([brief(fitted.to_pixels(points[:count])), brief(residual)])
-    found.append([brief(exact), brief(lens.parallax(points))])
+        result.append([brief(fitted.to_pixels(points[:count])), brief(residual)])
+    result.append([brief(exact), brief(lens.parallax(points))])
     scale = random.uniform(0.5, 2, (len(points), 1, 1)) * 100 * np.eye(2)
     pull = np.einsum("nij,nj->ni", scale, 0.3 * np.sin(points / 150))
     for through, knot in ((None, 120.0), (lens, 120.0), (None, 300.0)):
@@ -291,13 +291,15 @@ def test_lenses_and_sheets(pinned: Pinned) -> None:
         for roughness in (0.3, 1.5):
             bent = sheet.fitted(points, scale, pull, roughness)
             error = bent.errors_px(points, scale, points[::3] + 7)
-            found.append([brief(bent.at(points - 3)), brief(error), bent.likely_roughness_px(points, scale, roughness)])
+            result.append(
+                [brief(bent.at(points - 3)), brief(error), bent.likely_roughness_px(points, scale, roughness)]
+            )
     lateral = LateralColour.unmeasured((2601, 1733)).remeasured(
         exact, np.tile(scale, (3, 1, 1, 1)), random.normal(0, 30, (3, *exact.shape))
     )
     shifts = [lateral.shift_px(exact, channel) for channel in ("R", "G", "B")]
     corners = [[lateral.corner_px(channel), lateral.corner_error_px(channel)] for channel in ("R", "B")]
-    pinned("lenses and sheets", [found, brief(of_fields(lateral)), brief(shifts), corners], same=1e-4, nothing=1e-6)
+    pinned("lenses and sheets", [result, brief(of_fields(lateral)), brief(shifts), corners], same=1e-4, nothing=1e-6)
 
 
 @pytest.mark.slow
@@ -307,11 +309,13 @@ def test_levels_that_codes_predict(pinned: Pinned) -> None:
     level = printed(0.1) + 0.002 * random.standard_normal(512)
     models = [predicting.LevelModel.of(level, known, 3) for known in (ALL, usable)]
     large = predicting.LevelModel.of(np.linspace(0.1, 0.9, 4096), np.arange(4096) % 7 > 0, 4)
-    found = [[one.freedom, brief(one.predicted), brief(one.residual_of(level)), int(one.known.sum())] for one in models]
+    result = [
+        [one.freedom, brief(one.predicted), brief(one.residual_of(level)), int(one.known.sum())] for one in models
+    ]
     columns = random.standard_normal((4096, 3))
     pinned(
         "levels that codes predict",
-        [found, large.freedom, brief(large.residual(columns)), int(large.known.sum()),
+        [result, large.freedom, brief(large.residual(columns)), int(large.known.sum()),
          *(brief(predicting.neighbour_residual(columns[: 8**bits], bits)) for bits in (2, 3, 4))],
         **LOOSE,
     )  # fmt: skip
@@ -319,35 +323,35 @@ def test_levels_that_codes_predict(pinned: Pinned) -> None:
 
 @pytest.mark.slow
 def test_light_added_to_a_print(pinned: Pinned) -> None:
-    cells, level, found = places(), levels(), []
+    cells, level, result = places(), levels(), []
     for size, middle, height in ((25, (80.0, 80.0), 0.02), (12, (200.0, 50.0), 0.05), (60, (20.0, 140.0), 0.01)):
         spot = height * np.exp(-0.5 * (np.linalg.norm(cells - middle, axis=1) / size) ** 2)[:, None] * [1.0, 0.5, 0.1]
         seen_there = level + spot + NOISE * np.random.default_rng(15).standard_normal(level.shape)
         usable = np.arange(512) % 11 > 0
         one = added_light.added_light(seen_there, np.full_like(level, NOISE**2), usable, cells, PAGE_MM, 3)
-        found.append([brief(one), brief(one.certain_share_of(level)), brief(one.mean_square)])
+        result.append([brief(one), brief(one.certain_share_of(level)), brief(one.mean_square)])
     shapes = [brief(added_light._bumps(cells * [1.0, by])) for by in (0.2, 1.0, 3.0)]
-    pinned("light added to a print", [found, shapes], **LOOSE)
+    pinned("light added to a print", [result, shapes], **LOOSE)
 
 
 def test_shares_of_a_lens(pinned: Pinned) -> None:
-    found: list[Any] = []
+    result: list[Any] = []
     for seed, size in ((1, fitting.TERMS), (2, fitting.TERMS + 4)):
         _, value, matrix, vector = equations(2 * size, size, seed)
         prior = np.diag(np.linspace(0.5, 2, size))
         free = np.flatnonzero(fitting.free_terms())
-        found.append(brief(fitting._solved(matrix, vector, prior, free)))
+        result.append(brief(fitting._solved(matrix, vector, prior, free)))
         left = np.random.default_rng(seed).standard_normal(size * 2)
-        found.append(brief(fitting._weights(left, np.abs(value) * 1000)))
+        result.append(brief(fitting._weights(left, np.abs(value) * 1000)))
         if size == fitting.TERMS:
             shares, gain = fitting._positive(matrix, vector, np.arange(size)[::2])
-            found.append(
+            result.append(
                 [brief(shares), gain, fitting._selected(100 * matrix, 100 * vector, 1.0, fitting.groups_of_terms())]
             )
     random = np.random.default_rng(16)
     spots = random.uniform(-5, 60, (30, 2))
     laws = [fitting._law(power) for power in (0.5, 1.0, 1.5, 3.0, 6.0)]
-    pinned("shares of a lens", [found, brief(fitting.place_terms(spots, (40, 50))), laws], **LOOSE)
+    pinned("shares of a lens", [result, brief(fitting.place_terms(spots, (40, 50))), laws], **LOOSE)
 
 
 def brighter(means: _Array) -> _Array:

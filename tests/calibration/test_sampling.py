@@ -1,4 +1,4 @@
-"""Samples are the sensor's own counts at the right places; patches not of one colour are found; windows fit cells."""
+"""Raw samples at the right positions, detection of nonuniform patches, and window sizes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tests.calibration.lab import Lab
 
 
 @pytest.mark.slow
-def test_samples_are_pixels_of_the_half_size_picture(lab: Lab, tmp_path: Path) -> None:
+def test_samples_are_half_size_pixels(lab: Lab, tmp_path: Path) -> None:
     mosaic = lab.mosaic(tmp_path)
     black = frame_black(mosaic)
     picture = half_size(mosaic)
@@ -65,13 +65,13 @@ def test_samples_are_pixels_of_the_half_size_picture(lab: Lab, tmp_path: Path) -
 @example(20, 1)
 @example(48, 20)
 @example(20, 38)
-def test_a_patch_is_inside_when_all_its_pixels_are(x: float, y: float) -> None:
+def test_patch_is_inside_with_all_pixels(x: float, y: float) -> None:
     sites = sites_at(np.array([[x, y]]), (40, 50))
     column, row = int(np.rint(x)), int(np.rint(y))
     assert bool(sites.inside[0]) == (column - 2 >= 0 and row - 2 >= 0 and column + 2 <= 49 and row + 2 <= 39)
 
 
-def test_the_table_rounds_and_clips_at_zero() -> None:
+def test_table_values_round_and_clip() -> None:
     samples = np.array([[[-3.0, 0.4, 0.6]] * 25, [[100.0, 200.0, 300.0]] * 25], dtype=np.float32)
     values = table_values(samples, np.array([[1.0, 1.0, 1.0], [0.8, 1.0, 1.25]]))
     assert values.dtype == np.uint16
@@ -81,7 +81,7 @@ def test_the_table_rounds_and_clips_at_zero() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("window", [3, 5, 7])
-def test_one_pass_and_two_give_the_same_values(lab: Lab, tmp_path: Path, window: int) -> None:
+def test_one_pass_matches_two(lab: Lab, tmp_path: Path, window: int) -> None:
     mosaic = lab.mosaic(tmp_path)
     black = np.array([[2046.25, 2047.5], [2049.0, 2044.0]])
     random = np.random.default_rng(3)
@@ -105,33 +105,33 @@ def patches(level: float, sigma: float, count: int = 3000) -> np.ndarray[tuple[i
 
 
 def rim(window: int) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Return which samples of a window lie at its rim."""
+    """Return the samples of a window on its rim."""
     return np.pad(np.zeros((window - 2, window - 2), dtype=np.bool_), 1, constant_values=True).ravel()
 
 
-def test_a_rim_of_another_colour_is_found() -> None:
+def test_detects_rim_of_another_colour() -> None:
     samples = patches(8000, 60)
     samples[7, rim(5), 1] += 400
-    found = unevenness(samples, np.full((len(samples), 3), 60.0))
-    assert np.flatnonzero(found).tolist() == [7]
-    assert found[7] == pytest.approx(400 / (8000 + 400 * 16 / 25), rel=0.15)
+    result = unevenness(samples, np.full((len(samples), 3), 60.0))
+    assert np.flatnonzero(result).tolist() == [7]
+    assert result[7] == pytest.approx(400 / (8000 + 400 * 16 / 25), rel=0.15)
 
 
-def test_less_than_a_percent_is_let_be() -> None:
+def test_ignores_rim_below_one_percent() -> None:
     samples = patches(8000, 1)
     samples[:, rim(5)] += 70
     assert not unevenness(samples, np.full((len(samples), 3), 1.0)).any()
 
 
 @pytest.mark.parametrize("window", [3, 7, 9])
-def test_a_rim_is_found_in_other_windows(window: int) -> None:
-    """Noise of 0.4 %, a rim 8 % brighter: beyond 5 σ even of the single inner pixel of 3×3."""
+def test_detects_rim_in_other_windows(window: int) -> None:
+    """With 0.4 % noise, a rim 8 % brighter exceeds 5 σ even for the single inner pixel of 3×3."""
     samples = np.random.default_rng(6).normal(8000, 30, (3000, window**2, 3))
     samples[7, rim(window), 1] += 640
     assert np.flatnonzero(unevenness(samples, sample_noise(samples))).tolist() == [7]
 
 
-def test_noise_is_known_as_a_function_of_the_level() -> None:
+def test_noise_is_function_of_level() -> None:
     random = np.random.default_rng(5)
     level = random.uniform(50, 8000, 4000)
     sigma = np.sqrt(36 + level / 1.8)
@@ -141,21 +141,21 @@ def test_noise_is_known_as_a_function_of_the_level() -> None:
     assert np.abs(ratio[level > 500] - 1).max() < 0.15
 
 
-def test_patch_means_are_numpys() -> None:
+def test_patch_means_match_numpy() -> None:
     values = np.random.default_rng(4).integers(0, 65536, (50, 25, 3)).astype(np.uint16)
     np.testing.assert_allclose(patch_means(values), values.mean(axis=1), rtol=1e-14)
     np.testing.assert_allclose(patch_means(values[::3]), values[::3].mean(axis=1), rtol=1e-14)
 
 
-def test_the_bleed_is_that_of_the_table_of_arrangements() -> None:
-    """Rendered pixel by pixel: 8.6 px cells and 0.7 px blur give 1.3 %, 0.5 px blur 0.1 %; 10.2 px cells 0.07 %."""
+def test_bleed_matches_arrangement_table() -> None:
+    """Rendered pixel by pixel: 8.6 px cells with 0.7 px blur give 1.3 %, with 0.5 px 0.1 %; 10.2 px cells 0.07 %."""
     assert bleed(8.6, 0.7) == pytest.approx(0.013, rel=0.1)
     assert bleed(8.6, 0.5) == pytest.approx(0.001, rel=0.1)
     assert bleed(10.2, 0.7) < 0.0008
 
 
-def test_the_largest_windows_are_those_of_the_table_of_arrangements() -> None:
-    """Found by rendering: 5×5 on the EOS 550D and 7×7 on the 6D Mark II below 0.2 % at a blur of 0.7 px."""
+def test_largest_windows_match_arrangement_table() -> None:
+    """From rendering: 5×5 for the EOS 550D and 7×7 for the 6D Mark II below 0.2 % at a blur of 0.7 px."""
     assert largest_window(10.2, 0.7) == 5
     assert largest_window(12.4, 0.7) == 7
     assert largest_window(4.0, 0.7) == 0
@@ -166,7 +166,7 @@ def test_the_largest_windows_are_those_of_the_table_of_arrangements() -> None:
 
 
 @pytest.mark.parametrize("window", WINDOWS)
-def test_what_comes_from_beyond_a_cell_is_the_gaussian_s_tails(window: int) -> None:
+def test_bleed_is_tail_of_gaussian(window: int) -> None:
     cell_px, blur_px = 11.0, 1.4
     # A quarter of a pixel of registration and half of one of rounding towards the nearer edge.
     nearest = cell_px / 2 - (window // 2 + 0.75)
@@ -179,7 +179,7 @@ def test_what_comes_from_beyond_a_cell_is_the_gaussian_s_tails(window: int) -> N
     assert mean_bleed(cell_px, np.array([1e-9, blur_px]), window) == pytest.approx([0, expected], abs=1e-12)
 
 
-def test_a_dead_photosite_has_less_than_half_and_halves_what_two_greens_have() -> None:
+def test_detects_dead_photosite() -> None:
     samples = np.full((7, 25, 3), 400.0)
     for patch, (channel, level) in enumerate([(0, 199), (0, 201), (1, 299), (1, 301), (2, 199), (2, 201)]):
         samples[patch, 12, channel] = level
@@ -189,7 +189,7 @@ def test_a_dead_photosite_has_less_than_half_and_halves_what_two_greens_have() -
     assert has_dead_photosite(samples * 0.76)[0]
 
 
-def test_noise_at_a_level_is_the_median_of_like_cells_over_that_of_chi_square() -> None:
+def test_level_noise_is_scaled_median() -> None:
     random = np.random.default_rng(7)
     level = random.permutation(np.arange(96.0))
     for degrees in (8, 24, 80):
@@ -204,7 +204,7 @@ def test_noise_at_a_level_is_the_median_of_like_cells_over_that_of_chi_square() 
     assert [len(noise_levels(many, many, 25, 1, most)[0]) for most in (48, 32)] == [48, 32]
 
 
-def test_means_of_counts_are_those_of_their_samples(lab: Lab, tmp_path: Path) -> None:
+def test_count_means_match_samples(lab: Lab, tmp_path: Path) -> None:
     mosaic = lab.mosaic(tmp_path)
     # Of each channel another, green's mean too.
     black = np.array([[2046.25, 2047.5], [2049.0, 2044.0]])
@@ -223,30 +223,30 @@ def test_means_of_counts_are_those_of_their_samples(lab: Lab, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_gain_and_read_noise_are_found() -> None:
+def test_recovers_gain_and_read_noise() -> None:
     random = np.random.default_rng(4)
     level = random.uniform(20, 9000, (6000, 3))
     variance = np.array([36.0, 18, 36]) + level / [1.8, 3.6, 1.8] + (0.003 * level) ** 2
     samples = level[:, None] + np.sqrt(variance)[:, None] * random.standard_normal((6000, 25, 3))
-    found = photon_transfer(samples.mean(axis=1), samples.var(axis=1, ddof=1))
-    assert found.gain_e == pytest.approx([1.8, 3.6, 1.8], rel=0.06)
-    assert found.read_noise == pytest.approx(np.sqrt([36, 18, 36]), rel=0.4)
-    assert found.response == pytest.approx(0.003, rel=0.35)
-    assert (found.misfit < 0.1).all()
-    assert not found.noisy.any()
+    result = photon_transfer(samples.mean(axis=1), samples.var(axis=1, ddof=1))
+    assert result.gain_e == pytest.approx([1.8, 3.6, 1.8], rel=0.06)
+    assert result.read_noise == pytest.approx(np.sqrt([36, 18, 36]), rel=0.4)
+    assert result.response == pytest.approx(0.003, rel=0.35)
+    assert (result.misfit < 0.1).all()
+    assert not result.noisy.any()
 
 
-def test_cells_that_are_not_of_one_colour_are_listed() -> None:
+def test_lists_nonuniform_cells() -> None:
     random = np.random.default_rng(5)
     level = random.uniform(500, 9000, (3000, 3))
     samples = level[:, None] + np.sqrt(level / 1.8)[:, None] * random.standard_normal((3000, 25, 3))
     samples[7, :13] *= 1.15
-    found = photon_transfer(samples.mean(axis=1), samples.var(axis=1, ddof=1))
-    assert np.flatnonzero(found.noisy).tolist() == [7]
+    result = photon_transfer(samples.mean(axis=1), samples.var(axis=1, ddof=1))
+    assert np.flatnonzero(result.noisy).tolist() == [7]
 
 
 def stored(samples: np.ndarray[Any, Any], unfit: tuple[int, ...] = ()) -> Any:
-    """Return of a table (L, C, S, 3) what its noise is read from."""
+    """Return the parts of a table (L, C, S, 3) from which noise is read."""
     return SimpleNamespace(
         folder="a table",
         samples=samples,
@@ -256,19 +256,19 @@ def stored(samples: np.ndarray[Any, Any], unfit: tuple[int, ...] = ()) -> Any:
     )
 
 
-def test_a_table_s_noise_is_that_of_its_samples_however_little() -> None:
+def test_table_noise_matches_samples() -> None:
     level = np.linspace(100, 9000, 64)[None, :, None, None]
     noise = np.random.default_rng(3).normal(0, 0.5, (2, 64, 25, 3))
     quiet = np.rint(level + noise).astype(np.uint16)
     assert quiet.var(axis=2, ddof=1).max() < 1
-    found = noise_curve(stored(quiet))
-    assert found is not None
+    result = noise_curve(stored(quiet))
+    assert result is not None
     # Rounding adds a twelfth.
-    assert found.read_noise == pytest.approx(np.sqrt(0.25 + 1 / 12), rel=0.1)
+    assert result.read_noise == pytest.approx(np.sqrt(0.25 + 1 / 12), rel=0.1)
     assert noise_curve(stored(np.rint(level + 0 * noise).astype(np.uint16))) is None
 
 
-def test_a_table_of_too_few_cells_has_no_known_noise() -> None:
+def test_few_cells_give_no_noise() -> None:
     noisy = np.random.default_rng(3).normal(1000, 30, (1, 33, 25, 3)).astype(np.uint16)
     assert noise_curve(stored(noisy, unfit=(7,))) is not None
     # Samples that are 0 are cut, and their cell is no longer as noisy as its level.
@@ -280,7 +280,7 @@ def test_a_table_of_too_few_cells_has_no_known_noise() -> None:
         noise_curve(stored(noisy[:, :, :1]))
 
 
-def test_samples_that_follow_no_curve_have_no_known_noise() -> None:
+def test_samples_without_curve_give_no_noise() -> None:
     level = np.repeat([500.0, 1000, 2000, 4000], 16)[None, :, None, None]
     spread = np.repeat([60.0, 5, 60, 5], 16)[None, :, None, None]
     wild = level + spread * np.random.default_rng(3).normal(0, 1, (1, 64, 25, 3))

@@ -1,4 +1,4 @@
-"""Values against their limits, and which frames a refusal asks to be taken again."""
+"""Values against limits, and the frames to take again."""
 
 from __future__ import annotations
 
@@ -35,23 +35,21 @@ LIMIT = replace(
         ("at most", 2.0, None, float("nan"), "accept with remarks"),
     ],
 )
-def test_a_figure_is_judged_by_both_limits(
-    sense: Sense, accept: float, refuse: float | None, value: float, outcome: str
-) -> None:
+def test_judges_by_both_limits(sense: Sense, accept: float, refuse: float | None, value: float, outcome: str) -> None:
     limit = replace(LIMIT, sense=sense, accept=accept, refuse=refuse)
     assert judge({"x": value}, [limit]).outcome == outcome
 
 
-def test_the_worst_row_is_the_verdict() -> None:
+def test_verdict_is_worst_row() -> None:
     rows = [replace(LIMIT, name=name) for name in "abc"]
     assert judge({"a": 0, "b": 3, "c": 1.5}, rows).outcome == "refuse"
     assert judge({"a": 0, "c": 1.5}, rows).outcome == "accept with remarks"
     assert judge({}, rows).outcome == "accept"
 
 
-def test_a_row_gives_value_expectation_and_consequence() -> None:
+def test_row_text_has_value_expectation_consequence() -> None:
     (row,) = judge({"x": 1.5}, [LIMIT]).remarks
-    assert row.text() == "A figure: 1.5 px, at most 1 px expected, refused beyond 2 px; why"
+    assert row.text() == "A figure: 1.5 px, expected at most 1 px, refused above 2 px; why"
 
 
 def record(number: int, kind: str = "light") -> Any:
@@ -81,33 +79,31 @@ def nothing_explained(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("nothing_explained")
 @pytest.mark.parametrize(("scatters", "again"), [((1, 3, 1), [1]), ((3, 1, 4), [0, 2]), ((3, 3, 3), [])])
-def test_a_fault_of_every_frame_is_none_of_single_ones(scatters: tuple[float, ...], again: list[int]) -> None:
-    verdict, found = refused(FRAME_SCATTER, 2.0), measured(scatters)
-    assert [frame.attempt for frame in retaken_frames(verdict, found)] == again
-    assert is_mended_by_retaking(verdict, found) is bool(again)
+def test_fault_of_all_frames_asks_for_none(scatters: tuple[float, ...], again: list[int]) -> None:
+    verdict, result = refused(FRAME_SCATTER, 2.0), measured(scatters)
+    assert [frame.attempt for frame in retaken_frames(verdict, result)] == again
+    assert is_mended_by_retaking(verdict, result) is bool(again)
 
 
 @pytest.mark.usefixtures("nothing_explained")
-def test_a_frame_of_less_exposure_is_as_wrong_as_one_of_more() -> None:
+def test_retakes_shorter_and_longer_exposures() -> None:
     exposed = [
         SimpleNamespace(record=record(number, kind), ratio=ratio)
         for number, kind, ratio in ((0, "light", 0.5), (1, "light", 2.0), (2, "light", 1.01), (3, "dark", 0.5))
     ]
-    found = measured((0, 0, 0), exposed)
+    result = measured((0, 0, 0), exposed)
     # Dark frames are not among those with figures, and are taken again all the same.
-    again = retaken_frames(refused(OTHER_EXPOSURE, 0.1), found)
-    assert [frame.attempt for frame in again] == [0, 1, 3]
+    retaken = retaken_frames(refused(OTHER_EXPOSURE, 0.1), result)
+    assert [frame.attempt for frame in retaken] == [0, 1, 3]
 
 
 @pytest.mark.parametrize(("cause", "again"), [(HOT_PHOTOSITES, []), (DEFOCUS, [1])])
-def test_frames_are_not_taken_again_for_what_would_be_in_them_again(
-    cause: Cause, again: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_does_not_retake_for_persistent_cause(cause: Cause, again: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     def findings(*_: object) -> dict[str, ProbableCause]:
         decision = Decision(cause, RULES[0])
         return {FRAME_SCATTER.name: ProbableCause(FRAME_SCATTER.name, decision, Evidence(), (), ())}
 
     monkeypatch.setattr(module, "findings", findings)
-    verdict, found = refused(FRAME_SCATTER, 2.0), measured((1, 3, 1))
-    assert [frame.attempt for frame in retaken_frames(verdict, found)] == again
-    assert is_mended_by_retaking(verdict, found) is bool(again)
+    verdict, result = refused(FRAME_SCATTER, 2.0), measured((1, 3, 1))
+    assert [frame.attempt for frame in retaken_frames(verdict, result)] == again
+    assert is_mended_by_retaking(verdict, result) is bool(again)

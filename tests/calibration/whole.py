@@ -1,4 +1,4 @@
-"""What a build measured, judged, said and wrote as a whole, to be pinned."""
+"""Numbers of a whole build, to be pinned: measurements, verdict and files."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from calibration.table.lut import open_lut
 from calibration.verdict import BuildResult, findings, retaken_frames
 from tests.pinned import NOTHING
 
+# Tolerance for numbers of whole builds: they come from several fits, and another BLAS changes some by 3e-4.
 LIMITS: dict[str, float] = {"same": 1e-3, "nothing": 1e-6}
-"""What numbers of whole builds may differ by: they come from fits upon fits, and another BLAS moves some by 3e-4."""
 
+# Small differences of large numbers, or values that depend on excluded cells: 2 % by another processor.
 UNSURE = ("scatter", "frame_scatter", "noise", "noise_misfit", "transfer")
-"""What is a small difference of large numbers, or hangs on which cells are left out: 2 % by another processor."""
 
+# Number of listed unfit cells.
 MOST_UNFIT = 3
-"""Cells that are named."""
 
 OUTCOMES = ("accept", "accept with remarks", "refuse")
 
+# Keys of reports that are the same in all, or do not depend on the session.
 LEFT_OUT = (
     "gain_e",
     "response_spread",
@@ -41,11 +42,10 @@ LEFT_OUT = (
     "version",
     "chart_places",
 )
-"""What reports hold that is the same in all, or not of the session."""
 
 
 def together(values: Sequence[Any]) -> Any:
-    """Return like records field by field, what numbers each holds, however many, as one array."""
+    """Return similar records field by field, their numbers as one array."""
     match values[0]:
         case Mapping() as first:
             return {name: together([value[name] for value in values]) for name in first}
@@ -58,13 +58,13 @@ def together(values: Sequence[Any]) -> Any:
 
 
 def numbers_of(value: Any) -> Any:
-    """Return nested lists of numbers as one array; what holds anything else as it is."""
-    found = list(_numbers(value))
-    return value if any(isinstance(one, str) for one in found) else np.array(found, float)
+    """Return nested lists of numbers as one array; other values unchanged."""
+    result = list(_numbers(value))
+    return value if any(isinstance(one, str) for one in result) else np.array(result, float)
 
 
 def _numbers(value: Any) -> Generator[Any]:
-    """Yield what a number, an array or nested tuples hold."""
+    """Yield the numbers of a number, an array or nested tuples."""
     match value:
         case np.ndarray():
             yield from value.ravel().tolist()
@@ -80,12 +80,12 @@ def _numbers(value: Any) -> Generator[Any]:
 
 
 def of_fields(record: Any, *left_out: str) -> dict[str, Any]:
-    """Return a record's fields by name, but for those left out."""
+    """Return a record's fields by name, without those listed."""
     return {one.name: getattr(record, one.name) for one in fields(record) if one.name not in (*left_out, *UNSURE)}
 
 
 def brief(value: Any) -> Any:
-    """Return a record, arrays of more than four numbers by their root mean square and a sum by chance weights."""
+    """Return a record with large arrays replaced by their root mean square and a randomly weighted sum."""
     match value:
         case float():
             return 0.0 if abs(value) < NOTHING else value
@@ -93,8 +93,8 @@ def brief(value: Any) -> Any:
             return value
         case Mapping():
             # What is nothing is left out.
-            found = {name: brief(one) for name, one in value.items()}
-            return {name: one for name, one in found.items() if one not in (None, [], {}, False)}
+            result = {name: brief(one) for name, one in value.items()}
+            return {name: one for name, one in result.items() if one not in (None, [], {}, False)}
         case record if is_dataclass(record):
             return brief(of_fields(record))
         case [first, *_] if is_dataclass(first):
@@ -113,12 +113,12 @@ def brief(value: Any) -> Any:
 
 
 def known(evidence: Evidence) -> dict[str, float]:
-    """Return the evidence that is there, without what is unsure."""
-    return {name: value for name, value in evidence.known().items() if value and name not in UNSURE}
+    """Return the measured evidence without uncertain values."""
+    return {name: value for name, value in evidence.measured_values().items() if value and name not in UNSURE}
 
 
 def told(result: BuildResult) -> dict[str, Any]:
-    """Return the numbers of a build's verdict and of the causes that it names."""
+    """Return the numbers of a verdict and of its causes."""
     table, verdict = result.figures, result.verdict
     causes = findings(verdict, table).values()
     return {
@@ -132,7 +132,7 @@ def told(result: BuildResult) -> dict[str, Any]:
 
 
 def whole(result: BuildResult) -> dict[str, Any]:
-    """Return all numbers that a build measured and judged."""
+    """Return all measured and judged numbers of a build."""
     table = result.figures
     left_out = ("lights", "frames", "session", "origin", "origins", "registration", "cells", "budget", "primaries")
     return told(result) | {
@@ -156,12 +156,12 @@ def whole(result: BuildResult) -> dict[str, Any]:
 
 
 def _root(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return a covariance in the unit of its quantity, so that small ones are not as good as 0."""
+    """Return a covariance in the unit of its quantity, so that small ones are compared, too."""
     return np.sign(covariance) * np.sqrt(np.abs(covariance))
 
 
 def written(folder: Path) -> dict[str, Any]:
-    """Return what a table's folder holds: samples, the rows of its lists, what was corrected."""
+    """Return the content of a table's folder: samples, lists and corrections."""
     table = open_lut(folder)
     lists = {
         name: [line.split(",") for line in (folder / name).read_text(encoding="utf-8").splitlines()]
@@ -178,14 +178,14 @@ def written(folder: Path) -> dict[str, Any]:
 
 
 def corrections(done: Sequence[Mapping[str, Any]]) -> list[Any]:
-    """Return corrections as recorded, numbers as arrays."""
+    """Return recorded corrections with numbers as arrays."""
     return [
         {name: numbers_of(value) if isinstance(value, list) else value for name, value in one.items()} for one in done
     ]
 
 
 def reported(result: BuildResult) -> dict[str, Any]:
-    """Return what `report.json` holds, but for names of files' contents and what is in every report."""
+    """Return the content of `report.json` without hashes and constant parts."""
 
     def kept(value: Any) -> Any:
         match value:

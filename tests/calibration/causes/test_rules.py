@@ -1,4 +1,4 @@
-"""The table of causes, case by case."""
+"""The rules of causes, case by case."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from calibration.causes.rules import (
     evidence_names,
 )
 
+# A position on the print that is the same in all frames.
 PRINT = Evidence(
     frames=8, showing=0, even_showing=0, some_whites=0, in_first=0, spot=1, scatter=0.002, softer=0, share=0.03, hot=0
 )
-"""A place of the print that is the same in all frames."""
+# A position that deviates in the frame of one light.
 LIGHT = Evidence(frames=8, showing=0.125, even_showing=0, in_first=0, spot=0, scatter=0.006, softer=0, share=0.07)
-"""A place that is off in one light's frame."""
 
 CASES: list[tuple[Subject, Evidence, Cause]] = [
     ("block", replace(LIGHT, deviation=-0.9, tint=0, added=0, kept=0.1), OBJECT_IN_FRAME),
@@ -131,26 +131,26 @@ CASES: list[tuple[Subject, Evidence, Cause]] = [
 
 
 @pytest.mark.parametrize(("subject", "evidence", "cause"), CASES)
-def test_evidence_decides(subject: Subject, evidence: Evidence, cause: Cause) -> None:
+def test_decides_by_evidence(subject: Subject, evidence: Evidence, cause: Cause) -> None:
     assert decide(subject, evidence).cause is cause
 
 
-def test_what_is_not_known_decides_nothing() -> None:
-    assert not Evidence().known()
+def test_unknown_evidence_decides_nothing() -> None:
+    assert not Evidence().measured_values()
     for subject in get_args(Subject):
         assert decide(subject, Evidence()).cause is UNKNOWN
 
 
-def test_the_table_names_what_there_is() -> None:
+def test_rules_refer_to_existing_names() -> None:
     assert {condition.name for rule in RULES for condition in rule.conditions} <= set(evidence_names())
     assert {rule.cause for rule in RULES} | {UNKNOWN} == set(CAUSES)
     assert len({cause.name for cause in CAUSES}) == len(CAUSES)
     for cause in CAUSES[:-1]:
-        assert cause.says
+        assert cause.description
         assert cause.remedy
     for rule in RULES:
         assert rule.why
 
 
-def test_each_cause_is_tried() -> None:
+def test_every_cause_has_a_case() -> None:
     assert {cause for *_, cause in CASES} == set(CAUSES)

@@ -1,4 +1,4 @@
-"""Two tables compared: the same within noise where only noise differs, and each known deviation found, and named."""
+"""Comparison of two tables: same within noise if only noise differs, and every known deviation is reported."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ CHART = "cd" * 32
 COLOURS = 8**3
 
 
+# Relative standard error of a white in the tables written here.
 ERROR = 2e-4
-"""Relative standard error of a white in the tables written here."""
 
 
 _Array = npt.NDArray[np.float64]
@@ -65,7 +65,7 @@ def written(
     chart: str = CHART,
     camera: str = "Test",
 ) -> Lut:
-    """Return a table whose cells and whites have the noise that it states; one world for all seeds."""
+    """Return a table with the noise that it records; the same world for all seeds."""
     world, random = np.random.default_rng(1), np.random.default_rng(seed)
     folder.mkdir()
     writer = LutWriter(folder, len(lights), COLOURS, samples)
@@ -90,8 +90,8 @@ def written(
 
 
 def answer(comparison: TableComparison, name: str) -> NoiseAnswer:
-    (found,) = [each for each in comparison.answers if each.name == name]
-    return found
+    (result,) = [each for each in comparison.answers if each.name == name]
+    return result
 
 
 @pytest.fixture
@@ -101,17 +101,16 @@ def one(tmp_path: Path) -> Lut:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("samples", [25, 9])
-def test_other_noise_is_within_noise(one: Lut, tmp_path: Path, samples: int) -> None:
-    found = compare(one, written(tmp_path / "other", 20, samples=samples))
-    assert found.same_within_noise
-    assert found.cells.score == pytest.approx(1, abs=0.02)
-    assert found.cells.rms == pytest.approx(found.cells.rms_by_noise, rel=0.03)
+def test_other_noise_is_same_within_noise(one: Lut, tmp_path: Path, samples: int) -> None:
+    result = compare(one, written(tmp_path / "other", 20, samples=samples))
+    assert result.same_within_noise
+    assert result.cells.score == pytest.approx(1, abs=0.02)
+    assert result.cells.rms == pytest.approx(result.cells.rms_by_noise, rel=0.03)
 
 
 @pytest.mark.slow
-def test_chances_are_those_of_many_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of tables that differ by noise alone, chances are spread evenly from 0 to 1."""
-    monkeypatch.setattr(comparing, "ERROR_OF_ERRORS", 1.0)
+def test_probabilities_are_uniform_for_noise_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(comparing, "ERROR_FACTOR", 1.0)
     tables = [written(tmp_path / str(seed), seed, lights=LIGHTS) for seed in range(12)]
     pairs = [compare(first, second).lights for first, second in zip(tables[::2], tables[1::2], strict=True)]
     for chances in ([pair.angle_p for pair in pairs], [pair.brightness_p for pair in pairs]):
@@ -119,77 +118,77 @@ def test_chances_are_those_of_many_tables(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-def test_a_dimmer_lamp_is_a_difference_of_brightness_and_of_nothing_else(one: Lut, tmp_path: Path) -> None:
-    found = compare(one, written(tmp_path / "other", 20, gain=0.98))
-    assert [each.same_within_noise for each in found.answers] == [True, False, True]
-    assert float(np.median(found.lights.brightness)) == pytest.approx(-0.02, abs=3e-4)
+def test_dimmer_lamp_differs_only_in_brightness(one: Lut, tmp_path: Path) -> None:
+    result = compare(one, written(tmp_path / "other", 20, gain=0.98))
+    assert [each.same_within_noise for each in result.answers] == [True, False, True]
+    assert float(np.median(result.lights.brightness)) == pytest.approx(-0.02, abs=3e-4)
 
 
-def test_a_drift_of_2_per_cent_in_one_session_is_a_difference_of_brightness(one: Lut, tmp_path: Path) -> None:
+def test_drift_of_two_percent_differs_in_brightness(one: Lut, tmp_path: Path) -> None:
     course = np.ones((100, 3))
     course[: len(LIGHTS)] = np.linspace(1, 0.98, len(LIGHTS))[:, None]
-    found = compare(one, written(tmp_path / "other", 20, gain=course))
-    assert [each.same_within_noise for each in found.answers] == [True, False, True]
-    assert float(np.ptp(found.lights.brightness)) == pytest.approx(0.02, abs=1.5e-3)
+    result = compare(one, written(tmp_path / "other", 20, gain=course))
+    assert [each.same_within_noise for each in result.answers] == [True, False, True]
+    assert float(np.ptp(result.lights.brightness)) == pytest.approx(0.02, abs=1.5e-3)
 
 
-def test_a_light_of_another_colour_is_named(one: Lut, tmp_path: Path) -> None:
+def test_names_light_of_another_colour(one: Lut, tmp_path: Path) -> None:
     gain = np.ones((100, 3))
     gain[5] = (1.0015, 1, 0.9985)
-    found = compare(one, written(tmp_path / "other", 20, gain=gain))
-    assert [each.same_within_noise for each in found.answers] == [False, True, True]
-    assert answer(found, "colour of lights").said.endswith("1 lights are beyond noise: 5")
-    assert found.lights.angle_deg[5] == pytest.approx(0.07, abs=0.04)
+    result = compare(one, written(tmp_path / "other", 20, gain=gain))
+    assert [each.same_within_noise for each in result.answers] == [False, True, True]
+    assert answer(result, "colour of lights").said.endswith("1 illuminants exceed noise: 5")
+    assert result.lights.angle_deg[5] == pytest.approx(0.07, abs=0.04)
 
 
-def test_a_stain_is_named_cell_by_cell(one: Lut, tmp_path: Path) -> None:
+def test_names_stained_cells(one: Lut, tmp_path: Path) -> None:
     def stained(means: _Array) -> _Array:
         return means * np.where(np.isin(np.arange(COLOURS), (200, 201))[:, None], (1, 1, 0.95), 1)
 
-    found = compare(one, written(tmp_path / "other", 20, cells=stained))
-    assert [each.same_within_noise for each in found.answers] == [True, True, False]
-    assert "2 cells differ under all lights" in answer(found, "cells").said
-    assert sorted(comparison_json(found)["differing_cells"]) == [200, 201]
-    assert found.cells.mean[200, 2] == pytest.approx(-0.05, abs=0.01)
+    result = compare(one, written(tmp_path / "other", 20, cells=stained))
+    assert [each.same_within_noise for each in result.answers] == [True, True, False]
+    assert "2 patches differ under all illuminants" in answer(result, "cells").said
+    assert sorted(comparison_json(result)["differing_cells"]) == [200, 201]
+    assert result.cells.mean[200, 2] == pytest.approx(-0.05, abs=0.01)
 
 
-def test_a_shadow_in_one_frame_is_found_though_the_table_is_the_same_otherwise(one: Lut, tmp_path: Path) -> None:
+def test_detects_shadow_in_one_frame(one: Lut, tmp_path: Path) -> None:
     calls = iter(range(100))
 
     def shaded(means: _Array) -> _Array:
         return means * (np.where(np.arange(COLOURS)[:, None] < 60, 0.9, 1) if next(calls) == 7 else 1)
 
-    found = compare(one, written(tmp_path / "other", 20, cells=shaded))
-    assert not answer(found, "cells").same_within_noise
-    assert "1 lights are beyond 1.3 times their noise: 7" in answer(found, "cells").said
+    result = compare(one, written(tmp_path / "other", 20, cells=shaded))
+    assert not answer(result, "cells").same_within_noise
+    assert "1 illuminants exceed 1.3 times the noise: 7" in answer(result, "cells").said
 
 
-def test_paler_cells_are_beyond_noise(one: Lut, tmp_path: Path) -> None:
-    found = compare(one, written(tmp_path / "other", 20, cells=lambda means: means + 60))
-    assert not answer(found, "cells").same_within_noise
-    assert found.cells.rms > found.cells.rms_by_noise + 0.01
+def test_detects_paler_cells(one: Lut, tmp_path: Path) -> None:
+    result = compare(one, written(tmp_path / "other", 20, cells=lambda means: means + 60))
+    assert not answer(result, "cells").same_within_noise
+    assert result.cells.rms > result.cells.rms_by_noise + 0.01
 
 
-def test_a_table_with_itself_shows_nothing_and_says_so(one: Lut) -> None:
-    found = compare(one, one)
-    assert found.lights.angle_deg.max() == 0
-    assert found.cells.rms == 0
-    assert "both tables are of the same frames" in found.warnings[0]
+def test_warns_of_same_frames(one: Lut) -> None:
+    result = compare(one, one)
+    assert result.lights.angle_deg.max() == 0
+    assert result.cells.rms == 0
+    assert "both LUTs were built from the same frames" in result.warnings[0]
 
 
-def test_common_lights_of_other_lists_are_compared(one: Lut, tmp_path: Path) -> None:
+def test_compares_common_lights_of_different_lists(one: Lut, tmp_path: Path) -> None:
     lights = tuple(replace(light, index=number) for number, light in enumerate(LIGHTS[4:]))
     assert light_pairs(LIGHTS, lights) == [(light, light - 4) for light in range(4, len(LIGHTS))]
-    found = compare(one, written(tmp_path / "other", 20, lights=lights, camera="Another"))
-    assert len(found.lights.one) == len(LIGHTS) - 4
-    assert any("two cameras, Test and Another" in warning for warning in found.warnings)
-    said = f"{len(LIGHTS) - 4} common lights are compared; 4 are in A only, 0 in B only"
-    assert any(said in each for each in found.warnings)
+    result = compare(one, written(tmp_path / "other", 20, lights=lights, camera="Another"))
+    assert len(result.lights.one) == len(LIGHTS) - 4
+    assert any("two cameras, Test and Another" in warning for warning in result.warnings)
+    message = f"{len(LIGHTS) - 4} common illuminants are compared; 4 are only in A, 0 only in B"
+    assert any(message in each for each in result.warnings)
     # Other lights under the same numbers: what is compared are light 4 of one and 0 of the other, which differ here.
-    assert not found.same_within_noise
+    assert not result.same_within_noise
 
 
-def test_other_charts_and_no_common_light_are_refused(one: Lut, tmp_path: Path) -> None:
+def test_refuses_other_charts_and_no_common_light(one: Lut, tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="cdcdcdcdcdcd… against efefefefefef…"):
         compare(one, written(tmp_path / "chart", 20, chart="ef" * 32))
     other = tuple(replace(light, colour=Colour(1, 2, 3), kind="uniform", cct_k=None) for light in LIGHTS)
@@ -197,13 +196,13 @@ def test_other_charts_and_no_common_light_are_refused(one: Lut, tmp_path: Path) 
         compare(one, written(tmp_path / "lights", 20, lights=other))
 
 
-def test_damaged_samples_and_references_are_refused(one: Lut, tmp_path: Path) -> None:
+def test_refuses_damaged_samples_and_references(one: Lut, tmp_path: Path) -> None:
     one_light = "light,name,r_error,g_error,b_error\n0,white,1,1,1\n"
     for number, text in enumerate((None, "light,name\n0,white\n", one_light)):
         other = written(tmp_path / f"other{number}", 20, errors=text is not None)
         if text is not None:
             (other.folder / "references.csv").write_text(text)
-        with pytest.raises(FormatError, match=r"references\.csv .* build the table again"):
+        with pytest.raises(FormatError, match=r"references\.csv .* build the LUT again"):
             compare(one, other)
     data = bytearray((one.folder / "samples.npy").read_bytes())
     data[-1] ^= 1
@@ -212,39 +211,39 @@ def test_damaged_samples_and_references_are_refused(one: Lut, tmp_path: Path) ->
         compare(open_lut(one.folder), written(tmp_path / "whole", 20))
 
 
-def test_tables_in_which_every_cell_is_dark_are_refused(tmp_path: Path) -> None:
+def test_refuses_tables_with_dark_cells_only(tmp_path: Path) -> None:
     dark, other = (written(tmp_path / str(seed), seed, cells=lambda means: means / 100) for seed in (1, 2))
     with pytest.raises(FormatError):
         compare(dark, other)
 
 
-def test_unfit_cells_of_either_are_left_out(one: Lut, tmp_path: Path) -> None:
+def test_excludes_unfit_cells_of_both(one: Lut, tmp_path: Path) -> None:
     other = written(tmp_path / "other", 20)
     path = other.folder / "lut.json"
     document = json.loads(path.read_text())
     document["unfit"] = [{"colour": 7, "cause": "stained: x"}]
     path.write_text(json.dumps(document))
-    found = compare(one, open_lut(other.folder, check=False))
-    assert np.isnan(found.cells.mean[7]).all()
-    assert not found.cells.lights[7].any()
+    result = compare(one, open_lut(other.folder, check=False))
+    assert np.isnan(result.cells.mean[7]).all()
+    assert not result.cells.lights[7].any()
 
 
 @pytest.mark.slow
-def test_the_files_hold_every_light_and_every_cell(one: Lut, tmp_path: Path) -> None:
-    found = compare(one, written(tmp_path / "other", 20, gain=0.9))
-    write_comparison(found, tmp_path / "report")
+def test_files_contain_all_lights_and_cells(one: Lut, tmp_path: Path) -> None:
+    result = compare(one, written(tmp_path / "other", 20, gain=0.9))
+    write_comparison(result, tmp_path / "report")
     lights = np.genfromtxt(tmp_path / "report" / "lights.csv", delimiter=",", names=True)
     cells = np.genfromtxt(tmp_path / "report" / "cells.csv", delimiter=",", names=True)
-    np.testing.assert_allclose(lights["brightness"], found.lights.brightness, rtol=1e-5)
-    np.testing.assert_allclose(cells["mean_g"], found.cells.mean[:, 1], rtol=1e-5)
+    np.testing.assert_allclose(lights["brightness"], result.lights.brightness, rtol=1e-5)
+    np.testing.assert_allclose(cells["mean_g"], result.cells.mean[:, 1], rtol=1e-5)
     np.testing.assert_array_equal(cells["colour"], np.arange(COLOURS))
     page = (tmp_path / "report" / "report.html").read_text()
-    assert "They differ by more than noise." in page
+    assert "The difference exceeds noise." in page
     assert "-10.0" in page
     stored = json.loads((tmp_path / "report" / "comparison.json").read_text())
     assert (stored["format"], stored["same_within_noise"]) == ("crop.comparison", False)
     assert stored["tables"][0] == str(one.folder)
-    assert lines(found)[-1].endswith("no")
+    assert lines(result)[-1].endswith("no")
 
 
 WHITE = np.array([[9000.0, 8000, 7000], [6000, 250, 4000], [50, 60, 40], [8000, 8000, 200]])
@@ -260,7 +259,7 @@ PAIRS = [(light, light) for light in range(4)]
 
 
 def table(folder: Path, white: _Array, errors: _Array, samples: int, unfit: int) -> Any:
-    """Return what is compared of a table of eight colours, some of which are dark."""
+    """Return the compared parts of a table of eight colours, some of which are dark."""
     folder.mkdir()
     rows = [f"{light},white,{','.join(map(str, row))}" for light, row in enumerate(errors.tolist())]
     (folder / "references.csv").write_text("\n".join(["light,name,r_error,g_error,b_error", *rows, ""]))
@@ -283,7 +282,7 @@ def tables(tmp_path: Path) -> tuple[Any, Any]:
     return table(tmp_path / "one", WHITE, ERRORS, 4, 6), table(tmp_path / "other", OTHER, 2 * ERRORS, 9, 7)
 
 
-def test_lights_differ_in_colour_and_brightness_with_a_chance(tables: tuple[Any, Any]) -> None:
+def test_light_differences_match_least_squares(tables: tuple[Any, Any]) -> None:
     lights = comparing._compare_lights(*tables, PAIRS, np.zeros(4))
     for light in range(4):
         a, b = WHITE[light], OTHER[light]
@@ -298,7 +297,7 @@ def test_lights_differ_in_colour_and_brightness_with_a_chance(tables: tuple[Any,
         assert lights.brightness_p[light] == pytest.approx(2 * stats.norm.sf(abs(mean) * np.sqrt(weight)))
 
 
-def test_cells_differ_over_their_own_whites_in_units_of_their_noise(
+def test_cell_differences_are_relative_to_white_and_noise(
     tables: tuple[Any, Any],
 ) -> None:
     one, other = tables
@@ -308,20 +307,23 @@ def test_cells_differ_over_their_own_whites_in_units_of_their_noise(
     widening = float(stats.t(freedoms).std())
     share, variance = np.full((4, 8, 3), np.nan), np.full((4, 8, 3), np.nan)
     for light, colour, channel in np.ndindex(4, 6, 3):
-        seen = [each.samples[light, colour, :, channel].astype(float) for each in (one, other)]
-        if min(values.mean() for values in seen) > 300:
-            a, b = (values.mean() / each.white[light, channel] for values, each in zip(seen, (one, other), strict=True))
+        values_of_both = [each.samples[light, colour, :, channel].astype(float) for each in (one, other)]
+        if min(values.mean() for values in values_of_both) > 300:
+            a, b = (
+                values.mean() / each.white[light, channel]
+                for values, each in zip(values_of_both, (one, other), strict=True)
+            )
             share[light, colour, channel] = b / a - 1
             variance[light, colour, channel] = sum(
-                max(values.var(ddof=1), 1 / 12) / len(values) / values.mean() ** 2 for values in seen
+                max(values.var(ddof=1), 1 / 12) / len(values) / values.mean() ** 2 for values in values_of_both
             )
     score = share / np.sqrt(variance) / widening
-    there = np.isfinite(share)
-    assert 20 < there.sum() < 60
+    is_compared = np.isfinite(share)
+    assert 20 < is_compared.sum() < 60
     assert np.isnan(scores[2]), "nothing is bright enough under the third light"
     for light in (0, 1, 3):
-        assert scores[light] ** 2 == pytest.approx((score**2)[light][there[light]].mean())
-    count = there.sum(axis=0)
+        assert scores[light] ** 2 == pytest.approx((score**2)[light][is_compared[light]].mean())
+    count = is_compared.sum(axis=0)
     np.testing.assert_array_equal(cells.lights, count)
     known = count > 0
     np.testing.assert_array_equal(np.isfinite(cells.mean), known)
@@ -333,21 +335,21 @@ def test_cells_differ_over_their_own_whites_in_units_of_their_noise(
 
 
 def lights_with(count: int = 4, **more: npt.ArrayLike) -> LightDifferences:
-    """Return lights that do not differ, but for what is given."""
+    """Return lights without differences, except the given ones."""
     plain = {name: np.zeros(count) for name in ("angle_deg", "brightness", "cell_score")}
     plain |= {name: np.ones(count) for name in ("angle_p", "brightness_p")}
-    given = plain | {name: np.asarray(value, dtype=np.float64) for name, value in more.items()}
+    columns = plain | {name: np.asarray(value, dtype=np.float64) for name, value in more.items()}
     number = np.arange(count) + 10
-    return LightDifferences(one=number, other=number, **given)
+    return LightDifferences(one=number, other=number, **columns)
 
 
 def cells_with(mean: _Array, noise: float, score: float = 1.0) -> CellDifferences:
-    """Return cells that differ by means (C, 3) of a noise."""
+    """Return cells that differ by means (C, 3), with a noise."""
     count = np.ones(mean.shape, dtype=np.int64)
     return CellDifferences(count, mean, np.full(mean.shape, noise), np.array([0.1, 0, 0]), 0, 0, score)
 
 
-def test_what_differs_is_beyond_noise_and_beyond_what_is_called_none() -> None:
+def test_difference_exceeds_noise_and_floor() -> None:
     # A chance of one in a hundred in any of four lights.
     lights = lights_with(angle_deg=[0.0051, 0.0049, 0.02, 0.03], angle_p=[0.0024, 0.0024, 0.0026, 0.0024])
     assert differing_lights(lights).tolist() == [10, 13]
@@ -364,14 +366,14 @@ def test_what_differs_is_beyond_noise_and_beyond_what_is_called_none() -> None:
 @pytest.mark.parametrize(
     ("off", "chance", "same"), [(0.0019, 1e-9, True), (-0.0021, 0.0024, False), (0.0021, 0.0026, True)]
 )
-def test_brightness_is_the_same_within_noise_or_its_floor(off: float, chance: float, same: bool) -> None:
+def test_brightness_is_same_within_noise_or_floor(off: float, chance: float, same: bool) -> None:
     lights = lights_with(brightness=[off, 0, 0, 0], brightness_p=[chance, 1, 1, 1])
     assert comparing._brightness_answer(lights).same_within_noise is same
 
 
-def test_the_interval_of_the_median_holds_it_and_a_single_light_has_none() -> None:
+def test_brightness_interval_contains_median() -> None:
     one = comparing._brightness_answer(lights_with(1, brightness=[0.015]))
-    assert "+1.500 % on the median (95 % interval +1.500 to +1.500 %)" in one.said
+    assert "+1.500 % median (95 % interval +1.500 to +1.500 %)" in one.said
     many = comparing._brightness_answer(lights_with(101, brightness=np.linspace(-0.01, 0.03, 101)))
     # Ranks 41 and 61 of the 101 lights, by the binomial distribution: +0.6 to +1.4 %.
     low, high = map(float, re.findall(r"interval (\S+) to (\S+) %", many.said)[0])
@@ -379,7 +381,7 @@ def test_the_interval_of_the_median_holds_it_and_a_single_light_has_none() -> No
 
 
 @pytest.mark.parametrize(("score", "of_light", "same"), [(1.1, 1.3, True), (1.11, 1.3, False), (1.1, 1.31, False)])
-def test_cells_are_the_same_up_to_their_scores(score: float, of_light: float, same: bool) -> None:
+def test_cells_are_same_up_to_score_limits(score: float, of_light: float, same: bool) -> None:
     calm = cells_with(np.tile([0.1, 0, 0], (4, 1)), 1e-9)
     lights = lights_with(cell_score=[0, of_light, 0, 0])
     assert comparing._cells_answer(lights, replace(calm, score=score)).same_within_noise is same
@@ -390,13 +392,13 @@ FEW = LIGHTS[:7]
 
 @pytest.fixture(scope="module")
 def small() -> Lab:
-    """Return a lab of few colours, whose lens is not measured: it has an error of its own, which is no noise."""
+    """Return a lab with few colours, in which the lens and its error are not measured."""
     return hang(2, "A6")
 
 
 @pytest.fixture(scope="module")
 def folders(small: Lab, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Return a session in the room of `small`, and one of another day: another sheet, other noise, a dimmer lamp."""
+    """Return two sessions in the same room on different days: another sheet, other noise, a dimmer lamp."""
     place = tmp_path_factory.mktemp("compared")
     again = hang(2, "A6", room=Room(seed=7, waviness_mm=0.5, roll_deg=0.6, white_level_share=0.69))
     for name, room in (("monday", small), ("friday", again)):
@@ -405,7 +407,7 @@ def folders(small: Lab, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
 
 
 @pytest.mark.slow
-def test_two_days_differ_in_brightness_alone(
+def test_two_days_differ_only_in_brightness(
     folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "report"
@@ -415,23 +417,23 @@ def test_two_days_differ_in_brightness_alone(
     assert document["brightness"]["median"] == pytest.approx(0.69 / 0.7 - 1, abs=2.5e-3)
     assert {path.name for path in out.iterdir()} == {"report.html", "comparison.json", "cells.csv", "lights.csv"}
     page = (out / "report.html").read_text()
-    assert "The cells on the print." in page, "a session has its chart"
+    assert "Differences of patches on the print." in page, "a session has its chart"
     # Nothing stays beside the sessions.
     assert {path.name for path in folders[0].parent.iterdir()} == {"monday", "friday"}
 
 
 @pytest.mark.slow
-def test_one_room_and_other_noise_are_the_same(folders: tuple[Path, Path], small: Lab, tmp_path: Path) -> None:
+def test_same_room_with_other_noise_is_same(folders: tuple[Path, Path], small: Lab, tmp_path: Path) -> None:
     with take(small, tmp_path / "again", FEW, every=4, frame=lambda step: small.dng(step.colour, 900 + step.number)):
         pass
     with table_of(folders[0]) as one, table_of(tmp_path / "again") as other:
-        found = compare(one, other)
-    assert found.same_within_noise
-    assert float(found.lights.angle_deg.max()) < 0.05
+        result = compare(one, other)
+    assert result.same_within_noise
+    assert float(result.lights.angle_deg.max()) < 0.05
 
 
 @pytest.mark.slow
-def test_a_frame_that_ends_the_build_of_a_session_can_be_taken_again(small: Lab, tmp_path: Path) -> None:
+def test_reports_frame_that_ends_build_for_retake(small: Lab, tmp_path: Path) -> None:
     def nothing(counts: npt.NDArray[np.uint16]) -> None:
         counts[...] = counts.min()
 
@@ -447,10 +449,10 @@ def test_a_frame_that_ends_the_build_of_a_session_can_be_taken_again(small: Lab,
 
 
 @pytest.mark.slow
-def test_a_table_is_compared_with_a_session(
+def test_compares_table_with_session(
     folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with Session.open(folders[0]) as session:
         build(session, tmp_path / "lut")
     assert main(["compare", str(tmp_path / "lut"), str(folders[0])]) == 0
-    assert "warning: both tables" in capsys.readouterr().out
+    assert "warning: both LUTs" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Figures: each has its parts and stands once; limits at their borders."""
+"""Figures: complete and unique, with values and outcomes at their limits."""
 
 from __future__ import annotations
 
@@ -32,33 +32,31 @@ from experiment.chart.layout import design_chart
         {"cause": replace(light.ADDITIVITY.cause, follows=("nothing",)) if light.ADDITIVITY.cause else None},
     ],
 )
-def test_figures_that_contradict_themselves_do_not_import(
-    wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refuses_contradictory_figures(wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(light, "WRONG", replace(DARKEST_COUNTS, **{"name": "wrong", **wrong}), raising=False)  # pyrefly: ignore[bad-argument-type]
-    with pytest.raises(ValueError, match=r"wrong|one of the names"):
-        all_figures.collected()
+    with pytest.raises(ValueError, match=r"wrong|duplicate"):
+        all_figures.collect_figures()
 
 
-def test_a_limit_of_single_frames_has_a_name_of_its_own_and_a_reason() -> None:
+def test_frame_limits_have_unique_names_and_reasons() -> None:
     limits = (*RIG_LIMITS, *FRAME_LIMITS)
-    names = [one.name for one in (*FIGURES, *limits)]
+    names = [single_frame.name for single_frame in (*FIGURES, *limits)]
     assert len(set(names)) == len(names)
-    for one in limits:
-        assert all((one.title, one.why, one.source, one.remedy))
-        assert one.outcome(one.accept) == "accept"
-        assert one.refuse is None or one.outcome(one.refuse) != "refuse"
+    for single_frame in limits:
+        assert all((single_frame.title, single_frame.why, single_frame.source, single_frame.remedy))
+        assert single_frame.outcome(single_frame.accept) == "accept"
+        assert single_frame.refuse is None or single_frame.outcome(single_frame.refuse) != "refuse"
 
 
-def test_figures_are_listed_in_the_order_of_their_definitions() -> None:
-    assert all_figures.collected() == FIGURES
+def test_lists_figures_in_order_of_definition() -> None:
+    assert all_figures.collect_figures() == FIGURES
     texts = [Path(module.__file__ or "").read_text() for module in (geometry, radiometry, light, truth)]
     assert [figure.name for figure in FIGURES] == re.findall(r' = Figure\(\n    "(\w+)"', "".join(texts))
     assert {figure.group for figure in FIGURES} == QUESTIONS.keys()
 
 
-def test_some_figures_are_asked_more_than_others() -> None:
-    """What trial frames show, what names frames by itself, what a refusal speaks of first, what shares a cause."""
+def test_figures_have_required_properties() -> None:
+    """Before a session, foremost, retaken frames, and shared causes."""
     assert {figure.name for figure in FIGURES if not figure.before_session} >= {
         "correction_residual", "truth_median_deg", "truth_worst_deg", "white_frames", "primaries_lacking",
     }  # fmt: skip
@@ -83,9 +81,7 @@ def test_some_figures_are_asked_more_than_others() -> None:
     ("cells", "measured", "left_in", "told"),
     [(4096, True, False, True), (4095, True, False, False), (512, True, True, True), (4096, False, True, False)],
 )
-def test_what_a_lens_leaves_is_a_figure_where_cells_are_enough_to_tell_it(
-    cells: int, measured: bool, left_in: bool, told: bool
-) -> None:
+def test_lens_residual_needs_enough_cells(cells: int, measured: bool, left_in: bool, told: bool) -> None:
     table: Any = SimpleNamespace(
         is_of_one_frame=False,
         registration=SimpleNamespace(mismatched_cells=np.zeros(cells)),
@@ -104,9 +100,9 @@ NONE = Superposition.usual(10_000.0)
 
 
 def frame(number: int, **more: object) -> Any:
-    """Return the n-th of five frames: white, three lights, white."""
+    """Return one of five frames: white, three lights, white."""
     kind = KINDS[number]
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "record": SimpleNamespace(
             kind=kind, illumination=number - 1 if kind == "light" else None, file=f"{number}.dng", sha256=f"{number}"
         ),
@@ -120,12 +116,12 @@ def frame(number: int, **more: object) -> Any:
         ),
         "reregistered": number > 2,
     }  # fmt: skip
-    return SimpleNamespace(**found | more)
+    return SimpleNamespace(**result | more)
 
 
 def codes(**more: object) -> Any:
-    """Return how three lights agree with their codes: the last is off."""
-    found: dict[str, Any] = {
+    """Return the agreement of three lights with their codes; the last deviates."""
+    result: dict[str, Any] = {
         "off_deg": np.array([0.0, 1.0, 3.0]),
         "off_brightness": np.array([0.2, 0.0, 0.4]),
         "brightness": np.array([0.25, 0.01, -0.5]),
@@ -134,7 +130,7 @@ def codes(**more: object) -> Any:
         "exchange_deg": 1.5,
         "misfit": 0.75,
     }
-    return SimpleNamespace(**found | more)
+    return SimpleNamespace(**result | more)
 
 
 def pairs(count: int) -> tuple[Any, ...]:
@@ -145,7 +141,7 @@ def table(**more: object) -> Any:
     """Return a table of five frames."""
 
     def lights_off_codes(limit: float) -> list[int]:
-        return np.flatnonzero(found["lights"].off_codes_deg > limit).tolist()
+        return np.flatnonzero(result["lights"].off_codes_deg > limit).tolist()
 
     def added_bleed(one: Any) -> float:
         return one.blur_px - 0.5
@@ -156,7 +152,7 @@ def table(**more: object) -> Any:
         "subtracted": None, "additivity": None, "stray": None, "white": WHITE, "brightest": WHITE.max(axis=0),
         "lights_off_codes": lights_off_codes,
     }  # fmt: skip
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "is_of_one_frame": False,
         "frames": frames,
         "white_frames": [frames[0], frames[4]],
@@ -190,9 +186,9 @@ def table(**more: object) -> Any:
         elif name == "as_whites":
             lights["white_frames"] = value
         else:
-            found[name] = value
-    found["lights"] = SimpleNamespace(**lights)
-    return SimpleNamespace(**found)
+            result[name] = value
+    result["lights"] = SimpleNamespace(**lights)
+    return SimpleNamespace(**result)
 
 
 def off(*values: float, error: float = 0.0) -> Any:
@@ -200,12 +196,12 @@ def off(*values: float, error: float = 0.0) -> Any:
 
 
 def unlike(frames: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return frames of which the last is the first's file again."""
+    """Return frames, the last of which has the first one's file."""
     return (*frames[:4], frame(4, record=SimpleNamespace(kind="white", illumination=None, file="4.dng", sha256="0")))
 
 
 def lens_before(cells: int, **more: bool) -> dict[str, Any]:
-    """Return a lens that leaves 3 in a thousand, and as many cells."""
+    """Return a lens with a residual of 0.003, and the number of cells."""
     return {
         "registration": SimpleNamespace(mismatched_cells=np.zeros(cells)),
         "lens": SimpleNamespace(left=0.003, left_worst=0.02, **more),
@@ -303,17 +299,23 @@ AS_WHITES = SimpleNamespace(off_deg=np.array([0.0, 4.0]), off_brightness=np.arra
         (truth.DARKEST_COUNTS, {}, 295),
     ],
 )
-def test_a_figure_measures(figure: Any, more: dict[str, Any], value: float | None) -> None:
+def test_figure_measures_value(figure: Any, more: dict[str, Any], value: float | None) -> None:
     assert figure.measure(table(**more)) == (None if value is None else pytest.approx(value, rel=1e-3))
 
 
 def of_one_frame(**more: object) -> Any:
-    """Return what a check has, whose frame shows nothing wrong."""
+    """Return a check of a healthy frame."""
     origins = SimpleNamespace(other_camera=(), other_exposure=(), other_lens=(), other_iso=(), exposure_difference=0.0)
     paper = SimpleNamespace(white=np.array([4000.0, 9000, 2000]), references=100, spread=np.full(3, 0.001))
     calm = SimpleNamespace(scatter=0.0, block=0.0, disturbed=())
-    one = frame(0, paper=paper, consistency=calm)
-    usual = {"frames": (one,), "white_frames": (one,), "white": WHITE[1:2], "origins": origins, "black_drift": 0.1}
+    single_frame = frame(0, paper=paper, consistency=calm)
+    usual = {
+        "frames": (single_frame,),
+        "white_frames": (single_frame,),
+        "white": WHITE[1:2],
+        "origins": origins,
+        "black_drift": 0.1,
+    }
     return table(is_of_one_frame=True, **{**usual, **more})
 
 
@@ -328,9 +330,7 @@ def of_one_frame(**more: object) -> Any:
         (truth.REFERENCES_USED, {"session": SimpleNamespace(white_references=200)}),
     ],
 )
-def test_a_check_tells_what_more_frames_cannot_make_good_and_accepts_nothing_that_they_may_spoil(
-    figure: Any, beyond: dict[str, Any]
-) -> None:
+def test_check_judges_bounded_figures_only_beyond_limit(figure: Any, beyond: dict[str, Any]) -> None:
     fine, bad = of_one_frame(), of_one_frame(**beyond)
     assert figure.outcome(figure.measure(fine)) == "accept"
     assert figure.outcome(figure.measure(bad)) != "accept"
@@ -339,14 +339,14 @@ def test_a_check_tells_what_more_frames_cannot_make_good_and_accepts_nothing_tha
     assert figure.judged_value(fine) == figure.measure(fine)
 
 
-def test_a_check_does_not_judge_what_all_frames_tell() -> None:
-    found = of_one_frame(**lens_before(4096, measured=True, is_left_in=False))
+def test_check_skips_figures_of_all_frames() -> None:
+    result = of_one_frame(**lens_before(4096, measured=True, is_left_in=False))
     for figure in (geometry.CORRECTION_RESIDUAL, light.LINEARITY_KNOWN, radiometry.WHITE_FRAMES, truth.TRUTH_WORST_DEG):
-        assert figure.measure(found) is not None
-        assert figure.judged_value(found) is None
+        assert figure.measure(result) is not None
+        assert figure.judged_value(result) is None
 
 
-def test_leak_and_tint_are_held_against_white_alone() -> None:
+def test_leak_and_tint_need_white_frame() -> None:
     def tints_deg(white: object) -> Any:
         return np.array([2.0])
 
@@ -357,21 +357,21 @@ def test_leak_and_tint_are_held_against_white_alone() -> None:
         assert figure.judged_value(table(greys=greys, white_frames=())) is not None
 
 
-def test_a_bend_is_what_counts_lack_for_certain_over_paper_s_levels() -> None:
+def test_bend_is_significant_deviation_over_paper_levels() -> None:
     nodes = np.array(NODES)
     for lack, error in ((0.03, 0.0), (0.03, 0.002)):
-        found = Superposition(
+        result = Superposition(
             10_000.0, -lack * nodes**2 * 10_000, (error * nodes * 10_000) ** 2 * np.eye(len(nodes)), None
         )
-        sensor = SimpleNamespace(linearity=None, superposition=found)
-        made = table(sensor=sensor, off_codes_deg=None)
+        sensor = SimpleNamespace(linearity=None, superposition=result)
+        figures_table = table(sensor=sensor, off_codes_deg=None)
         level = np.geomspace(10_000 * NODES[1], 5000, 30)
-        relative = found.relative(level)[0]
+        relative = result.relative(level)[0]
         bend = np.abs(relative - relative[-1])
-        doubt = 2 * np.sqrt(found.beside(level, np.full(30, 5000.0))[1])
-        assert light.LINEARITY.measure(made) == pytest.approx(np.maximum(bend - doubt, 0).max(), abs=1e-9)
+        doubt = 2 * np.sqrt(result.beside(level, np.full(30, 5000.0))[1])
+        assert light.LINEARITY.measure(figures_table) == pytest.approx(np.maximum(bend - doubt, 0).max(), abs=1e-9)
         assert bend.max() == pytest.approx(lack * (0.5 - NODES[1]), rel=0.05)
-        assert light.LINEARITY_KNOWN.measure(made) == 1
+        assert light.LINEARITY_KNOWN.measure(figures_table) == 1
         # Lights that are not what they are called tell nothing.
         assert light.LINEARITY.measure(table(sensor=sensor)) is None
     assert light.LINEARITY.measure(table(off_codes_deg=None)) is None
@@ -398,14 +398,14 @@ def test_a_bend_is_what_counts_lack_for_certain_over_paper_s_levels() -> None:
         (radiometry.OTHER_EXPOSURE, 0.01, ["1", "2", "3"]),
     ],
 )
-def test_frames_beyond_a_limit_are_asked_for(figure: Any, limit: float, files: list[str] | None) -> None:
-    made = table(as_whites=AS_WHITES)
+def test_selects_frames_beyond_limit(figure: Any, limit: float, files: list[str] | None) -> None:
+    figures_table = table(as_whites=AS_WHITES)
     ratios = {1: 1.2, 2: 1 / 1.2, 3: 1 / 1.05}
-    made.origins.other_exposure = tuple(
-        SimpleNamespace(record=made.frames[number].record, ratio=ratio) for number, ratio in ratios.items()
+    figures_table.origins.other_exposure = tuple(
+        SimpleNamespace(record=figures_table.frames[number].record, ratio=ratio) for number, ratio in ratios.items()
     )
-    found = figure.retake(made, limit)
-    assert (None if found is None else [record.file.removesuffix(".dng") for record in found]) == files
+    result = figure.retake(figures_table, limit)
+    assert (None if result is None else [record.file.removesuffix(".dng") for record in result]) == files
 
 
 def worst(figure: Any, made: Any) -> Any:
@@ -416,13 +416,13 @@ def where(figure: Any, made: Any, accepted: float) -> Any:
     return figure.where(made, accepted)
 
 
-def test_a_figure_names_what_is_beyond_its_limit() -> None:
-    made = table(codes=codes(exchanges=pairs(6)))
+def test_figure_names_lights_beyond_limit() -> None:
+    figures_table = table(codes=codes(exchanges=pairs(6)))
     # Four pairs are named of six, white frames after the lights.
-    said = where(light.EXCHANGED_LIGHTS, made, 0.0)
-    assert "light 2 and white frame 0" in said
-    assert said.endswith("(and 2 pairs more), 2.5° apart in the first pair")
+    message = where(light.EXCHANGED_LIGHTS, figures_table, 0.0)
+    assert "illuminant 2 and white frame 0" in message
+    assert message.endswith("(and 2 more pairs); angle of the first pair 2.5°")
     assert "more" not in where(light.EXCHANGED_LIGHTS, table(codes=codes(exchanges=pairs(4))), 0.0)
-    assert where(light.OFF_BRIGHTNESS, made, 0.1) == "light 2 by -50 %, light 0 by +25 %"
+    assert where(light.OFF_BRIGHTNESS, figures_table, 0.1) == "illuminant 2 by -50 %, illuminant 0 by +25 %"
     assert where(light.REPEATED_FILES, table(frames=TWICE), 0.0) == "4.dng is 0.dng"
-    assert where(light.CROSS_CHECKED_SHARE, made, 0.0) == "2 of 3"
+    assert where(light.CROSS_CHECKED_SHARE, figures_table, 0.0) == "2 of 3"

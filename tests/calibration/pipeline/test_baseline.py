@@ -1,4 +1,4 @@
-"""The light on a chart without tags, read from its cells, against the light of the room."""
+"""The field on a chart without tags, from its cells, against the room's light."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ def seen(world: World, colour: Colour) -> tuple[npt.NDArray[np.float64], ...]:
     return cells, whites, bare / bare.mean(axis=0)
 
 
-def test_the_light_in_the_middle_is_told_by_the_cells(world: World) -> None:
+def test_cells_show_light_in_centre(world: World) -> None:
     cells, whites, true = seen(world, WHITE)
-    there = np.ones(len(cells), dtype=np.bool_)
-    field = field_of_cells(CHART.rgb, CHART.centres_mm, cells, there, WHITES_MM, whites, CHART.page_mm)
+    usable = np.ones(len(cells), dtype=np.bool_)
+    field = field_of_cells(CHART.rgb, CHART.centres_mm, cells, usable, WHITES_MM, whites, CHART.page_mm)
     error = field.at(CHART.centres_mm) / true - 1
     assert np.sqrt((error**2).mean()) < 0.004
     # References in the margin alone leave more than twice that.
@@ -49,16 +49,16 @@ def test_the_light_in_the_middle_is_told_by_the_cells(world: World) -> None:
     assert np.sqrt(((alone.at(CHART.centres_mm) / true - 1) ** 2).mean()) > 0.009
 
 
-def test_covered_cells_and_a_stained_reference_are_left_out(world: World) -> None:
+def test_excludes_covered_cells_and_stained_reference(world: World) -> None:
     cells, whites, true = seen(world, WHITE)
-    there = np.ones(len(cells), dtype=np.bool_)
-    there[1000:1100] = False
+    usable = np.ones(len(cells), dtype=np.bool_)
+    usable[1000:1100] = False
     cells[1000:1100] = 7000
     # A few that nobody has noticed.
     cells[2000:2020] *= 0.5
     whites[3] *= 0.8
     whites[5] = np.nan
-    field = field_of_cells(CHART.rgb, CHART.centres_mm, cells, there, WHITES_MM, whites, CHART.page_mm)
+    field = field_of_cells(CHART.rgb, CHART.centres_mm, cells, usable, WHITES_MM, whites, CHART.page_mm)
     assert np.sqrt(((field.at(CHART.centres_mm) / true - 1) ** 2).mean()) < 0.005
 
 
@@ -69,7 +69,7 @@ FEW_WHITES_MM = np.array([reference.centre_mm for reference in FEW.references])
 def planted(
     degree: int, order: int
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return levels of 64 cells and of paper whose logarithms are polynomials, and the field as that order shows it."""
+    """Return levels of 64 cells and of paper with polynomial logarithms, and the true field."""
     random = np.random.default_rng(3)
     codes = code_polynomial(FEW.rgb, degree)
     at_cells, at_paper = (page_polynomial(at, FEW.page_mm, order) for at in (FEW.centres_mm, FEW_WHITES_MM))
@@ -80,38 +80,38 @@ def planted(
     return levels, 3000 * np.exp(at_paper[:, 1:] @ light), smooth / smooth.mean(axis=0)
 
 
-def test_of_64_colours_what_has_the_form_of_the_model_is_found_to_the_last_digits() -> None:
-    """Polynomials of the second degree, in the codes and over the page: five cells for each of ten terms."""
+def test_recovers_model_field_with_64_colours() -> None:
+    """Second degree in codes and position: five cells for each of ten terms."""
     levels, paper, true = planted(2, 2)
-    there = np.ones(len(levels), dtype=np.bool_)
-    there[5], levels[5] = False, 50.0
+    usable = np.ones(len(levels), dtype=np.bool_)
+    usable[5], levels[5] = False, 50.0
     # Nothing is learned of what is too dark.
     levels[[7, 20]] = 9.9
-    field = field_of_cells(FEW.rgb, FEW.centres_mm, levels, there, FEW_WHITES_MM, paper, FEW.page_mm)
+    field = field_of_cells(FEW.rgb, FEW.centres_mm, levels, usable, FEW_WHITES_MM, paper, FEW.page_mm)
     np.testing.assert_allclose(field.at(FEW.centres_mm), true, rtol=1e-6)
 
 
-def test_a_reference_counts_for_ten_cells_and_few_patches_for_nothing() -> None:
+def test_reference_weighs_ten_cells() -> None:
     levels, paper, true = planted(2, 2)
-    there = np.ones(len(levels), dtype=np.bool_)
+    usable = np.ones(len(levels), dtype=np.bool_)
     # A field that cells and paper do not agree on is more that of the paper.
     turned = paper * (1 + 0.02 * (FEW_WHITES_MM[:, :1] / FEW.page_mm[0] - 0.5))
-    both = field_of_cells(FEW.rgb, FEW.centres_mm, levels, there, FEW_WHITES_MM, turned, FEW.page_mm)
+    both = field_of_cells(FEW.rgb, FEW.centres_mm, levels, usable, FEW_WHITES_MM, turned, FEW.page_mm)
     change = np.log(both.at(FEW.centres_mm) / true)
     slope = np.polyfit(FEW.centres_mm[:, 0] / FEW.page_mm[0], change, 1)[0] / 0.02
     assert ((slope > 0.5) & (slope < 1.2)).all()
     terms = len(code_powers(2)) + page_polynomial(FEW.centres_mm, FEW.page_mm, 2).shape[1]
     # Two patches for each number of the model are enough, one fewer is not.
     for count, shaped in ((2 * terms, True), (2 * terms - 1, False)):
-        there[:] = np.arange(len(there)) < count - len(FEW_WHITES_MM)
-        found = field_of_cells(FEW.rgb, FEW.centres_mm, levels, there, FEW_WHITES_MM, paper, FEW.page_mm)
-        assert (found.at(FEW.centres_mm) == 1).all() != shaped
+        usable[:] = np.arange(len(usable)) < count - len(FEW_WHITES_MM)
+        result = field_of_cells(FEW.rgb, FEW.centres_mm, levels, usable, FEW_WHITES_MM, paper, FEW.page_mm)
+        assert (result.at(FEW.centres_mm) == 1).all() != shaped
 
 
-def test_a_colour_without_light_has_no_shape(world: World) -> None:
+def test_channel_without_light_has_no_shape(world: World) -> None:
     cells, whites, _ = seen(world, Colour(0, 0, 255))
-    there = np.ones(len(cells), dtype=np.bool_)
+    usable = np.ones(len(cells), dtype=np.bool_)
     cells[:, 0] = np.random.default_rng(2).normal(0, 2, len(cells))
     whites[:, 0] = 0.5
-    field = field_of_cells(CHART.rgb, CHART.centres_mm, cells, there, WHITES_MM, whites, CHART.page_mm)
+    field = field_of_cells(CHART.rgb, CHART.centres_mm, cells, usable, WHITES_MM, whites, CHART.page_mm)
     assert (field.at(CHART.centres_mm)[:, 0] == 1).all()

@@ -1,4 +1,4 @@
-"""From a session to a table, against the light that the simulated room really had."""
+"""From a session to a table, against the true light of the simulated room."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def table(built: BuildResult) -> Lut:
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_table_has_a_place_for_every_light_colour_and_sample(table: Lut, lab: Lab) -> None:
+def test_table_has_expected_shape(table: Lut, lab: Lab) -> None:
     assert table.samples.shape == (len(LIGHTS), 512, 25, 3)
     assert table.illuminations == LIGHTS
     assert table.provenance.bits == 3
@@ -114,7 +114,7 @@ def test_the_table_has_a_place_for_every_light_colour_and_sample(table: Lut, lab
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_ground_truth_is_the_light(table: Lut, lab: Lab) -> None:
+def test_ground_truth_matches_light(table: Lut, lab: Lab) -> None:
     errors = [
         angle_deg(table.white[light.index], lab.world.white(light.colour, SETTINGS)) for light in table.illuminations
     ]
@@ -123,7 +123,7 @@ def test_the_ground_truth_is_the_light(table: Lut, lab: Lab) -> None:
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_every_colour_is_the_paper_s_under_every_light(table: Lut, lab: Lab) -> None:
+def test_cell_colours_match_paper_under_all_lights(table: Lut, lab: Lab) -> None:
     for light in table.illuminations:
         white = lab.world.white(light.colour, SETTINGS)
         true = lab.world.reflected(codes(lab.chart), light.colour, SETTINGS) / white
@@ -137,8 +137,8 @@ def test_every_colour_is_the_paper_s_under_every_light(table: Lut, lab: Lab) -> 
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_samples_have_the_noise_of_the_sensor(table: Lut, lab: Lab) -> None:
-    """Interpolated samples would have less."""
+def test_samples_keep_sensor_noise(table: Lut, lab: Lab) -> None:
+    """Interpolated samples would have less noise."""
     light = next(light for light in LIGHTS if light.colour == WHITE)
     samples = table.samples[light.index].astype(np.float64)
     signal = samples.mean(axis=1)
@@ -151,7 +151,7 @@ def test_samples_have_the_noise_of_the_sensor(table: Lut, lab: Lab) -> None:
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_nothing_is_unfit_in_a_healthy_session(built: BuildResult) -> None:
+def test_healthy_session_has_no_unfit_cells(built: BuildResult) -> None:
     assert len(built.figures.cells.unfit) <= 2
     assert built.figures.black_drift < 1
     assert built.figures.largest_shift_px < 0.02
@@ -159,11 +159,11 @@ def test_nothing_is_unfit_in_a_healthy_session(built: BuildResult) -> None:
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_field_can_be_undone(table: Lut, built: BuildResult, session: Session, lab: Lab) -> None:
-    """Multiplied by the field of `lut.json`, the table gives the counts of the frame again."""
-    done = {correction["name"]: correction for correction in table.provenance.corrections}
-    assert list(done) == ["black", "half size", "saturation", "field", "rounding", "drift", "primaries"]
-    assert len(done["field"]["per_light"]) == len(done["black"]["per_light"]) == len(LIGHTS)
+def test_field_correction_is_reversible(table: Lut, built: BuildResult, session: Session, lab: Lab) -> None:
+    """Multiplied by the field in `lut.json`, the table gives the counts of the frame."""
+    corrections = {correction["name"]: correction for correction in table.provenance.corrections}
+    assert list(corrections) == ["black", "half size", "saturation", "field", "rounding", "drift", "primaries"]
+    assert len(corrections["field"]["per_light"]) == len(corrections["black"]["per_light"]) == len(LIGHTS)
     figures = next(f for f in built.figures.frames if f.record.illumination == 5)
     field = figures.paper.field.at(lab.chart.centres_mm[lab.chart.cell_of_colour])
     assert field.mean(axis=0) == pytest.approx(1, abs=1e-6)
@@ -176,9 +176,9 @@ def test_the_field_can_be_undone(table: Lut, built: BuildResult, session: Sessio
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_primaries_correction_can_be_undone(table: Lut, built: BuildResult, lab: Lab) -> None:
-    """What `lut.json` records of it, and the table's own samples of the primaries, give the factor of every cell."""
-    recorded = next(done for done in table.provenance.corrections if done["name"] == "primaries")
+def test_primaries_correction_is_reversible(table: Lut, built: BuildResult, lab: Lab) -> None:
+    """`lut.json` and the samples of the primaries give the factor of every cell."""
+    recorded = next(corrections for corrections in table.provenance.corrections if corrections["name"] == "primaries")
     assert built.figures.primaries is not None
     places = lab.chart.centres_mm[lab.chart.cell_of_colour]
     fields = [
@@ -200,7 +200,7 @@ def test_the_primaries_correction_can_be_undone(table: Lut, built: BuildResult, 
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_dark_frames_show_the_projector_s_black(built: BuildResult, lab: Lab) -> None:
+def test_dark_frames_show_projector_black(built: BuildResult, lab: Lab) -> None:
     true = lab.world.white(BLACK, SETTINGS) / lab.world.white(WHITE, SETTINGS)
     white = next(figures.paper.white for figures in built.figures.frames if figures.record.kind == "white")
     dark = built.figures.dark_frames
@@ -211,13 +211,13 @@ def test_dark_frames_show_the_projector_s_black(built: BuildResult, lab: Lab) ->
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_simulated_projector_s_light_adds(built: BuildResult) -> None:
+def test_simulated_projector_is_additive(built: BuildResult) -> None:
     assert built.figures.lights.additivity is not None
     assert np.abs(built.figures.lights.additivity.off).max() < 0.006
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_every_level_of_grey_is_the_print_s(built: BuildResult, lab: Lab, table: Lut) -> None:
+def test_grey_levels_match_print(built: BuildResult, lab: Lab, table: Lut) -> None:
     greys = built.figures.greys
     codes = sorted({reference.rgb for reference in lab.chart.references if not reference.is_white}, reverse=True)
     assert len(codes) == len(greys.names) >= 2
@@ -232,7 +232,7 @@ def test_every_level_of_grey_is_the_print_s(built: BuildResult, lab: Lab, table:
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_noise_curve_is_the_sensor_s(built: BuildResult, lab: Lab) -> None:
+def test_noise_curve_matches_sensor(built: BuildResult, lab: Lab) -> None:
     body = lab.world.body
     assert built.figures.sensor.transfer.gain_e == pytest.approx(body.electrons_per_dn * np.array([1, 2, 1]), rel=0.2)
     assert built.figures.sensor.transfer.noisy.sum() <= 1
@@ -257,7 +257,7 @@ def test_a_hot_and_a_dead_photosite_are_named(lab: Lab, tmp_path: Path) -> None:
     with take(lab, tmp_path / "session", renumbered(LIGHTS[5:6]), frame=frame) as session:
         result = build(session, tmp_path / "lut")
     unfit = {cell.colour: cell.cause for cell in result.figures.cells.unfit}
-    assert unfit[hot].startswith("hot: a photosite stands out by ")
+    assert unfit[hot].startswith("hot: a photosite exceeds the others by ")
     assert unfit[dead].startswith("dead: ")
     assert len(unfit) <= 4
 
@@ -265,7 +265,7 @@ def test_a_hot_and_a_dead_photosite_are_named(lab: Lab, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
 @pytest.mark.usefixtures("lens_unmeasured")
 def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Path) -> None:
-    """3 % over the session: each light keeps its own ground truth, and the gain brings them to one lamp."""
+    """3 % over the session: each light keeps its ground truth, and the gains equalise the lamp."""
     lights = LIGHTS[:6]
     steps = len(plan_steps(lights, 2))
 
@@ -288,14 +288,14 @@ def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Pat
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_report_stands_alone(built: BuildResult) -> None:
+def test_report_is_self_contained(built: BuildResult) -> None:
     assert built.lut is not None
     page = (built.lut / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 8
     # Verdict, what to do, and the four pictures to look at first stand before everything that is folded.
     heads = re.findall(r"<h2>([^<]+)</h2>", page[: page.index("<details")])
-    assert [head for head in heads if head not in ("Probable causes",) and not head.startswith("Where it is")] == [
-        "What to do", "The chart as registered", "The lights", "Where cells err", "The noise", "All figures",
+    assert [head for head in heads if head not in ("Probable causes",) and not head.startswith("Position: ")] == [
+        "What to do", "The registered chart", "The illuminants", "Errors of patches", "Noise", "All figures",
     ]  # fmt: skip
     assert page.index("class='verdict ") < page.index("What to do")
     assert re.findall(r"<details id='(\w+)'", page) == [*QUESTIONS, "origin"]
@@ -314,23 +314,23 @@ def test_the_report_stands_alone(built: BuildResult) -> None:
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_summary_gives_figures_in_their_units(built: BuildResult) -> None:
+def test_summary_has_units(built: BuildResult) -> None:
     rows = {row.name: row for row in summary(built.figures)}
     # What the command prints, in this order.
     assert [name for name, row in rows.items() if row.brief] == [
-        "Tags found", "Residual of cell blocks", "Correlation with the chart", "Movement of the chart",
-        "Drift of white", "Uncertainty of the ground truth", "Cells unfit for use",
+        "Detected tags", "Residual of patch blocks", "Correlation with the chart", "Movement of the chart",
+        "Drift of white", "Uncertainty of the ground truth", "Unfit patches",
     ]  # fmt: skip
     figures, percent = built.figures, "{:.2f} %".format
-    assert rows["Lights"].value == str(len(LIGHTS))
-    assert rows["Tags found"].value == "4 of 4"
-    assert rows["Shorter side of a cell"].value == f"{figures.registration.cell_px:.1f} px"
+    assert rows["Illuminants"].value == str(len(LIGHTS))
+    assert rows["Detected tags"].value == "4 of 4"
+    assert rows["Shorter side of a patch"].value == f"{figures.registration.cell_px:.1f} px"
     assert rows["Movement of the chart"].value == f"{figures.largest_shift_px:.3f} px at most"
     assert rows["Drift of white"].value == percent(100 * figures.white_drift)
     black = np.mean([frame.black.mean() for frame in figures.frames])
     assert rows["Black level"].value == f"{black:.2f} counts"
     strongest = figures.lights.white.max(axis=1)
-    assert rows["Darkest light"].value == f"{strongest.min():.0f} counts"
+    assert rows["Darkest illuminant"].value == f"{strongest.min():.0f} counts"
     told = rows["Light while the projector shows black"].value
     dark = [float(value) for value in re.findall(r"\d\.\d\d", told)]
     white = next(frame.paper.white for frame in figures.frames if frame.record.kind == "white")
@@ -339,7 +339,7 @@ def test_the_summary_gives_figures_in_their_units(built: BuildResult) -> None:
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_whole_table_is_what_it_was(built: BuildResult, session: Session, pinned: Pinned) -> None:
+def test_table_matches_pinned_numbers(built: BuildResult, session: Session, pinned: Pinned) -> None:
     assert built.lut is not None
     pinned("table of 13 lights, measured", whole(built), **LIMITS)
     pinned("table of 13 lights, files", written(built.lut), **LIMITS)
@@ -347,7 +347,7 @@ def test_the_whole_table_is_what_it_was(built: BuildResult, session: Session, pi
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_a_check_measures_what_it_did_and_writes_nothing(session: Session, pinned: Pinned) -> None:
+def test_check_measures_and_writes_nothing(session: Session, pinned: Pinned) -> None:
     before = sorted(session.folder.rglob("*"))
     result = check(session)
     pinned("check of 13 lights", told(result), **LIMITS)
@@ -361,22 +361,22 @@ def small(lab: Lab, folder: Path, count: int = 2) -> Session:
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_a_light_without_an_accepted_frame_is_named(lab: Lab, tmp_path: Path) -> None:
+def test_names_light_without_accepted_frame(lab: Lab, tmp_path: Path) -> None:
     session = take(
         lab,
         tmp_path / "session",
         LIGHTS[:3],
         verdict=lambda step: "refused" if step.illumination == 1 else "accepted",
     )
-    with session, pytest.raises(FormatError, match=r"1 of 3 lights .*: 1;"):
+    with session, pytest.raises(FormatError, match=r"1 of 3 illuminants .*: 1;"):
         build(session, tmp_path / "lut")
     assert not (tmp_path / "lut").exists()
     assert list(tmp_path.iterdir()) == [tmp_path / "session"]
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-@pytest.mark.parametrize(("change", "said"), [("gone", "is missing"), ("altered", "is not the file that was taken")])
-def test_a_frame_that_is_not_as_taken_is_named(lab: Lab, tmp_path: Path, change: str, said: str) -> None:
+@pytest.mark.parametrize(("change", "said"), [("gone", "is missing"), ("altered", "has changed")])
+def test_names_changed_frame(lab: Lab, tmp_path: Path, change: str, said: str) -> None:
     with small(lab, tmp_path / "session") as session:
         path = session.folder / "frames/0003_light_001.dng"
         data = bytearray(path.read_bytes())
@@ -432,7 +432,7 @@ def test_a_small_movement_is_followed_without_registering_anew(lab: Lab, tmp_pat
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_a_table_s_folder_that_is_taken_is_left_alone(session: Session, tmp_path: Path) -> None:
+def test_keeps_existing_folder(session: Session, tmp_path: Path) -> None:
     (tmp_path / "lut").mkdir()
     (tmp_path / "lut" / "precious").write_text("x")
     with pytest.raises(InputError):
@@ -441,7 +441,7 @@ def test_a_table_s_folder_that_is_taken_is_left_alone(session: Session, tmp_path
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_an_overexposed_session_builds_no_table(lab: Lab, tmp_path: Path) -> None:
+def test_refuses_overexposed_session(lab: Lab, tmp_path: Path) -> None:
     bright = ExposureSettings(100, 8.0, 1.2)
     session = take(lab, tmp_path / "session", LIGHTS[:2], frame=lambda step: lab.dng(step.colour, step.number, bright))
     with session, pytest.raises(QualityError):
@@ -469,14 +469,14 @@ def test_cells_that_cannot_be_used_are_listed_with_their_cause(lab: Lab, tmp_pat
     with take(lab, tmp_path / "session", lights, frame=frame) as session:
         build(session, tmp_path / "lut")
     unfit = {cell.colour: cell.cause for cell in open_lut(tmp_path / "lut").provenance.unfit}
-    assert unfit[100].startswith("clipped: 13584 counts under light 0")
-    assert unfit[300].startswith("uneven: rim and middle differ by")
+    assert unfit[100].startswith("clipped: 13584 counts under illuminant 0")
+    assert unfit[300].startswith("uneven: rim and centre differ by")
     assert len(unfit) <= 3
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
 @pytest.mark.usefixtures("lens_unmeasured")
-def test_cells_under_a_cover_are_listed(lab: Lab, tmp_path: Path) -> None:
+def test_lists_covered_cells(lab: Lab, tmp_path: Path) -> None:
     visible = lab.world.body.visible
     corner = np.array([220, 130])
 
@@ -496,36 +496,34 @@ def test_cells_under_a_cover_are_listed(lab: Lab, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_command_builds_and_reports(session: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_builds_and_reports(session: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(session.folder), str(tmp_path / "lut")]) == 0
     printed = capsys.readouterr().out
-    assert "Residual of cell blocks" in printed
-    assert f"{len(LIGHTS)} lights, Canon CroP Test" in printed
+    assert "Residual of patch blocks" in printed
+    assert f"{len(LIGHTS)} illuminants, Canon CroP Test" in printed
     assert json.loads((tmp_path / "lut" / "lut.json").read_text())["format"] == "crop.lut"
     assert (tmp_path / "lut" / "report.html").exists()
 
 
 @pytest.mark.usefixtures("pinned_builds", "undrawn")
-def test_the_command_checks(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_checks(session: Session, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(session.folder)]) == 0
-    assert "the others take all frames" in capsys.readouterr().out
-    found = json_of(main, ["check", session.folder], capsys)
-    assert (found["command"], found["format"]) == ("build-lut check", "crop.report")
-    assert found["figures"]
+    assert "to judge all figures" in capsys.readouterr().out
+    result = json_of(main, ["check", session.folder], capsys)
+    assert (result["command"], result["format"]) == ("build-lut check", "crop.report")
+    assert result["figures"]
 
 
 # Options of a build: windows of other sizes than the paper's 5×5.
 
 
 @pytest.mark.parametrize("window", [1, 4, 11])
-def test_a_window_that_has_no_middle_or_no_place_is_refused(window: int) -> None:
+def test_refuses_even_or_oversized_window(window: int) -> None:
     with pytest.raises(InputError, match="3, 5, 7 or 9"):
         BuildOptions(window)
 
 
-def test_three_by_three_are_the_inner_samples_of_five_by_five(
-    session: Session, built: BuildResult, tmp_path: Path
-) -> None:
+def test_window_three_is_inner_part_of_five(session: Session, built: BuildResult, tmp_path: Path) -> None:
     small = build(session, tmp_path / "3", options=BuildOptions(3))
     assert built.lut is not None
     five, three = open_lut(built.lut), open_lut(tmp_path / "3")
@@ -534,9 +532,9 @@ def test_three_by_three_are_the_inner_samples_of_five_by_five(
     assert find_faults(three) == []
     inner = five.samples.reshape(*five.samples.shape[:2], 5, 5, 3)[:, :, 1:4, 1:4].reshape(three.samples.shape)
     # The same photosites; the field differs, since the references are sampled by the same window.
-    off = inner.astype(np.float64) - three.samples
-    assert np.abs(off).max() <= 1 + 0.02 * three.samples.max()
-    assert np.abs(off / np.maximum(inner, 100)).mean() < 0.004
+    deviation = inner.astype(np.float64) - three.samples
+    assert np.abs(deviation).max() <= 1 + 0.02 * three.samples.max()
+    assert np.abs(deviation / np.maximum(inner, 100)).mean() < 0.004
     assert three.ground_truth == pytest.approx(five.ground_truth, abs=0.003)
     assert judged_values(small.figures)["bleed"] < judged_values(built.figures)["bleed"]
     assert len(small.figures.cells.unfit) <= 2
@@ -544,16 +542,16 @@ def test_three_by_three_are_the_inner_samples_of_five_by_five(
 
 
 @pytest.mark.usefixtures("lens_unmeasured")
-def test_a_window_larger_than_the_cells_is_said(session: Session, built: BuildResult) -> None:
+def test_reports_window_larger_than_cells(session: Session, built: BuildResult) -> None:
     result = check(session, BuildOptions(9))
     assert "bleed" in {row.figure.name for row in result.verdict.refused}
     note = next(row.note for row in report_summary(result.figures) if row.name == "Window")
-    assert note.startswith("too large: ")
+    assert "less than 0.2 %" in note
     plain = next(row.note for row in report_summary(built.figures) if row.name == "Window")
     assert plain.startswith("up to 5×5")
 
 
-def test_dark_cells_that_the_lens_may_have_left_wrong_are_named_with_its_veil(built: BuildResult) -> None:
+def test_reports_dark_cells_affected_by_glare(built: BuildResult) -> None:
     figures = built.figures
     lens = replace(figures.lens, measured=True, corrected=True, residual=0.008, residual_worst=0.034, worst_level=0.045)
     # Of as many cells as show a veil: of fewer, it is in the uncertainty of each.
@@ -563,13 +561,13 @@ def test_dark_cells_that_the_lens_may_have_left_wrong_are_named_with_its_veil(bu
     )
     (row,) = (row for row in judge(judged_values(few)).remarks if row.figure.name.startswith("correction"))
     text = remark(row, few)
-    assert "up to 1 % is not excluded; cells of 4.5 % of paper may be off by 3.4 %" in text
+    assert "up to 1 % is not excluded; the error of patches with 4.5 % of paper white may reach 3.4 %" in text
     assert "hood" in text
     # Where the mean is remarked on, it is said once.
     many = replace(few, lens=replace(few.lens, residual=0.02, residual_worst=0.06))
     (row,) = (row for row in judge(judged_values(many)).remarks if row.figure.name.startswith("correction"))
     assert row.figure.name == "correction_residual"
-    assert "cells of 4.5 % of paper may be off by 6 %" in remark(row, many)
+    assert "the error of patches with 4.5 % of paper white may reach 6 %" in remark(row, many)
 
 
 # A table carries its verdict; a refused one leaves its report, and nothing else.
@@ -580,13 +578,13 @@ STRICT = (replace(next(limit for limit in FIGURES if limit.name == "cell_px"), r
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Generator[Session]:
-    """Lend a session of few colours: of these the lens is not measured, which takes longer than the rest."""
+    """Return a session with few colours, in which the lens is not measured."""
     with take(hang(2, "A6"), tmp_path_factory.mktemp("short") / "session", LIGHTS[:2]) as session:
         yield session
 
 
 @pytest.mark.usefixtures("undrawn", "lens_unmeasured")
-def test_a_table_carries_its_verdict(built: BuildResult) -> None:
+def test_table_contains_verdict(built: BuildResult) -> None:
     assert built.lut is not None
     report = json.loads((built.lut / "report.json").read_text())
     assert report["format"] == "crop.report"
@@ -604,7 +602,7 @@ def test_a_table_carries_its_verdict(built: BuildResult) -> None:
 
 
 @pytest.mark.usefixtures("undrawn", "lens_unmeasured")
-def test_a_refused_table_leaves_its_report_alone(short: Session, tmp_path: Path) -> None:
+def test_refused_table_leaves_only_report(short: Session, tmp_path: Path) -> None:
     with pytest.raises(QualityError):
         build(short, tmp_path / "lut", report=write_report, judged_by=STRICT)
     assert list(tmp_path.iterdir()) == [tmp_path / "lut.refused"] == [refused_folder(tmp_path / "lut")]
@@ -615,21 +613,19 @@ def test_a_refused_table_leaves_its_report_alone(short: Session, tmp_path: Path)
 
 
 @pytest.mark.usefixtures("undrawn", "lens_unmeasured")
-def test_a_check_is_judged_by_the_same_limits(short: Session) -> None:
+def test_check_uses_same_limits(short: Session) -> None:
     assert check(short).verdict.outcome != "refuse"
     assert [row.figure for row in check(short, judged_by=STRICT).verdict.refused] == list(STRICT)
 
 
 @pytest.mark.usefixtures("undrawn", "lens_unmeasured")
-def test_the_command_ends_with_the_exit_code_of_a_refusal(
-    lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_returns_refusal_exit_code(lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A window of nine pixels does not fit into the cells of a larger chart."""
     take(lab, tmp_path / "session", LIGHTS[:1]).close()
-    found = json_of(main, ["--window", "9", tmp_path / "session", tmp_path / "lut"], capsys, code=4)
-    assert (found["command"], found["verdict"]) == ("build-lut", "refuse")
-    assert found["figures"]
-    assert found["channels"]["window"] == 9
+    result = json_of(main, ["--window", "9", tmp_path / "session", tmp_path / "lut"], capsys, code=4)
+    assert (result["command"], result["verdict"]) == ("build-lut", "refuse")
+    assert result["figures"]
+    assert result["channels"]["window"] == 9
     assert not (tmp_path / "lut").exists()
 
 
@@ -641,19 +637,19 @@ COMMAND = "acquire run LAB.toml SESSION --retake bad"
 
 
 def shadow(counts: npt.NDArray[np.uint16]) -> None:
-    """Lay a shadow on the middle of the print."""
+    """Add a shadow to the centre of the print."""
     height, width = counts.shape
     part = counts[2 * height // 5 : 3 * height // 5, 2 * width // 5 : 3 * width // 5]
     part[...] = (part * 0.6).astype(np.uint16)
 
 
 def nothing(counts: npt.NDArray[np.uint16]) -> None:
-    """Let no light in."""
+    """Remove all light."""
     counts[...] = counts.min()
 
 
 def doctored(lab: Lab, folder: Path, kind: str, number: int | None, paint: Paint) -> Session:
-    """Return a session in which one light's frame, or every white frame but the first, is painted."""
+    """Return a session with one painted frame: of a light, or every white frame but the first."""
 
     def frame(step: SessionStep) -> bytes:
         chosen = step.kind == kind and step.illumination == number and step.number > 0
@@ -663,7 +659,7 @@ def doctored(lab: Lab, folder: Path, kind: str, number: int | None, paint: Paint
 
 
 def take_again(lab: Lab, folder: Path) -> list[str]:
-    """Take what `--retake bad` says; return the names of the steps."""
+    """Take the frames of `--retake bad` again; return the names of the steps."""
     with Session.open_for_run(folder) as session:
         session.retake("bad")
         steps = [step for step in plan_steps(SHORT, 25) if step.number not in session.done_steps()]
@@ -688,7 +684,7 @@ def take_again(lab: Lab, folder: Path) -> list[str]:
         ("white", None, "0005_white", ""),
     ],
 )
-def test_a_shadow_on_one_frame_costs_that_frame(
+def test_shadow_affects_one_frame(
     lab: Lab, tmp_path: Path, kind: str, number: int | None, stem: str, lights: str
 ) -> None:
     folder, out = tmp_path / "session", tmp_path / "lut"
@@ -701,7 +697,7 @@ def test_a_shadow_on_one_frame_costs_that_frame(
     assert (says["retake"], len(says["retake_sha256"])) == (lights, 1)
     if kind == "light":
         page = re.sub("</?span[^>]*>", "", (tmp_path / "lut.refused" / "report.html").read_text())
-        assert f"To be taken again (1 frame): frames/{stem}.dng; <code>{COMMAND}</code>." in page
+        assert f"Take 1 frame again: frames/{stem}.dng; <code>{COMMAND}</code>." in page
     assert take_again(lab, folder) == [stem]
     with Session.open(folder) as session:
         build(session, out, report=figures_alone)
@@ -712,7 +708,7 @@ def test_a_shadow_on_one_frame_costs_that_frame(
 
 
 @pytest.mark.usefixtures("undrawn", "lens_unmeasured")
-def test_a_frame_that_ends_the_build_is_named_too(lab: Lab, tmp_path: Path) -> None:
+def test_report_names_frame_that_ends_build(lab: Lab, tmp_path: Path) -> None:
     folder, out = tmp_path / "session", tmp_path / "lut"
     with (
         doctored(lab, folder, "light", 2, nothing) as session,
@@ -725,7 +721,7 @@ def test_a_frame_that_ends_the_build_is_named_too(lab: Lab, tmp_path: Path) -> N
 
 
 @pytest.mark.usefixtures("undrawn", "lens_unmeasured")
-def test_what_the_next_run_finds_by_itself_needs_no_option(lab: Lab, tmp_path: Path) -> None:
+def test_changed_frame_needs_no_retake_option(lab: Lab, tmp_path: Path) -> None:
     with take(lab, tmp_path / "session", SHORT) as session:
         victim = session.frames_folder / "0003_light_001.dng"
         data = bytearray(victim.read_bytes())
@@ -760,8 +756,8 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
     assert judged_values(result.figures).keys().isdisjoint({"frame_scatter", "block_deviation", "doubtful_share"})
     if bits == 1:
         report = (tmp_path / "report.html").read_text()
-        assert "The course of the session" in report
-        assert "The table can be used" in report
+        assert "Course of the session" in report
+        assert "The LUT can be used" in report
     table = open_lut(tmp_path / "lut")
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
     true = lab.world.reflected(codes, LIGHT[0].colour, SETTINGS) / lab.world.white(LIGHT[0].colour, SETTINGS)
@@ -769,14 +765,14 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
 
 
 @pytest.mark.usefixtures("pinned_builds")
-def test_large_cells_are_found_well_enough(tmp_path: Path) -> None:
+def test_registers_large_cells(tmp_path: Path) -> None:
     lab = hang_chart(design_chart(1), QUARTER, Room())
     mosaic = lab.mosaic(tmp_path)
-    found = register(mosaic, lab.chart)
-    error = found.to_pixels(lab.chart.centres_mm) - lab.truth_px(lab.chart.centres_mm, mosaic)
-    assert found.cell_px > 50
-    assert found.clearance > 14
-    assert np.linalg.norm(error, axis=1).max() < 0.05 * found.cell_px
+    result = register(mosaic, lab.chart)
+    error = result.to_pixels(lab.chart.centres_mm) - lab.truth_px(lab.chart.centres_mm, mosaic)
+    assert result.cell_px > 50
+    assert result.clearance > 14
+    assert np.linalg.norm(error, axis=1).max() < 0.05 * result.cell_px
 
 
 @pytest.mark.usefixtures("pinned_builds")
@@ -785,9 +781,9 @@ def test_a_small_chart_is_not_told_to_plan_lights_that_were_planned(tmp_path: Pa
     with take(lab, tmp_path / "session", plan_illuminations(1, ())) as session:
         result = build(session, tmp_path / "lut")
     unknown = next(row for row in result.verdict.remarks if row.figure.name == "linearity_known")
-    said = remark(unknown, result.figures)
-    assert "are needed" in said
-    assert "plan red" not in said
+    message = remark(unknown, result.figures)
+    assert "are needed" in message
+    assert "plan red" not in message
     (source,) = (one.source for one in result.figures.budget.components if one.name == "linearity")
     assert "are needed" in source
     assert "no lights" not in source
@@ -825,7 +821,7 @@ def test_the_tint_of_greys_tells_a_managed_print(
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_uneven_primaries_are_no_dirt_on_the_print(tmp_path: Path) -> None:
-    """A cell's field differs from paper's by what it reflects of each primary; its colour is still its code's."""
+    """A cell's field depends on its reflectance for each primary; its colour is still correct."""
     lab = hang(room=Room(waviness_mm=0.5, primary_difference=0.3, projector_falloff=0.3, lamp_spectrum="led"))
     with taken(lab, tmp_path / "session") as session:
         stains = build(session, tmp_path / "lut").figures.cells.stains
@@ -835,15 +831,15 @@ def test_uneven_primaries_are_no_dirt_on_the_print(tmp_path: Path) -> None:
     expected = np.log(own / of_paper)
     assert expected.std(axis=0).min() > 0.003
     for channel in range(3):
-        there = np.isfinite(stains.alone[:, channel])
+        is_measured = np.isfinite(stains.alone[:, channel])
         # 1 where cells are evened by the field of paper.
-        differs = expected[there, channel] - expected[there, channel].mean()
-        assert abs(differs @ stains.alone[there, channel] / (differs @ differs)) < 0.3
+        differs = expected[is_measured, channel] - expected[is_measured, channel].mean()
+        assert abs(differs @ stains.alone[is_measured, channel] / (differs @ differs)) < 0.3
 
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_hot_photosites_side_by_side_are_no_object(tmp_path: Path) -> None:
-    """In two cells that touch, in every frame: under lights these are as far off as what lies there makes them."""
+    """In two adjacent cells, in every frame: they deviate as much as covered ones."""
     lab = hang()
     light = next(light for light in BRIGHT if min(light.colour) > 80)
     codes, places = lab.chart.rgb[lab.chart.cell_of_colour], lab.chart.centres_mm[lab.chart.cell_of_colour]
@@ -869,7 +865,7 @@ def test_hot_photosites_side_by_side_are_no_object(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_hot_photosites_stay_in_the_samples_and_are_told(tmp_path: Path) -> None:
-    """120 a million: of 51 000 photosites in samples some six; a full chart has 3 million."""
+    """120 per million: about six of 51 000 photosites in samples; a full chart has 3 million."""
     lab = hang(room=Room(waviness_mm=0.5, hot_per_million=120.0, hot_dn_per_s=6000.0))
     cool = hang(room=Room(waviness_mm=0.5))
     for name, one in (("hot", lab), ("cool", cool)):
@@ -883,10 +879,10 @@ def test_hot_photosites_stay_in_the_samples_and_are_told(tmp_path: Path) -> None
     apart = hot - cool_samples
     assert np.abs(apart[np.abs(apart) > 100]).size == (apart > 100).sum() > 0, "heat only adds"
     # Each excess is that of a photosite of the room; of green, half of it, as a sample is the mean of two.
-    known = SETTINGS.shutter_s * lab.world.hot.dn_per_s
-    known = np.concatenate([known, known / 2])
+    expected_counts = SETTINGS.shutter_s * lab.world.hot.dn_per_s
+    expected_counts = np.concatenate([expected_counts, expected_counts / 2])
     for excess in apart[apart > 300]:
-        assert np.abs(known - excess).min() < 0.15 * excess + 60
+        assert np.abs(expected_counts - excess).min() < 0.15 * excess + 60
 
 
 # Room light that came and went between dark frames, and rooms in which it is there all the time.
@@ -896,8 +892,8 @@ STRAY_LIGHTS = {
     "red": Colour(255, 0, 0), "green": Colour(0, 255, 0), "blue": Colour(0, 0, 255), "white": Colour(255, 255, 255),
     "yellow": Colour(255, 180, 0), "warm": Colour(255, 164, 73),
 }  # fmt: skip
+# Limits that refuse nothing, so that a table is built.
 REMARKING = [replace(limit, refuse=None) for limit in FIGURES]
-"""Limits that refuse nothing, so that there are figures to look at."""
 DAYLIGHT = Situation(ambient=(0.008, 0.01, 0.012))
 
 
@@ -922,8 +918,8 @@ def test_light_that_no_dark_frame_shows_is_the_rooms(tmp_path: Path, leaking: se
     assert "stray_share" in rows
     # One per cent of white in a deep light is degrees: no table is made of it.
     assert "stray_share" in {row.figure.name for row in judge(judged_values(result.figures)).refused}
-    said = remark(rows["stray_share"], result.figures)
-    assert "light of the room" in said
+    message = remark(rows["stray_share"], result.figures)
+    assert "light of the room" in message
     stray = result.figures.lights.stray
     assert stray is not None
     assert ("yellow" in leaking) == (stray.lights_beyond(0.004) == [4])
@@ -940,12 +936,12 @@ def test_light_that_is_always_there_is_not_remarked_on_here(
     stray = result.figures.lights.stray
     assert stray is not None
     assert stray.share < 0.002
-    (row,) = [row for row in summary(result.figures) if row.name == "Light that no dark frame shows"]
-    assert "1 of 6 lights" in row.note
+    (row,) = [row for row in summary(result.figures) if row.name == "Light missing in the dark frames"]
+    assert "1 of 6 illuminants" in row.note
 
 
 @pytest.mark.usefixtures("pinned_builds")
-def test_a_sensor_that_compresses_white_does_not_hide_what_was_subtracted_too_much() -> None:
+def test_compressed_white_does_not_hide_oversubtraction() -> None:
     _, says, table = tried(3, Troubles(compression=0.037, in_darks=(0.0017, 0.0058, 0.0036)), small=True)
     assert table is None
     assert says[0].startswith(f"{TOO_DARK.title}: 0.4")
@@ -970,12 +966,12 @@ CORRECTED = BuildOptions(correct_drift=True)
 
 @pytest.fixture(scope="module")
 def small_lab() -> Lab:
-    """Return a lab of few colours: of these the lens is not measured, which takes longer than all that matters here."""
+    """Return a lab with few colours, in which the lens is not measured."""
     return hang(2, "A6")
 
 
 def session_of(small_lab: Lab, folder: Path, lamp: Callable[[int], float], every: int = 4) -> Session:
-    """Return a session under a lamp whose light at each step is given."""
+    """Return a session with a given lamp brightness at each step."""
 
     def frame(step: SessionStep) -> bytes:
         return small_lab.dng(step.colour, step.number, lamp=lamp(step.number))
@@ -985,7 +981,7 @@ def session_of(small_lab: Lab, folder: Path, lamp: Callable[[int], float], every
 
 @pytest.fixture(scope="module")
 def drifting(small_lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a session whose lamp loses 3 % from its first to its last frame."""
+    """Return a session whose lamp loses 3 % from the first to the last frame."""
     folder = tmp_path_factory.mktemp("drifting") / "session"
     session_of(small_lab, folder, lambda number: 1 - 0.03 * number / 20).close()
     return folder
@@ -993,7 +989,7 @@ def drifting(small_lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def tables(drifting: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Lut, Lut, BuildResult]:
-    """Return the session's table as measured, and with the drift taken out."""
+    """Return the session's table without and with drift correction."""
     folder = tmp_path_factory.mktemp("tables")
     with Session.open(drifting) as session:
         build(session, folder / "plain")
@@ -1013,15 +1009,15 @@ def test_all_lights_are_of_one_lamp(small_lab: Lab, tables: tuple[Lut, Lut, Buil
     _, corrected, _ = tables
     with session_of(small_lab, tmp_path / "steady", lambda number: 1.0) as steady:
         build(steady, tmp_path / "lut")
-    found = compare(open_lut(tmp_path / "lut"), corrected)
+    result = compare(open_lut(tmp_path / "lut"), corrected)
     # Bare paper is known to some hundredths of a per cent on this small chart.
-    assert float(np.abs(found.lights.brightness).max()) < 0.002
+    assert float(np.abs(result.lights.brightness).max()) < 0.002
     assert np.abs(compare(open_lut(tmp_path / "lut"), tables[0]).lights.brightness).max() > 0.02
-    assert found.same_within_noise
+    assert result.same_within_noise
 
 
 @pytest.mark.usefixtures("pinned_builds")
-def test_samples_and_truth_come_back_as_they_were(tables: tuple[Lut, Lut, BuildResult]) -> None:
+def test_drift_correction_is_reversible(tables: tuple[Lut, Lut, BuildResult]) -> None:
     plain, corrected, _ = tables
     gains = gains_of(corrected)
     assert gains.max() <= 1
@@ -1033,20 +1029,20 @@ def test_samples_and_truth_come_back_as_they_were(tables: tuple[Lut, Lut, BuildR
 
 
 @pytest.mark.usefixtures("pinned_builds")
-def test_samples_and_truth_are_of_one_light(tables: tuple[Lut, Lut, BuildResult]) -> None:
+def test_samples_and_truth_share_light(tables: tuple[Lut, Lut, BuildResult]) -> None:
     plain, corrected, _ = tables
     for light in range(len(LIGHTS)):
         before, after = (np.asarray(lut.samples[light]).mean(axis=1) / lut.white[light] for lut in (plain, corrected))
         level = np.asarray(plain.samples[light]).mean(axis=1)
         bright = level > 100
         # Samples that are rounded alike are off by half a count, 0.25 in the mean of the cells.
-        off = np.abs((after / before - 1)[bright] * level[bright])
-        assert off.max() < 0.25
-        assert off.mean() < 0.06
+        deviation = np.abs((after / before - 1)[bright] * level[bright])
+        assert deviation.max() < 0.25
+        assert deviation.mean() < 0.06
 
 
 @pytest.mark.usefixtures("pinned_builds")
-def test_references_go_along_and_the_table_verifies(tables: tuple[Lut, Lut, BuildResult]) -> None:
+def test_table_verifies_with_references(tables: tuple[Lut, Lut, BuildResult]) -> None:
     plain, corrected, _ = tables
     assert find_faults(corrected) == []
     rows = [(lut.folder / "references.csv").read_text().splitlines()[1].split(",")[2:] for lut in (plain, corrected)]
@@ -1056,7 +1052,7 @@ def test_references_go_along_and_the_table_verifies(tables: tuple[Lut, Lut, Buil
 
 
 @pytest.mark.usefixtures("pinned_builds")
-def test_the_verdict_judges_what_white_frames_leave_open(tables: tuple[Lut, Lut, BuildResult]) -> None:
+def test_judges_remaining_drift(tables: tuple[Lut, Lut, BuildResult]) -> None:
     rows = {row.figure.name: row for row in tables[2].verdict.rows}
     assert "white_drift" not in rows
     assert rows["drift_left"].outcome == "accept"
@@ -1071,7 +1067,7 @@ def test_a_jump_between_white_frames_is_refused_and_names_the_remedy(small_lab: 
 
 
 @pytest.mark.usefixtures("pinned_builds")
-def test_one_white_frame_is_refused_before_anything_is_read(small_lab: Lab, tmp_path: Path) -> None:
+def test_refuses_single_white_frame_first(small_lab: Lab, tmp_path: Path) -> None:
     def verdict(step: SessionStep) -> str:
         return "refused: x" if step.kind == "white" and step.number else "accepted"
 
@@ -1083,16 +1079,16 @@ def test_one_white_frame_is_refused_before_anything_is_read(small_lab: Lab, tmp_
 
 
 @pytest.mark.usefixtures("pinned_builds")
-def test_the_command_says_what_it_did(
+def test_command_prints_result(
     drifting: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("calibration.report.report.write_report", figures_alone)
     assert main([str(drifting), str(tmp_path / "lut"), "--correct-drift"]) == 0
     capsys.readouterr()
     assert main(["info", str(tmp_path / "lut")]) == 0
-    said = capsys.readouterr().out
-    assert "drift" in said
-    assert "drift (recorded" not in said
+    message = capsys.readouterr().out
+    assert "drift" in message
+    assert "drift (recorded" not in message
     figures = json.loads((tmp_path / "lut" / "report.json").read_text())["figures"]
     assert figures["drift_left"] < 0.002
 
@@ -1130,7 +1126,7 @@ def built_of(
 
 
 def refused(small_lab: Lab, tmp_path: Path, frame: Frame) -> tuple[str, dict[str, object]]:
-    """Return why a session makes no table, and what its report says for programs."""
+    """Return the message of a refusal, and its JSON report."""
     with take(small_lab, tmp_path / "session", EIGHT, frame=frame) as session, pytest.raises(QualityError) as error:
         build(session, tmp_path / "lut", report=figures_alone)
     return str(error.value), json.loads((tmp_path / "lut.refused" / "report.json").read_text())
@@ -1141,7 +1137,7 @@ def remarks(result: BuildResult) -> set[str]:
 
 
 def showing(small_lab: Lab, colours: Mapping[int, Colour]) -> Frame:
-    """Return frames of a session in which some lights show other colours than their names say."""
+    """Return frames of a session in which some lights show other colours."""
 
     def frame(step: SessionStep) -> bytes:
         colour = step.colour if step.illumination is None else colours.get(step.illumination, step.colour)
@@ -1163,10 +1159,10 @@ def test_a_session_with_nothing_wrong_has_no_remark(small_lab: Lab, tmp_path: Pa
 
 @pytest.mark.usefixtures("pinned_builds")
 def test_exchanged_lights_are_refused_and_both_named(small_lab: Lab, tmp_path: Path) -> None:
-    """Any two are found by `tests/calibration/checks/test_light_codes.py`."""
-    said, report = refused(small_lab, tmp_path, showing(small_lab, {WARM: CODES[COOL], COOL: CODES[WARM]}))
-    assert f"exchanged names: light {WARM} and light {COOL}" in said
-    assert "brilliant colour" not in said
+    """`tests/calibration/checks/test_light_codes.py` tests all pairs."""
+    message, report = refused(small_lab, tmp_path, showing(small_lab, {WARM: CODES[COOL], COOL: CODES[WARM]}))
+    assert f"exchanged names: illuminant {WARM} and illuminant {COOL}" in message
+    assert "brilliant colour" not in message
     assert report["retake"] == lights_text([WARM, COOL])
 
 
@@ -1176,9 +1172,11 @@ def test_a_white_frame_that_is_red_is_refused_as_such(small_lab: Lab, tmp_path: 
         shown = CODES[RED] if step.kind == "white" and step.number == 0 else step.colour
         return small_lab.dng(WHITE if step.illumination == RED else shown, step.number)
 
-    said, _ = refused(small_lab, tmp_path, frame)
-    assert "White frame against what the lights predict" in said or "exchanged names: light 1 and white frame 0" in said
-    assert "warm up" not in said
+    message, _ = refused(small_lab, tmp_path, frame)
+    assert (
+        "White frame against the prediction" in message or "exchanged names: illuminant 1 and white frame 0" in message
+    )
+    assert "warm up" not in message
 
 
 @pytest.mark.usefixtures("pinned_builds")
@@ -1189,9 +1187,9 @@ def test_two_lights_of_another_camera_are_refused(small_lab: Lab, tmp_path: Path
     def frame(step: SessionStep) -> bytes:
         return (other if step.illumination in (WARM, COOL) else small_lab).dng(step.colour, step.number)
 
-    said, report = refused(small_lab, tmp_path, frame)
-    assert "Frames of another camera: 2" in said
-    assert "Other" in said
+    message, report = refused(small_lab, tmp_path, frame)
+    assert "Frames of another camera: 2" in message
+    assert "Other" in message
     assert report["retake"] == "4-5"
 
 
@@ -1202,34 +1200,34 @@ def test_another_body_of_the_same_model_is_refused(small_lab: Lab, tmp_path: Pat
             return small_lab.dng(step.colour, step.number)
         return small_lab.dng(step.colour, serial="42")
 
-    said, _ = refused(small_lab, tmp_path, frame)
+    message, _ = refused(small_lab, tmp_path, frame)
     # The body is told apart; its number is not told, unless the small_lab asks for it.
-    assert "no. 42" not in said
-    assert re.search(r"no\. [0-9a-f]{32}\b", said)
+    assert "no. 42" not in message
+    assert re.search(r"no\. [0-9a-f]{32}\b", message)
 
 
 @pytest.mark.usefixtures("pinned_builds")
 def test_lights_whose_files_state_another_exposure_are_refused(small_lab: Lab, tmp_path: Path) -> None:
-    """Another ISO speed; another shutter time stands in the white frames of the test below."""
+    """Another ISO speed; the test below has another shutter time in white frames."""
 
     def frame(step: SessionStep) -> bytes:
-        off = step.illumination in (WARM, COOL)
-        return small_lab.dng(step.colour, step.number, stated=replace(SETTINGS, iso=200) if off else SETTINGS)
+        deviation = step.illumination in (WARM, COOL)
+        return small_lab.dng(step.colour, step.number, stated=replace(SETTINGS, iso=200) if deviation else SETTINGS)
 
-    said, report = refused(small_lab, tmp_path, frame)
-    assert "Exposure of a frame" in said
-    assert "instead of 0.5 s, ISO 100, f/8" in said
+    message, report = refused(small_lab, tmp_path, frame)
+    assert "Exposure of a frame" in message
+    assert "instead of 0.5 s, ISO 100, f/8" in message
     assert report["retake"] == "4-5"
 
 
 @pytest.mark.usefixtures("pinned_builds")
 def test_white_frames_at_half_exposure_are_no_brilliant_colour(small_lab: Lab, tmp_path: Path) -> None:
-    said, report = refused(
+    message, report = refused(
         small_lab,
         tmp_path,
         lambda step: small_lab.dng(step.colour, step.number, HALF if step.kind == "white" else SETTINGS),
     )
-    assert "Exposure of a frame" in said
+    assert "Exposure of a frame" in message
     assert "additivity" not in report["figures"]  # pyrefly: ignore[not-iterable]
 
 
@@ -1239,8 +1237,8 @@ def test_a_white_frame_at_half_exposure_that_does_not_say_so(small_lab: Lab, tmp
         exposed = HALF if step.kind == "white" else SETTINGS
         return small_lab.dng(step.colour, step.number, exposed, stated=SETTINGS)
 
-    said, report = refused(small_lab, tmp_path, frame)
-    assert "white" in said
+    message, report = refused(small_lab, tmp_path, frame)
+    assert "white" in message
     rows = {limit["name"] for limit in report["limits"] if limit["outcome"] != "accept"}  # pyrefly: ignore[not-iterable]
     assert "additivity" not in rows
     assert rows & {"white_frame_brightness", "white_deficit"}
@@ -1252,8 +1250,8 @@ def test_a_light_at_half_exposure_that_does_not_say_so(small_lab: Lab, tmp_path:
         exposed = HALF if step.illumination == WHITE_LIGHT else SETTINGS
         return small_lab.dng(step.colour, step.number, exposed, stated=SETTINGS)
 
-    said, report = refused(small_lab, tmp_path, frame)
-    assert "light 0 by -50 %" in said
+    message, report = refused(small_lab, tmp_path, frame)
+    assert "illuminant 0 by -50 %" in message
     assert report["retake"] == "0"
 
 
@@ -1266,7 +1264,7 @@ def test_a_session_without_red_says_what_was_not_measured(small_lab: Lab, tmp_pa
 
 @pytest.mark.usefixtures("pinned_builds")
 def test_brilliant_colour_is_called_that(small_lab: Lab, tmp_path: Path) -> None:
-    """A white segment adds three tenths of the least primary: frames of a projector that shows white brighter."""
+    """A white segment adds 30 % of the least primary."""
     dim = hang(2, "A6", room=Room(waviness_mm=0.5, white_level_share=0.5))
     world = dim.world
 
@@ -1295,7 +1293,7 @@ def test_two_lights_are_held_against_each_other(small_lab: Lab, tmp_path: Path) 
     (tmp_path / "wrong").mkdir()
     with (
         take(small_lab, tmp_path / "wrong" / "session", pair, frame=frame) as session,
-        pytest.raises(QualityError, match="light 0 and light 1"),
+        pytest.raises(QualityError, match="illuminant 0 and illuminant 1"),
     ):
         build(session, tmp_path / "wrong" / "lut")
 
@@ -1313,43 +1311,43 @@ def straight(share: _Array) -> _Array:
 
 
 def knee(share: _Array) -> _Array:
-    """Lose 4 % at saturation, nothing below a half."""
+    """Compress by 4 % at saturation, not below half of it."""
     return share * (1 - 0.04 * np.maximum(share - 0.5, 0) / 0.5)
 
 
 def power(share: _Array) -> _Array:
-    """Bend as a power does: ± 2.9 % over 5 to 95 %, and the ratios of patches show nothing."""
+    """Bend by a power: ± 2.9 % from 5 to 95 %; ratios of patches do not change."""
     return share**1.02
 
 
 def series(bend: Bend, times: _Array, stated: _Array | None = None, frame_error: float = 0.0) -> tuple[_Array, _Array]:
-    """Return what `deviations` finds of 2000 patches, with the noise of 25 samples."""
+    """Return the result of `deviations` for 2000 patches with the noise of 25 samples."""
     random = np.random.default_rng(7)
     reflectance = np.exp(random.uniform(np.log(0.03), np.log(0.95), (2000, 3)))
     light = times * (1 + frame_error * random.standard_normal(len(times)))
     share = light[:, None, None] / times[-1] * reflectance
-    seen = bend(share)
-    seen = seen + random.standard_normal(seen.shape) * np.sqrt(seen / 20_000 + 5e-7) / 5
-    return deviations(seen, times if stated is None else stated)
+    values = bend(share)
+    values = values + random.standard_normal(values.shape) * np.sqrt(values / 20_000 + 5e-7) / 5
+    return deviations(values, times if stated is None else stated)
 
 
-def test_a_straight_sensor_is_found_straight() -> None:
-    level, found = series(straight, np.array(TIMES))
+def test_linear_sensor_measures_linear() -> None:
+    level, result = series(straight, np.array(TIMES))
     assert level[0] == pytest.approx(0.05)
     assert level[-1] == pytest.approx(0.95)
-    assert np.nanmax(np.abs(found)) < 0.003
+    assert np.nanmax(np.abs(result)) < 0.003
 
 
 @pytest.mark.parametrize(("bend", "worst"), [(knee, 0.032), (power, 0.029)])
-def test_a_bend_is_measured(bend: Bend, worst: float) -> None:
-    level, found = series(bend, np.array(TIMES))
+def test_measures_bend(bend: Bend, worst: float) -> None:
+    level, result = series(bend, np.array(TIMES))
     true = np.log(bend(level) / level)
-    assert found == pytest.approx(np.broadcast_to(true - true.mean(), found.shape), abs=0.006)
-    assert np.nanmax(np.abs(found)) == pytest.approx(worst, rel=0.2)
+    assert result == pytest.approx(np.broadcast_to(true - true.mean(), result.shape), abs=0.006)
+    assert np.nanmax(np.abs(result)) == pytest.approx(worst, rel=0.2)
 
 
-def test_a_flickering_lamp_tilts_the_line_and_bends_nothing() -> None:
-    """2 % from frame to frame leaves a power of 0.8 %, as uncertain as the times; the patches' own tale stays."""
+def test_flickering_lamp_causes_no_bend() -> None:
+    """2 % between frames leaves a power of 0.8 %, as uncertain as the times."""
     level, flickering = series(straight, np.array(TIMES), frame_error=0.02)
     assert np.nanmax(np.abs(flickering)) < 0.03
     _, bent = series(knee, np.array(TIMES), frame_error=0.02)
@@ -1357,24 +1355,24 @@ def test_a_flickering_lamp_tilts_the_line_and_bends_nothing() -> None:
     assert bent - flickering == pytest.approx(np.broadcast_to(true - true.mean(), bent.shape), abs=0.006)
 
 
-def test_rounded_times_are_read_as_the_stops_they_stand_for() -> None:
+def test_reads_rounded_times_as_stops() -> None:
     stops = 2.0 ** (np.arange(-8, 1) / 3)
     nominal = np.array([0.15625, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0])
-    _, found = series(straight, stops, nominal)
-    assert np.nanmax(np.abs(found)) < 0.003
+    _, result = series(straight, stops, nominal)
+    assert np.nanmax(np.abs(result)) < 0.003
 
 
-def test_levels_without_patches_are_left_open() -> None:
+def test_levels_without_patches_are_empty() -> None:
     reflectance = np.full((1, 300, 3), 1.0)
-    _, found = deviations(np.array([0.4, 0.5, 0.6])[:, None, None] * reflectance, np.array([0.4, 0.5, 0.6]))
-    measured = np.isfinite(found[0])
+    _, result = deviations(np.array([0.4, 0.5, 0.6])[:, None, None] * reflectance, np.array([0.4, 0.5, 0.6]))
+    measured = np.isfinite(result[0])
     assert 2 <= measured.sum() < 6
-    assert np.abs(found[:, measured]).max() < 1e-5
+    assert np.abs(result[:, measured]).max() < 1e-5
     assert np.isnan(deviations(0.001 * reflectance.repeat(4, axis=0), np.arange(1.0, 5))[1]).all()
 
 
-def test_frames_that_do_not_follow_their_times_are_far_off() -> None:
-    """As with a flash, or a camera that exposes by itself."""
+def test_wrong_exposure_times_give_large_deviation() -> None:
+    """As with a flash, or with automatic exposure."""
     reflectance = np.exp(np.random.default_rng(1).uniform(-3, 0, (1, 500, 3)))
     assert np.nanmax(np.abs(deviations(0.7 * reflectance.repeat(5, axis=0), np.arange(1.0, 6))[1])) > 0.5
 
@@ -1401,27 +1399,25 @@ def shown(result: BuildResult) -> tuple[str, str]:
     return next((row.value, row.note) for row in summary(result.figures) if row.name == "Linearity")
 
 
-def test_the_table_says_how_linear_its_camera_is(
-    session: Session, built: BuildResult, lab: Lab, tmp_path: Path
-) -> None:
+def test_table_reports_linearity(session: Session, built: BuildResult, lab: Lab, tmp_path: Path) -> None:
     folder = write_series(lab, tmp_path / "series")
     result = build(session, tmp_path / "lut", report=figures_alone, linearity=folder)
     written = json.loads((tmp_path / "lut" / "report.json").read_text())
     assert written["figures"]["linearity"] < 0.005
     assert len(written["channels"]["linearity"]) == 10
-    assert shown(result)[0].endswith("from a straight line at most")
+    assert shown(result)[0].endswith("at most from a straight line")
     assert "8 exposures" in shown(result)[1]
     # The series says nothing of the samples, so it changes none of the table's bytes.
     assert built.lut is not None
     # Without it the primaries say so.
-    assert shown(built)[0].endswith("from proportion")
+    assert shown(built)[0].endswith("from proportionality")
     assert built.figures.sensor.superposition.measured
     for name in ("samples.npy", "illuminations.csv", "lut.json"):
         assert (tmp_path / "lut" / name).read_bytes() == (built.lut / name).read_bytes()
 
 
 @pytest.mark.usefixtures("lens_unmeasured")
-def test_a_sensor_that_bends_is_remarked_on(session: Session, lab: Lab, tmp_path: Path) -> None:
+def test_remarks_on_nonlinear_sensor(session: Session, lab: Lab, tmp_path: Path) -> None:
     result = check(session, linearity=write_series(lab, tmp_path / "series", knee))
     row = next(row for row in result.verdict.rows if row.figure.name == "linearity")
     assert row.outcome == "accept with remarks"
@@ -1429,9 +1425,7 @@ def test_a_sensor_that_bends_is_remarked_on(session: Session, lab: Lab, tmp_path
 
 
 @pytest.mark.usefixtures("lens_unmeasured")
-def test_what_is_no_series_is_refused(
-    session: Session, lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_refuses_invalid_series(session: Session, lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError):
         check(session, linearity=tmp_path / "nowhere")
     few = write_series(lab, tmp_path / "few", times=TIMES[:3])
@@ -1449,7 +1443,7 @@ def test_what_is_no_series_is_refused(
 
 
 @pytest.mark.usefixtures("lens_unmeasured")
-def test_a_chart_that_stands_elsewhere_is_refused(session: Session, tmp_path: Path) -> None:
+def test_refuses_series_of_moved_chart(session: Session, tmp_path: Path) -> None:
     moved = hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
     with pytest.raises(FormatError, match=r"0\.dng: the chart"):
         check(session, linearity=write_series(moved, tmp_path / "series"))
@@ -1469,7 +1463,7 @@ def plain() -> Lab:
 
 
 def moved_by(dx: float, dy: float, roll_deg: float = 0.0) -> Lab:
-    """Return the lab with the camera shifted so that the chart lies (dx, dy) half-size pixels further."""
+    """Return the lab with the camera shifted, so that the chart moves by (dx, dy) half-size px."""
     lab = hang_chart(SMALL, "Test", replace(ROOM, roll_deg=ROOM.roll_deg + roll_deg))
     x, y = lab.world.view.centre_px
     lab.world.view = replace(lab.world.view, centre_px=(x + dx, y + dy))
@@ -1477,7 +1471,7 @@ def moved_by(dx: float, dy: float, roll_deg: float = 0.0) -> Lab:
 
 
 def worst_error(lab: Lab, folder: Path) -> float:
-    """Return how far the means of cells lie from the room's truth, as a share of white, the worst of all lights."""
+    """Return the largest error of cell means under any light, relative to white."""
     table = open_lut(folder)
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
     worst = 0.0
@@ -1516,9 +1510,9 @@ def test_a_bump_is_followed_and_reported(plain: Lab, tmp_path: Path, by: tuple[f
     remarks = [row.figure.name for row in result.verdict.remarks]
     assert ("reregistered_frames" in remarks) == bool(anew)
     if anew:
-        found = findings(result.verdict, result.figures)["reregistered_frames"]
-        assert found.decision.cause is BUMP
-        assert [frame.illumination for frame in found.frames] == anew
+        detected = findings(result.verdict, result.figures)["reregistered_frames"]
+        assert detected.decision.cause is BUMP
+        assert [frame.illumination for frame in detected.frames] == anew
 
 
 Command = Callable[..., tuple[int, str]]
@@ -1528,17 +1522,17 @@ Command = Callable[..., tuple[int, str]]
 def command(capsys: pytest.CaptureFixture[str]) -> Command:
     def run(*arguments: object) -> tuple[int, str]:
         code = main([*map(str, arguments)])
-        said = capsys.readouterr()
-        return code, said.out + said.err
+        message = capsys.readouterr()
+        return code, message.out + message.err
 
     return run
 
 
 @pytest.mark.usefixtures("pinned_builds")
-def test_without_corners_the_command_says_how_to_give_them(
+def test_command_asks_for_corners(
     plain: Lab, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of red light alone nobody can say which way up the chart hangs; white frames are all refused here."""
+    """Red light alone does not show the orientation of the chart; all white frames are refused here."""
     monkeypatch.setattr("calibration.report.report.write_report", figures_alone)
     lights = renumbered([RED_LIGHT])
     with take(
@@ -1546,14 +1540,14 @@ def test_without_corners_the_command_says_how_to_give_them(
     ):
         pass
     missed = tmp_path / "missed.png"
-    code, said = command("check", tmp_path / "session", "--picture", missed)
+    code, message = command("check", tmp_path / "session", "--picture", missed)
     assert code == 4
-    assert "--corners 297,90" in said
-    assert f"see {missed}" in said
+    assert "--corners 297,90" in message
+    assert f"see {missed}" in message
     assert missed.read_bytes().startswith(b"\x89PNG")
     corners = raw_corners(plain, tmp_path)
-    code, said = command(tmp_path / "session", tmp_path / "lut", "--corners", *corners)
-    assert code == 0, said
+    code, message = command(tmp_path / "session", tmp_path / "lut", "--corners", *corners)
+    assert code == 0, message
     assert worst_error(plain, tmp_path / "lut") < 0.05
 
 
@@ -1562,18 +1556,18 @@ def raw_corners(lab: Lab, folder: Path) -> list[str]:
     return [f"{x:.0f},{y:.0f}" for x, y in raw + np.array([(9, -7), (-8, 6), (5, 8), (-9, -6)])]
 
 
-def test_a_check_that_fails_shows_what_was_looked_for(plain: Lab, tmp_path: Path, command: Command) -> None:
+def test_failed_check_draws_expected_chart(plain: Lab, tmp_path: Path, command: Command) -> None:
     with take(plain, tmp_path / "session", renumbered(LIGHTS[4:6])):
         pass
-    found = tmp_path / "found.png"
+    result = tmp_path / "found.png"
     corners = raw_corners(plain, tmp_path)
-    assert command("check", tmp_path / "session", "--picture", found, "--corners", *corners)[0] == 0
-    assert found.read_bytes().startswith(b"\x89PNG")
+    assert command("check", tmp_path / "session", "--picture", result, "--corners", *corners)[0] == 0
+    assert result.read_bytes().startswith(b"\x89PNG")
     design_chart(3, A_SERIES_MM["A5"]).save(tmp_path / "session" / "chart.json")
     missed = tmp_path / "missed.png"
-    code, said = command("check", tmp_path / "session", "--picture", missed)
+    code, message = command("check", tmp_path / "session", "--picture", missed)
     assert code == 4
-    assert f"see {missed}" in said
+    assert f"see {missed}" in message
     assert missed.read_bytes().startswith(b"\x89PNG")
 
 
@@ -1597,13 +1591,13 @@ def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     return request.param
 
 
-def test_frames_come_back_in_order(threads: int) -> None:
+def test_prefetches_frames_in_order(threads: int) -> None:
     todo = records("l" * 40)
     results = prefetched(lambda record: record.file, todo, lambda _: False)
     assert [(record.file, result) for record, result in results] == [(record.file, record.file) for record in todo]
 
 
-def test_what_follows_a_frame_that_others_wait_for_begins_after_it_is_taken_in(threads: int) -> None:
+def test_later_frames_wait_for_dark_frame(threads: int) -> None:
     todo, begun, lock = records("wdlldllldll"), list[str](), threading.Lock()
 
     def work(record: FrameRecord) -> None:
@@ -1619,7 +1613,7 @@ def test_what_follows_a_frame_that_others_wait_for_begins_after_it_is_taken_in(t
     assert taken == [record.file for record in todo]
 
 
-def test_a_fault_comes_in_its_turn(threads: int) -> None:
+def test_reports_fault_in_turn(threads: int) -> None:
     def work(record: FrameRecord) -> str:
         if record.file == "3.dng":
             raise ValueError(record.file)
@@ -1631,7 +1625,7 @@ def test_a_fault_comes_in_its_turn(threads: int) -> None:
     assert taken == ["0.dng", "1.dng", "2.dng"]
 
 
-def test_the_same_session_gives_the_same_table_by_any_number_of_threads(
+def test_table_is_independent_of_thread_count(
     session: Session, built: BuildResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert built.lut is not None
@@ -1647,8 +1641,8 @@ def test_the_same_session_gives_the_same_table_by_any_number_of_threads(
 # Sessions with one thing wrong: the frame, the place and the cause are named, and a clean one has no remark on it.
 
 
+# The limits without refusals: a table is built, and every fault is a remark.
 REMARKED = tuple(replace(limit, refuse=None) for limit in FIGURES)
-"""The limits, none of which refuses: a table is made, and all that is wrong is a remark."""
 
 
 def measured(session: Session, folder: Path) -> tuple[BuildResult, dict[str, ProbableCause]]:
@@ -1673,13 +1667,13 @@ def hand_in(which: str, lab: Lab, folder: Path) -> Session:
     [("white 0", "0000_white"), ("light 1", "0003_light_001")],
 )
 def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tmp_path: Path) -> None:
-    result, found = measured(hand_in(which, lab, tmp_path / "session"), tmp_path)
-    assert causes(found) == {OBJECT_IN_FRAME}
+    result, detected = measured(hand_in(which, lab, tmp_path / "session"), tmp_path)
+    assert causes(detected) == {OBJECT_IN_FRAME}
     assert [frame.file for frame in retaken_frames(result.verdict, result.figures)] == [f"frames/{file}.dng"]
     # Cells under a hand in the first frame do not look like the chart's and are not compared; references tell of it.
-    finding = found["reference_spread" if which == "white 0" else "block_deviation"]
+    finding = detected["reference_spread" if which == "white 0" else "block_deviation"]
     page = np.array(lab.chart.page_mm)
-    (place,) = finding.places
+    (place,) = finding.positions
     assert place.file == f"frames/{file}.dng"
     left, top, right, bottom = HAND.blobs[0].place
     assert left - 0.05 < place.x_mm / page[0] < right + 0.05
@@ -1687,7 +1681,7 @@ def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tm
     row = next(row for row in result.verdict.remarks if row.figure.name == finding.figure)
     told = remark(row, result.figures)
     assert f"in frames/{file}.dng, about" in told
-    assert "probably a hand, a person or an object before the print" in told
+    assert "probably a hand, a person or an object in front of the print" in told
     assert told.endswith(
         "take 1 frame again: acquire run LAB.toml SESSION --retake " + ("bad" if "w" in which else "1")
     )
@@ -1695,7 +1689,7 @@ def test_a_hand_in_one_frame_is_that_frame_s(which: str, file: str, lab: Lab, tm
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_what_covers_few_cells_costs_these_cells_and_not_the_table(lab: Lab, tmp_path: Path) -> None:
-    """A fly of two cells' size in one light: with the limits as they are."""
+    """A fly of the size of two cells in one light, with unchanged limits."""
     fly = Situation(blobs=(Blob((0.5, 0.5, 0.54, 0.56), left=0.4),))
     light = next(light.index for light in BRIGHT if min(light.colour) > 80)
     with taken(lab, tmp_path / "session", lambda step: step.illumination == light, situation=fly) as session:
@@ -1720,17 +1714,17 @@ def test_what_covers_few_cells_costs_these_cells_and_not_the_table(lab: Lab, tmp
 def test_a_reflection_in_one_frame_is_no_hand(lab: Lab, tmp_path: Path) -> None:
     light = next(light.index for light in BRIGHT if min(light.colour) > 80)
     session = taken(lab, tmp_path / "session", lambda step: step.illumination == light, paint=glare(lab, 0.05, 0.2))
-    result, found = measured(session, tmp_path)
-    assert causes(found) == {REFLECTION_IN_FRAME}
-    assert all(finding.is_known for finding in found.values())
+    result, detected = measured(session, tmp_path)
+    assert causes(detected) == {REFLECTION_IN_FRAME}
+    assert all(finding.is_known for finding in detected.values())
     assert [frame.illumination for frame in retaken_frames(result.verdict, result.figures)] == [light]
 
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_a_broad_glare_is_no_stain(lab: Lab, tmp_path: Path) -> None:
-    """3 % of paper's light, as a projector mirrored in a glossy print gives it."""
-    result, found = measured(taken(lab, tmp_path / "session", paint=glare(lab, 0.03, 0.3)), tmp_path)
-    assert causes(found) == {REFLECTION}
+    """3 % of paper's light, like a projector mirrored in a glossy print."""
+    result, detected = measured(taken(lab, tmp_path / "session", paint=glare(lab, 0.03, 0.3)), tmp_path)
+    assert causes(detected) == {REFLECTION}
     assert not retaken_frames(result.verdict, result.figures)
     row = next(row for row in result.verdict.remarks if row.figure.name == "unfit_share")
     assert "probably a reflection on the print in all frames" in remark(row, result.figures)
@@ -1740,11 +1734,11 @@ def test_a_broad_glare_is_no_stain(lab: Lab, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_a_stain_is_one(tmp_path: Path) -> None:
     lab = hang(room=Room(waviness_mm=0.5, stain_mm=25, stain_depth=0.3))
-    result, found = measured(taken(lab, tmp_path / "session"), tmp_path)
-    assert causes(found) == {STAIN}
+    result, detected = measured(taken(lab, tmp_path / "session"), tmp_path)
+    assert causes(detected) == {STAIN}
     stain = lab.world.stain
     assert stain is not None
-    place = found["doubtful_share"].places[0]
+    place = detected["doubtful_share"].positions[0]
     assert np.hypot(place.x_mm - stain.centre_mm[0], place.y_mm - stain.centre_mm[1]) < 8
     assert 18 < place.size_mm < 40
     assert not retaken_frames(result.verdict, result.figures)
@@ -1752,7 +1746,7 @@ def test_a_stain_is_one(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_one_hot_photosite_in_a_dark_cell_needs_no_word(lab: Lab, tmp_path: Path) -> None:
-    """3000 counts in every frame, dark ones too: the cell is listed, and no block is off for it."""
+    """3000 counts in every frame, also dark ones: the cell is listed, and no block deviates."""
     dark = int(np.argmin(lab.chart.rgb[lab.chart.cell_of_colour].sum(axis=1)))
     x, y = np.rint(2 * lab.world.project(lab.chart.centres_mm[lab.chart.cell_of_colour][[dark]])[0] + 0.5).astype(int)
     visible = lab.world.body.visible
@@ -1760,18 +1754,18 @@ def test_one_hot_photosite_in_a_dark_cell_needs_no_word(lab: Lab, tmp_path: Path
     def heat(counts: Counts, colour: Colour) -> None:
         counts[visible.top + y, visible.left + x] += 3000
 
-    result, found = measured(taken(lab, tmp_path / "session", paint=heat), tmp_path)
+    result, detected = measured(taken(lab, tmp_path / "session", paint=heat), tmp_path)
     assert [cell.colour for cell in result.figures.cells.unfit] == [dark]
     assert result.figures.cells.unfit[0].cause.startswith("hot")
-    assert "block_deviation" not in found
-    assert not causes(found)
+    assert "block_deviation" not in detected
+    assert not causes(detected)
 
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_a_white_frame_of_half_the_exposure_is_told_by_its_file(lab: Lab, tmp_path: Path) -> None:
-    _, found = measured(taken(lab, tmp_path / "session", nth_white(1), settings=half()), tmp_path)
-    assert causes(found) == {OTHER_EXPOSURE}
-    (frame,) = next(finding for finding in found.values() if finding.is_known).frames
+    _, result = measured(taken(lab, tmp_path / "session", nth_white(1), settings=half()), tmp_path)
+    assert causes(result) == {OTHER_EXPOSURE}
+    (frame,) = next(finding for finding in result.values() if finding.is_known).frames
     assert "white" in frame.file
 
 
@@ -1780,22 +1774,22 @@ def test_a_frame_out_of_focus_is_called_that(lab: Lab, tmp_path: Path) -> None:
     def one(step: SessionStep) -> bool:
         return step.kind == "light" and step.illumination == 2
 
-    _, found = measured(taken(lab, tmp_path / "session", one, situation=Situation(defocus_px=0.9)), tmp_path)
-    assert causes(found) == {DEFOCUS}
-    assert found["frame_blur"].decision.cause is DEFOCUS
+    _, result = measured(taken(lab, tmp_path / "session", one, situation=Situation(defocus_px=0.9)), tmp_path)
+    assert causes(result) == {DEFOCUS}
+    assert result["frame_blur"].decision.cause is DEFOCUS
 
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_dark_corners_are_no_dirt(tmp_path: Path) -> None:
-    """Corners at 42 to 52 % of the centre's light: the field follows them, and nothing is to be said."""
+    """Corners with 42 to 52 % of the central light: the field describes them."""
     lab = hang(room=Room(waviness_mm=0.5, vignetting=0.45, projector_falloff=0.25))
-    _, found = measured(taken(lab, tmp_path / "session"), tmp_path)
-    assert not {"reference_spread", "doubtful_share", "block_deviation"} & found.keys()
-    assert not causes(found)
+    _, result = measured(taken(lab, tmp_path / "session"), tmp_path)
+    assert not {"reference_spread", "doubtful_share", "block_deviation"} & result.keys()
+    assert not causes(result)
 
 
 @pytest.mark.usefixtures("pinned_builds", "lens_unmeasured")
 def test_a_clean_room_has_no_cause(tmp_path: Path) -> None:
     room = Room(seed=2, waviness_mm=0.8, vignetting=0.3, projector_falloff=0.1, primary_difference=0.2, blur_px=0.45)
-    _, found = measured(taken(hang(room=room), tmp_path / "session", lambda step: False), tmp_path)
-    assert not found
+    _, result = measured(taken(hang(room=room), tmp_path / "session", lambda step: False), tmp_path)
+    assert not result

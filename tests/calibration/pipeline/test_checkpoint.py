@@ -1,4 +1,4 @@
-"""A build that is stopped, anywhere, or that follows its session, ends in the bytes of an undisturbed one."""
+"""An interrupted or incremental build ends with the bytes of an undisturbed one."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
 
 pytestmark = pytest.mark.slow
 
+# Starts processes without repeating their imports.
 FORKS = multiprocessing.get_context("forkserver")
-"""Programs beside this one, without waiting for their imports each time."""
 FORKS.set_forkserver_preload([__name__])
 
 PLACES = {
@@ -49,12 +49,12 @@ PLACES = {
 
 @pytest.fixture(scope="module")
 def lab() -> Lab:
-    """Return a lab of few colours: of these the lens is not measured, which takes longer than all that matters here."""
+    """Return a lab with few colours, in which the lens is not measured."""
     return hang(2, "A6")
 
 
 def build_until_killed(place: str, count: int, folder: Path, out: Path) -> None:
-    """Build a table; the process is killed before the `count`-th call at a place."""
+    """Build a table; the process is killed before the `count`-th call of a function."""
     building.CHECKPOINT_EVERY = 3  # pyrefly: ignore[bad-assignment]
     owner, name = PLACES[place]
     real, left = getattr(owner, name), itertools.count(count, -1)
@@ -75,7 +75,7 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """Return a table's files, but for the reports that only the command writes."""
+    """Return a table's files without the reports, which only the command writes."""
     assert not list(folder.glob(f"{RECORD}*"))
     return {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.startswith("report")}
 
@@ -104,7 +104,7 @@ def interrupted_at(session: Session, out: Path, frame: int) -> None:
 
 
 @pytest.mark.parametrize(("place", "count"), [("putting", 2), ("saving", 2), ("finishing", 3), ("publishing", 1)])
-def test_a_killed_build_goes_on_to_the_same_bytes(
+def test_killed_build_resumes_to_same_bytes(
     session: Session, undisturbed: dict[str, bytes], tmp_path: Path, place: str, count: int
 ) -> None:
     program = FORKS.Process(target=build_until_killed, args=(place, count, session.folder, tmp_path / "lut"))
@@ -117,9 +117,7 @@ def test_a_killed_build_goes_on_to_the_same_bytes(
     assert list(tmp_path.iterdir()) == [tmp_path / "lut"]
 
 
-def test_a_build_that_goes_on_does_not_start_over(
-    session: Session, undisturbed: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_resumed_build_does_not_restart(session: Session, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
     interrupted_at(session, tmp_path / "lut", 7)
     done: list[int] = []
     build(session, tmp_path / "lut", lambda number, total, what: done.append(number))
@@ -128,9 +126,7 @@ def test_a_build_that_goes_on_does_not_start_over(
 
 
 @pytest.mark.parametrize("what", ["checkpoint", "checkpoint.*.npz", "samples.npy"])
-def test_damage_to_what_was_done_is_noticed(
-    session: Session, undisturbed: dict[str, bytes], tmp_path: Path, what: str
-) -> None:
+def test_detects_damaged_checkpoint(session: Session, undisturbed: dict[str, bytes], tmp_path: Path, what: str) -> None:
     interrupted_at(session, tmp_path / "lut", 8)
     (path,) = (tmp_path / ".lut.partial").glob(what)
     data = bytearray(path.read_bytes())
@@ -140,7 +136,7 @@ def test_damage_to_what_was_done_is_noticed(
     assert files(tmp_path / "lut") == undisturbed
 
 
-def test_a_bump_before_the_interruption_and_the_lens_are_remembered(tmp_path: Path) -> None:
+def test_checkpoint_keeps_bump_and_lens(tmp_path: Path) -> None:
     lab, bumped = hang(), hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
 
     def frame(step: SessionStep) -> bytes:
@@ -156,14 +152,14 @@ def test_a_bump_before_the_interruption_and_the_lens_are_remembered(tmp_path: Pa
 
 @pytest.fixture
 def session_under_way(session: Session, tmp_path: Path) -> Generator[Session]:
-    """Lend a copy of the session, in which frames can be made to have come, or not yet."""
+    """Return a copy of the session, in which frames can appear one by one."""
     shutil.copytree(session.folder, tmp_path / "session")
     with Session.open(tmp_path / "session") as copy:
         yield copy
 
 
 def show(session: Session, frames: int) -> None:
-    """Let the first `frames` frames of a session have come."""
+    """Let the first `frames` frames of a session appear."""
     rows = [record.file for record in session.frames()]
     changes: list[tuple[str, ...]] = [
         ("accepted" if number < frames else "refused", file) for number, file in enumerate(rows)
@@ -176,7 +172,7 @@ def alter(session: Session, change: str, rows: list[tuple[str, ...]]) -> None:
         journal.executemany(change, rows)
 
 
-def test_a_table_follows_its_session(session_under_way: Session, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
+def test_append_follows_session(session_under_way: Session, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
     session, out = session_under_way, tmp_path / "lut"
     every = len(session.frames())
     lights = len(session.illuminations)
@@ -195,17 +191,15 @@ def test_a_table_follows_its_session(session_under_way: Session, undisturbed: di
     with np.load(path) as stored:
         arrays = {name.rpartition(".")[2] for name in stored.files}
     assert arrays <= {name.partition(".")[2] for name in stored_names()}, "a checkpoint with other names is not used"
-    with pytest.raises(FormatError, match=r"1 of \d+ lights .*--append"):
+    with pytest.raises(FormatError, match=r"1 of \d+ illuminants .*--append"):
         build(session, out)
     show(session, every)
     assert isinstance(append(session, out), BuildResult)
     assert files(out) == undisturbed
 
 
-def test_a_light_taken_again_is_taken_in_again(
-    session_under_way: Session, undisturbed: dict[str, bytes], tmp_path: Path
-) -> None:
-    """What had been taken in of it before must not stay."""
+def test_rereads_light_taken_again(session_under_way: Session, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
+    """Results of the previous frame must not remain."""
     session = session_under_way
     one, other = (next(r for r in session.frames() if r.illumination == light) for light in (2, 3))
     show(session, 6)
@@ -220,12 +214,12 @@ def test_a_light_taken_again_is_taken_in_again(
     assert np.array_equal(lut.samples[3], before[2])
 
 
-def test_two_programs_do_not_make_one_table(session: Session, tmp_path: Path) -> None:
+def test_refuses_second_program(session: Session, tmp_path: Path) -> None:
     with unfinished_table(tmp_path / "lut"), pytest.raises(InputError):
         build(session, tmp_path / "lut")
 
 
-def test_a_checkpoint_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+def test_restores_checkpoint_exactly(tmp_path: Path) -> None:
     values = {"value": 0.1 + 0.2, "tiny": 5e-324, "nothing": None}
     with unfinished_table(tmp_path / "lut") as unfinished:
         (unfinished.folder / "samples.npy").touch()
@@ -242,7 +236,7 @@ def test_a_checkpoint_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_the_frames_of_a_table_are_found_again(session: Session, session_under_way: Session, tmp_path: Path) -> None:
+def test_verifies_frames_of_table(session: Session, session_under_way: Session, tmp_path: Path) -> None:
     build(session, tmp_path / "lut")
     lut = open_lut(tmp_path / "lut")
     assert find_faults(lut) == []

@@ -1,4 +1,4 @@
-"""Frames come in the order of the journal, and their times go on, whatever a clock was set to."""
+"""Frames in the order of the journal, with increasing times whatever the clock was set to."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ STEPS = plan_steps(LIGHTS, 2)
 
 @pytest.fixture
 def taken(tmp_path: Path) -> Callable[[Sequence[float]], Session]:
-    """Return what makes a session whose frames were taken so many seconds after `AT`, as its clock said."""
+    """Return a maker of sessions whose frames were taken at seconds after `AT` by their clock."""
 
     def make(seconds: Sequence[float]) -> Session:
         with Session.create(tmp_path / "s", 'rig = "simulated"\n', design_chart(1), LIGHTS, STEPS) as session:
@@ -51,7 +51,7 @@ def taken(tmp_path: Path) -> Callable[[Sequence[float]], Session]:
     return make
 
 
-def test_a_clock_that_goes_on_is_left_as_it_is(taken: Callable[[Sequence[float]], Session]) -> None:
+def test_keeps_times_of_steady_clock(taken: Callable[[Sequence[float]], Session]) -> None:
     seconds = [4.0 * number for number in range(len(STEPS))]
     with taken(seconds) as session:
         records = select_frames(session).records
@@ -59,7 +59,7 @@ def test_a_clock_that_goes_on_is_left_as_it_is(taken: Callable[[Sequence[float]]
     assert [record.file for record in records] == [f"frames/{step.stem}.cr2" for step in STEPS]
 
 
-def test_where_it_was_set_back_time_goes_on_by_the_usual_interval(taken: Callable[[Sequence[float]], Session]) -> None:
+def test_clock_set_back_continues_by_usual_interval(taken: Callable[[Sequence[float]], Session]) -> None:
     back = [4.0 * number - (3600 if number >= 5 else 0) - (90 if number >= 8 else 0) for number in range(len(STEPS))]
     with taken(back) as session:
         selected = select_frames(session)
@@ -71,7 +71,7 @@ def test_where_it_was_set_back_time_goes_on_by_the_usual_interval(taken: Callabl
     assert raw == [AT + timedelta(seconds=one) for one in back], "the journal says what the clock said"
 
 
-def test_frames_taken_by_other_means_have_their_times_alone(taken: Callable[[Sequence[float]], Session]) -> None:
+def test_imported_frames_keep_their_times(taken: Callable[[Sequence[float]], Session]) -> None:
     # A list may name the lights in the order of their numbers, whenever they were taken.
     listed = [float(7 * number % len(STEPS)) for number in range(len(STEPS))]
     with taken(listed) as session:
@@ -81,18 +81,18 @@ def test_frames_taken_by_other_means_have_their_times_alone(taken: Callable[[Seq
 
 
 @pytest.mark.parametrize("text", ["", "rig = ["])
-def test_damaged_settings_are_told_where_a_table_is_made(
+def test_warns_of_damaged_settings(
     taken: Callable[[Sequence[float]], Session], text: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     with taken([float(number) for number in range(len(STEPS))]) as session:
         (session.folder / "session.toml").write_text(text)
         assert stated_origin(session).rig is None
     assert "session.toml" in caplog.text
-    assert "neither its origin" in caplog.text
+    assert "will not contain origin" in caplog.text
 
 
 @pytest.mark.parametrize(("rig", "iso"), [("lab", 200), ("simulated", 200), ("imported", None)])
-def test_the_exposure_of_settings_is_stated_where_they_set_the_camera(
+def test_exposure_comes_from_settings_that_set_camera(
     taken: Callable[[Sequence[float]], Session], rig: str, iso: int | None
 ) -> None:
     with taken([float(number) for number in range(len(STEPS))]) as session:
@@ -102,7 +102,7 @@ def test_the_exposure_of_settings_is_stated_where_they_set_the_camera(
     assert (None if stated.camera is None else stated.camera.iso) == iso
 
 
-def test_patches_that_are_cut_off_or_clipped_have_no_mean() -> None:
+def test_outside_or_clipped_patches_have_no_mean() -> None:
     samples = np.arange(4 * 25 * 3, dtype=np.float32).reshape(4, 25, 3)
     sites = sites_at(np.array([[10.0, 10], [1, 10], [20, 20], [20, 10]]), (40, 40))
     limit = round(CLIPPING_SHARE * 10_000)
@@ -112,7 +112,7 @@ def test_patches_that_are_cut_off_or_clipped_have_no_mean() -> None:
     np.testing.assert_allclose(means[[0, 3]], samples[[0, 3]].mean(axis=1))
 
 
-def test_what_lies_behind_the_print_is_the_mean_of_places_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_background_is_mean_beside_print(monkeypatch: pytest.MonkeyPatch) -> None:
     def gathered(mosaic: object, black: object, sites: Any) -> npt.NDArray[np.float64]:
         return np.arange(3.0 * len(sites.rows)).reshape(-1, 3)
 

@@ -1,4 +1,4 @@
-"""What the budget makes of a table's figures, and which frames are held against each other, in numbers worked out."""
+"""The uncertainty budget of known figures, and the frames that are compared."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ PLACES = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
 
 
 def table(**more: object) -> Any:
-    """Return the figures of a table that a budget is made of: two lights and four cells."""
+    """Return the figures of a table for a budget: two lights and four cells."""
 
     def uncertainty_px(places: _Array) -> _Array:
         return np.linspace(0.1, 0.4, len(places))
 
     paper = SimpleNamespace(field=SimpleNamespace(coefficients=[[np.ones(4), np.ones(9)]]))
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "frames": tuple(SimpleNamespace(black=np.full((2, 2), level), paper=paper) for level in (100.0, 101.0, 99.0)),
         "lights": SimpleNamespace(
             white=WHITE, white_error=0.001 * WHITE * [[1, 2, 3]], brightest=BRIGHTEST, subtracted=None, additivity=None,
@@ -52,12 +52,12 @@ def table(**more: object) -> Any:
         "registration": SimpleNamespace(blur_px=0.7, cell_px=9.0, uncertainty_px=uncertainty_px),
         "white_scatter": np.array([0.001, 0.002, 0.0]),
     }  # fmt: skip
-    return SimpleNamespace(**found | more)
+    return SimpleNamespace(**result | more)
 
 
 def of(name: str, given: Any = None) -> Any:
-    (found,) = [one for one in budget_of(given or table()).components if one.name == name]
-    return found
+    (result,) = [one for one in budget_of(given or table()).components if one.name == name]
+    return result
 
 
 def frame(white: tuple[float, float, float] = (100.0, 200, 50), at_s: float = 0, exposure: float = 0.5) -> Any:
@@ -68,7 +68,7 @@ def frame(white: tuple[float, float, float] = (100.0, 200, 50), at_s: float = 0,
     )
 
 
-def test_frames_are_brought_to_the_usual_exposure_that_files_state() -> None:
+def test_scales_frames_to_median_exposure() -> None:
     def factors(*exposures: float) -> list[float]:
         frames = [frame(exposure=one) for one in exposures]
         return table_figures._to_one_exposure(frames).ravel().tolist()
@@ -90,15 +90,13 @@ def test_frames_are_brought_to_the_usual_exposure_that_files_state() -> None:
         ((100.0, 183, 50), False),
     ],
 )
-def test_white_frames_drift_by_less_than_15_per_cent_and_two_degrees(
-    white: tuple[float, float, float], is_drift: bool
-) -> None:
+def test_drift_has_limits_of_brightness_and_colour(white: tuple[float, float, float], is_drift: bool) -> None:
     # The median of three is what two of them have.
     frames = [frame(), frame(white), frame()]
-    assert table_figures._drift_is_one(frames) is is_drift
-    assert table_figures._drift_is_one([frame(white)])
+    assert table_figures._differ_by_drift(frames) is is_drift
+    assert table_figures._differ_by_drift([frame(white)])
 
 
-def test_times_are_since_the_first_white_frame() -> None:
+def test_times_start_at_first_white_frame() -> None:
     at, white_at = table_figures._times_s([frame(at_s=10), frame(at_s=60)], [frame(at_s=10), frame(at_s=110)])
     assert (at.tolist(), white_at.tolist()) == ([0, 50], [0, 100])

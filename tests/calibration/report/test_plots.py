@@ -1,4 +1,4 @@
-"""Half-size linear RGB, of any Bayer phase and any size; and what is drawn of cells and lights."""
+"""Half-size linear RGB of any Bayer phase and size, and the plots of cells and lights."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.causes.gathering import PrintPlace
+from calibration.causes.gathering import PrintPosition
 from calibration.comparison.comparing import CellDifferences
 from calibration.comparison.report import draw_map
 from calibration.report import plots
 from calibration.report.plots import (
     draw_chromaticities,
-    draw_places,
+    draw_positions,
     half_size,
     viewable,
 )
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.slow
 
 
 def drawn(draw: Callable[..., None], *arguments: Any) -> Any:
-    """Return the figure that is drawn, which nobody renders; Matplotlib is imported where one is."""
+    """Return a figure that is drawn but not rendered."""
     from matplotlib.figure import Figure
 
     figure: Any = Figure()
@@ -39,7 +39,7 @@ def drawn(draw: Callable[..., None], *arguments: Any) -> Any:
 
 
 def empty_axes() -> Any:
-    """Return axes on which nothing is drawn yet."""
+    """Return empty axes."""
     from matplotlib.figure import Figure
 
     return Figure().add_subplot()
@@ -48,7 +48,7 @@ def empty_axes() -> Any:
 def mosaic_of(
     counts: np.ndarray[tuple[int, int], np.dtype[np.uint16]], pattern: str, masked: tuple[Area, ...] = ()
 ) -> Mosaic:
-    """Return a mosaic of which `counts` is the whole sensor; masked columns are cut off the visible area."""
+    """Return a mosaic of a sensor with these counts; masked columns are outside the visible area."""
     left = max((area.left + area.width for area in masked), default=0)
     visible = Area(0, left, counts.shape[0], counts.shape[1] - left)
     return Mosaic(
@@ -66,7 +66,7 @@ def mosaic_of(
 @given(
     st.sampled_from(["RGGB", "BGGR", "GRBG", "GBRG"]), st.integers(2, 7), st.integers(2, 7), st.integers(0, 2**32 - 1)
 )
-def test_every_pixel_is_its_block(pattern: str, height: int, width: int, seed: int) -> None:
+def test_half_size_pixel_is_its_block(pattern: str, height: int, width: int, seed: int) -> None:
     counts = np.random.default_rng(seed).integers(0, 4096, (height, width)).astype(np.uint16)
     image = half_size(mosaic_of(counts, pattern))
     assert image.shape == (height // 2, width // 2, 3)
@@ -80,7 +80,7 @@ def test_every_pixel_is_its_block(pattern: str, height: int, width: int, seed: i
             assert image[i, j] == pytest.approx(expected)
 
 
-def test_the_masked_border_overrules_the_metadata() -> None:
+def test_masked_border_overrides_metadata() -> None:
     counts = np.full((200, 60), 1000, dtype=np.uint16)
     counts[:, :20] = 128
     image = half_size(mosaic_of(counts, "RGGB", (Area(0, 0, 200, 20),)))
@@ -91,7 +91,7 @@ CHART = design_chart(3, "A7")
 CELLS = CHART.centres_mm[CHART.cell_of_colour]
 
 
-def test_what_cells_of_two_tables_differ_by_is_drawn_in_the_channel_that_differs_most() -> None:
+def test_map_shows_channel_with_largest_difference() -> None:
     random = np.random.default_rng(1)
     mean, none = random.normal(0, 0.01, (len(CELLS), 3)), np.zeros((len(CELLS), 3))
     mean[7] = np.nan
@@ -104,7 +104,7 @@ def test_what_cells_of_two_tables_differ_by_is_drawn_in_the_channel_that_differs
     np.testing.assert_allclose(np.asarray(squares.get_array()), 100 * np.array(largest))
 
 
-def test_lights_are_drawn_at_their_chromaticities_in_the_triangle_of_all() -> None:
+def test_draws_lights_at_their_chromaticities() -> None:
     codes = np.array([[255.0, 0, 0], [255, 255, 255], [0, 0, 0], [0, 0, 255]])
     white = np.array([[600.0, 300, 100], [200, 500, 300], [0, 0, 0], [100, 300, 600]])
     bodies = np.array([False, True, False, False])
@@ -138,19 +138,19 @@ def place_errors(points_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def registered(**more: object) -> Any:
-    """Return a registration that sees millimetres twice as large, and the lens alone 1.9 times."""
+    """Return a registration with 2 px per mm, and 1.9 px per mm by the lens alone."""
     tag = SimpleNamespace(corners_px=np.array([[20.0, 20], [40, 20], [40, 41], [20, 40]]))
-    found = {
+    result = {
         "cell_px": 2 * CELL_W,
         "to_pixels": seen,
         "lens": SimpleNamespace(to_pixels=by_the_lens),
         "framing": SimpleNamespace(tags=[tag]),
         "uncertainty_px": place_errors,
     }
-    return SimpleNamespace(**found | more)
+    return SimpleNamespace(**result | more)
 
 
-def test_a_picture_is_bright_where_paper_is() -> None:
+def test_viewable_image_shows_paper_bright() -> None:
     even = np.tile(np.arange(0.0, 1000, dtype=np.float32)[:, None, None], (1, 8, 3)) * np.array([1, 2, 4], np.float32)
     shown = viewable(even)
     white = np.percentile(np.repeat(np.arange(0, 1000, 4), 2), 99.5)
@@ -159,7 +159,7 @@ def test_a_picture_is_bright_where_paper_is() -> None:
     assert viewable(np.full((8, 8, 3), 0.5, np.float32)) == pytest.approx(0.5 ** (1 / 2.2)), "of less than a count"
 
 
-def test_a_name_at_the_edge_of_a_plot_is_turned_inwards() -> None:
+def test_labels_at_edge_point_inwards() -> None:
     for x, y, ha, text in ((0.69, 0.69, "left", (8, 8)), (0.71, 0.71, "right", (-8, -14))):
         axes: Any = empty_axes()
         axes.set(xlim=(10, 30), ylim=(-5, 5))
@@ -169,8 +169,8 @@ def test_a_name_at_the_edge_of_a_plot_is_turned_inwards() -> None:
         assert (note.xy, note.get_ha(), note.xyann) == (place, ha, text)
 
 
-def test_places_are_circled_and_those_of_one_circle_share_its_numbers() -> None:
-    places = [("one", PrintPlace("a", 30.0, 40.0, 20.0)), ("two", PrintPlace("a", 30.0, 40.0, 20.0)),
-              ("one", PrintPlace("a", 60.0, 40.0, 0.0)), ("three", PrintPlace("a", 1.0, 40.0, 20.0))]  # fmt: skip
-    axes, _ = drawn(draw_places, FRAME, CHART, registered(), places).axes
+def test_draws_shared_circles_once() -> None:
+    places = [("one", PrintPosition("a", 30.0, 40.0, 20.0)), ("two", PrintPosition("a", 30.0, 40.0, 20.0)),
+              ("one", PrintPosition("a", 60.0, 40.0, 0.0)), ("three", PrintPosition("a", 1.0, 40.0, 20.0))]  # fmt: skip
+    axes, _ = drawn(draw_positions, FRAME, CHART, registered(), places).axes
     assert [text.get_text() for text in axes.texts] == ["1, 2", "1", "3"]

@@ -1,4 +1,4 @@
-"""What the report shows and says of a hand in one white frame."""
+"""The report of a session with a hand in one white frame."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from calibration.causes.gathering import PrintPlace
+from calibration.causes.gathering import PrintPosition
 from calibration.figures.all_figures import FIGURES
 from calibration.pipeline.build import build
-from calibration.report.plots import draw_places
+from calibration.report.plots import draw_positions
 from calibration.report.report import write_report
 from calibration.verdict import BuildResult
 from experiment.session.folder import Session
@@ -32,12 +32,12 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.usefixtures("lens_unmeasured")
-def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    circled: list[tuple[str, PrintPlace]] = []
+def test_report_names_and_circles_hand(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    circled: list[tuple[str, PrintPosition]] = []
 
     def blank(draw: Callable[..., None], *arguments: Any) -> bytes:
         # The last picture with places is that of the frame.
-        circled[:] = arguments[-1] if draw is draw_places else circled
+        circled[:] = arguments[-1] if draw is draw_positions else circled
         return b"\x89PNG\r\n\x1a\n"
 
     monkeypatch.setattr("calibration.report.report.draw_png", blank)
@@ -50,14 +50,14 @@ def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path, monkeypat
         build(session, out, report=write_report, judged_by=limits)
     page = (tmp_path / "lut.refused" / "report.html").read_text()
     assert "<b>hand or object in one frame</b>" in page
-    assert "<h2>Where it is: 0004_white</h2><div class='scroll'><img" in page
+    assert "<h2>Position: 0004_white</h2><div class='scroll'><img" in page
     assert re.search(r"<details id='radiometry' open>.*in frames/0004_white\.dng, about \d+, \d+ mm", page, re.DOTALL)
-    assert page.index("To be taken again") < page.index("<h2>Probable causes</h2>") < page.index("<details")
-    (found,) = json.loads((tmp_path / "lut.refused" / "report.json").read_text())["causes"]
-    assert found["cause"] == "hand or object in one frame"
-    assert found["files"] == ["frames/0004_white.dng"] == [place["file"] for place in found["places"]]
-    assert found["command"] == "acquire run LAB.toml SESSION --retake bad"
-    assert found["evidence"]["showing"] == pytest.approx(1 / 8)
+    assert page.index("Take 1 frame again: ") < page.index("<h2>Probable causes</h2>") < page.index("<details")
+    (result,) = json.loads((tmp_path / "lut.refused" / "report.json").read_text())["causes"]
+    assert result["cause"] == "hand or object in one frame"
+    assert result["files"] == ["frames/0004_white.dng"] == [place["file"] for place in result["places"]]
+    assert result["command"] == "acquire run LAB.toml SESSION --retake bad"
+    assert result["evidence"]["showing"] == pytest.approx(1 / 8)
     ((label, place),) = circled
     assert label.endswith(": hand or object in one frame")
     left, top, right, bottom = HAND.blobs[0].place
@@ -65,7 +65,7 @@ def test_the_report_names_and_circles_a_hand(lab: Lab, tmp_path: Path, monkeypat
     assert top < place.y_mm / lab.chart.page_mm[1] < bottom
 
 
-def test_every_picture_of_a_report_is_drawn(
+def test_draws_all_report_pictures(
     session: Session, built: BuildResult, tmp_path: Path, pinned: Pinned, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: dict[str, list[Any]] = {}
@@ -92,12 +92,12 @@ def test_every_picture_of_a_report_is_drawn(
         assert pixels.std() > 5, "something is on it"
 
 
-def test_a_group_says_how_many_of_its_figures_are_beyond_their_limits(built: BuildResult) -> None:
+def test_group_counts_figures_beyond_limits(built: BuildResult) -> None:
     assert built.lut is not None
     page = (built.lut / "report.html").read_text()
-    said = re.findall(r"(\d+) figures?, (all within|\d+ beyond) their limits", page)
+    summaries = re.findall(r"(\d+) figures?, (all within|\d+ beyond) their limits", page)
     beyond = sum(one.outcome != "accept" for one in built.verdict.rows)
-    assert said
-    assert all(how == "all within" or int(how.removesuffix(" beyond")) for _, how in said)
-    assert sum(int(how.removesuffix(" beyond")) for _, how in said if how != "all within") == beyond
-    assert sum(int(count) for count, _ in said) == len(built.verdict.rows)
+    assert summaries
+    assert all(how == "all within" or int(how.removesuffix(" beyond")) for _, how in summaries)
+    assert sum(int(how.removesuffix(" beyond")) for _, how in summaries if how != "all within") == beyond
+    assert sum(int(count) for count, _ in summaries) == len(built.verdict.rows)
