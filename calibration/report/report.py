@@ -141,7 +141,7 @@ def _chart_places(table: TableMeasurements) -> dict[str, Any]:
 
 def _geometry(table: TableMeasurements) -> dict[str, Any]:
     registration = table.registration
-    inner, outer = registration.places_known_px
+    inner, outer = registration.position_uncertainty_px
     lateral = registration.lateral
     return {
         "uncertainty_px": _rounded(inner),
