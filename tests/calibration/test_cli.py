@@ -73,7 +73,7 @@ def test_verify_names_the_light_that_has_changed(lut: Path, session: Session, co
     next((tmp_path / "session" / "frames").glob("*light_003*")).unlink()
     code, out, err = command("verify", tmp_path / "lut", tmp_path / "session")
     assert code == 2
-    assert f"the samples of 1 of {len(LIGHTS)} lights have changed: 4\n" in out
+    assert f"the samples of 1 of {len(LIGHTS)} illuminants have changed: 4\n" in out
     assert "light_003.dng cannot be read" in out
     assert "2 faults" in err
 
@@ -93,7 +93,7 @@ def test_append_says_how_far_the_table_is(session: Session, command: Command, tm
     code, out, _ = command("--append", tmp_path / "session", tmp_path / "lut")
     assert code == 0
     assert f"{len(LIGHTS) - 1} of {len(LIGHTS)} lights" in out
-    assert command("info", tmp_path / "lut")[2].count("in the making") == 1
+    assert command("info", tmp_path / "lut")[2].count("is not finished") == 1
 
 
 def _refuse(folder: Path, file: str) -> None:
