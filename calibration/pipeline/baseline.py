@@ -222,9 +222,9 @@ def _spread_frame(baseline: Baseline, same: Iterable[DecodedFrame], view: PrintV
     # Counts that are lost near black would look like a lack of light that the lens spreads, and hide a veil.
     means, beyond = (seen / count for seen in (total, beyond))
     usual = np.median(means[whites], axis=0)
-    means, beyond = (seen * (1 - sensor.beside(np.maximum(seen, 0), usual)[0]) for seen in (means, beyond))
+    means, beyond = (seen * (1 - sensor.difference(np.maximum(seen, 0), usual)[0]) for seen in (means, beyond))
     paper, _ = baseline.paper.read(np.where(usable[whites, None], means[whites], np.nan), file)
-    red, green, blue = np.sqrt(sensor.beside(DARK_LEVEL * paper.white, paper.white)[1]).tolist()
+    red, green, blue = np.sqrt(sensor.difference(DARK_LEVEL * paper.white, paper.white)[1]).tolist()
     return SpreadFrame(
         levels=FrameLevels(means, beyond),
         field=paper.field.at(view.grid.points_mm),

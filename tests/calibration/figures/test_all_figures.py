@@ -368,7 +368,7 @@ def test_a_bend_is_what_counts_lack_for_certain_over_paper_s_levels() -> None:
         level = np.geomspace(10_000 * NODES[1], 5000, 30)
         relative = found.relative(level)[0]
         bend = np.abs(relative - relative[-1])
-        doubt = 2 * np.sqrt(found.beside(level, np.full(30, 5000.0))[1])
+        doubt = 2 * np.sqrt(found.difference(level, np.full(30, 5000.0))[1])
         assert light.LINEARITY.measure(made) == pytest.approx(np.maximum(bend - doubt, 0).max(), abs=1e-9)
         assert bend.max() == pytest.approx(lack * (0.5 - NODES[1]), rel=0.05)
         assert light.LINEARITY_KNOWN.measure(made) == 1
