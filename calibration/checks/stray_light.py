@@ -66,7 +66,7 @@ class StrayLight:
         affected_primaries = [
             light
             for primary, light in enumerate(self.primaries)
-            if exceeds_white or self.lights_of[negative, primary].any()
+            if exceeds_white or any(self.lights_of[mixture, primary] for mixture in negative)
         ]
         return positive + [light for light in affected_primaries if light not in positive]
 

@@ -38,7 +38,7 @@ _Float = npt.NDArray[np.float32]
 # patches may reach 0.4 by chance.
 _LEAST_SCORE, _LEAST_SCORE_OF_FEW = 0.3, 0.5
 
-_FEW_CELLS = 64  # Blocks with less patches have few
+_FEW_CELLS = 64  # Blocks with fewer patches need the higher correlation
 
 _NEIGHBOUR_BLOCKS = 1.6  # Maximum distance of neighbours, in block spacings: the eight blocks around
 

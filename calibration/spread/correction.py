@@ -486,7 +486,7 @@ def _background_sites(grid: PrintedGrid, registration: Registration, shape: tupl
     width, height = grid.pitch_mm
     # The sheet: outermost patches, extended straight to its edge and a margin.
     low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
-    sheet = grid.slots_mm[grid.others[..., 2].ravel() < 0.5]
+    sheet = grid.slots_mm[grid.blank_shares[..., 2].ravel() < 0.5]
     low, high = np.minimum(low, sheet.min(axis=0)), np.maximum(high, sheet.max(axis=0))
     half = np.array([width, height]) / 2
     low, high = low - half, high + half

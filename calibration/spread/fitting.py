@@ -69,7 +69,7 @@ LOOSE_UNEVENNESS = 0.03  # the same for several primaries with different fields 
 
 FOLDS = 4  # folds of cross-validation over parts of the print
 
-# Width of a tile of one fold, as a fraction of the longer page side: each fold covers the whole print.
+# Number of tiles along the longer page side; each tile belongs to one fold, and each fold covers the whole print.
 _PATCHWORK = 10
 
 # Orders of polynomials over the page: of light outside of all kernels, of smooth factors of levels (as of a field), and
@@ -139,8 +139,7 @@ _APART = (0.03, CHANNELS_APART, 0.7)
 _APART_ODDS = (0.4, 0.4, 0.2)
 
 # Largest veiling glare with shares that are constant over the frame: the worst lens by ISO 9358 plus half a standard
-# uncertainty. Kernels that grew threefold to the corners were once taken for 4.6 % veiling glare; patch errors were 11
-# %.
+# uncertainty. Kernels that grew threefold to the corners were once taken for 4.6 % veiling glare, with errors of 11 %.
 MOST_VEIL = 0.02
 
 # Lower bound of the misfit for charts with few colours, because patch errors are correlated over channels. In 46 rooms

@@ -59,13 +59,13 @@ class PrintedGrid:
     column: npt.NDArray[np.int64]  # (P,)
     source: _Index  # (R, K) patch in each slot; −1: none
     parts: _Index  # (5 R, 5 K) patch in each part of a slot; P: paper, P + 1: black ink, P + 2: beyond the sheet
-    others: npt.NDArray[np.float32]  # (R, K, 3) share of paper, black ink, and beyond the sheet in each slot
+    blank_shares: npt.NDArray[np.float32]  # (R, K, 3) share of paper, black ink, and beyond the sheet in each slot
     slots_mm: _Array  # (R K, 2) centres of the slots
 
     @cached_property
     def plain_slots(self) -> float:
         """Area of paper and black ink, in slots."""
-        return float(self.others[..., :2].sum())
+        return float(self.blank_shares[..., :2].sum())
 
     @cached_property
     def neighbours(self) -> _Index:
@@ -137,7 +137,7 @@ def printed_grid(chart: Chart) -> PrintedGrid:
         column=column,
         source=source,
         parts=parts,
-        others=kinds.mean(axis=(1, 3)).astype(np.float32),
+        blank_shares=kinds.mean(axis=(1, 3)).astype(np.float32),
         slots_mm=np.column_stack([np.tile(slot_x, rows), np.repeat(slot_y, columns)]),
     )
 
@@ -161,7 +161,7 @@ class UsualLight:
     @staticmethod
     def of(grid: PrintedGrid, patches: _Array, slots: _Array) -> UsualLight:
         """Return the light of a grid from the field at patches (P, 3) and slots (R K, 3)."""
-        shares = grid.others.reshape(-1, 3).astype(np.float64)
+        shares = grid.blank_shares.reshape(-1, 3).astype(np.float64)
         return UsualLight(patches, slots, shares[:, :2].T @ slots)
 
 
@@ -190,14 +190,14 @@ class Surroundings:
         for k, scale in enumerate(NEAR_PX):
             kernels.window_shares(scale, pitches, offsets, self.window, shares[k])
         weights = np.empty((count, kernels.ACROSS**2, 3), dtype=np.float32)
-        others = np.empty((count, 3, 3), dtype=np.float32)
+        blank_weights = np.empty((count, 3, 3), dtype=np.float32)
         table = np.array([pitches[0], pitches[1] - pitches[0], first, step])
         grid, local = self.grid, np.ascontiguousarray(np.einsum("np,pck->nck", self.places, amounts))
         kernels.weights_around(
             grid.row, grid.column, grid.neighbours, grid.parts, self.offset_px, self.pitch_px, shares, table, local,
-            weights, others,
+            weights, blank_weights,
         )  # fmt: skip
-        return NearLight(grid.neighbours, weights, others, local.sum(axis=2), self.light.patches)
+        return NearLight(grid.neighbours, weights, blank_weights, local.sum(axis=2), self.light.patches)
 
     def inks(self, levels: FrameLevels) -> _Array:
         """Return paper, black ink and background, (3, 3) float64 counts at field 1."""
@@ -215,7 +215,7 @@ class Surroundings:
     def image(self, levels: FrameLevels, inks: _Array) -> _Float:
         """Return the print slot by slot, (R, K, 3) float32 counts; `inks` (3, 3) as of `inks`."""
         image = np.empty((*self.grid.source.shape, 3), dtype=np.float32)
-        kernels.print_slots(self.grid.others.reshape(-1, 3), self.light.slots, inks, image.reshape(-1, 3))
+        kernels.print_slots(self.grid.blank_shares.reshape(-1, 3), self.light.slots, inks, image.reshape(-1, 3))
         image[self.grid.row, self.grid.column] = levels.patches
         return image
 
@@ -254,7 +254,7 @@ class NearLight:
 
     neighbours: npt.NDArray[np.int32]  # (P, 25) patches around each patch
     weights: _Float  # (P, 25, 3) of each neighbour
-    others: _Float  # (P, 3, 3) of paper, black ink and background
+    blank_weights: _Float  # (P, 3, 3) of paper, black ink and background
     total: _Array  # (P, 3) sum of the weights of a patch
     light: _Array  # (P, 3) usual field at the patches
 
@@ -266,7 +266,7 @@ class NearLight:
     def at(self, levels: FrameLevels, inks: _Array) -> _Array:
         """Return the light (P, 3) float64 counts; `inks` (3, 3) as of `Surroundings.inks`."""
         out = np.empty_like(levels.patches)
-        kernels.light_around(self.neighbours, self.weights, self.others, levels.patches, self.light, inks, out)
+        kernels.light_around(self.neighbours, self.weights, self.blank_weights, levels.patches, self.light, inks, out)
         return out
 
 

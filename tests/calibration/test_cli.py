@@ -134,8 +134,8 @@ def test_a_table_and_its_entry_are_one_object(lut: Path, capsys: pytest.CaptureF
         (["-v", "--check", "session"], "build-lut check"),
         (["--window", 4, "session", "lut"], "4 pixels"),
         (["nowhere", "lut"], "nowhere is no session"),
-        (["info", "nowhere"], "nowhere is no table"),
-        (["compare", "a", "b"], "a is no table"),
+        (["info", "nowhere"], "nowhere is no LUT"),
+        (["compare", "a", "b"], "a is no LUT"),
     ],
 )
 def test_what_cannot_be_meant_is_said(
