@@ -1,1 +1,1 @@
-"""Checks of the print, of frames against each other, and of lights against their codes."""
+"""Checks of single frames, of stray light, and of illuminants against their codes."""

@@ -1,20 +1,19 @@
-"""What the whites of a session say of its projector, and what the other lights predict of each.
+"""Fit a projector model to the whites of a session, and predict each white from all others.
 
-White under a light is the sum of what three primaries give, each as strong as a tone curve makes it of its code, and
-what is added where two or three overlap (wheels with white, yellow, cyan or magenta segments):
+A white is the sum of the light of three primaries through their tone curves, and of light that is added where two or
+three primaries overlap (colour wheels with white, yellow, cyan or magenta segments):
 
     white(codes) = Σ_p P_p [f_p(code_p) + Σ_S u_Sp(m_S) f_p(m_S) + k_p],   m_S the least code of the primaries in S
 
-with P_p the primary in camera RGB, f_p its tone curve, u_Sp the light added where the primaries S overlap, and k_p a
-rest of light at code 0 after the dark frames' is taken off. Nothing of this is known; but all of it is known roughly:
-a camera's red channel sees mostly the red primary, and a curve is about a power of 2.2. These priors take the place of
-a number of lights from which on something could be said: with two lights they decide, with seven hundred they hardly
-count, and each prediction comes with the uncertainty that is left.
+with P_p the primary in camera RGB, f_p its tone curve, u_Sp the light added in the overlap of the primaries S, and k_p
+the remaining light at code 0 after subtraction of dark frames. All parameters have priors: the red channel of a camera
+is mostly sensitive to the red primary, and a tone curve is about a power of 2.2. With two illuminants the priors
+dominate, with seven hundred they have almost no effect. Each prediction has the resulting uncertainty.
 
-The posterior is Gaussian about its mode, found by Gauss and Newton's method (Laplace's approximation). Lights that do
-not fit count less, by the weights of Student's t with `_FREEDOM` degrees of freedom on the distance from what the other
-lights predict; the noise begins large and is let down to its own (graduated non-convexity), so that a few misnamed
-lights do not draw the start to themselves.
+The posterior is Gaussian about its mode (Laplace's approximation), which is found by Gauss-Newton steps. Outliers get
+small weights by Student's t distribution with `_FREEDOM` degrees of freedom, of the distance from the prediction by all
+other illuminants. Noise starts large and is reduced to its own value (graduated non-convexity), so that a few wrong
+names do not attract the first steps.
 
 Sources: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 2.22 to 2.26, 5.12
 (leaving out); K. L. Lange, R. J. A. Little, J. M. G. Taylor, "Robust statistical modeling using the t distribution",
@@ -31,100 +30,100 @@ import numpy.typing as npt
 
 _Array = npt.NDArray[np.float64]
 
-# Share of white's count in channel R, G, B (rows) that each primary has: middles of five cameras' measured
-# sensitivities under a mercury lamp and LEDs.
+# Contribution of each primary (columns) to white in R, G and B (rows): means of the measured sensitivities of five
+# cameras, with a mercury lamp and LEDs.
 _SEEN = np.array([[0.70, 0.28, 0.015], [0.055, 0.83, 0.11], [0.013, 0.25, 0.70]])
 
-# Prior standard deviations of their logarithms: half as much again as those cameras and lamps differ by.
+# Prior standard deviations of their logarithms: 1.5 times the differences between these cameras and lamps.
 _SEEN_SD = np.array([[0.25, 0.45, 0.9], [0.6, 0.2, 0.6], [1.0, 0.7, 0.25]])
 
-_CHANNELS = np.array([0.45, 1.0, 0.70])  # White's counts in the channels over green's, of those cameras and lamps
+_CHANNELS = np.array([0.45, 1.0, 0.70])  # Counts of white relative to green, for these cameras and lamps
 
-# Prior standard deviations (logarithm) of a channel's level, a primary's, and that of all: projectors of 5000 to 11
-# 000 K, and any exposure.
+# Prior standard deviations (logarithm) of the level of a channel, of a primary, and of all: projectors of 5000 to
+# 11 000 K, and any exposure.
 _CHANNEL_SD, _PRIMARY_SD, _SCALE_SD = 0.35, 0.3, 2.0
 
-# Codes at which tone curves are known; between them a curve bends by less than a thousandth.
+# Nodes of the tone curves, in codes; interpolation errors are below 0.001.
 _NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 184, 200, 216, 232, 255.0])
 
-_POWER = 2.2  # Exponent about which tone curves are described: displays have 1.8 to 2.6
+_POWER = 2.2  # Mean exponent of tone curves; displays have 1.8 to 2.6
 
-# Prior standard deviations of a tone curve's exponent and bends (logarithm), and the bends' length in the logarithm
-# of the code: sRGB, S-shaped curves and any exponent from 1.5 to 2.9 lie within two.
+# Prior standard deviations of the exponent and of bends of the logarithm of a tone curve, and the length scale of the
+# bends in log code. sRGB, S-shaped curves and exponents from 1.5 to 2.9 lie within two standard deviations.
 _SLOPE, _BEND, _LENGTH = 0.4, 0.2, 0.4
 
-_OWN = 0.2  # How much of that a primary has for itself: the three curves of a projector are much alike, LCDs least
+_OWN = 0.2  # Individual part of each primary: the three curves of a projector are similar, least in LCDs
 
-# Codes between which the light added where primaries overlap is interpolated.
+# Nodes of the light added in overlaps, in codes, for linear interpolation.
 _OVERLAP_NODES = np.array([0.0, 64.0, 128.0, 192.0, 255.0])
 
-# Prior standard deviations of the light added where primaries overlap, over the primary's own: of the whole, and of
-# its course with the code, and the length in codes of that. White segments add up to half.
+# Light added in overlaps, relative to the primary: prior standard deviations of the mean and of the variation with the
+# code, and its length scale in codes. White segments add up to half.
 _OVERLAP, _OVERLAP_BEND, _OVERLAP_LENGTH = 0.2, 0.15, 120.0
 
-# Primaries that overlap: each pair, and all three.
+# Overlaps: each pair of primaries, and all three.
 _SUBSETS: tuple[tuple[int, ...], ...] = ((0, 1), (0, 2), (1, 2), (0, 1, 2))
 
-# Three of each primary.
+# Three overlaps of each primary.
 _TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if primary in subset]
 
 
-# Prior standard deviation of the light at code 0, of a primary's full light: after the dark frames' is taken off, and
-# where there are none. Contrasts of 1 : 500 and more, and a lit room, lie within.
+# Prior standard deviation of the light at code 0, relative to the primary: with and without dark frames. This covers
+# contrasts of 500 : 1 and more, and room light.
 _REST, _REST_UNKNOWN = 5e-4, 0.02
 
-# Error of a channel's white that does not shrink with it, of the brightest white's: black levels and stray light.
+# Constant uncertainty of whites, relative to the brightest white: black level and stray light.
 _FLOOR = 2e-4
 
-_FREEDOM = 4.0  # Degrees of freedom of Student's t: outliers lose their weight, healthy lights keep nearly all of it
+_FREEDOM = 4.0  # Degrees of freedom of Student's t: outliers lose their weight, others keep nearly all of it
 
-# Noise added to each white in turn, as a share of it: from that of the priors down to none.
+# Additional relative noise of whites in successive rounds: from the level of the priors down to none.
 _SCHEDULE = (0.5, 0.2, 0.06, 0.015, 0.0, 0.0, 0.0)
 
-_STEPS = 4  # Steps of Gauss and Newton for each of these, at most
+_STEPS = 4  # Largest number of Gauss-Newton steps in each round
 
-_STILL = 1e-6  # Step, in standard deviations of what is known of any projector, after which no other follows
+_STILL = 1e-6  # Step, in prior standard deviations, that ends a round
 
-_DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)  # Damping of a step that is tried in turn, over the curvature
+_DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)  # Damping factors to try, relative to the curvature
 
-_N = 12  # Principal components of a tone curve that are kept: the next ones have standard deviations below .003
+_N = 12  # Number of principal components of a tone curve; further ones have standard deviations below 0.003
 
 _CURVES, _OVERLAPS = 4 * _N, len(_TERMS) * len(_OVERLAP_NODES)
 
 
-def _x(codes: npt.ArrayLike) -> _Array:
+def _log_code(codes: npt.ArrayLike) -> _Array:
     return np.log(np.maximum(np.asarray(codes, dtype=np.float64), 0.5) / 255)
 
 
 def _kernel(a: _Array, b: _Array) -> _Array:
     near = np.exp(-0.5 * ((a[:, None] - b[None]) / _LENGTH) ** 2)
-    # Bends are conditioned on none at 255, where a curve is 1 by definition.
+    # Conditioned on zero at code 255, where a curve is 1 by definition.
     full = np.exp(-0.5 * (a / _LENGTH) ** 2)[:, None] * np.exp(-0.5 * (b / _LENGTH) ** 2)[None]
     return _SLOPE**2 * a[:, None] * b[None] + _BEND**2 * (near - full)
 
 
 @cache
 def _curve_basis() -> _Array:
-    """Return (256, N): what each of N independent normal numbers adds to the logarithm of a curve at each code."""
-    nodes = _x(_NODES)
-    variance, across = np.linalg.eigh(_kernel(nodes, nodes))
-    variance, across = variance[-_N:], across[:, -_N:]
-    return np.asarray(_kernel(_x(np.arange(256)), nodes) @ (across / np.sqrt(variance)), dtype=np.float64)
+    """Return (256, N): change of the log tone curve at each code per normal parameter."""
+    nodes = _log_code(_NODES)
+    variance, components = np.linalg.eigh(_kernel(nodes, nodes))
+    variance, components = variance[-_N:], components[:, -_N:]
+    return np.asarray(_kernel(_log_code(np.arange(256)), nodes) @ (components / np.sqrt(variance)), dtype=np.float64)
 
 
 @cache
 def _overlap_basis() -> _Array:
-    """Return (256, K): what each of K independent normal numbers adds to the overlap at each code."""
     nodes, codes = _OVERLAP_NODES, np.arange(256.0)
-    far = (nodes[:, None] - nodes[None]) / _OVERLAP_LENGTH
-    root = np.linalg.cholesky(_OVERLAP**2 + _OVERLAP_BEND**2 * np.exp(-0.5 * far**2) + 1e-8 * np.eye(len(nodes)))
-    between: list[_Array] = [np.asarray(np.interp(codes, nodes, row), dtype=np.float64) for row in np.eye(len(nodes))]
-    return np.asarray(np.stack(between, axis=-1) @ root, dtype=np.float64)
+    distance = (nodes[:, None] - nodes[None]) / _OVERLAP_LENGTH
+    root = np.linalg.cholesky(_OVERLAP**2 + _OVERLAP_BEND**2 * np.exp(-0.5 * distance**2) + 1e-8 * np.eye(len(nodes)))
+    # hat functions of the linear interpolation
+    hats: list[_Array] = [np.asarray(np.interp(codes, nodes, row), dtype=np.float64) for row in np.eye(len(nodes))]
+    return np.asarray(np.stack(hats, axis=-1) @ root, dtype=np.float64)
 
 
 @cache
 def _primary_root() -> _Array:
-    """Return (9, 9): the root of the prior covariance of the primaries' logarithms, [channel, primary] flattened."""
+    """Return (9, 9): Cholesky factor of the prior covariance of log primaries, flattened [channel, primary]."""
     channel, primary = (grid.ravel() for grid in np.indices((3, 3)))
     same_channel, same_primary = channel[:, None] == channel[None], primary[:, None] == primary[None]
     covariance = np.diag(_SEEN_SD.ravel() ** 2) + _SCALE_SD**2
@@ -134,71 +133,59 @@ def _primary_root() -> _Array:
 
 @dataclass(frozen=True, eq=False)
 class _Codes:
-    """Codes of L lights, with what of the bases they use: computed once.
+    """Codes of L illuminants and their basis values.
 
-    Of each primary alone, and of each of its three overlaps, whose code is the least of the primaries that take part:
-
-    - `lit`: (L, 3, 4) bool, whether the code is above 0.
-    - `power`: (L, 3, 4) float64, logarithm of the light by the mean tone curve.
-    - `curves`: (L, 3, 4, N) float64, what the numbers of a curve add to it.
-    - `overlaps`: (L, 3, 3, K) float64, what the numbers of an overlap add to its amount.
+    The third axis holds each primary itself and its three overlaps; the code of an overlap is the least of its
+    primaries.
     """
 
-    lit: npt.NDArray[np.bool_]
-    power: _Array
-    curves: _Array
-    overlaps: _Array
+    lit: npt.NDArray[np.bool_]  # (L, 3, 4) whether the code is above 0
+    power: _Array  # (L, 3, 4) log light by the mean tone curve
+    curves: _Array  # (L, 3, 4, N) its change per curve parameter
+    overlaps: _Array  # (L, 3, 3, K) change of the overlap per parameter
 
     @staticmethod
     def of(codes: npt.NDArray[np.integer]) -> _Codes:
-        whole = np.asarray(codes, dtype=np.int64)
-        least = np.stack([whole[:, subset].min(axis=1) for _, subset in _TERMS], axis=-1).reshape(-1, 3, 3)
-        each = np.concatenate([whole[:, :, None], least], axis=2)
-        return _Codes(each > 0, _POWER * _x(each), _curve_basis()[each], _overlap_basis()[least])
+        integers = np.asarray(codes, dtype=np.int64)
+        overlap_codes = np.stack([integers[:, subset].min(axis=1) for _, subset in _TERMS], axis=-1).reshape(-1, 3, 3)
+        stacked = np.concatenate([integers[:, :, None], overlap_codes], axis=2)
+        return _Codes(
+            stacked > 0, _POWER * _log_code(stacked), _curve_basis()[stacked], _overlap_basis()[overlap_codes]
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectorFit:
-    """Whites of L lights, as the other lights of the session and what is known of any projector predict them.
+    """Whites of L illuminants and the model fitted to them."""
 
-    - `white`: (L, 3) float64, as given: counts, what is there at black taken off.
-    - `slopes`: (L, 3, K) float64, of each white by the K numbers of the model, each with a normal prior of variance 1.
-    - `covariance`: (K, K) float64 of these numbers.
-    - `residual`: (L, 3) float64 counts, white less the fitted one.
-    - `noise`: (L, 3, 3) float64, covariance of each white about the model: what is measured and the lamp's scatter.
-    - `trust`: (L,) float64, 0 … 1, weight of each light in the fit.
-    - `misfit`: sum of the squared distances of the whites from the model and of the model from what is known of any
-      projector, in standard deviations: about 3 for each light, or fewer, where all is well.
-    """
-
-    white: _Array
-    slopes: _Array
-    covariance: _Array
-    residual: _Array
-    noise: _Array
-    trust: _Array
-    misfit: float = 0.0
+    white: _Array  # (L, 3) counts, as given
+    slopes: _Array  # (L, 3, K) derivatives by the K model parameters with priors N(0, 1)
+    covariance: _Array  # (K, K) of the parameters
+    residual: _Array  # (L, 3) white minus fit, counts
+    noise: _Array  # (L, 3, 3) covariance of each white about the model: measurement and scatter of the lamp
+    trust: _Array  # (L,) weight of each illuminant in the fit, 0 … 1
+    misfit: float = 0.0  # χ² of the whites and of the parameters; without faults about 3 per illuminant or less
 
     def predicted(self, lights: npt.NDArray[np.int64]) -> tuple[_Array, _Array]:
-        """Return the whites that the lights not named predict for those named, and their covariance.
+        """Predict whites from all illuminants outside a set.
 
-        `lights`: (B, n) int64, B sets of n lights that are left out together. Returns (B, 3 n) float64 counts. Returns
-        (B, 3 n, 3 n) float64, of a new white of these codes: of the model, the measurement and the lamp.
+        `lights`: (B, n) int64, B sets of n illuminants that are left out together. Returns (B, 3 n) float64 counts, and
+        their covariance (B, 3 n, 3 n) from model, measurement and lamp.
         """
         sets, count = lights.shape
         size = 3 * count
         slopes = self.slopes[lights].reshape(sets, size, -1)
-        known = slopes @ self.covariance @ slopes.swapaxes(1, 2)
-        own, counted = np.zeros((sets, size, size)), np.zeros((sets, size, size))
+        fitted = slopes @ self.covariance @ slopes.swapaxes(1, 2)
+        noise, counted = np.zeros((sets, size, size)), np.zeros((sets, size, size))
         for n in range(count):
-            at = slice(3 * n, 3 * n + 3)
-            own[:, at, at] = self.noise[lights[:, n]]
-            counted[:, at, at] = np.linalg.inv(self.noise[lights[:, n]]) * self.trust[lights[:, n], None, None]
-        # What a light itself gave to the fit is taken out again (Woodbury's identity).
-        freed = np.linalg.inv(np.eye(size) - known @ counted)
-        left = (freed @ self.residual[lights].reshape(sets, size, 1))[..., 0]
-        covariance = freed @ known
-        return self.white[lights].reshape(sets, size) - left, (covariance + covariance.swapaxes(1, 2)) / 2 + own
+            block = slice(3 * n, 3 * n + 3)
+            noise[:, block, block] = self.noise[lights[:, n]]
+            counted[:, block, block] = np.linalg.inv(self.noise[lights[:, n]]) * self.trust[lights[:, n], None, None]
+        # Remove the contribution of the set from the fit (Woodbury's identity).
+        removal = np.linalg.inv(np.eye(size) - fitted @ counted)
+        residual = (removal @ self.residual[lights].reshape(sets, size, 1))[..., 0]
+        covariance = removal @ fitted
+        return self.white[lights].reshape(sets, size) - residual, (covariance + covariance.swapaxes(1, 2)) / 2 + noise
 
 
 def fit_projector(
@@ -211,50 +198,50 @@ def fit_projector(
     brightness_sd: float,
     used: npt.NDArray[np.bool_] | None = None,
 ) -> ProjectorFit:
-    """Return what the whites of a session say of its projector.
+    """Fit the projector model to the whites of a session.
 
-    `codes`: (L, 3) int64, 0 … 255. `white`: (L, 3) float64 counts of bare paper, exposed alike, what is there at black
-    taken off. `error`: (L, 3) float64 counts, standard errors of them. `used`: (L,) bool, lights to learn from, each
-    with its full weight; None where the distance from what others predict decides.
+    `codes`: (L, 3) int64, 0 … 255. `white`: (L, 3) float64 counts on paper at equal exposure, without black light.
+    `error`: (L, 3) float64, standard uncertainties. `chroma_sd`, `brightness_sd`: relative scatter of the lamp. `used`:
+    (L,) bool, illuminants in the fit; None: all, with robust weights.
     """
-    given = _Codes.of(codes)
+    code_basis = _Codes.of(codes)
     level = np.maximum(np.abs(white), _FLOOR * white.max())
     scale = float(white.max())
     noise = np.zeros((len(white), 3, 3))
     channels = np.arange(3)
     noise[:, channels, channels] = error**2 + (chroma_sd * level) ** 2 + (_FLOOR * scale) ** 2
     noise += brightness_sd**2 * level[:, :, None] * level[:, None, :]
-    rest = _REST if dark_known else _REST_UNKNOWN
+    rest_sd = _REST if dark_known else _REST_UNKNOWN
     state = np.zeros(9 + _CURVES + _OVERLAPS + 3)
     trust = np.ones(len(white)) if used is None else used.astype(np.float64)
-    fitted, slopes = _model(state, given, scale, rest)
-    for added in _SCHEDULE:
-        loose = noise.copy()
-        loose[:, channels, channels] += (added * level) ** 2
-        weights = np.linalg.inv(loose) * trust[:, None, None]
+    fitted, slopes = _model(state, code_basis, scale, rest_sd)
+    for added_noise in _SCHEDULE:
+        round_noise = noise.copy()
+        round_noise[:, channels, channels] += (added_noise * level) ** 2
+        weights = np.linalg.inv(round_noise) * trust[:, None, None]
         for _ in range(_STEPS):
             precision, weighted = _precision(slopes, weights)
-            before = _misfit(state, white - fitted, weights)
-            downhill = weighted.T @ (white - fitted).ravel() - state
-            # The tangent may lead too far: the step is damped until it is one towards the mode (Levenberg, Marquardt).
+            misfit_before = _misfit(state, white - fitted, weights)
+            gradient = weighted.T @ (white - fitted).ravel() - state
+            # The full step may be too large: increase the damping until the misfit decreases (Levenberg, Marquardt).
             for damping in _DAMPINGS:
-                by = np.linalg.solve(precision + damping * np.diag(np.diag(precision)), downhill)
-                reached, there = _model(state + by, given, scale, rest)
-                if _misfit(state + by, white - reached, weights) <= before:
-                    state, fitted, slopes = state + by, reached, there
+                step = np.linalg.solve(precision + damping * np.diag(np.diag(precision)), gradient)
+                next_fitted, next_slopes = _model(state + step, code_basis, scale, rest_sd)
+                if _misfit(state + step, white - next_fitted, weights) <= misfit_before:
+                    state, fitted, slopes = state + step, next_fitted, next_slopes
                     break
             else:
-                # It is at the mode but for rounding, and would try the same again.
+                # At the mode within rounding: a further step would be the same.
                 break
-            if np.abs(by).max() < _STILL:
+            if np.abs(step).max() < _STILL:
                 break
         if used is not None:
             continue
         covariance = _inverse(_precision(slopes, weights)[0])
-        fit = ProjectorFit(white, slopes, covariance, white - fitted, loose, trust)
-        mean, spread = fit.predicted(np.arange(len(white))[:, None])
-        off = white - mean
-        distance2 = np.einsum("lc,lcd,ld->l", off, np.linalg.inv(spread), off)
+        fit = ProjectorFit(white, slopes, covariance, white - fitted, round_noise, trust)
+        mean, covariances = fit.predicted(np.arange(len(white))[:, None])
+        difference = white - mean
+        distance2 = np.einsum("lc,lcd,ld->l", difference, np.linalg.inv(covariances), difference)
         trust = (_FREEDOM + 3) / (_FREEDOM + np.maximum(distance2, 3))
     weights = np.linalg.inv(noise) * trust[:, None, None]
     covariance = _inverse(_precision(slopes, weights)[0])
@@ -263,7 +250,6 @@ def fit_projector(
 
 
 def _precision(slopes: _Array, weights: _Array) -> tuple[_Array, _Array]:
-    """Return the inverse covariance (K, K) of the model's numbers, and the weighted slopes (3 L, K)."""
     size = slopes.shape[2]
     weighted = (weights @ slopes).reshape(-1, size)
     return np.eye(size) + slopes.reshape(-1, size).T @ weighted, weighted
@@ -274,35 +260,35 @@ def _inverse(matrix: _Array) -> _Array:
 
 
 def _misfit(state: _Array, residual: _Array, weights: _Array) -> float:
-    """Return twice the negative logarithm of the posterior, but for a constant."""
+    # −2 log posterior, without constant
     return float(state @ state + np.einsum("lc,lcd,ld->", residual, weights, residual))
 
 
-def _model(state: _Array, given: _Codes, scale: float, rest: float) -> tuple[_Array, _Array]:
-    """Return the whites (L, 3) that a state gives, and their slopes (L, 3, K)."""
-    count, nodes = len(given.lit), len(_OVERLAP_NODES)
+def _model(state: _Array, code_basis: _Codes, scale: float, rest_sd: float) -> tuple[_Array, _Array]:
+    """Return the whites (L, 3) of a parameter vector, and their derivatives (L, 3, K)."""
+    count, nodes = len(code_basis.lit), len(_OVERLAP_NODES)
     root = _primary_root()
     prior = np.log(_SEEN * _CHANNELS[:, None] * scale)
     primaries = np.exp(np.clip(prior + (root @ state[:9]).reshape(3, 3), -40, 40))
-    parts = state[9 : 9 + _CURVES].reshape(4, _N)
-    curves = np.sqrt(1 - _OWN**2) * parts[0] + _OWN * parts[1:]
+    curve_parameters = state[9 : 9 + _CURVES].reshape(4, _N)
+    curves = np.sqrt(1 - _OWN**2) * curve_parameters[0] + _OWN * curve_parameters[1:]
     overlaps = state[9 + _CURVES : 9 + _CURVES + _OVERLAPS].reshape(3, 3, nodes)
-    bent = np.einsum("lpjn,pn->lpj", given.curves, curves)
-    light = np.where(given.lit, np.exp(np.clip(given.power + bent, -30, 3)), 0.0)
-    part = light.copy()
-    part[:, :, 1:] *= np.einsum("lpjm,pjm->lpj", given.overlaps, overlaps)
-    by_curve = np.einsum("lpj,lpjn->lpn", part, given.curves)
-    by_overlap = (light[:, :, 1:, None] * given.overlaps).reshape(count, 3, -1)
-    by_state = np.zeros((count, 3, len(state)))
-    by_state[:, :, 9 : 9 + _N] = np.sqrt(1 - _OWN**2) * by_curve
-    rests = 9 + _CURVES + _OVERLAPS
+    bent = np.einsum("lpjn,pn->lpj", code_basis.curves, curves)
+    light = np.where(code_basis.lit, np.exp(np.clip(code_basis.power + bent, -30, 3)), 0.0)
+    contributions = light.copy()
+    contributions[:, :, 1:] *= np.einsum("lpjm,pjm->lpj", code_basis.overlaps, overlaps)
+    curve_slopes = np.einsum("lpj,lpjn->lpn", contributions, code_basis.curves)
+    overlap_slopes = (light[:, :, 1:, None] * code_basis.overlaps).reshape(count, 3, -1)
+    state_slopes = np.zeros((count, 3, len(state)))
+    state_slopes[:, :, 9 : 9 + _N] = np.sqrt(1 - _OWN**2) * curve_slopes
+    rest_start = 9 + _CURVES + _OVERLAPS
     for primary in range(3):
-        own, shared = 9 + _N * (1 + primary), 9 + _CURVES + 3 * nodes * primary
-        by_state[:, primary, own : own + _N] = _OWN * by_curve[:, primary]
-        by_state[:, primary, shared : shared + 3 * nodes] = by_overlap[:, primary]
-        by_state[:, primary, rests + primary] = rest
-    amounts = part.sum(axis=2) + rest * state[rests:]
-    slopes = primaries @ by_state
-    each = amounts[:, None, :] * primaries[None]
-    slopes[:, :, :9] += np.einsum("lcp,cpk->lck", each, root.reshape(3, 3, 9))
-    return each.sum(axis=2), slopes
+        own_start, overlap_start = 9 + _N * (1 + primary), 9 + _CURVES + 3 * nodes * primary
+        state_slopes[:, primary, own_start : own_start + _N] = _OWN * curve_slopes[:, primary]
+        state_slopes[:, primary, overlap_start : overlap_start + 3 * nodes] = overlap_slopes[:, primary]
+        state_slopes[:, primary, rest_start + primary] = rest_sd
+    amounts = contributions.sum(axis=2) + rest_sd * state[rest_start:]
+    slopes = primaries @ state_slopes
+    primary_light = amounts[:, None, :] * primaries[None]
+    slopes[:, :, :9] += np.einsum("lcp,cpk->lck", primary_light, root.reshape(3, 3, 9))
+    return primary_light.sum(axis=2), slopes

@@ -1,10 +1,10 @@
-"""Cells next to each other that are far off: what covers too few to move a block's mean, as a finger's tip does.
+"""Find small covered areas, such as a fingertip: adjacent patches with large deviations.
 
-A cell counts as far off that is beyond noise and the model's usual error, and beyond those whose codes are next to its
-own. What a polynomial cannot follow is spread over the print at random and a hot photosite stands alone, so that two
-such cells next to each other are a place; how many are enough follows from how many of the frame are far off at all.
-What touches such a place and is off by less, or is too dark to be compared, belongs to it. On a chart whose colours lie
-in order nothing is found.
+Such areas are too small to change the mean of a block. The deviation of a patch is large if it exceeds noise and the
+error of the model, and if it differs as much from patches with similar codes. Errors of the polynomial are distributed
+at random over the print, and hot photosites are isolated; so two adjacent patches are evidence of a cover. The required
+number follows from the number of all large deviations in the frame. Adjacent patches with smaller deviations, or too
+dark to be compared, are included. Charts with colours in order cannot be checked in this way.
 """
 
 from __future__ import annotations
@@ -19,133 +19,134 @@ _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
-_FAR = 5.0  # Standard deviations from which on a cell is far off: noise alone has one in a million comparisons there
+_FAR = 5.0  # Standard deviations of a large deviation: noise alone exceeds them once in a million comparisons
 
-# Standard deviations from which on a cell that stands alone is not what the print shows elsewhere (chosen: 707 frames
-# of a full chart are 70 million comparisons, and no polynomial is exact at the cube's corners).
+# Standard deviations above which an isolated patch is reported (judgement: 707 frames of a full chart are 70 million
+# comparisons, and no polynomial is exact at the corners of the colour cube).
 _ALONE = 8.0
 
-_LEAST_ALONE = 0.05  # Deviation of such a cell, at least, as a share (chosen)
+_LEAST_ALONE = 0.05  # Minimum relative deviation of an isolated patch (judgement)
 
-_ALSO = 3.0  # Standard deviations from which on a cell is part of a place that it touches
+_ALSO = 3.0  # Standard deviations above which a patch belongs to an adjacent area
 
-# Standard deviation of what a cell's code predicts, at least, as a share: photosites answer to some 0.4 % alike.
+# Minimum relative standard deviation of a prediction: the response of photosites differs by 0.4 %.
 LEAST_MODEL_ERROR = 0.004
 
-# Number of places of a size that a frame has by chance, from which on one of that size says nothing (chosen; in
-# frames of healthy rooms hardly a cell is far off, and two next to each other need two).
+# Areas of a size are ignored if a frame has more than this number of them by chance (judgement). Healthy frames have
+# hardly any large deviation.
 _BY_CHANCE = 0.1
 
-_NEXT = 1.6  # Distance, in distances of the nearest cell, up to which cells touch: diagonal ones do, 1.41
+_NEXT = 1.6  # Largest distance of adjacent patches, in patch distances; diagonal neighbours have 1.41
 
-AROUND = 8  # Cells that touch one, at most
+AROUND = 8  # Largest number of adjacent patches
 
-_ALIKE = 6  # Nearest codes that a cell is held against: one step along each axis of a cube of colours, either way
+_ALIKE = 6  # Number of similar codes for comparison: both neighbours along each axis of the colour cube
 
 
 class SmallPlaces:
-    """Finds cells that something covers in a frame, from how far each is off.
+    """Finds covered patches in a frame from their deviations.
 
-    `rgb`: (C, 3) printed codes. `cells_mm`: (C, 2) places. `usable`: (C,) bool, cells that are inside the frame and
-    were not covered from the start.
+    `rgb`: (C, 3) printed codes. `cells_mm`: (C, 2) positions. `usable`: (C,) bool, patches inside the frame that were
+    not covered in the reference frame.
     """
 
     def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, usable: _Mask) -> None:
         count = len(cells_mm)
-        found = cKDTree(cells_mm).query(cells_mm, k=min(AROUND + 1, count))
-        far, self._near = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.int64)
-        self._touching: _Mask = far <= _NEXT * float(np.median(far[:, 1]))
+        nearest = cKDTree(cells_mm).query(cells_mm, k=min(AROUND + 1, count))
+        distance, self._near = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.int64)
+        self._touching: _Mask = distance <= _NEXT * float(np.median(distance[:, 1]))
         self._touching[:, 0] = False
         codes = np.asarray(rgb, dtype=np.float64)
         self._alike: _Index = np.asarray(cKDTree(codes).query(codes, k=min(_ALIKE + 1, count))[1])[:, 1:]
         self._usable = usable
 
     def disturbed(self, deviation: _Array, sigma: _Array) -> tuple[_Index, _Array, _Index, _Index]:
-        """Return the cells (N,) int64 that something covers, ascending, how far each is off (N,), a share, and others.
+        """Find covered patches and isolated deviations.
 
-        The others are those of them that are far off by themselves (K,) int64, and cells that stand alone (M,) int64.
+        `deviation`: (K, C) float64, relative deviation from the code's value in each lit channel; NaN if not compared.
+        `sigma`: (K, C) float64, its standard deviation: noise of both frames and error of the model.
 
-        `deviation`: (K, C) float64 of each channel that is lit, a share of what the code gives; NaN of cells not
-        compared. `sigma`: (K, C) float64, its standard deviation: noise of both frames, and the model's usual error.
+        Returns covered patches (N,) int64 in ascending order, their relative deviations (N,), the covered patches with
+        large deviations (K,) int64, and isolated patches (M,) int64.
         """
         no_cells = np.zeros(0, dtype=np.int64)
-        far = np.abs(deviation)
-        far /= sigma
-        candidates = np.flatnonzero((far > _FAR).any(axis=0))
+        normalised = np.abs(deviation)
+        normalised /= sigma
+        candidates = np.flatnonzero((normalised > _FAR).any(axis=0))
         if not len(candidates):
             return no_cells, np.zeros(0), no_cells, no_cells
         own = deviation[:, candidates]
-        alike = self._alike[candidates]
-        like = np.where(np.isfinite(far[:, alike]), deviation[:, alike], np.nan)
-        known = np.asarray(np.isfinite(like).any(axis=2))
-        usual = np.where(known, np.nanmedian(np.where(known[..., None], like, 0.0), axis=2), 0.0)
-        apart = np.abs(own - usual) / sigma[:, candidates]
-        # As far off from its code as from those next to it.
-        certain = np.nan_to_num(np.minimum(apart, far[:, candidates]))
-        large = np.nan_to_num(np.minimum(np.abs(own), np.abs(own - usual))) > _LEAST_ALONE
+        similar = self._alike[candidates]
+        similar_deviation = np.where(np.isfinite(normalised[:, similar]), deviation[:, similar], np.nan)
+        is_known = np.asarray(np.isfinite(similar_deviation).any(axis=2))
+        median = np.where(is_known, np.nanmedian(np.where(is_known[..., None], similar_deviation, 0.0), axis=2), 0.0)
+        difference = np.abs(own - median) / sigma[:, candidates]
+        # Both the deviation from the model and the difference from similar codes must be large.
+        reliable = np.nan_to_num(np.minimum(difference, normalised[:, candidates]))
+        large = np.nan_to_num(np.minimum(np.abs(own), np.abs(own - median))) > _LEAST_ALONE
         usable = self._usable[candidates]
-        seeds = candidates[usable & (certain > _FAR).any(axis=0)]
-        alone = candidates[usable & ((certain > _ALONE) & large).any(axis=0)]
-        places = self._places(seeds)
-        if not places.any():
+        seeds = candidates[usable & (reliable > _FAR).any(axis=0)]
+        alone = candidates[usable & ((reliable > _ALONE) & large).any(axis=0)]
+        areas = self._significant_areas(seeds)
+        if not areas.any():
             return no_cells, np.zeros(0), no_cells, alone
-        compared = np.isfinite(far)
-        far[~compared] = 0.0
-        found = self._grown(places, self._usable & (far.max(axis=0) > _ALSO))
-        # Nothing is known of those that are too dark, so that a place does not grow through them.
-        found |= self._touched(found) & self._usable & ~compared.any(axis=0)
-        cells = np.flatnonzero(found)
-        worst = np.argmax(far[:, cells], axis=0)
-        return cells, np.nan_to_num(deviation[worst, cells]), seeds[found[seeds]], alone[~found[alone]]
+        compared = np.isfinite(normalised)
+        normalised[~compared] = 0.0
+        covered = self._grown(areas, self._usable & (normalised.max(axis=0) > _ALSO))
+        # Dark patches are included but not compared, so areas do not grow through them.
+        covered |= self._touched(covered) & self._usable & ~compared.any(axis=0)
+        patches = np.flatnonzero(covered)
+        worst = np.argmax(normalised[:, patches], axis=0)
+        return patches, np.nan_to_num(deviation[worst, patches]), seeds[covered[seeds]], alone[~covered[alone]]
 
-    def _places(self, seeds: _Index) -> _Mask:
-        """Return which cells (C,) lie at places that chance does not make, given those far off (N,), ascending."""
-        count, cells = len(self._usable), len(seeds)
-        kept = np.zeros(count, dtype=np.bool_)
+    def _significant_areas(self, seeds: _Index) -> _Mask:
+        """Return the patches (C,) of areas too large for chance, from those with large deviations (N,)."""
+        count, seed_count = len(self._usable), len(seeds)
+        is_significant = np.zeros(count, dtype=np.bool_)
         number = np.full(count, -1)
-        number[seeds] = np.arange(cells)
-        other = np.where(self._touching[seeds], number[self._near[seeds]], -1)
-        one, column = np.nonzero(other >= 0)
-        if not len(one):
-            return kept
-        pairs = coo_matrix((np.ones(len(one)), (one, other[one, column])), shape=(cells, cells))
+        number[seeds] = np.arange(seed_count)
+        neighbour = np.where(self._touching[seeds], number[self._near[seeds]], -1)
+        first, column = np.nonzero(neighbour >= 0)
+        if not len(first):
+            return is_significant
+        pairs = coo_matrix((np.ones(len(first)), (first, neighbour[first, column])), shape=(seed_count, seed_count))
         label = connected_components(pairs, directed=False)[1]
         size = np.bincount(label)[label]
-        # Of n cells strewn at random, n/2 (8 n / C)^(k - 1) places of k or more are to be expected.
-        by_chance = 0.5 * cells * (AROUND * cells / count) ** (size - 1.0)
-        # Where most of a print is far off, places are as large as it is.
-        kept[seeds[(size > 1) & ((by_chance < _BY_CHANCE) | (size > cells // 2))]] = True
-        return kept
+        # Of n randomly distributed patches, n/2 (8 n / C)^(k - 1) areas with at least k patches are expected.
+        expected_count = 0.5 * seed_count * (AROUND * seed_count / count) ** (size - 1.0)
+        # If most of the print deviates, the expected count is not valid: an area with most of the patches is
+        # significant.
+        is_significant[seeds[(size > 1) & ((expected_count < _BY_CHANCE) | (size > seed_count // 2))]] = True
+        return is_significant
 
-    def _grown(self, places: _Mask, joins: _Mask) -> _Mask:
-        """Return the places with all cells that touch them, directly or by way of others, and may join."""
+    def _grown(self, areas: _Mask, joins: _Mask) -> _Mask:
+        # Grow over all connected patches that may join.
         while True:
-            more = self._touched(places) & joins & ~places
-            if not more.any():
-                return places
-            places = places | more
+            added = self._touched(areas) & joins & ~areas
+            if not added.any():
+                return areas
+            areas = areas | added
 
-    def _touched(self, places: _Mask) -> _Mask:
-        """Return which cells (C,) touch one of the places."""
-        touched, cells = np.zeros_like(places), np.flatnonzero(places)
-        touched[self._near[cells][self._touching[cells]]] = True
+    # Patches adjacent to any patch of the areas, both (C,) bool.
+    def _touched(self, areas: _Mask) -> _Mask:
+        touched, patches = np.zeros_like(areas), np.flatnonzero(areas)
+        touched[self._near[patches][self._touching[patches]]] = True
         return touched
 
 
 def cells_without_hot(cells: _Index, seeds: _Index, hot: _Mask, cells_mm: _Array) -> tuple[_Mask, _Index]:
-    """Return which disturbed cells (N,) something covers, and which cells (M,) int64 stand alone, given the hot ones.
+    """Remove deviations by hot photosites: return which disturbed patches (N,) remain, and isolated ones (M,) int64.
 
-    A place counts on where two of its cells are far off without a hot photosite of their own. Of other places no more
-    than one such cell is left.
+    An area remains if at least two of its seeds have no hot photosite. Of other areas, a single such seed counts as
+    isolated.
 
-    `cells`, `seeds`: (N,) int64, ascending, what `SmallPlaces.disturbed` found, and (K,) int64, those far off by
-    themselves. `hot`: (C,) bool, cells that hold a photosite which is hot in the dark frames. `cells_mm`: (C, 2)
-    places.
+    `cells`, `seeds`: (N,) and (K,) int64 in ascending order, from `SmallPlaces.disturbed`. `hot`: (C,) bool, patches
+    with a photosite that is hot in the dark frames. `cells_mm`: (C, 2) positions.
     """
     nearest = np.asarray(cKDTree(cells_mm).query(cells_mm, k=2)[0])[:, 1]
     pairs = cKDTree(cells_mm[cells]).query_pairs(_NEXT * float(np.median(nearest)), output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
     label = connected_components(graph, directed=False)[1]
-    of_seed, own = label[np.searchsorted(cells, seeds)], ~hot[seeds]
-    counts = np.bincount(of_seed[own], minlength=len(cells))
-    return (counts[label] > 1) & ~hot[cells], seeds[own & (counts[of_seed] == 1)]
+    seed_label, is_valid_seed = label[np.searchsorted(cells, seeds)], ~hot[seeds]
+    counts = np.bincount(seed_label[is_valid_seed], minlength=len(cells))
+    return (counts[label] > 1) & ~hot[cells], seeds[is_valid_seed & (counts[seed_label] == 1)]

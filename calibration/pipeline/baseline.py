@@ -218,9 +218,9 @@ def _spread_frame(baseline: Baseline, frames: _Frames, view: PrintView, is_mixed
     # Counts lost near black would look like less spread light, and hide veiling glare.
     means, beyond = (values / count for values in (total, beyond))
     usual = np.median(means[whites], axis=0)
-    means, beyond = (values * (1 - sensor.beside(np.maximum(values, 0), usual)[0]) for values in (means, beyond))
+    means, beyond = (values * (1 - sensor.difference(np.maximum(values, 0), usual)[0]) for values in (means, beyond))
     paper, _ = baseline.paper.read(np.where(usable[whites, None], means[whites], np.nan), file)
-    red, green, blue = np.sqrt(sensor.beside(DARK_LEVEL * paper.white, paper.white)[1]).tolist()
+    red, green, blue = np.sqrt(sensor.difference(DARK_LEVEL * paper.white, paper.white)[1]).tolist()
     return SpreadFrame(
         levels=FrameLevels(means, beyond),
         field=paper.field.at(view.grid.points_mm),

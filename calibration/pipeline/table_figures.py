@@ -368,7 +368,7 @@ def _added_light_of_first(baseline: Baseline) -> AddedLight:
     """Return the light added to parts of the print in the first frame, independent of colour."""
     chart, levels, cells_mm = baseline.chart, baseline.levels, baseline.points.cells_mm
     if chart.bits < _MIN_BITS:
-        return AddedLight.none(len(cells_mm))
+        return AddedLight.zero(len(cells_mm))
     paper, _ = baseline.paper.read(baseline.whites, baseline.first.file)
     white = np.maximum(paper.white, 1e-9)
     noise = baseline.transfer.variance(levels * white) / baseline.options.samples / white**2

@@ -1,1 +1,1 @@
-"""From counts to linear light: paper, field, dark light, primaries, reference greys, noise."""
+"""From counts to linear light: dark frames, primaries, drift, linearity and noise."""

@@ -1,13 +1,13 @@
-"""Dark frames: the light that is there while the projector shows black, read noise, and hot photosites.
+"""Evaluate dark frames: light while the projector shows black, read noise, and hot photosites.
 
-The projector's leak and ambient light are one figure, read on bare paper, and part of every light: nothing is
-subtracted unless the user asks for it. A photosite is hot when it is an outlier in every dark frame. What a dark frame
-adds depends on those before it alone, so that a build that was stopped goes on to the same bits.
+Projector leak and ambient light are one value, measured on paper. They are part of every illuminant, and are only
+subtracted on request. A hot photosite is an outlier in every dark frame. The result after a dark frame depends only on
+earlier ones, so a resumed build gives identical bits.
 
-What is subtracted is predicted (docs/decisions/0009-dark-light-is-predicted.md), since a single dark frame shows each
-cell's light with as much noise: it is dark paper × field × the cell's reflectance, and what cells show beyond that is
-added as far as it is more than noise: the share w = 1 − noise² / variance of what is left over, one for each channel
-(empirical Bayes; B. Efron and C. Morris, Journal of the American Statistical Association 68, 1973).
+The subtracted dark light is predicted (docs/decisions/0009-dark-light-is-predicted.md), because the noise of a patch in
+one dark frame is as large as its light. The prediction is dark paper × field × reflectance of the patch. The residual
+of a patch is added with weight w = 1 − noise² / variance of all residuals, per channel (empirical Bayes; B. Efron and
+C. Morris, Journal of the American Statistical Association 68, 1973).
 """
 
 from __future__ import annotations
@@ -24,145 +24,122 @@ from experiment.session.records import FrameRecord
 from foundation.records import FloatArray
 from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
 
-_LEAST_WHITE = 50.0  # Counts that paper must have in a channel for a cell's reflectance to be read there
+_LEAST_WHITE = 50.0  # minimum counts of paper in a channel for measuring reflectance in it
 
-_MOST_REFLECTANCE = 1.5  # Of bare paper's: no print reflects more, but noise in a dim channel may seem to
+_MOST_REFLECTANCE = 1.5  # upper bound relative to paper, against noise in a dim channel
 
-# Standard deviations from its patch's median up to which a sample is light: read noise alone passes 6 σ once in 2.5
-# million samples, a chart's.
+# Largest deviation of a sample from the median of its patch, in σ: read noise exceeds it once in 2.5 million samples,
+# the number in a chart.
 _FAR_SIGMA = 6.0
 
 _Array = npt.NDArray[np.float64]
 
-# Counts above its patch from which a sample is hot: the signal of the darkest cells that are of use, about 30.
+# Minimum excess of a hot sample over its patch, counts: about the signal of the darkest useful patches.
 HOT_COUNTS = 32.0
 
-HOT_SIGMA = 10.0  # Read noise alone passes 6 σ once in 2.5 million samples, a chart's
+HOT_SIGMA = 10.0  # minimum excess of a hot sample, in σ of read noise
 
-_NEVER = 32767  # The excess of a sample that no dark frame has shown yet
+_NEVER = 32767  # excess before the first dark frame
 
 
 @dataclass(frozen=True, eq=False)
 class DarkLight:
-    """What is to be subtracted from frames.
+    """Dark light to subtract from frames."""
 
-    - `paper`: (3,) float64 counts, of bare paper with the field divided out: for the record.
-    - `patches`: (P, 3) float32 counts, of each patch as the camera sees it, field and all.
-    - `share`: (3,) float64, 0 … 1, how much of what cells show beyond the prediction was added.
-    """
-
-    paper: _Array
-    patches: npt.NDArray[np.float32]
-    share: _Array
+    paper: _Array  # (3,) counts of paper without field, for the record
+    patches: npt.NDArray[np.float32]  # (P, 3) counts of each patch as seen by the camera, with field
+    share: _Array  # (3,) weight of the residuals, 0 … 1
 
 
 def winsorised_means(samples: npt.NDArray[np.float32], noise: _Array) -> _Array:
-    """Return the winsorised means of dark samples, since a hot photosite or a cosmic ray is no light.
+    """Return winsorised means (P, 3) float64 of dark samples, robust against hot photosites and cosmic rays.
 
-    `samples`: (P, S, 3) float32 counts above black; those beyond 6 σ of their patch's median count as if they were
-    there. `noise`: (3,) float64 counts, σ of one sample. Returns (P, 3) float64 counts.
+    `samples`: (P, S, 3) float32 counts above black level; values beyond 6 σ of the patch median are clipped to that
+    limit. `noise`: (3,) float64 counts, σ of one sample.
     """
-    middle = np.median(samples, axis=1, keepdims=True)
-    far = (_FAR_SIGMA * noise).astype(np.float32)
-    return np.clip(samples, middle - far, middle + far).mean(axis=1, dtype=np.float64)
+    median = np.median(samples, axis=1, keepdims=True)
+    limit = (_FAR_SIGMA * noise).astype(np.float32)
+    return np.clip(samples, median - limit, median + limit).mean(axis=1, dtype=np.float64)
 
 
-def reflectances(seen: _Array, field: _Array, white: _Array) -> _Array:
-    """Return the reflectance (P, 3) float64 of patches, 1 = bare paper.
+def reflectances(measured: _Array, field: _Array, white: _Array) -> _Array:
+    """Return the reflectance (P, 3) float64 of patches, relative to paper.
 
-    `seen`: (P, 3) mean counts above black in a frame of even light. `field`: (P, 3) its flat field at the patches.
-    `white`: (3,) counts of bare paper in it. A channel without light has the reflectances of the brightest one.
+    `measured`: (P, 3) mean counts above black level under uniform illumination. `field`: (P, 3) flat field at the
+    patches. `white`: (3,) counts of paper. A channel without light gets the reflectances of the brightest channel.
     """
-    found = np.clip(seen / (field * np.maximum(white, _LEAST_WHITE)), 0, _MOST_REFLECTANCE)
-    found[:, white < _LEAST_WHITE] = found[:, [int(np.argmax(white))]]
-    return found
+    ratio = np.clip(measured / (field * np.maximum(white, _LEAST_WHITE)), 0, _MOST_REFLECTANCE)
+    ratio[:, white < _LEAST_WHITE] = ratio[:, [int(np.argmax(white))]]
+    return ratio
 
 
 @dataclass(frozen=True, eq=False)
 class DarkLightEstimate:
-    """What dark frames, one after another, have shown of the dark light; each makes a new one.
+    """Estimate of dark light from all dark frames so far; each frame gives a new estimate."""
 
-    - `reflectance`: (P, 3) float64 of each patch. `inside`: (P,) bool, whether a patch lies in the frame.
-    - `left`: (P, 3) float64 counts, sum of what patches showed beyond the prediction.
-    - `noise`: (3,) float64 counts², sum of the variances of a patch's mean.
-    """
-
-    reflectance: _Array
-    inside: npt.NDArray[np.bool_]
-    samples: int
-    left: _Array
-    noise: _Array
-    frames: int
+    reflectance: _Array  # (P, 3) of each patch
+    inside: npt.NDArray[np.bool_]  # (P,) patches in the frame
+    samples: int  # samples per patch
+    left: _Array  # (P, 3) sum of residuals from the prediction, counts
+    noise: _Array  # (3,) sum of the variances of a patch mean, counts²
+    frames: int  # number of dark frames
 
     @staticmethod
-    def none(reflectance: _Array, inside: npt.NDArray[np.bool_], samples: int) -> DarkLightEstimate:
-        """Return the estimate before any dark frame, of patches with reflectances (P, 3) that are inside (P,)."""
+    def start(reflectance: _Array, inside: npt.NDArray[np.bool_], samples: int) -> DarkLightEstimate:
+        """Return the estimate before the first dark frame, with reflectances (P, 3) and patches inside (P,)."""
         return DarkLightEstimate(reflectance, inside, samples, np.zeros_like(reflectance), np.zeros(3), 0)
 
     def restarted(self) -> DarkLightEstimate:
-        """Return it without what cells showed beyond the prediction: they lie on other photosites from now on."""
-        return DarkLightEstimate.none(self.reflectance, self.inside, self.samples)
+        """Return the estimate without residuals, because patches are on other photosites now."""
+        return DarkLightEstimate.start(self.reflectance, self.inside, self.samples)
 
     def with_frame(
         self, means: _Array, noise: _Array, paper: Paper, field: _Array
     ) -> tuple[DarkLightEstimate, DarkLight]:
-        """Return the estimate after a dark frame, and what is to be subtracted from the frames after it.
+        """Return the estimate after a dark frame, and the dark light for the frames after it.
 
-        `means`: (P, 3) mean counts above black of each patch. `noise`: (3,) standard deviation of one sample. `field`:
-        (P, 3) its field at the patches.
+        `means`: (P, 3) mean counts above black level of each patch. `noise`: (3,) standard deviation of one sample.
+        `field`: (P, 3) field at the patches.
         """
         predicted = paper.white * field * self.reflectance
-        after = replace(
+        updated = replace(
             self,
             left=self.left + (means - predicted),
             noise=self.noise + noise**2 / self.samples,
             frames=self.frames + 1,
         )
-        left = after.left / after.frames
-        spread = MAD_TO_SIGMA * np.median(np.abs(left[self.inside] - np.median(left[self.inside], axis=0)), axis=0)
-        chance = after.noise / after.frames**2
-        share = np.clip(1 - chance / np.maximum(spread**2, 1e-12), 0, 1)
-        return after, DarkLight(paper.white, (predicted + share * left).astype(np.float32), share)
+        rest = updated.left / updated.frames
+        spread = MAD_TO_SIGMA * np.median(np.abs(rest[self.inside] - np.median(rest[self.inside], axis=0)), axis=0)
+        noise2 = updated.noise / updated.frames**2
+        share = np.clip(1 - noise2 / np.maximum(spread**2, 1e-12), 0, 1)
+        return updated, DarkLight(paper.white, (predicted + share * rest).astype(np.float32), share)
 
 
 @dataclass(frozen=True, eq=False)
 class DarkSummary:
-    """What the dark frames of a session show together.
-
-    - `light`: (3,) float64 counts above black on bare paper, field divided out: leak and ambient light, the median of
-      the frames; NaN without dark frames.
-    - `error`: (3,) float64, standard error of `light`.
-    - `blacks`: (2, 2) float64 counts of each frame.
-    - `noise`: (3,) float64 counts, standard deviation of a sample: read noise, of green that of the mean of two
-      photosites.
-    - `hottest`: (C,) float64 counts, by how much the hottest sample of each cell exceeds its median in every frame; 0
-      where none does.
-    - `lights`: (3,) float64 counts on bare paper, of each frame.
-    """
+    """Summary of all dark frames of a session."""
 
     files: tuple[str, ...] = ()
+    # (3,) leak and ambient light on paper, counts, without field: median of frames; NaN without frames
     light: _Array = field(default_factory=lambda: np.full(3, np.nan))
-    error: _Array = field(default_factory=lambda: np.full(3, np.nan))
-    blacks: tuple[_Array, ...] = ()
+    error: _Array = field(default_factory=lambda: np.full(3, np.nan))  # (3,) its standard uncertainty
+    blacks: tuple[_Array, ...] = ()  # (2, 2) counts of each frame
+    # (3,) read noise of a sample, counts; green: mean of two photosites
     noise: _Array = field(default_factory=lambda: np.full(3, np.nan))
+    # (C,) excess of the hottest sample of each patch in every frame, counts; 0: none
     hottest: _Array = field(default_factory=lambda: np.zeros(0))
-    lights: tuple[_Array, ...] = ()
+    lights: tuple[_Array, ...] = ()  # (3,) counts on paper in each frame
 
 
 @dataclass(frozen=True, eq=False)
 class DarkFrameFigures:
-    """What was measured on one dark frame.
-
-    - `black`: (2, 2) float64 counts.
-    - `light`, `error`: (3,) float64 counts above black on bare paper, field divided out, and their standard error.
-    - `noise`: (3,) float64 counts, standard deviation of a sample.
-    """
+    """Measurements of one dark frame."""
 
     record: FrameRecord
-    black: FloatArray
-    light: FloatArray
-    error: FloatArray
-    noise: FloatArray
+    black: FloatArray  # (2, 2) counts
+    light: FloatArray  # (3,) counts above black level on paper, without field
+    error: FloatArray  # (3,) its standard uncertainty
+    noise: FloatArray  # (3,) standard deviation of a sample, counts
     origin: FrameOrigin = field(default_factory=FrameOrigin)
 
 
@@ -173,68 +150,64 @@ def measure_dark_frame(
     paper: npt.NDArray[np.float32],
     shape: _Array,
 ) -> tuple[DarkFrameFigures, npt.NDArray[np.int16]]:
-    """Return the figures of a dark frame, and how far each sample is above the median of its cell.
+    """Measure a dark frame: figures, and the excess of each sample over the median of its patch.
 
-    `black`: (2, 2) counts. `cells`: (C, S, 3) float32 samples of the cells, counts above black. `paper`: (N, S, 3)
-    float32 samples of the white references that lie in the frame. `shape`: (N, 3) field at these references. Returns
-    (C, S, 3) int16, whole counts above the cell's median.
+    `black`: (2, 2) counts. `cells`: (C, S, 3) float32, samples of the patches, counts above black level. `paper`: (N,
+    S, 3) float32, samples of white references inside the frame. `shape`: (N, 3), field at these references. Returns the
+    excess as (C, S, 3) int16, whole counts.
     """
     flat: _Array = paper.mean(axis=1, dtype=np.float64) / shape
     count = max(len(flat), 1)
-    middle: _Array = np.asarray(np.median(flat, axis=0), dtype=np.float64)
-    # The median of normal values has a standard error 1.25 times that of the mean.
-    spread: _Array = MAD_TO_SIGMA * np.median(np.abs(flat - middle), axis=0)
+    median: _Array = np.asarray(np.median(flat, axis=0), dtype=np.float64)
+    # For normal values, the standard uncertainty of the median is 1.25 times the uncertainty of the mean.
+    spread: _Array = MAD_TO_SIGMA * np.median(np.abs(flat - median), axis=0)
     excess: npt.NDArray[np.float32] = cells - np.median(cells, axis=1, keepdims=True)
-    # A seventh of the cells gives the noise well enough; about the median of 25 it is read 2 % low.
+    # A seventh of the patches is sufficient. About the median of 25 samples, noise is 2 % too low.
     noise: _Array = (1 + 0.5 / cells.shape[1]) * MAD_TO_SIGMA * np.median(np.abs(excess[::7]), axis=(0, 1))
-    figures = DarkFrameFigures(record, black, middle, MEDIAN_ERROR * spread / np.sqrt(count), noise)
+    figures = DarkFrameFigures(record, black, median, MEDIAN_ERROR * spread / np.sqrt(count), noise)
     return figures, np.clip(np.rint(excess), -32768, 32767).astype(np.int16)
 
 
 @dataclass(frozen=True, eq=False)
 class HotPixels:
-    """Which samples exceed their cells' medians in every dark frame so far; each frame makes a new one.
+    """Excess of samples over their patch medians in every dark frame so far; each frame gives a new value."""
 
-    - `least`: (C, S, 3) int16 counts, the least excess of each sample since the chart was registered last.
-    - `past`: (C,) float64 counts, by how much a cell was hot before that.
-    """
-
-    least: npt.NDArray[np.int16]
-    past: _Array
+    least: npt.NDArray[np.int16]  # (C, S, 3) least excess of each sample since the last registration, counts
+    past: _Array  # (C,) excess of each patch before that, counts
 
     @staticmethod
-    def none(cells: int, samples: int) -> HotPixels:
-        """Return what is known before any dark frame."""
+    def start(cells: int, samples: int) -> HotPixels:
+        """Return the state before the first dark frame."""
         return HotPixels(np.full((cells, samples, 3), _NEVER, dtype=np.int16), np.zeros(cells))
 
     def with_frame(self, excess: npt.NDArray[np.int16]) -> HotPixels:
-        """Return it after a frame; `excess` (C, S, 3) counts, as `measure_dark_frame` returned it."""
+        """Return the state after a frame with `excess` (C, S, 3) from `measure_dark_frame`."""
         return replace(self, least=np.minimum(self.least, excess))
 
     def restarted(self, noise: _Array) -> HotPixels:
-        """Return it begun again, since cells lie on other photosites from now on; cells that were hot so far stay so.
+        """Return a new state after patches moved to other photosites; patches that were hot stay hot.
 
-        `noise` (3,) counts is the standard deviation of a sample.
+        `noise`: (3,) counts, standard deviation of a sample.
         """
         return HotPixels(np.full_like(self.least, _NEVER), self.hottest(noise))
 
     def hottest(self, noise: _Array) -> _Array:
-        """Return how far the hottest sample of each cell (C,) float64 exceeds its median in every frame, counts.
+        """Return the excess (C,) float64 of the hottest sample of each patch in every frame, counts; 0 if none.
 
-        0 where none does. `noise` (3,) counts is the standard deviation of a sample.
+        `noise`: (3,) counts, standard deviation of a sample.
         """
-        hot = np.maximum(HOT_COUNTS, HOT_SIGMA * noise)
-        seen = (self.least > hot) & (self.least < _NEVER)
-        return np.maximum(np.where(seen, self.least, 0).max(axis=(1, 2)).astype(np.float64), self.past)
+        limit = np.maximum(HOT_COUNTS, HOT_SIGMA * noise)
+        is_hot = (self.least > limit) & (self.least < _NEVER)
+        return np.maximum(np.where(is_hot, self.least, 0).max(axis=(1, 2)).astype(np.float64), self.past)
 
 
 def median_noise(frames: Sequence[DarkFrameFigures]) -> _Array:
-    """Return the noise (3,) float64 counts of a sample, the median of dark frames; NaN without one."""
+    """Return the median noise (3,) float64 of a sample in dark frames, counts; NaN without frames."""
     return np.asarray(np.median([dark.noise for dark in frames], axis=0)) if frames else np.full(3, np.nan)
 
 
 def dark_summary(frames: Sequence[DarkFrameFigures], hot: HotPixels) -> DarkSummary:
-    """Return what dark frames show together."""
+    """Summarise all dark frames."""
     if not frames:
         return DarkSummary()
     noise = median_noise(frames)

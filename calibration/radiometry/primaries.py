@@ -1,9 +1,9 @@
-"""Red, green and blue alone: the flat field of coloured cells, whether the primaries add up, and how the lamp drifts.
+"""Use frames of red, green and blue alone: flat field of coloured patches, additivity, and lamp drift.
 
-A projector's red, green and blue do not fade alike towards the corners. The field of a light that mixes them, as bare
-paper shows it, is the mean of their fields, weighted by what paper reflects of each; a coloured cell reflects other
-shares, and its mean is another. The frames of the primaries alone show both
-(`docs/decisions/0014-fields-of-the-primaries.md`). Additivity and drift alter no table.
+The fall-off of red, green and blue towards the corners of the projected image differs. On paper, the field of a mixed
+illuminant is the mean of their fields weighted by the reflected light of each. A coloured patch reflects other
+proportions, so its mean field differs. The frames of the primaries give both
+(`docs/decisions/0014-fields-of-the-primaries.md`). Additivity and drift do not change a LUT.
 """
 
 from __future__ import annotations
@@ -23,24 +23,19 @@ from experiment.measures.paper import FlatField, Paper
 
 _Array = npt.NDArray[np.float64]
 
-# Counts above black that paper must show under a primary for its field to be known well enough (judgement).
+# Minimum counts above black level of paper under a primary for a precise field (judgement).
 LEAST_PAPER = 300.0
 
-_LARGEST = 0.2  # Share by which a cell's field may differ from paper's; beyond, the difference is noise and left out
+_LARGEST = 0.2  # largest relative difference of a patch's field from paper; more is noise, and ignored
 
 
 @dataclass(frozen=True, eq=False)
 class Additivity:
-    """How white is made of the primaries.
+    """Comparison of white with the sum of the primaries."""
 
-    - `off`: (3,) float64, by how much they together differ from white in each channel, relative to white.
-    - `error`: (3,) float64, its standard error by what is not known of the sensor.
-    - `amounts`: (3,) float64, how much of red, green and blue alone white has, 1 where it adds.
-    """
-
-    off: _Array
-    error: _Array
-    amounts: _Array
+    off: _Array  # (3,) relative difference of the sum from white in each channel
+    error: _Array  # (3,) its standard uncertainty from the linearity of the sensor
+    amounts: _Array  # (3,) amounts of red, green and blue in white; 1 if light adds
 
 
 def additivity(
@@ -51,39 +46,49 @@ def additivity(
     gains: _Array,
     sensor: Superposition,
 ) -> Additivity | None:
-    """Return how white is made of the primaries; None when one of them or white is missing.
+    """Compare white with the sum of the primaries; None if a primary or white is missing.
 
-    red + green + blue − 2 black = white where light adds: each of the three brings the projector's black along. A
-    projector with a white segment on its wheel, or one that processes colours, gives more or less. It harms no table,
-    since each light's ground truth is measured; it means that a light cannot be predicted from its codes. A sensor that
-    compresses white would hide that too much dark light was subtracted: what is measured of that is taken out first.
+    red + green + blue − 2 black = white if light adds, because each of the three includes the black of the projector. A
+    projector with a white segment in its wheel or with colour processing differs. This does not harm a LUT, because the
+    ground truth of each illuminant is measured, but whites cannot be predicted from codes. Measured nonlinearity is
+    corrected first: compression of white would hide that too much dark light was subtracted.
 
-    `lights`: L lights; used are the three with one full primary, and full white if `full_white` is None. `white`: (L,
-    3) their ground truths. `full_white`: (3,) paper under full white from the white frames, None without. `dark`: (3,)
-    paper in the dark frames; zeros where already subtracted. `gains`: (L, 3) the lamp's drift at each light, of which
-    white frames are free; `drift_gains`. `sensor`: how its counts deviate from proportion to light.
+    Parameters
+    ----------
+    lights : sequence of Illumination
+        The L illuminants; the three full primaries are used, and full white if `full_white` is None.
+    white : (L, 3) float64
+        Ground truths.
+    full_white : (3,) float64, optional
+        Paper in the white frames.
+    dark : (3,) float64
+        Paper in the dark frames; zeros if already subtracted.
+    gains : (L, 3) float64
+        Lamp drift at each illuminant (`drift_gains`), not in white frames.
+    sensor : Superposition
+        Linearity of the sensor.
     """
     index_of: dict[tuple[int, int, int], int] = {light.colour: light.index for light in lights}
     primaries = [index_of[codes] for codes in ((255, 0, 0), (0, 255, 0), (0, 0, 255)) if codes in index_of]
-    full = index_of.get((255, 255, 255))
-    if len(primaries) < 3 or (full_white is None and full is None) or not np.isfinite(dark).all():
+    white_index = index_of.get((255, 255, 255))
+    if len(primaries) < 3 or (full_white is None and white_index is None) or not np.isfinite(dark).all():
         return None
-    counts = np.array([white[full] if full_white is None else full_white, *white[primaries]])
+    counts = np.array([white[white_index] if full_white is None else full_white, *white[primaries]])
     deviation, weights = sensor.relative(np.maximum(counts, 0))
-    drift = np.ones(3) if full_white is not None else gains[full]
-    total, *alone = counts / (1 + deviation) / np.array([drift, *gains[primaries]]) - dark
-    off = (np.sum(alone, axis=0) - total) / (total + dark)
-    together = np.einsum("pc,pck->ck", np.array(alone) / (total + dark), weights[1:]) - weights[0]
-    error = np.sqrt(np.einsum("ck,kl,cl->c", together, sensor.covariance, together))
+    white_gain = np.ones(3) if full_white is not None else gains[white_index]
+    total, *alone = counts / (1 + deviation) / np.array([white_gain, *gains[primaries]]) - dark
+    difference = (np.sum(alone, axis=0) - total) / (total + dark)
+    error_weights = np.einsum("pc,pck->ck", np.array(alone) / (total + dark), weights[1:]) - weights[0]
+    error = np.sqrt(np.einsum("ck,kl,cl->c", error_weights, sensor.covariance, error_weights))
     amounts: _Array = np.asarray(np.linalg.lstsq(np.array(alone).T, total, rcond=None)[0], dtype=np.float64)
-    return Additivity(off, error, amounts)
+    return Additivity(difference, error, amounts)
 
 
 def drift_gains(at_s: _Array, white_at_s: _Array, white: _Array) -> _Array:
-    """Return the lamp's light at times over that of the first white frame, linear between white frames.
+    """Return the lamp relative to the first white frame (L, 3) float64, linear between white frames.
 
-    `at_s`: (L,) when each light was taken. `white_at_s`, `white`: (W,) and (W, 3) when the white frames were taken,
-    rising, and paper in them. Returns (L, 3) float64; ones where there are fewer than two white frames.
+    `at_s`: (L,) time of each illuminant, s. `white_at_s`, `white`: (W,) and (W, 3), times in ascending order and paper
+    in the white frames. Returns ones with fewer than two white frames.
     """
     if len(white) < 2:
         return np.ones((len(at_s), 3))
@@ -94,98 +99,91 @@ def drift_gains(at_s: _Array, white_at_s: _Array, white: _Array) -> _Array:
 
 
 def pure_lights(illuminations: Sequence[Illumination]) -> tuple[int, int, int] | None:
-    """Return the index of the brightest light of red alone, of green and of blue; None where one is not planned."""
-    found: list[int] = []
+    """Return the indices of the brightest red, green and blue alone; None if one is missing."""
+    indices: list[int] = []
     for channel in range(3):
-        alone: list[tuple[int, int]] = []
+        candidates: list[tuple[int, int]] = []
         for light in illuminations:
             code = light.colour[channel]
             if code > 0 and sum(light.colour) == code:
-                alone.append((code, -light.index))
-        if not alone:
+                candidates.append((code, -light.index))
+        if not candidates:
             return None
-        found.append(-max(alone)[1])
-    return found[0], found[1], found[2]
+        indices.append(-max(candidates)[1])
+    return indices[0], indices[1], indices[2]
 
 
 @dataclass(frozen=True, eq=False)
 class Primaries:
-    """The three primaries of a session, each from a frame of it alone.
+    """The three primaries of a session, each from its own frame."""
 
-    - `lights`: index of the light of red alone, of green and of blue.
-    - `fields`: the flat field of each, from the channel in which it is brightest, the same for all channels.
-    - `paper`: (3, 3) float64 counts above black of bare paper by primary and channel, field divided out.
-    - `at_cells`: (3, C) float64, the fields at the cells.
-    - `cells`: (3, C, 3) float64 mean counts of each cell by primary, as in the table's samples of that light.
-    """
-
-    lights: tuple[int, int, int]
+    lights: tuple[int, int, int]  # indices of red, green and blue alone
+    # flat field of each, from its brightest channel, used for all channels
     fields: tuple[FlatField, FlatField, FlatField]
-    paper: _Array
-    at_cells: _Array
-    cells: _Array
+    paper: _Array  # (3, 3) counts above black level of paper by primary and channel, without field
+    at_cells: _Array  # (3, C) fields at the patches
+    cells: _Array  # (3, C, 3) mean counts of each patch by primary, as in the LUT samples
 
     @staticmethod
     def of(
         lights: Sequence[int], papers: Sequence[Paper], cells: Sequence[_Array], cells_mm: _Array
     ) -> Primaries | None:
-        """Return the primaries, None where paper shows less than `LEAST_PAPER` counts under one.
+        """Return the primaries; None if paper has less than `LEAST_PAPER` counts under one.
 
-        `cells`: (C, 3) float64 mean counts of each cell in each frame, field divided out. `cells_mm`: (C, 2) float64
-        mm, the cells' centres.
+        `cells`: (C, 3) float64, mean counts of each patch in each frame, without field. `cells_mm`: (C, 2) float64,
+        centres of the patches.
         """
         white = np.array([paper.white for paper in papers])
         if white.max(axis=1).min() < LEAST_PAPER:
             return None
-        best = white.argmax(axis=1).tolist()
+        brightest_channels = white.argmax(axis=1).tolist()
         red, green, blue = (
             replace(paper.field, coefficients=(paper.field.coefficients[channel],) * 3)
-            for paper, channel in zip(papers, best, strict=True)
+            for paper, channel in zip(papers, brightest_channels, strict=True)
         )
         at_cells = np.array([shape.at(cells_mm)[:, 0] for shape in (red, green, blue)])
-        one, two, three = lights
-        return Primaries(
-            (one, two, three), (red, green, blue), np.maximum(white, 0), at_cells, np.maximum(np.array(cells), 0)
-        )
+        r, g, b = lights
+        return Primaries((r, g, b), (red, green, blue), np.maximum(white, 0), at_cells, np.maximum(np.array(cells), 0))
 
     def amounts(self, white: _Array) -> _Array:
-        """Return how much of each primary (3,) float64, ≥ 0, a light is made of, given its paper (3,) in counts.
+        """Return the amounts (3,) float64 ≥ 0 of the primaries in an illuminant from its paper (3,), counts.
 
-        By non-negative least squares; 1 is the primary as bright as in its own frame.
+        By non-negative least squares; 1 is the primary in its own frame.
         """
         return np.asarray(nnls(self.paper.T, np.maximum(white, 0))[0])
 
     def field_ratio(self, white: _Array) -> _Array:
-        """Return the field of each cell over the field of paper in its place, (C, 3) float64, near 1.
+        """Return the field of each patch relative to paper at its position, (C, 3) float64, near 1.
 
-        `white`: (3,) counts of bare paper under the light, field divided out.
+        `white`: (3,) counts of paper under the illuminant, without field.
         """
         amounts = self.amounts(white)
         shares = amounts[:, None] * self.paper
         total = shares.sum(axis=0)
-        of_paper = np.where(total > 1, product(self.at_cells.T, shares) / np.maximum(total, 1), 1.0)
-        plain, lit = np.zeros(self.cells.shape[1:]), np.zeros(self.cells.shape[1:])
+        paper_field = np.where(total > 1, product(self.at_cells.T, shares) / np.maximum(total, 1), 1.0)
+        total_light, field_light = np.zeros(self.cells.shape[1:]), np.zeros(self.cells.shape[1:])
         for amount, at_cells, cells in zip(amounts, self.at_cells, self.cells, strict=True):
             if amount > 0:
-                part = amount * cells
-                plain += part
-                lit += at_cells[:, None] * part
-        ratio = np.where((plain > 1) & (total > 1), lit / np.maximum(plain, 1) / of_paper, 1.0)
+                contribution = amount * cells
+                total_light += contribution
+                field_light += at_cells[:, None] * contribution
+        ratio = np.where((total_light > 1) & (total > 1), field_light / np.maximum(total_light, 1) / paper_field, 1.0)
         return np.where(np.abs(ratio - 1) < _LARGEST, ratio, 1.0)
 
     @property
     def difference(self) -> float:
-        """Largest difference of two primaries' fields at a cell, as a share."""
+        """Largest relative difference of two primaries' fields at a patch."""
         return float((self.at_cells.max(axis=0) / self.at_cells.min(axis=0)).max() - 1)
 
     def correction(self, white: _Array) -> dict[str, Any]:
-        """Return what was done, for `lut.json`; `white` is (L, 3) counts, paper under each light."""
+        """Return the correction for `lut.json`; `white` is (L, 3) counts, paper under each illuminant."""
         return {
             "name": "primaries",
-            "how": "samples divided by R besides the field: R = [sum w F a / sum w a] / [sum w F p / sum w p], sums "
-            "over the primaries; F the field of each at the cell, factors as under field; w how much of each a light "
-            "is made of; p paper under each, by channel; a the mean of the cell's samples in the light of each; R = 1 "
-            "where a divisor is below 1 count or R further from 1 than 0.2; multiply to undo, to within rounding",
+            "how": "samples divided by R in addition to the field: R = [sum w F a / sum w a] / [sum w F p / sum w p], "
+            "sums over the primaries; F field of the primary at the patch, factors as under field; w amount of the "
+            "primary in the illuminant; p paper under the primary, by channel; a mean of the patch's samples under the "
+            "primary; R = 1 if a divisor is below 1 count or R differs from 1 by more than 0.2; multiply to undo, "
+            "except rounding",
             "lights": list(self.lights),
             "field": [field.parameters()[0] for field in self.fields],
             "paper": np.round(self.paper, 4).tolist(),

@@ -1,14 +1,13 @@
-"""Linearity of the sensor by flux superposition: red, green and blue alone against a light that is made of them.
+"""Measure the linearity of the sensor by flux superposition: an illuminant against red, green and blue alone.
 
-Light adds: what a patch has under a light of several primaries is what it has under each alone, times how much of each
-there is. Counts that are proportional to light add up likewise; those of a sensor that compresses near saturation,
-loses counts near black or has its black elsewhere do not. The patches of a chart have all levels from black ink to bare
-paper, so that four frames show the whole curve. Neither print, lens nor the photosites' response matters, since the
-same photosites see all four; nor does a lamp that was brighter in one of the frames, since how much there is of each
-primary is fitted along. Detectors are calibrated so (superposition or flux-addition method: C. L. Sanders, Applied
-Optics 1, 1962).
+Light adds: the light of a patch under several primaries is the sum of its light under each primary, times the amount of
+each. Counts of a linear sensor add in the same way; the counts of a sensor with compression near saturation, loss near
+black or a wrong black level do not. The patches cover all levels from black ink to paper, so four frames show the whole
+curve. Chart, lens and photosite response do not matter, because the same photosites are compared. Lamp changes between
+frames do not matter, because the amounts of the primaries are fitted too. This is the superposition or flux-addition
+method of detector calibration (C. L. Sanders, Applied Optics 1, 1962).
 
-A factor common to all counts is not seen, and matters to no chromaticity.
+A factor common to all counts cannot be measured, and has no effect on chromaticities.
 """
 
 from __future__ import annotations
@@ -24,39 +23,39 @@ import numpy.typing as npt
 from experiment.measures.least_squares import code_polynomial
 from foundation.robust import huber_weights, sigma_by_level
 
-# Shares of saturation between which the deviation is interpolated; it is 0 at black.
+# Nodes of the interpolated deviation, relative to saturation; the deviation is 0 at black.
 NODES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0)
 
-# Standard deviation, before it is measured, of the relative deviation at saturation: EMVA 1288 linearity errors of
-# cameras' raw files are below 1 %.
+# Prior standard deviation of the relative deviation at saturation: EMVA 1288 linearity errors of raw files are below
+# 1 %.
 _USUAL_BEND = 0.01
 
-_USUAL_LOSS = 0.0005  # The same of what is lost or added near black, of saturation: some counts of 14 bits
+_USUAL_LOSS = 0.0005  # prior loss or gain near black, relative to saturation: some counts of 14 bits
 
-_LOSS_SCALES = (0.0005, 0.002)  # Shares of saturation within which that happens
+_LOSS_SCALES = (0.0005, 0.002)  # range of this loss, relative to saturation
 
-_USUAL_REST = 0.0003  # The same of what is neither, of each level
+_USUAL_REST = 0.0003  # prior of other deviations, relative to the level
 
-_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)  # By how much a camera may deviate otherwise than usual
+_SCALES = (0.03, 0.3, 1.0, 3.0, 10.0)  # factors of the usual deviations, with equal odds
 
-_LEAST_PATCHES = 100  # Patches in a channel from which on something is said (judgement)
+_LEAST_PATCHES = 100  # minimum number of patches (judgement)
 
-_CODE_DEGREE = 4  # Of the polynomial in the codes that says what a patch has without its noise
+_CODE_DEGREE = 4  # degree of the polynomial in the codes that predicts patches without noise
 
-_LOOSE = 10.0  # Standard deviation of how much of a primary a light has, before it is fitted: nothing is known
+_LOOSE = 10.0  # prior standard deviation of the amount of a primary: no information
 
-_OWN_SPECTRUM = 0.001  # The same of how it differs from channel to channel: a primary keeps its spectrum
+_OWN_SPECTRUM = 0.001  # prior for differences of it between channels: a primary keeps its spectrum
 
-# What full white may be: how its primaries differ beside what they have in common, how each does from channel to
-# channel, and how likely that is beforehand (chosen). The primaries as they are alone; these, of a wheel that
-# exposures cut; and light of another spectrum besides, of a projector that brightens white.
+# Models of full white: standard deviation of the primaries' amounts, the same between channels, and prior odds
+# (judgement). The primaries as in their own frames; with exposures that cut the period of a colour wheel; and with
+# additional light of another spectrum, from a projector that boosts white.
 _WHITES = ((0.003, _OWN_SPECTRUM, 0.6), (0.05, _OWN_SPECTRUM, 0.3), (_LOOSE, _LOOSE, 0.1))
 
-_GROUPS = 12  # Groups of like levels, in each of which the scatter is measured
+_GROUPS = 12  # number of groups of similar levels for measuring the scatter
 
-_ROUNDS = 3  # Solutions in a row, each weighted and linearised by the one before
+_ROUNDS = 3  # number of solutions, each weighted and linearised by the previous one
 
-_AMOUNTS = 12  # Unknowns before the nodes': of each primary, and what each channel sees otherwise
+_AMOUNTS = 12  # unknowns before the nodes: amount of each primary, and its difference in each channel
 
 _Array = npt.NDArray[np.float64]
 
@@ -66,77 +65,69 @@ _SERIES = "give a series of exposures of the chart with --linearity"
 
 @dataclass(frozen=True)
 class Unmeasured:
-    """Why superposition shows nothing in a session, and what would."""
+    """Reason for a missing linearity measurement, and the remedy."""
 
     why: str
     remedy: str
 
 
 NO_PRIMARIES = Unmeasured(
-    "no lights of each primary alone show it",
-    f"plan red, green and blue each alone (acquire illuminations does), or {_SERIES}",
+    "the session has no illuminants of each primary alone",
+    f"plan red, green and blue each alone, as acquire illuminations does, or {_SERIES}",
 )
 MOVED = Unmeasured(
-    "the chart moved between the frames of the primaries and the one that is registered first",
-    f"see that print and camera stay where they are, or {_SERIES}",
+    "the chart moved between the frames of the primaries and the first registered frame",
+    f"keep chart and camera in place, or {_SERIES}",
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Superposition:
-    """How counts deviate from proportion to light, and how well that is known.
+    """Deviation of counts from proportionality to light, with its uncertainty."""
 
-    - `full`: counts above black of saturation.
-    - `deviation`: (K,) float64 counts at `NODES`, what is measured less what a proportional sensor would have.
-    - `covariance`: (K, K) float64 counts².
-    - `unmeasured`: why frames do not show it, where it is what is usual of cameras; None where they do.
-    """
-
-    full: float
-    deviation: _Array
-    covariance: _Array
-    unmeasured: Unmeasured | None
+    full: float  # counts above black level at saturation
+    deviation: _Array  # (K,) counts at `NODES`, measured minus proportional
+    covariance: _Array  # (K, K) counts²
+    unmeasured: Unmeasured | None  # reason for assuming usual deviations; None: measured
 
     @staticmethod
     def usual(full: float, unmeasured: Unmeasured = NO_PRIMARIES) -> Superposition:
-        """Return what is usual of cameras, where a session shows nothing of it."""
+        """Return usual deviations of cameras, for a session without a measurement."""
         return Superposition(full, np.zeros(len(NODES)), _usual(full), unmeasured)
 
     @property
     def measured(self) -> bool:
-        """Whether frames show it."""
+        """Whether frames show the deviation."""
         return self.unmeasured is None
 
     def relative(self, level: _Array) -> tuple[_Array, _Array]:
-        """Return the relative deviation (...) at levels (...), counts above black, and its weights (..., K)."""
+        """Return the relative deviation (...) at levels (...), counts above black level, and its weights (..., K)."""
         weights = _hats(level / self.full) / np.maximum(level, 1e-9)[..., None]
         return weights @ self.deviation, weights
 
     def errors(self, level: _Array, reference: _Array) -> _Array:
-        """Return the mean square (...) of the relative error of levels (...) to references of any shape that fits.
+        """Return the mean square (...) of the relative error of levels (...) against references, broadcast."""
+        # Counts are not corrected for the deviation, so its full size is an error.
+        deviation, variance = self.difference(level, reference)
+        return deviation**2 + variance
 
-        What is measured is not taken out of the counts: it counts as an error of its full size.
-        """
-        off, variance = self.beside(level, reference)
-        return off**2 + variance
-
-    def beside(self, level: _Array, reference: _Array) -> tuple[_Array, _Array]:
-        """Return the relative deviation (...) of levels less that of references, and the square of its error."""
-        (found, weights), (at_reference, of_reference) = self.relative(level), self.relative(reference)
-        weights = weights - of_reference
-        return found - at_reference, np.einsum("...k,kl,...l->...", weights, self.covariance, weights)
+    def difference(self, level: _Array, reference: _Array) -> tuple[_Array, _Array]:
+        """Return the relative deviation (...) of levels minus references, and its variance."""
+        (deviation, weights), (reference_deviation, reference_weights) = self.relative(level), self.relative(reference)
+        weights = weights - reference_weights
+        return deviation - reference_deviation, np.einsum("...k,kl,...l->...", weights, self.covariance, weights)
 
     def white_covariance(self, white: _Array) -> _Array:
-        """Return the mean square (L, 3, 3) float64 of the relative error that it leaves in whites (L, 3), counts."""
-        found, weights = self.relative(white)
-        off = found - found.mean(axis=1, keepdims=True)
-        return weights @ self.covariance @ np.swapaxes(weights, 1, 2) + off[:, :, None] * off[:, None, :]
+        """Return the mean square (L, 3, 3) float64 of the relative error of whites (L, 3), counts."""
+        deviation, weights = self.relative(white)
+        chromatic = deviation - deviation.mean(axis=1, keepdims=True)
+        return weights @ self.covariance @ np.swapaxes(weights, 1, 2) + chromatic[:, :, None] * chromatic[:, None, :]
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as `report.json` states it: shares of each node's level."""
+        """Return the content of `report.json`, relative to the level of each node."""
         level = np.array(NODES) * self.full
         shares = {"deviation": self.deviation / level, "standard_error": np.sqrt(np.diag(self.covariance)) / level}
-        rounded = {name: [float(f"{value:.4g}") for value in found.tolist()] for name, found in shares.items()}
+        rounded = {name: [float(f"{value:.4g}") for value in values.tolist()] for name, values in shares.items()}
         return {"measured": self.measured, "level_share": list(NODES), **rounded}
 
 
@@ -145,126 +136,132 @@ def superposition(
     together: _Array,
     full: float,
     usable: npt.NDArray[np.bool_],
-    known: _Array,
+    predictors: _Array,
     white: bool,
 ) -> Superposition:
-    """Return what a light of several primaries shows beside each alone; what is usual where that is too little.
+    """Measure the linearity from an illuminant and its primaries; usual deviations if there are too few patches.
 
-    `alone`: three (P, 3) float64 counts above black of patches under red, green and blue alone, nothing but black
-    subtracted. `together`: (P, 3) the same under the light. `full`: counts above black of saturation. `usable`: (P,)
-    bool, patches that are inside the frames, not clipped and not covered. `known`: (P, M) float64, what patches are
-    printed with, which predicts their levels without noise. `white`: whether the light is all of each primary.
+    Parameters
+    ----------
+    alone : three (P, 3) float64
+        Counts above black level of patches under red, green and blue alone, not corrected for dark light.
+    together : (P, 3) float64
+        The same under the illuminant.
+    full : float
+        Counts above black level at saturation.
+    usable : (P,) bool
+        Patches inside the frames that are not clipped or covered.
+    predictors : (P, M) float64
+        Functions of the printed codes that predict levels without noise (`printed_predictors`).
+    white : bool
+        The illuminant is full white.
     """
-    patches, needed = int(usable.sum()), max(_LEAST_PATCHES, 2 * known.shape[1])
+    patches, needed = int(usable.sum()), max(_LEAST_PATCHES, 2 * predictors.shape[1])
     if patches < needed:
-        why = f"{patches} patches of the chart can be used for it and {needed} are needed, whichever lights are planned"
-        return Superposition.usual(full, Unmeasured(why, f"use a chart of more colours, or {_SERIES}"))
-    seen, known = np.stack([together, *alone])[:, usable], known[usable]
-    hats, size = _hats(seen / full), _AMOUNTS + len(NODES)
+        why = f"the chart has {patches} usable patches, minimum {needed}, with any illuminants"
+        return Superposition.usual(full, Unmeasured(why, f"use a chart with more colours, or {_SERIES}"))
+    levels, predictors = np.stack([together, *alone])[:, usable], predictors[usable]
+    hats, size = _hats(levels / full), _AMOUNTS + len(NODES)
     whites = _WHITES if white else ((_LOOSE, _LOOSE, 1.0),)
-    priors = [(_prior(full, scale, like, own), odds) for scale, (like, own, odds) in product(_SCALES, whites)]
-    # Unknowns are what is there beside this: sums of squares of the light itself would drown what tells priors apart.
-    usual = np.zeros(size)
-    usual[:3] = 1.0 if white else np.linalg.lstsq(seen[1:].reshape(3, -1).T, seen[0].ravel(), rcond=None)[0]
-    solution, covariance = usual, np.zeros((size, size))
+    priors = [(_prior(full, scale, *sigmas), odds) for scale, (*sigmas, odds) in product(_SCALES, whites)]
+    # Unknowns are differences from this start: squares of the full light would hide the differences between priors.
+    start = np.zeros(size)
+    start[:3] = 1.0 if white else np.linalg.lstsq(levels[1:].reshape(3, -1).T, levels[0].ravel(), rcond=None)[0]
+    solution, covariance = start, np.zeros((size, size))
     for _ in range(_ROUNDS):
         matrix, right, misfit = np.zeros((size, size)), np.zeros(size), 1.0
         for channel in range(3):
             own = slice(3 + 3 * channel, 6 + 3 * channel)
             amounts = solution[:3] + solution[own]
-            value, parts = seen[0, :, channel], seen[1:, :, channel].T
-            # What proportional counts would have: value - m(value) = sum of amount (part - m(part)).
+            value, primaries = levels[0, :, channel], levels[1:, :, channel].T
+            # Corrected counts are proportional: value - m(value) = sum of amount (primary - m(primary)).
             bend = hats[0, :, channel] - np.einsum("k,kpn->pn", amounts, hats[1:, :, channel])
             design = np.zeros((len(value), size))
-            design[:, :3], design[:, own], design[:, _AMOUNTS:] = parts, parts, bend
-            left = value - design @ solution
-            sigma = sigma_by_level(left, value, _GROUPS) + 1e-9
-            root = huber_weights(np.abs(left) / sigma, 1.0) / sigma
-            # The primaries' frames have noise, too; what the print gives of them has not (two-stage least squares).
-            rows, told = root[:, None] * known, root[:, None] * design
-            clean = rows @ np.linalg.lstsq(rows, told, rcond=None)[0]
-            matrix += clean.T @ clean
-            right += clean.T @ (root * (value - design @ usual))
-            misfit = max(misfit, _misfit(rows, root * left))
-        beside, covariance = _posterior(matrix / misfit, right / misfit, priors)
-        solution = usual + beside
+            design[:, :3], design[:, own], design[:, _AMOUNTS:] = primaries, primaries, bend
+            residual = value - design @ solution
+            sigma = sigma_by_level(residual, value, _GROUPS) + 1e-9
+            root = huber_weights(np.abs(residual) / sigma, 1.0) / sigma
+            # The frames of primaries have noise; their prediction from the codes has none (two-stage least squares).
+            rows, weighted = root[:, None] * predictors, root[:, None] * design
+            projected = rows @ np.linalg.lstsq(rows, weighted, rcond=None)[0]
+            matrix += projected.T @ projected
+            right += projected.T @ (root * (value - design @ start))
+            misfit = max(misfit, _misfit(rows, root * residual))
+        difference, covariance = _posterior(matrix / misfit, right / misfit, priors)
+        solution = start + difference
     return Superposition(full, solution[_AMOUNTS:], covariance[_AMOUNTS:, _AMOUNTS:], None)
 
 
 def _posterior(matrix: _Array, right: _Array, priors: Sequence[tuple[_Array, float]]) -> tuple[_Array, _Array]:
-    """Return mean (U,) and covariance (U, U) of the unknowns: of each prior's solution by how likely it makes the data.
-
-    `priors`: the inverse (U, U) of each one's covariance, and how likely it is beforehand.
-
-    Bayesian model averaging (J. A. Hoeting and others, Statistical Science 14, 1999): of a small bend the usual prior
-    says more than a chart of few cells, of a large one the cells do.
-    """
+    """Return mean (U,) and covariance (U, U) of the unknowns, averaged over priors weighted by evidence."""
+    # Bayesian model averaging (J. A. Hoeting and others, Statistical Science 14, 1999): for a small deviation the usual
+    # prior has more information than a chart with few patches, for a large one the patches have more.
     covariances: list[_Array] = []
     means: list[_Array] = []
     evidence = np.zeros(len(priors))
     for number, (prior, odds) in enumerate(priors):
-        # Brought to a diagonal of 1: amounts of light and counts near black differ by ten powers of ten.
+        # Scale the diagonal to 1: amounts and counts near black differ by ten orders of magnitude.
         size = np.sqrt(np.diag(matrix + prior))
         scaled = (matrix + prior) / np.outer(size, size)
         covariance: _Array = np.linalg.inv(scaled) / np.outer(size, size)
         mean: _Array = np.linalg.solve(scaled, right / size) / size
-        known = np.linalg.slogdet(scaled)[1] + 2 * np.log(size).sum()
-        evidence[number] = 0.5 * (right @ mean - known + np.linalg.slogdet(prior)[1]) + np.log(odds)
+        log_determinant = np.linalg.slogdet(scaled)[1] + 2 * np.log(size).sum()
+        evidence[number] = 0.5 * (right @ mean - log_determinant + np.linalg.slogdet(prior)[1]) + np.log(odds)
         covariances.append(covariance)
         means.append(mean)
     weights = np.exp(evidence - evidence.max())
     weights /= weights.sum()
     mean = np.einsum("m,mu->u", weights, means)
-    apart = np.array(means) - mean
-    return mean, np.einsum("m,muv->uv", weights, covariances) + np.einsum("m,mu,mv->uv", weights, apart, apart)
+    delta = np.array(means) - mean
+    return mean, np.einsum("m,muv->uv", weights, covariances) + np.einsum("m,mu,mv->uv", weights, delta, delta)
 
 
 def printed_predictors(codes: npt.ArrayLike, references: npt.NDArray[np.integer]) -> _Array:
-    """Return what cells and references are printed with, (C + N, M) float64, as `superposition` asks for.
+    """Return predictors (C + N, M) float64 of patches and references, for `superposition`.
 
-    `codes`: (C, 3) int, 0 … 255. `references`: (N,) int, which of them have one colour, from 0.
+    `codes`: (C, 3) int, 0 … 255. `references`: (N,) int, index of the colour of each reference, from 0.
     """
-    cells = code_polynomial(codes, _CODE_DEGREE)
-    alike = np.eye(int(references.max(initial=-1)) + 1)[references]
-    corner = np.zeros((len(cells), alike.shape[1])), np.zeros((len(alike), cells.shape[1]))
-    return np.block([[cells, corner[0]], [corner[1], alike]])
+    patches = code_polynomial(codes, _CODE_DEGREE)
+    reference_colours = np.eye(int(references.max(initial=-1)) + 1)[references]
+    zeros = np.zeros((len(patches), reference_colours.shape[1])), np.zeros((len(reference_colours), patches.shape[1]))
+    return np.block([[patches, zeros[0]], [zeros[1], reference_colours]])
 
 
-def _prior(full: float, scale: float, like: float, own: float) -> _Array:
-    """Return the inverse of the prior covariance of all unknowns; `like`, `own`: as in `_WHITES`."""
+def _prior(full: float, scale: float, amount_sd: float, channel_sd: float) -> _Array:
+    # Inverse of the prior covariance of all unknowns; arguments as in `_WHITES`.
     prior = np.zeros((_AMOUNTS + len(NODES), _AMOUNTS + len(NODES)))
-    prior[:3, :3] = np.linalg.inv(_LOOSE**2 * np.ones((3, 3)) + like**2 * np.eye(3))
-    prior[3:_AMOUNTS, 3:_AMOUNTS] = np.eye(_AMOUNTS - 3) / own**2
+    prior[:3, :3] = np.linalg.inv(_LOOSE**2 * np.ones((3, 3)) + amount_sd**2 * np.eye(3))
+    prior[3:_AMOUNTS, 3:_AMOUNTS] = np.eye(_AMOUNTS - 3) / channel_sd**2
     prior[_AMOUNTS:, _AMOUNTS:] = np.linalg.inv(scale**2 * _usual(full))
     return prior
 
 
 def _usual(full: float) -> _Array:
-    """Return the covariance (K, K) float64 counts² that is usual: bends of all counts, what is lost near black."""
+    """Return the prior covariance (K, K) float64 counts²: curvature of all counts, and loss near black."""
     level = np.array(NODES)
     bends = [_USUAL_BEND * level**2, _USUAL_BEND * level**3]
     losses = [_USUAL_LOSS * (1 - np.exp(-level / scale)) for scale in _LOSS_SCALES]
-    # The amounts of the primaries go along with any straight line: of all that fit as well, the one with none.
+    # A straight line is equivalent to other amounts of the primaries: remove it from each shape.
     shapes = [shape - level * float((shape / level).mean()) for shape in (*bends, *losses)]
-    found: _Array = full**2 * (
-        np.sum([np.outer(one, one) for one in shapes], axis=0) + np.diag(_USUAL_REST * level) ** 2
+    covariance: _Array = full**2 * (
+        np.sum([np.outer(shape, shape) for shape in shapes], axis=0) + np.diag(_USUAL_REST * level) ** 2
     )
-    return found
+    return covariance
 
 
 def _hats(share: _Array) -> _Array:
-    """Return the weights (..., K) float64 of the nodes at shares (...) of saturation, linear between them."""
+    # weights (..., K) of linear interpolation between the nodes, 0 at black
     nodes = np.array([0.0, *NODES])
     inside = np.clip(share, 0, nodes[-1])
     right = np.clip(np.searchsorted(nodes, inside, side="right"), 1, len(nodes) - 1)
-    part = (inside - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
+    fraction = (inside - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
     weights = np.zeros((*share.shape, len(nodes)))
-    np.put_along_axis(weights, right[..., None], part[..., None], axis=-1)
-    np.put_along_axis(weights, right[..., None] - 1, 1 - part[..., None], axis=-1)
+    np.put_along_axis(weights, right[..., None], fraction[..., None], axis=-1)
+    np.put_along_axis(weights, right[..., None] - 1, 1 - fraction[..., None], axis=-1)
     return weights[..., 1:]
 
 
-def _misfit(known: _Array, left: _Array) -> float:
-    """Return what the print explains of what is left, for each of its unknowns, over chance: at least 1."""
-    explained = known @ np.linalg.lstsq(known, left, rcond=None)[0]
-    return max(1.0, float(explained @ explained) / known.shape[1])
+def _misfit(predictors: _Array, residual: _Array) -> float:
+    # χ² per predictor of the part of the residual that the predictors explain, at least 1.
+    explained = predictors @ np.linalg.lstsq(predictors, residual, rcond=None)[0]
+    return max(1.0, float(explained @ explained) / predictors.shape[1])

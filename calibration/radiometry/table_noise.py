@@ -1,4 +1,4 @@
-"""The photon-transfer curve of a table: how the variance of its samples grows with their mean."""
+"""Measure the photon-transfer curve of a LUT: variance of its samples against their mean."""
 
 from __future__ import annotations
 
@@ -14,23 +14,25 @@ if TYPE_CHECKING:
     from calibration.sampling import PhotonTransfer
     from calibration.table.lut import Lut
 
-_LIGHTS: Final = 6  # Lights whose cells are measured: 200 000 cells of a full table tell each number to a percent
+_LIGHTS: Final = 6  # illuminants to measure: 200 000 patches of a full LUT give each parameter to 1 %
 
-# RMS by which variances may differ from the curve, relative: .006 in the simulated tables of two cameras, and .1
-# where a table has so few cells that a level is known from eight.
+# Largest relative RMS difference of variances from the curve: 0.006 in simulated LUTs of two cameras, 0.1 in LUTs with
+# only eight patches per level.
 _MISFIT: Final = 0.25
 
-_FEWEST: Final = 32  # Cells that a curve of three numbers is fitted to at least
+_FEWEST: Final = 32  # minimum number of patches for a curve of three parameters
 
 
 def noise_curve(lut: Lut) -> PhotonTransfer | None:
-    """Return the photon-transfer curve of a table's samples; None where they have no noise at all.
+    """Return the photon-transfer curve of the samples of a LUT; None if they have no noise at all.
 
-    Read from the cells under up to six of its lights, those that are brightest in their darkest channel, so that
-    dark samples, which are cut at 0 and hence too quiet, are few; cells with such a sample, and unfit cells, are left
-    out. The curve is fitted by `calibration.sampling`.
+    Uses up to six illuminants, those with the brightest darkest channel. Samples of 0 are clipped, so their noise is
+    too small: patches with such samples are excluded, and unfit patches as well. `calibration.sampling` fits the curve.
 
-    Raises `InputError`: the samples do not follow the curve, or too few cells can be read.
+    Raises
+    ------
+    InputError
+        If the samples do not follow the curve, or too few patches are usable.
     """
     count = lut.samples.shape[2]
     lights = np.argsort(-lut.white.min(axis=1), kind="stable")[:_LIGHTS]
@@ -46,15 +48,15 @@ def noise_curve(lut: Lut) -> PhotonTransfer | None:
     cells = sum(map(len, means))
     if cells < _FEWEST:
         raise InputError(
-            f"the noise of {lut.folder} cannot be measured: {cells} cells with several samples above 0, expected "
-            f"{_FEWEST} or more; leave out --iso, --exposure and --gradient, or use another table"
+            f"the noise of {lut.folder} cannot be measured: {cells} patches have several samples above 0, minimum "
+            f"{_FEWEST}; omit --iso, --exposure and --gradient, or use another LUT"
         )
     curve = photon_transfer(np.concatenate(means), np.concatenate(variances), count)
-    seen = np.concatenate(variances).max() > 0
-    if seen and not curve.misfit.max() <= _MISFIT:
+    has_noise = np.concatenate(variances).max() > 0
+    if has_noise and not curve.misfit.max() <= _MISFIT:
         raise InputError(
-            f"the samples of {lut.folder} do not follow the photon-transfer curve: variances differ from it by "
-            f"{curve.misfit.max():.0%} RMS, expected {_MISFIT:.0%} or less; leave out --iso, --exposure and "
-            "--gradient, or use another table"
+            f"the samples of {lut.folder} do not follow the photon-transfer curve: their variances differ by "
+            f"{curve.misfit.max():.0%} RMS, limit {_MISFIT:.0%}; omit --iso, --exposure and --gradient, or use "
+            "another LUT"
         )
-    return curve if seen else None
+    return curve if has_noise else None

@@ -1,1 +1,1 @@
-"""Where every cell of the chart lies in a frame, and how far a later frame has moved."""
+"""Registration: the position of every patch in a frame, and movements in later frames."""

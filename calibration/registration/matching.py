@@ -1,9 +1,9 @@
-"""The map from print to frame moved until both coincide, and how well each place is known then.
+"""Move the map from print to frame until both coincide, and estimate the uncertainty of positions.
 
-The frame is rectified to the print, compared with the print's colours as the camera sees them (a colour model fitted on
-the frame itself), and a smooth displacement is fitted to what does not coincide: first whole blocks are found by
-correlation (`find_blocks`), then all cells move together, by Gauss-Newton steps (`compare_tiles`). Without the first
-the second locks onto the neighbouring cell. All colours are used, each in its own place; the map is green's.
+The frame is rectified to the print and compared with the print in camera colours (a model fitted to the frame itself).
+A smooth displacement is fitted to the differences. First, blocks of patches are located by correlation (`find_blocks`);
+otherwise the next stage could converge to neighbouring patches. Then all patches move together in Gauss-Newton steps
+(`compare_tiles`). All channels are used, each at its own position; the map describes green.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 
-from calibration.registration.colours import ColourModel, fit_colours, slipped_parts
+from calibration.registration.colours import ColourModel, displaced_areas, fit_colours
 from calibration.registration.geometry import (
     MOST_ROUGHNESS_PX,
     ROUGHNESS_PX,
@@ -32,76 +32,78 @@ from experiment.chart.model import PAPER_WHITE, Chart
 from experiment.framing.homography import rms
 from foundation.errors import RegistrationError
 
-# px⁻²: a block whose place has a standard error of half a pixel or more does not count as compared.
+# px⁻²: blocks with a standard uncertainty of their position of 0.5 px or more are not used.
 _LEAST_INFORMATION = 4.0
 
 _MEDIAN_CHI2 = 1.386  # Median of χ² with 2 degrees of freedom
 
-# Cells along a neighbourhood whose own movements are averaged: one alone is known to .05 px, its noise.
+# Width in patches of the window for averaging residual movements; a single patch has a noise of 0.05 px.
 _AROUND_CELLS = 3
 
-# Of the usual cell's information, from which on a cell's movement counts as much as others': a curled rim has less.
+# Upper bound of the weight of a patch, relative to the median information: a curled rim has less than others.
 _LEAST_SHARE = 0.15
 
-# Standard error that no number of cells takes away: the print as predicted is not blurred quite as the frame is
-# (simulated frames, small charts and large).
+# Systematic standard uncertainty of positions: the blur of the predicted print is not exact (simulated frames, small
+# and large charts).
 SYSTEMATIC_PX = 0.01
 
-# Square of a place's error for each square of the outline's residual: two axes for the one across, and twice that, as
-# the map bends towards the outline's points and not towards places inside.
-_OF_OUTLINE = 4.0
+# Squared position error per squared outline residual: 2 for two axes instead of one, times 2 because the map is fitted
+# to the points of the outline and not to positions inside.
+_INSIDE_FACTOR = 4.0
 
-_NEAR_MARKS = 24  # Points of an outline of 640 whose mean square is that of a part of it: known to a third
+# Number of neighbouring outline points (of 640) in a local mean square, which is then accurate to a third.
+_NEAR_MARKS = 24
 
-_NOISE = 2.0  # Times the noise to be expected of such a mean that are taken off its square: what is left is no noise
+# Multiple of the expected noise that is subtracted from the square of an averaged movement.
+_NOISE = 2.0
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
-# Cells along the blocks that are searched for, and how far, first and then: large ones are never taken for others,
-# small ones follow waves of 150 mm and curled edges to 0.2 … 0.3 px RMS, in simulated frames (of 6 mm).
+# Width of blocks and search range, both in patches, of the first and second search. Large blocks are never confused;
+# small blocks follow waves (6 mm, period 150 mm) and curled edges to 0.2 … 0.3 px RMS in simulated frames.
 _COARSE_BLOCKS = ((10, 1.5), (5, 1.0))
 
-# Cells along the window of the fine comparison: blocks of 6 leave larger errors at the worst cell, .40 px for .38.
+# Width in patches of the window of the fine comparison. With 6, the largest error is 0.40 px instead of 0.38 px.
 _BLOCK_CELLS = 8
 
-# Cells between the displacement's knots: less than a window's, so that the spline follows what windows resolve.
+# Distance of spline knots in patches: smaller than a window, to follow all that the window resolves.
 _KNOT_CELLS = 5
 
-_COARSE_PER_CELL = 5  # Raster elements along a cell where whole blocks are searched for
+_COARSE_PER_CELL = 5  # Raster elements along a patch in the search of blocks
 
-# Raster elements for each pixel of a cell in the fine comparison, and how many a cell has.
+# Fine comparison: raster elements per pixel, and least and largest number along a patch.
 _PER_CELL_PX, _LEAST_PER_CELL, _MOST_PER_CELL = 0.8, 8, 16
 
-# Cells along the window within which gain and offset are constant where print and frame are blurred by cells.
+# Width in patches of the window with constant gain and offset when print and frame are blurred over patches.
 _FOLLOWED_CELLS = 12
 
-# Independent measurements that such a window counts for: what the colours leave is alike over many cells.
-_WINDOW_WORTH = 4
+# Number of independent measurements in such a window: colour errors are correlated over many patches.
+_WINDOW_MEASUREMENTS = 4
 
-_RIM_SIGMAS = 3.0  # Standard deviations of the blur by which the field's rim is left out
+_RIM_SIGMAS = 3.0  # Width of the excluded rim of the field, in σ of the blur
 
-# How many neighbouring elements the misfit of the colours is alike over, where steps of colour are all there is.
+# Number of neighbouring elements with correlated colour errors, for charts of smooth order.
 _COLOURS_REPEAT = 10
 
-# Of a cell: standard error of places by what the model of a smooth order's colours misses. It is taken for a
-# movement, alike over many cells (simulated frames: .002 to .005 RMS at cells of 8 to 23 px).
+# Standard uncertainty of positions, in patches, from colour errors that appear as movements in a smooth order
+# (simulated frames: 0.002 to 0.005 RMS for patches of 8 to 23 px).
 _COLOURS_SHIFT = 0.005
 
-_BLURRED_CELLS = 0.6  # Blur in cells at which blocks of a smooth order are compared with the chart's
+_BLURRED_CELLS = 0.6  # Blur in patches for the scores of blocks of a smooth order
 
-_LEAST_BLOCK_SCORE = 0.3  # Median correlation of the blocks that are searched for; blocks of another chart give about 0
+_LEAST_BLOCK_SCORE = 0.3  # Minimum median correlation of located blocks; another chart gives about 0
 
-# Patches that the colour model is fitted on: more do not improve a polynomial of some dozen terms.
+# Number of patches for fitting the colour model; more do not improve a polynomial of some dozen terms.
 _COLOUR_PATCHES = 5000
 
-_LENS_POINTS = 2000  # Cells that the lens is fitted to again: more do not improve a dozen parameters
+_LENS_POINTS = 2000  # Number of patches for refitting the lens; more do not improve a dozen parameters
 
-# How well they are known then (judgement): what is lost of the displacement, .02 px, the next steps measure again.
+# Their assumed standard uncertainty (judgement). The smoothing error, 0.02 px, is corrected by the next steps.
 _LENS_POINT_SIGMA_PX = 0.1
 
-# σ that cubic interpolation adds to a frame's edges: measured on edges of σ 0.4 to 0.7 px, less where they are
-# softer. Without it in the template, the error of the cells' places is half as large again.
+# Blur σ that cubic interpolation adds: measured on edges of σ 0.4 to 0.7 px, less on softer edges. Without it in the
+# template, position errors are 1.5 times as large.
 _INTERPOLATION_PX = 0.28
 
 _Float = npt.NDArray[np.float32]
@@ -109,70 +111,57 @@ _Float = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """How well the registration fits block by block, after the last step.
+    """Quality of the registration, block by block, after the last step."""
 
-    - `centres_mm`: (B, 2) float64.
-    - `score`: (B,) float64, correlation of the frame with the print as predicted, −1 … 1; 0 where nothing can be
-      compared.
-    - `residual_px`: (B, 2) float64, displacement that the block alone would still need.
-    """
-
-    centres_mm: _Array
-    score: _Array
-    residual_px: _Array
+    centres_mm: _Array  # (B, 2)
+    score: _Array  # (B,) correlation of frame and predicted print, −1 … 1; 0 if not comparable
+    residual_px: _Array  # (B, 2) displacement that the block alone would still need
 
     @property
     def good(self) -> _Mask:
-        """(B,) bool, whether a block was used."""
+        """(B,) bool, blocks with a sufficient correlation."""
         return self.score >= MIN_SCORE
 
 
 def fit_blocks(
-    comparison: TileComparison, raster: Raster, per_cell: int, chart: Chart, block_cells: int, all_known: bool
+    comparison: TileComparison, raster: Raster, per_cell: int, chart: Chart, block_cells: int, keep_scores: bool
 ) -> Blocks:
-    """Return how each block of cells fits, and by how much it alone would move.
-
-    `chart`: the chart. Blank margins have nothing to compare: only tiles that hold a cell count.
-    """
+    """Return score and residual of each block of patches; `keep_scores` keeps scores of low contrast."""
     rows, columns = raster.tiles(per_cell)
     across, down = (max(1, count // block_cells) for count in (columns, rows))
-    of_column = np.minimum(np.arange(columns) * across // columns, across - 1)
-    of_row = np.minimum(np.arange(rows) * down // rows, down - 1)
-    block = (of_row[:, None] * across + of_column[None, :]).ravel()
+    block_column = np.minimum(np.arange(columns) * across // columns, across - 1)
+    block_row = np.minimum(np.arange(rows) * down // rows, down - 1)
+    block = (block_row[:, None] * across + block_column[None, :]).ravel()
     count = across * down
     matrix, right = np.zeros((count, 2, 2)), np.zeros((count, 2))
     np.add.at(matrix, block, comparison.information)
     np.add.at(right, block, comparison.pull)
+    # Blank margins have no contrast: only tiles with a patch count.
     column, row = np.floor((chart.centres_mm - raster.low_mm) / np.array(chart.cell_mm)).astype(int).T
     occupied = np.zeros((rows, columns))
     occupied[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)] = 1
-    holds = occupied.ravel()
-    cells = np.bincount(block, holds, count)
-    used = cells > 0
-    divisor = np.maximum(cells, 1)
+    has_patch = occupied.ravel()
+    patch_counts = np.bincount(block, has_patch, count)
+    is_used = patch_counts > 0
+    divisor = np.maximum(patch_counts, 1)
     points = comparison.points_mm
-    centres = np.stack([np.bincount(block, points[:, axis] * holds, count) / divisor for axis in (0, 1)], axis=-1)
-    mean = np.bincount(block, comparison.score * holds, count) / divisor
-    known = np.linalg.eigvalsh(matrix)[:, 0] > _LEAST_INFORMATION
+    centres = np.stack([np.bincount(block, points[:, axis] * has_patch, count) / divisor for axis in (0, 1)], axis=-1)
+    mean = np.bincount(block, comparison.score * has_patch, count) / divisor
+    is_known = np.linalg.eigvalsh(matrix)[:, 0] > _LEAST_INFORMATION
     residual = np.zeros((count, 2))
-    residual[known] = np.linalg.solve(matrix[known], right[known, :, None])[..., 0]
-    return Blocks(centres[used], np.where(known | all_known, mean, 0.0)[used], residual[used])
+    residual[is_known] = np.linalg.solve(matrix[is_known], right[is_known, :, None])[..., 0]
+    return Blocks(centres[is_used], np.where(is_known | keep_scores, mean, 0.0)[is_used], residual[is_used])
 
 
 @dataclass(frozen=True, eq=False)
 class PlaceErrors:
-    """How well the places of a registration are known.
+    """Standard uncertainty of the positions of a registration."""
 
-    - `raster`: A raster on the print whose elements are cells.
-    - `error_px`: (rows, columns) float64, standard error of the place of each element's middle, its length over x and
-      y.
-    """
-
-    raster: Raster
-    error_px: _Array
+    raster: Raster  # on the print, one element per patch
+    error_px: _Array  # (rows, columns) at the centre of each element, length over x and y
 
     def at(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the standard error (N,) float64 px at points (N, 2) mm; beyond the field, that of its rim."""
+        """Return the standard uncertainty (N,) float64 px at points (N, 2) mm; outside, the value of the rim."""
         column, row = ((np.asarray(points_mm, dtype=np.float64) - self.raster.low_mm) / self.raster.step_mm - 0.5).T
         return np.asarray(ndimage.map_coordinates(self.error_px, [row, column], order=1, mode="nearest"))
 
@@ -180,28 +169,28 @@ class PlaceErrors:
 def unfollowed_px(
     points_mm: _Array, marks_mm: _Array, residual_px: _Array, departure_px: float, reach_mm: float
 ) -> _Array:
-    """Return the standard error (N,) float64 px of places by what the map does not follow of an outline.
+    """Return the standard uncertainty (N,) float64 px from waves of the outline that the map does not follow.
 
-    A sheet is taken to wave as much inside as its outline does, along both axes; near a part of the outline, as much as
-    there. Where a part of the outline was not found, a curled corner for instance, it is taken to lie as far from a
-    plane seen through a lens as the sheet does elsewhere.
+    Inside, a sheet is taken to wave as much as its outline along both axes; near the outline, as much as the outline
+    there.
 
-    `points_mm`: (N, 2) float64. `marks_mm`, `residual_px`: (M, 2) float64, points of the outline, a rectangle, and how
-    far from the map they are seen, across it.
+    `points_mm`: (N, 2) float64. `marks_mm`, `residual_px`: (M, 2) float64, outline points and their distance from the
+    map. `departure_px`: RMS displacement of the outline. `reach_mm`: range of the local mean.
     """
-    off2 = (residual_px**2).sum(axis=1)
-    far, near = cKDTree(marks_mm).query(points_mm, k=min(_NEAR_MARKS, len(off2)))
-    far, near = np.reshape(far, (len(points_mm), -1)), np.reshape(near, (len(points_mm), -1))
-    here = np.where(far[:, 0] <= reach_mm, off2[near].mean(axis=1), 0.0)
-    squared = _OF_OUTLINE * np.maximum(here, off2.mean())
+    squared_residual = (residual_px**2).sum(axis=1)
+    distance, neighbours = cKDTree(marks_mm).query(points_mm, k=min(_NEAR_MARKS, len(squared_residual)))
+    distance, neighbours = np.reshape(distance, (len(points_mm), -1)), np.reshape(neighbours, (len(points_mm), -1))
+    local = np.where(distance[:, 0] <= reach_mm, squared_residual[neighbours].mean(axis=1), 0.0)
+    squared = _INSIDE_FACTOR * np.maximum(local, squared_residual.mean())
     low, high = marks_mm.min(axis=0), marks_mm.max(axis=0)
-    # Points at a corner may be of either side, and each tells of one direction alone.
-    on = (marks_mm - low < reach_mm / 4) | (high - marks_mm < reach_mm / 4)
+    # Corner points may belong to either side, and each measures only one direction.
+    on_side = (marks_mm - low < reach_mm / 4) | (high - marks_mm < reach_mm / 4)
     for axis in (0, 1):
         for end in (low[axis], high[axis]):
-            side = marks_mm[(np.abs(marks_mm[:, axis] - end) < reach_mm / 4) & ~on[:, 1 - axis]]
-            lost = cKDTree(side).query(points_mm)[0] > np.abs(points_mm[:, axis] - end) + reach_mm
-            squared = np.where(lost, np.maximum(squared, departure_px**2), squared)
+            side = marks_mm[(np.abs(marks_mm[:, axis] - end) < reach_mm / 4) & ~on_side[:, 1 - axis]]
+            # A missing part of the outline, such as a curled corner, gets the departure of the other parts.
+            is_missing = cKDTree(side).query(points_mm)[0] > np.abs(points_mm[:, axis] - end) + reach_mm
+            squared = np.where(is_missing, np.maximum(squared, departure_px**2), squared)
     return np.sqrt(squared)
 
 
@@ -212,88 +201,80 @@ def place_errors(
     displacement: Displacement,
     anchors: tuple[_Array, _Array],
     systematic_px: _Array | float = SYSTEMATIC_PX,
-    alike: bool = False,
+    correlated: bool = False,
 ) -> PlaceErrors:
-    """Return how well places are known: what scatter leaves open, and what the cells still ask for.
+    """Estimate the standard uncertainty of positions from scatter and from residual movements of patches.
 
-    The first is the error of the smooth displacement's fit, its measurements taken to scatter as they are found to; it
-    grows where nothing was compared. The second is what a displacement cannot follow, or has not: folds, a curled edge.
-    In simulated rooms with waves, curl and dog-ears 99 % of a whole chart's cells lie within three standard errors,
-    98 % of a chart of 512 cells.
+    The scatter part is the posterior uncertainty of the smooth fit; it grows in areas without measurements. The
+    residual part covers shapes that the displacement cannot follow, such as folds and curled edges. In simulated rooms
+    with waves, curl and dog-ears, 99 % of the patches of a full chart lie within three standard uncertainties, and 98 %
+    of the patches of a chart with 512.
 
-    `anchors`: (N, 2) mm and (N, 2, 2) px⁻², places that fix the map besides cells, and their information.
-    `systematic_px`: standard error besides, at all tiles' middles or (N,) at each.
+    `anchors`: (N, 2) mm and (N, 2, 2) px⁻², other points that fix the map, and their information. `systematic_px`:
+    additional standard uncertainty, one value or (N,) per tile. `correlated`: neighbouring patches have common errors.
     """
     shape, information = raster.tiles(per_cell), comparison.information
-    known = np.linalg.eigvalsh(information)[:, 0] > _LEAST_INFORMATION
-    own = np.zeros_like(comparison.pull)
-    own[known] = np.linalg.solve(information[known], comparison.pull[known, :, None])[..., 0]
-    chi2 = (own * comparison.pull).sum(axis=1)[known]
+    is_known = np.linalg.eigvalsh(information)[:, 0] > _LEAST_INFORMATION
+    movement = np.zeros_like(comparison.pull)
+    movement[is_known] = np.linalg.solve(information[is_known], comparison.pull[is_known, :, None])[..., 0]
+    chi2 = (movement * comparison.pull).sum(axis=1)[is_known]
     scatter = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2) if len(chi2) else 1.0
     points = comparison.points_mm
-    fitted = displacement.errors_px(
+    fit_error = displacement.errors_px(
         np.concatenate([points, anchors[0]]), np.concatenate([information / scatter, anchors[1]]), points
     )
-    # Cells whose edges differ strongly would outvote those beside them, those that hardly differ would bring noise.
+    # The weight limit keeps strong edges from dominating; patches with weak edges get a low weight against noise.
     strength = np.zeros(len(points))
-    strength[known] = np.linalg.eigvalsh(information[known])[:, 0]
-    most = _LEAST_SHARE * float(np.median(strength[known])) if len(chi2) else 0.0
-    weight = np.minimum(strength, most)
+    strength[is_known] = np.linalg.eigvalsh(information[is_known])[:, 0]
+    weight_limit = _LEAST_SHARE * float(np.median(strength[is_known])) if len(chi2) else 0.0
+    weight = np.minimum(strength, weight_limit)
 
-    def around(values: _Array) -> _Array:
+    def local_mean(values: _Array) -> _Array:
         return np.asarray(box_mean(values.reshape(shape), _AROUND_CELLS), dtype=np.float64)
 
-    total = np.maximum(around(weight), 1e-6)
-    asked = (around(weight * own[:, 0]) / total) ** 2 + (around(weight * own[:, 1]) / total) ** 2
-    if alike:
-        noise = 2 * scatter * (around(weight / np.sqrt(np.maximum(strength, 1e-6))) / total) ** 2
+    total = np.maximum(local_mean(weight), 1e-6)
+    residual2 = (local_mean(weight * movement[:, 0]) / total) ** 2 + (local_mean(weight * movement[:, 1]) / total) ** 2
+    if correlated:
+        noise = 2 * scatter * (local_mean(weight / np.sqrt(np.maximum(strength, 1e-6))) / total) ** 2
     else:
-        noise = 2 * scatter * around(weight**2 / np.maximum(strength, 1e-6)) / (_AROUND_CELLS * total) ** 2
-    asked = np.maximum(asked - _NOISE * noise, 0.0)
-    # In the margin and beside tags it would be one cell's noise, or the rounding of the means, over almost nothing.
-    asked[total < 0.5 * most] = 0.0
-    # What a displacement cannot follow swings about it: next to where it shows it may be hidden.
-    asked = ndimage.maximum_filter(asked, _AROUND_CELLS)
-    cells = Raster(raster.low_mm, raster.step_mm * per_cell, shape)
-    return PlaceErrors(cells, np.sqrt((fitted**2 + np.square(systematic_px)).reshape(shape) + asked))
+        noise = 2 * scatter * local_mean(weight**2 / np.maximum(strength, 1e-6)) / (_AROUND_CELLS * total) ** 2
+    residual2 = np.maximum(residual2 - _NOISE * noise, 0.0)
+    # In the margin and next to tags this is the noise of one patch or a rounding error.
+    residual2[total < 0.5 * weight_limit] = 0.0
+    # Unfollowed shapes oscillate around the map: their residual passes through zero next to its maximum.
+    residual2 = ndimage.maximum_filter(residual2, _AROUND_CELLS)
+    patch_raster = Raster(raster.low_mm, raster.step_mm * per_cell, shape)
+    return PlaceErrors(patch_raster, np.sqrt((fit_error**2 + np.square(systematic_px)).reshape(shape) + residual2))
 
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
-    """Places found by other means, which fix the map where no cells are.
+    """Points measured by other means, which fix the map in areas without patches."""
 
-    - `points_mm`: (N, 2) float64.
-    - `places_px`: (3, N, 2) float64 where red, green and blue see them; any finite values where they were not measured.
-    - `information`: (3, N, 2, 2) float64, inverse covariance of the places, px⁻²; 0 where they were not measured.
-    """
+    points_mm: _Array  # (N, 2)
+    places_px: _Array  # (3, N, 2) positions of red, green and blue; any finite value without a measurement
+    information: _Array  # (3, N, 2, 2) inverse covariance of the positions, px⁻²; 0 without a measurement
 
-    points_mm: _Array
-    places_px: _Array
-    information: _Array
+    def select(self, selection: _Mask) -> Anchors:
+        """Return the anchors of a selection (N,) bool."""
+        return Anchors(self.points_mm[selection], self.places_px[:, selection], self.information[:, selection])
 
-    def of(self, chosen: _Mask) -> Anchors:
-        """Return those chosen (N,)."""
-        return Anchors(self.points_mm[chosen], self.places_px[:, chosen], self.information[:, chosen])
-
-    def known_to(self, factor: float) -> Anchors:
-        """Return them with standard errors a factor times as large."""
+    def with_errors_scaled(self, factor: float) -> Anchors:
+        """Return anchors with standard uncertainties multiplied by a factor."""
         return Anchors(self.points_mm, self.places_px, self.information / factor**2)
 
     def pull(self, expected_px: _Array) -> _Array:
-        """Return information times the distance (3, N, 2) float64 px⁻¹ from places (3, N, 2) expected."""
+        """Return information times distance (3, N, 2) float64 px⁻¹ from expected positions (3, N, 2)."""
         return np.einsum("cnij,cnj->cni", self.information, self.places_px - expected_px)
 
     def residual_px(self, expected_px: _Array) -> _Array:
-        """Return the distance (N, 2) float64 px from places (3, N, 2) expected, the colours' weighted mean."""
+        """Return the distance (N, 2) float64 px from expected positions (3, N, 2), weighted mean of the channels."""
         inverse = np.asarray(np.linalg.pinv(self.information.sum(axis=0), rcond=1e-9, hermitian=True), dtype=np.float64)
         return np.einsum("nij,cnj->ni", inverse, self.pull(expected_px))
 
 
 class Matcher:
-    """Compares a frame with the print, in the print's own raster, and moves the map until they coincide.
-
-    - `displacement`: what is added to the lens; zero at first.
-    """
+    """Compares a frame with the print on a raster on the print, and moves the map until both coincide."""
 
     def __init__(
         self,
@@ -306,7 +287,7 @@ class Matcher:
         cell_px: float,
     ) -> None:
         self._chart = chart
-        # A smooth order of colours, as the paper's, has no more than the steps between neighbouring codes to go by.
+        # In a smooth order of colours only the steps between neighbouring codes give contrast.
         self._smooth_order = not chart.tags
         self._planes = planes
         self.lens = lens
@@ -321,81 +302,75 @@ class Matcher:
         self._sizes = np.concatenate(
             [np.broadcast_to(cell, chart.centres_mm.shape), np.array([r.size_mm for r in references]).reshape(-1, 2)]
         )
-        marks = np.concatenate([self._centres - self._sizes / 2, self._centres + self._sizes / 2])
-        marks = np.concatenate([marks, *(tag.corners_mm for tag in chart.tags)])
-        low = np.maximum(marks.min(axis=0) - cell / 2, 0)
-        high = np.minimum(marks.max(axis=0) + cell / 2, chart.page_mm)
-        # The raster is aligned with the first cell, so that edges of a regular chart fall between its elements.
+        corners_mm = np.concatenate([self._centres - self._sizes / 2, self._centres + self._sizes / 2])
+        corners_mm = np.concatenate([corners_mm, *(tag.corners_mm for tag in chart.tags)])
+        low = np.maximum(corners_mm.min(axis=0) - cell / 2, 0)
+        high = np.minimum(corners_mm.max(axis=0) + cell / 2, chart.page_mm)
+        # The raster is aligned with the first patch: edges of a regular chart fall between elements.
         low -= (low - chart.centres_mm[0] + cell / 2) % cell
         self._cells_across = np.ceil((high - low) / cell).astype(int)
         self._low, self._cell = low, cell
-        across = float(self._cells_across.min())
-        self._block_cells = int(np.clip(across // 4, 1, _BLOCK_CELLS))
+        smaller_count = float(self._cells_across.min())
+        self._block_cells = int(np.clip(smaller_count // 4, 1, _BLOCK_CELLS))
         self.displacement = Displacement.over(
             low,
             low + self._cells_across * cell,
-            float(cell.max()) * max(2.0, min(_KNOT_CELLS, across / 3)),
+            float(cell.max()) * max(2.0, min(_KNOT_CELLS, smaller_count / 3)),
             lens if self._smooth_order else None,
         )
         self._roughness_px = ROUGHNESS_PX
         self._per_cell = int(np.clip(round(_PER_CELL_PX * cell_px), _LEAST_PER_CELL, _MOST_PER_CELL))
         self._raster = Raster.of(low, cell / self._per_cell, self._cells_across * self._per_cell)
         self._cover = self._raster.coverage(self._centres, self._sizes)
-        self._free = self._raster.outside_tags(chart.tags) & self._raster.near(self._cover, self._per_cell)
+        self._valid = self._raster.outside_tags(chart.tags) & self._raster.near(self._cover, self._per_cell)
         if self._smooth_order:
-            # The margin's light that is blurred into the outermost cells is stronger than all their steps.
-            rim = 2 * int(np.ceil(_RIM_SIGMAS * blur_px / cell_px * self._per_cell)) + 1
-            cells = (self._raster.coverage(chart.centres_mm, self._sizes[: chart.colour_count]) > 0).sum(axis=1)
-            covered = np.asarray(cells).reshape(self._raster.shape).astype(np.uint8)
-            self._free = np.asarray(cv2.erode(covered, np.ones((rim, rim), dtype=np.uint8))).astype(np.bool_)
+            # Blur from the margin into the outermost patches is larger than the steps between patches.
+            kernel = 2 * int(np.ceil(_RIM_SIGMAS * blur_px / cell_px * self._per_cell)) + 1
+            patch_cover = (self._raster.coverage(chart.centres_mm, self._sizes[: chart.colour_count]) > 0).sum(axis=1)
+            covered = np.asarray(patch_cover).reshape(self._raster.shape).astype(np.uint8)
+            self._valid = np.asarray(cv2.erode(covered, np.ones((kernel, kernel), dtype=np.uint8))).astype(np.bool_)
         self.colours = self._fit_colours()
-        self._left: TileComparison | None = None
+        self._remainder: TileComparison | None = None
 
     def to_pixels(self, points_mm: npt.ArrayLike, channel: Channel = "G") -> _Array:
-        """Return the half-size pixels (N, 2) float64 where a channel sees points (N, 2) mm by the map of the moment."""
-        places = self.lens.to_pixels(points_mm) + self.displacement.at(points_mm)
-        return places + self.lateral.shift_px(places, channel)
+        """Map points (N, 2) mm to half-size px (N, 2) float64 of a channel, by the present map."""
+        positions_px = self.lens.to_pixels(points_mm) + self.displacement.at(points_mm)
+        return positions_px + self.lateral.shift_px(positions_px, channel)
 
     def in_channels(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the half-size pixels (3, N, 2) float64 where red, green and blue see points (N, 2) mm."""
+        """Map points (N, 2) mm to half-size px (3, N, 2) float64 of red, green and blue."""
         return self.lateral.seen_px(self.to_pixels(points_mm))
 
-    def _seen(self) -> _Array:
-        """Return the camera RGB (N, 3) at the middle of every patch, counts, NaN outside the frame."""
-        places = self.to_pixels(self._centres)
-        seen = np.empty((len(places), 3))
+    def _measured_rgb(self) -> _Array:
+        positions_px = self.to_pixels(self._centres)
+        measured = np.empty((len(positions_px), 3))
         for column, plane in enumerate(self._planes):
-            x, y = (places + self.lateral.shift_px(places, plane.channel) - plane.offset_px).T
+            x, y = (positions_px + self.lateral.shift_px(positions_px, plane.channel) - plane.offset_px).T
             smooth = cv2.blur(plane.values, (3, 3))
-            seen[:, column] = ndimage.map_coordinates(smooth, [y, x], order=1, cval=float("nan"))
-        return seen
+            measured[:, column] = ndimage.map_coordinates(smooth, [y, x], order=1, cval=float("nan"))
+        return measured
 
     def patches(self) -> tuple[_Array, _Array, _Array]:
-        """Return camera RGB of all patches as seen and as expected, and of bare paper, counts.
+        """Return measured and predicted camera RGB of all patches, and of the paper, counts.
 
-        Returns (N, 3) float64 of the cells in the chart's order, then of the references; seen NaN outside the frame.
-        Returns (3,) float64.
+        Patches and references: (N, 3) float64, references last; measured is NaN outside the frame. Paper: (3,) float64.
         """
         self.colours = self._fit_colours()
-        return self._seen(), self.colours.seen(self._rgb, self._centres), self._paper()
+        return self._measured_rgb(), self.colours.seen(self._rgb, self._centres), self._paper_rgb()
 
-    def _paper(self) -> _Array:
-        """Return camera RGB (3,) of bare paper under even light."""
+    def _paper_rgb(self) -> _Array:
         return self.colours.flat(np.array([PAPER_WHITE]))[0]
 
     def _fit_colours(self) -> ColourModel:
-        seen = self._seen()
-        there = np.flatnonzero(np.isfinite(seen).all(axis=1))
-        there = there[:: max(1, len(there) // _COLOUR_PATCHES)]
-        return fit_colours(self._rgb[there], self._centres[there], seen[there], self._chart.page_mm, self._smooth_order)
+        rgb = self._measured_rgb()
+        used = np.flatnonzero(np.isfinite(rgb).all(axis=1))
+        used = used[:: max(1, len(used) // _COLOUR_PATCHES)]
+        return fit_colours(self._rgb[used], self._centres[used], rgb[used], self._chart.page_mm, self._smooth_order)
 
     def _template(self, raster: Raster, cover: sparse.csr_array, sigma: _Array) -> _Float:
-        """Return the print as the camera would see it, (H, W, 3) float32; under even light if it has tags.
-
-        `sigma` (2,) along x and y is that of the blur in elements of the raster, interpolation not included.
-        """
+        """Predict the print (H, W, 3) float32 as seen by the camera; `sigma` (2,) is the blur in elements."""
         flat = self.colours.flat(self._rgb)
-        paper = self._paper()
+        paper = self._paper_rgb()
         image = np.asarray(cover @ (flat - paper)) + paper
         image = image.reshape(*raster.shape, 3).astype(np.float32)
         if self._smooth_order:
@@ -403,214 +378,206 @@ class Matcher:
         x, y = np.hypot(sigma, self._elements(raster, _INTERPOLATION_PX)).tolist()
         return np.asarray(cv2.GaussianBlur(image, (0, 0), x, sigmaY=y), dtype=np.float32)
 
+    # Length in elements of a raster along x and y: patches need not be square.
     def _elements(self, raster: Raster, length_px: float) -> _Array:
-        """Return a length in the frame in elements of a raster, (2,) along x and y: cells need not be square."""
         return np.asarray(length_px / self.cell_px * self._cell.min() / raster.step_mm, dtype=np.float64)
 
     def _rectified(self, raster: Raster) -> tuple[_Float, _Mask]:
-        """Return the frame as seen on the print's raster, (H, W, 3) float32, and where it exists, (H, W) bool."""
-        places = raster.element_places(self.to_pixels)
+        positions = raster.element_places(self.to_pixels)
         image = np.empty((*raster.shape, 3), dtype=np.float32)
         for channel, plane in enumerate(self._planes):
-            own = places
+            channel_positions = positions
             if plane.channel != "G" and self.lateral.terms_px.any():
-                own = raster.element_places(partial(self.to_pixels, channel=plane.channel))
+                channel_positions = raster.element_places(partial(self.to_pixels, channel=plane.channel))
             image[..., channel] = cv2.remap(
                 plane.values,
-                own[..., 0] - np.float32(plane.offset_px[0]),
-                own[..., 1] - np.float32(plane.offset_px[1]),
+                channel_positions[..., 0] - np.float32(plane.offset_px[0]),
+                channel_positions[..., 1] - np.float32(plane.offset_px[1]),
                 cv2.INTER_CUBIC,
                 borderMode=cv2.BORDER_REPLICATE,
             )
         height, width = self._planes[0].values.shape
-        there = (places >= 1).all(axis=-1) & (places[..., 0] <= width - 2) & (places[..., 1] <= height - 2)
-        return image, there
+        is_inside = (positions >= 1).all(axis=-1) & (positions[..., 0] <= width - 2) & (positions[..., 1] <= height - 2)
+        return image, is_inside
 
-    def match_coarsely(self, what: str) -> None:
-        """Find blocks of cells where they are, up to one and a half cells away, and follow them smoothly."""
-        n, across = _COARSE_PER_CELL, int(self._cells_across.min())
-        blocks = [int(np.clip(across // 3, 2, cells)) for cells, _ in _COARSE_BLOCKS]
-        reaches = [round(n * min(far, 0.25 * blocks[0])) for _, far in _COARSE_BLOCKS]
-        # The raster goes on beyond the outermost cells as far as they are looked for, so that blocks reach the rim.
-        step, beyond = self._cell / n, max(reaches)
-        raster = Raster.of(self._low - beyond * step, step, self._cells_across * n + 2 * beyond)
+    def match_coarsely(self, frame_name: str) -> None:
+        """Locate blocks of patches up to 1.5 patches away, and fit a smooth displacement to them."""
+        elements, smaller_count = _COARSE_PER_CELL, int(self._cells_across.min())
+        blocks = [int(np.clip(smaller_count // 3, 2, cells)) for cells, _ in _COARSE_BLOCKS]
+        reaches = [round(elements * min(range_cells, 0.25 * blocks[0])) for _, range_cells in _COARSE_BLOCKS]
+        # The raster exceeds the outermost patches by the search range, so that blocks include the rim.
+        step, margin = self._cell / elements, max(reaches)
+        raster = Raster.of(self._low - margin * step, step, self._cells_across * elements + 2 * margin)
         cover = raster.coverage(self._centres, self._sizes)
-        best = 0.0
+        best_score = 0.0
         for block, reach in zip(blocks, reaches, strict=True):
             template = self._template(raster, cover, self._elements(raster, max(self.blur_px, 0.7)))
-            image, there = self._rectified(raster)
-            # What is printed in the margin must not move cells.
-            bare = ~raster.near(cover, n)
-            image[bare] = template[bare]
-            found = find_blocks(raster, template, image, there, block * n, reach, block**2)
-            if not len(found.score):
+            image, is_inside = self._rectified(raster)
+            # Print in the margin must not move patches.
+            is_margin = ~raster.near(cover, elements)
+            image[is_margin] = template[is_margin]
+            located = find_blocks(raster, template, image, is_inside, block * elements, reach, block**2)
+            if not len(located.score):
                 raise RegistrationError(
-                    f"{what}: too little of the chart lies in the picture; bring all of it into the picture"
+                    f"{frame_name}: no block of patches lies inside the frame; bring the whole chart into the frame"
                 )
-            centre = found.centres_mm
-            best = max(best, float(np.median(found.score)))
-            shift = self.to_pixels(centre + found.moves_mm) - self.to_pixels(centre)
-            information = found.information(shift, self._cell * block, self.cell_px)
+            centre = located.centres_mm
+            best_score = max(best_score, float(np.median(located.score)))
+            shift = self.to_pixels(centre + located.moves_mm) - self.to_pixels(centre)
+            information = located.information(shift, self._cell * block, self.cell_px)
             total = self.displacement.at(centre) + shift
             self.displacement = self.displacement.fitted(
                 centre, information, np.einsum("nij,nj->ni", information, total), MOST_ROUGHNESS_PX
             )
             self.colours = self._fit_colours()
-        if best < _LEAST_BLOCK_SCORE:
+        if best_score < _LEAST_BLOCK_SCORE:
             raise not_this_chart(
-                what, f"blocks of cells correlate by {best:.2f} with the chart's, {_LEAST_BLOCK_SCORE:g} expected"
+                frame_name, f"the correlation of blocks is {best_score:.2f}, minimum {_LEAST_BLOCK_SCORE:g}"
             )
 
     def follow(self, sigma_cells: float) -> None:
-        """Move the map by one Gauss-Newton step of what is coarser than cells.
-
-        Blurred by `sigma_cells`, the steps between cells are gone, and with them the danger to lock onto the
-        neighbouring cell; folds of a smooth order and the texture of a random one remain. Where the colours only rise
-        evenly a tile measures nothing, and the map goes on smoothly from where others do.
-        """
-        # What the colours leave is alike over many cells: a window is about one measurement.
-        repeat = (_FOLLOWED_CELLS * _COARSE_PER_CELL) ** 2 / _WINDOW_WORTH
-        self._move(self._compared_softly(sigma_cells).weakened(repeat))
+        """Make one Gauss-Newton step with print and frame blurred by `sigma_cells` patches."""
+        # The blur removes steps between patches, so the map cannot lock onto neighbouring patches. Folds of a smooth
+        # order and the texture of a random order remain. Areas with an even gradient follow their neighbours smoothly.
+        # Colour errors are correlated over many patches: a window is about one measurement.
+        repeat = (_FOLLOWED_CELLS * _COARSE_PER_CELL) ** 2 / _WINDOW_MEASUREMENTS
+        self._move(self._compare_blurred(sigma_cells).weakened(repeat))
         self.colours = self._fit_colours()
 
     def refit_lens(self) -> None:
-        """Fit the lens to where the whole field is found, and the sheet's heights to what that leaves.
-
-        An outline alone does not tell a curl from distortion, whose steep corners no smooth displacement takes back.
-        """
+        """Refit the lens to the positions of all patches, and the heights to its residual."""
+        # The outline alone cannot separate curl from distortion, and no smooth displacement can correct steep corners.
         points = self._chart.centres_mm[:: max(1, self._chart.colour_count // _LENS_POINTS)]
-        places = self.to_pixels(points)
+        positions_px = self.to_pixels(points)
         height, width = self._planes[0].values.shape
-        self.lens, left = fit_lens(points, places, (width, height))
-        flat = replace(self.displacement, lens=self.lens)
-        known = np.broadcast_to(np.eye(2) / _LENS_POINT_SIGMA_PX**2, (len(points), 2, 2))
-        self.displacement = flat.fitted(points, known, left / _LENS_POINT_SIGMA_PX**2, self._roughness_px)
+        self.lens, residual = fit_lens(points, positions_px, (width, height))
+        start = replace(self.displacement, lens=self.lens)
+        information = np.broadcast_to(np.eye(2) / _LENS_POINT_SIGMA_PX**2, (len(points), 2, 2))
+        self.displacement = start.fitted(points, information, residual / _LENS_POINT_SIGMA_PX**2, self._roughness_px)
 
-    def _compared_softly(self, sigma_cells: float) -> TileComparison:
-        n = _COARSE_PER_CELL
-        raster = Raster.of(self._low, self._cell / n, self._cells_across * n)
+    def _compare_blurred(self, sigma_cells: float) -> TileComparison:
+        elements = _COARSE_PER_CELL
+        raster = Raster.of(self._low, self._cell / elements, self._cells_across * elements)
         cover = raster.coverage(self._centres, self._sizes)
-        free = raster.outside_tags(self._chart.tags) & raster.near(cover, n)
-        template = self._template(raster, cover, np.full(2, sigma_cells * n))
-        image, there = self._rectified(raster)
-        own = self._elements(raster, self.blur_px)
-        image[~free] = self._template(raster, cover, own)[~free]
-        x, y = np.sqrt(np.maximum((sigma_cells * n) ** 2 - own**2, 0.01 * n**2)).tolist()
+        is_comparable = raster.outside_tags(self._chart.tags) & raster.near(cover, elements)
+        template = self._template(raster, cover, np.full(2, sigma_cells * elements))
+        image, is_inside = self._rectified(raster)
+        frame_sigma = self._elements(raster, self.blur_px)
+        image[~is_comparable] = self._template(raster, cover, frame_sigma)[~is_comparable]
+        x, y = np.sqrt(np.maximum((sigma_cells * elements) ** 2 - frame_sigma**2, 0.01 * elements**2)).tolist()
         for channel in range(3):
             image[..., channel] = cv2.GaussianBlur(image[..., channel], (0, 0), x, sigmaY=y)
-        weight = (there & free).astype(np.float32)
-        window = _FOLLOWED_CELLS * n
+        weight = (is_inside & is_comparable).astype(np.float32)
+        window = _FOLLOWED_CELLS * elements
         return compare_tiles(
-            raster, n, template, image, weight, window, self.to_pixels, self.cell_px, without_gradient=True
+            raster, elements, template, image, weight, window, self.to_pixels, self.cell_px, without_gradient=True
         )
 
     def blocks(self) -> Blocks:
-        """Return how each block fits after the last step; a step must have been made."""
-        assert self._left is not None
-        comparison = self._left
+        """Return the quality of all blocks; requires a previous step."""
+        assert self._remainder is not None
+        comparison = self._remainder
         if self._smooth_order:
-            # The steps of dark cells drown in noise; whether these are the chart's colours shows over many cells.
-            comparison = replace(comparison, score=self._compared_softly(_BLURRED_CELLS).score)
+            # Steps between dark patches are below the noise; agreement with the chart shows only over many patches.
+            comparison = replace(comparison, score=self._compare_blurred(_BLURRED_CELLS).score)
         return fit_blocks(
-            comparison, self._raster, self._per_cell, self._chart, self._block_cells, all_known=self._smooth_order
+            comparison, self._raster, self._per_cell, self._chart, self._block_cells, keep_scores=self._smooth_order
         )
 
     def place_errors(self) -> PlaceErrors:
-        """Return how well places are known after the last step; a step must have been made."""
-        assert self._left is not None
+        """Return the uncertainty of positions; requires a previous step."""
+        assert self._remainder is not None
         points, information = self._anchors.points_mm, self._anchors.information.sum(axis=0)
         systematic: _Array | float = SYSTEMATIC_PX
         if self._smooth_order:
             residual = self._anchors.residual_px(self.in_channels(points))
             reach = _KNOT_CELLS * float(self._cell.max())
             departure = rms(self.displacement.at(points))
-            unfollowed = unfollowed_px(self._left.points_mm, points, residual, departure, reach)
+            unfollowed = unfollowed_px(self._remainder.points_mm, points, residual, departure, reach)
             systematic = np.hypot(unfollowed, _COLOURS_SHIFT * self.cell_px)
         anchors = points, information
         return place_errors(
-            self._left, self._raster, self._per_cell, self.displacement, anchors, systematic, self._smooth_order
+            self._remainder, self._raster, self._per_cell, self.displacement, anchors, systematic, self._smooth_order
         )
 
     def slipped(self, mismatched_cells: _Mask) -> tuple[_Array, int]:
-        """Return the middles (B, 2) mm of parts of the field with their neighbours' colours, and of how many parts.
+        """Return the centres (B, 2) mm of areas that match their neighbouring patches, and the number of areas.
 
-        `mismatched_cells` (C,) bool are left out.
+        `mismatched_cells` (C,) bool are ignored.
         """
-        seen, expected, paper = self.patches()
+        measured, expected, paper = self.patches()
         count = self._chart.colour_count
         column, row = np.floor((self._chart.centres_mm - self._low) / self._cell).astype(int).T
         columns, rows = self._cells_across.tolist()
-        places, parts = slipped_parts(
-            seen[:count], expected[:count], paper, mismatched_cells, (row, column), (rows, columns)
+        centres, area_count = displaced_areas(
+            measured[:count], expected[:count], paper, mismatched_cells, (row, column), (rows, columns)
         )
-        return self._low + places * self._cell, parts
+        return self._low + centres * self._cell, area_count
 
     def step(self) -> tuple[float, float]:
-        """Move the map by one Gauss-Newton step of all cells together; return the RMS and largest movement, px."""
-        raster, n = self._raster, self._per_cell
+        """Make one Gauss-Newton step of all patches together; return the RMS and the largest movement, px."""
+        raster, elements = self._raster, self._per_cell
         template = self._template(raster, self._cover, self._elements(raster, self.blur_px))
-        image, there = self._rectified(raster)
-        weight = (there & self._free).astype(np.float32)
-        window = self._block_cells * n
+        image, is_inside = self._rectified(raster)
+        weight = (is_inside & self._valid).astype(np.float32)
+        window = self._block_cells * elements
         compared = compare_tiles(
-            raster, n, template, image, weight, window, self.to_pixels, self.cell_px, self._smooth_order
+            raster, elements, template, image, weight, window, self.to_pixels, self.cell_px, self._smooth_order
         )
         if self._smooth_order:
             compared = compared.weakened(_COLOURS_REPEAT)
         points = compared.points_mm
-        before, places = self.displacement, self.to_pixels(points)
-        shifted = self.lateral.seen_px(places)
-        self.lateral = self.lateral.remeasured(*self._with_anchors(*self._in_blocks(compared, places)))
-        compared = compared.after(self.lateral.seen_px(places) - shifted)
+        previous, positions_px = self.displacement, self.to_pixels(points)
+        shifted = self.lateral.seen_px(positions_px)
+        self.lateral = self.lateral.remeasured(*self._with_anchors(*self._in_blocks(compared, positions_px)))
+        compared = compared.after(self.lateral.seen_px(positions_px) - shifted)
         moved = self._move(compared)
-        self._left = compared.after(self.displacement.at(points) - before.at(points))
+        self._remainder = compared.after(self.displacement.at(points) - previous.at(points))
         return moved
 
-    def _in_blocks(self, compared: TileComparison, places_px: _Array) -> tuple[_Array, _Array, _Array]:
-        """Return middles (B, 2) px of blocks of cells, and their information (3, B, 2, 2) and pull (3, B, 2)."""
+    def _in_blocks(self, compared: TileComparison, positions_px: _Array) -> tuple[_Array, _Array, _Array]:
         column, row = np.floor((compared.points_mm - self._low) / (self._cell * self._block_cells)).astype(int).T
-        number = row * (column.max() + 1) + column
-        count = int(number.max()) + 1
+        block = row * (column.max() + 1) + column
+        count = int(block.max()) + 1
 
         def summed(values: _Array) -> _Array:
             total = np.zeros((count, *values.shape[1:]))
-            np.add.at(total, number, values)
+            np.add.at(total, block, values)
             return total
 
-        tiles = np.maximum(np.bincount(number, minlength=count), 1)
-        information, pull = (np.stack([summed(one) for one in channels]) for channels in compared.of_channels)
-        return summed(places_px) / tiles[:, None], information, pull
+        tiles = np.maximum(np.bincount(block, minlength=count), 1)
+        information, pull = (np.stack([summed(c) for c in channels]) for channels in compared.of_channels)
+        return summed(positions_px) / tiles[:, None], information, pull
 
-    def _with_anchors(self, places_px: _Array, information: _Array, pull: _Array) -> tuple[_Array, _Array, _Array]:
-        """Return what blocks measure channel by channel and, after them, what anchors do; arrays as of `_in_blocks`."""
+    def _with_anchors(self, positions_px: _Array, information: _Array, pull: _Array) -> tuple[_Array, _Array, _Array]:
         anchors = self._anchors
-        places = self.in_channels(anchors.points_mm)
+        anchor_px = self.in_channels(anchors.points_mm)
         return (
-            np.concatenate([places_px, places[CHANNELS.index("G")]]),
+            np.concatenate([positions_px, anchor_px[CHANNELS.index("G")]]),
             np.concatenate([information, anchors.information], axis=1),
-            np.concatenate([pull, anchors.pull(places)], axis=1),
+            np.concatenate([pull, anchors.pull(anchor_px)], axis=1),
         )
 
     def _move(self, compared: TileComparison) -> tuple[float, float]:
-        """Move the map to where tiles and anchors measured it; return the tiles' RMS and largest movement, px."""
+        """Fit the map to tiles and anchors; return the RMS and the largest movement of the tiles, px."""
         anchors, points = self._anchors, compared.points_mm
         all_points = np.concatenate([points, anchors.points_mm])
         all_information = np.concatenate([compared.information, anchors.information.sum(axis=0)])
-        before = self.displacement.at(all_points)
+        previous = self.displacement.at(all_points)
         anchored = anchors.pull(self.in_channels(anchors.points_mm)).sum(axis=0)
-        total = np.concatenate([compared.pull, anchored]) + np.einsum("nij,nj->ni", all_information, before)
+        total = np.concatenate([compared.pull, anchored]) + np.einsum("nij,nj->ni", all_information, previous)
         self.displacement = self.displacement.fitted(all_points, all_information, total, self._roughness_px)
         if self._smooth_order:
-            # Colours that only rise evenly leave the sheet's shape to what it is taken to be.
+            # Even gradients do not measure the shape of the sheet, so the result depends on the roughness.
             self._roughness_px = self.displacement.likely_roughness_px(all_points, all_information, self._roughness_px)
-        moved = (self.displacement.at(all_points) - before)[: len(points)]
+        moved = (self.displacement.at(all_points) - previous)[: len(points)]
         moved = moved[compared.information[:, 0, 0] > 0]
         return rms(moved), float(np.linalg.norm(moved, axis=1).max(initial=0.0))
 
 
-def not_this_chart(what: str, measured: str) -> RegistrationError:
-    """Return the error that the chart seen is another one."""
+def not_this_chart(frame_name: str, measurement: str) -> RegistrationError:
+    """Return the error for a frame that shows another chart."""
     return RegistrationError(
-        f"{what}: a chart is there, but its cells' colours are not those of the chart: {measured}; "
-        "name the chart.json of this print, or uncover it"
+        f"{frame_name}: the colours of the patches do not match the chart: {measurement}; "
+        "give the chart.json of this print, or uncover it"
     )

@@ -137,7 +137,7 @@ def _grid_json(table: TableMeasurements) -> dict[str, Any]:
 
 def _geometry_json(table: TableMeasurements) -> dict[str, Any]:
     registration = table.registration
-    inner_px, rim_px = registration.places_known_px
+    inner_px, rim_px = registration.position_uncertainty_px
     lateral = registration.lateral
     return {
         "uncertainty_px": _rounded(inner_px),

@@ -1,1 +1,1 @@
-"""The lens as the print shows it: how much light of their surroundings reaches the cells, and what is left without."""
+"""Measurement and correction of light that the lens scatters onto patches."""

@@ -1,10 +1,10 @@
-"""The correction: what surroundings add to each patch of a frame, and what is said of it.
+"""Correct the light that the lens brings from the surroundings to each patch, and report the result.
 
-What is subtracted from a patch's samples is one number for each channel: the light that the lens brought in, less what
-it took away. The samples' noise is not touched. Levels of a frame are taken from the frame itself, as it is: the shares
-were fitted on such levels, so that light which was spread twice is in them.
+The correction subtracts one number per patch and channel from the samples: the light that the lens added, minus the
+light that it removed. The noise of samples is unchanged. Levels are taken from the uncorrected frame, as in the fit of
+the shares, so light that was scattered twice is included.
 
-P patches as in `PrintedGrid`; counts above black; half-size pixels.
+P patches as in `PrintedGrid`; counts above black level; half-size pixels.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from calibration.spread.fitting import (
     PointSpread,
     ReferenceData,
     SpreadData,
+    channel_terms,
     channels_alike,
     far_groups,
     fit_spread,
     kernel_of_terms,
     place_terms,
-    terms_of,
 )
 from calibration.spread.predicting import VARYING_BITS, LevelModel
 from calibration.spread.surroundings import (
@@ -49,36 +49,30 @@ from drivers.raw.rawfile import CHANNELS
 from experiment.measures.least_squares import page_polynomial, page_powers
 from experiment.measures.paper import FlatField
 
-_MARGIN_PX = 12.0  # How far from the sheet's edge what lies behind it is looked at
+_MARGIN_PX = 12.0  # minimum distance of background samples from the edge of the sheet
 
-_LATTICE_PX = 24  # Distance of the places at which what lies behind the sheet is looked at
+_LATTICE_PX = 24  # distance of background samples
 
-# References of one colour for each term of what is smooth over the page, at least, for them to say anything else.
+# Minimum number of references of one colour per term of the smooth component over the page.
 _LEAST_REFERENCES = 3
 
-_FIELD_ORDER = 6  # Highest order of the smooth change of white references by which a frame's field would change
+_FIELD_ORDER = 6  # highest order of a smooth change of white references, which changes the field
 
-_LEAST_LEVEL = 1e-3  # Level, bare paper 1, below which a cell's relative error is that of such a cell
+_LEAST_LEVEL = 1e-3  # lower bound of levels in relative errors
 
 _Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class PrintView:
-    """What holds for all frames of a session: the print's grid, its usual light, and where it is looked past.
-
-    - `whites`: places of the white references among the patches.
-    - `photosites_px`: (3, 2) float64, where each channel's photosites lie from a block's centre.
-    - `frame_px`: rows and columns of the half-size frame.
-    - `beyond`: places that show what lies behind the print; none where the print fills the frame.
-    """
+    """Properties common to all frames of a session: grid of the print, usual light, and background samples."""
 
     grid: PrintedGrid
-    whites: slice
-    photosites_px: _Array
-    frame_px: tuple[int, int]
+    whites: slice  # indices of the white references
+    photosites_px: _Array  # (3, 2) offset of the photosites of each channel from the centre of a block
+    frame_px: tuple[int, int]  # rows and columns of the half-size frame
     light: UsualLight
-    beyond: Sites
+    beyond: Sites  # positions of the background; empty if the print fills the frame
 
     @staticmethod
     def of(
@@ -90,17 +84,14 @@ class PrintView:
         shape: tuple[int, int],
         window: int,
     ) -> PrintView:
-        """Return the view of a session.
-
-        `photosites_px`: (3, 2) float64, where each channel's photosites lie from a block's centre.
-        """
+        """Return the view of a session; `photosites_px` (3, 2): offset of photosites from the centre of a block."""
         low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
         light = UsualLight.of(grid, field.at(grid.points_mm), field.at(np.clip(grid.slots_mm, low, high)))
-        beyond = _places_beyond(grid, registration, shape, window)
+        beyond = _background_sites(grid, registration, shape, window)
         return PrintView(grid, whites, photosites_px, shape, light, beyond)
 
     def around(self, registration: Registration, cells: Sites, references: Sites) -> Surroundings:
-        """Return the surroundings of the patches of a frame, given where they are sampled."""
+        """Return the surroundings of the patches of a frame from their sampling positions."""
         half, points = np.array(self.grid.pitch_mm) / 2, self.grid.points_mm
         across, down = (
             registration.to_pixels(points + half * axis) - registration.to_pixels(points - half * axis)
@@ -109,9 +100,9 @@ class PrintView:
         pitch = np.stack([np.linalg.norm(across, axis=1), np.linalg.norm(down, axis=1)], axis=1)
         to_slots = np.linalg.inv(np.stack([across, down], axis=-1))
         columns = np.concatenate([cells.columns, references.columns])
-        middle = np.stack([columns, np.concatenate([cells.rows, references.rows])], axis=1)
-        seen = np.stack([registration.to_pixels(points, channel) for channel in CHANNELS], axis=1)
-        from_centre = middle[:, None] + self.photosites_px - seen
+        window_px = np.stack([columns, np.concatenate([cells.rows, references.rows])], axis=1)
+        channel_px = np.stack([registration.to_pixels(points, channel) for channel in CHANNELS], axis=1)
+        from_centre = window_px[:, None] + self.photosites_px - channel_px
         offset = np.einsum("nij,ncj->nci", to_slots, from_centre) * pitch[:, None]
         return Surroundings(
             grid=self.grid,
@@ -119,7 +110,7 @@ class PrintView:
             offset_px=np.ascontiguousarray(offset),
             pitch_px=pitch,
             frame_slots=float(np.prod(self.frame_px) / pitch.prod(axis=1).mean()),
-            places=place_terms(middle.astype(np.float64), self.frame_px),
+            places=place_terms(window_px.astype(np.float64), self.frame_px),
             whites=self.whites,
             light=self.light,
         )
@@ -127,15 +118,12 @@ class PrintView:
 
 @dataclass(frozen=True, eq=False)
 class FrameCorrection:
-    """The correction of frames that are sampled at the same places.
-
-    - `far`, `veil`: shares of the far kernels (3, F), and of the veil (3,), by channel.
-    """
+    """Correction of frames with the same sampling positions."""
 
     around: Surroundings
     near: NearLight
-    far: _Array
-    veil: _Array
+    far: _Array  # (3, F) shares of far kernels by channel
+    veil: _Array  # (3,) shares of veiling glare by channel
     beyond: Sites
 
     @staticmethod
@@ -146,7 +134,7 @@ class FrameCorrection:
         return FrameCorrection(around, around.near(amounts[:, :, :near]), far, veil, view.beyond)
 
     def added(self, levels: FrameLevels) -> _Array:
-        """Return what the lens added to each patch, (P, 3) float64 counts; negative where it took more away."""
+        """Return the light that the lens added to each patch, (P, 3) float64 counts; negative if it removed more."""
         around, inks = self.around, self.around.inks(levels)
         added = self.near.at(levels, inks) - self.near.total * levels.patches
         if self.far.any():
@@ -162,71 +150,46 @@ class FrameCorrection:
 
 @dataclass(frozen=True, eq=False)
 class SpreadFrame:
-    """A frame that the point spread is measured on.
-
-    - `field`: (P, 3) float64, its flat field at the patches.
-    - `white`: (3,) float64 counts, its bare paper.
-    - `usable`: (P,) bool, patches that are in the frame, not clipped and not covered.
-    - `unevenness`: as in `SpreadData`.
-    - `printed`: (P,) int64, which references have one colour: a number for each, −1 of cells; None where they are not
-      used.
-    - `frames`: of how many frames it is the mean.
-    - `bend`: of each channel, as in `SpreadData`.
-    """
+    """A frame for measuring the point spread."""
 
     levels: FrameLevels
-    field: _Array
-    white: _Array
-    usable: npt.NDArray[np.bool_]
-    unevenness: float
+    field: _Array  # (P, 3) flat field at the patches
+    white: _Array  # (3,) counts of paper
+    usable: npt.NDArray[np.bool_]  # (P,) patches in the frame that are not clipped or covered
+    unevenness: float  # as in `SpreadData`
+    # (P,) colour number of each reference, −1 for patches; None: references are not used
     printed: npt.NDArray[np.int64] | None = None
-    frames: int = 1
-    bend: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    frames: int = 1  # number of averaged frames
+    bend: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of each channel, as in `SpreadData`
 
 
 @dataclass(frozen=True, eq=False)
 class LensFigures:
-    """What the correction comes to under the light of the frames that it was measured on; cells above 300 counts.
+    """Effect of the lens and its correction under the illuminants of the measurement, for patches above 300 counts."""
 
-    - `rms`, `worst`: change of the cells' means relative to paper, RMS and the largest; 0 where nothing is corrected.
-    - `residual`, `residual_worst`: RMS error that the means have after it, and that of the cell that it is largest of:
-      by the shares' standard errors, proven or not, and by what is likely of the veil but not subtracted.
-    - `worst_level`: level of that cell, bare paper 1.
-    - `veil`, `veil_error`: likeliest share of the frame's mean light that lies on all of it, subtracted or not, and its
-      standard error, of the channel in which both may come to most.
-    - `beyond_cell`: share of the light of a window's worst sample that the kernels bring from beyond its cell, channel
-      by channel the largest.
-    - `left_in_worst`: the same beyond that of the window's mean, which is what is corrected.
-    - `white_covariance`: (3, 3) float64, of the relative error that the lens leaves in the white of bare paper, the
-      ground truth, in R, G and B: by the shares' covariance, and by all of what is likely but not subtracted. An
-      assumed one, of a usual veil, where the lens is not measured.
-    - `cells_error`: (C, 3) float64, relative standard error that it leaves in the means of cells, in the order of
-      colour indices, against that white, under the light that is brightest in the channel; by the same covariance.
-    - `measured`, `corrected`: whether the lens could be measured on the print, and whether samples and ground truth are
-      corrected by it.
-    - `why_not`: why nothing was measured or nothing is corrected; "" where it is.
-    """
-
-    rms: float
-    worst: float
+    rms: float  # RMS change of patch means relative to paper; 0 without correction
+    worst: float  # largest change
+    # RMS error of patch means after correction: uncertainty of the shares and uncorrected veiling glare
     residual: float
-    residual_worst: float
-    worst_level: float
-    veil: float
-    veil_error: float
-    beyond_cell: float
-    left_in_worst: float
+    residual_worst: float  # of the worst patch
+    worst_level: float  # level of the worst patch relative to paper
+    veil: float  # most likely veiling glare relative to the mean light of the frame, worst channel
+    veil_error: float  # its standard uncertainty
+    beyond_cell: float  # largest share of light from beyond the patch in the worst sample
+    left_in_worst: float  # part of it that exceeds the window mean, and is not corrected
+    # (3, 3) relative error of the white (ground truth); assumes usual veiling glare if not measured
     white_covariance: _Array
+    # (C, 3) relative standard uncertainty of patch means against white, brightest frame of each channel
     cells_error: _Array
-    measured: bool = True
-    corrected: bool = True
-    why_not: str = ""
+    measured: bool = True  # whether the lens could be measured
+    corrected: bool = True  # whether samples and ground truth are corrected
+    why_not: str = ""  # reason for a missing measurement or correction, or ""
 
     @staticmethod
     def unknown(why_not: str, levels: _Array) -> LensFigures:
-        """Return the figures of a lens that could not be measured, and why.
+        """Return the figures of a lens that could not be measured, with usual veiling glare.
 
-        A veil of the usual size is assumed. `levels`: (C, 3) float64 of the cells, bare paper 1; NaN where not seen.
+        `levels`: (C, 3) float64 of the patches, relative to paper; NaN if not visible.
         """
         mean = np.nanmean(levels, axis=0)
         levels = np.where(np.isfinite(levels), levels, mean)
@@ -243,67 +206,67 @@ class LensFigures:
 
     @property
     def uncorrected_in_worst(self) -> float:
-        """Share of the worst sample's light from beyond its cell, but for the sharp core's, that is not corrected."""
+        """Uncorrected share of light from beyond the patch in the worst sample, without the sharp core."""
         return max(self.left_in_worst, 0.0) if self.corrected else self.beyond_cell
 
     @property
     def is_left_in(self) -> bool:
-        """Whether spread that the print shows is not corrected."""
+        """Whether measured spread is not corrected."""
         return self.measured and not self.corrected and self.beyond_cell > 0
 
     @property
     def left(self) -> float:
-        """RMS error that the lens leaves in the means of cells, relative to paper."""
-        return self._left(self.rms, self.residual)
+        """RMS error of patch means by the lens, relative to paper."""
+        return self._remaining(self.rms, self.residual)
 
     @property
     def left_worst(self) -> float:
-        """The same of the cell that it is largest of."""
-        return self._left(self.worst, self.residual_worst)
+        """The same of the worst patch."""
+        return self._remaining(self.worst, self.residual_worst)
 
-    def _left(self, size: float, residual: float) -> float:
+    def _remaining(self, size: float, residual: float) -> float:
         return residual if self.corrected or not self.beyond_cell else float(np.hypot(size, residual))
 
     @property
     def veil_at_most(self) -> float:
-        """Share of the frame's mean light that the veil hardly exceeds: two standard errors above the likeliest."""
+        """Upper bound of veiling glare: two standard uncertainties above the most likely value."""
         return self.veil + 2 * self.veil_error
 
     def to_json(self) -> dict[str, Any]:
-        """Return the figures as `lut.json` and `report.json` state them."""
-        shares = [one.name for one in fields(self) if isinstance(getattr(self, one.name), float)]
-        found: dict[str, Any] = {name: float(f"{getattr(self, name):.4g}") for name in shares}
-        found |= {
+        """Return the content of `lut.json` and `report.json`."""
+        shares = [field.name for field in fields(self) if isinstance(getattr(self, field.name), float)]
+        values: dict[str, Any] = {name: float(f"{getattr(self, name):.4g}") for name in shares}
+        values |= {
             "white_covariance": [[float(f"{value:.4g}") for value in row] for row in self.white_covariance.tolist()],
             "assumed": not self.measured,
         }
-        return {"measured": self.measured, "corrected": self.corrected, "why_not": self.why_not, **found}
+        return {"measured": self.measured, "corrected": self.corrected, "why_not": self.why_not, **values}
 
 
 @dataclass(frozen=True, eq=False)
 class LensCorrection:
-    """The lens of a session: its point spread, what is said of it, and the view by which frames are corrected."""
+    """Lens of a session: point spread, figures, and the view for correcting frames."""
 
     view: PrintView
     spread: PointSpread
     figures: LensFigures
 
     def correction(self) -> dict[str, Any]:
-        """Return what was done, for `lut.json`."""
+        """Return the entry of `lut.json`."""
         return {
             "name": "lens",
-            "how": "subtracted from samples, ground truth and references before the field is divided out, one number "
-            "for each patch and channel: sum over kernels k of share[k] (B_k - m) + share[veil] (M - m); m the patch's "
-            "mean in the frame, B_k the print as the frame shows it, blurred by a Gaussian of sigma_px[k] half-size px "
-            "and averaged over the patch's window, M the frame's mean light; share[term][channel][kernel], terms "
-            "P_i(x) P_j(y) over the frame, Legendre, j rising slowest, i, j 0 ... 2, x, y -1 ... 1; the last kernel is "
-            "the veil; samples' noise is not touched; build-lut --no-lens-correction leaves it out",
+            "how": "subtracted from samples, ground truth and references before division by the field, one number per "
+            "patch and channel: sum over kernels k of share[k] (B_k - m) + share[veil] (M - m); m mean of the patch in "
+            "the frame, B_k print in the frame, blurred by a Gaussian of sigma_px[k] half-size px and averaged over "
+            "the window of the patch, M mean light of the frame; share[term][channel][kernel], terms P_i(x) P_j(y) "
+            "over the frame, Legendre, j slowest, i, j 0 ... 2, x, y -1 ... 1; the last kernel is veiling glare; the "
+            "noise of samples is unchanged; build-lut --no-lens-correction omits this correction",
             **self.figures.to_json(),
             **self.spread.to_json(),
         }
 
     def of(self, registration: Registration, cells: Sites, references: Sites) -> FrameCorrection:
-        """Return the correction of frames that are sampled at these places."""
+        """Return the correction of frames with these sampling positions."""
         return FrameCorrection.of(self.spread, self.view, self.view.around(registration, cells, references))
 
 
@@ -313,34 +276,34 @@ def measure_spread(
     page_mm: tuple[float, float],
     bits: int,
     least_counts: float,
-    left_out: str = "",
+    reason_uncorrected: str = "",
 ) -> tuple[PointSpread, LensFigures] | None:
-    """Return the point spread that frames show, and its figures; None where no frame is bright enough.
+    """Measure the point spread on frames; None if no frame is bright enough.
 
-    `least_counts`: counts of bare paper from which on a channel is used, and of a cell from which on figures count it.
-    `left_out`: why frames are not corrected by it though it is proven; "" where they are.
+    `least_counts`: minimum counts of paper in a used channel, and of patches in the figures. `reason_uncorrected`:
+    reason for not correcting frames with a proven spread, or "".
     """
     if not frames:
         return None
     count = 8**bits
     data: list[SpreadData] = []
     scales: list[_Array] = []
-    of_paper: dict[int, _Array] = {}
+    paper_changes: dict[int, _Array] = {}
     references: list[ReferenceData] = []
-    # All of a near kernel, the same over the frame, and nothing of the others.
-    whole = np.zeros((len(NEAR_PX), PLACES, 3, len(NEAR_PX)))
-    whole[:, 0] = np.eye(len(NEAR_PX))[:, None]
-    near = [around.near(amounts) for amounts in whole]
-    # Of each channel the frame in which it has most light, of all frames that it is the mean of.
-    best = np.argmax([frame.white * frame.frames for frame in frames], axis=0)
-    for number, frame in enumerate(frames):
-        bright = np.flatnonzero((best == number) & (frame.white >= least_counts))
-        if not len(bright):
+    # share 1 of each near kernel in turn, constant over the frame
+    unit_shares = np.zeros((len(NEAR_PX), PLACES, 3, len(NEAR_PX)))
+    unit_shares[:, 0] = np.eye(len(NEAR_PX))[:, None]
+    near = [around.near(amounts) for amounts in unit_shares]
+    # brightest frame of each channel, with the number of averaged frames as factor
+    brightest = np.argmax([frame.white * frame.frames for frame in frames], axis=0)
+    for index, frame in enumerate(frames):
+        channels = np.flatnonzero((brightest == index) & (frame.white >= least_counts))
+        if not len(channels):
             continue
-        seen, inks = _seen(frame, around, near), around.inks(frame.levels)
+        light, inks = _kernel_light(frame, around, near), around.inks(frame.levels)
         even = around.mean(frame.levels, inks)
-        for channel in bright.tolist():
-            changes, gains, of_paper[channel] = _changes(frame, around, seen, page_mm, bits, channel)
+        for channel in channels.tolist():
+            changes, gains, paper_changes[channel] = _changes(frame, around, light, page_mm, bits, channel)
             relative = frame.field[:count, channel] * frame.white[channel]
             level = frame.levels.patches[:count, channel] / relative
             usable = frame.usable[:count]
@@ -351,181 +314,179 @@ def measure_spread(
                 )
             )  # fmt: skip
             if bits < VARYING_BITS:
-                references += _references(frame, around, channel, changes.T)
+                references += _reference_data(frame, around, channel, changes.T)
             scales.append(np.append(gains, frame.white[channel]))
     if not data:
         return None
     spread = fit_spread(data, around.grid.points_mm[:count], page_mm, bits, references)
     if spread is None:
         return None
-    return spread, _figures(spread, data, scales, of_paper, around, bits, least_counts, left_out)
+    return spread, _figures(spread, data, scales, paper_changes, around, bits, least_counts, reason_uncorrected)
 
 
-def _references(frame: SpreadFrame, around: Surroundings, channel: int, changes: _Array) -> list[ReferenceData]:
-    """Return a channel's references, colour by colour; `changes` (P, T)."""
+def _reference_data(frame: SpreadFrame, around: Surroundings, channel: int, changes: _Array) -> list[ReferenceData]:
     if frame.printed is None:
         return []
-    found: list[ReferenceData] = []
+    references: list[ReferenceData] = []
     level = frame.levels.patches[:, channel] / np.maximum(frame.field[:, channel] * frame.white[channel], 1e-6)
     whites = np.zeros(len(level), dtype=np.bool_)
     whites[around.whites] = True
-    for number in range(int(frame.printed.max()) + 1):
-        chosen = np.flatnonzero((frame.printed == number) & frame.usable)
-        order = _white_order(len(chosen)) if whites[chosen].any() else 1
-        if len(chosen) >= _LEAST_REFERENCES * len(page_powers(order)):
-            places = around.grid.points_mm[chosen]
-            field = frame.field[chosen, channel]
-            found.append(ReferenceData(channel, level[chosen], changes[chosen], field, places, order))
-    return found
+    for colour in range(int(frame.printed.max()) + 1):
+        selected = np.flatnonzero((frame.printed == colour) & frame.usable)
+        order = _white_order(len(selected)) if whites[selected].any() else 1
+        if len(selected) >= _LEAST_REFERENCES * len(page_powers(order)):
+            positions_mm = around.grid.points_mm[selected]
+            field = frame.field[selected, channel]
+            references.append(ReferenceData(channel, level[selected], changes[selected], field, positions_mm, order))
+    return references
 
 
 def _white_order(count: int) -> int:
-    """Return the order of the smooth change that so many white references show."""
     return next((n for n in range(_FIELD_ORDER, 0, -1) if 3 * len(page_powers(n)) <= count), 0)
 
 
 def _changes(
     frame: SpreadFrame,
     around: Surroundings,
-    seen: list[tuple[_Array, _Array]],
+    light: list[tuple[_Array, _Array]],
     page_mm: tuple[float, float],
     bits: int,
     channel: int,
 ) -> tuple[_Array, _Array, _Array]:
-    """Return what a whole share of each unknown changes in a channel.
+    """Return changes of a channel per share of each unknown.
 
-    The change (T, P) of its levels: what comes in, less what the white references get, since the field is fitted
-    through them. Their mean (T,), by which all levels change alike. The relative change (T,) of white itself: that
-    mean, less what a patch loses. `seen` is what `_seen` returns.
+    1. (T, P), change of levels: added light minus the change of white references, because the field is fitted to them.
+    2. (T,), mean of the latter, by which all levels change.
+    3. (T,), relative change of white: this mean minus the light that a patch loses.
     """
     count, points = 8**bits, around.grid.points_mm
-    seen_levels = frame.levels.patches[:, channel]
+    levels = frame.levels.patches[:, channel]
     relative = np.maximum(frame.field[:, channel] * frame.white[channel], 1e-6)
-    expected = seen_levels / relative
+    expected = levels / relative
     expected[:count] = LevelModel.of(expected[:count], frame.usable[:count], bits).predicted
     if frame.printed is not None:
-        for number in range(int(frame.printed.max()) + 1):
-            expected[frame.printed == number] = np.median(expected[frame.printed == number])
+        for colour in range(int(frame.printed.max()) + 1):
+            expected[frame.printed == colour] = np.median(expected[frame.printed == colour])
     whites = np.arange(len(points))[around.whites]
     whites = whites[frame.usable[whites]]
-    at_all = page_polynomial(points, page_mm, _white_order(len(whites)))
+    page_terms = page_polynomial(points, page_mm, _white_order(len(whites)))
     terms = kernel_of_terms()
-    coming, differs = np.empty((2, len(terms), len(points)))
-    lost = np.empty(len(terms))
+    added, deviation = np.empty((2, len(terms), len(points)))
+    loss = np.empty(len(terms))
     for term, (kernel, place) in enumerate(terms):
-        light, own = (part[:, channel] for part in seen[kernel])
-        np.divide(light - own * seen_levels, relative, out=coming[term])
-        np.subtract(own, own[:count].mean(), out=differs[term])
-        lost[term] = 1 - own[:count].mean()
+        brought, own = (values[:, channel] for values in light[kernel])
+        np.divide(brought - own * levels, relative, out=added[term])
+        np.subtract(own, own[:count].mean(), out=deviation[term])
+        loss[term] = 1 - own[:count].mean()
         if place is not None:
-            lost[term] *= around.places[whites, place].mean()
-            coming[term] *= around.places[:, place]
-            differs[term] *= around.places[:, place]
-    of_white = (coming[:, whites] + differs[:, whites]).T
-    smooth = (at_all @ np.linalg.lstsq(at_all[whites], of_white, rcond=None)[0]).T
+            loss[term] *= around.places[whites, place].mean()
+            added[term] *= around.places[:, place]
+            deviation[term] *= around.places[:, place]
+    at_whites = (added[:, whites] + deviation[:, whites]).T
+    smooth = (page_terms @ np.linalg.lstsq(page_terms[whites], at_whites, rcond=None)[0]).T
     gains = smooth[:, :count].mean(axis=1)
     smooth -= gains[:, None]
-    differs -= smooth
-    differs *= expected
-    coming += differs
-    return coming, gains, gains - lost
+    deviation -= smooth
+    deviation *= expected
+    added += deviation
+    return added, gains, gains - loss
 
 
-def _seen(frame: SpreadFrame, around: Surroundings, near: list[NearLight]) -> list[tuple[_Array, _Array]]:
-    """Return for each kernel the light (P, 3) that it brings, counts, and the share (P, 3) of a patch's own in it."""
+def _kernel_light(frame: SpreadFrame, around: Surroundings, near: list[NearLight]) -> list[tuple[_Array, _Array]]:
+    """Return for each kernel its light (P, 3), counts, and the share (P, 3) of a patch's own light in it."""
     levels = frame.levels
     inks = around.inks(levels)
     image = around.image(levels, inks)
-    found = [(one.at(levels, inks), one.own) for one in near]
-    found += [(around.far(image, scale), np.full_like(levels.patches, around.own_share(scale))) for scale in FAR_PX]
+    results = [(kernel.at(levels, inks), kernel.own) for kernel in near]
+    results += [(around.far(image, scale), np.full_like(levels.patches, around.own_share(scale))) for scale in FAR_PX]
     even = np.broadcast_to(around.mean(levels, inks), levels.patches.shape)
-    return [*found, (even, np.zeros_like(levels.patches))]
+    return [*results, (even, np.zeros_like(levels.patches))]
 
 
 def _figures(
     spread: PointSpread,
     data: list[SpreadData],
     scales: list[_Array],
-    of_paper: dict[int, _Array],
+    paper: dict[int, _Array],
     around: Surroundings,
     bits: int,
     least_counts: float,
-    left_out: str,
+    reason: str,
 ) -> LensFigures:
     amounts = spread.amounts()
     corrected: list[_Array] = []
-    unknown: list[_Array] = []
+    error2: list[_Array] = []
     levels: list[_Array] = []
     mean_square = spread.unexplained
-    off_by = spread.off_by(np.zeros(TERMS)) if left_out else mean_square
+    total_error = spread.mean_square_error(np.zeros(TERMS)) if reason else mean_square
     cells: dict[int, _Array] = {}
-    for one, scale in zip(data, scales, strict=True):
-        expected = LevelModel.of(one.level, one.usable, bits).predicted
-        lit = one.usable & (one.level * scale[-1] > least_counts)
-        # All of the change: with white's mean, by which a level over paper's changes too.
-        change = (one.changes[lit] - np.outer(expected[lit], scale[:-1])) / one.level[lit, None]
-        terms = terms_of(one.channel)
+    for item, scale in zip(data, scales, strict=True):
+        expected = LevelModel.of(item.level, item.usable, bits).predicted
+        is_bright = item.usable & (item.level * scale[-1] > least_counts)
+        # The full change includes the mean of white, because levels are relative to paper.
+        change = (item.changes[is_bright] - np.outer(expected[is_bright], scale[:-1])) / item.level[is_bright, None]
+        terms = channel_terms(item.channel)
         corrected.append(change @ spread.shares[terms])
-        unknown.append(((change @ mean_square[np.ix_(terms, terms)]) * change).sum(axis=1))
-        levels.append(one.level[lit])
-        change = one.changes / np.maximum(one.level, _LEAST_LEVEL)[:, None] - scale[:-1]
-        cells[one.channel] = np.sqrt(((change @ off_by[np.ix_(terms, terms)]) * change).sum(axis=1))
-    size, left, level = np.concatenate(corrected), np.concatenate(unknown), np.concatenate(levels)
+        error2.append(((change @ mean_square[np.ix_(terms, terms)]) * change).sum(axis=1))
+        levels.append(item.level[is_bright])
+        change = item.changes / np.maximum(item.level, _LEAST_LEVEL)[:, None] - scale[:-1]
+        cells[item.channel] = np.sqrt(((change @ total_error[np.ix_(terms, terms)]) * change).sum(axis=1))
+    correction, error, level = np.concatenate(corrected), np.concatenate(error2), np.concatenate(levels)
     worst, mean = _beyond_cell(around)
     near = amounts[:, :, : len(NEAR_PX)]
     wide = amounts[:, :, len(NEAR_PX) :].sum(axis=2)
-    nothing = len(size) == 0
-    subtracted = spread.proven and not left_out
+    is_empty = len(correction) == 0
+    subtracted = spread.proven and not reason
     veils = far_groups()[-1]
     veil, veil_error = spread.likeliest[veils], np.sqrt(np.diag(spread.covariance)[veils])
-    largest = int(np.argmax(veil + 2 * veil_error))
-    # Of a channel that is too dark to measure on, what the brightest of the others has.
-    other = data[int(np.argmax([scale[-1] for scale in scales]))].channel
+    worst_channel = int(np.argmax(veil + 2 * veil_error))
+    # A channel too dark for a measurement gets the values of the brightest channel.
+    best = data[int(np.argmax([scale[-1] for scale in scales]))].channel
     return LensFigures(
-        rms=0.0 if nothing else float(np.sqrt((size**2).mean())),
-        worst=0.0 if nothing else float(np.abs(size).max()),
-        residual=0.0 if nothing else float(np.sqrt(left.mean())),
-        residual_worst=0.0 if nothing else float(np.sqrt(left.max())),
-        worst_level=0.0 if nothing else float(level[np.argmax(left)]),
-        veil=float(veil[largest]),
-        veil_error=float(veil_error[largest]),
+        rms=0.0 if is_empty else float(np.sqrt((correction**2).mean())),
+        worst=0.0 if is_empty else float(np.abs(correction).max()),
+        residual=0.0 if is_empty else float(np.sqrt(error.mean())),
+        residual_worst=0.0 if is_empty else float(np.sqrt(error.max())),
+        worst_level=0.0 if is_empty else float(level[np.argmax(error)]),
+        veil=float(veil[worst_channel]),
+        veil_error=float(veil_error[worst_channel]),
         beyond_cell=float((near @ worst + wide).max()),
         left_in_worst=float((near @ (worst - mean)).max()),
-        white_covariance=_of_white(off_by, [of_paper.get(channel, of_paper[other]) for channel in range(3)]),
-        cells_error=np.stack([cells.get(channel, cells[other]) for channel in range(3)], axis=1),
+        white_covariance=_white_covariance(total_error, [paper.get(channel, paper[best]) for channel in range(3)]),
+        cells_error=np.stack([cells.get(channel, cells[best]) for channel in range(3)], axis=1),
         corrected=subtracted,
-        why_not="" if subtracted else left_out if spread.proven else "no spread beside the sharp core is proven",
+        why_not="" if subtracted else reason if spread.proven else "no spread outside of the sharp core is proven",
     )
 
 
-def _of_white(off_by: _Array, of_paper: list[_Array]) -> _Array:
-    """Return the covariance (3, 3) of paper white's relative errors, by its change (T,) for whole shares by channel."""
+def _white_covariance(shares_error: _Array, paper_changes: list[_Array]) -> _Array:
+    """Return the covariance (3, 3) of relative errors of paper, from its changes (T,) per channel."""
     change = np.zeros((3, TERMS))
     for channel in range(3):
-        change[channel, terms_of(channel)] = of_paper[channel]
-    # What leaves the frame is no error: it dims all that a channel sees alike, as the glass does.
-    return change @ off_by @ change.T
+        change[channel, channel_terms(channel)] = paper_changes[channel]
+    # Light that leaves the frame is no error: it dims all patches of a channel alike, like glass.
+    return change @ shares_error @ change.T
 
 
 def _beyond_cell(around: Surroundings) -> tuple[_Array, _Array]:
-    """Return the share (N,) of each near kernel from beyond a cell, in the worst sample and in the mean of a window."""
+    """Return the share (N,) of each near kernel from beyond a patch, in the worst sample and in the window mean."""
     cell, reach = float(around.pitch_px.min()), around.window // 2
     worst, mean = np.empty(len(NEAR_PX)), np.empty(len(NEAR_PX))
-    # A corner's pixel, half a pixel of rounding towards the corner.
+    # The worst sample is a corner pixel, with 0.5 px of rounding towards the corner.
     for kernel, scale in enumerate(NEAR_PX):
-        at = np.arange(-reach, reach + 1) + 0.5
-        inside = ndtr((cell / 2 - at) / scale) - ndtr((-cell / 2 - at) / scale)
+        offsets = np.arange(-reach, reach + 1) + 0.5
+        inside = ndtr((cell / 2 - offsets) / scale) - ndtr((-cell / 2 - offsets) / scale)
         worst[kernel] = 1 - inside[-1] ** 2
         mean[kernel] = 1 - inside.mean() ** 2
     return worst, mean
 
 
-def _places_beyond(grid: PrintedGrid, registration: Registration, shape: tuple[int, int], window: int) -> Sites:
+def _background_sites(grid: PrintedGrid, registration: Registration, shape: tuple[int, int], window: int) -> Sites:
     rows, columns = shape
     width, height = grid.pitch_mm
-    # The outermost patches, and from them straight on to the sheet's edge and a margin.
+    # The sheet: outermost patches, extended straight to its edge and a margin.
     low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
-    sheet = grid.slots_mm[grid.others[..., 2].ravel() < 0.5]
+    sheet = grid.slots_mm[grid.blank_shares[..., 2].ravel() < 0.5]
     low, high = np.minimum(low, sheet.min(axis=0)), np.maximum(high, sheet.max(axis=0))
     half = np.array([width, height]) / 2
     low, high = low - half, high + half
@@ -539,5 +500,5 @@ def _places_beyond(grid: PrintedGrid, registration: Registration, shape: tuple[i
     covered = cv2.dilate(covered, np.ones((reach, reach), dtype=np.uint8))
     y, x = np.mgrid[_LATTICE_PX // 2 : rows : _LATTICE_PX, _LATTICE_PX // 2 : columns : _LATTICE_PX]
     free = covered[y, x] == 0
-    found = sites_at(np.stack([x[free], y[free]], axis=1).astype(np.float64).reshape(-1, 2), shape, window)
-    return Sites(found.rows[found.inside], found.columns[found.inside], found.inside[found.inside], window)
+    sites = sites_at(np.stack([x[free], y[free]], axis=1).astype(np.float64).reshape(-1, 2), shape, window)
+    return Sites(sites.rows[sites.inside], sites.columns[sites.inside], sites.inside[sites.inside], window)

@@ -1,1 +1,1 @@
-"""The look-up table on disk and in a store."""
+"""The look-up table (LUT) on disk and in a store."""

@@ -1,4 +1,4 @@
-"""The table of those who have none: commands that take the folder of a table take `demo:` for it."""
+"""Make and cache the demonstration LUT: commands accept `demo:` instead of a LUT folder."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from foundation.files import sha256_of
 from foundation.folders import cache_folder
 from foundation.version import software
 
-DEMO: Final = "demo:"  # What stands in place of a table's folder
+DEMO: Final = "demo:"  # given instead of a LUT folder
 
 CAMERA: Final = "Canon_EOS_600D"
-# Incandescent lamp to blue sky, a fluorescent lamp and an LED between.
+# From incandescent lamp to blue sky, with a fluorescent lamp and an LED.
 LIGHTS: Final = "2856K,4000K,D55,D65,FL2,LED-B3,7500K,10000K"
 
-BITS: Final = 4  # Bits kept of each channel: 4096 colours, 5 MB
+BITS: Final = 4  # bits per channel: 4096 colours, 5 MB
 
 _SETTINGS: Final = f"""\
 [room]
@@ -30,35 +30,35 @@ bits = {BITS}
 """
 
 
-def table_folder(given: Path) -> Path:
-    """Return the folder of a table: the one given, or that of the table to begin with, made if it is not there."""
-    if str(given) != DEMO:
-        return given
+def table_folder(folder_or_demo: Path) -> Path:
+    """Return the folder of a LUT; for `demo:`, the cached demonstration LUT, which is made at first use."""
+    if str(folder_or_demo) != DEMO:
+        return folder_or_demo
     cache = cache_folder()
     if cache is None:
         raise InputError(
-            f"{DEMO} needs a place to keep its table, and there is no home folder; set XDG_CACHE_HOME, or make one "
-            "with sim table"
+            f"{DEMO} needs a cache folder, but there is no home folder; set XDG_CACHE_HOME, or make a LUT with "
+            "sim table"
         )
     key = sha256_of(repr((software(), CAMERA, LIGHTS, BITS)).encode())[:12]
-    folder = cache / f"demo-{key}"
-    if not (folder / "lut.json").is_file():
-        _make(folder)
-    print(f"{DEMO} {folder}: a computed table of {CAMERA}, {8**BITS} colours under {LIGHTS}; see sim table --help")
-    return folder
+    demo_folder = cache / f"demo-{key}"
+    if not (demo_folder / "lut.json").is_file():
+        _make(demo_folder)
+    print(f"{DEMO} {demo_folder}: a computed table of {CAMERA}, {8**BITS} colours under {LIGHTS}; see sim table --help")
+    return demo_folder
 
 
 def _make(folder: Path) -> None:
-    """Have ``sim table`` make it, as a user would: what makes computed tables stands above this package."""
+    # `sim table` runs as a command, because its package is above this one.
     options = ["--camera", CAMERA, "--lights", LIGHTS]
-    with TemporaryDirectory() as place:
-        settings = Path(place) / "settings.toml"
+    with TemporaryDirectory() as temporary:
+        settings = Path(temporary) / "settings.toml"
         settings.write_text(_SETTINGS, encoding="utf-8")
-        words = [sys.executable, "-m", "synthesis.cli", "table", str(folder), *options, "--settings", str(settings)]
-        done = subprocess.run(words, stdout=subprocess.DEVNULL, check=False)
-    # Another program may have made it meanwhile, of the same bytes.
-    if done.returncode and not (folder / "lut.json").is_file():
+        command = [sys.executable, "-m", "synthesis.cli", "table", str(folder), *options, "--settings", str(settings)]
+        completed = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
+    # Another process may have made an identical folder at the same time.
+    if completed.returncode and not (folder / "lut.json").is_file():
         raise StorageError(
-            f"the table for {DEMO} could not be made in {folder}: sim table ended with exit code {done.returncode}, "
-            "and says above why; mend that, or make a table elsewhere with sim table"
+            f"the LUT for {DEMO} could not be made in {folder}: sim table returned {completed.returncode}, expected "
+            "0; correct the error above, or make a LUT elsewhere with sim table"
         )

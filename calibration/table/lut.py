@@ -1,9 +1,9 @@
-"""The look-up table on disk: what lies in it (docs/formats.md), and how it is opened for reading.
+"""The look-up table (LUT) on disk: its files (docs/formats.md), and how to open it.
 
-The generator reads tables through this file, and nothing behind it; `calibration.table.writing` writes them. Every
-released version of the format stays readable. `SHA256SUMS` has the form of `sha256sum`, so that a table is checked
-without this software, and its own hash names the table. Small files are held against their hashes whenever a table is
-opened, samples when a light is first used.
+This module is the interface of the generator to LUTs; `calibration.table.writing` writes them. Every released version
+of the format stays readable. `SHA256SUMS` has the form of `sha256sum`, so a LUT can be verified without this software;
+the hash of that file identifies the LUT. Opening a LUT verifies small files; samples are verified at the first use of
+an illuminant.
 """
 
 from __future__ import annotations
@@ -31,44 +31,44 @@ from foundation.records import Record, from_json
 
 FORMAT: Final = "crop.lut"
 
-VERSION: Final = 1  # The only version so far
+VERSION: Final = 1  # the only version so far
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]  # A SHA-256 as 64 lowercase hexadecimal digits
 
-# Name of a file that lies in the table's own folder.
+# Name of a file in the folder of the LUT
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$")]
 
-FRAME_FIELDS: Final = ("kind", "illumination", "file", "sha256")  # Columns of a table's `frames.csv` (docs/formats.md)
+FRAME_FIELDS: Final = ("kind", "illumination", "file", "sha256")  # columns of `frames.csv`
 
-MOST_SAMPLES: Final = 1024  # Samples of a cell at most: the largest window has 9×9
+MOST_SAMPLES: Final = 1024  # largest number of samples per patch; the largest window has 9×9
 
-# What the table was made from and how; written last, so that a folder without it is no table.
+# Origin and processing of the LUT; written last: a folder without it is incomplete.
 PROVENANCE: Final = "lut.json"
 
-SAMPLES: Final = "samples.npy"  # The samples, uint16 little-endian, C order, [light, colour, sample, RGB]
+SAMPLES: Final = "samples.npy"  # uint16 little-endian, C order, [illuminant, colour, sample, RGB]
 
-ILLUMINATIONS: Final = "illuminations.csv"  # The lights and their ground truth
+ILLUMINATIONS: Final = "illuminations.csv"  # illuminants and their ground truth
 
-FRAMES: Final = "frames.csv"  # The raw files that the table was made from; absent in computed tables
+FRAMES: Final = "frames.csv"  # raw files of the LUT; absent in computed LUTs
 
-REFERENCES: Final = "references.csv"  # The grey references under each light, where the chart has some
+REFERENCES: Final = "references.csv"  # grey references under each illuminant, if the chart has any
 
-# The expanded uncertainty of each light's ground truth, and its causes; absent in computed tables.
+# Expanded uncertainty of each ground truth, and its components; absent in computed LUTs
 UNCERTAINTY: Final = "uncertainty.csv"
 
-CELLS: Final = "cells.csv"  # The expanded relative uncertainty of each cell's mean; absent in computed tables
+CELLS: Final = "cells.csv"  # expanded relative uncertainty of patch means; absent in computed LUTs
 
-REPORT_PAGE: Final = "report.html"  # The report for people
+REPORT_PAGE: Final = "report.html"  # report as a page
 
-REPORT_JSON: Final = "report.json"  # The report for programs
+REPORT_JSON: Final = "report.json"  # report for programs
 
-SUMS: Final = "SHA256SUMS"  # Hashes of all other files of the table, as `sha256sum -c` reads them
+SUMS: Final = "SHA256SUMS"  # hashes of all other files, for `sha256sum -c`
 
 REPORT_FORMAT: Final = "crop.report"
 
 REPORT_VERSION: Final = 1  # `format` and `version` of `report.json` (docs/formats.md)
 
-# Largest sizes of a table's files but its samples: forty times those of 707 lights and 32 768 colours.
+# Largest sizes of files except samples, bytes: forty times the sizes for 707 illuminants and 32 768 colours.
 MOST_BYTES: Final = {
     PROVENANCE: 64 << 20,
     ILLUMINATIONS: 16 << 20,
@@ -81,27 +81,27 @@ MOST_BYTES: Final = {
     SUMS: 64 << 10,
 }
 
-# Files that a table may do without: no number is read from them, and a table that was fetched has none.
+# Files that may be missing: no data are read from them, and fetched LUTs do not have them.
 OPTIONAL: Final = frozenset({REPORT_PAGE})
 
 _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_][A-Za-z0-9_.-]{0,99})")
 _TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, REPORT_PAGE)
-RESTORE: Final = "restore it from a copy, fetch the table again, or build it anew"
+RESTORE: Final = "restore it from a copy, fetch the LUT again, or build it again"
 
-# Columns of `illuminations.csv` with the ground truth, after those of the lights.
+# Columns of `illuminations.csv` with the ground truth, after the columns of the illuminants
 WHITE_COLUMNS: Final = ("white_r", "white_g", "white_b")
 
-EXPANDED: Final = "expanded_deg"  # Column of `uncertainty.csv` with a light's expanded uncertainty
+EXPANDED: Final = "expanded_deg"  # column of `uncertainty.csv`
 
-CELL_COLUMNS: Final = ("expanded_r", "expanded_g", "expanded_b")  # Columns of `cells.csv` after the colour's index
+CELL_COLUMNS: Final = ("expanded_r", "expanded_g", "expanded_b")  # columns of `cells.csv` after the colour index
 
-# A ground truth is below this, in units of samples of 16 bits: what is larger was not measured, and its chromaticity
-# might not be a number.
+# Upper bound of ground truths, in units of 16-bit samples: larger values are not measurements, and their chromaticity
+# may overflow.
 MOST_WHITE: Final = 1_000_000
 
 
 class Unfit(BaseModel):
-    """A cell whose samples must not be used, and why."""
+    """A patch with samples that must not be used, and the cause."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -110,59 +110,48 @@ class Unfit(BaseModel):
 
     @property
     def kind(self) -> str:
-        """The cause in a word, without its numbers."""
+        """The cause as one word, without numbers."""
         return self.cause.split(":")[0]
 
 
 class Provenance(Record):
-    """The content of `lut.json`.
-
-    - `camera`: maker and model as the raw files name it.
-    - `bits`: bits kept of each channel; the table has 8**bits colours.
-    - `white_level`: sample value of sensor saturation: linear camera RGB after black subtraction.
-    - `corrections`: what was applied to the counts, with its parameters, in order.
-    - `session_sha256`: hash over the frames' hashes (`calibration.table.lut.frames_sha256`).
-    - `chart_sha256`: hash of the chart.
-    - `samples_sha256`, `illuminations_sha256`: of the files; None until the table is written.
-    - `lights_sha256`: of each light's samples as they lie in the file, in the order of lights, so that damage can be
-      traced to a light.
-    - `files_sha256`: of further files of the table, `references.csv`.
-    - `has_sums`: whether `SHA256SUMS` lists every file of the table; false until it is written.
-    - `computed`: where the table was computed from spectra and a model of the sensor and nothing was photographed: by
-      what, and with which settings. None where it was made from frames.
-    - `origin`: with what, when and by whom the frames were taken, and under which licence the table may be used; None
-      in computed tables of which nothing is stated.
-    """
+    """The content of `lut.json`."""
 
     format: Literal["crop.lut"] = FORMAT
     version: Literal[1] = VERSION
-    camera: str
-    bits: int = Field(ge=1, le=5)
+    camera: str  # maker and model from the raw files
+    bits: int = Field(ge=1, le=5)  # bits per channel of the codes; the LUT has 8**bits colours
+    # sample value of sensor saturation: linear camera RGB after black subtraction
     white_level: int = Field(ge=1, le=65535)
+    # applied corrections with parameters, in order
     corrections: list[dict[str, Any]] = Field(default_factory=list[dict[str, Any]])
-    session_sha256: str
+    session_sha256: str  # hash over the hashes of all frames (`frames_sha256`)
     chart_sha256: str
     software: str
     unfit: list[Unfit] = Field(default_factory=list[Unfit])
-    samples_sha256: Sha256 | None = None
+    samples_sha256: Sha256 | None = None  # None until the LUT is written
     illuminations_sha256: Sha256 | None = None
+    # of the samples of each illuminant as bytes of the file, to locate damage
     lights_sha256: list[Sha256] = Field(default_factory=list[Sha256])
+    # of further files: `references.csv`
     files_sha256: dict[FileName, Sha256] = Field(default_factory=dict[FileName, Sha256])
-    has_sums: bool = False
+    has_sums: bool = False  # `SHA256SUMS` lists all files; false until it is written
+    # program and settings, if the LUT was computed from spectra and a sensor model; None for frames
     computed: dict[str, Any] | None = None
+    # equipment, date, author and licence; None in computed LUTs without this information
     origin: OriginRecord | None = None
 
     @model_validator(mode="after")
     def _require_colours(self) -> Self:
-        beyond = [cell.colour for cell in self.unfit if cell.colour >= 8**self.bits]
-        if beyond:
-            raise ValueError(f"unfit: colour {beyond[0]} is none of the {8**self.bits} of {self.bits} bits a channel")
+        invalid = [cell.colour for cell in self.unfit if cell.colour >= 8**self.bits]
+        if invalid:
+            raise ValueError(f"unfit: colour {invalid[0]}, but {self.bits} bits a channel have {8**self.bits} colours")
         return self
 
     def to_json(self) -> str:
-        """Return the text of `lut.json`; `computed` and `origin` stand in it where they are known."""
-        left_out = {name for name in ("computed", "origin") if getattr(self, name) is None}
-        return self.model_dump_json(indent=2, exclude=left_out) + "\n"
+        """Return the text of `lut.json`, without `computed` and `origin` if they are None."""
+        excluded = {name for name in ("computed", "origin") if getattr(self, name) is None}
+        return self.model_dump_json(indent=2, exclude=excluded) + "\n"
 
 
 class _Head(BaseModel):
@@ -171,48 +160,42 @@ class _Head(BaseModel):
 
 
 def parse_provenance(text: bytes, path: Path) -> Provenance:
-    """Return the content of `lut.json` from its bytes."""
+    """Parse the bytes of `lut.json`."""
     try:
         head = _Head.model_validate_json(text)
     except ValidationError as error:
-        raise FormatError(f"{path} is no table's description: it is damaged; build the table again") from error
+        raise FormatError(f"{path} is damaged: a JSON object was expected; build the LUT again") from error
     if head.format != FORMAT:
-        raise FormatError(f"{path} is no table of CroP: its format is not {FORMAT!r}; name a folder made by build-lut")
+        raise FormatError(f"{path} has format {head.format!r}, expected {FORMAT!r}; name a folder made by build-lut")
     if head.version != VERSION:
         raise FormatError(
             f"{path.parent} is a table of version {head.version!r}, this software reads version {VERSION}; "
             "build it again from its session with build-lut, or install the software that wrote it"
         )
-    found = from_json(Provenance, text, path, "restore it from a copy")
-    if not found.has_sums:
-        raise FormatError(f"{path} does not know of {SUMS} beside it; {RESTORE}")
-    return found
+    provenance = from_json(Provenance, text, path, "restore it from a copy")
+    if not provenance.has_sums:
+        raise FormatError(f"{path} does not refer to {SUMS}, expected has_sums = true; {RESTORE}")
+    return provenance
 
 
 @dataclass(frozen=True)
 class SourceFrame:
-    """A raw file that a table was made from.
+    """A raw file used for a LUT."""
 
-    - `kind`: ``light``, ``white`` or ``dark``.
-    - `illumination`: number of the light; None for white and dark frames.
-    - `file`: path relative to the session's folder.
-    - `sha256`: of the file.
-    """
-
-    kind: str
-    illumination: int | None
-    file: str
-    sha256: str
+    kind: str  # ``light``, ``white`` or ``dark``
+    illumination: int | None  # index of the illuminant; None for white and dark frames
+    file: str  # path relative to the session folder
+    sha256: str  # of the file
 
 
 def frames_sha256(frames: Sequence[SourceFrame]) -> str:
-    """Return the hash that names a session: SHA-256 over kind, light and hash of each frame used, a line each."""
+    """Return the hash that identifies a session: SHA-256 over one line of kind, index and hash for each frame."""
     lines = [f"{frame.kind},{frame.illumination},{frame.sha256}\n" for frame in frames]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def load_frames(path: Path) -> tuple[SourceFrame, ...]:
-    """Return the frames that a `frames.csv` lists, in the order taken; none where the file does not exist."""
+    """Return the frames of a `frames.csv` in the order of exposure; empty if the file does not exist."""
     if not path.is_file():
         return ()
     try:
@@ -225,34 +208,34 @@ def load_frames(path: Path) -> tuple[SourceFrame, ...]:
         )
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise FormatError(
-            f"{path} is damaged: columns {','.join(FRAME_FIELDS)} expected; build the table again"
+            f"{path} is damaged: columns {','.join(FRAME_FIELDS)} expected; build the LUT again"
         ) from error
 
 
 def light_sha256(samples: npt.NDArray[np.uint16]) -> str:
-    """Return the SHA-256 of one light's samples (8**bits, S, 3) uint16, as their bytes lie in the file."""
+    """Return the SHA-256 of the samples (8**bits, S, 3) uint16 of one illuminant, as bytes of the file."""
     return sha256_of(np.ascontiguousarray(samples, dtype="<u2").data)
 
 
 def map_samples(path: Path, lights: int, bits: int) -> npt.NDArray[np.uint16]:
-    """Return `samples.npy` (lights, 8**bits, samples, 3) uint16, mapped from the disk."""
+    """Memory-map `samples.npy`: (illuminants, 8**bits, samples, 3) uint16."""
     try:
         with path.open("rb") as stream:
             version = np.lib.format.read_magic(stream)
             if version != (1, 0):
-                raise ValueError(f"it is of version {version[0]}.{version[1]}, 1.0 expected")
+                raise ValueError(f"its version is {version[0]}.{version[1]}, expected 1.0")
             shape, columns_first, dtype = np.lib.format.read_array_header_1_0(stream)
             offset, size = stream.tell(), stream.seek(0, 2)
     except OSError as error:
-        raise reading_error(path, error, "build the table again") from error
+        raise reading_error(path, error, "build the LUT again") from error
     except Exception as error:
-        # The head is a Python literal, which fails in many ways.
-        raise FormatError(f"cannot read {path}: {error}; restore it from a copy, or build the table again") from error
-    plain = dtype == np.dtype("<u2") and not columns_first and len(shape) == 4
-    if not plain or shape[:2] != (lights, 8**bits) or not 0 < shape[2] <= MOST_SAMPLES or shape[3] != 3:
+        # The header is a Python literal, which can raise many kinds of errors.
+        raise FormatError(f"cannot read {path}: {error}; restore it from a copy, or build the LUT again") from error
+    is_plain = dtype == np.dtype("<u2") and not columns_first and len(shape) == 4
+    if not is_plain or shape[:2] != (lights, 8**bits) or not 0 < shape[2] <= MOST_SAMPLES or shape[3] != 3:
         raise FormatError(
             f"{path} holds {dtype} {shape}, expected uint16 ({lights}, {8**bits}, samples, 3) of 1 to {MOST_SAMPLES} "
-            "samples; build the table again"
+            "samples; build the LUT again"
         )
     expected = offset + math.prod(shape) * 2
     if size != expected:
@@ -263,104 +246,99 @@ def map_samples(path: Path, lights: int, bits: int) -> npt.NDArray[np.uint16]:
 def samples_sha256(
     path: Path, samples: npt.NDArray[np.uint16], progress: Callable[[int, int], None] | None = None
 ) -> tuple[str, list[str]]:
-    """Return the hash of the file, and of each light's part of it, read once and in order.
+    """Return the hash of the file and of the part of each illuminant, in one pass.
 
-    `samples`: (L, 8**bits, S, 3) uint16, the same file mapped: its shape is used.
+    `samples`: (L, 8**bits, S, 3) uint16, the same file, memory-mapped; only its shape is used.
     """
-    whole, lights = hashlib.sha256(), list[str]()
+    file_hash, lights = hashlib.sha256(), list[str]()
     size = samples[0].nbytes
     try:
         with path.open("rb") as stream:
-            whole.update(stream.read(path.stat().st_size - len(samples) * size))
+            file_hash.update(stream.read(path.stat().st_size - len(samples) * size))
             for light in range(len(samples)):
                 slab = stream.read(size)
-                whole.update(slab)
+                file_hash.update(slab)
                 lights.append(sha256_of(slab))
                 if progress is not None:
                     progress(light + 1, len(samples))
     except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror}; check the disk, or build the table again") from error
-    return whole.hexdigest(), lights
+        raise FormatError(f"cannot read {path}: {error.strerror}; check the disk, or build the LUT again") from error
+    return file_hash.hexdigest(), lights
 
 
-def sums_of(folder: Path, samples_sha256: str, provenance: str) -> str:
-    """Return the text of `SHA256SUMS` of a table that is complete but for `lut.json`."""
+def sums_text(folder: Path, samples_sha256: str, provenance: str) -> str:
+    """Return the text of `SHA256SUMS` for a LUT that is complete except for `lut.json`."""
     hashes = {name: file_sha256(folder / name) for name in _TEXTS if (folder / name).is_file()}
     hashes |= {SAMPLES: samples_sha256, PROVENANCE: provenance}
     return "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes))
 
 
 def parse_sums(text: str, path: Path) -> dict[str, str]:
-    """Return the hashes of a table's files by name."""
+    """Return the hashes of the files of a LUT by name."""
     hashes: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        found = _LINE.fullmatch(line)
-        if found is None or found[2] in hashes:
-            raise FormatError(f"{path}, line {number}: expected a hash, two blanks and a name of its own; {RESTORE}")
-        hashes[found[2]] = found[1]
-    lacking = {PROVENANCE, ILLUMINATIONS, SAMPLES} - hashes.keys()
-    if lacking:
-        raise FormatError(f"{path} does not list {' and '.join(sorted(lacking))}; {RESTORE}")
+        match = _LINE.fullmatch(line)
+        if match is None or match[2] in hashes:
+            raise FormatError(f"{path}, line {number}: expected a hash, two blanks and a unique name; {RESTORE}")
+        hashes[match[2]] = match[1]
+    missing = {PROVENANCE, ILLUMINATIONS, SAMPLES} - hashes.keys()
+    if missing:
+        raise FormatError(f"{path} does not list {' and '.join(sorted(missing))}, which every LUT has; {RESTORE}")
     return hashes
 
 
 def require_plain_table(folder: Path) -> None:
-    """Refuse a table's folder with files that are no files, or larger than they may be; a FormatError says which."""
+    """Raise `FormatError` if the folder has other than regular files, or files above their largest size."""
     require_plain_folder(folder, MOST_BYTES)
 
 
-def known_sums(folder: Path) -> dict[str, str]:
-    """Return the recorded hashes of a table's files by name, `samples.npy` included."""
+def recorded_sums(folder: Path) -> dict[str, str]:
+    """Return the recorded hashes of the files of a LUT by name, including `samples.npy`."""
     return parse_sums(read_text(folder / SUMS, RESTORE), folder / SUMS)
 
 
-def changed_files(folder: Path, known: Mapping[str, str]) -> Iterator[str]:
-    """Yield, in words, each file of a table but its samples that is not as it was built, is gone, or is not listed."""
-    for name, then in known.items():
+def changed_files(folder: Path, recorded: Mapping[str, str]) -> Iterator[str]:
+    """Yield a message for each file, except samples, that has changed, is missing or is not listed."""
+    for name, expected_hash in recorded.items():
         path = folder / name
         if name == SAMPLES or (name in OPTIONAL and not path.exists()):
             continue
         if not path.is_file():
-            yield f"{name} is gone"
-        elif file_sha256(path) != then:
-            yield f"{name} is not as it was built" + ": lights or ground truth have changed" * (name == ILLUMINATIONS)
-    # Nothing but what is listed is read, so that only files of a table's own names matter.
+            yield f"{name} is missing"
+        elif file_sha256(path) != expected_hash:
+            yield f"{name} has changed since the build" + ": codes or ground truth" * (name == ILLUMINATIONS)
+    # Only listed files are read, so other unlisted names do no harm.
     yield from (
-        f"{name} is no part of the table as it was built"
-        for name in _TEXTS
-        if name not in known and (folder / name).exists()
+        f"{name} was added after the build" for name in _TEXTS if name not in recorded and (folder / name).exists()
     )
 
 
 def require_listed(folder: Path, provenance: Provenance, lights: int) -> dict[str, str]:
-    """Return the recorded hashes of a table's files after holding all but the samples against them."""
+    """Verify all files except samples, and return their recorded hashes."""
     hashes = len(provenance.lights_sha256)
     if hashes != lights:
-        raise FormatError(
-            f"{folder / PROVENANCE} has hashes of {hashes} lights, the table has {lights} lights; {RESTORE}"
-        )
-    known = known_sums(folder)
-    for fault in changed_files(folder, known):
+        raise FormatError(f"{folder / PROVENANCE} has hashes of {hashes} illuminants, expected {lights}; {RESTORE}")
+    recorded = recorded_sums(folder)
+    for fault in changed_files(folder, recorded):
         raise FormatError(f"{folder}: {fault}; {RESTORE}")
-    return known
+    return recorded
 
 
 @dataclass(frozen=True, eq=False)
 class Lut:
-    """A table, its samples mapped from disk and read only where they are used.
+    """A look-up table (LUT). Samples are memory-mapped, and read when they are used.
 
     Attributes
     ----------
-    folder
-        Where it lies.
-    samples
-        (L, 8**bits, S, 3) uint16, linear camera RGB, `provenance.white_level` = saturation.
-    illuminations
-        The L lights.
-    white
-        (L, 3) float64, linear camera RGB of the achromatic reference in the units of the samples: the ground truth.
-    provenance
-        The content of `lut.json`.
+    folder : Path
+    samples : (L, 8**bits, S, 3) uint16
+        Linear camera RGB; `provenance.white_level` is saturation.
+    illuminations : tuple of Illumination
+        The L illuminants.
+    white : (L, 3) float64
+        Ground truth: linear camera RGB of the achromatic reference in the units of the samples.
+    provenance : Provenance
+        Content of `lut.json`.
     """
 
     folder: Path
@@ -370,45 +348,45 @@ class Lut:
     provenance: Provenance
 
     def __repr__(self) -> str:
-        """Return one line: provenance alone would be some hundred kilobytes."""
+        """Return one line; the provenance alone would be several hundred kilobytes."""
         lights, colours, samples, _ = self.samples.shape
-        told = f"{lights} lights, {colours} colours of {samples} samples"
-        return f"Lut({str(self.folder)!r}, {self.provenance.camera}, {told})"
+        sizes = f"{lights} illuminants, {colours} colours, {samples} samples each"
+        return f"Lut({str(self.folder)!r}, {self.provenance.camera}, {sizes})"
 
     @cached_property
     def ground_truth(self) -> npt.NDArray[np.float64]:
-        """(L, 3) float64, the lights' chromaticities, r + g + b = 1."""
+        """(L, 3) float64, chromaticities of the illuminants, r + g + b = 1."""
         return self.white / self.white.sum(axis=1, keepdims=True)
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 that names the table, as a dataset records it: of `SHA256SUMS`, which has the hash of every file."""
+        """SHA-256 of `SHA256SUMS`, which identifies the LUT; recorded in data sets."""
         return file_sha256(self.folder / SUMS)
 
     def require_unchanged(self, light: int) -> None:
-        """Raise unless a light's samples are those that were measured; costs the reading of a light, once for each.
+        """Verify the samples of an illuminant, by reading them once.
 
         Raises
         ------
         FormatError
-            They are not.
+            If they have changed since the build.
         """
         if light in self._unchanged:
             return
         if light_sha256(self.samples[light]) != self.provenance.lights_sha256[light]:
             raise FormatError(
-                f"{self.folder / SAMPLES}: the samples of light {light} are not those that were measured; see what "
-                f"else has changed with build-lut verify {self.folder}, then copy the table again or build it anew"
+                f"{self.folder / SAMPLES}: the hash of the samples of illuminant {light} differs from {PROVENANCE}; "
+                f"list all changes with build-lut verify {self.folder}, then copy the LUT again or build it again"
             )
         self._unchanged.add(light)
 
     def light_samples(self, light: int) -> npt.NDArray[np.uint16]:
-        """Return the samples (8**bits, S, 3) uint16 of a light, as they are on the disk, after `require_unchanged`.
+        """Return the verified samples (8**bits, S, 3) uint16 of an illuminant, memory-mapped.
 
         Raises
         ------
         FormatError
-            They are not those that were measured.
+            If they have changed since the build.
         """
         self.require_unchanged(light)
         return self.samples[light]
@@ -419,44 +397,42 @@ class Lut:
 
     @cached_property
     def truth_uncertainty_deg(self) -> npt.NDArray[np.float64] | None:
-        """(L,) float64 degrees, expanded uncertainty (k = 2) of the ground truth; None in computed tables.
+        """(L,) float64, degrees: expanded uncertainty (k = 2) of the ground truth; None in computed LUTs.
 
         Raises
         ------
         FormatError
-            `uncertainty.csv` is damaged.
+            If `uncertainty.csv` is damaged.
         """
         path = self.folder / UNCERTAINTY
         return _load_uncertainty(path, len(self.illuminations)) if path.is_file() else None
 
     @cached_property
     def frames(self) -> tuple[SourceFrame, ...]:
-        """The frames the table was made from, in the order taken; empty in computed tables.
+        """Frames of the LUT in the order of exposure; empty in computed LUTs.
 
         Raises
         ------
         FormatError
-            `frames.csv` is damaged.
+            If `frames.csv` is damaged.
         """
         return load_frames(self.folder / FRAMES)
 
 
 def open_lut(folder: Path, *, check: bool = True) -> Lut:
-    """Open a LUT folder; costs milliseconds whatever its size.
+    """Open a LUT folder; takes milliseconds for any size.
 
     Parameters
     ----------
-    folder
-        The table.
-    check
-        Whether its files but the samples are held against their recorded hashes; `calibration.table.verification` does
-        so itself, to name all that have changed. Samples are held against theirs when a light is first used.
+    folder : Path
+    check : bool
+        Verify the hashes of all files except samples; `calibration.table.verification` does this itself to list all
+        changes. Samples are verified at the first use of an illuminant.
 
     Raises
     ------
     FormatError
-        The folder is no table, of a version not known here, a file has changed since it was built, or its files
-        disagree.
+        If the folder is no LUT, its version is unknown, its files disagree, or a file has changed since the build.
     """
     path = folder / PROVENANCE
     require_plain_table(folder)
@@ -464,11 +440,9 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
         text = path.read_bytes()
     except OSError as error:
         if (partial_path(folder) / SAMPLES).is_file():
-            raise FormatError(
-                f"{folder} is a table in the making; finish it with build-lut SESSION {folder}"
-            ) from error
+            raise FormatError(f"{folder} is not finished; finish it with build-lut SESSION {folder}") from error
         raise FormatError(
-            f"{folder} is no table: cannot read {PROVENANCE} ({error.strerror}); make one with build-lut"
+            f"{folder} is no LUT: cannot read {PROVENANCE} ({error.strerror}); make one with build-lut"
         ) from error
     provenance = parse_provenance(text, path)
     lights = load_illuminations(folder / ILLUMINATIONS, computed=True)
@@ -479,15 +453,14 @@ def open_lut(folder: Path, *, check: bool = True) -> Lut:
 
 
 def _load_uncertainty(path: Path, count: int) -> npt.NDArray[np.float64]:
-    """Return the expanded uncertainties (count,) float64 of the lights."""
     try:
         rows = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8")))
-        found = np.array([float(row[EXPANDED]) for row in rows])
+        expanded = np.array([float(row[EXPANDED]) for row in rows])
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{path} is damaged: numbers under {EXPANDED} expected; {RESTORE}") from error
-    if len(found) != count or not np.isfinite(found).all() or (found < 0).any():
-        raise FormatError(f"{path} has {len(found)} rows, {count} of finite numbers from 0 on expected; {RESTORE}")
-    return found
+    if len(expanded) != count or not np.isfinite(expanded).all() or (expanded < 0).any():
+        raise FormatError(f"{path} has {len(expanded)} rows, expected {count} of finite numbers ≥ 0; {RESTORE}")
+    return expanded
 
 
 def _load_white(path: Path) -> npt.NDArray[np.float64]:
@@ -495,13 +468,13 @@ def _load_white(path: Path) -> npt.NDArray[np.float64]:
     try:
         white = np.array([[float(row[column]) for column in WHITE_COLUMNS] for row in rows])
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{path}: expected numbers under {','.join(WHITE_COLUMNS)}; build the table again") from error
+        raise FormatError(f"{path}: expected numbers under {','.join(WHITE_COLUMNS)}; build the LUT again") from error
     if not ((white > 0).all() and (white < MOST_WHITE).all()):
-        raise FormatError(f"{path}: a ground truth is not between 0 and {MOST_WHITE}; build the table again")
+        raise FormatError(f"{path}: a ground truth is outside of 0 … {MOST_WHITE}; build the LUT again")
     return white
 
 
-def require_lut(given: object) -> None:
-    """Refuse what is no table, such as the path of one, or a picture in its place."""
-    if not isinstance(given, Lut):
-        raise InputError(f"the table is {value_text(given)}, expected a Lut, which open_lut(FOLDER) returns, as first")
+def require_lut(value: object) -> None:
+    """Raise `InputError` if a value is not a `Lut`, such as a path or an image."""
+    if not isinstance(value, Lut):
+        raise InputError(f"the first argument is {value_text(value)}, expected a Lut, as returned by open_lut(FOLDER)")

@@ -1,4 +1,4 @@
-"""What a table is, in lines for people; whether it is as it was built, byte by byte; whether two tables correspond."""
+"""Describe a LUT for people, verify every byte of it, and compare two LUTs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calibration.table.lut import (
     UNCERTAINTY,
     Lut,
     changed_files,
-    known_sums,
+    recorded_sums,
     samples_sha256,
 )
 from foundation.errors import FormatError, first_few
@@ -25,16 +25,16 @@ from foundation.errors import FormatError, first_few
 def _uncertainty(lut: Lut) -> str:
     expanded = lut.truth_uncertainty_deg
     if expanded is None:
-        return "not stated: the table was computed"
+        return "not available: computed LUT"
     return (
-        f"{np.median(expanded):.2g}° median, {expanded.max():.2g}° worst light ({int(np.argmax(expanded))}), k = 2; "
-        f"causes in {UNCERTAINTY}"
+        f"median {np.median(expanded):.2g}°, largest {expanded.max():.2g}° (illuminant {int(np.argmax(expanded))}), "
+        f"k = 2; components in {UNCERTAINTY}"
     )
 
 
 def describe(lut: Lut) -> list[tuple[str, str]]:
-    """Return what a table is and what it was made from: names and values, for people to read."""
-    known, lights = lut.provenance, lut.illuminations
+    """Return names and values that describe a LUT and its origin, for people to read."""
+    source, lights = lut.provenance, lut.illuminations
     black_bodies = [light.cct_k for light in lights if light.cct_k is not None]
     spectra = sum(light.kind == "spectrum" for light in lights)
     kinds = f"{len(lights) - len(black_bodies) - spectra} uniform, {len(black_bodies)} black bodies"
@@ -43,108 +43,106 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
     if spectra:
         kinds += f", {spectra} spectra"
     causes: dict[str, int] = {}
-    for cell in known.unfit:
+    for cell in source.unfit:
         cause = cell.cause.split(":")[0]
         causes[cause] = causes.get(cause, 0) + 1
     brightest = lut.white.max(axis=1)
     low, high = lut.ground_truth.min(axis=0), lut.ground_truth.max(axis=0)
     chromaticities = ", ".join(
-        f"{channel} {least:.3f} to {most:.3f}"
-        for channel, least, most in zip("rgb", low.tolist(), high.tolist(), strict=True)
+        f"{channel} {low_value:.3f} to {high_value:.3f}"
+        for channel, low_value, high_value in zip("rgb", low.tolist(), high.tolist(), strict=True)
     )
     frames = f"{len(lut.frames)}, listed in {FRAMES}" if lut.frames else "not listed"
     origin: list[tuple[str, str]] = []
-    session = known.session_sha256
-    if known.computed is not None:
-        by = known.computed.get("by", "a program")
-        origin = [("Origin", f"computed by {by} from spectra and a model of the sensor; nothing was photographed")]
+    session = source.session_sha256
+    if source.computed is not None:
+        by = source.computed.get("by", "a program")
+        origin = [("Origin", f"computed by {by} from spectra and a sensor model, not photographed")]
         frames = session = "none: computed"
     return [
         *origin,
-        ("Camera", known.camera),
+        ("Camera", source.camera),
         ("Lights", f"{len(lights)}: {kinds}"),
-        ("Colours", f"{8**known.bits} ({known.bits} bits a channel), {lut.samples.shape[2]} samples each"),
+        ("Colours", f"{8**source.bits} ({source.bits} bits a channel), {lut.samples.shape[2]} samples each"),
         ("Size", f"{lut.samples.nbytes / 1e9:.2f} GB of samples"),
         (
             "White",
-            f"{brightest.min():.0f} to {brightest.max():.0f} in the brightest channel, saturation {known.white_level}",
+            f"{brightest.min():.0f} to {brightest.max():.0f} in the brightest channel, saturation {source.white_level}",
         ),
         ("Chromaticities", chromaticities),
         ("Uncertainty", _uncertainty(lut)),
         (
             "Cells unfit",
-            f"{len(known.unfit)} of {8**known.bits}"
+            f"{len(source.unfit)} of {8**source.bits}"
             + "".join(f", {count} {cause}" for cause, count in sorted(causes.items())),
         ),
-        ("Corrections", ", ".join(_name(correction) for correction in known.corrections)),
-        *origin_lines(known.origin),
-        ("Built by", known.software),
+        ("Corrections", ", ".join(_name(correction) for correction in source.corrections)),
+        *origin_lines(source.origin),
+        ("Built by", source.software),
         ("Frames", frames),
         ("Session", session),
-        ("Chart", known.chart_sha256),
-        ("Samples", known.samples_sha256 or ""),
-        ("Hashes", f"every file, in {SUMS}, whose own names the table"),
+        ("Chart", source.chart_sha256),
+        ("Samples", source.samples_sha256 or ""),
+        ("Hashes", f"every file, in {SUMS}, whose own names the LUT"),
         ("Table", lut.sha256),
     ]
 
 
 def citation_of(lut: Lut) -> str:
-    """Return a BibTeX entry of a table, with its hash."""
-    known = lut.provenance
-    computed = known.computed is not None
-    return bibtex(known.camera, len(lut.illuminations), known.software, lut.sha256, known.origin, computed)
+    """Return a BibTeX entry of a LUT, with its hash."""
+    source = lut.provenance
+    computed = source.computed is not None
+    return bibtex(source.camera, len(lut.illuminations), source.software, lut.sha256, source.origin, computed)
 
 
 def _name(correction: Mapping[str, Any]) -> str:
-    """Return what a correction is called, and whether it was only recorded."""
     name = str(correction.get("name", "?"))
     return f"{name} (recorded, not applied)" if correction.get("applied") is False else name
 
 
 def find_faults(lut: Lut, progress: Callable[[int, int], None] | None = None) -> list[str]:
-    """Return what of a table is not as it was built, each fault in words; none where all is. Reads every byte of it."""
-    sums = known_sums(lut.folder)
+    """Return a message for each difference from the time of the build; reads every byte."""
+    sums = recorded_sums(lut.folder)
     faults = list(changed_files(lut.folder, sums))
-    whole, lights = samples_sha256(lut.folder / SAMPLES, lut.samples, progress)
+    file_hash, lights = samples_sha256(lut.folder / SAMPLES, lut.samples, progress)
     recorded = lut.provenance.lights_sha256
     if len(recorded) != len(lights):
-        return [*faults, f"{PROVENANCE}: it has hashes of {len(recorded)} lights, the table has {len(lights)}"]
-    changed = [light for light, (now, then) in enumerate(zip(lights, recorded, strict=True)) if now != then]
+        return [*faults, f"{PROVENANCE} has hashes of {len(recorded)} illuminants, the LUT has {len(lights)}"]
+    changed = [light for light, (new, old) in enumerate(zip(lights, recorded, strict=True)) if new != old]
     if changed:
-        named = first_few(changed, 20)
-        faults.append(f"{SAMPLES}: the samples of {len(changed)} of {len(lights)} lights have changed: {named}")
-    elif whole != sums[SAMPLES]:
-        faults.append(f"{SAMPLES}: its first bytes, before the samples, have changed")
+        indices = first_few(changed, 20)
+        faults.append(f"{SAMPLES}: the samples of {len(changed)} of {len(lights)} illuminants have changed: {indices}")
+    elif file_hash != sums[SAMPLES]:
+        faults.append(f"{SAMPLES}: its header has changed")
     return faults
 
 
-def chart_difference(one: Lut, other: Lut) -> str:
-    """Return in what the charts of two tables differ, so that a colour means another place; "" of one chart."""
-    ours, theirs = one.provenance, other.provenance
-    if ours.bits != theirs.bits:
-        return f"{ours.bits} bits of each channel against {theirs.bits}"
-    if ours.chart_sha256 != theirs.chart_sha256:
-        return f"chart {ours.chart_sha256[:12]}… against {theirs.chart_sha256[:12]}…"
+def chart_difference(first: Lut, second: Lut) -> str:
+    """Return the difference between the charts of two LUTs as text; "" if they are the same."""
+    chart, other_chart = first.provenance, second.provenance
+    if chart.bits != other_chart.bits:
+        return f"{chart.bits} bits of each channel against {other_chart.bits}"
+    if chart.chart_sha256 != other_chart.chart_sha256:
+        return f"chart {chart.chart_sha256[:12]}… against {other_chart.chart_sha256[:12]}…"
     return ""
 
 
-def require_match(one: Lut, other: Lut) -> None:
-    """Refuse two tables whose colours or lights do not correspond number by number.
+def require_match(first: Lut, second: Lut) -> None:
+    """Raise `FormatError` if colours or illuminants of two LUTs do not correspond by index.
 
-    Tables of one chart under one list of lights, photographed by two bodies or on two days, pass: colour index and
-    light index then mean the same in both.
+    LUTs of the same chart and list of illuminants pass, whatever the camera and the day.
     """
-    differs = chart_difference(one, other)
-    found = [differs] if differs else []
-    if len(one.illuminations) != len(other.illuminations):
-        found.append(f"{len(one.illuminations)} lights against {len(other.illuminations)}")
+    chart_text = chart_difference(first, second)
+    differences = [chart_text] if chart_text else []
+    if len(first.illuminations) != len(second.illuminations):
+        differences.append(f"{len(first.illuminations)} illuminants against {len(second.illuminations)}")
     else:
-        pairs = zip(one.illuminations, other.illuminations, strict=True)
-        differing = [light.index for light, counterpart in pairs if light != counterpart]
-        if differing:
-            found.append(f"other codes under {len(differing)} lights: {first_few(differing)}")
-    if found:
+        pairs = zip(first.illuminations, second.illuminations, strict=True)
+        different = [light.index for light, other_light in pairs if light != other_light]
+        if different:
+            differences.append(f"other codes for {len(different)} illuminants: {first_few(different)}")
+    if differences:
         raise FormatError(
-            f"{one.folder} and {other.folder} do not correspond: {'; '.join(found)}; "
+            f"{first.folder} and {second.folder} do not correspond: {'; '.join(differences)}; "
             "name two tables of one chart.json and one illuminations.csv"
         )

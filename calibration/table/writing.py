@@ -1,4 +1,4 @@
-"""A table is written: samples light by light, its ground truth, and its description last (docs/formats.md)."""
+"""Write a look-up table (LUT): samples by illuminant, ground truth, and provenance last (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from calibration.table.lut import (
     SourceFrame,
     light_sha256,
     samples_sha256,
-    sums_of,
+    sums_text,
 )
 from experiment.lights import COLUMNS, NAME, Illumination
 from foundation.errors import StorageError
@@ -43,11 +43,9 @@ def frames_csv(frames: Sequence[SourceFrame]) -> str:
 
 
 class LutWriter:
-    """Fills a new LUT folder light by light; the folder is the caller's to rename into place.
+    """Writes a new LUT folder, one illuminant at a time; the caller renames the folder when it is complete.
 
-    The samples' whole size is claimed at the start, so that a full disk is met before the work and not in its midst.
-
-    `sha256`: SHA-256 of the samples of each light that was put, by its number.
+    The full size of the samples is allocated first, so that a full disk is detected before the work.
     """
 
     def __init__(
@@ -57,6 +55,7 @@ class LutWriter:
         self._path = folder / SAMPLES
         self._shape = (lights, colours, samples, 3)
         self._size = colours * samples * 6
+        # SHA-256 of the samples of each written illuminant, by index
         self.sha256: dict[int, str] = dict(written or {})
         header = io.BytesIO()
         np.lib.format.write_array_header_1_0(header, {"descr": "<u2", "fortran_order": False, "shape": self._shape})
@@ -70,7 +69,7 @@ class LutWriter:
             raise storage_error(self._path, error) from error
 
     def put(self, light: int, samples: npt.NDArray[np.uint16]) -> None:
-        """Store the samples (colours, samples, 3) uint16 of light number `light`."""
+        """Write the samples (colours, samples, 3) uint16 of illuminant number `light`."""
         data = np.ascontiguousarray(np.broadcast_to(samples, self._shape[1:]), dtype="<u2").tobytes()
         try:
             with self._path.open("r+b") as stream:
@@ -81,11 +80,11 @@ class LutWriter:
         self.sha256[light] = sha256_of(data)
 
     def get(self, light: int) -> npt.NDArray[np.uint16]:
-        """Return the samples (colours, samples, 3) uint16 that were put for light number `light`, from the disk."""
+        """Read back the samples (colours, samples, 3) uint16 of illuminant number `light`."""
         return np.array(np.load(self._path, mmap_mode="r", allow_pickle=False)[light])
 
     def flush(self) -> None:
-        """Wait until the disk holds what was put (`fsync`)."""
+        """Wait until all samples are on the disk (`fsync`)."""
         try:
             with self._path.open("r+b") as stream:
                 os.fsync(stream.fileno())
@@ -93,9 +92,9 @@ class LutWriter:
             raise storage_error(self._path, error) from error
 
     def damaged(self) -> list[int]:
-        """Return the lights whose samples on the disk are not what was put."""
+        """Return the illuminants with samples on disk that differ from the written ones."""
         samples = np.load(self._path, mmap_mode="r", allow_pickle=False)
-        return [light for light, known in self.sha256.items() if light_sha256(samples[light]) != known]
+        return [light for light, written_hash in self.sha256.items() if light_sha256(samples[light]) != written_hash]
 
     def finish(
         self,
@@ -105,19 +104,19 @@ class LutWriter:
         frames: Sequence[SourceFrame] = (),
         files: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        """Write the frames, the ground truth, the hashes and the provenance; after this the folder is a table.
+        """Write frames, ground truth, hashes and provenance; after this the folder is a LUT.
 
-        A report of the table must be in the folder by now: its hash is written too.
+        The report must be in the folder already, because its hash is written.
 
-        `white`: (L, 3) float64, the ground truth.
+        `white`: (L, 3) float64, ground truth.
         """
         self.flush()
-        whole, lights = samples_sha256(self._path, np.load(self._path, mmap_mode="r", allow_pickle=False))
-        lost = [light for light, known in self.sha256.items() if lights[light] != known]
-        if lost:
+        file_hash, lights = samples_sha256(self._path, np.load(self._path, mmap_mode="r", allow_pickle=False))
+        damaged = [light for light, written_hash in self.sha256.items() if lights[light] != written_hash]
+        if damaged:
             raise StorageError(
-                f"{self._path}: the samples of lights {', '.join(map(str, lost[:10]))} read back are not those "
-                "written; check the disk, then build the table on another"
+                f"{self._path}: the samples of illuminants {', '.join(map(str, damaged[:10]))} on disk differ from the "
+                "written ones; check the disk, then build the LUT on another"
             )
         truth = _ground_truth_csv(illuminations, white)
         write_atomic(self._folder / ILLUMINATIONS, truth)
@@ -127,19 +126,18 @@ class LutWriter:
             write_atomic(self._folder / name, text)
         hashes = {
             "files_sha256": {name: sha256_of(text.encode()) for name, text in files.items()},
-            "samples_sha256": whole,
+            "samples_sha256": file_hash,
             "illuminations_sha256": sha256_of(truth.encode()),
             "lights_sha256": lights,
             "has_sums": True,
         }
-        described = provenance.model_copy(update=hashes).to_json()
-        write_atomic(self._folder / SUMS, sums_of(self._folder, whole, sha256_of(described.encode())))
-        write_atomic(self._folder / PROVENANCE, described)
+        description = provenance.model_copy(update=hashes).to_json()
+        write_atomic(self._folder / SUMS, sums_text(self._folder, file_hash, sha256_of(description.encode())))
+        write_atomic(self._folder / PROVENANCE, description)
 
 
 def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[np.float64]) -> str:
-    """Return the text of `illuminations.csv`: the lights with their whites (L, 3), six decimals."""
-    named = any(light.name is not None for light in illuminations)
+    has_names = any(light.name is not None for light in illuminations)
     rows = (
         [
             light.index,
@@ -147,24 +145,23 @@ def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[
             None if light.cct_k is None else f"{light.cct_k:g}",
             *light.colour,
             *(f"{value:.6f}" for value in values),
-            *([light.name] if named else []),
+            *([light.name] if has_names else []),
         ]
         for light, values in zip(illuminations, white, strict=True)
     )
-    return csv_text([[*COLUMNS, *WHITE_COLUMNS, *([NAME] if named else [])], *rows])
+    return csv_text([[*COLUMNS, *WHITE_COLUMNS, *([NAME] if has_names else [])], *rows])
 
 
 def references_csv(names: Sequence[str], white: _Array, white_error: _Array, greys: _Array, errors: _Array) -> str:
-    """Return the text of `references.csv`: every light's white, then its greys.
+    """Return the text of `references.csv`: for each illuminant the white, then the greys.
 
-    `white`, `white_error`: (L, 3), units of the samples. `greys`, `errors`: (L, G, 3), the same units; NaN is left
-    empty.
+    `white`, `white_error`: (L, 3), units of the samples. `greys`, `errors`: (L, G, 3), same units; NaN becomes empty.
     """
     values = np.concatenate([white[:, None], greys], axis=1)
-    off = np.concatenate([white_error[:, None], errors], axis=1)
+    all_errors = np.concatenate([white_error[:, None], errors], axis=1)
     rows = (
         [light, name, *(None if np.isnan(number) else f"{number:.6f}" for number in (*value.tolist(), *error.tolist()))]
         for light in range(len(white))
-        for name, value, error in zip(("white", *names), values[light], off[light], strict=True)
+        for name, value, error in zip(("white", *names), values[light], all_errors[light], strict=True)
     )
     return csv_text([REFERENCE_COLUMNS, *rows])

@@ -1,12 +1,12 @@
-"""A table as others get it: a sharded Zarr array on any store that fsspec reaches, and back to the folder that is used.
+"""Publish a LUT as a sharded Zarr array on any fsspec store, and fetch it back to a folder.
 
-Zarr specification version 3 with the codec `sharding_indexed`: one light is a chunk, 32 lights an object, compressed by
-Blosc (Zstandard after bit shuffle). The table's other files are attributes, word for word; `whole` is set last, and
-nothing is overwritten but an array without it.
+Zarr specification version 3 with the codec `sharding_indexed`: one chunk per illuminant, 32 illuminants per object,
+compressed by Blosc (Zstandard after bit shuffle). The other files of the LUT are attributes, unchanged. `whole` is set
+last; only an array without it is overwritten.
 
-Nothing that a store says of itself is believed before it fits together: texts, the array's shape, its chunks and the
-head of `samples.npy` have to say the same. Sizes are bounded, names and codecs are those of published tables. A table
-that is fetched appears in its folder whole and verified, or not at all. Needs zarr, the extra `cluster`.
+Data from a store are not trusted: texts, shape and chunks of the array and the header of `samples.npy` must agree.
+Sizes are limited; names and codecs must be those of published LUTs. A fetched LUT appears in its folder complete and
+verified, or not at all. Needs zarr, the extra `cluster`.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from calibration.table.lut import (
     SUMS,
     UNCERTAINTY,
     Lut,
-    known_sums,
     light_sha256,
     open_lut,
     parse_provenance,
+    recorded_sums,
     require_listed,
 )
 from experiment.lights import load_illuminations
@@ -51,119 +51,118 @@ from foundation.folders import atomic_folder, require_free
 
 FORMAT: Final = "crop.lut.published"
 
-VERSION: Final = 1  # The only version so far
+VERSION: Final = 1  # the only version so far
 
-# Files that go along where the table has them, the one that makes a folder a table last.
+# Text files that are published if they exist; `lut.json` last, because it completes a LUT.
 TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, UNCERTAINTY, CELLS, REPORT_JSON, SUMS, PROVENANCE)
 
-MOST_LIGHTS: Final = 65_536  # Lights of a table that is fetched, at most: a hundred times those of the paper
+MOST_LIGHTS: Final = 65_536  # largest number of illuminants in a fetched LUT: a hundred times the paper's
 
 _METADATA: Final = "zarr.json"
 
-# The metadata hold all files of the table but samples and page; see `calibration.table.lut.MOST_BYTES`.
+# Largest metadata, bytes: all files except samples and report page; see `calibration.table.lut.MOST_BYTES`.
 _MOST_METADATA: Final = 256 << 20
 
-_MOST_HEAD: Final = 10_000  # Longest head of an array file that NumPy reads
+_MOST_HEAD: Final = 10_000  # longest header of an array file that NumPy reads, bytes
 
-# Codecs of published tables; others are not run, for a store may name any that this machine has.
+# Codecs of published LUTs; others are not run, because a store could name any installed codec.
 _CODECS: Final = frozenset({"sharding_indexed", "bytes", "blosc", "crc32c"})
 
-HASH: Final = re.compile("[0-9a-f]{64}")  # A SHA-256 as it is printed and given
+HASH: Final = re.compile("[0-9a-f]{64}")  # a SHA-256 as printed
 
-# Lights of one object of the store: 100 MB compressed of a full table, a size that stores and networks like.
+# Illuminants per object of the store: 100 MB compressed for a full LUT, a good size for stores and networks.
 SHARD_LIGHTS: Final = 32
 
-ReportLights = Callable[[int, int], None]  # Called with the number of lights copied, and the number of all
+ReportLights = Callable[[int, int], None]  # called with the number of illuminants copied, and of all
 
 
-def reason_of(error: Exception) -> str:
-    """Return what a store's library says, on one line."""
+def error_text(error: Exception) -> str:
+    """Return the message of a store's error on one line."""
     return " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
 
 
-def texts_of(attributes: dict[str, Any], url: str) -> dict[str, str]:
-    """Return the table's files of text by name, those alone that a table has; a FormatError if one is none."""
+def table_texts(attributes: dict[str, Any], url: str) -> dict[str, str]:
+    """Return the text files of a LUT by name; raise `FormatError` for any other file."""
     files = attributes.get("files")
     if not isinstance(files, dict):
-        raise FormatError(f"{url} does not hold the files of a table; publish it again")
-    found: dict[str, str] = {}
+        raise FormatError(f"{url} has no files attribute, which every LUT has; publish the LUT again")
+    texts: dict[str, str] = {}
     for name, text in cast("dict[str, Any]", files).items():
         if name not in TEXTS or not isinstance(text, str) or len(text) > MOST_BYTES[name]:
-            raise FormatError(f"{url} holds {name!r}, which is no file of a table or too large; publish it again")
-        found[name] = text
-    lacking = {PROVENANCE, ILLUMINATIONS, SUMS} - found.keys()
-    if lacking:
-        raise FormatError(f"{url} lacks {' and '.join(sorted(lacking))}; publish the table again")
-    return found
+            raise FormatError(f"{url} holds {name!r}, no file of a LUT or too large; publish the LUT again")
+        texts[name] = text
+    missing = {PROVENANCE, ILLUMINATIONS, SUMS} - texts.keys()
+    if missing:
+        raise FormatError(f"{url} lacks {' and '.join(sorted(missing))}; publish the LUT again")
+    return texts
 
 
 def require_expected(folder: Path, expect: str | None, url: str) -> None:
-    """Refuse a table of another hash than expected; None expects none."""
-    found = file_sha256(folder / SUMS)
-    if expect is not None and found != expect:
+    """Raise `FormatError` if the hash of a LUT differs from `expect`; None accepts any."""
+    table_hash = file_sha256(folder / SUMS)
+    if expect is not None and table_hash != expect:
         raise FormatError(
-            f"{url} is not the table that was expected: its hash is {found}, expected {expect}; ask who told you the "
-            "hash which table they mean"
+            f"{url} is another LUT: its hash is {table_hash}, expected {expect}; check the hash and the address"
         )
 
 
-def require_shape(described: dict[str, Any], expected: tuple[int, int], url: str) -> tuple[int, int, int, int]:
-    """Return the shape of the samples; a FormatError if it, or how they lie there, is not that of a published table."""
-    shape = described.get("shape")
+def require_shape(metadata: dict[str, Any], expected: tuple[int, int], url: str) -> tuple[int, int, int, int]:
+    """Return the shape of the samples; raise `FormatError` if the array is not stored like a published LUT."""
+    shape = metadata.get("shape")
     chunks: Any = {}
     codecs: set[Any] = set()
     try:
-        (sharding,) = described["codecs"]
+        (sharding,) = metadata["codecs"]
         chunks = sharding["configuration"]["chunk_shape"]
         inner = sharding["configuration"]["codecs"] + sharding["configuration"]["index_codecs"]
         codecs = {sharding["name"], *(codec["name"] for codec in inner)}
         lights, colours, samples, channels = (int(side) for side in cast("list[int]", shape))
-        fits = (
+        is_valid = (
             (lights, colours, channels) == (*expected, 3)
             and 0 < samples <= MOST_SAMPLES
             and lights <= MOST_LIGHTS
             and list(chunks) == [1, colours, samples, 3]
-            and described["data_type"] == "uint16"
+            and metadata["data_type"] == "uint16"
             and codecs <= _CODECS
         )
     except (KeyError, TypeError, ValueError, OverflowError):
-        fits, (lights, colours, samples, channels) = False, (0, 0, 0, 0)
-    if not fits:
+        is_valid, (lights, colours, samples, channels) = False, (0, 0, 0, 0)
+    if not is_valid:
         raise FormatError(
-            f"{url} is an array {str(shape)[:200]} that is not stored as published tables are; expected "
-            f"[{expected[0]}, {expected[1]}, samples, 3], as its files say, a light a chunk; publish the table again"
+            f"{url} is an array of shape {str(shape)[:200]}, expected [{expected[0]}, {expected[1]}, samples, 3] as in "
+            "its files, uint16 with a chunk per illuminant; publish the LUT again"
         )
     return lights, colours, samples, channels
 
 
-def head_of(attributes: dict[str, Any], shape: tuple[int, int, int, int], url: str) -> bytes:
-    """Return the first bytes of `samples.npy`; a FormatError if they do not belong to samples of that shape."""
+def samples_header(attributes: dict[str, Any], shape: tuple[int, int, int, int], url: str) -> bytes:
+    """Return the header of `samples.npy`; raise `FormatError` if it does not match the shape."""
     try:
         head = base64.b64decode(attributes["head"], validate=True)[:_MOST_HEAD]
         stream = io.BytesIO(head)
         if np.lib.format.read_magic(stream) != (1, 0):
-            raise ValueError("it is not of version 1.0")
-        described = np.lib.format.read_array_header_1_0(stream)
-        if described != (shape, False, np.dtype("<u2")) or stream.read():
-            raise ValueError("it is that of another array")
+            raise ValueError("its version is not 1.0")
+        header = np.lib.format.read_array_header_1_0(stream)
+        if header != (shape, False, np.dtype("<u2")) or stream.read():
+            raise ValueError("it belongs to another array")
     except Exception as error:
-        # The head is a Python literal, which fails in many ways.
-        raise FormatError(f"the head of the samples of {url} is damaged: {error}; publish the table again") from error
+        # The header is a Python literal, which can raise many kinds of errors.
+        raise FormatError(f"the header of the samples of {url} is damaged: {error}; publish the LUT again") from error
     return head
 
 
 def require_room(folder: Path, size: int, url: str) -> None:
-    """Refuse what does not fit on the disk, before any of it has come."""
-    free = shutil.disk_usage(folder).free
-    if size > free:
+    """Raise `StorageError` if the samples do not fit on the disk, before they are copied."""
+    free_bytes = shutil.disk_usage(folder).free
+    if size > free_bytes:
         raise StorageError(
-            f"the samples of {url} have {size / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free at {folder.parent}; free "
-            "space or choose another disk, then run the same command again"
+            f"the samples of {url} need {size / 1e9:.1f} GB, but {free_bytes / 1e9:.1f} GB are free at "
+            f"{folder.parent}; free space or choose another disk, then run the same command again"
         )
 
 
-def described_at(url: str) -> dict[str, Any] | None:
-    """Return what a store says of an array, `zarr.json` (Zarr 3, "Array metadata"); None where there is none."""
+def read_metadata(url: str) -> dict[str, Any] | None:
+    """Return the metadata of an array, `zarr.json` (Zarr 3, "Array metadata"); None if there is none."""
     from fsspec.core import url_to_fs
 
     if "://" not in url or url.startswith("file://"):
@@ -175,24 +174,24 @@ def described_at(url: str) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except Exception as error:
-        # Every store raises errors of its own.
-        raise InputError(f"cannot look into {url}: {reason_of(error)}; check the address") from error
+        # Each kind of store has its own errors.
+        raise InputError(f"cannot read {url}: {error_text(error)}; check the address") from error
     if len(data) > _MOST_METADATA:
-        raise FormatError(f"{url} has a {_METADATA} of more than {_MOST_METADATA} bytes, which no table has")
+        raise FormatError(f"{url}: {_METADATA} has more than {_MOST_METADATA} bytes, the limit; check the address")
     return parse_json_object(data, f"{_METADATA} of {url}")
 
 
-def attributes_of(described: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Return the attributes of a published table, finished or not; None where there is none."""
-    attributes = (described or {}).get("attributes")
+def table_attributes(metadata: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Return the attributes of a published LUT, complete or not; None if there is none."""
+    attributes = (metadata or {}).get("attributes")
     if not isinstance(attributes, dict):
         return None
-    found = cast("dict[str, Any]", attributes)
-    return found if found.get("format") == FORMAT else None
+    published = cast("dict[str, Any]", attributes)
+    return published if published.get("format") == FORMAT else None
 
 
 def publish(lut: Lut, url: str, progress: ReportLights | None = None) -> None:
-    """Write a table to a store."""
+    """Write a LUT to a store."""
     zarr = _zarr()
     lights, colours, samples, _ = lut.samples.shape
     _require_free(url)
@@ -220,60 +219,62 @@ def publish(lut: Lut, url: str, progress: ReportLights | None = None) -> None:
     except CropError:
         raise
     except Exception as error:
-        # Every store raises errors of its own.
+        # Each kind of store has its own errors.
         raise StorageError(
-            f"cannot write {url}: {reason_of(error)}; check the address and that you may write there"
+            f"cannot write {url}: {error_text(error)}; check the address and your permissions"
         ) from error
 
 
 def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: str | None = None) -> Lut:
-    """Copy a published table to a folder, where it is memory-mapped.
+    """Copy a published LUT to a folder, and open it.
 
-    What a store claims is believed only as far as it fits together and on the disk: the texts come first, and say how
-    large the samples are; each light is held against its hash when it has come.
+    Texts are read first; they give the size of the samples. The samples of each illuminant are verified on arrival.
 
-    `expect`: the table's hash as `Lut.sha256`, told by somebody who is trusted; None for any.
+    Parameters
+    ----------
+    url : str
+    folder : Path
+    progress : callable, optional
+        Called with the numbers of illuminants copied and in total.
+    expect : str, optional
+        Hash of the LUT (`Lut.sha256`) from a trusted person; None accepts any.
     """
     zarr = _zarr()
     if expect is not None and not HASH.fullmatch(expect):
-        raise InputError(f"{expect!r} is no hash of a table; give the 64 digits that build-lut info prints as Table")
-    require_free(folder, "the table")
-    described = described_at(url)
-    attributes = attributes_of(described)
-    if described is None or attributes is None or attributes.get("whole") is not True:
-        raise FormatError(
-            f"{url} holds no table, or one that was never finished; check the address, or publish it again"
-        )
+        raise InputError(f"{expect!r} is no hash of a LUT; give the 64 digits in the line Table of build-lut info")
+    require_free(folder, "the LUT")
+    metadata = read_metadata(url)
+    attributes = table_attributes(metadata)
+    if metadata is None or attributes is None or attributes.get("whole") is not True:
+        raise FormatError(f"{url} holds no complete LUT; check the address, or publish the LUT again")
     if attributes.get("version") != VERSION:
-        raise FormatError(
-            f"{url} is published in version {attributes.get('version')!r}, this software reads {VERSION}; update it"
-        )
-    files = texts_of(attributes, url)
-    with atomic_folder(folder, "the table") as partial:
+        raise FormatError(f"{url} has version {attributes.get('version')!r}, expected {VERSION}; update this software")
+    files = table_texts(attributes, url)
+    with atomic_folder(folder, "the LUT") as partial:
         for name in TEXTS:
             if name in files:
                 write_atomic(partial / name, files[name])
-        known = parse_provenance(files[PROVENANCE].encode(), partial / PROVENANCE)
+        provenance = parse_provenance(files[PROVENANCE].encode(), partial / PROVENANCE)
         require_expected(partial, expect, url)
         lights = len(load_illuminations(partial / ILLUMINATIONS, computed=True))
-        require_listed(partial, known, lights)
-        shape = require_shape(described, (lights, 8**known.bits), url)
-        head = head_of(attributes, shape, url)
+        require_listed(partial, provenance, lights)
+        shape = require_shape(metadata, (lights, 8**provenance.bits), url)
+        head = samples_header(attributes, shape, url)
         require_room(partial, len(head) + math.prod(shape) * 2, url)
         try:
             array: Any = zarr.open_array(url, mode="r")
         except Exception as error:
-            # Every store raises errors of its own.
-            raise FormatError(f"cannot read {url}: {reason_of(error)}; publish the table again") from error
+            # Each kind of store has its own errors.
+            raise FormatError(f"cannot read {url}: {error_text(error)}; publish the LUT again") from error
         path = partial / SAMPLES
         try:
             with path.open("wb") as stream:
                 stream.write(head)
                 for light in range(lights):
                     samples = _light(array, light, shape, url)
-                    if light_sha256(samples) != known.lights_sha256[light]:
+                    if light_sha256(samples) != provenance.lights_sha256[light]:
                         raise FormatError(
-                            f"the samples of light {light} from {url} are not those that were measured; publish again"
+                            f"the samples of illuminant {light} of {url} are damaged; publish the LUT again"
                         )
                     stream.write(samples.tobytes())
                     if progress is not None:
@@ -281,8 +282,8 @@ def fetch(url: str, folder: Path, progress: ReportLights | None = None, expect: 
         except OSError as error:
             raise storage_error(path, error) from error
         open_lut(partial)
-        if file_sha256(path) != known_sums(partial)[SAMPLES]:
-            raise FormatError(f"the samples from {url} are not those that were measured; publish the table again")
+        if file_sha256(path) != recorded_sums(partial)[SAMPLES]:
+            raise FormatError(f"the samples of {url} are damaged; publish the LUT again")
     return open_lut(folder)
 
 
@@ -290,28 +291,28 @@ def _light(array: Any, light: int, shape: tuple[int, int, int, int], url: str) -
     try:
         samples = np.asarray(array[light], dtype="<u2")
         if samples.shape != shape[1:]:
-            raise ValueError(f"it is of shape {samples.shape}")
+            raise ValueError(f"its shape is {samples.shape}, expected {shape[1:]}")
     except Exception as error:
-        # Every store raises errors of its own, and a damaged chunk those of its codec.
-        raise FormatError(f"cannot read light {light} of {url}: {reason_of(error)}; publish the table again") from error
+        # Each kind of store has its own errors, and damaged chunks raise errors of the codec.
+        raise FormatError(f"cannot read illuminant {light} of {url}: {error_text(error)}; publish it again") from error
     return samples
 
 
 def _require_free(url: str) -> None:
     from fsspec.core import url_to_fs
 
-    attributes = attributes_of(described_at(url))
+    attributes = table_attributes(read_metadata(url))
     if attributes is not None and attributes.get("whole"):
-        raise InputError(f"{url} already holds a table; name another place, or remove what is there")
+        raise InputError(f"{url} already holds a LUT; give another address, or remove it")
     if attributes is None:
         files, root = url_to_fs(url)
         if files.exists(root) and files.find(root):
-            raise InputError(f"{url} already holds something else; name another place, or remove what is there")
+            raise InputError(f"{url} already holds other files; give another address, or remove them")
 
 
 def _zarr() -> Any:
     if find_spec("zarr") is None:
-        raise InputError("published tables need zarr; install it with: pip install zarr")
+        raise InputError("published LUTs need zarr; install it with: pip install zarr")
     zarr = import_module("zarr")
     import_module("zarr.codecs")
     return zarr

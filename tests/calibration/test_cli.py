@@ -73,7 +73,7 @@ def test_verify_names_changed_light(lut: Path, session: Session, command: Comman
     next((tmp_path / "session" / "frames").glob("*light_003*")).unlink()
     code, out, err = command("verify", tmp_path / "lut", tmp_path / "session")
     assert code == 2
-    assert f"the samples of 1 of {len(LIGHTS)} lights have changed: 4\n" in out
+    assert f"the samples of 1 of {len(LIGHTS)} illuminants have changed: 4\n" in out
     assert "light_003.dng cannot be read" in out
     assert "2 faults" in err
 
@@ -93,7 +93,7 @@ def test_append_prints_progress(session: Session, command: Command, tmp_path: Pa
     code, out, _ = command("--append", tmp_path / "session", tmp_path / "lut")
     assert code == 0
     assert f"{len(LIGHTS) - 1} of {len(LIGHTS)} illuminants" in out
-    assert command("info", tmp_path / "lut")[2].count("in the making") == 1
+    assert command("info", tmp_path / "lut")[2].count("is not finished") == 1
 
 
 def _refuse(folder: Path, file: str) -> None:
@@ -134,8 +134,8 @@ def test_info_json_contains_entry(lut: Path, capsys: pytest.CaptureFixture[str])
         (["-v", "--check", "session"], "build-lut check"),
         (["--window", 4, "session", "lut"], "4 px"),
         (["nowhere", "lut"], "nowhere is not a session"),
-        (["info", "nowhere"], "nowhere is no table"),
-        (["compare", "a", "b"], "a is no table"),
+        (["info", "nowhere"], "nowhere is no LUT"),
+        (["compare", "a", "b"], "a is no LUT"),
     ],
 )
 def test_refuses_meaningless_options(

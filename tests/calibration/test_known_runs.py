@@ -26,15 +26,15 @@ from calibration.spread import added_light, fitting, predicting
 from experiment.chart.layout import paper_chart
 from tests.calibration.checks.test_frame_consistency import Sheet
 from tests.calibration.checks.test_light_codes import SESSIONS, agreement, random_session
-from tests.calibration.checks.test_stray_light import found as stray_found
+from tests.calibration.checks.test_stray_light import measured as stray_found
 from tests.calibration.comparison.test_comparing import written
-from tests.calibration.radiometry.test_superposition import LEVELS, compressed, proportional, seen, short_of_counts
+from tests.calibration.radiometry.test_superposition import LEVELS, compressed, measured, proportional, short_of_counts
 from tests.calibration.registration.test_matching import CHART, RASTER, compared
 from tests.calibration.registration.test_tiles import RASTER as TILED
 from tests.calibration.registration.test_tiles import TILE, moved, texture, to_pixels
-from tests.calibration.spread.test_added_light import NOISE, PAGE_MM, levels, places
+from tests.calibration.spread.test_added_light import NOISE, PAGE_MM, levels, positions
 from tests.calibration.spread.test_fitting import equations
-from tests.calibration.spread.test_predicting import ALL, printed
+from tests.calibration.spread.test_predicting import ALL, printed_levels
 from tests.calibration.whole import brief, of_fields
 from tests.pinned import Pinned
 
@@ -96,7 +96,7 @@ def test_frames_against_the_print(pinned: Pinned) -> None:
     cases = [sheet.other, 0.3 * sheet.other, *(sheet.other * np.where(near < size, left, 1.0)[:, None]
              for size, left in ((30, 0.9), (8, 0.3), (12, 1.5), (60, 0.97)))]  # fmt: skip
     cases += [sheet.other + 200 * (near < 30)[:, None], sheet.random.permutation(sheet.other)]
-    pinned("frames against the print", [brief(sheet.compared(true, usable)) for true in cases], **LOOSE)
+    pinned("frames against the print", [brief(sheet.compare(true, usable)) for true in cases], **LOOSE)
 
 
 def test_small_places(pinned: Pinned) -> None:
@@ -124,13 +124,13 @@ def test_superposition(pinned: Pinned) -> None:
         {"bits": 1},
     ]
     runs = {
-        f"{sensor.__name__} {more}": seen(sensor, **more)
+        f"{sensor.__name__} {more}": measured(sensor, **more)
         for sensor in (proportional, compressed, short_of_counts)
         for more in kinds
     }
     numbers = {
         name: [brief(one), *map(brief, one.relative(LEVELS)), brief(one.errors(LEVELS, LEVELS[::-1])), one.to_json(),
-               *map(brief, one.beside(LEVELS, LEVELS[::-1])), brief(one.white_covariance(LEVELS[:3] * np.eye(3)))]
+               *map(brief, one.difference(LEVELS, LEVELS[::-1])), brief(one.white_covariance(LEVELS[:3] * np.eye(3)))]
         for name, one in runs.items()
     }  # fmt: skip
     pinned("superposition of three sensors", numbers, **LOOSE)
@@ -188,7 +188,7 @@ def test_values_among_their_neighbours(pinned: Pinned) -> None:
 
 
 def test_dark_frames(pinned: Pinned) -> None:
-    random, hot = np.random.default_rng(5), HotPixels.none(40, 25)
+    random, hot = np.random.default_rng(5), HotPixels.start(40, 25)
     for _ in range(5):
         excess = random.normal(0, 6, (40, 25, 3))
         excess[7, 3] += 90
@@ -306,7 +306,7 @@ def test_lenses_and_sheets(pinned: Pinned) -> None:
 def test_levels_that_codes_predict(pinned: Pinned) -> None:
     random = np.random.default_rng(14)
     usable = random.random(512) < 0.9
-    level = printed(0.1) + 0.002 * random.standard_normal(512)
+    level = printed_levels(0.1) + 0.002 * random.standard_normal(512)
     models = [predicting.LevelModel.of(level, known, 3) for known in (ALL, usable)]
     large = predicting.LevelModel.of(np.linspace(0.1, 0.9, 4096), np.arange(4096) % 7 > 0, 4)
     result = [
@@ -323,7 +323,7 @@ def test_levels_that_codes_predict(pinned: Pinned) -> None:
 
 @pytest.mark.slow
 def test_light_added_to_a_print(pinned: Pinned) -> None:
-    cells, level, result = places(), levels(), []
+    cells, level, result = positions(), levels(), []
     for size, middle, height in ((25, (80.0, 80.0), 0.02), (12, (200.0, 50.0), 0.05), (60, (20.0, 140.0), 0.01)):
         spot = height * np.exp(-0.5 * (np.linalg.norm(cells - middle, axis=1) / size) ** 2)[:, None] * [1.0, 0.5, 0.1]
         seen_there = level + spot + NOISE * np.random.default_rng(15).standard_normal(level.shape)

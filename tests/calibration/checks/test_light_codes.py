@@ -1,4 +1,4 @@
-"""Lights that bear another's codes, against rooms whose light is known and against healthy ones of every kind."""
+"""Exchanged illuminants in rooms with known light, and healthy rooms of all kinds."""
 
 from __future__ import annotations
 
@@ -53,25 +53,24 @@ CAMERAS = ("Canon_EOS-1Ds_Mark_III", "Canon_EOS_200D", "Canon_EOS_5DS", "Canon_E
 
 
 def random_session(codes: Codes, seed: int) -> tuple[_Array, _Array]:
-    """Return whites (L, 3) of a healthy room and their errors, the room drawn at random.
+    """Return whites (L, 3) of a random healthy room and their uncertainty.
 
-    Tone curves of sRGB, a power of 1.7 to 2.7 or the shape of an S, alike or each primary with its own; five cameras,
-    mercury lamps and diodes, primaries balanced and mixed as projectors do it; wheels with white and coloured segments;
-    lamps that flicker by up to 3 %, noise to .2 %.
+    Tone curves: sRGB, powers of 1.7 to 2.7, or S-shaped; common or individual. Five cameras; mercury lamps and LEDs;
+    balanced and mixed primaries; wheels with white and coloured segments; flicker up to 3 %, noise up to 0.2 %.
     """
     random = np.random.default_rng([seed, len(codes)])
     share = np.array(codes) / 255
-    kind = random.choice(["srgb", "power", "s", "own"])
-    if kind == "srgb":
+    curve = random.choice(["srgb", "power", "s", "own"])
+    if curve == "srgb":
         light = decode_srgb(share)
-    elif kind == "power":
+    elif curve == "power":
         light = share ** random.uniform(1.7, 2.7)
     else:
         steep, middle, mixed = random.uniform(2, 7), random.uniform(0.45, 0.6), random.uniform(0.2, 0.8)
         low, high = (1 / (1 + np.exp(-steep * (x - middle))) for x in (0, 1))
         s = (1 / (1 + np.exp(-steep * (share - middle))) - low) / (high - low) * np.sqrt(share)
         light = (1 - mixed) * share ** random.uniform(1.8, 2.4) + mixed * s
-    if kind == "own":
+    if curve == "own":
         light = light ** (1 + 0.08 * random.standard_normal(3))
     lamp = "led" if random.random() < 0.5 else "uhp"
     camera = CAMERAS[int(random.integers(len(CAMERAS)))]
@@ -98,18 +97,18 @@ def agreement(codes: Codes, white: _Array, error: _Array) -> CodeAgreement:
     return code_agreement(np.array(codes), white, error, dark_known=True, drift_known=True)
 
 
-def of_plan(white: _Array, error: float = 0.0005) -> CodeAgreement:
+def agreement_of_plan(white: _Array, error: float = 0.0005) -> CodeAgreement:
     return agreement([light.colour for light in PLAN], white, error * white + 0.1)
 
 
-def exchanged(values: _Array, one: int, other: int) -> _Array:
+def exchange(values: _Array, first: int, second: int) -> _Array:
     values = values.copy()
-    values[[one, other]] = values[[other, one]]
+    values[[first, second]] = values[[second, first]]
     return values
 
 
-def whites(room: Room, noise: float = 0.001) -> _Array:
-    """Return the lights' whites (L, 3), read with an error, what is there at black taken off."""
+def room_whites(room: Room, noise: float = 0.001) -> _Array:
+    """Return whites (L, 3) with noise, without black light."""
     world = hang(room=room).world
     codes = [light.colour for light in PLAN]
     white = np.array([world.white(colour, SETTINGS) for colour in codes])
@@ -118,112 +117,112 @@ def whites(room: Room, noise: float = 0.001) -> _Array:
 
 
 @pytest.mark.parametrize("codes", SESSIONS.values(), ids=SESSIONS)
-def test_random_healthy_rooms_have_nothing_remarked(codes: Codes) -> None:
+def test_accepts_random_healthy_rooms(codes: Codes) -> None:
     for seed in range(4):
-        found = agreement(codes, *random_session(codes, seed))
-        assert found.off_deg.max() < 1, seed
-        assert found.off_brightness.max() < 0.05, seed
-        assert found.exchanges == (), seed
+        result = agreement(codes, *random_session(codes, seed))
+        assert result.off_deg.max() < 1, seed
+        assert result.off_brightness.max() < 0.05, seed
+        assert result.exchanges == (), seed
 
 
 @pytest.mark.parametrize("codes", [codes for codes in SESSIONS.values() if len(codes) < 9], ids=list(SESSIONS)[:6])
-def test_any_two_lights_of_a_small_session_are_found_exchanged(codes: Codes) -> None:
-    seen = decode_srgb(np.array(codes) / 255)
-    # Some pairs of many: an exchange is looked for among all of them.
+def test_detects_any_exchange_in_small_sessions(codes: Codes) -> None:
+    light = decode_srgb(np.array(codes) / 255)
+    # a sample of all pairs, which are all searched
     pairs = [*enumerate(combinations(range(len(codes)), 2))][:: max(1, 2 * len(codes) - 5)][::2]
-    for seed, (one, other) in pairs:
-        if angles_deg(seen[one], seen[other]) < 6:
+    for seed, (first, second) in pairs:
+        if angles_deg(light[first], light[second]) < 6:
             continue
         white, error = random_session(codes, seed)
-        found = agreement(codes, exchanged(white, one, other), exchanged(error, one, other))
-        assert [(pair.one, pair.other) for pair in found.exchanges] == [(one, other)], (seed, one, other)
+        result = agreement(codes, exchange(white, first, second), exchange(error, first, second))
+        assert [(pair.one, pair.other) for pair in result.exchanges] == [(first, second)], (seed, first, second)
 
 
-def test_one_wrong_light_of_eight_is_named_alone() -> None:
+def test_reports_one_wrong_illuminant_of_eight() -> None:
     codes = SESSIONS["eight"]
     white, error = random_session(codes, 1)
     white[4] = white[5]
-    found = agreement(codes, white, error)
-    assert int(np.argmax(found.off_deg)) == 4
-    assert found.seen_as[4] == 5
-    assert found.exchanges == ()
+    result = agreement(codes, white, error)
+    assert int(np.argmax(result.off_deg)) == 4
+    assert result.seen_as[4] == 5
+    assert result.exchanges == ()
 
 
-def test_a_single_light_is_held_against_nothing() -> None:
-    found = agreement([(255, 120, 60)], *random_session([(255, 120, 60)], 1))
-    assert not found.off_deg.any()
-    assert not found.held.any()
+def test_single_illuminant_is_not_verified() -> None:
+    result = agreement([(255, 120, 60)], *random_session([(255, 120, 60)], 1))
+    assert not result.off_deg.any()
+    assert not result.held.any()
 
 
 @pytest.mark.parametrize("room", ROOMS.values(), ids=ROOMS)
-def test_the_codes_of_a_healthy_room_give_its_whites(room: Room) -> None:
-    found = of_plan(whites(room))
-    assert found.off_deg.max() < LIMIT.accept / 8
-    assert found.held.all()
-    assert found.exchange_deg < 2
+def test_predicts_whites_of_healthy_rooms(room: Room) -> None:
+    result = agreement_of_plan(room_whites(room))
+    assert result.off_deg.max() < LIMIT.accept / 8
+    assert result.held.all()
+    assert result.exchange_deg < 2
 
 
-def test_a_lamp_whose_drift_is_not_known_is_no_wrong_name() -> None:
+def test_ignores_unknown_drift() -> None:
     fading = 1 - 0.1 * np.arange(len(PLAN)) / len(PLAN)
-    assert of_plan(whites(Room()) * fading[:, None]).off_deg.max() < LIMIT.accept / 3
+    assert agreement_of_plan(room_whites(Room()) * fading[:, None]).off_deg.max() < LIMIT.accept / 3
 
 
-def shifted(count: int) -> npt.NDArray[np.int64]:
+def shift(count: int) -> npt.NDArray[np.int64]:
     return np.minimum(np.arange(count) + 1, count - 1)
 
 
-def shifted_but_for_primaries(count: int) -> npt.NDArray[np.int64]:
+def shift_except_primaries(count: int) -> npt.NDArray[np.int64]:
     alone = [np.count_nonzero(light.colour) == 1 for light in PLAN]
-    return np.where(alone, np.arange(count), shifted(count))
+    return np.where(alone, np.arange(count), shift(count))
 
 
-@pytest.mark.parametrize("shift", [shifted, shifted_but_for_primaries])
+@pytest.mark.parametrize("shift_list", [shift, shift_except_primaries])
 @pytest.mark.parametrize("room", ROOMS.values(), ids=ROOMS)
-def test_a_shifted_list_is_refused(room: Room, shift: Callable[[int], npt.NDArray[np.int64]]) -> None:
-    found = of_plan(whites(room)[shift(len(PLAN))])
-    assert judge({LIMIT.name: float(found.off_deg.max())}).outcome == "refuse"
-    assert (found.off_deg > LIMIT.accept).sum() >= 6
+def test_refuses_shifted_list(room: Room, shift_list: Callable[[int], npt.NDArray[np.int64]]) -> None:
+    result = agreement_of_plan(room_whites(room)[shift_list(len(PLAN))])
+    assert judge({LIMIT.name: float(result.off_deg.max())}).outcome == "refuse"
+    assert (result.off_deg > LIMIT.accept).sum() >= 6
 
 
-@pytest.mark.parametrize(("one", "other"), [(35, 53), (40, 41), (0, 50), (0, 104)])
-def test_two_exchanged_lights_of_many_are_named(one: int, other: int) -> None:
-    found = of_plan(exchanged(whites(Room()), one, other))
-    assert [(pair.one, pair.other) for pair in found.exchanges] == [(one, other)]
+@pytest.mark.parametrize(("first", "second"), [(35, 53), (40, 41), (0, 50), (0, 104)])
+def test_reports_exchange_among_many(first: int, second: int) -> None:
+    result = agreement_of_plan(exchange(room_whites(Room()), first, second))
+    assert [(pair.one, pair.other) for pair in result.exchanges] == [(first, second)]
 
 
-def test_neighbours_are_found_down_to_the_angle_that_is_stated() -> None:
+def test_detects_exchanges_above_reported_angle() -> None:
     codes = SESSIONS["41 black bodies"]
     white, error = random_session(codes, 3)
-    down_to = agreement(codes, white, error).exchange_deg
-    assert down_to < 0.6
-    apart = angles_deg(white[:-1], white[1:])
-    further = np.flatnonzero(apart > down_to)[[0, 5, 9]].tolist()
-    for one in further:
-        found = agreement(codes, exchanged(white, one, one + 1), exchanged(error, one, one + 1))
-        assert [(pair.one, pair.other) for pair in found.exchanges] == [(one, one + 1)]
+    limit_deg = agreement(codes, white, error).exchange_deg
+    assert limit_deg < 0.6
+    angles = angles_deg(white[:-1], white[1:])
+    detectable = np.flatnonzero(angles > limit_deg)[[0, 5, 9]].tolist()
+    for first in detectable:
+        result = agreement(codes, exchange(white, first, first + 1), exchange(error, first, first + 1))
+        assert [(pair.one, pair.other) for pair in result.exchanges] == [(first, first + 1)]
 
 
-def test_a_white_that_is_not_known_is_not_judged() -> None:
-    white = whites(Room(), noise=0.05)
-    assert of_plan(white, error=0.05).off_deg.max() < LIMIT.accept
-    # Nor is it said of such lights that they were held against their codes.
-    assert of_plan(white, error=0.3).held.mean() < 0.5
+def test_does_not_judge_uncertain_whites() -> None:
+    white = room_whites(Room(), noise=0.05)
+    assert agreement_of_plan(white, error=0.05).off_deg.max() < LIMIT.accept
+    # Such illuminants are not verified either.
+    assert agreement_of_plan(white, error=0.3).held.mean() < 0.5
 
 
-def test_a_light_of_half_the_brightness_is_found() -> None:
+def test_detects_half_brightness() -> None:
     codes = [*SESSIONS["eight"], (255, 255, 255)]
     white, error = random_session(codes, 1)
     white[0] /= 2
-    found = agreement(codes, white, error)
-    assert found.off_brightness[0] > 0.1
-    assert found.off_deg.max() < 2
+    result = agreement(codes, white, error)
+    assert result.off_brightness[0] > 0.1
+    assert result.off_deg.max() < 2
 
 
-def test_two_lights_of_one_file_make_no_table(lab: Lab, tmp_path: Path) -> None:
-    one = lab.dng()
+def test_refuses_two_illuminants_from_one_file(lab: Lab, tmp_path: Path) -> None:
+    dng = lab.dng()
 
     def frame(step: SessionStep) -> bytes:
-        return one if step.illumination in (1, 2) else lab.dng(step.colour, step.number)
+        return dng if step.illumination in (1, 2) else lab.dng(step.colour, step.number)
 
     with (
         take(lab, tmp_path / "session", LIGHTS[:3], frame=frame) as session,

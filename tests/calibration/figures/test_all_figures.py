@@ -368,7 +368,7 @@ def test_bend_is_significant_deviation_over_paper_levels() -> None:
         level = np.geomspace(10_000 * NODES[1], 5000, 30)
         relative = result.relative(level)[0]
         bend = np.abs(relative - relative[-1])
-        doubt = 2 * np.sqrt(result.beside(level, np.full(30, 5000.0))[1])
+        doubt = 2 * np.sqrt(result.difference(level, np.full(30, 5000.0))[1])
         assert light.LINEARITY.measure(figures_table) == pytest.approx(np.maximum(bend - doubt, 0).max(), abs=1e-9)
         assert bend.max() == pytest.approx(lack * (0.5 - NODES[1]), rel=0.05)
         assert light.LINEARITY_KNOWN.measure(figures_table) == 1

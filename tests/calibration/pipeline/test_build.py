@@ -782,11 +782,11 @@ def test_a_small_chart_is_not_told_to_plan_lights_that_were_planned(tmp_path: Pa
         result = build(session, tmp_path / "lut")
     unknown = next(row for row in result.verdict.remarks if row.figure.name == "linearity_known")
     message = remark(unknown, result.figures)
-    assert "are needed" in message
+    assert "usable patches" in message
     assert "plan red" not in message
     (source,) = (one.source for one in result.figures.budget.components if one.name == "linearity")
-    assert "are needed" in source
-    assert "no lights" not in source
+    assert "usable patches" in source
+    assert "no illuminants" not in source
 
 
 # What is said of a managed and an unmanaged print, of uneven primaries on a clean one, and of hot photosites.

@@ -31,7 +31,7 @@ def empty() -> Any:
     unknown: Any = None
     return Accumulator(
         session=unknown, selected=unknown, baseline=baseline, figures=(), saturation=SATURATION, registered=unknown,  # pyrefly: ignore[bad-argument-type]
-        dark=None, estimate=unknown, hot=HotPixels.none(CELLS, 25), highest=np.full(CELLS, 500, np.uint16),
+        dark=None, estimate=unknown, hot=HotPixels.start(CELLS, 25), highest=np.full(CELLS, 500, np.uint16),
         highest_at=np.zeros(CELLS, np.int64), outside=np.zeros(CELLS, np.bool_), covered=np.zeros(CELLS, np.bool_),
         place_error=np.zeros(CELLS), even_sum=np.full((CELLS, 25, 3), 1000, np.float32),
         even_noise2=np.full((CELLS, 3), 800.0), even_frames=2,
@@ -56,7 +56,7 @@ def at(cell: int, value: float, *others: int) -> npt.NDArray[np.float64]:
 def causes(
     done: Any, stains: Stains | None = None, frames: tuple[Any, ...] = (), added: AddedLight | None = None
 ) -> Any:
-    result = done.unfit(stains or clean(), frames, added or AddedLight.none(CELLS))
+    result = done.unfit(stains or clean(), frames, added or AddedLight.zero(CELLS))
     return {one.colour: one.cause for one in result}
 
 
@@ -84,7 +84,7 @@ def test_photosites_and_stains_make_cell_unfit() -> None:
     assert causes(accumulator, stained) == {
         3: "stained: its area is 4.0% darker than the same codes elsewhere on the print"
     }
-    hot = HotPixels.none(CELLS, 25)
+    hot = HotPixels.start(CELLS, 25)
     hot.least[...] = 0
     hot.least[5, 7, 1] = 900
     noise = np.full(3, 5.0)

@@ -1,4 +1,4 @@
-"""Dark frames, from made-up counts whose truth is known."""
+"""Dark frames: synthetic counts with known light, and a session in a room with ambient light."""
 
 from __future__ import annotations
 
@@ -49,16 +49,16 @@ def dark_frame(
     return measure_dark_frame(record, np.full((2, 2), 2048.0 + number), cells, paper, shape)
 
 
-def test_leak_and_hot_photosites_are_read() -> None:
+def test_measures_leak_and_hot_photosites() -> None:
     shape = np.random.default_rng(1).uniform(0.8, 1.2, (400, 1)) * np.ones(3)
-    hot, frames = HotPixels.none(2000, 25), list[DarkFrameFigures]()
+    hot, frames = HotPixels.start(2000, 25), list[DarkFrameFigures]()
     for number in range(3):
         cells, paper = samples(2000, (1, 2, 1), 10 + number), samples(400, (0, 0, 0), 20 + number)
         paper += (shape[:, None] * (4, 7, 5)).astype(np.float32)
         cells[17, 3, 1] += 200
         cells[99 + number, 5, 0] += 900
         figures, excess = dark_frame(number, cells, paper, shape)
-        frames.append(from_plain(DarkFrameFigures, to_plain(figures), "a checkpoint", "begin anew"))
+        frames.append(from_plain(DarkFrameFigures, to_plain(figures), "a checkpoint", "start again"))
         hot = hot.with_frame(excess)
     dark = dark_summary(frames, hot)
     assert dark.light == pytest.approx([4, 7, 5], abs=4 * 6 / np.sqrt(400 * 25))
@@ -69,61 +69,61 @@ def test_leak_and_hot_photosites_are_read() -> None:
     assert len(dark.blacks) == 3
 
 
-def test_the_dark_light_of_two_frames_is_their_mean() -> None:
+def test_dark_light_of_two_frames_is_their_mean() -> None:
     paper = Paper(FlatField.uniform((1, 1)), np.array([4.0, 7.0, 5.0]), np.full(3, 0.1), 9, np.zeros(3))
-    beyond = np.random.default_rng(3).normal(0, 2, (50, 3))
-    estimate = DarkLightEstimate.none(np.full((50, 3), 0.5), np.ones(50, dtype=bool), 25)
-    found: list[DarkLight] = []
-    for times in (1.0, 3.0):
-        means = 0.5 * paper.white + times * beyond
+    residual = np.random.default_rng(3).normal(0, 2, (50, 3))
+    estimate = DarkLightEstimate.start(np.full((50, 3), 0.5), np.ones(50, dtype=bool), 25)
+    results: list[DarkLight] = []
+    for factor in (1.0, 3.0):
+        means = 0.5 * paper.white + factor * residual
         estimate, light = estimate.with_frame(means, np.zeros(3), paper, np.ones((50, 3)))
-        found.append(light)
-    # Without noise all that lies beyond the prediction is believed.
-    np.testing.assert_allclose(found[0].patches, 0.5 * paper.white + beyond, rtol=1e-5)
-    np.testing.assert_allclose(found[1].patches, 0.5 * paper.white + 2 * beyond, rtol=1e-5)
+        results.append(light)
+    # Without noise the residual is used in full.
+    np.testing.assert_allclose(results[0].patches, 0.5 * paper.white + residual, rtol=1e-5)
+    np.testing.assert_allclose(results[1].patches, 0.5 * paper.white + 2 * residual, rtol=1e-5)
 
 
-def test_a_hot_photosite_is_remembered_over_a_bump() -> None:
-    """Before it, cell 3 lies on the photosite; after it, cell 4; a cosmic ray in one frame of a stretch is none."""
-    hot, noise = HotPixels.none(10, 25), np.full(3, 6.0)
-    none = np.zeros((10, 25, 3), dtype=np.int16)
+def test_keeps_hot_photosites_after_movement() -> None:
+    """First patch 3 is on the hot photosite, then patch 4; a cosmic ray in one frame is ignored."""
+    hot, noise = HotPixels.start(10, 25), np.full(3, 6.0)
+    zeros = np.zeros((10, 25, 3), dtype=np.int16)
     for number in range(4):
         if number == 2:
             hot = hot.restarted(noise)
-        excess = none.copy()
+        excess = zeros.copy()
         excess[3 if number < 2 else 4, 12, 0] = 150
         excess[number, 1, 1] += 800
         hot = hot.with_frame(excess)
     assert np.flatnonzero(hot.hottest(noise)).tolist() == [3, 4]
 
 
-def test_a_stretch_without_dark_frames_has_nothing_hot() -> None:
-    hot = HotPixels.none(4, 25)
+def test_has_no_hot_photosites_without_frames() -> None:
+    hot = HotPixels.start(4, 25)
     assert not hot.hottest(np.full(3, np.nan)).any()
     assert not hot.restarted(np.full(3, np.nan)).hottest(np.full(3, 6.0)).any()
 
 
-def test_without_dark_frames_nothing_is_known() -> None:
-    assert np.isnan(dark_summary([], HotPixels.none(2, 25)).light).all()
+def test_summary_without_frames_is_nan() -> None:
+    assert np.isnan(dark_summary([], HotPixels.start(2, 25)).light).all()
 
 
-# Leak and ambient light are taken out: by made-up counts whose truth is known, and in a room that is not dark.
+# Subtraction of leak and ambient light.
 
 
 PATCHES = 4000
 NOISE = np.array([6.0, 4.2, 6.0])
-# Without the lens: a chart of 512 cells cannot tell room light from a veil.
+# without lens correction: 512 patches cannot separate room light from veiling glare
 SUBTRACTED = BuildOptions(subtract_dark=True, lens_correction=False)
 _Array = npt.NDArray[np.float64]
 
 
-def learnt(
-    light: _Array, reflectance: _Array, frames: int, seed: int, beyond: _Array | float = 0.0
+def estimate_after(
+    light: _Array, reflectance: _Array, frames: int, seed: int, residual: _Array | float = 0.0
 ) -> tuple[DarkLightEstimate, DarkLight, _Array]:
-    """Return estimate and dark light after dark frames of 25 samples, and the true dark light of the patches."""
+    """Return estimate and dark light after dark frames with 25 samples, and the true dark light."""
     random = np.random.default_rng(seed)
-    estimate = DarkLightEstimate.none(reflectance, np.ones(len(reflectance), dtype=bool), 25)
-    truth = light * reflectance + beyond
+    estimate = DarkLightEstimate.start(reflectance, np.ones(len(reflectance), dtype=bool), 25)
+    truth = light * reflectance + residual
     dark = DarkLight(light, truth.astype(np.float32), np.zeros(3))
     for _ in range(frames):
         means = truth + random.normal(0, 1, truth.shape) * NOISE / 5
@@ -139,18 +139,18 @@ def reflectance() -> _Array:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frames", [1, 4])
-def test_where_the_prediction_is_right_no_noise_is_added(reflectance: _Array, frames: int) -> None:
-    """The share that is believed by chance: the robust variance of 4000 values is good to 3.7 %, 5 σ."""
-    _, dark, truth = learnt(np.array([3.0, 8.0, 5.0]), reflectance, frames, 2)
+def test_adds_no_noise_to_correct_prediction(reflectance: _Array, frames: int) -> None:
+    """Residuals get a small weight by chance: the robust variance of 4000 values is accurate to 3.7 %, 5 σ."""
+    _, dark, truth = estimate_after(np.array([3.0, 8.0, 5.0]), reflectance, frames, 2)
     assert (dark.share < 0.19).all()
     assert ((dark.patches - truth).std(axis=0) < 0.2 * NOISE / 5 / np.sqrt(frames)).all()
 
 
 @pytest.mark.slow
-def test_where_it_is_wrong_what_cells_show_is_believed(reflectance: _Array) -> None:
-    """A lamp of another colour in the room: patches reflect it otherwise than the projector's light, by 10 %."""
-    beyond = 30 * reflectance * np.random.default_rng(5).normal(0, 0.1, (PATCHES, 1))
-    estimate, dark, truth = learnt(np.array([30.0, 30.0, 30.0]), reflectance, 8, 6, beyond)
+def test_uses_residuals_of_wrong_prediction(reflectance: _Array) -> None:
+    """With a lamp of another colour, reflectances differ by 10 %."""
+    residual = 30 * reflectance * np.random.default_rng(5).normal(0, 0.1, (PATCHES, 1))
+    estimate, dark, truth = estimate_after(np.array([30.0, 30.0, 30.0]), reflectance, 8, 6, residual)
     predicted = 30 * reflectance
     assert (dark.share > 0.7).all()
     assert ((dark.patches - truth).std(axis=0) < 0.5 * (predicted - truth).std(axis=0)).all()
@@ -160,7 +160,7 @@ def test_where_it_is_wrong_what_cells_show_is_believed(reflectance: _Array) -> N
 
 
 @pytest.mark.slow
-def test_a_hot_photosite_is_no_light() -> None:
+def test_winsorised_mean_ignores_hot_photosite() -> None:
     samples = np.random.default_rng(3).normal(2, 6, (50, 25, 3)).astype(np.float32)
     hot = samples.copy()
     hot[7, 3] += 900
@@ -170,13 +170,13 @@ def test_a_hot_photosite_is_no_light() -> None:
 
 
 @pytest.mark.slow
-def test_a_channel_without_light_borrows_its_reflectances() -> None:
-    seen = np.array([[100.0, 4000.0, 1.0], [50.0, 400.0, -1.0]])
-    found = reflectances(seen, np.ones((2, 3)), np.array([200.0, 8000.0, 0.5]))
-    assert found.tolist() == [[0.5, 0.5, 0.5], [0.25, 0.05, 0.05]]
+def test_dark_channel_gets_reflectance_of_brightest() -> None:
+    measured = np.array([[100.0, 4000.0, 1.0], [50.0, 400.0, -1.0]])
+    result = reflectances(measured, np.ones((2, 3)), np.array([200.0, 8000.0, 0.5]))
+    assert result.tolist() == [[0.5, 0.5, 0.5], [0.25, 0.05, 0.05]]
 
 
-# A whole session: one hundredth of full white is there at all times, and a contrast of 1 : 200.
+# A session with ambient light of 1 % of full white, and a contrast of 200 : 1.
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +196,7 @@ def subtracted(session: Session, tmp_path_factory: pytest.TempPathFactory) -> Bu
 
 
 @pytest.mark.slow
-def test_table_and_ground_truth_are_those_of_a_dark_room(room: Lab, subtracted: BuildResult) -> None:
+def test_lut_matches_dark_room(room: Lab, subtracted: BuildResult) -> None:
     assert subtracted.lut is not None
     table = open_lut(subtracted.lut)
     codes = room.chart.rgb[room.chart.cell_of_colour]
@@ -204,22 +204,22 @@ def test_table_and_ground_truth_are_those_of_a_dark_room(room: Lab, subtracted: 
     assert (black > 50).all()
     for light in LIGHTS:
         white = room.world.white(light.colour, SETTINGS) - black
-        shown = white > 300
-        seen = table.white[light.index]
-        assert seen[shown] / seen[shown].max() == pytest.approx(white[shown] / white[shown].max(), rel=0.01)
-        # A channel that the light lacks is left with nothing, to the noise of its references.
-        assert (seen[~shown] < white[~shown] + 4 * subtracted.figures.lights.white_error[light.index][~shown]).all()
+        lit = white > 300
+        rgb = table.white[light.index]
+        assert rgb[lit] / rgb[lit].max() == pytest.approx(white[lit] / white[lit].max(), rel=0.01)
+        # Channels without light are zero within the noise of the references.
+        assert (rgb[~lit] < white[~lit] + 4 * subtracted.figures.lights.white_error[light.index][~lit]).all()
         true = room.world.reflected(codes, light.colour, SETTINGS) - room.world.reflected(codes, BLACK, SETTINGS)
-        scale = (seen[shown] / white[shown]).mean()
-        mean, true = table.samples[light.index].mean(axis=1)[:, shown], true[:, shown] * scale
+        scale = (rgb[lit] / white[lit]).mean()
+        mean, true = table.samples[light.index].mean(axis=1)[:, lit], true[:, lit] * scale
         noise = np.sqrt((true + 100) / body.electrons_per_dn + body.read_noise_dn**2) / 5
-        # 5 σ of 19 968 means (one false alarm in 90 runs), 1 % of the field, and the cut at 0 of the darkest cells.
+        # 5 σ of 19 968 means (one false alarm in 90 runs), 1 % of the field, and the clipping at 0 of dark patches
         assert (np.abs(mean - true) < 5 * noise + 0.012 * true + 0.4 * 5 * noise).all()
         assert np.abs((mean - true).mean(axis=0)).max() < 0.003 * true.max()
 
 
 @pytest.mark.slow
-def test_light_adds_when_the_dark_is_out(room: Lab, subtracted: BuildResult) -> None:
+def test_light_adds_after_subtraction(room: Lab, subtracted: BuildResult) -> None:
     assert subtracted.figures.lights.additivity is not None
     assert np.abs(subtracted.figures.lights.additivity.off).max() < 0.006
     assert "leak_share" not in {row.figure.name for row in subtracted.verdict.rows}
@@ -228,10 +228,10 @@ def test_light_adds_when_the_dark_is_out(room: Lab, subtracted: BuildResult) -> 
 
 
 @pytest.mark.slow
-def test_what_is_left_of_the_dark_light_is_as_large_a_share_of_any_cell(subtracted: BuildResult) -> None:
-    """It is what a cell reflects of it; above paper it is no more than paper's."""
+def test_remaining_dark_light_is_proportional(subtracted: BuildResult) -> None:
+    """A patch reflects the remaining dark light as any light; brighter patches have no more than paper."""
     figures = subtracted.figures
-    (darkness,) = (one for one in figures.budget.components if one.name == "darkness")
+    (darkness,) = (component for component in figures.budget.components if component.name == "darkness")
     darker = (figures.cells.levels < 0.9).all(axis=1)
     assert darker.sum() > 30
     assert (np.ptp(darkness.cells[darker], axis=0) < 1e-9 * darkness.cells[darker].max(axis=0)).all()
@@ -239,7 +239,7 @@ def test_what_is_left_of_the_dark_light_is_as_large_a_share_of_any_cell(subtract
 
 
 @pytest.mark.slow
-def test_samples_keep_their_noise(room: Lab, subtracted: BuildResult) -> None:
+def test_keeps_noise_of_samples(room: Lab, subtracted: BuildResult) -> None:
     assert subtracted.lut is not None
     light = next(light for light in LIGHTS if light.colour.red == light.colour.green == light.colour.blue == 255)
     samples = open_lut(subtracted.lut).samples[light.index].astype(np.float64)
@@ -248,30 +248,30 @@ def test_samples_keep_their_noise(room: Lab, subtracted: BuildResult) -> None:
         response = (room.world.room.response_spread * signal[:, channel]) ** 2
         expected = (signal[:, channel] / body.electrons_per_dn + body.read_noise_dn**2 + response) / photosites
         spread = samples[..., channel].var(axis=1, ddof=1)
-        # The median of 64 variances of 25 values is 0.97, good to 1.25 · √(2/24/64) = 4.5 %.
+        # The median of 64 variances of 25 values is 0.97, accurate to 1.25 · √(2/24/64) = 4.5 %.
         assert np.median(spread / expected) == pytest.approx(0.97, abs=0.14)
 
 
 @pytest.mark.slow
-def test_what_was_subtracted_is_recorded(room: Lab, session: Session, subtracted: BuildResult) -> None:
+def test_records_subtracted_light(room: Lab, session: Session, subtracted: BuildResult) -> None:
     assert subtracted.lut is not None
-    done = json.loads((subtracted.lut / "lut.json").read_text())["corrections"]
-    names = [correction["name"] for correction in done]
+    corrections = json.loads((subtracted.lut / "lut.json").read_text())["corrections"]
+    names = [correction["name"] for correction in corrections]
     assert names.index("black") < names.index("dark") < names.index("field")
-    dark = np.array(done[names.index("dark")]["per_light"])
+    dark = np.array(corrections[names.index("dark")]["per_light"])
     black = room.world.white(BLACK, SETTINGS) * np.mean(room.world.field(room.chart.centres_mm))
     assert dark == pytest.approx(np.broadcast_to(black, dark.shape), rel=0.1)
-    at_zero = done[names.index("rounding")]["share_at_zero"]
+    at_zero = corrections[names.index("rounding")]["share_at_zero"]
     assert len(at_zero) == len(LIGHTS)
     assert max(at_zero) > 0.01
     assert min(at_zero) < 0.001
 
 
-def interrupted(session: Session, out: Path, options: BuildOptions) -> None:
-    """Build until the seventeenth frame."""
+def build_until_interrupted(session: Session, out: Path, options: BuildOptions) -> None:
+    """Build up to the seventeenth frame."""
 
-    def progress(done: int, total: int, what: str) -> None:
-        if done == 17:
+    def progress(number: int, total: int, task: str) -> None:
+        if number == 17:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -279,37 +279,37 @@ def interrupted(session: Session, out: Path, options: BuildOptions) -> None:
 
 
 @pytest.mark.slow
-def test_a_growing_table_ends_in_the_same_bytes(session: Session, subtracted: BuildResult, tmp_path: Path) -> None:
-    """Interrupted between two checkpoints, and with another choice in between, which begins anew."""
+def test_resumed_build_gives_identical_files(session: Session, subtracted: BuildResult, tmp_path: Path) -> None:
+    """The build is interrupted between two checkpoints."""
     assert subtracted.lut is not None
 
-    interrupted(session, tmp_path / "lut", SUBTRACTED)
-    done: list[int] = []
-    grown = append(session, tmp_path / "lut", lambda number, total, what: done.append(number), options=SUBTRACTED)
-    assert not isinstance(grown, TableProgress)
-    assert done[1] == 17
+    build_until_interrupted(session, tmp_path / "lut", SUBTRACTED)
+    numbers: list[int] = []
+    appended = append(session, tmp_path / "lut", lambda number, total, task: numbers.append(number), options=SUBTRACTED)
+    assert not isinstance(appended, TableProgress)
+    assert numbers[1] == 17
     for path in subtracted.lut.iterdir():
         assert path.read_bytes() == (tmp_path / "lut" / path.name).read_bytes()
 
 
 @pytest.mark.slow
-def test_a_checkpoint_of_another_choice_is_not_gone_on_from(session: Session, tmp_path: Path) -> None:
-    interrupted(session, tmp_path / "lut", SUBTRACTED)
-    interrupted(session, tmp_path / "lut", BuildOptions())
-    done: list[int] = []
-    build(session, tmp_path / "lut", lambda number, total, what: done.append(number), options=SUBTRACTED)
-    assert done[:2] == [0, 1]
+def test_ignores_checkpoint_with_other_options(session: Session, tmp_path: Path) -> None:
+    build_until_interrupted(session, tmp_path / "lut", SUBTRACTED)
+    build_until_interrupted(session, tmp_path / "lut", BuildOptions())
+    numbers: list[int] = []
+    build(session, tmp_path / "lut", lambda number, total, task: numbers.append(number), options=SUBTRACTED)
+    assert numbers[:2] == [0, 1]
 
 
 @pytest.mark.slow
-def test_without_dark_frames_it_is_refused(lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refuses_subtraction_without_dark_frames(lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def refuse_darks(step: SessionStep) -> str:
         return "refused" if step.kind == "dark" else "accepted"
 
     with take(lab, tmp_path / "session", LIGHTS[:2], verdict=refuse_darks) as session:
-        for make in (build, append):
+        for build_lut in (build, append):
             with pytest.raises(FormatError, match=r"dark frame.*--subtract-dark"):
-                make(session, tmp_path / "lut", options=SUBTRACTED)
+                build_lut(session, tmp_path / "lut", options=SUBTRACTED)
         with pytest.raises(FormatError):
             check(session, SUBTRACTED)
     assert main(["--subtract-dark", str(tmp_path / "session"), str(tmp_path / "lut")]) == 2
@@ -318,8 +318,8 @@ def test_without_dark_frames_it_is_refused(lab: Lab, tmp_path: Path, capsys: pyt
 
 
 @pytest.mark.slow
-def test_lights_before_the_first_dark_frame_take_the_first(room: Lab, tmp_path: Path) -> None:
-    """A session put together from files may have its dark frames at the end."""
+def test_uses_first_dark_frame_for_earlier_illuminants(room: Lab, tmp_path: Path) -> None:
+    """An imported session may have its dark frames at the end."""
 
     def refuse_first(step: SessionStep) -> str:
         return "refused" if step.kind == "dark" and step.number < 3 else "accepted"

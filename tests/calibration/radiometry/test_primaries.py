@@ -1,4 +1,4 @@
-"""Primaries of unlike field: synthetic cells whose light is known, then a session compared with its room."""
+"""Primaries with different fields: synthetic patches with known light, and a session compared with its room."""
 
 from __future__ import annotations
 
@@ -30,49 +30,49 @@ def lights(codes: tuple[tuple[int, int, int], ...]) -> list[Illumination]:
     return [Illumination(number, "uniform", None, Colour(*code)) for number, code in enumerate(codes)]
 
 
-def test_light_adds_but_for_the_black_that_each_brings_along() -> None:
-    black, parts = np.array([3.0, 5.0, 4.0]), np.array([[3000.0, 700, 90], [400, 6000, 500], [80, 900, 4000]])
-    white = black + parts.sum(axis=0)
-    even = np.ones((3, 3))
+def test_light_adds_after_black_subtraction() -> None:
+    black, primaries = np.array([3.0, 5.0, 4.0]), np.array([[3000.0, 700, 90], [400, 6000, 500], [80, 900, 4000]])
+    white = black + primaries.sum(axis=0)
+    ones = np.ones((3, 3))
 
-    def told(seen: _Array, full_white: _Array, gains: _Array = even) -> Additivity:
-        found = additivity(lights(PRIMARIES), seen, full_white, black, gains, USUAL)
-        assert found is not None
-        return found
+    def measure(whites: _Array, full_white: _Array, gains: _Array = ones) -> Additivity:
+        result = additivity(lights(PRIMARIES), whites, full_white, black, gains, USUAL)
+        assert result is not None
+        return result
 
-    adds = told(parts + black, white)
+    adds = measure(primaries + black, white)
     assert adds.off == pytest.approx(np.zeros(3), abs=1e-9)
     assert adds.amounts == pytest.approx(np.ones(3))
-    assert told(parts + black, 1.25 * white).off == pytest.approx(np.full(3, -0.2), abs=1e-3)
-    assert told(0.9 * (parts + black), white, 0.9 * even).off == pytest.approx(np.zeros(3), abs=1e-9)
+    assert measure(primaries + black, 1.25 * white).off == pytest.approx(np.full(3, -0.2), abs=1e-3)
+    assert measure(0.9 * (primaries + black), white, 0.9 * ones).off == pytest.approx(np.zeros(3), abs=1e-9)
     # A shadow in the frame of green alone: white has more of green than that frame.
-    shadowed = parts * np.array([[1.0], [0.9], [1.0]]) + black
-    assert told(shadowed, white).amounts == pytest.approx([1, 1 / 0.9, 1])
+    shadowed = primaries * np.array([[1.0], [0.9], [1.0]]) + black
+    assert measure(shadowed, white).amounts == pytest.approx([1, 1 / 0.9, 1])
 
 
-def test_what_is_measured_of_a_sensor_is_taken_out_of_white() -> None:
-    parts, nodes = np.array([[3000.0, 700, 90], [400, 6000, 500], [80, 900, 4000]]), np.array(NODES)
-    seen, white = (light * (1 - 0.04 * light / FULL) for light in (parts, parts.sum(axis=0)))
-    known = replace(USUAL, deviation=-0.04 * nodes**2 * FULL, covariance=USUAL.covariance / 100, unmeasured=None)
+def test_corrects_white_for_measured_linearity() -> None:
+    primaries, nodes = np.array([[3000.0, 700, 90], [400, 6000, 500], [80, 900, 4000]]), np.array(NODES)
+    whites, white = (light * (1 - 0.04 * light / FULL) for light in (primaries, primaries.sum(axis=0)))
+    measured = replace(USUAL, deviation=-0.04 * nodes**2 * FULL, covariance=USUAL.covariance / 100, unmeasured=None)
 
-    def of(sensor: Superposition) -> Additivity:
-        found = additivity(lights(PRIMARIES), seen, white, np.zeros(3), np.ones((3, 3)), sensor)
-        assert found is not None
-        return found
+    def measure(sensor: Superposition) -> Additivity:
+        result = additivity(lights(PRIMARIES), whites, white, np.zeros(3), np.ones((3, 3)), sensor)
+        assert result is not None
+        return result
 
-    assert of(USUAL).off.max() > 0.008
-    assert np.abs(of(known).off).max() < 0.002
-    # What is not known of the sensor may be in white, too.
-    assert of(known).error == pytest.approx(of(USUAL).error / 10, rel=0.1)
-    assert of(USUAL).error.max() > 0.001
+    assert measure(USUAL).off.max() > 0.008
+    assert np.abs(measure(measured).off).max() < 0.002
+    # The uncertainty of the sensor is part of the result.
+    assert measure(measured).error == pytest.approx(measure(USUAL).error / 10, rel=0.1)
+    assert measure(USUAL).error.max() > 0.001
 
 
-def test_a_missing_primary_leaves_it_untold() -> None:
+def test_returns_none_without_primary_or_white() -> None:
     assert additivity(lights(PRIMARIES[:2]), np.ones((2, 3)), np.ones(3), np.zeros(3), np.ones((2, 3)), USUAL) is None
     assert additivity(lights(PRIMARIES), np.ones((3, 3)), None, np.zeros(3), np.ones((3, 3)), USUAL) is None
 
 
-def test_the_drift_is_linear_between_white_frames() -> None:
+def test_drift_is_linear_between_white_frames() -> None:
     gains = drift_gains(
         np.array([0.0, 5, 10, 15, 30]), np.array([0.0, 10, 20]), np.array([[8.0, 4, 2], [4, 4, 2], [4, 4, 1]])
     )
@@ -94,81 +94,81 @@ def shapes(points: _Array) -> _Array:
     return np.stack([1 - 0.1 * x * x, 1 - 0.06 * y * y + 0.03 * x, 1 - 0.12 * x * y], axis=-1)
 
 
-def test_a_cells_field_is_what_it_reflects() -> None:
+def test_field_of_patch_depends_on_reflected_light() -> None:
     fields = shapes(CENTRES) / shapes(CENTRES).mean(axis=0)
     at_paper = shapes(PLACES) / shapes(CENTRES).mean(axis=0)
-    # What paper, and each cell, reflects of each primary into each channel.
+    # counts of paper and of each patch, by primary and channel
     paper = np.array([[3000.0, 600, 100], [500, 5000, 700], [80, 900, 4000]])
     cells: _Array = paper[:, None] * (0.02 + RANDOM.random((3, 1000, 1)) ** 2)
     reader = PaperReader(PLACES, CENTRES, PAGE)
     alone = [reader.read(at_paper[:, [p]] * paper[p])[0] for p in range(3)]
-    known = Primaries.of((0, 1, 2), alone, [*cells], CENTRES)
-    assert known is not None
-    assert known.difference == pytest.approx((fields.max(axis=1) / fields.min(axis=1)).max() - 1, abs=0.01)
+    primaries = Primaries.of((0, 1, 2), alone, [*cells], CENTRES)
+    assert primaries is not None
+    assert primaries.difference == pytest.approx((fields.max(axis=1) / fields.min(axis=1)).max() - 1, abs=0.01)
     amounts = np.array([0.7, 0.3, 0.9])
     white = amounts @ paper
-    assert known.amounts(white) == pytest.approx(amounts, rel=1e-3)
+    assert primaries.amounts(white) == pytest.approx(amounts, rel=1e-3)
     true = np.einsum("p,ip,pic->ic", amounts, fields, cells) / np.einsum("p,pic->ic", amounts, cells)
-    of_paper = np.einsum("p,ip,pc->ic", amounts, fields, paper) / white
-    assert np.abs(true / of_paper - 1).max() > 0.01
-    assert known.field_ratio(white) == pytest.approx(true / of_paper, abs=3e-3)
-    # Undone by what `lut.json` records.
-    record = known.correction(white[None])
+    paper_field = np.einsum("p,ip,pc->ic", amounts, fields, paper) / white
+    assert np.abs(true / paper_field - 1).max() > 0.01
+    assert primaries.field_ratio(white) == pytest.approx(true / paper_field, abs=3e-3)
+    # `lut.json` has all values to undo it.
+    record = primaries.correction(white[None])
     assert record["lights"] == [0, 1, 2]
     assert record["per_light"][0] == pytest.approx(amounts, rel=1e-3)
 
 
-def test_one_primary_has_papers_field() -> None:
+def test_single_primary_has_field_of_paper() -> None:
     reader = PaperReader(PLACES, CENTRES, PAGE)
     alone = [reader.read(shapes(PLACES)[:, [p]] * np.full(3, 1000.0))[0] for p in range(3)]
-    known = Primaries.of((0, 1, 2), alone, [RANDOM.random((1000, 3)) * 900 for _ in range(3)], CENTRES)
-    assert known is not None
+    primaries = Primaries.of((0, 1, 2), alone, [RANDOM.random((1000, 3)) * 900 for _ in range(3)], CENTRES)
+    assert primaries is not None
     pure = Primaries.of(
-        (0, 1, 2), [replace(p, white=np.eye(3)[n] * 1000) for n, p in enumerate(alone)], [*known.cells], CENTRES
+        (0, 1, 2), [replace(p, white=np.eye(3)[n] * 1000) for n, p in enumerate(alone)], [*primaries.cells], CENTRES
     )
     assert pure is not None
     assert pure.field_ratio(np.array([0, 800.0, 0])) == pytest.approx(1, abs=1e-12)
 
 
-def test_a_dim_primary_tells_nothing() -> None:
+def test_returns_none_for_dim_primary() -> None:
     even = FlatField(PAGE, ((), (), ()))
     dim = [Paper(even, np.array([1000.0, 10, 10]), np.ones(3), 9, np.zeros(3)) for _ in range(2)]
     dim.append(Paper(even, np.array([1.0, 10, 200]), np.ones(3), 9, np.zeros(3)))
     assert Primaries.of((0, 1, 2), dim, [np.ones((10, 3)) for _ in range(3)], RANDOM.random((10, 2))) is None
 
 
-def test_counts_below_black_are_no_light() -> None:
+def test_clips_counts_below_black() -> None:
     even = FlatField(PAGE, ((), (), ()))
     papers = [Paper(even, white, np.ones(3), 9, np.zeros(3)) for white in 900 * np.eye(3) - 0.4 * (1 - np.eye(3)) + 0.2]
     cells = [np.array([[-3.0, 0.5, 70.0]])] * 3
-    found = Primaries.of((0, 1, 2), papers, cells, np.array([[1.0, 1.0]]))
-    assert found is not None
-    np.testing.assert_allclose(found.paper, 900.2 * np.eye(3))
-    np.testing.assert_allclose(found.cells, [[[0, 0.5, 70]]] * 3)
+    primaries = Primaries.of((0, 1, 2), papers, cells, np.array([[1.0, 1.0]]))
+    assert primaries is not None
+    np.testing.assert_allclose(primaries.paper, 900.2 * np.eye(3))
+    np.testing.assert_allclose(primaries.cells, [[[0, 0.5, 70]]] * 3)
 
 
-def test_the_brightest_pure_lights_are_chosen() -> None:
+def test_selects_brightest_pure_illuminants() -> None:
     lights = plan_illuminations(3, (3000,))
-    found = pure_lights(lights)
-    assert found is not None
-    assert [lights[n].colour for n in found] == [
+    indices = pure_lights(lights)
+    assert indices is not None
+    assert [lights[n].colour for n in indices] == [
         (255, 0, 0),
         (0, 255, 0),
         (0, 0, 255),
     ]
     assert pure_lights([light for light in lights if light.kind == "cct"]) is None
 
-    def chosen(*codes: tuple[int, int, int]) -> tuple[int, int, int] | None:
+    def selected(*codes: tuple[int, int, int]) -> tuple[int, int, int] | None:
         return pure_lights([Illumination(n, "uniform", None, Colour(*code)) for n, code in enumerate(codes)])
 
-    # Of equal ones the first; black is none of them.
-    assert chosen((200, 0, 0), (255, 0, 0), (255, 0, 0), (0, 9, 0), (0, 0, 9), (255, 9, 0)) == (1, 3, 4)
-    assert chosen((0, 0, 0), (0, 255, 0), (0, 0, 255)) is None
+    # The first of equal ones; black does not count.
+    assert selected((200, 0, 0), (255, 0, 0), (255, 0, 0), (0, 9, 0), (0, 0, 9), (255, 9, 0)) == (1, 3, 4)
+    assert selected((0, 0, 0), (0, 255, 0), (0, 0, 255)) is None
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("lens_unmeasured")
-def test_a_session_of_unlike_primaries_is_told_true(tmp_path: Path) -> None:
+def test_corrects_session_with_different_primaries(tmp_path: Path) -> None:
     room = Room(waviness_mm=0.5, projector_falloff=0.3, primary_difference=0.4, response_spread=0.0)
     lab = hang(room=room)
     lights = renumbered(plan_illuminations(2, (4500, 6500)))
@@ -176,23 +176,23 @@ def test_a_session_of_unlike_primaries_is_told_true(tmp_path: Path) -> None:
         result = build(session, tmp_path / "lut")
     lut = open_lut(tmp_path / "lut")
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
-    fit = np.ones(len(codes), dtype=bool)
-    fit[[cell.colour for cell in lut.provenance.unfit]] = False
+    is_fit = np.ones(len(codes), dtype=bool)
+    is_fit[[cell.colour for cell in lut.provenance.unfit]] = False
     assert result.figures.primaries is not None
-    # Cells that frames are compared with have the field of their own colour, too: the same frame differs by nothing.
-    itself = result.figures.registered_frame.consistency
-    assert itself.scatter < 0.001
-    assert itself.block < 0.001
-    assert not itself.disturbed
+    # The reference patches have the field of their colour, too: the same frame has no differences.
+    consistency = result.figures.registered_frame.consistency
+    assert consistency.scatter < 0.001
+    assert consistency.block < 0.001
+    assert not consistency.disturbed
     corrected: list[_Array] = []
     plain: list[_Array] = []
     for light in lights:
         white = lab.world.white(light.colour, SETTINGS)
         true = lab.world.reflected(codes, light.colour, SETTINGS) / white * lut.white[light.index]
-        off = lut.samples[light.index].mean(axis=1) / true - 1
-        lit = fit[:, None] & (true > 1500)
-        undone = (1 + off) * result.figures.primaries.field_ratio(lut.white[light.index]) - 1
-        corrected.append(off[lit])
-        plain.append(undone[lit])
-    one, other = (float(np.sqrt((np.concatenate(values) ** 2).mean())) for values in (corrected, plain))
-    assert one < 0.9 * other
+        error = lut.samples[light.index].mean(axis=1) / true - 1
+        is_bright = is_fit[:, None] & (true > 1500)
+        undone = (1 + error) * result.figures.primaries.field_ratio(lut.white[light.index]) - 1
+        corrected.append(error[is_bright])
+        plain.append(undone[is_bright])
+    rms, plain_rms = (float(np.sqrt((np.concatenate(values) ** 2).mean())) for values in (corrected, plain))
+    assert rms < 0.9 * plain_rms

@@ -1,4 +1,4 @@
-"""How well places are known: what an outline tells of places beside it and inside."""
+"""Uncertainty of positions from the outline of a chart without tags."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ def outline(step: float = 1.0) -> npt.NDArray[np.float64]:
     return np.concatenate([np.stack(side, axis=-1) for side in sides])
 
 
-def test_inside_it_is_what_the_outline_shows_and_more_beside_a_part_that_waves() -> None:
+def test_uncertainty_follows_outline_and_rises_near_waves() -> None:
     marks = outline()
     residual = np.full_like(marks, 0.01 / np.sqrt(2))
-    waves = (marks[:, 1] == 0) & (np.abs(marks[:, 0] - 100) < 20)
-    residual[waves] = 0.3 / np.sqrt(2)
-    inside, beside, elsewhere = unfollowed_px(np.array([(100, 50), (100, 5), (30, 95.0)]), marks, residual, 5.0, REACH)
-    usual = np.sqrt((residual**2).sum(axis=1).mean())
-    assert inside == elsewhere == pytest.approx(2 * usual)
-    assert beside == pytest.approx(0.6)
+    is_wave = (marks[:, 1] == 0) & (np.abs(marks[:, 0] - 100) < 20)
+    residual[is_wave] = 0.3 / np.sqrt(2)
+    inside, wavy, elsewhere = unfollowed_px(np.array([(100, 50), (100, 5), (30, 95.0)]), marks, residual, 5.0, REACH)
+    outline_rms = np.sqrt((residual**2).sum(axis=1).mean())
+    assert inside == elsewhere == pytest.approx(2 * outline_rms)
+    assert wavy == pytest.approx(0.6)
 
 
-def test_at_a_corner_that_was_not_found_it_is_how_far_the_sheet_is_off_a_plane() -> None:
+def test_missing_corner_has_departure_from_plane() -> None:
     marks = outline()
-    lost = (marks[:, 1] == 0) & (marks[:, 0] < 60)
-    marks = marks[~lost]
-    places = np.array([(5, 5), (30, 5), (55, 5), (30, 95), (150, 5), (100, 50.0)])
-    found = unfollowed_px(places, marks, np.full_like(marks, 0.01), 0.8, REACH)
-    assert found == pytest.approx([0.8, 0.8, 0.02 * np.sqrt(2), 0.02 * np.sqrt(2), *[0.02 * np.sqrt(2)] * 2])
+    is_missing = (marks[:, 1] == 0) & (marks[:, 0] < 60)
+    marks = marks[~is_missing]
+    points = np.array([(5, 5), (30, 5), (55, 5), (30, 95), (150, 5), (100, 50.0)])
+    uncertainty = unfollowed_px(points, marks, np.full_like(marks, 0.01), 0.8, REACH)
+    assert uncertainty == pytest.approx([0.8, 0.8, 0.02 * np.sqrt(2), 0.02 * np.sqrt(2), *[0.02 * np.sqrt(2)] * 2])
 
 
+# 4096 patches without gaps, one tile each
 CHART = paper_chart("A4", 4)
-"""4096 cells without a gap: a tile each."""
 RASTER = Raster(
     CHART.centres_mm.min(axis=0) - np.array(CHART.cell_mm) / 2,
     np.array(CHART.cell_mm),
@@ -51,7 +51,7 @@ RASTER = Raster(
 
 
 def compared(residual: npt.NDArray[np.float64], strength: float, seed: int = 1) -> TileComparison:
-    """Return what tiles measure of residuals (rows, columns, 2) px, each with as much information, never even."""
+    """Return the comparison for residuals (rows, columns, 2) px, with random information of given strength."""
     rows, columns = RASTER.shape
     y, x = np.mgrid[:rows, :columns]
     points = RASTER.low_mm + (np.stack([x.ravel(), y.ravel()], axis=1) + 0.5) * RASTER.step_mm

@@ -1,4 +1,4 @@
-"""Blocks are found where they are, and tiles say how the map must move, on pictures moved by known amounts."""
+"""Comparison of images that were moved by known amounts, by blocks and by tiles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from calibration.registration.tiles import (
     MIN_SCORE,
-    FoundBlocks,
+    LocatedBlocks,
     Raster,
     compare_tiles,
     find_blocks,
@@ -17,8 +17,8 @@ from calibration.registration.tiles import (
 
 _Float = npt.NDArray[np.float32]
 
+# one element is 1 mm and, with `to_pixels`, 1 px
 RASTER = Raster.of(np.zeros(2), np.ones(2), np.array([240, 160]))
-"""One element is a millimetre and, by the map of these tests, a pixel."""
 
 TILE = 10
 
@@ -39,57 +39,57 @@ def moved(image: _Float, dx: float, dy: float) -> _Float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.6, 300.0)])
-def test_a_small_movement_is_measured_whatever_gain_and_offset(gain: float, offset: float) -> None:
+def test_measures_small_movement_with_any_gain_and_offset(gain: float, offset: float) -> None:
     image = texture()
-    seen = gain * moved(image, 0.3, -0.2) + np.float32(offset)
+    measured = gain * moved(image, 0.3, -0.2) + np.float32(offset)
     weight = np.ones(RASTER.shape, dtype=np.float32)
-    found = compare_tiles(RASTER, TILE, image, seen, weight, 8 * TILE, to_pixels, float(TILE))
-    assert (found.score > 0.9).all()
-    total = np.asarray(np.linalg.solve(found.information.sum(axis=0), found.pull.sum(axis=0)), dtype=np.float64)
+    result = compare_tiles(RASTER, TILE, image, measured, weight, 8 * TILE, to_pixels, float(TILE))
+    assert (result.score > 0.9).all()
+    total = np.asarray(np.linalg.solve(result.information.sum(axis=0), result.pull.sum(axis=0)), dtype=np.float64)
     assert total == pytest.approx([0.3, -0.2], abs=0.02)
-    left = found.after(np.broadcast_to(total, found.pull.shape))
-    assert left.pull.sum(axis=0) == pytest.approx(0, abs=1e-6 * np.abs(found.pull).sum())
+    remainder = result.after(np.broadcast_to(total, result.pull.shape))
+    assert remainder.pull.sum(axis=0) == pytest.approx(0, abs=1e-6 * np.abs(result.pull).sum())
 
 
-def test_another_picture_moves_nothing() -> None:
+def test_ignores_another_image() -> None:
     image = texture()
     weight = np.ones(RASTER.shape, dtype=np.float32)
-    found = compare_tiles(
+    comparison = compare_tiles(
         RASTER, TILE, image, np.ascontiguousarray(image[::-1, ::-1]), weight, 8 * TILE, to_pixels, float(TILE)
     )
-    assert (found.score < MIN_SCORE).all()
-    assert not found.information.any()
-    assert not found.pull.any()
+    assert (comparison.score < MIN_SCORE).all()
+    assert not comparison.information.any()
+    assert not comparison.pull.any()
 
 
-def test_blocks_are_found_where_they_are() -> None:
+def test_locates_blocks() -> None:
     random = np.random.default_rng(2)
     raster = Raster.of(np.zeros(2), np.array([2.0, 1.5]), np.array([200, 150]))
     expected = random.uniform(100, 9000, (30, 40, 3)).repeat(5, axis=0).repeat(5, axis=1).astype(np.float32)
-    seen = np.roll(expected, (3, -4), axis=(0, 1))
-    there = np.ones(raster.shape, dtype=np.bool_)
-    there[:, 150:] = False
-    found = find_blocks(raster, expected, seen, there, 40, 8, 64)
-    assert 4 <= len(found.score) < 20
-    assert (found.score > 0.99).all()
-    assert found.moves_mm == pytest.approx(np.broadcast_to([-4 * 2.0, 3 * 1.5], found.moves_mm.shape), abs=0.1)
-    assert (found.centres_mm[:, 0] < 300).all()
+    measured = np.roll(expected, (3, -4), axis=(0, 1))
+    is_inside = np.ones(raster.shape, dtype=np.bool_)
+    is_inside[:, 150:] = False
+    blocks = find_blocks(raster, expected, measured, is_inside, 40, 8, 64)
+    assert 4 <= len(blocks.score) < 20
+    assert (blocks.score > 0.99).all()
+    assert blocks.moves_mm == pytest.approx(np.broadcast_to([-4 * 2.0, 3 * 1.5], blocks.moves_mm.shape), abs=0.1)
+    assert (blocks.centres_mm[:, 0] < 300).all()
 
 
-def test_a_block_that_moves_otherwise_than_its_neighbours_does_not_count() -> None:
+def test_ignores_block_that_disagrees_with_neighbours() -> None:
     x, y = np.meshgrid(np.arange(5.0), np.arange(4.0))
     centres = 50 * np.stack([x.ravel(), y.ravel()], axis=-1)
     score = np.full(20, 0.9)
     score[3] = 0.2
     moves = np.broadcast_to([2.0, 1.0], (20, 2)).copy()
     moves[7] += [10.0, 0.0]
-    found = FoundBlocks(centres, moves, score)
-    counted = found.information(moves, np.array([50.0, 50.0]), 10.0)[:, 0, 0] > 0
-    assert np.flatnonzero(~counted).tolist() == [3, 7]
+    blocks = LocatedBlocks(centres, moves, score)
+    is_used = blocks.information(moves, np.array([50.0, 50.0]), 10.0)[:, 0, 0] > 0
+    assert np.flatnonzero(~is_used).tolist() == [3, 7]
 
 
-def test_patches_cover_elements_by_their_shares_up_to_the_border() -> None:
-    """A patch of 2.5 × 2 elements whose left half element lies in the first column, and one that is cut off."""
+def test_coverage_is_fractional_up_to_border() -> None:
+    """A patch of 2.5 × 2 elements with half an element in the first column, and a patch that is cut off."""
     raster = Raster.of(np.zeros(2), np.ones(2), np.array([12, 6]))
     cover = raster.coverage(np.array([[1.75, 2.0], [11.5, 6.0]]), np.array([[2.5, 2.0], [2.0, 2.0]])).toarray()
     first, second = cover[:, 0].reshape(6, 12), cover[:, 1].reshape(6, 12)
@@ -98,7 +98,7 @@ def test_patches_cover_elements_by_their_shares_up_to_the_border() -> None:
     np.testing.assert_allclose(first, expected)
     assert np.argwhere(second).tolist() == [[5, 10], [5, 11]]
     assert second[5].tolist()[10:] == [0.5, 1]
-    # A fifth of a cell of ten elements about both, at least one.
+    # Margin of a fifth of a patch, at least one element.
     for per_cell, reach in ((10, 2), (2, 1)):
         near = raster.near(raster.coverage(np.array([[6.5, 3.5]]), np.array([[1.0, 1.0]])), per_cell)
         assert np.argwhere(near).tolist() == [

@@ -1,4 +1,4 @@
-"""Small tables for these tests, and a way to damage them."""
+"""Small LUTs for tests, and functions that damage them."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def write(folder: Path, seed: int = 0, chart: str = "cd" * 32, lights: int = len
     return lut
 
 
-def flip(name: str, place: int) -> Callable[[Path], None]:
+def flip(name: str, position: int) -> Callable[[Path], None]:
     def change(folder: Path) -> None:
         data = bytearray((folder / name).read_bytes())
-        data[place] ^= 1
+        data[position] ^= 1
         (folder / name).write_bytes(data)
 
     return change

@@ -1,4 +1,4 @@
-"""The table to begin with: made once, kept, used."""
+"""The demonstration LUT: made once, cached, and used by commands."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("kept")
 
 
-def run_here(words: list[str], **_: object) -> subprocess.CompletedProcess[bytes]:
-    """Run `sim` in this process: Python takes longer to start and to read its modules than the table takes."""
-    assert words[:3] == [sys.executable, "-m", "synthesis.cli"]
-    return subprocess.CompletedProcess(words, sim(words[3:]))
+def run_here(command: list[str], **_: object) -> subprocess.CompletedProcess[bytes]:
+    """Run `sim` in this process: starting Python takes longer than making the LUT."""
+    assert command[:3] == [sys.executable, "-m", "synthesis.cli"]
+    return subprocess.CompletedProcess(command, sim(command[3:]))
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    """Make it small, and keep it for the tests that use it."""
+    """Make the LUT small, and cache it for all tests."""
     program = SimpleNamespace(run=run_here, DEVNULL=subprocess.DEVNULL)
     monkeypatch.setattr(demo_table, "subprocess", program)
     monkeypatch.setattr(demo_table, "BITS", 1)
@@ -44,28 +44,28 @@ def small(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_it_is_made_once_and_says_what_it_is(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_makes_lut_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = table_folder(Path("demo:"))
     assert first.is_relative_to(folder)
     assert "computed table" in capsys.readouterr().out
-    made = (first / "lut.json").stat().st_mtime_ns
+    time_ns = (first / "lut.json").stat().st_mtime_ns
     assert table_folder(Path("demo:")) == first
-    assert (first / "lut.json").stat().st_mtime_ns == made
+    assert (first / "lut.json").stat().st_mtime_ns == time_ns
     assert [light.name for light in open_lut(first).illuminations] == ["D65", "A"]
 
 
-def test_any_other_folder_is_itself(tmp_path: Path) -> None:
+def test_returns_other_folders(tmp_path: Path) -> None:
     assert table_folder(tmp_path) == tmp_path
 
 
-def test_without_a_place_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_remedy_without_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("calibration.table.demo_table.cache_folder", lambda: None)
     with pytest.raises(InputError, match="XDG_CACHE_HOME"):
         table_folder(Path("demo:"))
 
 
 @pytest.mark.slow
-def test_one_command_makes_images_of_a_picture(tmp_path: Path) -> None:
+def test_generates_images_in_one_command(tmp_path: Path) -> None:
     picture = tmp_path / "cat.png"
     cv2.imwrite(str(picture), np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8))
     assert main(["demo:", str(tmp_path / "out"), "--sources", str(picture), "--light", "0-1"]) == 0
@@ -73,7 +73,7 @@ def test_one_command_makes_images_of_a_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_other_commands_take_it_too(capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_commands_accept_demo(capsys: pytest.CaptureFixture[str]) -> None:
     assert build_lut(["info", "demo:"]) == 0
     assert "computed by sim table" in capsys.readouterr().out
     assert build_lut(["match", "demo:", "demo:"]) == 0

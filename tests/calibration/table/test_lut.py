@@ -1,4 +1,4 @@
-"""The table on disk: samples that have changed are not used."""
+"""The LUT on disk, and refusal of changed samples."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from foundation.errors import FormatError, StorageError
 from tests.calibration.table.tables import FRAMES, LIGHTS, flip, write
 
 
-def test_the_hashes_are_those_of_the_files(tmp_path: Path) -> None:
+def test_records_hashes_of_files(tmp_path: Path) -> None:
     lut = write(tmp_path / "lut")
     record = json.loads((lut.folder / "lut.json").read_text())
     assert record["samples_sha256"] == hashlib.sha256((lut.folder / "samples.npy").read_bytes()).hexdigest()
@@ -27,46 +27,46 @@ def test_the_hashes_are_those_of_the_files(tmp_path: Path) -> None:
     assert find_faults(lut) == []
 
 
-@pytest.mark.parametrize("wrong", [0, -1, MOST_WHITE, "nan"])
-def test_a_ground_truth_that_was_not_measured_is_refused(wrong: object, tmp_path: Path) -> None:
+@pytest.mark.parametrize("invalid", [0, -1, MOST_WHITE, "nan"])
+def test_refuses_invalid_ground_truth(invalid: object, tmp_path: Path) -> None:
     path = write(tmp_path / "lut").folder / "illuminations.csv"
-    header, first, *others = path.read_text().splitlines()
+    header, first, *other_rows = path.read_text().splitlines()
     row = first.split(",")
-    row[header.split(",").index("white_g")] = str(wrong)
-    path.write_text("\n".join([header, ",".join(row), *others, ""]))
+    row[header.split(",").index("white_g")] = str(invalid)
+    path.write_text("\n".join([header, ",".join(row), *other_rows, ""]))
     with pytest.raises(FormatError):
         open_lut(path.parent)
 
 
-def test_a_disk_that_forgets_is_noticed(tmp_path: Path) -> None:
+def test_detects_samples_lost_by_disk(tmp_path: Path) -> None:
     (tmp_path / "lut").mkdir()
     writer = LutWriter(tmp_path / "lut", 1, 8, 25)
     writer.put(0, np.ones((8, 25, 3), dtype=np.uint16))
     flip("samples.npy", -1)(tmp_path / "lut")
     assert writer.damaged() == [0]
-    known = Provenance(camera="T", bits=1, white_level=1, session_sha256="", chart_sha256="", software="")
-    with pytest.raises(StorageError, match="lights 0 "):
-        writer.finish(LIGHTS[:1], np.ones((1, 3)), known)
+    provenance = Provenance(camera="T", bits=1, white_level=1, session_sha256="", chart_sha256="", software="")
+    with pytest.raises(StorageError, match="illuminants 0 "):
+        writer.finish(LIGHTS[:1], np.ones((1, 3)), provenance)
     assert not (tmp_path / "lut" / "lut.json").exists()
 
 
-def test_a_table_s_name_changes_with_its_samples(tmp_path: Path) -> None:
+def test_hash_depends_on_samples(tmp_path: Path) -> None:
     assert write(tmp_path / "one", 0).sha256 == write(tmp_path / "same", 0).sha256
     assert write(tmp_path / "other", 1).sha256 != open_lut(tmp_path / "one").sha256
 
 
-def test_samples_that_have_changed_are_not_used(tmp_path: Path) -> None:
+def test_refuses_changed_samples(tmp_path: Path) -> None:
     lut = write(tmp_path / "lut")
     flip("samples.npy", 128 + 2 * 1200 + 7)(lut.folder)
     changed = open_lut(lut.folder)
     for light in (0, 1, 3):
         assert changed.light_samples(light).shape == (8, 25, 3)
-    with pytest.raises(FormatError, match="light 2"):
+    with pytest.raises(FormatError, match="illuminant 2 "):
         changed.light_samples(2)
 
 
 @pytest.mark.parametrize(
-    ("shape", "kind", "order"),
+    ("shape", "dtype", "order"),
     [
         ((2, 8, 1025, 3), "<u2", "C"),
         ((2, 8, 0, 3), "<u2", "C"),
@@ -76,18 +76,18 @@ def test_samples_that_have_changed_are_not_used(tmp_path: Path) -> None:
         ((2, 8, 9, 3), "<u2", "F"),
     ],
 )
-def test_samples_of_another_form_are_not_mapped(
-    shape: tuple[int, ...], kind: str, order: Literal["C", "F"], tmp_path: Path
+def test_refuses_samples_of_wrong_format(
+    shape: tuple[int, ...], dtype: str, order: Literal["C", "F"], tmp_path: Path
 ) -> None:
-    np.save(tmp_path / "samples.npy", np.zeros(shape, kind, order=order))
+    np.save(tmp_path / "samples.npy", np.zeros(shape, dtype, order=order))
     with pytest.raises(FormatError, match=r"uint16 \(2, 8, samples, 3\) of 1 to 1024"):
         map_samples(tmp_path / "samples.npy", 2, 1)
-    most = np.arange(2 * 8 * 1024 * 3, dtype="<u2").reshape(2, 8, 1024, 3)
-    np.save(tmp_path / "most.npy", most)
-    assert np.array_equal(map_samples(tmp_path / "most.npy", 2, 1), most)
+    largest = np.arange(2 * 8 * 1024 * 3, dtype="<u2").reshape(2, 8, 1024, 3)
+    np.save(tmp_path / "most.npy", largest)
+    assert np.array_equal(map_samples(tmp_path / "most.npy", 2, 1), largest)
 
 
-def test_a_table_in_the_making_is_not_read(tmp_path: Path) -> None:
+def test_refuses_unfinished_lut(tmp_path: Path) -> None:
     (tmp_path / ".lut.partial").mkdir()
     LutWriter(tmp_path / ".lut.partial", 1, 8, 25)
     with pytest.raises(FormatError):

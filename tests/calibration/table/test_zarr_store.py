@@ -1,4 +1,4 @@
-"""Published tables: what was fetched is what was published, byte by byte, or is refused."""
+"""Published LUTs: a fetched LUT is identical to the published one, or it is refused."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LIGHTS = SHARD_LIGHTS + 3
 
 @pytest.fixture
 def lut(tmp_path: Path) -> Lut:
-    """Return a table with more lights than one object holds."""
+    """Return a LUT with more illuminants than one object holds."""
     folder = tmp_path / "lut"
     folder.mkdir()
     writer = LutWriter(folder, LIGHTS, 64, 25)
@@ -40,10 +40,10 @@ def lut(tmp_path: Path) -> Lut:
         writer.put(light, rng.poisson(500 + light, (64, 25, 3)).astype(np.uint16))
     lights = [Illumination(light, "uniform", None, Colour(9, 8, light)) for light in range(LIGHTS)]
     white: npt.NDArray[np.float64] = 900.0 + np.arange(3.0 * LIGHTS).reshape(LIGHTS, 3)
-    known = Provenance(
+    provenance = Provenance(
         camera="Šestica", bits=2, white_level=8000, session_sha256="1", chart_sha256="2", software="test 1"
     )
-    writer.finish(lights, white, known, [SourceFrame("light", 0, "a.CR2", "3" * 64)])
+    writer.finish(lights, white, provenance, [SourceFrame("light", 0, "a.CR2", "3" * 64)])
     return open_lut(folder)
 
 
@@ -51,29 +51,29 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("place", ["{}/published", "memory://bucket/published"])
-def test_there_and_back(lut: Lut, tmp_path: Path, place: str) -> None:
+@pytest.mark.parametrize("address", ["{}/published", "memory://bucket/published"])
+def test_fetches_published_lut(lut: Lut, tmp_path: Path, address: str) -> None:
     MemoryFileSystem.store.clear()
-    url = place.format(tmp_path)
+    url = address.format(tmp_path)
     steps: list[tuple[int, int]] = []
     publish(lut, url, lambda done, total: steps.append((done, total)))
     assert steps == [(SHARD_LIGHTS, LIGHTS), (LIGHTS, LIGHTS)]
-    back = fetch(url, tmp_path / "back")
+    fetched = fetch(url, tmp_path / "back")
     assert files(tmp_path / "back") == files(lut.folder)
-    assert back.sha256 == lut.sha256
-    np.testing.assert_array_equal(back.samples, lut.samples)
+    assert fetched.sha256 == lut.sha256
+    np.testing.assert_array_equal(fetched.samples, lut.samples)
     with pytest.raises(InputError):
         publish(lut, url)
     with pytest.raises(InputError):
         fetch(url, tmp_path / "back")
 
 
-def test_one_light_a_chunk_and_32_an_object(lut: Lut, tmp_path: Path) -> None:
+def test_stores_one_illuminant_per_chunk_and_32_per_object(lut: Lut, tmp_path: Path) -> None:
     publish(lut, str(tmp_path / "published"))
-    described = json.loads((tmp_path / "published" / "zarr.json").read_text())
-    assert (described["zarr_format"], described["data_type"], described["shape"]) == (3, "uint16", [LIGHTS, 64, 25, 3])
-    assert described["chunk_grid"]["configuration"]["chunk_shape"] == [32, 64, 25, 3]
-    (sharding,) = described["codecs"]
+    metadata = json.loads((tmp_path / "published" / "zarr.json").read_text())
+    assert (metadata["zarr_format"], metadata["data_type"], metadata["shape"]) == (3, "uint16", [LIGHTS, 64, 25, 3])
+    assert metadata["chunk_grid"]["configuration"]["chunk_shape"] == [32, 64, 25, 3]
+    (sharding,) = metadata["codecs"]
     assert sharding["name"] == "sharding_indexed"
     assert sharding["configuration"]["chunk_shape"] == [1, 64, 25, 3]
     blosc = sharding["configuration"]["codecs"][-1]
@@ -86,7 +86,7 @@ def test_one_light_a_chunk_and_32_an_object(lut: Lut, tmp_path: Path) -> None:
     assert len(objects) == 2
 
 
-def test_what_was_never_finished_is_published_anew(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replaces_unfinished_publication(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     url = str(tmp_path / "published")
 
     def stop(done: int, total: int) -> None:
@@ -101,7 +101,7 @@ def test_what_was_never_finished_is_published_anew(lut: Lut, tmp_path: Path, mon
     assert files(fetch(url, tmp_path / "back").folder) == files(lut.folder)
 
 
-def test_nothing_else_is_overwritten(lut: Lut, tmp_path: Path) -> None:
+def test_refuses_to_overwrite_other_files(lut: Lut, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     with pytest.raises(InputError):
@@ -109,25 +109,25 @@ def test_nothing_else_is_overwritten(lut: Lut, tmp_path: Path) -> None:
     assert (tmp_path / "mine" / "notes.txt").read_text() == "mine"
 
 
-def test_what_changed_on_the_way_is_refused(lut: Lut, tmp_path: Path) -> None:
+def test_refuses_changed_samples(lut: Lut, tmp_path: Path) -> None:
     url = str(tmp_path / "published")
     publish(lut, url)
     array = import_module("zarr").open_array(url, mode="r+")
     array[7, 5, 4, 1] = 12345
-    with pytest.raises(FormatError, match="light 7"):
+    with pytest.raises(FormatError, match="illuminant 7"):
         fetch(url, tmp_path / "back")
     (shard,) = (path for path in (tmp_path / "published" / "c" / "1").rglob("*") if path.is_file())
     data = bytearray(shard.read_bytes())
     data[100:200] = bytes(100)
     shard.write_bytes(bytes(data))
     array[7] = np.asarray(lut.samples[7])
-    with pytest.raises(FormatError, match=rf"(light {SHARD_LIGHTS} of|of light {SHARD_LIGHTS} from) "):
+    with pytest.raises(FormatError, match=rf"illuminant {SHARD_LIGHTS} of "):
         fetch(url, tmp_path / "back")
     assert not (tmp_path / "back").exists()
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
-def test_what_is_not_there_or_not_installed(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_missing_store_or_library(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(FormatError):
         fetch(str(tmp_path / "nowhere"), tmp_path / "back")
     with pytest.raises((InputError, StorageError), match="nosuch://bucket"):
@@ -143,85 +143,85 @@ def test_what_is_not_there_or_not_installed(lut: Lut, tmp_path: Path, monkeypatc
 
 def edit(published: Path, change: Callable[[dict[str, Any]], object]) -> None:
     path = published / "zarr.json"
-    described = json.loads(path.read_text())
-    change(described)
-    path.write_text(json.dumps(described))
+    metadata = json.loads(path.read_text())
+    change(metadata)
+    path.write_text(json.dumps(metadata))
 
 
-def brighten_the_truth(described: dict[str, Any]) -> None:
-    files = described["attributes"]["files"]
+def change_ground_truth(metadata: dict[str, Any]) -> None:
+    files = metadata["attributes"]["files"]
     files["illuminations.csv"] = files["illuminations.csv"].replace("900.000000", "990.000000", 1)
 
 
-def retell_everything(described: dict[str, Any]) -> None:
-    """Change the ground truth, and every hash that stands for it: what only another's word can show."""
-    files = described["attributes"]["files"]
-    for before in ("illuminations.csv", "lut.json"):
-        old = hashlib.sha256(files[before].encode()).hexdigest()
-        if before == "illuminations.csv":
-            brighten_the_truth(described)
-        new = hashlib.sha256(files[before].encode()).hexdigest()
+def change_all_hashes(metadata: dict[str, Any]) -> None:
+    """Change the ground truth and all hashes that depend on it: only a hash from elsewhere detects this."""
+    files = metadata["attributes"]["files"]
+    for changed_file in ("illuminations.csv", "lut.json"):
+        old = hashlib.sha256(files[changed_file].encode()).hexdigest()
+        if changed_file == "illuminations.csv":
+            change_ground_truth(metadata)
+        new = hashlib.sha256(files[changed_file].encode()).hexdigest()
         for name in ("lut.json", "SHA256SUMS"):
-            told = files["lut.json"]
+            old_text = files["lut.json"]
             files[name] = files[name].replace(old, new)
-            if name == "lut.json" and before == "illuminations.csv":
+            if name == "lut.json" and changed_file == "illuminations.csv":
                 files["SHA256SUMS"] = files["SHA256SUMS"].replace(
-                    hashlib.sha256(told.encode()).hexdigest(), hashlib.sha256(files[name].encode()).hexdigest()
+                    hashlib.sha256(old_text.encode()).hexdigest(), hashlib.sha256(files[name].encode()).hexdigest()
                 )
 
 
-def test_a_published_truth_that_was_edited_is_refused(lut: Lut, tmp_path: Path) -> None:
+def test_refuses_edited_ground_truth(lut: Lut, tmp_path: Path) -> None:
     publish(lut, str(tmp_path / "published"))
-    edit(tmp_path / "published", brighten_the_truth)
+    edit(tmp_path / "published", change_ground_truth)
     with pytest.raises(FormatError, match=r"illuminations\.csv"):
         fetch(str(tmp_path / "published"), tmp_path / "back")
     assert not (tmp_path / "back").exists()
 
 
-def test_a_table_is_the_one_that_was_told_of(lut: Lut, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_compares_expected_hash(lut: Lut, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     url = str(tmp_path / "published")
     assert main(["publish", str(lut.folder), url]) == 0
     assert f"{LIGHTS} lights" in capsys.readouterr().out
     assert main(["info", str(lut.folder)]) == 0
     assert f"Table:           {lut.sha256}" in capsys.readouterr().out
-    assert main(["fetch", url, str(tmp_path / "told"), "--expect", lut.sha256]) == 0
+    assert main(["fetch", url, str(tmp_path / "expected"), "--expect", lut.sha256]) == 0
     assert "it is the table expected" in capsys.readouterr().out
-    assert main(["fetch", url, str(tmp_path / "untold")]) == 0
-    said = capsys.readouterr().out
-    assert f"its hash, {lut.sha256}: compare it" in said
-    assert "every file is as its own hashes say" in said
-    edit(tmp_path / "published", retell_everything)
-    # All of it fits together: nothing but a hash from elsewhere can tell.
+    assert main(["fetch", url, str(tmp_path / "unknown")]) == 0
+    printed = capsys.readouterr().out
+    assert f"its hash, {lut.sha256}: compare it" in printed
+    assert "every file is as its own hashes say" in printed
+    edit(tmp_path / "published", change_all_hashes)
+    # All files are consistent: only a hash from elsewhere detects the change.
     assert main(["fetch", url, str(tmp_path / "other")]) == 0
     assert open_lut(tmp_path / "other").white[0, 0] == 990
     capsys.readouterr()
     assert main(["fetch", url, str(tmp_path / "refused"), "--expect", lut.sha256]) == 2
-    assert "is not the table" in capsys.readouterr().err
+    assert "is another LUT" in capsys.readouterr().err
     assert not (tmp_path / "refused").exists()
     assert main(["fetch", url, str(tmp_path / "refused"), "--expect", lut.sha256[:12]]) == 2
-    assert "is no hash of a table" in capsys.readouterr().err
+    assert "is no hash of a LUT" in capsys.readouterr().err
 
 
 Change = Callable[[dict[str, Any]], object]
 
 CLAIMS: list[tuple[Change, str]] = [
-    (lambda said: said.update(shape=[10**6, 64, 25, 3]), "not stored"),
-    (lambda said: said.update(shape=[LIGHTS, 64, "25", 3]), "not stored|cannot read|head of the samples"),
-    (lambda said: said.update(data_type="float64"), "not stored"),
-    (lambda said: said["codecs"][0]["configuration"]["codecs"].append({"name": "numcodecs.bz2"}), "not stored"),
-    (lambda said: said["codecs"][0]["configuration"].update(chunk_shape=[LIGHTS, 64, 25, 3]), "not stored"),
-    (lambda said: said["attributes"].update(files=[1]), "does not hold the files of a table"),
-    (lambda said: said["attributes"]["files"].update({"../x": "y"}), "which is no file of a table"),
-    (lambda said: said["attributes"]["files"].pop("lut.json"), "lacks lut.json"),
-    (lambda said: said["attributes"]["files"].pop("SHA256SUMS"), "lacks SHA256SUMS"),
-    (lambda said: said["attributes"].update(head="AAAA"), "the head of the samples"),
-    (lambda said: said["attributes"].update(whole="no"), "holds no table, or one that was never finished"),
-    (lambda said: said["attributes"].update(version=[2]), r"published in version \[2\]"),
+    (lambda data: data.update(shape=[10**6, 64, 25, 3]), "array of shape"),
+    (lambda data: data.update(shape=[LIGHTS, 64, "25", 3]), "array of shape|cannot read|header of the samples"),
+    (lambda data: data.update(data_type="float64"), "array of shape"),
+    (lambda data: data["codecs"][0]["configuration"]["codecs"].append({"name": "numcodecs.bz2"}), "array of shape"),
+    (lambda data: data["codecs"][0]["configuration"].update(chunk_shape=[LIGHTS, 64, 25, 3]), "array of shape"),
+    (lambda data: data["attributes"].update(files=[1]), "has no files attribute"),
+    (lambda data: data["attributes"]["files"].update({"../x": "y"}), "no file of a LUT"),
+    (lambda data: data["attributes"]["files"].pop("lut.json"), "lacks lut.json"),
+    (lambda data: data["attributes"]["files"].pop("SHA256SUMS"), "lacks SHA256SUMS"),
+    (lambda data: data["attributes"].update(head="AAAA"), "the header of the samples"),
+    (lambda data: data["attributes"].update(whole="no"), "holds no complete LUT"),
+    (lambda data: data["attributes"].update(version=[2]), r"has version \[2\]"),
 ]
 
 
 @pytest.mark.parametrize(("change", "fault"), CLAIMS)
-def test_what_a_store_claims_has_to_fit_together(lut: Lut, tmp_path: Path, change: Change, fault: str) -> None:
+def test_refuses_inconsistent_metadata(lut: Lut, tmp_path: Path, change: Change, fault: str) -> None:
     publish(lut, str(tmp_path / "published"))
     edit(tmp_path / "published", change)
     with pytest.raises(FormatError, match=fault):
@@ -229,7 +229,7 @@ def test_what_a_store_claims_has_to_fit_together(lut: Lut, tmp_path: Path, chang
     assert [path.name for path in tmp_path.iterdir() if path.name not in ("lut", "published")] == []
 
 
-def test_claimed_lights_do_not_fill_the_disk(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_lut_that_does_not_fit_disk(lut: Lut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     publish(lut, str(tmp_path / "published"))
 
     def nearly_full(place: Path) -> SimpleNamespace:
@@ -241,7 +241,7 @@ def test_claimed_lights_do_not_fill_the_disk(lut: Lut, tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("kind", ["pipe", "link"])
-def test_a_published_folder_of_no_plain_files_is_refused(lut: Lut, tmp_path: Path, kind: str) -> None:
+def test_refuses_irregular_files_in_store(lut: Lut, tmp_path: Path, kind: str) -> None:
     publish(lut, str(tmp_path / "published"))
     shard = next(path for path in (tmp_path / "published" / "c").rglob("*") if path.is_file())
     shard.unlink()
@@ -253,11 +253,11 @@ def test_a_published_folder_of_no_plain_files_is_refused(lut: Lut, tmp_path: Pat
         fetch(str(tmp_path / "published"), tmp_path / "back")
 
 
-def test_damaged_samples_are_not_published(lut: Lut, tmp_path: Path) -> None:
+def test_does_not_publish_damaged_samples(lut: Lut, tmp_path: Path) -> None:
     with (lut.folder / "samples.npy").open("r+b") as stream:
         stream.seek(-1, 2)
         stream.write(b"\x7f")
-    with pytest.raises(FormatError, match=f"light {LIGHTS - 1} "):
+    with pytest.raises(FormatError, match=f"illuminant {LIGHTS - 1} "):
         publish(open_lut(lut.folder), str(tmp_path / "published"))
     with pytest.raises(FormatError):
         fetch(str(tmp_path / "published"), tmp_path / "back")

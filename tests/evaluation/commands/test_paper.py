@@ -121,12 +121,12 @@ def test_what_was_computed_is_kept_where_the_reader_of_the_output_left(tmp_path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("chromaticities", "nowhere"), "nowhere is no table"),
+        (("chromaticities", "nowhere"), "nowhere is no LUT"),
         *(
             (("table1", "nowhere", "--pictures", ".", "--lights-like", "x.csv", option, given), message)
             for option, given, message in (
                 ("--sizes", "12,big", "'big' is no side of an image"),
-                ("--sizes", "1,65535", "nowhere is no table"),
+                ("--sizes", "1,65535", "nowhere is no LUT"),
             )
         ),
         (("bits", "nowhere.npz", "--out", "taken"), "taken already exists"),

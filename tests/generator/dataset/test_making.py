@@ -164,12 +164,12 @@ def test_images_come_of_samples_as_they_were_measured(make_lut: MakeLut, picture
     sources = find_pictures([pictures])
     by_codes = DatasetOptions(rendering="codes")
     generate_dataset(lut, tmp_path / "sound", sources, [0, 1], options=by_codes)
-    with pytest.raises(FormatError, match="samples of light 3"):
+    with pytest.raises(FormatError, match="illuminant 3"):
         generate_dataset(lut, tmp_path / "out", sources, [0, 3], options=by_codes)
-    with pytest.raises(FormatError, match="samples of light 3"):
+    with pytest.raises(FormatError, match="illuminant 3"):
         generate_dataset(lut, tmp_path / "mixed", sources, ListedLights((mixture_of({0: 1, 3: 1}),)), options=by_codes)
     # By colour the map of the print may rest on any light.
-    with pytest.raises(FormatError, match="samples of light 3"):
+    with pytest.raises(FormatError, match="illuminant 3"):
         generate_dataset(lut, tmp_path / "by-colour", sources, [3])
 
 
