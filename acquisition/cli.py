@@ -264,7 +264,7 @@ def check(
             print(line)
         if picture is not None:
             print(f"picture     {picture}")
-    if faults := [finding.name for finding in report.of("fault")]:
+    if faults := [finding.name for finding in report.with_grade("fault")]:
         raise QualityError(
             f"{counted(len(faults), 'fault')}: {', '.join(faults)}", remedy="the verdicts say what mends it"
         )

@@ -24,7 +24,7 @@ from acquisition.run import devices, run
 from acquisition.run.devices import (
     PAUSE_S,
     RETRY_S,
-    TOLD_LATER,
+    REPORTED_LATE,
     Devices,
     HealthWatch,
     RetryPolicy,
@@ -33,7 +33,7 @@ from acquisition.run.devices import (
     ask_all,
     await_health,
     health_fault,
-    lamp_fate,
+    settle_lamp,
     leave_lab,
     make_ready,
     pause_cause,
@@ -109,7 +109,7 @@ def test_an_answer_that_is_lost_does_not_let_the_lamp_burn(lost: int, said: str)
             return super().power()
 
     clock = SimulatedClock()
-    sentence = lamp_fate(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
+    sentence = settle_lamp(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
     assert sentence.startswith(said)
 
 
@@ -119,7 +119,7 @@ def test_a_lamp_that_is_out_is_left_alone() -> None:
             raise AssertionError
 
     clock = SimulatedClock()
-    said = lamp_fate(Untouched(clock), RunEnd.COMPLETE, SequenceSettings(), clock)
+    said = settle_lamp(Untouched(clock), RunEnd.COMPLETE, SequenceSettings(), clock)
     assert said == "it is out already: the projector is in standby"
 
 
@@ -128,7 +128,7 @@ def test_a_lamp_that_does_not_obey_is_said_to_burn() -> None:
         def switch_off(self) -> None: ...
 
     clock = SimulatedClock()
-    said = lamp_fate(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
+    said = settle_lamp(Deaf(clock, power=ON), RunEnd.COMPLETE, SequenceSettings(), clock)
     assert "burns on though the projector was told" in said
     assert "by hand" in said
     assert clock.monotonic() == 5
@@ -446,7 +446,7 @@ def test_a_full_disk_takes_the_notes_of_its_pause_when_there_is_space() -> None:
     retry = RetryPolicy(room.clock, 600, report, on_wait=beat)
     assert retry.attempt(room.broken(full), "the disk") == "done"
     assert room.words == ["retry", "paused", "resumed"]
-    late = [sentence for _, sentence in room.said if TOLD_LATER in sentence]
+    late = [sentence for _, sentence in room.said if REPORTED_LATE in sentence]
     assert len(late) == 2, "that it was retried and paused, two minutes ago"
     assert pause_cause(late[1]) == "the disk is full"
 
