@@ -273,7 +273,7 @@ def leave_lab(devices: Devices, end: RunEnd, sequence: SequenceSettings, report:
     try:
         devices.presenter.show(BLACK)
     except DeviceError as error:
-        _report_safely(report, "screen", f"the screen could not be set to black: {error}")
+        _report_safely(report, "screen", f"it could not be set to black: {error}")
     _report_safely(report, "lamp", settle_lamp(devices.projector, end, sequence, devices.clock))
 
 
@@ -367,9 +367,9 @@ def ask_all(questions: Mapping[str, Callable[[], object]]) -> None:
         ((name, fault),) = faults.items()
         raise fault_of(name, fault)
     is_input_error = all(isinstance(fault, InputError) for fault in faults.values())
-    error_class = ConfigurationError if is_input_error else DeviceError
+    cls = ConfigurationError if is_input_error else DeviceError
     lines = "".join(f"\n  {name}: {fault}" for name, fault in faults.items())
-    raise error_class(f"{len(faults)} of {len(questions)} devices cannot be used:{lines}") from next(iter(faults.values()))
+    raise cls(f"{len(faults)} of {len(questions)} devices cannot be used:{lines}") from next(iter(faults.values()))
 
 
 def fault_of(device: str, fault: CropError) -> CropError:
@@ -532,9 +532,9 @@ class RetryPolicy:
         self._unreported.append((event, sentence, self.clock.now()))
         with suppress(StorageError):
             while self._unreported:
-                event, sentence, reported_at = self._unreported[0]
-                is_late = (self.clock.now() - reported_at).total_seconds() > RETRY_S
-                self._report(event, f"{sentence}{REPORTED_LATE}{reported_at.astimezone():%H:%M:%S})" if is_late else sentence)
+                event, sentence, at = self._unreported[0]
+                is_late = (self.clock.now() - at).total_seconds() > RETRY_S
+                self._report(event, f"{sentence}{REPORTED_LATE}{at.astimezone():%H:%M:%S})" if is_late else sentence)
                 self._unreported.pop(0)
 
     def wait(self, seconds: float, state: str, sentence: Callable[[], str], *, idle: bool = True) -> None:
@@ -609,7 +609,7 @@ class Pause:
             how_long = "without limit" if math.isinf(policy.limit_s) else f"up to {duration_text(left_s)}"
             policy.report(
                 "still paused" if self._reported else "paused",
-                f"{_with_name(self._name, fault.while_waiting())} (the run waits {how_long}, and resumes automatically)",
+                f"{_with_name(self._name, fault.while_waiting())} (the run waits {how_long}, resumes automatically)",
             )
             self._reported = cause_text
         policy.wait(min(PAUSE_S, left_s), "paused", lambda: self._countdown(fault), idle=self._idle)
@@ -705,7 +705,7 @@ class RunWatch:
 
     def __init__(
         self,
-        on_late: Callable[[str, datetime], object] = lambda sentence, begun: None,
+        on_late: Callable[[str, datetime], object] = lambda sentence, started: None,
         elapsed: Callable[[], float] | None = None,
     ) -> None:
         self._on_late = on_late
@@ -761,7 +761,11 @@ class RunWatch:
                 self._gap_s += passed
                 if step is not None:
                     step.started += passed
-            if step is not None and not step.is_reported and now_s - step.started > LATE_TIMES * step.expected_s + LATE_S:
+            if (
+                step is not None
+                and not step.is_reported
+                and now_s - step.started > LATE_TIMES * step.expected_s + LATE_S
+            ):
                 late, step.is_reported = step, True
         if late is not None:
             started = datetime.now(UTC) - timedelta(seconds=now_s - late.started)

@@ -664,11 +664,11 @@ def test_what_hangs_is_named_while_it_hangs(
             watches.append(self)
 
         @contextmanager
-        def step(self, device: str, doing: str, expected_s: float, kind: str) -> Generator[None]:
-            expected[kind] = expected_s
-            with super().step(device, doing, expected_s, kind):
+        def step(self, device: str, doing: str, expected_s: float, step_kind: str) -> Generator[None]:
+            expected[step_kind] = expected_s
+            with super().step(device, doing, expected_s, step_kind):
                 with entered:
-                    kinds[:] = [kind]
+                    kinds[:] = [step_kind]
                     entered.notify_all()
                 try:
                     yield

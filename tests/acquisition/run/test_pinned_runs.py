@@ -155,7 +155,7 @@ def test_changes_that_a_run_follows_are_told_as_they_were(pinned: Pinned) -> Non
     for step, value in product(steps, (-2.0, -1.0, -0.2, 0.0, 0.2, 0.5, 0.51, 1.0, 1.01)):
         for name in ("movement", "off_brightness", "leak_share"):
             judged = Judgement((Check(name, value, -1.5, 1.5),))
-            found.append(len(list(pipeline._followed_changes(step, judged, steps, JudgeSettings()))))
+            found.append(len(list(pipeline._accepted_changes(step, judged, steps, JudgeSettings()))))
     pinned("changes that a run follows", found)
 
 

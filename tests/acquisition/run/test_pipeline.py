@@ -170,7 +170,7 @@ class TestRefusals:
         left: list[int] = []
 
         def count(taken: Taken) -> None:
-            left.append(taken.left)
+            left.append(taken.remaining)
 
         assert run(lab, judge, observe=count).complete
         assert left[:5] == [9, 8, 7, 6, 8], "what was voided is left again"

@@ -311,7 +311,7 @@ class TestDryRun:
     def test_a_rig_that_cannot_be_opened_is_a_fault_of_the_plan(self, lab: Path) -> None:
         lab.write_text(lab.read_text().replace('"Test"', '"Box"'))
         plan = dry_run(load_lab(lab), lab.parent / "night")
-        assert plan.work.left == 8
+        assert plan.work.remaining == 8
         with pytest.raises(ConfigurationError):
             plan.require()
 

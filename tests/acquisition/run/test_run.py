@@ -748,7 +748,7 @@ def test_the_time_left_is_that_of_the_last_frames_without_pauses(
             """Return what is said of ten frames left after others that took so long."""
             for seconds in frames_s:
                 now[0] += seconds
-                terminal.taken(Taken(STEP, Judgement((Check("file", reason=reason),)), 10))
+                terminal.show_frame(Taken(STEP, Judgement((Check("file", reason=reason),)), 10))
             terminal.progress(0, 10)
             return capsys.readouterr().err
 
@@ -767,7 +767,7 @@ def test_a_run_into_a_file_has_a_line_now_and_then(capsys: pytest.CaptureFixture
         for done in range(1, 201):
             now[0] += 2.0
             checks = Check("movement", 0.031, None, 0.2, "px"), Check("off_codes_deg", 0.7, None, 0.5, "°")
-            terminal.taken(Taken(STEP, Judgement(checks), 200 - done))
+            terminal.show_frame(Taken(STEP, Judgement(checks), 200 - done))
             terminal.progress(done, 200)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 + int(400 // PLAIN_S) + 1
